@@ -1,0 +1,122 @@
+"""Numeric arguments of the models: arrays and times, or an error that names them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def real_array(name: str, value: Any) -> Array:
+    """`value` as a new array of floats, or a ValueError that names the argument.
+
+    Strings that look like numbers and complex numbers are refused: converting them
+    silently hides a mistake.
+
+    Examples
+    --------
+    >>> real_array("A", [[1, 2]])
+    array([[1., 2.]])
+    >>> real_array("A", [["k", 2]])
+    Traceback (most recent call last):
+        ...
+    ValueError: `A` must hold real numbers only. Got [['k', 2]].
+    """
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind in "biufO":
+            return np.array(array, dtype=np.float64)
+    except (TypeError, ValueError):
+        pass
+    shown = repr(value)
+    shown = shown if len(shown) <= 80 else shown[:77] + "..."
+    raise ValueError(f"`{name}` must hold real numbers only. Got {shown}.")
+
+
+def matrix(name: str, value: ArrayLike) -> Array:
+    """`value` as a new finite matrix; a number or one row may stand for it."""
+    array = real_array(name, value)
+    if array.ndim < 2:
+        array = array.reshape(1, -1) if array.size else np.zeros((0, 0))
+    if array.ndim != 2:
+        raise ValueError(f"`{name}` must have 2 dimensions. Got shape {array.shape}.")
+    if not np.isfinite(array).all():
+        i, j = np.argwhere(~np.isfinite(array))[0]
+        raise ValueError(f"`{name}` must be finite. Got {array[i, j]} at [{i}, {j}].")
+    return array
+
+
+def positive_time(name: str, value: Any) -> float:
+    """`value` as a positive finite float, or a ValueError that names it."""
+    try:
+        time = np.nan if isinstance(value, bool | str) else float(value)
+    except (TypeError, ValueError):
+        time = np.nan
+    if not 0.0 < time < np.inf:
+        raise ValueError(
+            f"`{name}` must be a positive number of seconds. Got {value!r}."
+        )
+    return time
+
+
+def whole_number(name: str, value: Any, low: int, high: int | None = None) -> int:
+    """`value` as an int from `low` to `high`, or a ValueError that names it."""
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not whole or value < low or (high is not None and value > high):
+        limits = f"at least {low}" if high is None else f"{low} to {high}"
+        raise ValueError(f"`{name}` must be an integer, {limits}. Got {value!r}.")
+    return int(value)
+
+
+def input_samples(u: ArrayLike, n_inputs: int) -> Array:
+    """`u` as a finite array of shape (n_samples, n_inputs), or a ValueError."""
+    u = real_array("u", u)
+    if u.ndim == 1:
+        u = u[:, None]
+    if u.ndim != 2 or u.shape[1] != n_inputs:
+        raise ValueError(f"`u` must have shape (n_samples, {n_inputs}). Got {u.shape}.")
+    if not np.isfinite(u).all():
+        k, j = np.argwhere(~np.isfinite(u))[0]
+        raise ValueError(f"`u` must be finite. Got {u[k, j]} at sample {k}, input {j}.")
+    return u
+
+
+def state_vector(x0: ArrayLike, order: int) -> Array:
+    """`x0` as a finite array of shape (order,), or a ValueError that names it."""
+    x0 = real_array("initial_state", x0).reshape(-1)
+    if x0.shape != (order,):
+        raise ValueError(f"`initial_state` must have shape ({order},). Got {x0.shape}.")
+    if not np.isfinite(x0).all():
+        raise ValueError(f"`initial_state` must be finite. Got {x0}.")
+    return x0
+
+
+def named_values(
+    argument: str,
+    values: ArrayLike | Mapping[str, float],
+    names: Sequence[str] | None,
+) -> tuple[Array, list[str]]:
+    """Finite values of parameters, and their names (p1, p2, ... if not given)."""
+    if isinstance(values, Mapping):
+        names = list(values) if names is None else list(names)
+        if set(names) != set(values):
+            raise ValueError(
+                f"`{argument}` must have a value for each of {names}. Got values for "
+                f"{list(values)}."
+            )
+        values = [values[name] for name in names]
+    start = np.atleast_1d(real_array(argument, values))
+    names = [f"p{i + 1}" for i in range(len(start))] if names is None else list(names)
+    if not names or len(set(names)) != len(names):
+        raise ValueError(f"`parameter_names` must be distinct names. Got {names}.")
+    if start.shape != (len(names),) or not np.isfinite(start).all():
+        raise ValueError(
+            f"`{argument}` must hold one finite value for each of the {len(names)} "
+            f"parameters. Got {start}."
+        )
+    return start, names

@@ -1,0 +1,160 @@
+"""Gramians and balanced realisations (square-root algorithm)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import matrix_balance, schur, solve_triangular
+
+Array = NDArray[np.float64]
+
+
+def gramian_factor(A: Array, B: Array, discrete: bool) -> Array:
+    """Factor `L` of the controllability Gramian ``W = L L^T`` of a stable pair.
+
+    ``A W + W A^T + B B^T = 0`` in continuous time, ``A W A^T - W + B B^T = 0`` in
+    discrete time. The observability factor is ``gramian_factor(A.T, C.T, ...)``.
+
+    The factor itself is computed, not W: a factor taken from W has lost half of the
+    digits, and shows states that are not controllable as faintly controllable.
+
+    Parameters
+    ----------
+    A : ndarray of shape (n, n)
+        Stable.
+    B : ndarray of shape (n, n_inputs)
+    discrete : bool
+
+    Returns
+    -------
+    ndarray of shape (n, n)
+
+    Raises
+    ------
+    ValueError
+        If A is not stable.
+
+    References
+    ----------
+    .. [1] S. J. Hammarling, "Numerical solution of the stable, non-negative definite
+       Lyapunov equation", IMA Journal of Numerical Analysis 2, 1982.
+
+    Examples
+    --------
+    ``dx/dt = -2 x + 2 u`` has the Gramian 2^2 / (2 * 2) = 1:
+
+    >>> import numpy as np
+    >>> gramian_factor(np.array([[-2.0]]), np.array([[2.0]]), discrete=False) ** 2
+    array([[1.]])
+    """
+    n = len(A)
+    if n == 0:
+        return np.zeros((0, 0))
+    A, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    T, Q = schur(A, output="complex")
+    poles = np.diag(T)
+    margin = 1.0 - np.abs(poles) if discrete else -poles.real
+    if not (margin > 0).all():
+        worst = poles[margin.argmin()]
+        raise ValueError(f"a Gramian needs a stable model. Got a pole at {worst:.4g}.")
+    F = Q.conj().T @ (B / scale[:, None])
+    L = np.zeros((n, n), dtype=complex)
+    # Column k from the last input direction that state k receives; what is left of
+    # the earlier states is a Lyapunov equation of order k, with the input F[:k].
+    for k in range(n - 1, -1, -1):
+        pole = poles[k]
+        size = np.linalg.norm(F[k])
+        direction = F[k] / size if size > 0 else F[k]
+        if discrete:
+            root = np.sqrt(margin[k] * (1.0 + abs(pole)))
+            L[k, k] = size / root
+            along = F[:k] @ direction.conj()
+            rhs = pole.conj() * T[:k, k] * L[k, k] + root * along
+            L[:k, k] = _triangular(np.eye(k) - pole.conj() * T[:k, :k], rhs)
+            moved = T[:k, :k] @ L[:k, k] + T[:k, k] * L[k, k]
+            change = root * moved - (1.0 + pole) * along
+        else:
+            root = np.sqrt(2.0 * margin[k])
+            L[k, k] = size / root
+            rhs = -T[:k, k] * L[k, k] - root * (F[:k] @ direction.conj())
+            L[:k, k] = _triangular(T[:k, :k] + pole.conj() * np.eye(k), rhs)
+            change = -root * L[:k, k]
+        F[:k] += np.outer(change, direction)
+    factor = Q @ L
+    # W is real, so the real and imaginary parts side by side are a factor too.
+    side_by_side = np.hstack([factor.real, factor.imag])
+    R = np.asarray(np.linalg.qr(side_by_side.T, mode="r"))
+    return scale[:, None] * R.T
+
+
+def _triangular(U: NDArray, rhs: NDArray) -> NDArray:
+    return solve_triangular(U, rhs) if len(rhs) else rhs
+
+
+def balancing_transformation(
+    A: Array, B: Array, C: Array, discrete: bool
+) -> tuple[Array, Array, Array]:
+    """Hankel singular values and the balancing projections of a stable model.
+
+    Parameters
+    ----------
+    A, B, C : ndarray
+        Shapes (n, n), (n, n_inputs), (n_outputs, n).
+    discrete : bool
+
+    Returns
+    -------
+    hankel : ndarray of shape (n,)
+        Hankel singular values, descending.
+    left : ndarray of shape (r, n)
+    right : ndarray of shape (n, r)
+        ``left @ right = I``; ``(left A right, left B, C right)`` is balanced. `r` is
+        less than `n` when the remaining singular values are rounding noise
+        (states that are not controllable or not observable).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> A, B = np.diag([-1.0, -3.0]), np.array([[1.0], [0.0]])
+    >>> hankel, left, right = balancing_transformation(A, B, np.ones((1, 2)), False)
+    >>> hankel
+    array([0.5, 0. ])
+    >>> right.shape
+    (2, 1)
+    """
+    n = len(A)
+    controllable = gramian_factor(A, B, discrete)
+    observable = gramian_factor(A.T, C.T, discrete)
+    U, hankel, Vt = np.linalg.svd(observable.T @ controllable)
+    r = int((hankel > 1e-13 * max(n, 1) * hankel.max(initial=0.0)).sum())
+    root = np.sqrt(hankel[:r])
+    left = (U[:, :r] / root).T @ observable.T
+    right = controllable @ (Vt[:r].T / root)
+    return hankel, left, right
+
+
+def align_signs(B: Array, C: Array, B_ref: Array, C_ref: Array) -> Array:
+    """Signs (+1 or -1) that bring a balanced realisation next to a reference.
+
+    A balanced realisation with distinct Hankel singular values is unique up to the
+    sign of every state; the sign chosen for state ``i`` maximises
+    ``B_ref[i] B[i]^T + C_ref[:, i]^T C[:, i]``.
+
+    Parameters
+    ----------
+    B, B_ref : ndarray of shape (n, n_inputs)
+    C, C_ref : ndarray of shape (n_outputs, n)
+
+    Returns
+    -------
+    ndarray of shape (n,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> B, C = np.array([[1.0], [2.0]]), np.array([[1.0, 2.0]])
+    >>> align_signs(-B, -C, B, C)
+    array([-1., -1.])
+    """
+    match = np.einsum("ij,ij->i", B_ref, B) + np.einsum("ji,ji->i", C_ref, C)
+    return np.where(match < 0, -1.0, 1.0)

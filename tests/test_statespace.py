@@ -1,0 +1,350 @@
+"""StateSpace: a value object with the algebra of linear systems."""
+
+import copy
+import pickle
+import sys
+import types
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lpvlearn import StateSpace
+
+OMEGA = np.array([0.0, 0.1, 1.0, 7.0, 40.0])
+
+
+def random_model(seed, order=4, n_inputs=2, n_outputs=3, sampling_time=None):
+    """A stable model with feedthrough."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(order, order))
+    poles = np.linalg.eigvals(A)
+    if sampling_time is None:
+        A = A - (poles.real.max(initial=0.0) + 0.2) * np.eye(order)
+    else:
+        A = A / (1.1 * np.abs(poles).max(initial=1.0))
+    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
+    return StateSpace(A, B, C, rng.normal(size=(n_outputs, n_inputs)), sampling_time)
+
+
+@pytest.mark.parametrize("sampling_time", [None, 0.05])
+def test_frequency_response_is_its_definition(sampling_time):
+    model = random_model(0, sampling_time=sampling_time)
+    points = 1j * OMEGA if sampling_time is None else np.exp(1j * OMEGA * sampling_time)
+    expected = [
+        model.C @ np.linalg.solve(z * np.eye(4) - model.A, model.B) + model.D
+        for z in points
+    ]
+    np.testing.assert_allclose(
+        model.frequency_response(OMEGA), expected, rtol=1e-11, atol=1e-12
+    )
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    seed=st.integers(0, 10**6),
+    order=st.integers(1, 6),
+    scales=st.lists(st.floats(-6, 6), min_size=6, max_size=6),
+)
+def test_a_change_of_basis_leaves_the_response(seed, order, scales):
+    model = random_model(seed, order)
+    rng = np.random.default_rng(seed + 1)
+    rotation = np.linalg.qr(rng.normal(size=(order, order)))[0]
+    T = np.diag(10.0 ** np.array(scales[:order])) @ rotation
+    other = model.transform(T)
+    G, H = model.frequency_response(OMEGA), other.frequency_response(OMEGA)
+    np.testing.assert_allclose(H, G, rtol=1e-8, atol=1e-8 * np.abs(G).max())
+    np.testing.assert_array_equal(other.D, model.D)
+
+
+def test_transform_maps_the_state():
+    rng = np.random.default_rng(3)
+    model, T = random_model(1), rng.normal(size=(4, 4))
+    u, x0 = rng.normal(size=(30, 2)), rng.normal(size=4)
+    y = model.simulate(u, sampling_time=0.1, initial_state=x0)
+    z = model.transform(T).simulate(u, sampling_time=0.1, initial_state=T @ x0)
+    np.testing.assert_allclose(z, y, atol=1e-10 * np.abs(y).max())
+
+
+@pytest.mark.parametrize("sampling_time", [None, 0.05])
+def test_difference_has_the_difference_of_responses(sampling_time):
+    one = random_model(0, 4, sampling_time=sampling_time)
+    two = random_model(1, 2, sampling_time=sampling_time)
+    G = one.frequency_response(OMEGA) - two.frequency_response(OMEGA)
+    difference = one - two
+    assert difference.order == 6
+    np.testing.assert_allclose(difference.frequency_response(OMEGA), G, atol=1e-11)
+    assert (one - one).hinf_norm() < 1e-10 * one.hinf_norm()
+
+
+def test_dc_gain_is_the_settled_step_response():
+    model = random_model(5)
+    y = model.simulate(np.ones((4000, 2)), sampling_time=0.1)
+    np.testing.assert_allclose(y[-1], model.dc_gain() @ np.ones(2), rtol=1e-9)
+    np.testing.assert_allclose(
+        model.to_discrete(0.3).dc_gain(), model.dc_gain(), rtol=1e-10
+    )
+
+
+def test_dc_gain_of_an_integrator_is_infinite():
+    assert np.isinf(StateSpace(0, 1, 1).dc_gain()).all()
+
+
+@pytest.mark.parametrize("damping", [0.01, 0.3, 0.7])
+def test_hinf_norm_of_a_resonance(damping):
+    model = StateSpace([[0, 1], [-1, -2 * damping]], [[0], [1]], [[1, 0]])
+    expected = 1 / (2 * damping * np.sqrt(1 - damping**2))
+    assert model.hinf_norm() == pytest.approx(expected, rel=1e-9)
+
+
+def test_hinf_norm_of_lags_all_passes_and_unstable_models():
+    assert StateSpace(-2, 6, 1).hinf_norm() == pytest.approx(3.0)
+    all_pass = StateSpace(-1, 2, -1, 1)  # (s - 1) / (s + 1)
+    assert all_pass.hinf_norm() == pytest.approx(1.0)
+    assert StateSpace(0.5, 1, 1, sampling_time=1.0).hinf_norm() == pytest.approx(2.0)
+    assert StateSpace(1, 1, 1).hinf_norm() == np.inf
+    assert StateSpace(0, 1, 1).hinf_norm() == np.inf
+
+
+@pytest.mark.parametrize("sampling_time", [None, 0.1])
+def test_hinf_norm_bounds_every_frequency(sampling_time):
+    model = random_model(8, sampling_time=sampling_time)
+    omega = np.concatenate([[0.0], np.logspace(-3, np.log10(np.pi / 0.1), 4000)])
+    largest = np.linalg.svd(model.frequency_response(omega), compute_uv=False).max()
+    assert largest <= model.hinf_norm() * (1 + 1e-9)
+    assert largest == pytest.approx(model.hinf_norm(), rel=1e-3)
+
+
+def test_poles_are_sorted_and_stability_follows_them():
+    model = StateSpace(np.diag([3.0, -1.0, 2.0]), np.ones((3, 1)), np.ones((1, 3)))
+    np.testing.assert_array_equal(model.poles(), [-1, 2, 3])
+    assert not model.is_stable
+    assert random_model(0).is_stable and random_model(0, sampling_time=1.0).is_stable
+    assert not StateSpace(0, 1, 1).is_stable
+    assert StateSpace(0, 1, 1, sampling_time=1.0).is_stable
+    assert not StateSpace(-1, 1, 1, sampling_time=1.0).is_stable
+
+
+# -- simulation ------------------------------------------------------------------
+
+
+def test_simulation_of_a_lag_is_the_exponential():
+    t = 0.1 * np.arange(50)
+    y = StateSpace(-2, 2, 1).simulate(np.ones(50), sampling_time=0.1)
+    np.testing.assert_allclose(y[:, 0], 1 - np.exp(-2 * t), atol=1e-13)
+
+
+def test_continuous_simulation_is_that_of_the_sampled_model():
+    model, u = random_model(2), np.random.default_rng(0).normal(size=(200, 2))
+    x0 = np.arange(4.0)
+    y = model.simulate(u, sampling_time=0.2, initial_state=x0)
+    sampled = model.to_discrete(0.2)
+    np.testing.assert_array_equal(y, sampled.simulate(u, initial_state=x0))
+    np.testing.assert_array_equal(
+        y, sampled.simulate(u, sampling_time=0.2 * (1 + 1e-9), initial_state=x0)
+    )
+
+
+def test_simulation_is_causal_and_linear():
+    model, rng = random_model(2), np.random.default_rng(0)
+    u, v = rng.normal(size=(2, 60, 2))
+    run = lambda w: model.simulate(w, sampling_time=0.1)  # noqa: E731
+    np.testing.assert_allclose(run(2 * u - v), 2 * run(u) - run(v), atol=1e-11)
+    later = u.copy()
+    later[30:] += 1
+    np.testing.assert_array_equal(run(later)[:30], run(u)[:30])
+
+
+# -- a pure gain -----------------------------------------------------------------
+
+
+def test_pure_gain_has_every_method():
+    D = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    gain, u = StateSpace([], [], [], D), np.arange(12.0).reshape(4, 3)
+    assert (gain.order, gain.n_inputs, gain.n_outputs) == (0, 3, 2)
+    np.testing.assert_array_equal(gain.simulate(u, sampling_time=1.0), u @ D.T)
+    np.testing.assert_array_equal(
+        gain.frequency_response([0.0, 1.0, np.inf]), np.array([D, D, D])
+    )
+    np.testing.assert_array_equal(gain.dc_gain(), D)
+    assert gain.hinf_norm() == pytest.approx(np.linalg.norm(D, 2))
+    assert gain.is_stable and gain.poles().shape == (0,)
+    assert gain.balance().order == 0 and gain.hankel_singular_values().shape == (0,)
+    assert gain.transform(np.zeros((0, 0))).order == 0
+    assert ((gain - gain).D == 0).all()
+    np.testing.assert_array_equal((gain - random_model(0, 2, 3, 2)).A.shape, (2, 2))
+    for method in ("zoh", "tustin"):
+        sampled = gain.to_discrete(0.1, method)
+        np.testing.assert_array_equal(sampled.D, D)
+        np.testing.assert_array_equal(sampled.to_continuous(method).D, D)
+
+
+def test_pure_gain_takes_its_shape_from_any_matrix():
+    model = StateSpace(np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((3, 0)))
+    np.testing.assert_array_equal(model.D, np.zeros((3, 2)))
+    assert StateSpace([], [], [], 2.0).D.shape == (1, 1)
+
+
+# -- a value object --------------------------------------------------------------
+
+
+def test_models_cannot_be_changed():
+    A = np.array([[-1.0]])
+    model = StateSpace(A, 1, 1)
+    A[0, 0] = 5.0
+    assert model.A[0, 0] == -1.0
+    with pytest.raises(FrozenInstanceError):
+        model.A = A
+    with pytest.raises(FrozenInstanceError):
+        model.label = "new"
+    with pytest.raises(ValueError, match="read-only"):
+        model.A[0, 0] = 2.0
+
+
+@pytest.mark.parametrize(
+    "duplicate",
+    [copy.copy, copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))],
+)
+@pytest.mark.parametrize("order", [0, 3])
+def test_copies_and_pickles_are_equal_and_read_only(duplicate, order):
+    model = random_model(0, order, sampling_time=0.1)
+    other = duplicate(model)
+    assert isinstance(other, StateSpace) and other.sampling_time == 0.1
+    for name in "ABCD":
+        np.testing.assert_array_equal(getattr(other, name), getattr(model, name))
+        assert not getattr(other, name).flags.writeable
+
+
+def test_repr_tells_the_dimensions():
+    text = "StateSpace(order=4, n_inputs=2, n_outputs=3, "
+    assert repr(random_model(0)) == text + "continuous time)"
+    assert repr(random_model(0, sampling_time=0.1)) == text + "sampling_time=0.1)"
+
+
+# -- errors ----------------------------------------------------------------------
+
+ONE = [[1.0]]
+SQUARE = [[-1.0, 0.0], [0.0, -2.0]]
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ((ONE, ONE, ONE, [[1, 2]]), r"`D` must have shape \(1, 1\).*\(1, 2\)"),
+        (([[1, 2]], ONE, ONE), r"`A` must be square. Got shape \(1, 2\)"),
+        ((SQUARE, [1, 1], [[1, 1]]), r"`B` needs 2 rows and `C` 2 columns"),
+        ((SQUARE, [[1], [1]], [[1]]), r"`B` needs 2 rows and `C` 2 columns"),
+        ((np.zeros((1, 1, 1)), ONE, ONE), "`A` must have 2 dimensions"),
+        (([[np.nan]], ONE, ONE), r"`A` must be finite. Got nan at \[0, 0\]"),
+        ((SQUARE, [[1], [np.inf]], [[1, 1]]), r"`B` must be finite.*inf at \[1, 0\]"),
+        ((ONE, ONE, ONE, [[np.nan]]), "`D` must be finite"),
+        (([["k"]], ONE, ONE), "`A` must hold real numbers only"),
+        (([["1"]], ONE, ONE), "`A` must hold real numbers only"),
+        ((ONE, [[1j]], ONE), "`B` must hold real numbers only"),
+        ((ONE, [[None]], ONE), "`B` must hold real|`B` must be finite"),
+        (([[1, 2], [3]], ONE, ONE), "`A` must hold real numbers only"),
+        ((ONE, ONE, ONE, None, 0.0), "`sampling_time` must be a positive"),
+        ((ONE, ONE, ONE, None, -1), "`sampling_time` must be a positive"),
+        ((ONE, ONE, ONE, None, np.nan), "`sampling_time` must be a positive"),
+        ((ONE, ONE, ONE, None, np.inf), "`sampling_time` must be a positive"),
+        ((ONE, ONE, ONE, None, "1"), "`sampling_time` must be a positive"),
+        ((ONE, ONE, ONE, None, True), "`sampling_time` must be a positive"),
+        ((ONE, ONE, ONE, None, [1, 2]), "`sampling_time` must be a positive"),
+        (([], [], []), "a pure gain takes them from `D`"),
+        ((ONE, np.zeros((1, 0)), ONE), "at least one input and one output"),
+        (([], np.zeros((0, 3)), [], [[1, 2]]), "`D` must have shape"),
+        (([], [[1]], [], [[1]]), "`B` needs 0 rows"),
+    ],
+)
+def test_wrong_matrices_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        StateSpace(*arguments)
+
+
+CONTINUOUS, DISCRETE = random_model(0), random_model(0, sampling_time=0.1)
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: CONTINUOUS.frequency_response([np.nan]), "`omega`.*1 NaN"),
+        (lambda: CONTINUOUS.frequency_response([[1.0]]), r"`omega`.*\(n_freq,\)"),
+        (lambda: CONTINUOUS.frequency_response("dc"), "`omega` must hold real"),
+        (lambda: DISCRETE.frequency_response([np.inf]), "`omega` must be finite"),
+        (lambda: CONTINUOUS.simulate(np.ones((3, 2))), "`sampling_time`.*Got None"),
+        (lambda: DISCRETE.simulate(np.ones((3, 1))), r"`u`.*\(n_samples, 2\)"),
+        (lambda: DISCRETE.simulate(1.0), r"`u`.*\(n_samples, 2\)"),
+        (lambda: DISCRETE.simulate([[1, np.nan]]), "`u`.*nan at sample 0, input 1"),
+        (lambda: DISCRETE.simulate("u"), "`u` must hold real"),
+        (
+            lambda: DISCRETE.simulate(np.ones((3, 2)), sampling_time=0.2),
+            "`sampling_time` must be 0.1 s",
+        ),
+        (
+            lambda: DISCRETE.simulate(np.ones((3, 2)), initial_state=[1.0]),
+            r"`initial_state` must have shape \(4,\)",
+        ),
+        (
+            lambda: DISCRETE.simulate(np.ones((3, 2)), initial_state=[np.nan] * 4),
+            "`initial_state` must be finite",
+        ),
+        (lambda: DISCRETE.transform(np.eye(3)), "`T` must have shape"),
+        (lambda: DISCRETE.transform(np.ones((4, 4))), "`T` must be invertible"),
+        (lambda: DISCRETE.transform(np.zeros((4, 4))), "`T` must be invertible"),
+        (lambda: DISCRETE - CONTINUOUS, "same inputs, outputs and sampling"),
+        (lambda: DISCRETE - random_model(0, 4, 1), "same inputs, outputs"),
+        (lambda: DISCRETE.to_discrete(0.1), "needs a continuous-time model"),
+        (lambda: CONTINUOUS.to_discrete(0.1, "euler"), "`method`.*'euler'"),
+        (lambda: CONTINUOUS.to_discrete(0), "`sampling_time` must be a positive"),
+        (lambda: DISCRETE.to_continuous("euler"), "`method`.*'euler'"),
+        (lambda: CONTINUOUS.to_continuous("euler"), "`method`.*'euler'"),
+        (lambda: StateSpace(1e6, 1, 1).to_discrete(1.0), "too long.*1e\\+06"),
+        (lambda: CONTINUOUS.balance(5), "`order` must be an integer, 0 to 4"),
+        (lambda: CONTINUOUS.balance(-1), "`order` must be an integer, 0 to 4"),
+        (lambda: CONTINUOUS.balance(2.0), "`order` must be an integer"),
+        (lambda: CONTINUOUS.balance(True), "`order` must be an integer"),
+        (lambda: StateSpace(1, 1, 1).balance(), "stable model. Got a pole at 1"),
+        (lambda: StateSpace(0, 1, 1).hankel_singular_values(), "stable model"),
+    ],
+)
+def test_wrong_calls_are_explained(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_subtracting_something_else_is_a_type_error():
+    with pytest.raises(TypeError):
+        CONTINUOUS - 3
+
+
+# -- python-control --------------------------------------------------------------
+
+
+def test_round_trip_through_control():
+    pytest.importorskip("control")
+    for model in (CONTINUOUS, DISCRETE):
+        back = StateSpace.from_control(model.to_control())
+        assert back.sampling_time == model.sampling_time
+        for name in "ABCD":
+            np.testing.assert_array_equal(getattr(back, name), getattr(model, name))
+
+
+def test_control_gets_zero_for_continuous_time(monkeypatch):
+    fake = types.ModuleType("control")
+    fake.ss = lambda A, B, C, D, dt: types.SimpleNamespace(A=A, B=B, C=C, D=D, dt=dt)
+    monkeypatch.setitem(sys.modules, "control", fake)
+    assert CONTINUOUS.to_control().dt == 0 and DISCRETE.to_control().dt == 0.1
+    for model in (CONTINUOUS, DISCRETE):
+        back = StateSpace.from_control(model.to_control())
+        assert back.sampling_time == model.sampling_time
+
+
+def test_control_models_of_unknown_time_or_kind_are_refused():
+    known = dict(A=ONE, B=ONE, C=ONE, D=ONE)
+    for dt in (None, True):
+        with pytest.raises(ValueError, match="`model.dt`"):
+            StateSpace.from_control(types.SimpleNamespace(**known, dt=dt))
+    with pytest.raises(ValueError, match="must be a control.StateSpace.*int"):
+        StateSpace.from_control(3)
