@@ -1,0 +1,117 @@
+"""Local identifiability of a gray-box structure from its frequency response."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr
+
+Array = NDArray[np.float64]
+
+_RANK_TOLERANCE = 1e-9
+_NAMED = 0.1
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """Rank analysis of the derivative of the response to the parameters.
+
+    Attributes
+    ----------
+    rank : int
+        Number of parameter combinations that the response determines.
+    n_params : int
+    condition : float
+        Largest over smallest singular value; relative errors of the response grow into
+        the parameters by up to this factor. Infinite or huge if the rank is deficient.
+    directions : tuple of dict
+        One for every undetermined combination: change by parameter name, in steps that
+        have the same effect on the response, the largest 1; below 0.1 it is left out.
+    """
+
+    rank: int
+    n_params: int
+    condition: float
+    directions: tuple[dict[str, float], ...]
+
+    def __str__(self) -> str:
+        if not self.directions:
+            return (
+                f"all {self.n_params} parameters are identifiable "
+                f"(condition {self.condition:.2g})."
+            )
+        parts = [
+            " ".join(f"{value:+.2g} {name}" for name, value in direction.items())
+            for direction in self.directions
+        ]
+        return (
+            f"the response determines {self.rank} of the {self.n_params} parameters. "
+            f"It does not change along: {'; '.join(parts)} (in steps of equal effect). "
+            "Fix a parameter of each combination in the template."
+        )
+
+    @classmethod
+    def from_jacobian(
+        cls, J: NDArray[np.complex128], names: Sequence[str]
+    ) -> Identifiability:
+        """Analysis of the response Jacobian.
+
+        Every column is divided by its norm: the analysis does not depend on the units
+        of the parameters, nor on parameters that happen to be zero.
+
+        Parameters
+        ----------
+        J : ndarray of shape (n_freq, n_outputs, n_inputs, n_params)
+            Derivatives of the frequency response.
+        names : sequence of str
+
+        Returns
+        -------
+        Identifiability
+
+        Examples
+        --------
+        The gain ``b c`` of a response does not tell ``b`` from ``c``:
+
+        >>> J = np.array([[[[2.0 + 0j, 3.0]]]])  # at b = 3, c = 2
+        >>> found = Identifiability.from_jacobian(J, ["b", "c"])
+        >>> found.rank, found.directions
+        (1, ({'b': 1.0, 'c': -1.0},))
+        """
+        n = J.shape[-1]
+        flat = J.reshape(int(np.prod(J.shape[:-1])), n)
+        # Rows of zeros: few frequencies must not hide undetermined combinations.
+        columns = np.vstack([flat.real, flat.imag, np.zeros((n, n))])
+        effect = np.linalg.norm(columns, axis=0)
+        columns = columns / np.where(effect > 0, effect, 1.0)
+        _, s, Vt = np.linalg.svd(columns, full_matrices=False)
+        top = float(s.max(initial=0.0))
+        rank = int((s > _RANK_TOLERANCE * top).sum())
+        directions = tuple(
+            {
+                name: float(value)
+                for name, value in zip(names, row, strict=True)
+                if abs(value) > _NAMED
+            }
+            for row in _sparse_rows(Vt[rank:])
+        )
+        low = float(s.min(initial=top))
+        condition = top / low if low > 0 else np.inf
+        return cls(rank, n, condition, directions)
+
+
+def _sparse_rows(null: Array) -> Array:
+    """Basis of the row space, each row with one entry of its own, largest entry 1.
+
+    Combinations that have nothing to do with one another come apart; an orthonormal
+    basis would mix them.
+    """
+    if len(null) == 0:
+        return null
+    own = qr(null, mode="r", pivoting=True)[1][: len(null)]
+    rows = np.linalg.solve(null[:, own], null)
+    largest = np.take_along_axis(rows, np.abs(rows).argmax(1)[:, None], 1)
+    return (rows / largest).round(12) + 0.0

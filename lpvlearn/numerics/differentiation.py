@@ -1,0 +1,119 @@
+"""Derivatives of array-valued functions of a vector, by complex step or differences."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.exceptions import ComplexWarning
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_COMPLEX_STEP = 1e-30
+_CENTRAL_STEP = 6e-6  # about eps^(1/3): rounding and truncation balance
+_CURVATURE_STEP = 1e-5
+_AGREEMENT = 1e-4
+
+
+def parameter_scale(theta: Array, typical: Array | None = None) -> Array:
+    """Size of every parameter, for steps; units may differ from one to another.
+
+    Parameters
+    ----------
+    theta : ndarray of shape (n_params,)
+    typical : ndarray of shape (n_params,), default=None
+        Usual values; a parameter is not taken as smaller than a thousandth of them.
+        None, or 0, stands for 1.
+
+    Returns
+    -------
+    ndarray of shape (n_params,)
+    """
+    usual = np.ones(len(theta)) if typical is None else np.abs(typical)
+    return np.maximum(np.abs(theta), 1e-3 * np.where(usual > 0, usual, 1.0))
+
+
+def numerical_jacobian(
+    f: Callable[[Any], Any], theta: Array, typical: Array | None = None
+) -> Array:
+    """Derivative of `f` at `theta`, exact to rounding where `f` is analytic.
+
+    Parameters
+    ----------
+    f : callable
+        Maps (n_params,) to an array of any shape; where it cannot take complex
+        parameters, or is not analytic, central differences are used.
+    theta : ndarray of shape (n_params,)
+    typical : ndarray of shape (n_params,), default=None
+        Usual sizes of the parameters.
+
+    Returns
+    -------
+    ndarray of shape (n_params, ...)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> numerical_jacobian(lambda t: np.array([t[0] * t[1], np.exp(t[0])]),
+    ...                    np.array([0.0, 3.0]))
+    array([[3., 1.],
+           [0., 0.]])
+    """
+    scale = parameter_scale(theta, typical)
+    central = _central(f, theta, _CENTRAL_STEP * scale)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", ComplexWarning)
+            columns = [
+                np.imag(f(theta + 1j * step)) / step.max()
+                for step in np.diag(_COMPLEX_STEP * scale)
+            ]
+        exact = np.array(columns, dtype=float)
+    except (TypeError, ValueError, NotImplementedError, ComplexWarning):
+        return central
+    # A function that is not analytic (abs, real, conj) fails the complex step in
+    # silence. The change per relative change of a parameter tells, entry by entry.
+    size = scale.reshape(-1, *[1] * (central.ndim - 1))
+    change, rounding = np.abs(central) * size, 1e-8 * np.abs(f(theta))
+    agrees = np.abs(exact - central) * size <= _AGREEMENT * change + rounding
+    return exact if agrees.all() else central
+
+
+def numerical_curvature(
+    jacobian: Callable[[Array], Array], theta: Array, typical: Array | None = None
+) -> Array:
+    """Second derivatives, by central differences of a Jacobian, symmetrised.
+
+    Parameters
+    ----------
+    jacobian : callable
+        Maps (n_params,) to (n_params, ...).
+    theta : ndarray of shape (n_params,)
+    typical : ndarray of shape (n_params,), default=None
+        Usual sizes of the parameters.
+
+    Returns
+    -------
+    ndarray of shape (n_params, n_params, ...)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> H = numerical_curvature(lambda t: np.array([3 * t[0] ** 2]), np.array([2.0]))
+    >>> H.round(6)
+    array([[12.]])
+    """
+    H = _central(jacobian, theta, _CURVATURE_STEP * parameter_scale(theta, typical))
+    return 0.5 * (H + H.swapaxes(0, 1))
+
+
+def _central(f: Callable[[Any], Any], theta: Array, steps: Array) -> Array:
+    return np.array(
+        [
+            (f(theta + step) - f(theta - step)) / (2.0 * step.max())
+            for step in np.diag(steps)
+        ]
+    )
