@@ -1,0 +1,347 @@
+"""Scorers and reports of fit for estimators that simulate.
+
+The measures `bft_score`, `vaf_score` and `parameter_fit` are pure functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+from sklearn.pipeline import Pipeline
+
+from .columns import Table, is_table
+from .experiments import read_outputs
+from .scores import bft_score, parameter_fit, r2_ratio, vaf_score
+
+__all__ = [
+    "TrajectoryScorer",
+    "bft_score",
+    "bft_scorer",
+    "fit_report",
+    "make_bft_scorer",
+    "make_vaf_scorer",
+    "parameter_fit",
+    "vaf_score",
+    "vaf_scorer",
+]
+
+InitialState = Literal["rest", "estimate"]
+
+
+@dataclass(frozen=True)
+class TrajectoryScorer:
+    """A scorer, `scorer(estimator, X, y) -> float`, for estimators that simulate.
+
+    Made by `make_bft_scorer` and `make_vaf_scorer`; usable as `scoring=` wherever
+    scikit-learn takes a callable.
+
+    Attributes
+    ----------
+    metric : {"BFT", "VAF"}
+    initial_state : {"rest", "estimate"}
+    burn_in : int
+    multioutput : "uniform_average" or tuple of float
+    average : {"pool", "experiment"}
+    """
+
+    metric: Literal["BFT", "VAF"]
+    initial_state: InitialState = "rest"
+    burn_in: int = 0
+    multioutput: str | tuple[float, ...] = "uniform_average"
+    average: Literal["pool", "experiment"] = "pool"
+
+    def __call__(self, estimator: Any, X: Any, y: Any) -> float:
+        """Score an estimator's simulation of `X` against `y`."""
+        score = bft_score if self.metric == "BFT" else vaf_score
+        simulator, X = _unwrap(estimator, X)
+        Y, _ = read_outputs(y)
+        Y_pred = _simulate(simulator, X, y, self.initial_state)
+        pool = self.average == "pool"
+        groups = [np.arange(len(Y))]
+        if self.burn_in or not pool:
+            groups = _drop_start(_split(simulator, X), self.burn_in)
+        if pool:
+            groups = [np.concatenate(groups)]
+        scores = [
+            score(Y[rows], Y_pred[rows], multioutput=self.multioutput)
+            for rows in groups
+        ]
+        return float(np.mean(scores))
+
+
+def make_bft_scorer(
+    *,
+    initial_state: InitialState = "rest",
+    burn_in: int = 0,
+    multioutput: Literal["uniform_average"] | ArrayLike = "uniform_average",
+    average: Literal["pool", "experiment"] = "pool",
+) -> TrajectoryScorer:
+    """Make a scorer of the best fit ratio.
+
+    Parameters
+    ----------
+    initial_state : {"rest", "estimate"}, default="rest"
+        State at the start of each experiment. "rest" scores `estimator.predict(X)`;
+        "estimate" scores `estimator.predict_with_initial_state(X, y)`, which fits the
+        initial state to the outputs by least squares: use it when a split starts in
+        mid-trajectory, as `TimeSeriesSplit` does.
+    burn_in : int, default=0
+        Samples at the start of each experiment that are simulated but not scored. The
+        estimator's `split_experiments(X)` tells the rows of each experiment.
+    multioutput : "uniform_average" or array-like of shape (n_outputs,)
+        Mean over the outputs, or weights: `[1, 0]` scores the first output alone.
+    average : {"pool", "experiment"}, default="pool"
+        Score all experiments as one record, as scikit-learn does, or take the mean of
+        their scores, which offsets between experiments cannot flatter.
+
+    Returns
+    -------
+    TrajectoryScorer
+
+    Raises
+    ------
+    ValueError
+        When an option is not one of those above.
+
+    Examples
+    --------
+    >>> from lpvlearn.metrics import make_bft_scorer
+    >>> make_bft_scorer(burn_in=20).burn_in
+    20
+    """
+    return _make_scorer("BFT", initial_state, burn_in, multioutput, average)
+
+
+def make_vaf_scorer(
+    *,
+    initial_state: InitialState = "rest",
+    burn_in: int = 0,
+    multioutput: Literal["uniform_average"] | ArrayLike = "uniform_average",
+    average: Literal["pool", "experiment"] = "pool",
+) -> TrajectoryScorer:
+    """Make a scorer of the variance accounted for.
+
+    Parameters
+    ----------
+    initial_state : {"rest", "estimate"}, default="rest"
+    burn_in : int, default=0
+    multioutput : "uniform_average" or array-like of shape (n_outputs,)
+    average : {"pool", "experiment"}, default="pool"
+        As in `make_bft_scorer`.
+
+    Returns
+    -------
+    TrajectoryScorer
+
+    Raises
+    ------
+    ValueError
+        When an option is not one of those above.
+
+    Examples
+    --------
+    >>> from lpvlearn.metrics import make_vaf_scorer
+    >>> make_vaf_scorer(multioutput=[1, 0]).multioutput
+    (1.0, 0.0)
+    """
+    return _make_scorer("VAF", initial_state, burn_in, multioutput, average)
+
+
+def fit_report(
+    estimator: Any,
+    X: Any,
+    y: Any,
+    *,
+    initial_state: InitialState = "rest",
+    burn_in: int = 0,
+) -> pd.DataFrame:
+    """Report the fit of every output in every experiment.
+
+    Parameters
+    ----------
+    estimator : fitted estimator
+        Anything with `predict`; without `split_experiments(X)`, the table is taken as
+        one experiment.
+    X : DataFrame or array-like of shape (n_samples, n_features)
+    y : DataFrame, Series or array-like of shape (n_samples,) or (n_samples, n_outputs)
+        Measured outputs.
+    initial_state : {"rest", "estimate"}, default="rest"
+    burn_in : int, default=0
+        As in `make_bft_scorer`.
+
+    Returns
+    -------
+    DataFrame
+        One row per experiment and output; columns `experiment`, `operating_point` (the
+        label, else the mean of the scheduling variable, a tuple for several),
+        `output`, `BFT` and `VAF` (percent), `RMSE` (units of the output) and `R2`.
+
+    Raises
+    ------
+    ValueError
+        When shapes differ, or `burn_in` leaves nothing of an experiment.
+    TypeError
+        When the estimator lacks the method that an option needs.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sklearn.linear_model import LinearRegression
+    >>> from lpvlearn.metrics import fit_report
+    >>> u = np.array([[0.0], [1.0], [2.0]])
+    >>> fit_report(LinearRegression().fit(u, [0, 1, 2]), u, [0, 1, 3]).round(3)
+       experiment operating_point output     BFT     VAF   RMSE     R2
+    0           0            None     y1  53.709  85.714  0.577  0.786
+    """
+    _check_options(initial_state, burn_in)
+    simulator, X = _unwrap(estimator, X)
+    Y, names = read_outputs(y)
+    Y_pred = _simulate(simulator, X, y, initial_state)
+    groups = [np.arange(len(Y))]
+    labels: list[tuple[Hashable, Hashable]] = [(0, None)]
+    if burn_in or _owner_of_experiments(simulator) is not None:
+        groups = _split(simulator, X)
+        labels = _labels(simulator, X, groups)
+    table = []
+    for rows, (experiment, operating_point) in zip(
+        _drop_start(groups, burn_in), labels, strict=True
+    ):
+        true, pred = Y[rows], Y_pred[rows]
+        bft = bft_score(true, pred, multioutput="raw_values")
+        vaf = vaf_score(true, pred, multioutput="raw_values")
+        rmse = np.sqrt(np.mean((true - pred) ** 2, axis=0))
+        r2 = r2_ratio(true, pred)
+        for k, name in enumerate(names):
+            table.append(
+                {
+                    "experiment": experiment,
+                    "operating_point": operating_point,
+                    "output": name,
+                    "BFT": float(bft[k]),
+                    "VAF": float(vaf[k]),
+                    "RMSE": float(rmse[k]),
+                    "R2": float(r2[k]),
+                }
+            )
+    return pd.DataFrame(table)
+
+
+def _make_scorer(
+    metric: Literal["BFT", "VAF"],
+    initial_state: InitialState,
+    burn_in: int,
+    multioutput: Any,
+    average: Literal["pool", "experiment"],
+) -> TrajectoryScorer:
+    _check_options(initial_state, burn_in)
+    if average not in ("pool", "experiment"):
+        raise ValueError(f"`average` must be 'pool' or 'experiment'. Got {average!r}.")
+    if isinstance(multioutput, str):
+        if multioutput != "uniform_average":
+            raise ValueError(
+                "`multioutput` of a scorer must be 'uniform_average' or one weight per "
+                f"output, as a scorer returns one number. Got {multioutput!r}."
+            )
+    else:
+        multioutput = tuple(np.asarray(multioutput, dtype=np.float64).tolist())
+    return TrajectoryScorer(metric, initial_state, burn_in, multioutput, average)
+
+
+def _check_options(initial_state: str, burn_in: int) -> None:
+    if initial_state not in ("rest", "estimate"):
+        raise ValueError(
+            f"`initial_state` must be 'rest' or 'estimate'. Got {initial_state!r}."
+        )
+    if not isinstance(burn_in, (int, np.integer)) or burn_in < 0:
+        raise ValueError(
+            f"`burn_in` must be a number of samples, an integer >= 0. Got {burn_in!r}."
+        )
+
+
+def _unwrap(estimator: Any, X: Any) -> tuple[Any, Any]:
+    """Return the simulating estimator within a search or pipeline, and its input."""
+    while True:
+        if hasattr(estimator, "best_estimator_"):
+            estimator = estimator.best_estimator_
+        elif isinstance(estimator, Pipeline):
+            X = estimator[:-1].transform(X) if len(estimator) > 1 else X
+            estimator = estimator[-1]
+        else:
+            return estimator, X
+
+
+def _simulate(
+    estimator: Any, X: Any, y: Any, initial_state: InitialState
+) -> NDArray[np.float64]:
+    if initial_state == "rest":
+        return read_outputs(estimator.predict(X))[0]
+    if not hasattr(estimator, "predict_with_initial_state"):
+        raise TypeError(
+            "`initial_state='estimate'` needs an estimator with the method "
+            f"predict_with_initial_state(X, y). Got {type(estimator).__name__}; use "
+            "`initial_state='rest'`, with `burn_in` to leave out the transient."
+        )
+    return read_outputs(estimator.predict_with_initial_state(X, y))[0]
+
+
+def _owner_of_experiments(estimator: Any) -> Any:
+    """Return who knows the experiments: the estimator, or what it wraps."""
+    for owner in (estimator, getattr(estimator, "regressor_", None)):
+        if hasattr(owner, "split_experiments"):
+            return owner
+    return None
+
+
+def _split(estimator: Any, X: Any) -> list[NDArray[np.intp]]:
+    """Return the rows of each experiment."""
+    owner = _owner_of_experiments(estimator)
+    if owner is None:
+        raise TypeError(
+            "`burn_in` and `average='experiment'` need an estimator with the method "
+            f"split_experiments(X). Got {type(estimator).__name__}; use `burn_in=0` "
+            "and `average='pool'`."
+        )
+    return list(owner.split_experiments(X))
+
+
+def _drop_start(
+    groups: Sequence[NDArray[np.intp]], burn_in: int
+) -> list[NDArray[np.intp]]:
+    shortest = min(len(rows) for rows in groups)
+    if burn_in >= shortest:
+        raise ValueError(
+            "`burn_in` must be less than the number of samples of each experiment, "
+            f"{shortest} in the shortest. Got {burn_in}."
+        )
+    return [rows[burn_in:] for rows in groups]
+
+
+def _labels(
+    estimator: Any, X: Any, groups: Sequence[NDArray[np.intp]]
+) -> list[tuple[Hashable, Hashable]]:
+    """Return the experiment's and operating point's label for each group of rows."""
+    roles = _owner_of_experiments(estimator).get_params(deep=False)
+    table = Table(X if is_table(X) else np.asarray(X, dtype=object))
+    label = table.one(roles.get("experiment"), "experiment")
+    point = table.one(roles.get("operating_point"), "operating_point")
+    kappa = table.several(roles.get("scheduling"), "scheduling")
+    names: list[Hashable] = [0] * len(groups)
+    points: list[Hashable] = [None] * len(groups)
+    if label is not None:
+        names = label[1].labels([rows[0] for rows in groups])
+    if point is not None:
+        points = point[1].labels([rows[0] for rows in groups])
+    elif kappa:
+        values = np.column_stack([column.numbers("X") for _, column in kappa])
+        means = [tuple(values[rows].mean(axis=0).tolist()) for rows in groups]
+        points = [mean if len(mean) > 1 else mean[0] for mean in means]
+    return list(zip(names, points, strict=True))
+
+
+bft_scorer = make_bft_scorer()
+vaf_scorer = make_vaf_scorer()
