@@ -1,0 +1,144 @@
+"""Levenberg-Marquardt, and the frequency-response fit that starts the minimax."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .matching import ErrorSystem
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+# residuals and Jacobian at a point, None where the point is not admissible
+Residuals = Callable[[Array], tuple[Array, Array] | None]
+
+
+@dataclass(frozen=True)
+class LeastSquaresResult:
+    """Minimiser, cost ``|r|^2``, and the triangular factor of the Jacobian there."""
+
+    x: Array
+    cost: float
+    R: Array
+    n_iter: int
+
+
+def levenberg_marquardt(
+    residuals: Residuals, x0: Array, *, max_iter: int = 50, tol: float = 1e-9
+) -> LeastSquaresResult | None:
+    """Minimise ``|r(x)|^2`` with Marquardt's scaling; None if `x0` is not admissible.
+
+    Stops when the cost falls by less than `tol` relative, twice in a row, or when the
+    predicted decrease is rounding noise.
+    """
+    state = residuals(x0)
+    if state is None:
+        return None
+    x, (r, J) = x0.copy(), state
+    cost = float(r @ r)
+    damping, small = 1e-3, 0
+    scale = np.zeros(len(x))
+    n_iter = 0
+    Q, R = np.linalg.qr(J)
+    for n_iter in range(1, max_iter + 1):  # noqa: B007
+        scale = np.maximum(scale, np.linalg.norm(R, axis=0))
+        d = np.where(scale > 0, scale, 1.0)
+        rhs = np.concatenate([-(Q.T @ r), np.zeros(len(x))])
+        accepted = False
+        while damping < 1e12:
+            stacked = np.vstack([R, np.sqrt(damping) * np.diag(d)])
+            step = np.linalg.lstsq(stacked, rhs, rcond=None)[0]
+            predicted = (
+                cost
+                - float(np.sum((Q.T @ r + R @ step) ** 2))
+                - (float(r @ r) - float(np.sum((Q.T @ r) ** 2)))
+            )
+            if predicted <= 1e-14 * cost:
+                break
+            trial = residuals(x + step)
+            if trial is not None:
+                new = float(trial[0] @ trial[0])
+                if new < cost:
+                    accepted = True
+                    gain = (cost - new) / predicted
+                    damping = max(damping * (0.1 if gain > 0.75 else 1.0), 1e-12)
+                    break
+            damping *= 4.0
+        if not accepted:
+            break
+        small = small + 1 if cost - new <= tol * cost else 0
+        x, (r, J), cost = x + step, trial, new
+        Q, R = np.linalg.qr(J)
+        if small >= 2 or cost == 0.0:
+            break
+    return LeastSquaresResult(x, cost, R, n_iter)
+
+
+def frequency_grid(poles: Complex, dt: float | None, n_points: int = 60) -> Array:
+    """Frequencies (rad/s) that see every pole: logarithmic, and around resonances.
+
+    Parameters
+    ----------
+    poles : ndarray
+        Poles of the black-box model, in its own time domain.
+    dt : float or None
+        Sampling time; the grid of a discrete model ends at the Nyquist frequency.
+    """
+    if dt is not None:
+        poles = np.log(np.where(np.abs(poles) > 0, poles, 1e-12).astype(complex)) / dt
+    size = np.abs(poles)
+    size = size[size > 0]
+    low, high = (size.min(), size.max()) if size.size else (1.0, 1.0)
+    decay, turn = np.abs(poles.real), np.abs(poles.imag)
+    around = (turn[:, None] + decay[:, None] * np.array([-1.0, 0.0, 1.0])).ravel()
+    grid = np.concatenate([np.geomspace(low / 20, high * 10, n_points), size, around])
+    if dt is not None:
+        grid = grid[grid < np.pi / dt]
+    return np.unique(grid[grid > 0])
+
+
+def fit_frequency_response(
+    system: ErrorSystem,
+    theta0: Array,
+    omega: Array,
+    G0: Complex,
+    *,
+    weight: Array | None = None,
+    admissible: Callable[[Array], bool],
+    max_iter: int = 60,
+) -> LeastSquaresResult | None:
+    """Least-squares fit of ``G(theta)`` to `G0` over a frequency grid.
+
+    Minimises ``mean_k |W_k (G(j omega_k, theta) - G0_k)|_F^2``. The triangular factor
+    of its Jacobian is the Gauss-Newton metric: ``|R d|`` is the root-mean-square
+    change of the response that a change `d` of the parameters makes.
+
+    Parameters
+    ----------
+    system : ErrorSystem
+    theta0 : ndarray of shape (n_params,)
+    omega : ndarray of shape (k,)
+    G0 : ndarray of shape (k, n_outputs, n_inputs)
+    weight : ndarray of shape (k,) or (k, n_outputs, n_inputs), default=None
+    admissible : callable
+        False where the model may not go (an unstable one).
+    """
+    w = np.full(G0.shape, 1.0 / np.sqrt(len(omega)))
+    if weight is not None:
+        w = w * (weight if weight.ndim == 3 else weight[:, None, None])
+
+    def residuals(theta: Array) -> tuple[Array, Array] | None:
+        if not admissible(theta):
+            return None
+        G, J = system.response_jacobian(theta, omega)
+        r = (w * (G - G0)).ravel()
+        J = (w[..., None] * J).reshape(len(r), -1)
+        if not np.isfinite(J).all():
+            return None
+        return np.concatenate([r.real, r.imag]), np.vstack([J.real, J.imag])
+
+    return levenberg_marquardt(residuals, theta0, max_iter=max_iter)

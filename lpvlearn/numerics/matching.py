@@ -1,0 +1,299 @@
+"""The error system of model matching, Eq. (8), and the derivatives of its peaks.
+
+With ``S(theta) = [[A, B], [C, D]]`` and ``Phi = (s I - A)^-1`` the error is
+``E = C Phi B + D - G0(s)`` and its derivative, Eq. (24)-(25) in one product,
+``dE_j = L S_j R`` with ``L = [C Phi, I]``, ``R = [Phi B; I]``, ``S_j = dS/dtheta_j``.
+The largest singular value ``sigma = u^H E v`` is differentiated twice with respect to
+the parameters and the frequency together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .hinf import PeakSet, linf_norm
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+
+class Structure(Protocol):
+    """What this room needs of a gray-box structure."""
+
+    order: int
+    n_params: int
+
+    def system_matrix(self, theta: Array) -> Array: ...
+    def jacobian(self, theta: Array) -> Array: ...
+    def curvature(self, theta: Array) -> Array | None: ...
+
+
+@dataclass(frozen=True)
+class Target:
+    """The black-box model to match; `dt` None is continuous time."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    dt: float | None = None
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Quantities at one theta and several frequencies (leading axis k)."""
+
+    L: Complex  # (k, n_outputs, n + n_outputs)
+    R: Complex  # (k, n + n_inputs, n_inputs)
+    E: Complex  # (k, n_outputs, n_inputs)
+    Phi: Complex  # (k, n, n)
+
+
+def laplace_variable(
+    omega: Array, dt: float | None
+) -> tuple[Complex, Complex, Complex]:
+    """``s(omega)`` and its two derivatives: ``j omega`` or ``exp(j omega dt)``."""
+    if dt is None:
+        return 1j * omega, np.full(omega.shape, 1j), np.zeros(omega.shape, complex)
+    z = np.exp(1j * omega * dt)
+    return z, 1j * dt * z, -(dt**2) * z
+
+
+def resolvent(A: Array, s: Complex) -> Complex:
+    """``(s I - A)^-1`` for every `s`; zero at infinity."""
+    finite = np.isfinite(s)
+    M = np.where(finite, s, 0.0)[:, None, None] * np.eye(len(A)) - A
+    if not finite.all():
+        M[~finite] = np.eye(len(A))
+    inverse = np.linalg.inv(M)
+    inverse[~finite] = 0.0
+    return inverse
+
+
+class ErrorSystem:
+    """``Sigma(theta) = G(theta) - G0`` for a structure and a black-box model."""
+
+    peaks_move = True  # the peaks are local maxima over a continuum of frequencies
+
+    def __init__(self, structure: Structure, target: Target) -> None:
+        self.structure, self.target, self.dt = structure, target, target.dt
+        self.n = structure.order
+        self.n_outputs, self.n_inputs = target.D.shape
+
+    def split(self, S: Array) -> tuple[Array, Array, Array, Array]:
+        """Blocks ``A, B, C, D`` of a system matrix."""
+        n = self.n
+        return S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
+
+    def poles(self, theta: Array) -> Complex:
+        """Poles of the gray-box model."""
+        A = self.split(self.structure.system_matrix(theta))[0]
+        return np.linalg.eigvals(A).astype(complex)
+
+    def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
+        """H-infinity norm of the error and its local maxima over frequency.
+
+        The gray-box model must be stable: the level-set method measures the
+        L-infinity norm, which stays finite (and meaningless) beyond the boundary.
+        """
+        A, B, C, D = self.split(self.structure.system_matrix(theta))
+        t = self.target
+        n, n0 = self.n, len(t.A)
+        Ae = np.zeros((n + n0, n + n0))
+        Ae[:n, :n], Ae[n:, n:] = A, t.A
+        Be, Ce = np.vstack([B, t.B]), np.hstack([C, -t.C])
+        return linf_norm(Ae, Be, Ce, D - t.D, dt=self.dt, within=within)
+
+    def target_response(self, omega: Array) -> Complex:
+        """``G0`` at the frequencies, shape (k, n_outputs, n_inputs)."""
+        t = self.target
+        s = laplace_variable(omega, self.dt)[0]
+        return t.C @ resolvent(t.A, s) @ t.B + t.D
+
+    def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        """``G0`` and its first two derivatives along the frequency."""
+        t = self.target
+        s, s1, s2 = laplace_variable(omega, self.dt)
+        P = resolvent(t.A, s)
+        PB = P @ t.B
+        X = P @ PB
+        first = -s1[:, None, None] * (t.C @ X)
+        second = 2.0 * s1[:, None, None] ** 2 * (t.C @ (P @ X))
+        second -= s2[:, None, None] * (t.C @ X)
+        return t.C @ PB + t.D, first, second
+
+    def response(self, theta: Array, omega: Array) -> Complex:
+        """Response of the gray-box model, shape (k, n_outputs, n_inputs)."""
+        A, B, C, D = self.split(self.structure.system_matrix(theta))
+        s = laplace_variable(omega, self.dt)[0]
+        return C @ resolvent(A, s) @ B + D
+
+    def response_jacobian(self, theta: Array, omega: Array) -> tuple[Complex, Complex]:
+        """Response and its derivatives, shapes (k, p, m) and (k, p, m, n_params)."""
+        at = self._point(theta, omega, np.zeros((self.n_outputs, self.n_inputs)))
+        S = self.structure.jacobian(theta)
+        # contract the short axes first: (k, p, a) (j, a, b) -> (k, p, j, b)
+        left = np.tensordot(at.L, S, axes=(2, 1))
+        return at.E, np.einsum("kpjb,kbm->kpmj", left, at.R)
+
+    def _point(self, theta: Array, omega: Array, G0: Complex | Array) -> _Point:
+        A, B, C, D = self.split(self.structure.system_matrix(theta))
+        Phi = resolvent(A, laplace_variable(omega, self.dt)[0])
+        k, p, m = len(omega), self.n_outputs, self.n_inputs
+        L = np.empty((k, p, self.n + p), complex)
+        L[:, :, : self.n], L[:, :, self.n :] = C @ Phi, np.eye(p)
+        R = np.empty((k, self.n + m, m), complex)
+        R[:, : self.n], R[:, self.n :] = Phi @ B, np.eye(m)
+        return _Point(L, R, C @ R[:, : self.n] + D - G0, Phi)
+
+    def gradients(self, theta: Array, omega: Array) -> tuple[Array, Array]:
+        """Largest singular values and their gradients, Eq. (20) for sigma itself.
+
+        Returns
+        -------
+        sigma : ndarray of shape (k,)
+        gradients : ndarray of shape (k, n_params)
+        """
+        at = self._point(theta, omega, self.target_response(omega))
+        U, sigma, Vh = np.linalg.svd(at.E)
+        left = np.einsum("kp,kpa->ka", U[:, :, 0].conj(), at.L)
+        right = np.einsum("kbm,km->kb", at.R, Vh[:, 0].conj())
+        outer = np.real(left[:, :, None] * right[:, None, :]).reshape(len(omega), -1)
+        S = self.structure.jacobian(theta).reshape(self.structure.n_params, -1)
+        return sigma[:, 0], outer @ S.T
+
+    def hessians(self, theta: Array, omega: Array, moving: NDArray[np.bool_]) -> Array:
+        """Second derivatives of the singular values at the given frequencies.
+
+        Where `moving`, the frequency is a local maximum that follows the parameters,
+        ``H = sigma_tt - sigma_tw sigma_tw^T / sigma_ww``.
+
+        Returns
+        -------
+        ndarray of shape (k, n_params, n_params)
+        """
+        q = self.structure.n_params
+        joint = self.joint_hessians(theta, omega)
+        out = joint[:, :q, :q].copy()
+        for k in range(len(omega)):
+            row, ww = joint[k, :q, q], joint[k, q, q]
+            if moving[k] and ww < 0:
+                out[k] -= np.outer(row, row) / ww
+        return out
+
+    def joint_hessians(self, theta: Array, omega: Array) -> Array:
+        """Hessians of sigma in (theta, omega), shape (k, n_params + 1, n_params + 1)."""
+        q, n = self.structure.n_params, self.n
+        S = self.structure.jacobian(theta)
+        curvature = self.structure.curvature(theta)
+        p, m = self.n_outputs, self.n_inputs
+        _, s1, s2 = laplace_variable(omega, self.dt)
+        G0, G0_1, G0_2 = self._target_derivatives(omega)
+        at = self._point(theta, omega, G0)
+        A, B, C, _ = self.split(self.structure.system_matrix(theta))
+        U, sigma, Vh = np.linalg.svd(at.E)
+        out = np.empty((len(omega), q + 1, q + 1))
+        for k in range(len(omega)):
+            u, v = U[k, :, 0], Vh[k, 0].conj()
+            Phi, L, R = at.Phi[k], at.L[k], at.R[k]
+            left, right = u.conj() @ L, R @ v
+            dE = np.empty((q + 1, p, m), complex)
+            dE[:q] = L @ S @ R
+            first, second = _frequency_derivatives(Phi, B, C, s1[k], s2[k])
+            dE[q] = first - G0_1[k]
+            # u^H (d2E) v: pairs of parameters, parameter and frequency, frequency
+            mixed = (left @ S)[:, :n] @ Phi @ (S[:, :n] @ right).T
+            d2 = np.zeros((q + 1, q + 1), complex)
+            d2[:q, :q] = mixed + mixed.T
+            if curvature is not None:
+                d2[:q, :q] += np.einsum("a,ijab,b->ij", left, curvature, right)
+            dleft = -s1[k] * (left[:n] @ Phi)
+            dright = -s1[k] * (Phi @ right[:n])
+            cross = (dleft @ S[:, :n]) @ right + (left @ S[:, :, :n]) @ dright
+            d2[:q, q] = d2[q, :q] = cross
+            d2[q, q] = u.conj() @ (second - G0_2[k]) @ v
+            out[k] = np.real(d2) + _coupling(dE, U[k], sigma[k], Vh[k])
+        return out
+
+
+class MeasuredErrorSystem(ErrorSystem):
+    """The error of a structure against a measured frequency response.
+
+    The maximum runs over the measured frequencies only: a lower bound of the
+    H-infinity norm.
+    """
+
+    peaks_move = False
+
+    def __init__(self, structure: Structure, omega: Array, G: Complex) -> None:
+        n_outputs, n_inputs = G.shape[1:]
+        empty = np.zeros((0, 0))
+        D = np.zeros((n_outputs, n_inputs))
+        target = Target(empty, np.zeros((0, n_inputs)), np.zeros((n_outputs, 0)), D)
+        super().__init__(structure, target)
+        order = np.argsort(omega)
+        self.omega, self.G = omega[order], G[order]
+
+    def target_response(self, omega: Array) -> Complex:
+        """The measured response at some of the measured frequencies."""
+        return self.G[np.searchsorted(self.omega, omega)]
+
+    def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        G0 = self.target_response(omega)
+        return G0, np.zeros_like(G0), np.zeros_like(G0)
+
+    def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
+        """Local maxima of the error over the measured frequencies."""
+        E = self.response(theta, self.omega) - self.G
+        sigma = np.linalg.norm(E, 2, axis=(1, 2))
+        top = float(sigma.max())
+        rising = np.r_[True, sigma[1:] >= sigma[:-1]]
+        falling = np.r_[sigma[:-1] >= sigma[1:], True]
+        level = top if within is None else (1.0 - within) * top
+        index = np.flatnonzero(rising & falling & (sigma >= level))
+        index = index[np.argsort(-sigma[index], kind="stable")]
+        return PeakSet(top, self.omega[index], sigma[index])
+
+
+def _frequency_derivatives(
+    Phi: Complex, B: Array, C: Array, s1: complex, s2: complex
+) -> tuple[Complex, Complex]:
+    """First and second derivative of ``C (s I - A)^-1 B`` along the frequency."""
+    X = Phi @ (Phi @ B)
+    return -s1 * (C @ X), 2.0 * s1**2 * (C @ (Phi @ X)) - s2 * (C @ X)
+
+
+def _coupling(dE: Complex, U: Complex, sigma: Array, Vh: Complex) -> Array:
+    """Second-order term of the largest singular value through the other ones.
+
+    sigma is an eigenvalue of ``[[0, E], [E^H, 0]]``, whose other eigenvalues are
+    ``+-sigma_a`` and zeros: ``2 Re sum_a conj(c_a) c_a^T / (sigma - lambda_a)``.
+    """
+    p, m = dE.shape[1:]
+    r = len(sigma)
+    Ev = dE @ Vh[0].conj()  # (q, p)
+    uE = U[:, 0].conj() @ dE  # (q, m)
+    a = Ev @ U.conj()  # u_a^H dE v
+    b = (uE @ Vh.conj().T).conj()  # v_a^H dE^H u
+    total = np.zeros((len(dE), len(dE)))
+    floor = 1e-10 * sigma[0]
+    for i in range(max(p, m)):
+        if i < r:
+            terms = [
+                ((a[:, i] + b[:, i]) / 2.0, sigma[i]),
+                ((a[:, i] - b[:, i]) / 2.0, -sigma[i]),
+            ]
+        elif p > m:
+            terms = [(a[:, i] / np.sqrt(2.0), 0.0)]
+        else:
+            terms = [(b[:, i] / np.sqrt(2.0), 0.0)]
+        if i == 0:
+            terms = terms[1:]
+        for c, value in terms:
+            gap = max(sigma[0] - value, floor)
+            total += 2.0 * np.real(np.outer(c.conj(), c)) / gap
+    return total

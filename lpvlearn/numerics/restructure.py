@@ -1,0 +1,269 @@
+"""Minimisation of the H-infinity norm of the error over the parameters, Eq. (14)-(16).
+
+The parameters are written ``theta = theta_0 + T y`` in the Gauss-Newton metric of the
+least-squares fit, where a unit step changes the response by about the objective.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .matching import ErrorSystem
+from .bundle import proximal_bundle
+from .minimax import Flags, MinimaxProblem, MinimaxResult, Peaks, minimax_sqp
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_DEPTH = 0.6  # peaks down to that fraction below the objective enter the local model
+_FLAT = 1e-7  # a peak with a smaller relative gradient does not depend on theta
+_METRIC_CAP = 1e-5
+_STATIONARY = 1e-6
+_POLISH_ROUNDS = 3
+_POLISH_STEPS = 150
+_SECONDARY_TOLERANCE = 1e-3
+_SECONDARY_STEPS = 40
+_HARD_STEPS = (0.99, 0.9999)
+
+
+def decay_rates(system: ErrorSystem, theta: Array) -> tuple[Array, Complex]:
+    """Growth rate of every mode, ``Re lambda`` or ``log |lambda| / dt``, and poles."""
+    poles = system.poles(theta)
+    return growth(poles, system.dt), poles
+
+
+def growth(poles: Complex, dt: float | None) -> Array:
+    """Growth rates (1/s) of poles: negative for stable ones."""
+    if dt is None:
+        return poles.real
+    return np.log(np.maximum(np.abs(poles), 1e-300)) / dt
+
+
+def growth_gradients(system: ErrorSystem, theta: Array) -> tuple[Array, Array, Array]:
+    """Growth rates, their gradients (n, n_params), and sizes for relative scaling."""
+    n = system.n
+    A = system.split(system.structure.system_matrix(theta))[0]
+    poles, V = np.linalg.eig(A)
+    W = np.linalg.pinv(V)
+    dA = system.structure.jacobian(theta)[:, :n, :n]
+    d = np.einsum("ia,jab,bi->ij", W, dA, V)
+    rate = growth(poles, system.dt)
+    if system.dt is None:
+        return rate, np.real(d), np.abs(poles)
+    safe = np.where(poles == 0, 1.0, poles)
+    return rate, np.real(d / safe[:, None]) / system.dt, np.abs(np.log(np.abs(safe)))
+
+
+def metric_coordinates(R: Array, size: float) -> Array:
+    """`T` with ``|R T y| = size |y|`` on the directions that `R` sees.
+
+    `R` is the triangular factor of the response Jacobian. Directions that it does not
+    see (unidentifiable ones) are capped.
+    """
+    _, s, Vt = np.linalg.svd(R)
+    s = np.maximum(s, _METRIC_CAP * s.max(initial=0.0))
+    s = np.where(s > 0, s, 1.0)
+    return Vt.T * (size / s)
+
+
+@dataclass
+class HinfObjective:
+    """Peaks of the error in the coordinates y, with constant peaks set aside.
+
+    Attributes
+    ----------
+    system : ErrorSystem
+    theta0 : ndarray of shape (n_params,)
+    T : ndarray of shape (n_params, n_params)
+    margin : float
+        Growth rates stay below ``-margin`` (1/s).
+    floor : float
+        Highest peak met so far whose value does not depend on the parameters.
+    """
+
+    system: ErrorSystem
+    theta0: Array
+    T: Array
+    margin: float
+    floor: float = 0.0
+    _top: float = 0.0
+
+    def theta(self, y: Array) -> Array:
+        """Parameters at the coordinates `y`."""
+        return self.theta0 + self.T @ y
+
+    def admissible(self, theta: Array) -> bool:
+        """Whether the gray-box model keeps (most of) the stability margin."""
+        rate = decay_rates(self.system, theta)[0]
+        return bool(np.isfinite(rate).all() and rate.max() <= -0.8 * self.margin)
+
+    def peaks(self, y: Array) -> Peaks | None:
+        """Peaks that depend on the parameters; None where the model is unstable."""
+        theta = self.theta(y)
+        if not self.admissible(theta):
+            return None
+        within = _DEPTH
+        if self.floor > 0 and self._top > 0:
+            within = max(_DEPTH, 1.0 - (1.0 - _DEPTH) * self._top / self.floor)
+        for depth in (within, *(h for h in _HARD_STEPS if h > within), 1.0):
+            found = self.system.peaks(theta, min(depth, 1.0 - 1e-9))
+            _, gradients = self.system.gradients(theta, found.frequencies)
+            gradients = gradients @ self.T
+            steep = np.linalg.norm(gradients, axis=1) > _FLAT * found.values
+            if found.norm == 0.0 or steep.any():
+                break
+        if not steep.all():
+            self.floor = max(self.floor, float(found.values[~steep].max()))
+        if not steep.any():  # nothing is left that the parameters could lower
+            none = np.zeros(1)
+            return Peaks(none, none, np.zeros((1, len(y))), none > 0)
+        peaks = Peaks(
+            found.values[steep],
+            found.frequencies[steep],
+            gradients[steep],
+            np.full(int(steep.sum()), self.system.peaks_move),
+        )
+        self._top = peaks.top
+        return peaks
+
+    def samples(self, y: Array, omega: Array) -> Peaks:
+        """Singular values at fixed frequencies, and their gradients."""
+        values, gradients = self.system.gradients(self.theta(y), omega)
+        return Peaks(values, omega, gradients @ self.T, np.zeros(len(omega), bool))
+
+    def hessians(self, y: Array, omega: Array, moving: Flags) -> Array:
+        """Second derivatives of the peaks in the coordinates y."""
+        H = self.system.hessians(self.theta(y), omega, moving)
+        return self.T.T @ H @ self.T
+
+    def constraints(self, y: Array) -> tuple[Array, Array]:
+        """``(growth rate + margin) / |pole| <= 0``, and the gradients."""
+        rate, gradients, size = growth_gradients(self.system, self.theta(y))
+        size = np.maximum(size, self.margin)
+        return (rate + self.margin) / size, gradients @ self.T / size[:, None]
+
+    def problem(self) -> MinimaxProblem:
+        """The callbacks of the minimax solvers."""
+        return MinimaxProblem(self.peaks, self.samples, self.hessians, self.constraints)
+
+
+Solver = Callable[..., MinimaxResult]
+
+
+def polished_sqp(
+    problem: MinimaxProblem, y0: Array, *, max_iter: int, tol: float, negligible: float
+) -> MinimaxResult:
+    """`minimax_sqp`, helped by `proximal_bundle` where it stalls.
+
+    Two peaks that merge and split again are no smooth functions; the cutting planes of
+    the bundle pass them, and the second-order method finishes.
+    """
+    best = minimax_sqp(problem, y0, max_iter=max_iter, tol=tol, negligible=negligible)
+    for _ in range(_POLISH_ROUNDS):
+        if best.stationarity <= _STATIONARY or best.n_iter >= max_iter:
+            break
+        helped = proximal_bundle(
+            problem, best.y, max_iter=_POLISH_STEPS, tol=tol, negligible=negligible
+        )
+        after = minimax_sqp(
+            problem,
+            helped.y,
+            max_iter=max_iter,
+            tol=tol,
+            radius=0.01,
+            negligible=negligible,
+        )
+        done = after.peaks.top > best.peaks.top * (1.0 - 1e-9)
+        best = replace(
+            after,
+            n_iter=best.n_iter + helped.n_iter + after.n_iter,
+            history=best.history + helped.history + after.history,
+        )
+        if done:
+            break
+    return best
+
+
+SOLVERS: dict[str, Solver] = {"sqp": polished_sqp, "bundle": proximal_bundle}
+
+
+def minimise_hinf(
+    system: ErrorSystem,
+    theta0: Array,
+    R: Array,
+    margin: float,
+    solver: Solver,
+    *,
+    max_iter: int,
+    tol: float,
+    negligible: float,
+) -> tuple[Array, MinimaxResult, float]:
+    """Minimise the H-infinity norm of the error from a stable point.
+
+    Parameters
+    ----------
+    system : ErrorSystem
+    theta0 : ndarray of shape (n_params,)
+    R : ndarray of shape (n_params, n_params)
+        Triangular factor of the response Jacobian at `theta0`.
+    margin : float
+        Stability margin, 1/s.
+    solver : callable
+        One of `SOLVERS`.
+    negligible : float
+        Errors at or below it are rounding noise.
+
+    Returns
+    -------
+    theta : ndarray of shape (n_params,)
+    result : MinimaxResult
+        Of the peaks that depend on the parameters.
+    floor : float
+        Highest constant peak (0 where there is none).
+
+    Notes
+    -----
+    Where the floor is above all other peaks, the start is already optimal, and so is
+    every theta that keeps the others below it. Those others are then lowered, too
+    (lexicographic minimax), but not to the last digit: a peak can vanish into the
+    shoulder of the constant one, so that they are no continuous functions.
+    """
+    start = system.peaks(theta0)
+    size = start.norm
+    if size <= negligible:  # exact already
+        flat = np.zeros((len(start.values), len(theta0)))
+        peaks = Peaks(start.values, start.frequencies, flat, flat.any(1))
+        return theta0, MinimaxResult(theta0, peaks, 0.0, np.inf, True, 0), 0.0
+    origin = np.zeros(len(theta0))
+    probe = HinfObjective(system, theta0, metric_coordinates(R, 1.0), margin)
+    first = probe.peaks(origin)
+    below_floor = first is not None and probe.floor >= first.top
+    if first is not None and below_floor:
+        size = first.top
+    T = metric_coordinates(R, max(size, negligible, 1e-300))
+    objective = HinfObjective(system, theta0, T, margin)
+    if below_floor:
+        result = minimax_sqp(
+            objective.problem(),
+            origin,
+            max_iter=min(max_iter, _SECONDARY_STEPS),
+            tol=_SECONDARY_TOLERANCE,
+            negligible=negligible,
+        )
+        # a constant peak is active: its zero gradient certifies the optimum, which
+        # is not strict
+        result = replace(result, stationarity=0.0, second_order=0.0, converged=True)
+    else:
+        result = solver(
+            objective.problem(),
+            origin,
+            max_iter=max_iter,
+            tol=tol,
+            negligible=negligible,
+        )
+    floor = objective.floor if objective.floor > negligible else 0.0
+    return objective.theta(result.y), result, floor

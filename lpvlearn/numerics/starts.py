@@ -1,0 +1,145 @@
+"""Starting points of the restructuring: candidates, ranked by frequency response."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .balancing import balancing_transformation
+from .leastsquares import LeastSquaresResult, fit_frequency_response
+from .matching import ErrorSystem, Target
+from .restructure import growth
+from .similarity import scaled_problem, similarity_starts
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_SPREAD = 0.3  # standard deviation of log-parameters around a given first guess
+
+
+def same_order(target: Target, order: int, rng: np.random.Generator) -> Target:
+    """The black box with `order` states: truncated, or padded with faint fast modes."""
+    n = len(target.A)
+    discrete = target.dt is not None
+    if n > order:
+        _, left, right = balancing_transformation(
+            target.A, target.B, target.C, discrete=discrete
+        )
+        left, right = left[:order], right[:, :order]
+        if len(left) == order:
+            A, B, C = left @ target.A @ right, left @ target.B, target.C @ right
+            return Target(A, B, C, target.D, target.dt)
+        target = Target(
+            left @ target.A @ right,
+            left @ target.B,
+            target.C @ right,
+            target.D,
+            target.dt,
+        )
+        n = len(target.A)
+    if n == order:
+        return target
+    extra = order - n
+    rates = growth(np.linalg.eigvals(target.A).astype(complex), target.dt)
+    fast = 3.0 * max(float(np.abs(rates).max(initial=0.0)), 1e-300)
+    decay = -fast * (1.0 + np.arange(extra))
+    A = np.zeros((order, order))
+    A[:n, :n] = target.A
+    A[n:, n:] = np.diag(np.exp(decay * target.dt) if target.dt else decay)
+    size_B = np.abs(target.B).max(initial=1e-300)
+    size_C = np.abs(target.C).max(initial=1e-300)
+    faint_B = 0.03 * size_B * rng.normal(size=(extra, target.B.shape[1]))
+    faint_C = 0.03 * size_C * rng.normal(size=(target.C.shape[0], extra))
+    return Target(
+        A,
+        np.vstack([target.B, faint_B]),
+        np.hstack([target.C, faint_C]),
+        target.D,
+        target.dt,
+    )
+
+
+def similarity_candidates(
+    target: Target,
+    offset: Array,
+    basis: Array,
+    order: int,
+    n_starts: int,
+    rng: np.random.Generator,
+) -> Array:
+    """Parameters of an affine structure from random similarities, shape (k, n_params).
+
+    Two time scales: the geometric mean and the maximum of the pole sizes.
+    """
+    box = same_order(target, order, rng)
+    poles = np.abs(np.linalg.eigvals(box.A))
+    poles = poles[poles > 1e-9 * poles.max(initial=0.0)]
+    if target.dt is not None or poles.size == 0:
+        scales = [1.0]
+    else:
+        scales = [float(np.exp(np.log(poles).mean())), float(poles.max())]
+    found = []
+    for rate in scales:
+        problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, rate)
+        found.append(similarity_starts(problem, n_starts, rng)[0])
+    return np.vstack(found)
+
+
+def perturbed_candidates(
+    theta: Array, n_starts: int, rng: np.random.Generator
+) -> Array:
+    """A given first guess, and random ones around it that keep the signs."""
+    factors = np.exp(_SPREAD * rng.normal(size=(max(n_starts - 1, 0), len(theta))))
+    return np.vstack([theta, theta * factors])
+
+
+def distinct(thetas: Array, tol: float = 1e-6) -> Array:
+    """Indices of rows that differ from all rows before them by more than `tol`."""
+    kept: list[int] = []
+    for i, theta in enumerate(thetas):
+        size = np.linalg.norm(theta)
+        if all(np.linalg.norm(theta - thetas[j]) > tol * size for j in kept):
+            kept.append(i)
+    return np.array(kept, dtype=int)
+
+
+def best_fits(
+    system: ErrorSystem,
+    candidates: Array,
+    omega: Array,
+    G0: Complex,
+    *,
+    weight: Array | None,
+    admissible: Callable[[Array], bool],
+    n_fits: int,
+) -> list[LeastSquaresResult]:
+    """Least-squares fits from the best candidates, by ascending cost.
+
+    The candidates are ranked by the error of their frequency response, not by their
+    distance to the structure, and the best `n_fits` distinct ones are fitted.
+    """
+    usable = [theta for theta in candidates if admissible(theta)]
+    if not usable:
+        return []
+    thetas = np.array(usable)
+    w = (
+        np.ones(G0.shape)
+        if weight is None
+        else np.broadcast_to(
+            weight if weight.ndim == 3 else weight[:, None, None], G0.shape
+        )
+    )
+    errors = np.array(
+        [np.linalg.norm(w * (system.response(t, omega) - G0)) for t in thetas]
+    )
+    thetas = thetas[np.argsort(errors, kind="stable")]
+    thetas = thetas[distinct(thetas)]
+    fits = [
+        fit_frequency_response(
+            system, theta, omega, G0, weight=weight, admissible=admissible
+        )
+        for theta in thetas[:n_fits]
+    ]
+    return sorted((fit for fit in fits if fit is not None), key=lambda fit: fit.cost)

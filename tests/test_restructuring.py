@@ -1,0 +1,378 @@
+"""GrayBoxRestructurer: a black box in the user's structure."""
+
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
+
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn.datasets import FlexibleArm
+from lpvlearn.exceptions import RankWarning
+
+
+def spring_mass():
+    """One mass; stiffness, damping and gain."""
+    return GrayBoxStructure.from_template(
+        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
+    )
+
+
+def two_masses():
+    """Two masses in a chain: five parameters, one input, both positions."""
+    return GrayBoxStructure.from_template(
+        [
+            [0, 0, 1, 0],
+            [0, 0, 0, 1],
+            ["-k1", "k2", "-c1", 0],
+            ["k3", "-k3", 0, "-c2"],
+        ],
+        [[0], [0], ["b"], [0]],
+        [[1, 0, 0, 0], [0, 1, 0, 0]],
+    )
+
+
+def heat_exchanger():
+    """First-order lags in series, three outputs, a feedthrough parameter."""
+    return GrayBoxStructure.from_template(
+        [["-a1", 0, 0], ["a2", "-a2", 0], [0, "a3", "-a3"]],
+        [["a1"], [0], [0]],
+        np.eye(3),
+        [[0], [0], ["d"]],
+    )
+
+
+CASES = {
+    "spring_mass": (spring_mass(), {"k": 9.0, "c": 0.4, "b": 2.0}),
+    "two_masses": (
+        two_masses(),
+        {"k1": 30.0, "k2": 12.0, "k3": 20.0, "c1": 0.5, "c2": 0.9, "b": 3.0},
+    ),
+    "heat_exchanger": (
+        heat_exchanger(),
+        {"a1": 0.5, "a2": 2.0, "a3": 0.3, "d": 0.1},
+    ),
+    "arm": (
+        FlexibleArm().structure(),
+        dict(
+            zip(
+                FlexibleArm().structure().parameter_names,
+                FlexibleArm().parameters(0.9),
+                strict=True,
+            )
+        ),
+    ),
+}
+
+
+def disguised(model, rng):
+    """The same transfer function in another state basis."""
+    T = rng.normal(size=model.A.shape) + 2 * np.eye(model.order)
+    return model.transform(T)
+
+
+def off_structure(model, rng, size):
+    """A black box near a model, outside of its structure."""
+    A = model.A * (1 + size * rng.normal(size=model.A.shape))
+    B = model.B * (1 + size * rng.normal(size=model.B.shape))
+    C = model.C + size * rng.normal(size=model.C.shape) * np.abs(model.C).max()
+    return StateSpace(A, B, C, model.D)
+
+
+@pytest.fixture
+def rough():
+    """Black boxes far off the structure: the warning about them is not the subject."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the structure comes no nearer")
+        yield
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_exact_models_are_recovered_from_nothing(name):
+    structure, params = CASES[name]
+    theta = structure.check_params(params)
+    black_box = disguised(structure.model(theta), np.random.default_rng(0))
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    np.testing.assert_allclose(fitted.params_, theta, rtol=1e-6)
+    assert fitted.relative_error_ < 1e-9
+    assert fitted.structural_floor_ == 0.0
+
+
+@pytest.mark.parametrize("name", ["spring_mass", "two_masses", "heat_exchanger"])
+def test_measured_responses_are_recovered_from_nothing(name):
+    structure, params = CASES[name]
+    theta = structure.check_params(params)
+    model = structure.model(theta)
+    omega = np.geomspace(0.02, 50, 80)
+    fitted = GrayBoxRestructurer(structure).fit(omega, model.frequency_response(omega))
+    np.testing.assert_allclose(fitted.params_, theta, rtol=1e-6)
+    table = fitted.predict(omega)
+    assert table.shape == (80, 2 * model.n_outputs)
+    assert fitted.score(omega, table) == 1.0
+
+
+def test_table_and_complex_responses_are_the_same_data():
+    structure, params = CASES["two_masses"]
+    omega = np.geomspace(0.1, 30, 50)
+    G = structure.model(params).frequency_response(omega)
+    flat = G.reshape(50, -1)
+    table = np.hstack([flat.real, flat.imag])
+    one = GrayBoxRestructurer(structure).fit(omega[:, None], table)
+    two = GrayBoxRestructurer(structure).fit(omega, G)
+    np.testing.assert_array_equal(one.params_, two.params_)
+
+
+def test_result_does_not_depend_on_the_basis_of_the_black_box():
+    structure, params = CASES["spring_mass"]
+    rng = np.random.default_rng(3)
+    black_box = off_structure(structure.model(params), rng, 0.02)
+    first = GrayBoxRestructurer(structure).fit_model(black_box)
+    second = GrayBoxRestructurer(structure).fit_model(disguised(black_box, rng))
+    assert np.isclose(first.error_, second.error_, rtol=1e-6)
+    np.testing.assert_allclose(first.params_, second.params_, rtol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_error_is_a_minimum_and_both_solvers_find_it(seed, rough):
+    structure, params = CASES["two_masses"]
+    rng = np.random.default_rng(seed)
+    black_box = off_structure(structure.model(params), rng, 0.03)
+    sqp = GrayBoxRestructurer(structure).fit_model(black_box)
+    bundle = GrayBoxRestructurer(structure, solver="bundle", max_iter=2000)
+    bundle.fit_model(black_box)
+    assert np.isclose(sqp.error_, bundle.error_, rtol=1e-5)
+    assert sqp.stationarity_ < 1e-5
+    assert np.isclose(sqp.error_, (sqp.lti_ - black_box).hinf_norm(), rtol=1e-9)
+    for _ in range(30):
+        near = sqp.params_ * (1 + 1e-3 * rng.normal(size=len(sqp.params_)))
+        error = (structure.model(near) - black_box).hinf_norm()
+        assert error >= sqp.error_ * (1 - 1e-9)
+
+
+def test_active_frequencies_carry_the_norm(rough):
+    structure, params = CASES["two_masses"]
+    black_box = off_structure(structure.model(params), np.random.default_rng(1), 0.03)
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    E = (fitted.lti_ - black_box).frequency_response(fitted.active_frequencies_)
+    sigma = np.linalg.norm(E, 2, axis=(1, 2))
+    np.testing.assert_allclose(sigma, fitted.error_, rtol=1e-5)
+    assert len(sigma) > 1
+
+
+def test_gain_fixed_by_the_structure_is_reported_as_a_floor():
+    structure = GrayBoxStructure.from_template([["-a"]], [["a"]], [[1]])  # G(0) = 1
+    black_box = StateSpace([[-2.0]], [[2.0]], [[1.05]])
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    assert np.isclose(fitted.structural_floor_, 0.05, rtol=1e-9)
+    assert np.isclose(fitted.error_, 0.05, rtol=1e-6)
+    assert np.isclose(fitted.params_[0], 2.0, rtol=0.1)
+
+
+def test_canonical_form_without_a_structure_reproduces_the_model():
+    rng = np.random.default_rng(2)
+    structure, params = CASES["two_masses"]
+    black_box = disguised(structure.model(params), rng)
+    fitted = GrayBoxRestructurer().fit_model(black_box)
+    assert fitted.relative_error_ < 1e-8
+    assert fitted.structure_.n_params == 4 * 2 + 4
+
+
+def test_discrete_time_models_are_restructured_in_discrete_time():
+    structure = GrayBoxStructure.from_template(
+        [[0, 1], ["-a0", "-a1"]], [[0], ["b"]], [[1, 0]]
+    )
+    model = structure.model({"a0": 0.8, "a1": -1.6, "b": 0.1}, sampling_time=0.05)
+    fitted = GrayBoxRestructurer(structure).fit_model(
+        disguised(model, np.random.default_rng(0))
+    )
+    np.testing.assert_allclose(fitted.params_, [0.8, -1.6, 0.1], rtol=1e-6)
+    assert fitted.lti_.sampling_time == 0.05
+
+
+def test_black_box_of_higher_order_than_the_structure():
+    structure, params = CASES["spring_mass"]
+    truth = structure.model(params)
+    # a fast parasitic pole, hardly visible
+    A = np.zeros((3, 3))
+    A[:2, :2], A[2, 2] = truth.A, -500.0
+    black_box = StateSpace(
+        A, np.vstack([truth.B, [[1.0]]]), np.hstack([truth.C, [[1e-2]]])
+    )
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    np.testing.assert_allclose(
+        fitted.params_, structure.check_params(params), rtol=1e-2
+    )
+
+
+def test_black_box_of_lower_order_than_the_structure():
+    structure = heat_exchanger()
+    black_box = StateSpace(
+        [[-0.5, 0.0], [2.0, -2.0]],
+        [[0.5], [0.0]],
+        [[1, 0], [0, 1], [0, 1]],
+        [[0], [0], [0.1]],
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    assert fitted.relative_error_ < 0.05
+
+
+@pytest.mark.parametrize("rate", [1e-5, 1e5])
+@pytest.mark.parametrize("channel", [1e-6, 1e6])
+def test_time_scale_and_units_do_not_matter(rate, channel):
+    structure, params = CASES["spring_mass"]
+    theta = {
+        "k": params["k"] * rate**2,
+        "c": params["c"] * rate,
+        "b": params["b"] * rate**2 * channel,
+    }
+    black_box = structure.model(theta).balance()
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    np.testing.assert_allclose(fitted.params_, structure.check_params(theta), rtol=1e-6)
+
+
+def test_smooth_structures_start_from_their_first_guess():
+    def pendulum(p):
+        length, damping = p
+        return [[0, 1], [-9.81 / length, -damping]], [[0], [1 / length**2]], [[1, 0]]
+
+    structure = GrayBoxStructure.from_function(
+        pendulum, {"length": 1.0, "damping": 0.3}
+    )
+    truth = [0.63, 0.21]
+    fitted = GrayBoxRestructurer(structure).fit_model(structure.model(truth).balance())
+    np.testing.assert_allclose(fitted.params_, truth, rtol=1e-6)
+
+
+def test_a_physical_guess_is_used():
+    structure, params = CASES["arm"]
+    theta = structure.check_params(params)
+    guess = theta * 1.05
+    fitted = GrayBoxRestructurer(structure, init=guess, n_starts=1).fit_model(
+        structure.model(theta).balance()
+    )
+    np.testing.assert_allclose(fitted.params_, theta, rtol=1e-6)
+
+
+def test_neighbours_parameters_are_compared_by_their_fit():
+    structure, params = CASES["arm"]
+    theta = structure.check_params(params)
+    black_box = structure.model(theta).balance()
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    near = FlexibleArm().parameters(1.0)
+    assert fitted.start_error(black_box, near) < 1e-6
+    assert fitted.start_error(black_box, -theta) == np.inf  # unstable
+
+
+def test_feedthrough_that_the_structure_lacks_is_reported():
+    structure, params = CASES["spring_mass"]
+    model = structure.model(params)
+    black_box = StateSpace(model.A, model.B, model.C, [[0.25]])
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    np.testing.assert_array_equal(fitted.dropped_feedthrough_, [[0.25]])
+    np.testing.assert_allclose(
+        fitted.params_, structure.check_params(params), rtol=1e-6
+    )
+
+
+def test_unidentifiable_combination_is_named_and_a_fit_returned():
+    structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [["c"]])
+    black_box = StateSpace([[-2.0]], [[3.0]], [[1.0]])
+    with pytest.warns(RankWarning, match=r"determines 2 of the 3.*b.*c"):
+        fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    assert fitted.relative_error_ < 1e-6
+    assert fitted.identifiability_.rank == 2
+
+
+def test_structure_that_cannot_fit_warns():
+    structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+    resonance = StateSpace([[0, 1], [-4, -0.2]], [[0], [1]], [[1, 0]])
+    with pytest.warns(ConvergenceWarning, match="cannot represent the model"):
+        GrayBoxRestructurer(structure).fit_model(resonance)
+
+
+def test_too_few_iterations_warn_and_keep_the_best_point(rough):
+    structure, params = CASES["two_masses"]
+    black_box = off_structure(structure.model(params), np.random.default_rng(0), 0.03)
+    full = GrayBoxRestructurer(structure).fit_model(black_box)
+    with pytest.warns(ConvergenceWarning, match="`max_iter`=1"):
+        short = GrayBoxRestructurer(structure, max_iter=1).fit_model(black_box)
+    assert full.error_ <= short.error_ < 2 * full.error_
+
+
+def unstable():
+    return StateSpace([[0.5]], [[1.0]], [[1.0]])
+
+
+GOOD = CASES["spring_mass"][0].model(CASES["spring_mass"][1])
+ERRORS = [
+    (lambda: GrayBoxRestructurer().fit_model(unstable()), "must be stable.*0.5"),
+    (lambda: GrayBoxRestructurer().fit_model([[1.0]]), "must be a StateSpace.*list"),
+    (
+        lambda: GrayBoxRestructurer(two_masses()).fit_model(GOOD),
+        "2 outputs and 1 inputs, `model` has 1 and 1",
+    ),
+    (lambda: GrayBoxRestructurer("pendulum").fit_model(GOOD), "GrayBoxStructure.*str"),
+    (
+        lambda: GrayBoxRestructurer(norm="l1").fit_model(GOOD),
+        r"`norm` must be one of .*Got 'l1'",
+    ),
+    (
+        lambda: GrayBoxRestructurer(solver="adam").fit_model(GOOD),
+        r"`solver` must be one of .*Got 'adam'",
+    ),
+    (
+        lambda: GrayBoxRestructurer(init="random").fit_model(GOOD),
+        "`init` must be 'similarity' or a vector",
+    ),
+    (
+        lambda: GrayBoxRestructurer(spring_mass(), init=[1.0]).fit_model(GOOD),
+        r"parameters must be 3 finite values \(b, c, k",
+    ),
+    (
+        lambda: GrayBoxRestructurer().fit([1.0, 2.0], [[1.0, 0.0], [1.0, 0.0]]),
+        "`structure` must be given",
+    ),
+    (
+        lambda: GrayBoxRestructurer(spring_mass()).fit([1.0, 2.0], [[1.0], [2.0]]),
+        r"`frf` must have shape \(2, 2\)",
+    ),
+    (
+        lambda: GrayBoxRestructurer(spring_mass()).fit(
+            [1.0, 1.0], [[1.0, 0.0], [1.0, 0.0]]
+        ),
+        "every frequency once",
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "words"), ERRORS)
+def test_errors_teach(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_scikit_learn_conventions():
+    structure, params = CASES["spring_mass"]
+    restructurer = GrayBoxRestructurer(structure, n_starts=4)
+    with pytest.raises(NotFittedError):
+        restructurer.predict([1.0])
+    copy = clone(restructurer)
+    assert copy.get_params()["n_starts"] == 4
+    fitted = copy.fit_model(structure.model(params))
+    again = pickle.loads(pickle.dumps(fitted))
+    omega = np.array([0.1, 1.0, 10.0])
+    np.testing.assert_array_equal(fitted.predict(omega), again.predict(omega))
+    assert not hasattr(restructurer, "params_")
+
+
+def test_result_is_reproducible():
+    structure, params = CASES["arm"]
+    rng = np.random.default_rng(5)
+    black_box = off_structure(structure.model(params), rng, 1e-4)
+    first = GrayBoxRestructurer(structure, random_state=1).fit_model(black_box)
+    second = GrayBoxRestructurer(structure, random_state=1).fit_model(black_box)
+    np.testing.assert_array_equal(first.params_, second.params_)
