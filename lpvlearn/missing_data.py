@@ -1,0 +1,116 @@
+"""Records with gaps and with offsets: what is done to samples before identification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .experiments import Experiment
+
+Array = NDArray[np.float64]
+Pairs = list[tuple[Array, Array]]
+
+DETRENDS = (None, "constant", "linear")
+
+
+def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Cut experiments where an input or an output is missing.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        Inputs and outputs may hold NaN.
+
+    Returns
+    -------
+    list of Experiment
+        Every run of at least two complete samples, with the label it had. It starts
+        from an initial state of its own.
+
+    Raises
+    ------
+    ValueError
+        If no two consecutive samples are complete.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> u = np.array([[1.0], [2.0], [np.nan], [4.0], [5.0], [6.0]])
+    >>> whole = Experiment("a", np.arange(6), u, np.zeros((6, 1)))
+    >>> [part.rows.tolist() for part in split_at_gaps([whole])]
+    [[0, 1], [3, 4, 5]]
+    """
+    parts = []
+    for experiment in experiments:
+        complete = np.isfinite(experiment.inputs).all(axis=1)
+        if experiment.outputs is not None:
+            complete &= np.isfinite(experiment.outputs).all(axis=1)
+        edges = np.flatnonzero(np.diff(complete, prepend=False, append=False))
+        for start, stop in edges.reshape(-1, 2):
+            if stop - start >= 2:
+                parts.append(_rows(experiment, slice(start, stop)))
+    if not parts:
+        raise ValueError(
+            "missing='split' needs runs of at least 2 consecutive complete samples. "
+            "Got none: check X and y for columns that are NaN throughout."
+        )
+    return parts
+
+
+def _rows(experiment: Experiment, part: slice) -> Experiment:
+    def cut(values: Array | None) -> Array | None:
+        return None if values is None else values[part]
+
+    return replace(
+        experiment,
+        rows=experiment.rows[part],
+        inputs=experiment.inputs[part],
+        outputs=cut(experiment.outputs),
+        scheduling=cut(experiment.scheduling),
+    )
+
+
+def remove_trends(pairs: Pairs, detrend: str | None) -> tuple[Pairs, Array, Array]:
+    """Subtract its mean or its straight line from every channel of every experiment.
+
+    Parameters
+    ----------
+    pairs : list of (u, y)
+    detrend : {None, "constant", "linear"}
+
+    Returns
+    -------
+    pairs : list of (u, y)
+    input_offset : ndarray of shape (n_inputs,)
+        Mean over all samples; zero with ``detrend=None``.
+    output_offset : ndarray of shape (n_outputs,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.arange(4.0)[:, None]
+    >>> pairs, u0, y0 = remove_trends([(t, 2.0 * t + 1.0)], "linear")
+    >>> u0, y0, np.abs(pairs[0][1]).max() < 1e-12
+    (array([1.5]), array([4.]), np.True_)
+    """
+    if detrend is None:
+        return pairs, np.zeros(pairs[0][0].shape[1]), np.zeros(pairs[0][1].shape[1])
+    degree = 0 if detrend == "constant" else 1
+    cleaned = [(u - _trend(u, degree), y - _trend(y, degree)) for u, y in pairs]
+    total = sum(len(u) for u, _ in pairs)
+    offsets = [
+        np.asarray(sum(pair[k].sum(axis=0) for pair in pairs)) / total for k in (0, 1)
+    ]
+    return cleaned, offsets[0], offsets[1]
+
+
+def _trend(values: Array, degree: int) -> Array:
+    mean = values.mean(axis=0)
+    if degree == 0 or len(values) < 3:
+        return np.broadcast_to(mean, values.shape)
+    t = np.linspace(-1.0, 1.0, len(values))
+    slope = t @ values / (t @ t)
+    return mean + t[:, None] * slope

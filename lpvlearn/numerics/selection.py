@@ -1,0 +1,330 @@
+"""Choice of the order and of the horizon by what validates.
+
+Every candidate is identified on the first part of each experiment. For a given order
+all horizons have the same number of parameters, so that the one with the smallest
+simulation error is simply the best; orders are compared by the simulation error on
+the part held out, and the smallest that is not significantly worse than the best is
+taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .identification import max_horizon, max_order, realize, subspace_of
+from .refinement import refine_simulation
+from .signals import Record
+from .simulation import lti_response
+from .simulationfit import Realization, freedom
+
+Array = NDArray[np.float64]
+
+_ESTIMATION_SHARE = 0.7
+_N_BLOCKS = 20
+# Rows of the largest block-Hankel matrix tried, and ratio between horizons.
+_MAX_ROWS = 1000
+_HORIZON_RATIO = 1.5
+_MAX_ORDER = 20
+# A choice needs fewer samples than an estimate.
+_MAX_SAMPLES = 12_000
+# Orders tried beyond the last one that reduced the simulation error noticeably.
+_PATIENCE = 3
+_NOTICEABLE = 0.99
+_NEGLIGIBLE_GAIN = 3e-3
+# A start this close to the best one ends in the same minimum when it is refined; the
+# shorter horizon is then the cheaper one. Unrefined, a horizon must be as good.
+_LOSS_SLACK = {True: 1.05, False: 1.005}
+
+
+class Candidate(NamedTuple):
+    """One row of the selection table.
+
+    Attributes
+    ----------
+    order, horizon : int
+    criterion : float
+        Simulation error of the subspace model on the estimation part, root mean
+        square relative to the outputs.
+    validation_bft : float
+        Best fit (percent) on the held-out part of the model that would be returned,
+        the mean over outputs; NaN for a horizon that lost within its order.
+    """
+
+    order: int
+    horizon: int
+    criterion: float
+    validation_bft: float
+
+
+class Selection(NamedTuple):
+    """Outcome of `select`.
+
+    Attributes
+    ----------
+    order, horizon : int
+        The choice.
+    candidates : list of Candidate
+        Everything that was tried.
+    """
+
+    order: int
+    horizon: int
+    candidates: list[Candidate]
+
+
+def horizon_grid(lowest: int, highest: int) -> list[int]:
+    """Horizons to try, in a geometric progression that ends at the highest.
+
+    Examples
+    --------
+    >>> horizon_grid(4, 30)
+    [4, 6, 9, 13, 20, 30]
+    """
+    grid = [highest]
+    while grid[-1] / _HORIZON_RATIO >= lowest + 0.5:
+        grid.append(round(grid[-1] / _HORIZON_RATIO))
+    if grid[-1] > lowest:
+        grid.append(lowest)
+    return sorted(set(grid))
+
+
+def split_record(record: Record) -> tuple[Record, int]:
+    """First part of a record, for estimation, and its length."""
+    n = record.u.shape[1]
+    cut = n if n < 8 else int(np.ceil(_ESTIMATION_SHARE * n))
+    return Record(record.u[:, :cut].copy(), record.y[:, :cut].copy()), cut
+
+
+def thin_records(records: Sequence[Record], n_samples: int) -> list[Record]:
+    """Evenly spread experiments of about `n_samples` in total, at least one.
+
+    Experiments beyond that length are cut to it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
+    >>> [run.u.shape[1] for run in thin_records(runs, 120)]
+    [50, 60]
+    """
+    lengths = [record.u.shape[1] for record in records]
+    keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
+    spread = [i * len(records) // keep for i in range(keep)]
+    return [
+        Record(
+            np.ascontiguousarray(records[i].u[:, :n_samples]),
+            np.ascontiguousarray(records[i].y[:, :n_samples]),
+        )
+        for i in spread
+    ]
+
+
+def held_out_errors(
+    model: Realization, records: Sequence[Record], cuts: Sequence[int]
+) -> tuple[Array, float]:
+    """Simulation errors after the cuts.
+
+    Parameters
+    ----------
+    model : Realization
+        Identified on the parts before the cuts, with their initial states.
+    records : sequence of Record
+        Whole records.
+    cuts : sequence of int
+        Where the held-out part of each begins.
+
+    Returns
+    -------
+    blocks : ndarray of shape (n_blocks,)
+        Sums of squared errors over consecutive blocks of time.
+    bft : float
+        Best fit over the held-out parts, percent, the mean over outputs.
+    """
+    blocks, errors, outputs = [], [], []
+    for record, cut, x0 in zip(records, cuts, model.initial_states, strict=True):
+        if cut == record.u.shape[1]:
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            fitted = lti_response(model.A, model.B, model.C, model.D, record.u.T, x0)
+        error = record.y.T[cut:] - fitted[cut:]
+        errors.append(error)
+        outputs.append(record.y.T[cut:])
+        n_blocks = min(_N_BLOCKS, len(error))
+        blocks += [float((b**2).sum()) for b in np.array_split(error, n_blocks)]
+    if not errors:
+        return np.zeros(0), np.nan
+    error, output = np.vstack(errors), np.vstack(outputs)
+    spread = np.sqrt(((output - output.mean(axis=0)) ** 2).sum(axis=0))
+    spread[spread == 0.0] = 1.0
+    miss = np.sqrt((error**2).sum(axis=0)) / spread
+    bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
+    return np.array(blocks), bft if np.isfinite(bft) else 0.0
+
+
+def smallest_good_order(orders: Sequence[int], blocks: Sequence[Array]) -> int:
+    """Smallest order whose held-out error is not significantly above the best.
+
+    Parameters
+    ----------
+    orders : sequence of int
+        Ascending.
+    blocks : sequence of ndarray of shape (n_blocks,)
+        Block sums of squared held-out errors of each order.
+
+    Returns
+    -------
+    int
+
+    Notes
+    -----
+    Significantly worse means by more than two standard errors of the sum of the
+    blockwise differences, and by more than 0.3 % of the best error, which is less than
+    one superfluous state costs in a record of a few thousand samples.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> errors = [np.full(10, 5.0), np.full(10, 1.001), np.full(10, 1.0)]
+    >>> smallest_good_order([1, 2, 3], errors)
+    2
+    """
+    totals = [block.sum() if len(block) else np.inf for block in blocks]
+    totals = [total if np.isfinite(total) else np.inf for total in totals]
+    best = int(np.argmin(totals))
+    for order, block, total in zip(orders, blocks, totals, strict=True):
+        if not np.isfinite(total):
+            continue
+        gap = block - blocks[best]
+        error = 2.0 * gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
+        if total - totals[best] <= max(error, _NEGLIGIBLE_GAIN * totals[best]):
+            return order
+    return orders[best]
+
+
+def _best_horizon(losses: dict[int, float], refine: bool) -> int:
+    """Smallest horizon whose loss is near the best."""
+    limit = min(losses.values()) * _LOSS_SLACK[refine]
+    return min(h for h, loss in losses.items() if loss <= limit)
+
+
+def select(
+    records: Sequence[Record],
+    order: int | None,
+    horizon: int | None,
+    *,
+    method: str = "po-moesp",
+    feedthrough: bool | NDArray[np.bool_] = True,
+    refine: bool = True,
+    enforce_stability: bool = False,
+    n_noise_states: int = 0,
+) -> Selection:
+    """Choose the order, the horizon or both.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Scaled.
+    order, horizon : int or None
+        None is to be chosen.
+    method, feedthrough, refine, enforce_stability, n_noise_states
+        As in `identify`.
+
+    Returns
+    -------
+    Selection
+    """
+    m, ny = len(records[0].u), len(records[0].y)
+    records = thin_records(records, _MAX_SAMPLES)
+    splits = [split_record(record) for record in records]
+    parts, cuts = [part for part, _ in splits], [cut for _, cut in splits]
+    if order and max_order(max_horizon(cuts, m, ny), m, ny, method) < order:
+        # Too few samples to hold any out.
+        parts, cuts = list(records), [record.u.shape[1] for record in records]
+    energy = sum(float((part.y**2).sum()) for part in parts) or 1.0
+    horizons = _horizons(cuts, m, ny, order, horizon, method)
+    highest = _highest_order(parts, m, ny, horizons, method) if order is None else order
+    spaces = {
+        h: subspace_of(
+            parts,
+            h,
+            min(highest + n_noise_states, max_order(h, m, ny, method)),
+            method=method,
+        )
+        for h in horizons
+    }
+    free = freedom(ny, m, feedthrough)
+    options = {
+        "free": free,
+        "enforce_stability": enforce_stability,
+        "n_noise_states": n_noise_states,
+    }
+    candidates, tried, held_out, chosen = [], [], [], {}
+    best_loss, stale = np.inf, 0
+    for n in [order] if order is not None else range(highest + 1):
+        models = {
+            h: realize(space, parts, n, **options)
+            for h, space in spaces.items()
+            if n <= max_order(h, m, ny, method)
+        }
+        losses = {h: model.loss for h, model in models.items()}
+        chosen[n] = _best_horizon(losses, refine)
+        for h, model in models.items():
+            bft = np.nan
+            if h == chosen[n] or order is not None:
+                if refine:
+                    start = model
+                    model = refine_simulation(start, parts, free)[0]
+                blocks, bft = held_out_errors(model, records, cuts)
+                if h == chosen[n]:
+                    tried.append(n)
+                    held_out.append(blocks)
+                    refined_loss = model.loss
+            criterion = float(np.sqrt(losses[h] / energy))
+            candidates.append(Candidate(n, h, criterion, bft))
+        stale = 0 if refined_loss < _NOTICEABLE * best_loss else stale + 1
+        best_loss = min(best_loss, refined_loss)
+        if stale > _PATIENCE or best_loss <= 1e-18 * energy:
+            break
+    best = order if order is not None else smallest_good_order(tried, held_out)
+    if refine or horizon is not None:
+        return Selection(best, chosen[best], candidates)
+    # Nothing corrects the horizon afterwards: compare on the whole records.
+    losses = {}
+    for h in horizons:
+        if best <= max_order(h, m, ny, method):
+            space = subspace_of(records, h, best + n_noise_states, method=method)
+            losses[h] = realize(space, records, best, **options).loss
+    return Selection(best, _best_horizon(losses, refine), candidates)
+
+
+def _horizons(
+    lengths: Sequence[int],
+    m: int,
+    ny: int,
+    order: int | None,
+    horizon: int | None,
+    method: str,
+) -> list[int]:
+    """Horizons to try: those that show the order and that the data can fill."""
+    if horizon is not None:
+        return [horizon]
+    height = 2 * m + (1 if method == "pi-moesp" else 2) * ny
+    highest = min(max_horizon(lengths, m, ny), max(2, _MAX_ROWS // height))
+    lowest = 2 if highest > 1 else 1
+    while lowest < highest and max_order(lowest, m, ny, method) < (order or 0):
+        lowest += 1
+    return horizon_grid(lowest, highest)
+
+
+def _highest_order(
+    parts: Sequence[Record], m: int, ny: int, horizons: Sequence[int], method: str
+) -> int:
+    """Highest order to try: one that leaves ten values per parameter."""
+    n_values = sum(part.y.size for part in parts)
+    affordable = (n_values / 10 - m * ny) / (m + ny + len(parts))
+    by_horizon = max(max_order(h, m, ny, method) for h in horizons)
+    return int(np.clip(affordable, 0, min(_MAX_ORDER, by_horizon)))

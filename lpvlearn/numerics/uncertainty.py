@@ -1,0 +1,194 @@
+"""Asymptotic covariance of a model that minimises the simulation error.
+
+With J the Jacobian of the simulated outputs and v the simulation error, the estimate
+moves by ``inv(J.T J) J.T v`` to first order. Its covariance is the sandwich
+``inv(H) S inv(H)`` with ``H = J.T J`` and ``S = J.T cov(v) J``; cov(v) comes from an
+autoregression of the errors, so that coloured noise and outputs of different quality
+are accounted for (Ljung, *System Identification*, 1999, Section 9.4). J is a fixed
+combination of the section signals; S is summed over frequencies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from .innovations import NoiseModel, spectrum
+from .regression import Freedom, Point, jacobian_regression, n_own
+from .sections import state_coefficients
+from .signals import Record, signal_pieces
+from .simulationfit import Realization
+
+Array = NDArray[np.float64]
+
+# The weakest direction of the scaled information that is told from rounding.
+_RCOND = 1e-15
+
+
+def parameter_covariance(
+    model: Realization, records: Sequence[Record], free: Freedom, noise: NoiseModel
+) -> Array:
+    """Covariance of B, D, A and C, initial states allowed for.
+
+    Parameters
+    ----------
+    model : Realization
+        In section form, at the minimum of the simulation error.
+    records : sequence of Record
+        The data it was estimated on.
+    free : Freedom
+    noise : NoiseModel
+        Of the simulation errors.
+
+    Returns
+    -------
+    ndarray of shape (n_parameters, n_parameters)
+        Parameters: B (state-major), free entries of D, A (blocks, row-major), C. Along
+        changes of the state basis, which the data do not determine, it is zero.
+    """
+    assert model.blocks is not None
+    information: Array | float = 0.0
+    score: Array | float = 0.0
+    for record, x0 in zip(records, model.initial_states, strict=True):
+        H, S = _experiment_terms(model, record, x0, free, noise)
+        own = n_own(len(model.A), free)
+        if own:
+            # What the initial state can explain tells nothing about the others.
+            explain = np.linalg.pinv(H[:own, :own], hermitian=True) @ H[:own, own:]
+            keep = np.vstack([-explain, np.eye(len(H) - own)])
+            H, S = keep.T @ H @ keep, keep.T @ S @ keep
+        information, score = information + H, score + S
+    H, S = np.asarray(information), np.asarray(score)
+    scale = np.sqrt(np.diagonal(H))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(H / scale[:, None] / scale)
+    n_gauge = sum(block.size for block in model.blocks)
+    kept = np.arange(len(values)) >= n_gauge
+    kept &= values > _RCOND * values[-1]
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+    inverse = inverse / scale[:, None] / scale
+    n_values = sum(record.y.size for record in records)
+    n_free = int(kept.sum()) + len(records) * n_own(len(model.A), free)
+    return inverse @ S @ inverse * (n_values / max(n_values - n_free, 1))
+
+
+def _experiment_terms(
+    model: Realization, record: Record, x0: Array, free: Freedom, noise: NoiseModel
+) -> tuple[Array, Array]:
+    """``J.T J`` and ``J.T cov(v) J`` of one experiment, initial state first."""
+    assert model.blocks is not None
+    driven = np.column_stack([x0, model.B])
+    state_map = state_coefficients(model.blocks, driven) if len(model.A) else None
+    pieces = signal_pieces(model.blocks, record, state_map)
+    X = np.hstack([piece.copy() for piece in pieces])
+    k, ny = len(X), len(record.y)
+    point = Point(model.C, model.D, driven)
+    # Of the unit matrix: the Jacobian's coefficients in the signals, output by output.
+    maps = jacobian_regression(np.eye(k), model.blocks, point, free)
+    maps = maps[:, :-1].reshape(ny, k, -1)
+    gram = X @ X.T
+    H = sum(L.T @ gram @ L for L in maps)
+    if len(noise.A) == 0:
+        return np.asarray(H), sum(
+            noise.covariance[i, j] * (maps[i].T @ gram @ maps[j])
+            for i in range(ny)
+            for j in range(ny)
+        )
+    size = fft.next_fast_len(2 * X.shape[1], real=True)
+    transformed = fft.rfft(X, size, axis=1)
+    density = spectrum(noise, 2.0 * np.pi * np.arange(size // 2 + 1) / size)
+    weight = np.full(size // 2 + 1, 2.0 / size)
+    weight[0] = 1.0 / size
+    if size % 2 == 0:
+        weight[-1] = 1.0 / size
+    S = np.zeros_like(H)
+    for i in range(ny):
+        for j in range(ny):
+            # Sum over t, s of X[:, t] r_ij(t - s) X[:, s].T
+            by_frequency = transformed.conj() * (weight * density[:, i, j])
+            S += maps[i].T @ (by_frequency @ transformed.T).real @ maps[j]
+    return np.asarray(H), S
+
+
+def frequency_response_jacobian(
+    model: Realization, free: Freedom, omega: Array
+) -> NDArray[np.complex128]:
+    """Derivatives of the frequency response by the parameters.
+
+    Parameters
+    ----------
+    model : Realization
+        In section form.
+    free : Freedom
+    omega : ndarray of shape (n_freq,)
+        Radians per sample.
+
+    Returns
+    -------
+    ndarray of shape (n_freq, n_outputs, n_inputs, n_parameters)
+        Parameters as in `parameter_covariance`.
+    """
+    assert model.blocks is not None
+    (ny, n), m = model.C.shape, model.B.shape[1]
+    z = np.exp(1j * np.asarray(omega))
+    resolvent = np.linalg.inv(z[:, None, None] * np.eye(n) - model.A)
+    to_output = model.C @ resolvent  # (f, ny, n)
+    from_input = resolvent @ model.B  # (f, n, m)
+    where = np.argwhere(free.direct)
+    n_a = sum(block.size for block in model.blocks)
+    out = np.zeros((len(z), ny, m, n * m + len(where) + n_a + ny * n), dtype=complex)
+    for p in range(n):
+        for j in range(m):
+            out[:, :, j, p * m + j] = to_output[:, :, p]
+    for column, (i, j) in enumerate(where, start=n * m):
+        out[:, i, j, column] = 1.0
+    column, start = n * m + len(where), 0
+    for block in model.blocks:
+        for p in range(start, start + len(block)):
+            for q in range(start, start + len(block)):
+                effect = to_output[:, :, p, None] * from_input[:, None, q, :]
+                out[:, :, :, column] = effect
+                column += 1
+        start += len(block)
+    for i in range(ny):
+        out[:, i, :, column + i * n : column + (i + 1) * n] = from_input.transpose(
+            0, 2, 1
+        )
+    return out
+
+
+def pole_jacobian(
+    model: Realization, n_parameters: int
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Poles and their derivatives by the parameters.
+
+    Parameters
+    ----------
+    model : Realization
+        In section form.
+    n_parameters : int
+
+    Returns
+    -------
+    poles : ndarray of shape (order,)
+    jacobian : ndarray of shape (order, n_parameters)
+    """
+    assert model.blocks is not None
+    n_a = sum(block.size for block in model.blocks)
+    start = n_parameters - model.C.size - n_a
+    poles = np.zeros(len(model.A), dtype=complex)
+    jacobian = np.zeros((len(model.A), n_parameters), dtype=complex)
+    row = 0
+    for block in model.blocks:
+        values, right = np.linalg.eig(block + 0j)
+        left = np.linalg.pinv(right)
+        for i, value in enumerate(values):
+            poles[row] = value
+            effect = np.outer(left[i], right[:, i])
+            jacobian[row, start : start + block.size] = effect.ravel()
+            row += 1
+        start += block.size
+    return poles, jacobian

@@ -1,0 +1,227 @@
+"""What the simulation errors of an identified model tell: prediction and uncertainty."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import check_is_fitted
+
+from .innovation_model import InnovationModel
+from .numerics.innovations import NoiseModel, autoregression, reduce_noise_model
+from .numerics.refinement import in_sections
+from .numerics.regression import Freedom
+from .numerics.signals import Record
+from .numerics.simulation import lti_response
+from .numerics.simulationfit import Realization
+from .numerics.uncertainty import (
+    frequency_response_jacobian,
+    parameter_covariance,
+    pole_jacobian,
+)
+from .statespace import StateSpace
+
+Array = NDArray[np.float64]
+
+# Samples that averages over the record are taken from.
+_MAX_SAMPLES = 30_000
+
+
+class Evidence(NamedTuple):
+    """The scaled model and the samples that its statistics are computed from.
+
+    Attributes
+    ----------
+    model : Realization
+        Of the scaled records.
+    records : list of Record
+    input_scale, output_scale : ndarray
+    basis : ndarray of shape (n_inputs, rank)
+        Original inputs in terms of the independent ones.
+    free : Freedom
+    refined : bool
+        Whether the model minimises the simulation error.
+    share : float
+        Samples in `records` by all samples that were used.
+    """
+
+    model: Realization
+    records: list[Record]
+    input_scale: Array
+    output_scale: Array
+    basis: Array
+    free: Freedom
+    refined: bool
+    share: float
+
+
+def shorten(records: list[Record]) -> tuple[list[Record], float]:
+    """Heads of the records, some 30,000 samples in total, and their share."""
+    total = sum(record.u.shape[1] for record in records)
+    share = _MAX_SAMPLES / total
+    if share >= 1.0:
+        return records, 1.0
+    parts = []
+    for record in records:
+        stop = max(2, int(share * record.u.shape[1]))
+        parts.append(Record(record.u[:, :stop].copy(), record.y[:, :stop].copy()))
+    return parts, sum(record.u.shape[1] for record in parts) / total
+
+
+def noise_of(evidence: Evidence) -> NoiseModel:
+    """Autoregression of the scaled simulation errors."""
+    A, B, C, D = evidence.model[:4]
+    states = evidence.model.initial_states
+    errors = [
+        record.y.T - lti_response(A, B, C, D, record.u.T, x0)
+        for record, x0 in zip(evidence.records, states, strict=True)
+    ]
+    return autoregression(errors)
+
+
+class SimulationErrorStatistics:
+    """Mixin: noise model, prediction, covariance of the estimate.
+
+    All of it is computed when first asked for, from samples that `fit` keeps.
+    """
+
+    n_noise_states: int | str
+    lti_: StateSpace
+    _evidence: Evidence
+    _noise: NoiseModel | None
+    _parameters_covariance: Array | None
+
+    @property
+    def predictor_(self) -> InnovationModel:
+        """Innovation model: `lti_`, the noise model, K and innovation covariance."""
+        check_is_fitted(self)
+        model = self._scaled_noise()
+        if self.n_noise_states != "auto":
+            model = reduce_noise_model(model, int(self.n_noise_states))
+        sy = self._evidence.output_scale
+        noise = NoiseModel(
+            model.A,
+            sy[:, None] * model.C,
+            model.K / sy,
+            model.covariance * np.outer(sy, sy),
+        )
+        return InnovationModel(self.lti_, noise)
+
+    @property
+    def poles_std_(self) -> NDArray[np.complex128]:
+        """Standard deviations of the poles, in the order of ``lti_.poles()``.
+
+        The real part is that of a pole's real part, the imaginary part that of its
+        imaginary part.
+        """
+        check_is_fitted(self)
+        try:
+            covariance = self._covariance()
+        except ValueError as error:
+            raise AttributeError(str(error)) from None
+        model = in_sections(self._evidence.model)
+        poles, J = pole_jacobian(model, len(covariance))
+        std = _deviations(J.real, covariance) + 1j * _deviations(J.imag, covariance)
+        order = np.lexsort((poles.imag, poles.real, np.abs(poles)))
+        return std[order]
+
+    def frequency_response_covariance(self, omega: ArrayLike) -> Array:
+        """Covariance of the frequency response at every frequency.
+
+        Asymptotic, from the Gauss-Newton Jacobian of the simulation error; valid for
+        coloured noise and outputs of different quality.
+
+        Parameters
+        ----------
+        omega : array-like of shape (n_freq,)
+            Angular frequencies, rad/s.
+
+        Returns
+        -------
+        ndarray of shape (n_freq, k, k), ``k = 2 n_outputs n_inputs``
+            Of the real parts of all entries, output by output, then of the imaginary
+            parts: the columns of the frequency-response tables of
+            `GrayBoxRestructurer`.
+
+        Raises
+        ------
+        ValueError
+            If the model does not minimise the simulation error (``refine=False``).
+        """
+        check_is_fitted(self)
+        covariance = self._covariance()
+        J = self._frequency_jacobian(omega)
+        flat = J.reshape(len(J), -1, J.shape[-1])
+        parts = np.concatenate([flat.real, flat.imag], axis=1)
+        return parts @ covariance @ parts.transpose(0, 2, 1)
+
+    def frequency_response_std(self, omega: ArrayLike) -> NDArray[np.complex128]:
+        """Standard deviation of the frequency response.
+
+        Parameters
+        ----------
+        omega : array-like of shape (n_freq,)
+            Angular frequencies, rad/s.
+
+        Returns
+        -------
+        ndarray of complex, shape (n_freq, n_outputs, n_inputs)
+            The real part is the standard deviation of the real part of the response,
+            the imaginary part that of the imaginary part. Its modulus is the root mean
+            square of the complex error.
+
+        Raises
+        ------
+        ValueError
+            As `frequency_response_covariance`.
+
+        Notes
+        -----
+        A 95 % band of a real part is 1.96 standard deviations to both sides.
+        """
+        check_is_fitted(self)
+        covariance = self._covariance()
+        J = self._frequency_jacobian(omega)
+        return _deviations(J.real, covariance) + 1j * _deviations(J.imag, covariance)
+
+    def _frequency_jacobian(self, omega: ArrayLike) -> NDArray[np.complex128]:
+        evidence = self._evidence
+        step = self.lti_.sampling_time or 1.0
+        omega = np.atleast_1d(np.asarray(omega, dtype=float)) * step
+        J = frequency_response_jacobian(
+            in_sections(evidence.model), evidence.free, omega
+        )
+        to_inputs = evidence.basis / evidence.input_scale
+        J = np.einsum("foip,ui->foup", J, to_inputs)
+        return J * evidence.output_scale[:, None, None]
+
+    def _scaled_noise(self) -> NoiseModel:
+        if self._noise is None:
+            self._noise = noise_of(self._evidence)
+        return self._noise
+
+    def _covariance(self) -> Array:
+        if self._parameters_covariance is None:
+            evidence = self._evidence
+            if not evidence.refined:
+                raise ValueError(
+                    "The covariance is that of a model that minimises the simulation "
+                    "error: it needs refine=True and an unconstrained minimum."
+                )
+            model = in_sections(evidence.model)
+            if model.blocks is None:
+                raise ValueError(
+                    "The covariance needs poles of multiplicity two at most. Lower "
+                    "`order`."
+                )
+            covariance = parameter_covariance(
+                model, evidence.records, evidence.free, self._scaled_noise()
+            )
+            self._parameters_covariance = covariance * evidence.share
+        return self._parameters_covariance
+
+
+def _deviations(J: Any, covariance: Array) -> Array:
+    variance = np.einsum("...p,pq,...q->...", J, covariance, J)
+    return np.sqrt(np.maximum(variance, 0.0))
