@@ -1,0 +1,39 @@
+"""Local linear parameter-varying (LPV) identification."""
+
+from .experiments import from_trajectories
+from .interpolation import PolynomialLPV
+from .lpv import LPVStateSpace
+from .metrics import (
+    bft_score,
+    bft_scorer,
+    fit_report,
+    make_bft_scorer,
+    make_vaf_scorer,
+    parameter_fit,
+    vaf_score,
+    vaf_scorer,
+)
+from .pipeline import LocalLPVPipeline
+from .restructuring import GrayBoxRestructurer
+from .statespace import StateSpace
+from .structures import GrayBoxStructure
+from .subspace import SubspaceLTI
+
+__all__ = [
+    "GrayBoxRestructurer",
+    "GrayBoxStructure",
+    "LPVStateSpace",
+    "LocalLPVPipeline",
+    "PolynomialLPV",
+    "StateSpace",
+    "SubspaceLTI",
+    "bft_score",
+    "bft_scorer",
+    "fit_report",
+    "from_trajectories",
+    "make_bft_scorer",
+    "make_vaf_scorer",
+    "parameter_fit",
+    "vaf_score",
+    "vaf_scorer",
+]

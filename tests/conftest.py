@@ -1,0 +1,78 @@
+"""Small systems that several rooms test with."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV
+
+KAPPA = (0.0, 0.5, 1.0, 1.5)
+
+
+def spring_structure():
+    """A mass with a spring that depends on the scheduling variable."""
+    return GrayBoxStructure.from_template(
+        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
+    )
+
+
+def spring_truth(kappa):
+    """Parameters b, c, k at scheduling values: k = 40 + 10 kappa + 20 kappa^2."""
+    kappa = np.asarray(kappa, dtype=float)
+    ones = np.ones_like(kappa)
+    return np.column_stack([30 * ones, 1.2 * ones, 40 + 10 * kappa + 20 * kappa**2])
+
+
+def spring_lpv():
+    """The true LPV model."""
+    kappa = np.linspace(0, 1.5, 5)[:, None]
+    interpolator = PolynomialLPV(2).fit(kappa, spring_truth(kappa[:, 0]))
+    bounds = np.array([[0.0], [1.5]])
+    return LPVStateSpace(spring_structure(), interpolator, bounds)
+
+
+def spring_tables(noise=0.0, n_samples=600, n_repeats=1, seed=0, kappas=KAPPA):
+    """Local experiments on the spring, sampled at 20 ms: X and y."""
+    rng = np.random.default_rng(seed)
+    lpv, dt, tables, outputs = spring_lpv(), 0.02, [], []
+    for point, kappa in enumerate(kappas):
+        for repeat in range(n_repeats):
+            u = rng.choice([-1.0, 1.0], size=(n_samples // 5, 1)).repeat(5, axis=0)
+            y = lpv.at(kappa).simulate(u, sampling_time=dt)
+            y = y + noise * y.std() * rng.normal(size=y.shape)
+            tables.append(
+                pd.DataFrame(
+                    {
+                        "force": u[:, 0],
+                        "kappa": kappa,
+                        "run": f"p{point}r{repeat}",
+                        "time": dt * np.arange(len(u)),
+                    }
+                )
+            )
+            outputs.append(y)
+    X = pd.concat(tables, ignore_index=True)
+    return X, pd.DataFrame(np.vstack(outputs), columns=["position"])
+
+
+def spring_sweep(n_samples=1500, seed=9):
+    """A validation experiment through the whole scheduling range."""
+    rng = np.random.default_rng(seed)
+    u = rng.choice([-1.0, 1.0], size=(n_samples // 5, 1)).repeat(5, axis=0)
+    kappa = 0.75 - 0.75 * np.cos(np.linspace(0, 3 * np.pi, n_samples))
+    y = spring_lpv().simulate(u, kappa, 0.02)
+    X = pd.DataFrame(
+        {
+            "force": u[:, 0],
+            "kappa": kappa,
+            "run": "sweep",
+            "time": 0.02 * np.arange(n_samples),
+        }
+    )
+    return X, pd.DataFrame(y, columns=["position"])
+
+
+@pytest.fixture(scope="session")
+def spring():
+    """Noise-free local experiments and a sweep."""
+    return *spring_tables(), *spring_sweep()
