@@ -22,16 +22,17 @@ from sklearn.utils.validation import check_is_fitted
 from .exceptions import RankWarning
 from .frequency_data import read_frequency_data, stack_response
 from .identifiability import Identifiability
+from .numerics.certificates import ACTIVE_PEAK
 from .numerics.frf_realization import realize_response
 from .numerics.leastsquares import (
     LeastSquaresResult,
     fit_frequency_response,
     frequency_grid,
 )
-from .numerics.matching import ErrorSystem, MeasuredErrorSystem, Target
-from .numerics.minimax import ACTIVE_PEAK
+from .numerics.matching import ErrorSystem, MeasuredErrorSystem
 from .numerics.restructure import SOLVERS, decay_rates, growth, minimise_hinf
 from .numerics.starts import best_fits, perturbed_candidates, similarity_candidates
+from .numerics.transfer import Target
 from .statespace import StateSpace
 from .structures import GrayBoxStructure
 
@@ -291,7 +292,6 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 candidates,
                 omega,
                 G0,
-                weight=None,
                 admissible=_stability_test(system, margin),
                 n_fits=_N_FITS + len(given),
             )

@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxStructure, StateSpace
-from lpvlearn.numerics.matching import (
-    ErrorSystem,
-    MeasuredErrorSystem,
-    Target,
-    resolvent,
-)
+from lpvlearn.numerics.matching import ErrorSystem, MeasuredErrorSystem
+from lpvlearn.numerics.transfer import Target, resolvent
 
 
 def stable_model(rng, order, n_inputs, n_outputs, sampling_time=None):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lpvlearn.numerics.bundle import proximal_bundle
-from lpvlearn.numerics.minimax import MinimaxProblem, Peaks, minimax_sqp
+from lpvlearn.numerics.certificates import MinimaxProblem, Peaks
+from lpvlearn.numerics.minimax import minimax_sqp
 from lpvlearn.numerics.quadratic import epigraph_step, shortest_in_hull
 
 

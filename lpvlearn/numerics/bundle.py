@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .minimax import MinimaxProblem, MinimaxResult, Peaks, certificate
+from .certificates import MinimaxProblem, MinimaxResult, Peaks, certificate
 from .quadratic import epigraph_step
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .matching import Target
 from .sampling import d2c_tustin
+from .transfer import Target
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -107,7 +107,6 @@ def fit_frequency_response(
     omega: Array,
     G0: Complex,
     *,
-    weight: Array | None = None,
     admissible: Callable[[Array], bool],
     max_iter: int = 60,
 ) -> LeastSquaresResult | None:
@@ -123,20 +122,18 @@ def fit_frequency_response(
     theta0 : ndarray of shape (n_params,)
     omega : ndarray of shape (k,)
     G0 : ndarray of shape (k, n_outputs, n_inputs)
-    weight : ndarray of shape (k,) or (k, n_outputs, n_inputs), default=None
     admissible : callable
         False where the model may not go (an unstable one).
     """
-    w = np.full(G0.shape, 1.0 / np.sqrt(len(omega)))
-    if weight is not None:
-        w = w * (weight if weight.ndim == 3 else weight[:, None, None])
+    W = system.weight_response(omega)[0] / np.sqrt(len(omega))
+    target = W @ G0
 
     def residuals(theta: Array) -> tuple[Array, Array] | None:
         if not admissible(theta):
             return None
         G, J = system.response_jacobian(theta, omega)
-        r = (w * (G - G0)).ravel()
-        J = (w[..., None] * J).reshape(len(r), -1)
+        r = (W @ G - target).ravel()
+        J = np.einsum("kpq,kqmj->kpmj", W, J).reshape(len(r), -1)
         if not np.isfinite(J).all():
             return None
         return np.concatenate([r.real, r.imag]), np.vstack([J.real, J.imag])

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .hinf import PeakSet, linf_norm
+from .transfer import Target, laplace_variable, model_derivatives, resolvent, series
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -33,17 +34,6 @@ class Structure(Protocol):
 
 
 @dataclass(frozen=True)
-class Target:
-    """The black-box model to match; `dt` None is continuous time."""
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    dt: float | None = None
-
-
-@dataclass(frozen=True)
 class _Point:
     """Quantities at one theta and several frequencies (leading axis k)."""
 
@@ -53,36 +43,26 @@ class _Point:
     Phi: Complex  # (k, n, n)
 
 
-def laplace_variable(
-    omega: Array, dt: float | None
-) -> tuple[Complex, Complex, Complex]:
-    """``s(omega)`` and its two derivatives: ``j omega`` or ``exp(j omega dt)``."""
-    if dt is None:
-        return 1j * omega, np.full(omega.shape, 1j), np.zeros(omega.shape, complex)
-    z = np.exp(1j * omega * dt)
-    return z, 1j * dt * z, -(dt**2) * z
-
-
-def resolvent(A: Array, s: Complex) -> Complex:
-    """``(s I - A)^-1`` for every `s`; zero at infinity."""
-    finite = np.isfinite(s)
-    M = np.where(finite, s, 0.0)[:, None, None] * np.eye(len(A)) - A
-    if not finite.all():
-        M[~finite] = np.eye(len(A))
-    inverse = np.linalg.inv(M)
-    inverse[~finite] = 0.0
-    return inverse
-
-
 class ErrorSystem:
-    """``Sigma(theta) = G(theta) - G0`` for a structure and a black-box model."""
+    """``W (G(theta) - G0)`` for a structure, a black-box model and a weight.
+
+    The weight is a stable model with one output, for all outputs alike, or a square
+    one; None is no weight.
+    """
 
     peaks_move = True  # the peaks are local maxima over a continuum of frequencies
 
-    def __init__(self, structure: Structure, target: Target) -> None:
+    def __init__(
+        self, structure: Structure, target: Target, weight: Target | None = None
+    ) -> None:
         self.structure, self.target, self.dt = structure, target, target.dt
         self.n = structure.order
         self.n_outputs, self.n_inputs = target.D.shape
+        self.weight = weight
+        if weight is not None and weight.D.shape == (1, 1) and self.n_outputs > 1:
+            eye = np.eye(self.n_outputs)
+            blocks = (np.kron(eye, M) for M in (weight.A, weight.B, weight.C, weight.D))
+            self.weight = Target(*blocks, weight.dt)
 
     def split(self, S: Array) -> tuple[Array, Array, Array, Array]:
         """Blocks ``A, B, C, D`` of a system matrix."""
@@ -105,8 +85,30 @@ class ErrorSystem:
         n, n0 = self.n, len(t.A)
         Ae = np.zeros((n + n0, n + n0))
         Ae[:n, :n], Ae[n:, n:] = A, t.A
-        Be, Ce = np.vstack([B, t.B]), np.hstack([C, -t.C])
-        return linf_norm(Ae, Be, Ce, D - t.D, dt=self.dt, within=within)
+        Be, Ce, De = np.vstack([B, t.B]), np.hstack([C, -t.C]), D - t.D
+        if self.weight is not None:
+            Ae, Be, Ce, De = series(Ae, Be, Ce, De, self.weight)
+        return linf_norm(Ae, Be, Ce, De, dt=self.dt, within=within)
+
+    def reweighted(self, weight: Target) -> ErrorSystem:
+        """The same error behind one more weight (a scalar one)."""
+        if self.weight is not None:
+            eye = np.eye(self.n_outputs)
+            parts = (np.kron(eye, M) for M in (weight.A, weight.B, weight.C, weight.D))
+            old = self.weight
+            total = series(old.A, old.B, old.C, old.D, Target(*parts, weight.dt))
+            weight = Target(*total, weight.dt)
+        return ErrorSystem(self.structure, self.target, weight)
+
+    def weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        """``W`` and its first two derivatives along the frequency, (k, p, p)."""
+        if self.weight is None:
+            eye = np.broadcast_to(
+                np.eye(self.n_outputs), (len(omega),) + (self.n_outputs,) * 2
+            )
+            zero = np.zeros_like(eye)
+            return eye.astype(complex), zero.astype(complex), zero.astype(complex)
+        return model_derivatives(self.weight, omega)
 
     def target_response(self, omega: Array) -> Complex:
         """``G0`` at the frequencies, shape (k, n_outputs, n_inputs)."""
@@ -115,16 +117,7 @@ class ErrorSystem:
         return t.C @ resolvent(t.A, s) @ t.B + t.D
 
     def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
-        """``G0`` and its first two derivatives along the frequency."""
-        t = self.target
-        s, s1, s2 = laplace_variable(omega, self.dt)
-        P = resolvent(t.A, s)
-        PB = P @ t.B
-        X = P @ PB
-        first = -s1[:, None, None] * (t.C @ X)
-        second = 2.0 * s1[:, None, None] ** 2 * (t.C @ (P @ X))
-        second -= s2[:, None, None] * (t.C @ X)
-        return t.C @ PB + t.D, first, second
+        return model_derivatives(self.target, omega)
 
     def response(self, theta: Array, omega: Array) -> Complex:
         """Response of the gray-box model, shape (k, n_outputs, n_inputs)."""
@@ -159,8 +152,9 @@ class ErrorSystem:
         gradients : ndarray of shape (k, n_params)
         """
         at = self._point(theta, omega, self.target_response(omega))
-        U, sigma, Vh = np.linalg.svd(at.E)
-        left = np.einsum("kp,kpa->ka", U[:, :, 0].conj(), at.L)
+        W = self.weight_response(omega)[0]
+        U, sigma, Vh = np.linalg.svd(W @ at.E)
+        left = np.einsum("kp,kpq,kqa->ka", U[:, :, 0].conj(), W, at.L)
         right = np.einsum("kbm,km->kb", at.R, Vh[:, 0].conj())
         outer = np.real(left[:, :, None] * right[:, None, :]).reshape(len(omega), -1)
         S = self.structure.jacobian(theta).reshape(self.structure.n_params, -1)
@@ -186,7 +180,7 @@ class ErrorSystem:
         return out
 
     def joint_hessians(self, theta: Array, omega: Array) -> Array:
-        """Hessians of sigma in (theta, omega), shape (k, n_params + 1, n_params + 1)."""
+        """Hessians of sigma in theta and omega, (k, n_params + 1, n_params + 1)."""
         q, n = self.structure.n_params, self.n
         S = self.structure.jacobian(theta)
         curvature = self.structure.curvature(theta)
@@ -195,29 +189,59 @@ class ErrorSystem:
         G0, G0_1, G0_2 = self._target_derivatives(omega)
         at = self._point(theta, omega, G0)
         A, B, C, _ = self.split(self.structure.system_matrix(theta))
-        U, sigma, Vh = np.linalg.svd(at.E)
+        W, W1, W2 = self.weight_response(omega)
+        U, sigma, Vh = np.linalg.svd(W @ at.E)
         out = np.empty((len(omega), q + 1, q + 1))
         for k in range(len(omega)):
             u, v = U[k, :, 0], Vh[k, 0].conj()
             Phi, L, R = at.Phi[k], at.L[k], at.R[k]
-            left, right = u.conj() @ L, R @ v
+            uW, uW1 = u.conj() @ W[k], u.conj() @ W1[k]
+            left, right = uW @ L, R @ v
             dE = np.empty((q + 1, p, m), complex)
-            dE[:q] = L @ S @ R
+            dE[:q] = W[k] @ L @ S @ R
             first, second = _frequency_derivatives(Phi, B, C, s1[k], s2[k])
-            dE[q] = first - G0_1[k]
+            first, second = first - G0_1[k], second - G0_2[k]
+            dE[q] = W1[k] @ at.E[k] + W[k] @ first
             # u^H (d2E) v: pairs of parameters, parameter and frequency, frequency
             mixed = (left @ S)[:, :n] @ Phi @ (S[:, :n] @ right).T
             d2 = np.zeros((q + 1, q + 1), complex)
             d2[:q, :q] = mixed + mixed.T
             if curvature is not None:
                 d2[:q, :q] += np.einsum("a,ijab,b->ij", left, curvature, right)
-            dleft = -s1[k] * (left[:n] @ Phi)
+            dleft = uW1 @ L
+            dleft[:n] -= s1[k] * (left[:n] @ Phi)
             dright = -s1[k] * (Phi @ right[:n])
-            cross = (dleft @ S[:, :n]) @ right + (left @ S[:, :, :n]) @ dright
+            cross = (dleft @ S) @ right + (left @ S[:, :, :n]) @ dright
             d2[:q, q] = d2[q, :q] = cross
-            d2[q, q] = u.conj() @ (second - G0_2[k]) @ v
+            bend = u.conj() @ W2[k] @ at.E[k] + 2.0 * (uW1 @ first) + uW @ second
+            d2[q, q] = bend @ v
             out[k] = np.real(d2) + _coupling(dE, U[k], sigma[k], Vh[k])
         return out
+
+
+def vanishing_weight(system: ErrorSystem, omega: float) -> Target | None:
+    """First-order weight that vanishes at zero or infinite frequency.
+
+    ``s / (s + c)`` with `c` the fastest pole of the black box, or ``c / (s + c)`` with
+    the slowest; None for a frequency in between.
+    """
+    poles = np.linalg.eigvals(system.target.A).astype(complex)
+    dt = system.dt
+    if dt is not None:
+        poles = np.log(np.where(poles == 0, 1e-300, poles)) / dt
+    size = np.abs(poles)
+    size = size[size > 0]
+    if size.size == 0 or (0 < omega < np.inf):
+        return None
+    one = np.ones((1, 1))
+    if omega == 0:
+        c = float(size.max())
+        if dt is None:
+            return Target(-c * one, c * one, -one, one)
+        a = np.exp(-c * dt)
+        return Target(a * one, (a - 1.0) * one, one, one, dt)
+    c = float(size.min())
+    return Target(-c * one, c * one, one, 0 * one)
 
 
 class MeasuredErrorSystem(ErrorSystem):
@@ -229,7 +253,13 @@ class MeasuredErrorSystem(ErrorSystem):
 
     peaks_move = False
 
-    def __init__(self, structure: Structure, omega: Array, G: Complex) -> None:
+    def __init__(
+        self,
+        structure: Structure,
+        omega: Array,
+        G: Complex,
+        weight: Complex | None = None,
+    ) -> None:
         n_outputs, n_inputs = G.shape[1:]
         empty = np.zeros((0, 0))
         D = np.zeros((n_outputs, n_inputs))
@@ -237,6 +267,18 @@ class MeasuredErrorSystem(ErrorSystem):
         super().__init__(structure, target)
         order = np.argsort(omega)
         self.omega, self.G = omega[order], G[order]
+        unit = np.broadcast_to(np.eye(n_outputs), (len(omega), n_outputs, n_outputs))
+        self.W = (unit if weight is None else weight[order]).astype(complex)
+
+    def reweighted(self, weight: Target) -> ErrorSystem:
+        """The same error behind one more weight (a scalar one)."""
+        factor = model_derivatives(weight, self.omega)[0][:, :1, :1]
+        return MeasuredErrorSystem(self.structure, self.omega, self.G, factor * self.W)
+
+    def weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        """The weight at some of the measured frequencies."""
+        W = self.W[np.searchsorted(self.omega, omega)]
+        return W, np.zeros_like(W), np.zeros_like(W)
 
     def target_response(self, omega: Array) -> Complex:
         """The measured response at some of the measured frequencies."""
@@ -248,7 +290,7 @@ class MeasuredErrorSystem(ErrorSystem):
 
     def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
         """Local maxima of the error over the measured frequencies."""
-        E = self.response(theta, self.omega) - self.G
+        E = self.W @ (self.response(theta, self.omega) - self.G)
         sigma = np.linalg.norm(E, 2, axis=(1, 2))
         top = float(sigma.max())
         rising = np.r_[True, sigma[1:] >= sigma[:-1]]

@@ -7,91 +7,24 @@ norm enter the local model, with the exact Hessian of the Lagrangian.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .quadratic import epigraph_step, shortest_in_hull
+from .certificates import (
+    ACTIVE_MULTIPLIER,
+    MinimaxProblem,
+    MinimaxResult,
+    Peaks,
+    certificate,
+    convexified,
+)
+from .quadratic import epigraph_step
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
-_ACTIVE = 1e-8  # multipliers below it do not count
 _MAX_ENTRIES = 60
-ACTIVE_PEAK = 1e-6  # peaks within that fraction of the highest one are active
-
-
-@dataclass(frozen=True)
-class Peaks:
-    """Values, frequencies (rad/s) and gradients of the peaks at one point.
-
-    Where `moving` is False, the entry is the singular value at a fixed frequency, a
-    lower bound of the objective everywhere, and no local maximum.
-    """
-
-    values: Array
-    frequencies: Array
-    gradients: Array
-    moving: Flags
-
-    @property
-    def top(self) -> float:
-        """The objective: the highest peak."""
-        return float(self.values.max())
-
-
-@dataclass(frozen=True)
-class MinimaxProblem:
-    """What the minimax solvers ask of a problem.
-
-    Attributes
-    ----------
-    peaks : callable
-        ``y -> Peaks``, or None where `y` is not admissible (an unstable model).
-    samples : callable
-        ``(y, frequencies) -> Peaks``: the singular value at fixed frequencies.
-    hessians : callable
-        ``(y, frequencies, moving) -> (k, q, q)``, second derivatives of the values.
-    constraints : callable
-        ``y -> (c, dc)``: smooth constraints ``c(y) <= 0`` and their gradients.
-    """
-
-    peaks: Callable[[Array], Peaks | None]
-    samples: Callable[[Array, Array], Peaks]
-    hessians: Callable[[Array, Array, Flags], Array]
-    constraints: Callable[[Array], tuple[Array, Array]]
-
-
-@dataclass(frozen=True)
-class MinimaxResult:
-    """Best point, its peaks, and what certifies it.
-
-    Attributes
-    ----------
-    y : ndarray of shape (q,)
-    peaks : Peaks
-    stationarity : float
-        Shortest vector in the convex hull of the active gradients, relative to the
-        objective; constraint gradients are projected out.
-    second_order : float
-        Smallest eigenvalue of the Hessian of the Lagrangian on the subspace along
-        which all active peaks stay equal, relative to the objective; positive for a
-        strict local minimum, NaN where the solver has no second-order model.
-    converged : bool
-    n_iter : int
-    history : list of dict
-        One row per iteration: objective, predicted decrease, radius, active peaks.
-    """
-
-    y: Array
-    peaks: Peaks
-    stationarity: float
-    second_order: float
-    converged: bool
-    n_iter: int
-    history: list[dict[str, float]] = field(default_factory=list)
 
 
 def minimax_sqp(
@@ -154,7 +87,7 @@ def minimax_sqp(
                 "objective": f,
                 "predicted": linear,
                 "radius": radius,
-                "active": float((multipliers > _ACTIVE).sum()),
+                "active": float((multipliers > ACTIVE_MULTIPLIER).sum()),
             }
         )
         if linear <= tol or radius < 1e-14:
@@ -234,57 +167,20 @@ def _model(
     H = None
     for _ in range(2):  # the multipliers of the second-order model refine themselves
         _, multipliers, mu = solution
-        active = multipliers > _ACTIVE
+        active = multipliers > ACTIVE_MULTIPLIER
         if not active.any():
             return _Model(first_order)
         weights = multipliers[active] / multipliers[active].sum()
         hessians = problem.hessians(y, peaks.frequencies[active], peaks.moving[active])
         L = np.tensordot(weights, hessians, axes=1) / f
-        H = convexified(L, G[active], dc[mu > _ACTIVE])
+        H = convexified(L, G[active], dc[mu > ACTIVE_MULTIPLIER])
         solution = epigraph_step(
             H, peaks.values / f - 1.0, G, np.minimum(c, 0.0), dc, radius
         )
-        if solution is None or ((solution[1] > _ACTIVE) == active).all():
+        if solution is None or ((solution[1] > ACTIVE_MULTIPLIER) == active).all():
             break
     assert H is not None
     return _Model(H)
-
-
-def tangent_spaces(G: Array, dc: Array) -> tuple[Array, Array]:
-    """Bases of the span of active gradient differences and constraints, and its
-    complement, along which all active peaks stay equal to first order."""
-    rows = [G[1:] - G[0], dc]
-    D = np.vstack(rows).T
-    if D.size == 0:
-        return np.zeros((G.shape[1], 0)), np.eye(G.shape[1])
-    U, s, _ = np.linalg.svd(D, full_matrices=True)
-    r = int((s > 1e-10 * s.max(initial=0.0)).sum())
-    return U[:, :r], U[:, r:]
-
-
-def convexified(L: Array, G: Array, dc: Array) -> Array:
-    """Positive definite Hessian that agrees with `L` where curvature matters.
-
-    Negative curvature is mirrored on the tangent space of the active peaks, and a
-    multiple of the projector on its complement, where the peaks themselves bend the
-    objective, makes the rest positive.
-    """
-    scale = max(float(np.abs(np.linalg.eigvalsh(L)).max()), 1e-12)
-    Y, Z = tangent_spaces(G, dc)
-    H = L.copy()
-    if Z.shape[1]:
-        values, vectors = np.linalg.eigh(Z.T @ L @ Z)
-        positive = np.maximum(np.abs(values), 1e-9 * scale)
-        W = Z @ vectors
-        H += (W * (positive - values)) @ W.T
-    if Y.shape[1]:
-        S = Y.T @ H @ Y
-        if Z.shape[1]:
-            C = Y.T @ H @ Z
-            S = S - C @ np.linalg.solve(Z.T @ H @ Z, C.T)
-        low = float(np.linalg.eigvalsh(0.5 * (S + S.T)).min())
-        H += (max(0.0, -low) + 1e-8 * scale) * Y @ Y.T
-    return 0.5 * (H + H.T) + 1e-11 * scale * np.eye(len(H))
 
 
 def _second_order_correction(
@@ -388,31 +284,3 @@ def nearest_peak(frequencies: Array, omega: float, ratio: float = 1.25) -> int |
     distance[usable] = np.abs(np.log(frequencies[usable] / omega))
     j = int(np.argmin(distance))
     return j if distance[j] <= np.log(ratio) else None
-
-
-def certificate(
-    problem: MinimaxProblem,
-    y: Array,
-    peaks: Peaks,
-    constraints: tuple[Array, Array],
-    negligible: float,
-) -> tuple[float, float]:
-    """Stationarity and second-order measure at a point, see `MinimaxResult`."""
-    f = peaks.top
-    if f <= negligible:
-        return 0.0, np.inf
-    active = peaks.values >= f * (1.0 - ACTIVE_PEAK)
-    G = peaks.gradients[active] / f
-    c, dc = constraints
-    binding = dc[c >= -1e-9]
-    projected = G
-    if len(binding):
-        basis = np.linalg.qr(binding.T)[0]
-        projected = G - (G @ basis) @ basis.T
-    distance, weights = shortest_in_hull(projected)
-    hessians = problem.hessians(y, peaks.frequencies[active], peaks.moving[active])
-    L = np.tensordot(weights, hessians, axes=1) / f
-    Z = tangent_spaces(G[weights > _ACTIVE], binding)[1]
-    if Z.shape[1] == 0:
-        return distance, np.inf
-    return distance, float(np.linalg.eigvalsh(Z.T @ L @ Z).min())

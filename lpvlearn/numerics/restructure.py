@@ -7,14 +7,17 @@ least-squares fit, where a unit step changes the response by about the objective
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .matching import ErrorSystem
 from .bundle import proximal_bundle
-from .minimax import Flags, MinimaxProblem, MinimaxResult, Peaks, minimax_sqp
+from .certificates import Flags, MinimaxProblem, MinimaxResult, Peaks
+from .leastsquares import fit_frequency_response, frequency_grid
+from .matching import ErrorSystem, MeasuredErrorSystem, vanishing_weight
+from .minimax import minimax_sqp
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -25,8 +28,10 @@ _METRIC_CAP = 1e-5
 _STATIONARY = 1e-6
 _POLISH_ROUNDS = 3
 _POLISH_STEPS = 150
-_SECONDARY_TOLERANCE = 1e-3
-_SECONDARY_STEPS = 40
+_REMAINDER_TOLERANCE = 1e-6
+_REMAINDER_STEPS = 80
+_CAP_TOLERANCE = 1e-7
+_MAX_CAPS = 12
 _HARD_STEPS = (0.99, 0.9999)
 
 
@@ -81,7 +86,11 @@ class HinfObjective:
     T : ndarray of shape (n_params, n_params)
     margin : float
         Growth rates stay below ``-margin`` (1/s).
-    floor : float
+    cap : float
+        With `capped`: its norm stays below that.
+    capped : ErrorSystem or None
+        The error whose norm is bounded while that of `system` is minimised.
+    floor, floor_frequency : float
         Highest peak met so far whose value does not depend on the parameters.
     """
 
@@ -89,20 +98,36 @@ class HinfObjective:
     theta0: Array
     T: Array
     margin: float
+    cap: float = np.inf
+    capped: ErrorSystem | None = None
     floor: float = 0.0
+    floor_frequency: float = 0.0
     _top: float = 0.0
+    _cap_frequencies: Array = field(default_factory=lambda: np.zeros(0))
 
     def theta(self, y: Array) -> Array:
         """Parameters at the coordinates `y`."""
         return self.theta0 + self.T @ y
 
     def admissible(self, theta: Array) -> bool:
-        """Whether the gray-box model keeps (most of) the stability margin."""
+        """Whether the gray-box model keeps (most of) the margin, and the cap."""
         rate = decay_rates(self.system, theta)[0]
-        return bool(np.isfinite(rate).all() and rate.max() <= -0.8 * self.margin)
+        if (
+            not np.isfinite(rate).all()
+            or rate.max(initial=-np.inf) > -0.8 * self.margin
+        ):
+            return False
+        if self.capped is None:
+            return True
+        found = self.capped.peaks(theta, 1e-3)
+        high = found.frequencies[found.values > self.cap * (1.0 + _CAP_TOLERANCE)]
+        if high.size:  # bounded there from now on, by a smooth constraint
+            known = np.concatenate([self._cap_frequencies, high])
+            self._cap_frequencies = np.unique(known)[-_MAX_CAPS:]
+        return high.size == 0
 
     def peaks(self, y: Array) -> Peaks | None:
-        """Peaks that depend on the parameters; None where the model is unstable."""
+        """Peaks that depend on the parameters; None where `y` is not admissible."""
         theta = self.theta(y)
         if not self.admissible(theta):
             return None
@@ -117,7 +142,10 @@ class HinfObjective:
             if found.norm == 0.0 or steep.any():
                 break
         if not steep.all():
-            self.floor = max(self.floor, float(found.values[~steep].max()))
+            flat = int(np.argmax(np.where(steep, -np.inf, found.values)))
+            if found.values[flat] > self.floor:
+                self.floor = float(found.values[flat])
+                self.floor_frequency = float(found.frequencies[flat])
         if not steep.any():  # nothing is left that the parameters could lower
             none = np.zeros(1)
             return Peaks(none, none, np.zeros((1, len(y))), none > 0)
@@ -141,10 +169,18 @@ class HinfObjective:
         return self.T.T @ H @ self.T
 
     def constraints(self, y: Array) -> tuple[Array, Array]:
-        """``(growth rate + margin) / |pole| <= 0``, and the gradients."""
-        rate, gradients, size = growth_gradients(self.system, self.theta(y))
+        """``(growth rate + margin) / |pole| <= 0``, the cap, and their gradients."""
+        theta = self.theta(y)
+        rate, gradients, size = growth_gradients(self.system, theta)
         size = np.maximum(size, self.margin)
-        return (rate + self.margin) / size, gradients @ self.T / size[:, None]
+        c, dc = (rate + self.margin) / size, gradients @ self.T / size[:, None]
+        if self.capped is None or self._cap_frequencies.size == 0:
+            return c, dc
+        values, slopes = self.capped.gradients(theta, self._cap_frequencies)
+        return (
+            np.concatenate([c, values / self.cap - 1.0]),
+            np.vstack([dc, slopes @ self.T / self.cap]),
+        )
 
     def problem(self) -> MinimaxProblem:
         """The callbacks of the minimax solvers."""
@@ -228,42 +264,71 @@ def minimise_hinf(
     Notes
     -----
     Where the floor is above all other peaks, the start is already optimal, and so is
-    every theta that keeps the others below it. Those others are then lowered, too
-    (lexicographic minimax), but not to the last digit: a peak can vanish into the
-    shoulder of the constant one, so that they are no continuous functions.
+    every theta that keeps the others below it. Then a weight that vanishes at the
+    floor's frequency sets it aside, and the norm of what remains is minimised among
+    these optimal points.
     """
     start = system.peaks(theta0)
-    size = start.norm
-    if size <= negligible:  # exact already
+    if start.norm <= negligible:  # exact already
         flat = np.zeros((len(start.values), len(theta0)))
         peaks = Peaks(start.values, start.frequencies, flat, flat.any(1))
         return theta0, MinimaxResult(theta0, peaks, 0.0, np.inf, True, 0), 0.0
     origin = np.zeros(len(theta0))
-    probe = HinfObjective(system, theta0, metric_coordinates(R, 1.0), margin)
-    first = probe.peaks(origin)
-    below_floor = first is not None and probe.floor >= first.top
-    if first is not None and below_floor:
-        size = first.top
-    T = metric_coordinates(R, max(size, negligible, 1e-300))
+    T = metric_coordinates(R, max(start.norm, 1e-300))
     objective = HinfObjective(system, theta0, T, margin)
-    if below_floor:
-        result = minimax_sqp(
-            objective.problem(),
-            origin,
-            max_iter=min(max_iter, _SECONDARY_STEPS),
-            tol=_SECONDARY_TOLERANCE,
-            negligible=negligible,
-        )
-        # a constant peak is active: its zero gradient certifies the optimum, which
-        # is not strict
-        result = replace(result, stationarity=0.0, second_order=0.0, converged=True)
-    else:
-        result = solver(
-            objective.problem(),
-            origin,
-            max_iter=max_iter,
-            tol=tol,
-            negligible=negligible,
-        )
-    floor = objective.floor if objective.floor > negligible else 0.0
-    return objective.theta(result.y), result, floor
+    first = objective.peaks(origin)
+    options: dict[str, Any] = {
+        "max_iter": max_iter,
+        "tol": tol,
+        "negligible": negligible,
+    }
+    if first is None or objective.floor < first.top:
+        result = solver(objective.problem(), origin, **options)
+        floor = objective.floor if objective.floor > negligible else 0.0
+        return objective.theta(result.y), result, floor
+    weight = vanishing_weight(system, objective.floor_frequency)
+    if weight is None:
+        certified = MinimaxResult(theta0, first, 0.0, 0.0, True, 0)
+        return theta0, certified, objective.floor
+    theta, result = _minimise_remainder(
+        system, system.reweighted(weight), objective.floor, theta0, margin, options
+    )
+    # a constant peak is active: its zero gradient certifies the optimum, though
+    # not a strict one
+    certified = replace(result, stationarity=0.0, second_order=0.0, converged=True)
+    return theta, certified, objective.floor
+
+
+def _minimise_remainder(
+    system: ErrorSystem,
+    remainder: ErrorSystem,
+    floor: float,
+    theta0: Array,
+    margin: float,
+    options: dict[str, Any],
+) -> tuple[Array, MinimaxResult]:
+    """Minimise the weighted remainder while the error stays on its floor."""
+    poles = np.linalg.eigvals(system.target.A).astype(complex)
+    omega = (
+        system.omega
+        if isinstance(system, MeasuredErrorSystem)
+        else frequency_grid(poles, system.dt)
+    )
+    bound = HinfObjective(remainder, theta0, np.eye(len(theta0)), margin, floor, system)
+    fit = fit_frequency_response(
+        remainder,
+        theta0,
+        omega,
+        remainder.target_response(omega),
+        admissible=bound.admissible,
+    )
+    assert fit is not None  # theta0 is admissible
+    T = metric_coordinates(fit.R, max(remainder.peaks(fit.x).norm, 1e-300))
+    objective = HinfObjective(remainder, fit.x, T, margin, floor, system)
+    # the optimum is certified by the floor; what follows chooses among optimal points
+    options = options | {
+        "tol": max(options["tol"], _REMAINDER_TOLERANCE),
+        "max_iter": min(options["max_iter"], _REMAINDER_STEPS),
+    }
+    result = minimax_sqp(objective.problem(), np.zeros(len(theta0)), **options)
+    return objective.theta(result.y), result

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from .balancing import balancing_transformation
 from .leastsquares import LeastSquaresResult, fit_frequency_response
-from .matching import ErrorSystem, Target
+from .matching import ErrorSystem
 from .restructure import growth
 from .similarity import scaled_problem, similarity_starts
+from .transfer import Target
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -111,7 +112,6 @@ def best_fits(
     omega: Array,
     G0: Complex,
     *,
-    weight: Array | None,
     admissible: Callable[[Array], bool],
     n_fits: int,
 ) -> list[LeastSquaresResult]:
@@ -124,22 +124,14 @@ def best_fits(
     if not usable:
         return []
     thetas = np.array(usable)
-    w = (
-        np.ones(G0.shape)
-        if weight is None
-        else np.broadcast_to(
-            weight if weight.ndim == 3 else weight[:, None, None], G0.shape
-        )
-    )
+    W = system.weight_response(omega)[0]
     errors = np.array(
-        [np.linalg.norm(w * (system.response(t, omega) - G0)) for t in thetas]
+        [np.linalg.norm(W @ (system.response(t, omega) - G0)) for t in thetas]
     )
     thetas = thetas[np.argsort(errors, kind="stable")]
     thetas = thetas[distinct(thetas)]
     fits = [
-        fit_frequency_response(
-            system, theta, omega, G0, weight=weight, admissible=admissible
-        )
+        fit_frequency_response(system, theta, omega, G0, admissible=admissible)
         for theta in thetas[:n_fits]
     ]
     return sorted((fit for fit in fits if fit is not None), key=lambda fit: fit.cost)
