@@ -303,6 +303,119 @@ def test_too_few_iterations_warn_and_keep_the_best_point(rough):
     assert full.error_ <= short.error_ < 2 * full.error_
 
 
+def test_similarity_norm_solves_the_bilinear_equations():
+    structure, params = CASES["two_masses"]
+    theta = structure.check_params(params)
+    black_box = disguised(structure.model(theta), np.random.default_rng(0))
+    fitted = GrayBoxRestructurer(structure, norm="similarity").fit_model(black_box)
+    np.testing.assert_allclose(fitted.params_, theta, rtol=1e-6)
+    assert fitted.objective_ < 1e-8
+
+
+def test_hinf_norm_is_smaller_than_with_the_bilinear_equations(rough):
+    structure, params = CASES["two_masses"]
+    black_box = off_structure(structure.model(params), np.random.default_rng(1), 0.03)
+    bilinear = GrayBoxRestructurer(structure, norm="similarity").fit_model(black_box)
+    hinf = GrayBoxRestructurer(structure).fit_model(black_box)
+    assert hinf.error_ < bilinear.error_
+
+
+@pytest.mark.parametrize("kind", ["band", "scalar", "matrix"])
+def test_weighted_error_is_the_norm_of_the_weighted_difference(kind, rough):
+    structure, params = CASES["two_masses"]
+    black_box = off_structure(structure.model(params), np.random.default_rng(2), 0.03)
+    low = StateSpace([[-2.0]], [[2.0]], [[1.0]])
+    pair = StateSpace(-2 * np.eye(2), 2 * np.eye(2), np.diag([1.0, 0.1]))
+    weight = {"band": (None, 2.0), "scalar": low, "matrix": pair}[kind]
+    fitted = GrayBoxRestructurer(structure, frequency_weight=weight)
+    fitted.fit_model(black_box)
+    omega = np.geomspace(1e-3, 1e3, 4000)
+    E = (fitted.lti_ - black_box).frequency_response(omega)
+    W = (pair if kind == "matrix" else low).frequency_response(omega)
+    sigma = np.linalg.norm(W @ E if kind == "matrix" else W * E, 2, axis=(1, 2))
+    assert np.isclose(fitted.error_, sigma.max(), rtol=1e-3)
+    plain = GrayBoxRestructurer(structure).fit_model(black_box)
+    E = (plain.lti_ - black_box).frequency_response(omega)
+    sigma = np.linalg.norm(W @ E if kind == "matrix" else W * E, 2, axis=(1, 2))
+    assert fitted.error_ <= sigma.max() * (1 + 1e-6)
+
+
+def test_weights_of_the_samples_decide_between_frequencies(rough):
+    structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+    omega = np.array([0.1, 0.2, 0.5, 20.0, 40.0])
+    G = np.where(omega < 1, 1.0 / (1j * omega + 1), 3.0 / (1j * omega + 2))
+    trusted = np.where(omega < 1, 1.0, 1e-6)
+    fitted = GrayBoxRestructurer(structure).fit(omega, G, sample_weight=trusted)
+    np.testing.assert_allclose(fitted.params_, [1.0, 1.0], rtol=1e-3)
+
+
+def test_several_models_of_one_point_are_matched_together(rough):
+    structure, params = CASES["spring_mass"]
+    theta = structure.check_params(params)
+    rng = np.random.default_rng(0)
+    exact = structure.model(theta)
+    same = GrayBoxRestructurer(structure).fit_model([exact, disguised(exact, rng)])
+    np.testing.assert_allclose(same.params_, theta, rtol=1e-6)
+    boxes = [off_structure(exact, rng, 5e-3) for _ in range(3)]
+    fitted = GrayBoxRestructurer(structure).fit_model(boxes)
+    omega = np.geomspace(0.01, 100, 20000)
+    stacked = np.concatenate(
+        [(fitted.lti_ - box).frequency_response(omega) for box in boxes], axis=1
+    )
+    assert np.isclose(
+        fitted.error_, np.linalg.norm(stacked, 2, axis=(1, 2)).max(), rtol=1e-4
+    )
+
+
+def test_covariance_of_the_parameters_predicts_their_spread():
+    structure, params = CASES["spring_mass"]
+    theta = structure.check_params(params)
+    rng = np.random.default_rng(0)
+    exact, size, n = structure.model(theta), 2e-4, 400
+
+    def noisy():
+        A = exact.A + size * rng.normal(size=(2, 2))
+        B = exact.B + size * rng.normal(size=(2, 1))
+        return StateSpace(A, B, exact.C)
+
+    models = [noisy() for _ in range(n)]
+    fitted = GrayBoxRestructurer(structure, norm="h2").fit_model(
+        exact, realizations=models
+    )
+    single = fitted.params_covariance_ * n
+    estimates = np.array(
+        [
+            GrayBoxRestructurer(structure, norm="h2", init=theta, n_starts=1)
+            .fit_model(model)
+            .start_params_
+            for model in models[:150]
+        ]
+    )
+    spread = estimates.std(0)
+    np.testing.assert_allclose(np.sqrt(np.diag(single)), spread, rtol=0.2)
+
+
+def test_restarts_from_perturbations_agree():
+    structure, params = CASES["two_masses"]
+    black_box = structure.model(params)
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    table = fitted.perturbation_check(black_box, n_restarts=4)
+    assert table.shape == (4, 7)
+    assert (table.drop(columns="error_").abs() < 1e-6).all(axis=None)
+
+
+def test_hankel_singular_value_bounds_the_error_from_below(rough):
+    structure, params = CASES["spring_mass"]
+    truth = structure.model(params)
+    A = np.zeros((3, 3))
+    A[:2, :2], A[2, 2] = truth.A, -4.0
+    black_box = StateSpace(A, np.vstack([truth.B, [[1]]]), np.hstack([truth.C, [[1]]]))
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    hankel = black_box.hankel_singular_values()[2]
+    assert fitted.lower_bound_ == hankel
+    assert hankel <= fitted.error_
+
+
 def unstable():
     return StateSpace([[0.5]], [[1.0]], [[1.0]])
 
@@ -331,6 +444,34 @@ ERRORS = [
     (
         lambda: GrayBoxRestructurer(spring_mass(), init=[1.0]).fit_model(GOOD),
         r"parameters must be 3 finite values \(b, c, k",
+    ),
+    (
+        lambda: GrayBoxRestructurer(frequency_weight=(3, 1)).fit_model(GOOD),
+        "0 <= low < high",
+    ),
+    (
+        lambda: GrayBoxRestructurer(frequency_weight="low").fit_model(GOOD),
+        "`frequency_weight` must be a StateSpace or a band",
+    ),
+    (
+        lambda: GrayBoxRestructurer(frequency_weight=unstable()).fit_model(GOOD),
+        "`frequency_weight` must be stable",
+    ),
+    (
+        lambda: GrayBoxRestructurer(spring_mass(), norm="similarity").fit_model(
+            GOOD - StateSpace([[-3.0]], [[0.1]], [[0.1]])
+        ),
+        "needs an affine structure of the order",
+    ),
+    (
+        lambda: GrayBoxRestructurer(spring_mass(), norm="h2").fit([1.0], [[1.0, 0.0]]),
+        "`norm` must be 'hinf'",
+    ),
+    (
+        lambda: GrayBoxRestructurer(spring_mass()).fit(
+            [1.0], [[1.0, 0.0]], sample_weight=[-1.0]
+        ),
+        "`sample_weight` must hold 1 finite weights",
     ),
     (
         lambda: GrayBoxRestructurer().fit([1.0, 2.0], [[1.0, 0.0], [1.0, 0.0]]),

@@ -15,7 +15,11 @@ from numpy.typing import NDArray
 
 from .bundle import proximal_bundle
 from .certificates import Flags, MinimaxProblem, MinimaxResult, Peaks
-from .leastsquares import fit_frequency_response, frequency_grid
+from .leastsquares import (
+    LeastSquaresResult,
+    fit_frequency_response,
+    frequency_grid,
+)
 from .matching import ErrorSystem, MeasuredErrorSystem, vanishing_weight
 from .minimax import minimax_sqp
 
@@ -229,8 +233,7 @@ SOLVERS: dict[str, Solver] = {"sqp": polished_sqp, "bundle": proximal_bundle}
 
 def minimise_hinf(
     system: ErrorSystem,
-    theta0: Array,
-    R: Array,
+    fit: LeastSquaresResult,
     margin: float,
     solver: Solver,
     *,
@@ -243,9 +246,8 @@ def minimise_hinf(
     Parameters
     ----------
     system : ErrorSystem
-    theta0 : ndarray of shape (n_params,)
-    R : ndarray of shape (n_params, n_params)
-        Triangular factor of the response Jacobian at `theta0`.
+    fit : LeastSquaresResult
+        Stable start, and the metric of the steps.
     margin : float
         Stability margin, 1/s.
     solver : callable
@@ -268,6 +270,7 @@ def minimise_hinf(
     floor's frequency sets it aside, and the norm of what remains is minimised among
     these optimal points.
     """
+    theta0, R = fit.x, fit.R
     start = system.peaks(theta0)
     if start.norm <= negligible:  # exact already
         flat = np.zeros((len(start.values), len(theta0)))

@@ -13,6 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
+from scipy.optimize import least_squares
+
+from .certificates import MinimaxResult, Peaks
+from .matching import Structure
+from .transfer import Target
 
 Array = NDArray[np.float64]
 
@@ -225,3 +230,89 @@ def _batched_lm(
         tiny = cost[rows] <= 1e-24 * (1.0 + np.abs(problem.offset).sum()) ** 2
         active[rows] = (stalled[rows] < 12) & ~tiny
     return Z, cost
+
+
+def bilinear_fit(
+    problem: AffineProblem, theta: Array, max_iter: int
+) -> tuple[Array, float, int, bool]:
+    """Minimise Eq. (7) over parameters and similarity from given parameters.
+
+    ``|A T - T A(theta)|_F^2 + |B - T B(theta)|_F^2 + |C T - C(theta)|_F^2``, where T
+    takes the structured state to that of the black box. The cost is quadratic in T for
+    given parameters, which starts T, and quadratic in the parameters for given T.
+
+    Returns
+    -------
+    theta : ndarray of shape (n_params,)
+    distance : float
+        Square root of the cost.
+    n_iter : int
+    converged : bool
+    """
+    n = len(problem.A)
+    eye = np.eye(n)
+
+    def blocks(theta: Array) -> tuple[Array, Array, Array]:
+        S = problem.offset + np.tensordot(theta, problem.basis, axes=1)
+        return S[:n, :n], S[:n, n:], S[n:, :n]
+
+    def residuals(x: Array) -> Array:
+        T = x[: n * n].reshape(n, n)
+        A, B, C = blocks(x[n * n :])
+        parts = (problem.A @ T - T @ A, problem.B - T @ B, problem.C @ T - C)
+        return np.concatenate([part.ravel() for part in parts])
+
+    def jacobian(x: Array) -> Array:
+        T = x[: n * n].reshape(n, n)
+        A, B, _ = blocks(x[n * n :])
+        in_T = np.vstack(
+            [
+                np.kron(problem.A, eye) - np.kron(eye, A.T),
+                -np.kron(eye, B.T),
+                np.kron(problem.C, eye),
+            ]
+        )
+        q = len(problem.basis)
+        in_theta = np.hstack(
+            [
+                -(T @ problem.basis[:, :n, :n]).reshape(q, -1),
+                -(T @ problem.basis[:, :n, n:]).reshape(q, -1),
+                -problem.basis[:, n:, :n].reshape(q, -1),
+            ]
+        ).T
+        return np.hstack([in_T, in_theta])
+
+    x = np.concatenate([np.zeros(n * n), theta])
+    J = jacobian(x)[:, : n * n]
+    rhs = residuals(x)
+    x[: n * n] = -np.linalg.lstsq(J, rhs, rcond=None)[0]
+    found = least_squares(residuals, x, jacobian, x_scale="jac", max_nfev=max_iter)
+    return found.x[n * n :], np.sqrt(2.0 * found.cost), found.nfev, found.status > 0
+
+
+def minimise_bilinear(
+    structure: Structure, box: Target | None, theta: Array, max_iter: int
+) -> tuple[Array, MinimaxResult]:
+    """Minimise Eq. (7) from given parameters, time and states scaled.
+
+    Raises
+    ------
+    ValueError
+        If the structure is not affine or of another order than the black box.
+    """
+    offset = getattr(structure, "offset", None)
+    if offset is None or box is None or len(box.A) != structure.order:
+        raise ValueError(
+            "`norm='similarity'` needs an affine structure of the order of the black "
+            f"box, as Eq. (7) does. Got {structure} and order "
+            f"{'unknown' if box is None else len(box.A)}."
+        )
+    poles = np.abs(np.linalg.eigvals(box.A))
+    rate = 1.0 if box.dt is not None else max(float(poles.max(initial=0.0)), 1e-300)
+    basis = structure.jacobian(theta)
+    problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, rate)
+    theta, cost, n_iter, done = bilinear_fit(problem, theta, max(max_iter, 1))
+    peaks = Peaks(
+        np.array([cost]), np.zeros(0), np.zeros((1, len(theta))), np.zeros(1) > 0
+    )
+    return theta, MinimaxResult(theta, peaks, np.nan, np.nan, done, n_iter)

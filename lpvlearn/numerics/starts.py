@@ -8,15 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .balancing import balancing_transformation
-from .leastsquares import LeastSquaresResult, fit_frequency_response
+from .leastsquares import (
+    LeastSquaresResult,
+    fit_frequency_response,
+    frequency_grid,
+)
 from .matching import ErrorSystem
-from .restructure import growth
+from .restructure import decay_rates, growth
 from .similarity import scaled_problem, similarity_starts
 from .transfer import Target
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
+GOOD_FIT = 3e-3  # relative least-squares error that needs no further starts
+_ROUNDS = 3
+_MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
 _SPREAD = 0.3  # standard deviation of log-parameters around a given first guess
 
 
@@ -135,3 +142,59 @@ def best_fits(
         for theta in thetas[:n_fits]
     ]
     return sorted((fit for fit in fits if fit is not None), key=lambda fit: fit.cost)
+
+
+def search_fits(
+    system: ErrorSystem,
+    candidates: Callable[[int], Array],
+    omega: Array,
+    G0: Complex,
+    admissible: Callable[[Array], bool],
+    n_fits: int,
+) -> list[LeastSquaresResult]:
+    """Rounds of candidates and fits, until one is good; by ascending cost.
+
+    Parameters
+    ----------
+    candidates : callable
+        Round number to parameters of shape (k, n_params).
+    n_fits : int
+        Least-squares fits in a round.
+    """
+    size = rms(system.weight_response(omega)[0] @ G0)
+    fits: list[LeastSquaresResult] = []
+    for number in range(_ROUNDS):
+        found = candidates(number)
+        if len(found) == 0 and number:
+            break
+        fits += best_fits(
+            system, found, omega, G0, admissible=admissible, n_fits=n_fits
+        )
+        fits.sort(key=lambda fit: fit.cost)
+        if fits and np.sqrt(fits[0].cost) <= GOOD_FIT * size:
+            break
+    return fits
+
+
+def grid_and_margin(target: Target) -> tuple[Array, float]:
+    """Frequencies of the least-squares fit, and the stability margin (1/s)."""
+    poles = np.linalg.eigvals(target.A).astype(complex)
+    slowest = np.abs(growth(poles, target.dt)).min(initial=np.inf)
+    margin = _MARGIN * float(slowest) if np.isfinite(slowest) else 0.0
+    return frequency_grid(poles, target.dt), margin
+
+
+def stability_test(system: ErrorSystem, margin: float) -> Callable[[Array], bool]:
+    """Whether parameters give a model that keeps the stability margin."""
+
+    def stable(theta: Array) -> bool:
+        rate = decay_rates(system, theta)[0]
+        return bool(np.isfinite(rate).all() and rate.max(initial=-np.inf) <= -margin)
+
+    return stable
+
+
+def rms(G: Complex) -> float:
+    """Root mean square over frequency of the Frobenius norm, not zero."""
+    mean = np.mean(np.sum(np.abs(G) ** 2, axis=(1, 2)))
+    return max(float(np.sqrt(mean)), 1e-300)

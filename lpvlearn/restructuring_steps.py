@@ -1,0 +1,146 @@
+"""The steps of a restructuring: candidates, minimisation, warnings."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.exceptions import ConvergenceWarning
+
+from .exceptions import RankWarning
+from .numerics.certificates import MinimaxResult
+from .numerics.h2 import minimise_h2
+from .numerics.leastsquares import LeastSquaresResult
+from .numerics.restructure import SOLVERS, minimise_hinf
+from .numerics.similarity import minimise_bilinear
+from .numerics.starts import perturbed_candidates, rms, similarity_candidates
+from .restructuring_problem import RestructuringProblem
+
+Array = NDArray[np.float64]
+
+_NORMS = ("hinf", "h2", "similarity")
+_POOR_FIT = 2e-2  # relative least-squares error that is warned about
+_ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
+
+
+def check_options(restructurer: Any) -> None:
+    """A ValueError for options of a GrayBoxRestructurer that are not valid."""
+    for name, allowed in (("norm", _NORMS), ("solver", tuple(SOLVERS))):
+        value = getattr(restructurer, name)
+        if value not in allowed:
+            raise ValueError(f"`{name}` must be one of {allowed}. Got {value!r}.")
+    init = restructurer.init
+    if isinstance(init, str) and init != "similarity":
+        raise ValueError(
+            f"`init` must be 'similarity' or a vector of parameters. Got {init!r}."
+        )
+    n_starts, max_iter = restructurer.n_starts, restructurer.max_iter
+    if n_starts < 1 or max_iter < 0:
+        raise ValueError(
+            "`n_starts` must be at least 1 and `max_iter` at least 0. Got "
+            f"{n_starts} and {max_iter}."
+        )
+
+
+def candidates(
+    problem: RestructuringProblem,
+    init: str | ArrayLike,
+    n_starts: int,
+    given: list[Array],
+    number: int,
+    rng: np.random.Generator,
+) -> Array:
+    """Parameters to start from in a round of the search, shape (k, n_params)."""
+    structure = problem.structure
+    n_starts = n_starts * (1 + number)
+    rows = [np.zeros((0, structure.n_params))]
+    if number == 0 and given:
+        rows.append(np.array(given))
+    if structure.order == 0:  # a gain: linear in the parameters
+        rows.append(np.zeros((1, structure.n_params)))
+    elif not isinstance(init, str):
+        guess = structure.check_params(init)
+        rows.append(perturbed_candidates(guess, n_starts, rng))
+    elif structure.is_affine and problem.box is not None:
+        assert structure.offset is not None and structure.basis is not None
+        rows.append(
+            similarity_candidates(
+                problem.box,
+                structure.offset,
+                structure.basis,
+                structure.order,
+                n_starts,
+                rng,
+            )
+        )
+    elif structure.initial is not None:
+        rows.append(perturbed_candidates(structure.initial, n_starts, rng))
+    return np.vstack(rows)
+
+
+def minimise(
+    problem: RestructuringProblem,
+    fit: LeastSquaresResult,
+    *,
+    norm: str,
+    solver: str,
+    max_iter: int,
+    tol: float,
+) -> tuple[Array, MinimaxResult, float]:
+    """Minimise the norm of the error from a least-squares fit.
+
+    Returns
+    -------
+    theta : ndarray of shape (n_params,)
+    result : MinimaxResult
+    floor : float
+        Highest peak that no parameter changes.
+    """
+    options: dict[str, Any] = {
+        "max_iter": max_iter,
+        "tol": tol,
+        "negligible": _ROUNDING * problem.reference,
+    }
+    system, margin = problem.system, problem.margin
+    if norm == "h2":
+        return *minimise_h2(system, fit, margin, **options), 0.0
+    if norm == "similarity":
+        found = minimise_bilinear(problem.structure, problem.box, fit.x, max_iter)
+        return *found, 0.0
+    return minimise_hinf(system, fit, margin, SOLVERS[solver], **options)
+
+
+def relative_error(fit: LeastSquaresResult, problem: RestructuringProblem) -> float:
+    """Root-mean-square error of a fit over frequency, relative to the black box."""
+    W = problem.system.weight_response(problem.omega)[0]
+    return float(np.sqrt(fit.cost)) / rms(W @ problem.response)
+
+
+def warn_about(
+    restructurer: Any, problem: RestructuringProblem, result: MinimaxResult
+) -> None:
+    """Warnings about a fitted GrayBoxRestructurer."""
+    if not result.converged:
+        warnings.warn(
+            f"`max_iter`={restructurer.max_iter} iterations ended before the solver "
+            f"converged to `tol`={restructurer.tol}; the best point is kept. Raise "
+            "`max_iter`.",
+            ConvergenceWarning,
+            stacklevel=4,
+        )
+    error = restructurer.fit_error_
+    floor = restructurer.structural_floor_ / max(problem.reference, 1e-300)
+    if error - floor > _POOR_FIT:
+        warnings.warn(
+            f"the structure comes no nearer than {100 * error:.2g} % (root mean square "
+            f"over frequency) to the black box in {len(restructurer.starts_)} fits: "
+            "either it cannot represent the model, or the search ended in a wrong "
+            "basin. Give `init`, or raise `n_starts`.",
+            ConvergenceWarning,
+            stacklevel=4,
+        )
+    found = restructurer.identifiability_
+    if found.rank < problem.structure.n_params:
+        warnings.warn(str(found), RankWarning, stacklevel=4)
