@@ -125,7 +125,8 @@ def best_fits(
     """Least-squares fits from the best candidates, by ascending cost.
 
     The candidates are ranked by the error of their frequency response, not by their
-    distance to the structure, and the best `n_fits` distinct ones are fitted.
+    distance to the structure, and the best `n_fits` distinct ones are fitted, until
+    one is good.
     """
     usable = [theta for theta in candidates if admissible(theta)]
     if not usable:
@@ -137,10 +138,13 @@ def best_fits(
     )
     thetas = thetas[np.argsort(errors, kind="stable")]
     thetas = thetas[distinct(thetas)]
-    fits = [
-        fit_frequency_response(system, theta, omega, G0, admissible=admissible)
-        for theta in thetas[:n_fits]
-    ]
+    good = GOOD_FIT * rms(W @ G0)
+    fits = []
+    for theta in thetas[:n_fits]:
+        fit = fit_frequency_response(system, theta, omega, G0, admissible=admissible)
+        fits.append(fit)
+        if fit is not None and np.sqrt(fit.cost) <= good:
+            break
     return sorted((fit for fit in fits if fit is not None), key=lambda fit: fit.cost)
 
 
