@@ -8,27 +8,33 @@ given as a template, and any smooth function otherwise.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import named_values, real_array, whole_number
-from .numerics.differentiation import numerical_curvature, numerical_jacobian
+from .arguments import named_values
 from .statespace import StateSpace
-from .system_matrices import stack_system
-from .templates import Entry, affine_system, full_cells, observable_canonical_cells
+from .structure_forms import (
+    dimensions,
+    mechanical_system,
+    modal_cells,
+    observable_canonical_cells,
+)
+from .structure_map import StructureMap
+from .templates import Entry, affine_system, full_cells
 
 __all__ = ["GrayBoxStructure"]
 
 Array = NDArray[np.float64]
 
 
-class GrayBoxStructure:
+class GrayBoxStructure(StructureMap):
     """The map from parameters to the matrices of a gray-box model, Eq. (2).
 
     Build one with :meth:`from_template` (entries affine in the parameters),
-    :meth:`from_function` (smooth), :meth:`observable_canonical` or :meth:`full`.
+    :meth:`from_function` (smooth), :meth:`mechanical` (equations of motion),
+    :meth:`modal`, :meth:`observable_canonical` or :meth:`full`. It is never changed:
+    :meth:`fix`, :meth:`with_bounds` and :meth:`with_ranges` return another one.
 
     Attributes
     ----------
@@ -41,6 +47,11 @@ class GrayBoxStructure:
         ``S_j`` of an affine structure.
     initial : ndarray of shape (n_params,) or None
         A first guess, where the structure carries one.
+    lower, upper : ndarray of shape (n_params,)
+        Bounds that optimisers respect; -inf and inf where there is none.
+    is_bounded : bool
+    ranges : ndarray of shape (2, n_params)
+        Where a parameter is expected; NaN where that is not known.
 
     Examples
     --------
@@ -55,41 +66,6 @@ class GrayBoxStructure:
     array([[ 0. ,  1. ],
            [-4. , -0.5]])
     """
-
-    def __init__(
-        self,
-        order: int,
-        offset: Array | None,
-        basis: Array | None,
-        parameter_names: Sequence[str],
-        *,
-        function: Callable[[Any], Any] | None = None,
-        jacobian: Callable[[Any], Any] | None = None,
-        initial: Array | None = None,
-        shape: tuple[int, int] | None = None,
-    ) -> None:
-        self.order = order
-        self.parameter_names = tuple(parameter_names)
-        self.n_params = len(self.parameter_names)
-        self.is_affine = function is None
-        self.offset, self.basis = offset, basis
-        self.function, self._jacobian, self.initial = function, jacobian, initial
-        for array in (offset, basis, initial):
-            if array is not None:
-                array.setflags(write=False)
-        rows, columns = offset.shape if offset is not None else shape  # type: ignore
-        self.n_outputs, self.n_inputs = rows - order, columns - order
-
-    @property
-    def _shape(self) -> tuple[int, int, int]:
-        return self.order, self.n_inputs, self.n_outputs
-
-    def __repr__(self) -> str:
-        kind = "affine" if self.is_affine else "function"
-        return (
-            f"GrayBoxStructure(order={self.order}, n_inputs={self.n_inputs}, "
-            f"n_outputs={self.n_outputs}, n_params={self.n_params}, {kind})"
-        )
 
     @classmethod
     def from_template(
@@ -127,7 +103,7 @@ class GrayBoxStructure:
         array([[-2.]])
         """
         order, offset, basis, names = affine_system(A, B, C, D, parameter_names)
-        return cls(order, offset, basis, names)
+        return cls(order, names, offset, basis)
 
     @classmethod
     def from_function(
@@ -184,16 +160,14 @@ class GrayBoxStructure:
             )
         A, B, C = blocks[:3]
         model = StateSpace(A, B, C, blocks[3] if len(blocks) == 4 else None)
-        shape = (model.order + model.n_outputs, model.order + model.n_inputs)
         structure = cls(
             model.order,
-            None,
-            None,
             names,
+            np.empty([model.order + k for k in (model.n_outputs, model.n_inputs)]),
+            None,
             function=function,
             jacobian=jacobian,
             initial=start,
-            shape=shape,
         )
         if jacobian is not None:
             structure.jacobian(start)  # its shapes are told of here, not in a fit
@@ -234,7 +208,7 @@ class GrayBoxStructure:
         array([[ 0.,  1.],
                [-4., -1.]])
         """
-        order, m, p = _dimensions(order, n_inputs, n_outputs, feedthrough)
+        order, m, p = dimensions(order, n_inputs, n_outputs, feedthrough)
         A, C = observable_canonical_cells(order, p)
         B = full_cells("b", order, m)
         D = full_cells("d", p, m) if feedthrough else None
@@ -263,138 +237,119 @@ class GrayBoxStructure:
         >>> GrayBoxStructure.full(1, 1, 1).parameter_names
         ('a1_1', 'b1_1', 'c1_1', 'd1_1')
         """
-        order, m, p = _dimensions(order, n_inputs, n_outputs, feedthrough)
+        order, m, p = dimensions(order, n_inputs, n_outputs, feedthrough)
         A, B = full_cells("a", order, order), full_cells("b", order, m)
         C, D = full_cells("c", p, order), full_cells("d", p, m) if feedthrough else None
         blocks = (A, B, C, D or [])
         names = [str(name) for block in blocks for row in block for name in row]
         return cls.from_template(A, B, C, D, parameter_names=names)
 
-    def check_params(self, theta: ArrayLike | Mapping[str, float]) -> Array:
-        """`theta` as a finite vector.
+    @classmethod
+    def modal(
+        cls,
+        n_modes: int,
+        n_inputs: int = 1,
+        n_outputs: int = 1,
+        n_real: int = 0,
+        feedthrough: bool = False,
+        *,
+        normalize: str = "input",
+    ) -> GrayBoxStructure:
+        """Real modal form: decoupled second-order modes and real poles.
+
+        Mode ``i`` is ``[[0, 1], [-w2_i, -d_i]]``: a pair of poles with the square of
+        the natural frequency (rad/s) and twice the decay rate (1/s), complex or real;
+        a real pole is ``-r_i``. Every model with distinct poles that the normalised
+        input reaches (that the normalised output sees) has such a form, unique up to
+        the order of the modes.
 
         Parameters
         ----------
-        theta : array-like of shape (n_params,) or mapping from name to value
-
-        Returns
-        -------
-        ndarray of shape (n_params,)
+        n_modes, n_inputs, n_outputs : int
+        n_real : int, default=0
+            Real poles, behind the modes.
+        feedthrough : bool, default=False
+            Also free the entries of D.
+        normalize : {"input", "output"}, default="input"
+            What settles the scale of the modes: the first column of B is ``[0, 1]`` for
+            a mode and 1 for a real pole, or the first row of C is ``[1, 0]`` and 1. The
+            other entries of B and C are free.
 
         Raises
         ------
         ValueError
-            If a name has no value or is unknown, or a value is not finite.
+            If a number is not a valid integer, there is no pole, or `normalize` is
+            unknown.
+
+        Examples
+        --------
+        >>> structure = GrayBoxStructure.modal(1, n_outputs=2)
+        >>> structure.parameter_names
+        ('c1_1', 'c1_2', 'c2_1', 'c2_2', 'd_1', 'w2_1')
         """
-        if isinstance(theta, Mapping):
-            if set(theta) != set(self.parameter_names):
-                wrong = sorted(set(theta) ^ set(self.parameter_names), key=str)
-                raise ValueError(
-                    "parameters must have a value for each name of the structure. "
-                    f"Missing or unknown: {', '.join(map(str, wrong))}."
-                )
-            theta = [theta[name] for name in self.parameter_names]
-        vector = real_array("parameters", theta).reshape(-1)
-        if vector.shape != (self.n_params,) or not np.isfinite(vector).all():
-            some = ", ".join(self.parameter_names[:4])
-            raise ValueError(
-                f"parameters must be {self.n_params} finite values "
-                f"({some}{', ...' if self.n_params > 4 else ''}). Got {vector}."
-            )
-        return vector
-
-    def system_matrix(self, theta: Array) -> Array:
-        """``S = [[A, B], [C, D]]``, shape (..., order + n_outputs, order + n_inputs).
-
-        Parameters
-        ----------
-        theta : ndarray of shape (..., n_params)
-        """
-        if self.function is None:
-            assert self.offset is not None and self.basis is not None
-            flat = self.basis.reshape(self.n_params, self.offset.size)
-            shape = np.shape(theta)[:-1] + self.offset.shape
-            return self.offset + (theta @ flat).reshape(shape)
-        if np.ndim(theta) > 1:
-            rows = np.reshape(theta, (-1, self.n_params))
-            stack = np.array([self.system_matrix(row) for row in rows])
-            shape = (self.order + self.n_outputs, self.order + self.n_inputs)
-            return stack.reshape(np.shape(theta)[:-1] + shape)
-        return stack_system("function", self.function(theta), self._shape, ())
-
-    def jacobian(self, theta: Array) -> Array:
-        """``dS / dtheta``, shape (n_params, order + n_outputs, order + n_inputs)."""
-        if self.function is None:
-            assert self.basis is not None
-            return self.basis
-        if self._jacobian is not None:
-            blocks = self._jacobian(theta)
-            return stack_system("jacobian", blocks, self._shape, (self.n_params,))
-        return numerical_jacobian(self.system_matrix, theta, self.initial)
-
-    def curvature(self, theta: Array) -> Array | None:
-        """Second derivatives of S, or None where they are zero (affine).
-
-        Parameters
-        ----------
-        theta : ndarray of shape (n_params,)
-
-        Returns
-        -------
-        ndarray of shape (n_params, n_params, order + n_outputs, order + n_inputs) or
-        None
-        """
-        if self.is_affine:
-            return None
-        return numerical_curvature(self.jacobian, theta, self.initial)
-
-    def matrices(self, theta: ArrayLike) -> tuple[Array, Array, Array, Array]:
-        """Matrices ``(A, B, C, D)`` at `theta`, stacked over its leading axes.
-
-        Parameters
-        ----------
-        theta : array-like of shape (..., n_params)
-
-        Raises
-        ------
-        ValueError
-            If the last axis does not have length n_params.
-        """
-        n, theta = self.order, real_array("theta", theta)
-        if theta.shape[-1:] != (self.n_params,):
-            raise ValueError(
-                f"`theta` must have shape (..., {self.n_params}). Got {theta.shape}."
-            )
-        S = self.system_matrix(theta)
-        return S[..., :n, :n], S[..., :n, n:], S[..., n:, :n], S[..., n:, n:]
-
-    def model(
-        self, theta: ArrayLike | Mapping[str, float], sampling_time: float | None = None
-    ) -> StateSpace:
-        """The model at `theta`.
-
-        Parameters
-        ----------
-        theta : array-like of shape (n_params,) or mapping from name to value
-        sampling_time : float, default=None
-            Seconds; None is continuous time.
-
-        Raises
-        ------
-        ValueError
-            If `theta` does not fit the parameters.
-        """
-        return StateSpace(*self.matrices(self.check_params(theta)), sampling_time)
-
-
-def _dimensions(
-    order: int, n_inputs: int, n_outputs: int, feedthrough: bool
-) -> tuple[int, int, int]:
-    order = whole_number("order", order, 0)
-    if order == 0 and not feedthrough:
-        raise ValueError(
-            "`feedthrough` must be True for order 0: a pure gain has no other "
-            "parameters. Got False."
+        _, m, p = dimensions(1, n_inputs, n_outputs, feedthrough)
+        A, B, C = modal_cells(n_modes, n_real, m, p, normalize)
+        return cls.from_template(
+            A, B, C, full_cells("d", p, m) if feedthrough else None
         )
-    n_inputs = whole_number("n_inputs", n_inputs, 1)
-    return order, n_inputs, whole_number("n_outputs", n_outputs, 1)
+
+    @classmethod
+    def mechanical(
+        cls,
+        M: Sequence[Sequence[Entry]],
+        D: Sequence[Sequence[Entry]],
+        K: Sequence[Sequence[Entry]],
+        F: Sequence[Sequence[Entry]],
+        outputs: str = "position",
+        *,
+        sensors: ArrayLike | None = None,
+        initial: ArrayLike | Mapping[str, float] | None = None,
+        parameter_names: Sequence[str] | None = None,
+    ) -> GrayBoxStructure:
+        """Equations of motion ``M q'' + D q' + K q = F u`` with states ``[q, q']``.
+
+        Parameters
+        ----------
+        M, D, K : nested sequences of float or str
+            Mass, damping and stiffness, shape (n_dof, n_dof), affine in the parameters.
+        F : nested sequences of float or str
+            Shape (n_dof, n_inputs).
+        outputs : {"position", "velocity", "acceleration"}, default="position"
+        sensors : array-like of shape (n_outputs, n_dof), default=None
+            What the outputs measure, e.g. ``[[1, 0]]`` for the first coordinate alone;
+            None is every coordinate.
+        initial : array-like of shape (n_params,) or mapping, default=None
+            A first guess.
+        parameter_names : sequence of str, default=None
+            Order of the parameters; None is the natural alphabetical order.
+
+        Returns
+        -------
+        GrayBoxStructure
+            Affine where M holds numbers only, else a function with exact derivatives.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, an entry is not affine, or M is singular.
+
+        Notes
+        -----
+        Motion does not tell a common factor of M, D, K and F: at least one of their
+        entries must be a number.
+
+        Examples
+        --------
+        >>> structure = GrayBoxStructure.mechanical(
+        ...     M=[["m"]], D=[["c"]], K=[["k"]], F=[[1]])
+        >>> structure.model({"m": 2.0, "c": 1.0, "k": 8.0}).A
+        array([[ 0. ,  1. ],
+               [-4. , -0.5]])
+        """
+        system, names = mechanical_system(M, D, K, F, outputs, sensors, parameter_names)
+        start = None
+        if initial is not None:
+            start = named_values("initial", initial, names)[0]
+        elif system.M[1:].any():
+            system.regular_point()  # that there is none is told of here
+        return cls._from_implicit(system, names, start)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from .arguments import matrix, positive_time
 
 Array = NDArray[np.float64]
+Blocks = tuple[Array, Array, Array, Array]
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
@@ -124,6 +125,19 @@ def sorted_poles(A: Array) -> NDArray[np.complex128]:
     poles = np.linalg.eigvals(A).astype(complex)
     order = np.lexsort((poles.imag, poles.real, np.abs(poles)), axis=-1)
     return np.take_along_axis(poles, order, axis=-1)
+
+
+def blocks(S: Array, order: int) -> Blocks:
+    """A, B, C, D of ``S = [[A, B], [C, D]]``, stacked over its leading axes.
+
+    Examples
+    --------
+    >>> A, B, C, D = blocks(np.arange(4.0).reshape(2, 2), 1)
+    >>> float(B[0, 0])
+    1.0
+    """
+    n = order
+    return S[..., :n, :n], S[..., :n, n:], S[..., n:, :n], S[..., n:, n:]
 
 
 def stack_system(

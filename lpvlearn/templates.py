@@ -177,32 +177,32 @@ def affine_system(
             )
     rows = [a + b for a, b in zip(cells["A"], cells["B"], strict=True)]
     rows += [c + d for c, d in zip(cells["C"], cells["D"], strict=True)]
+    offset, basis, names = affine_arrays(rows, parameter_names)
+    return n, offset, basis, names
+
+
+def affine_arrays(
+    rows: Sequence[Sequence[Affine]], parameter_names: Sequence[str] | None
+) -> tuple[Array, Array, list[str]]:
+    """The constant part, the part of every parameter, and the parameter names.
+
+    Examples
+    --------
+    >>> offset, basis, names = affine_arrays([[{"": 2.0}, {"k": 3.0, "": 1.0}]], None)
+    >>> offset.tolist(), basis.tolist(), names
+    ([[2.0, 1.0]], [[[0.0, 3.0]]], ['k'])
+    """
     used = {name for row in rows for entry in row for name in entry if name}
     names = ordered_names(used, parameter_names)
 
     def coefficients(name: str) -> list[list[float]]:
         return [[entry.get(name, 0.0) for entry in row] for row in rows]
 
+    offset = np.array(coefficients(""))
     basis = np.array([coefficients(name) for name in names])
-    return n, np.array(coefficients("")), basis.reshape(-1, n + p, n + m), names
+    return offset, basis.reshape(-1, *offset.shape), names
 
 
 def full_cells(letter: str, rows: int, columns: int) -> Cells:
     """A matrix whose entries are all parameters: ``a1_1, a1_2, ...``."""
     return [[f"{letter}{i + 1}_{j + 1}" for j in range(columns)] for i in range(rows)]
-
-
-def observable_canonical_cells(order: int, n_outputs: int) -> tuple[Cells, Cells]:
-    """A and C of the observable canonical form with generic observability indices."""
-    lengths = [order // n_outputs + (i < order % n_outputs) for i in range(n_outputs)]
-    A: Cells = [[0.0] * order for _ in range(order)]
-    C = full_cells("c", n_outputs, order)  # rows beyond the order stay free
-    first = 0
-    for i, length in enumerate(lengths[: min(order, n_outputs)]):
-        C[i] = [1.0 if j == first else 0.0 for j in range(order)]
-        last = first + length - 1
-        for k in range(first, last):
-            A[k][k + 1] = 1.0
-        A[last] = [f"a{last + 1}_{j + 1}" for j in range(order)]
-        first += length
-    return A, C
