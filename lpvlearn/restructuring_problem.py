@@ -71,6 +71,7 @@ class RepeatedOutputs:
     def __init__(self, structure: GrayBoxStructure, copies: int) -> None:
         self.structure, self.copies = structure, copies
         self.order, self.n_params = structure.order, structure.n_params
+        self.lower, self.upper = structure.lower, structure.upper
 
     def system_matrix(self, theta: Array) -> Array:
         """``[[A, B], [C, D], [C, D], ...]``."""

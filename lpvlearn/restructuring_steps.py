@@ -75,9 +75,11 @@ def candidates(
                 rng,
             )
         )
-    elif structure.initial is not None:
-        rows.append(perturbed_candidates(structure.initial, n_starts, rng))
-    return np.vstack(rows)
+    drawn = structure.draw(n_starts, rng)
+    if drawn is not None and isinstance(init, str):
+        known = [] if structure.initial is None else [structure.initial[None]]
+        rows += [*known, drawn]
+    return np.clip(np.vstack(rows), structure.lower, structure.upper)
 
 
 def minimise(

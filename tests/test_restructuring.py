@@ -416,6 +416,57 @@ def test_hankel_singular_value_bounds_the_error_from_below(rough):
     assert hankel <= fitted.error_
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"solver": "bundle", "max_iter": 1000}, {"norm": "h2"}, {"norm": "similarity"}],
+    ids=["sqp", "bundle", "h2", "similarity"],
+)
+def test_bounds_are_respected_and_touched(options, rough):
+    structure, params = CASES["two_masses"]
+    black_box = structure.model(params)
+    bounded = structure.with_bounds({"k1": (None, 25.0), "b": (0.0, None)})
+    fitted = GrayBoxRestructurer(bounded, **options).fit_model(black_box)
+    found = dict(zip(structure.parameter_names, fitted.params_, strict=True))
+    assert np.isclose(found["k1"], 25.0, rtol=1e-9) and found["k1"] <= 25.0
+    assert found["b"] > 0
+
+
+def test_bounded_optimum_is_a_minimum_within_the_bounds(rough):
+    structure, params = CASES["spring_mass"]
+    black_box = structure.model(params)
+    bounded = structure.with_bounds({"k": (None, 8.0)})
+    fitted = GrayBoxRestructurer(bounded).fit_model(black_box)
+    assert fitted.stationarity_ < 1e-5
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        near = fitted.params_ * (1 + 1e-3 * rng.normal(size=3))
+        near = np.clip(near, bounded.lower, bounded.upper)
+        error = (structure.model(near) - black_box).hinf_norm()
+        assert error >= fitted.error_ * (1 - 1e-9)
+
+
+def test_fixed_parameters_stay():
+    structure, params = CASES["two_masses"]
+    fixed = structure.fix({"k3": params["k3"]})
+    fitted = GrayBoxRestructurer(fixed).fit_model(structure.model(params))
+    others = [v for k, v in sorted(params.items()) if k != "k3"]
+    np.testing.assert_allclose(fitted.params_, others, rtol=1e-6)
+
+
+def test_known_ranges_replace_a_first_guess():
+    def oscillator(p):
+        period, quality = p
+        w = 2 * np.pi / period
+        return [[0, 1], [-(w**2), -w / quality]], [[0], [w**2]], [[1, 0]]
+
+    structure = GrayBoxStructure.from_function(
+        oscillator, {"period": 20.0, "quality": 1.0}
+    ).with_ranges({"period": (0.1, 50.0), "quality": (0.5, 100.0)})
+    truth = [0.7, 12.0]
+    fitted = GrayBoxRestructurer(structure).fit_model(structure.model(truth))
+    np.testing.assert_allclose(fitted.params_, truth, rtol=1e-6)
+
+
 def unstable():
     return StateSpace([[0.5]], [[1.0]], [[1.0]])
 

@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from .certificates import MinimaxResult, Peaks
 from .leastsquares import LeastSquaresResult
 from .matching import ErrorSystem
-from .restructure import decay_rates, metric_coordinates
+from .restructure import decay_rates, metric_coordinates, within_bounds
 from .transfer import series
 
 Array = NDArray[np.float64]
@@ -93,12 +93,15 @@ def minimise_h2(
     J0, _ = squared_h2(system, theta0)
     scale = np.sqrt(J0) if J0 > 0 else 1.0
     T = metric_coordinates(fit.R[:, active], max(np.sqrt(fit.cost), negligible, 1e-300))
+    bounded = np.isfinite([system.structure.lower, system.structure.upper]).any()
+    if bounded:  # coordinates in which the bounds stay bounds
+        T = np.diag(np.maximum(np.abs(theta0[active]), 1e-300))
     history: list[dict[str, float]] = []
 
     def theta_of(y: Array) -> Array:
         theta = theta0.copy()
         theta[active] += T @ y
-        return theta
+        return within_bounds(system, theta)
 
     def objective(y: Array) -> tuple[float, Array]:
         theta = theta_of(y)
@@ -110,11 +113,17 @@ def minimise_h2(
 
     y, found = np.zeros(len(T)), None
     if J0 > negligible**2:
+        size = np.diag(T)
+        room = [
+            (system.structure.lower - theta0)[active] / size,
+            (system.structure.upper - theta0)[active] / size,
+        ]
         found = minimize(
             objective,
             y,
             jac=True,
-            method="BFGS",
+            method="L-BFGS-B" if bounded else "BFGS",
+            bounds=np.transpose(room) if bounded else None,
             options={"maxiter": max_iter, "gtol": max(tol, 1e-12) ** 0.75},
             callback=lambda z: history.append(
                 {"objective": scale * np.sqrt(max(objective(z)[0], 0.0))}

@@ -28,17 +28,27 @@ class LeastSquaresResult:
 
 
 def levenberg_marquardt(
-    residuals: Residuals, x0: Array, *, max_iter: int = 50, tol: float = 1e-9
+    residuals: Residuals,
+    x0: Array,
+    *,
+    lower: Array | float = -np.inf,
+    upper: Array | float = np.inf,
+    max_iter: int = 50,
+    tol: float = 1e-9,
 ) -> LeastSquaresResult | None:
     """Minimise ``|r(x)|^2`` with Marquardt's scaling; None if `x0` is not admissible.
+
+    Steps are projected on the bounds; a variable whose bound the gradient presses
+    against is left out of the step.
 
     Stops when the cost falls by less than `tol` relative, twice in a row, or when the
     predicted decrease is rounding noise.
     """
-    state = residuals(x0)
+    x = np.clip(x0, lower, upper)
+    state = residuals(x)
     if state is None:
         return None
-    x, (r, J) = x0.copy(), state
+    r, J = state
     cost = float(r @ r)
     damping, small = 1e-3, 0
     scale = np.zeros(len(x))
@@ -47,11 +57,15 @@ def levenberg_marquardt(
     for n_iter in range(1, max_iter + 1):  # noqa: B007
         scale = np.maximum(scale, np.linalg.norm(R, axis=0))
         d = np.where(scale > 0, scale, 1.0)
+        g = R.T @ (Q.T @ r)
+        held = ((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0))
+        free = np.where(held, 0.0, 1.0)
         rhs = np.concatenate([-(Q.T @ r), np.zeros(len(x))])
         accepted = False
         while damping < 1e12:
-            stacked = np.vstack([R, np.sqrt(damping) * np.diag(d)])
-            step = np.linalg.lstsq(stacked, rhs, rcond=None)[0]
+            stacked = np.vstack([R * free, np.sqrt(damping) * np.diag(d)])
+            step = free * np.linalg.lstsq(stacked, rhs, rcond=None)[0]
+            step = np.clip(x + step, lower, upper) - x
             predicted = (
                 cost
                 - float(np.sum((Q.T @ r + R @ step) ** 2))
@@ -138,4 +152,11 @@ def fit_frequency_response(
             return None
         return np.concatenate([r.real, r.imag]), np.vstack([J.real, J.imag])
 
-    return levenberg_marquardt(residuals, theta0, max_iter=max_iter)
+    structure = system.structure
+    return levenberg_marquardt(
+        residuals,
+        theta0,
+        lower=structure.lower,
+        upper=structure.upper,
+        max_iter=max_iter,
+    )

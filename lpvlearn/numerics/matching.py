@@ -27,6 +27,8 @@ class Structure(Protocol):
 
     order: int
     n_params: int
+    lower: Array
+    upper: Array
 
     def system_matrix(self, theta: Array) -> Array: ...
     def jacobian(self, theta: Array) -> Array: ...

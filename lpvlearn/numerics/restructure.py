@@ -79,6 +79,26 @@ def metric_coordinates(R: Array, size: float) -> Array:
     return Vt.T * (size / s)
 
 
+def within_bounds(system: ErrorSystem, theta: Array) -> Array:
+    """`theta` without the rounding errors that pass a bound."""
+    return np.clip(theta, system.structure.lower, system.structure.upper)
+
+
+def bound_rows(system: ErrorSystem, theta: Array) -> tuple[Array, Array]:
+    """The finite bounds of the parameters as ``c <= 0``, scaled, and gradients."""
+    lower, upper = system.structure.lower, system.structure.upper
+    low, high = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
+    eye = np.eye(len(theta))
+    size = np.maximum(np.abs(theta), 1e-300)
+    size = np.maximum(size, 1e-3 * size.max(initial=0.0))
+    return (
+        np.concatenate(
+            [(lower - theta)[low] / size[low], (theta - upper)[high] / size[high]]
+        ),
+        np.vstack([-eye[low] / size[low, None], eye[high] / size[high, None]]),
+    )
+
+
 @dataclass
 class HinfObjective:
     """Peaks of the error in the coordinates y, with constant peaks set aside.
@@ -178,6 +198,8 @@ class HinfObjective:
         rate, gradients, size = growth_gradients(self.system, theta)
         size = np.maximum(size, self.margin)
         c, dc = (rate + self.margin) / size, gradients @ self.T / size[:, None]
+        bounds, rows = bound_rows(self.system, theta)
+        c, dc = np.concatenate([c, bounds]), np.vstack([dc, rows @ self.T])
         if self.capped is None or self._cap_frequencies.size == 0:
             return c, dc
         values, slopes = self.capped.gradients(theta, self._cap_frequencies)
@@ -288,7 +310,7 @@ def minimise_hinf(
     if first is None or objective.floor < first.top:
         result = solver(objective.problem(), origin, **options)
         floor = objective.floor if objective.floor > negligible else 0.0
-        return objective.theta(result.y), result, floor
+        return within_bounds(system, objective.theta(result.y)), result, floor
     weight = vanishing_weight(system, objective.floor_frequency)
     if weight is None:
         certified = MinimaxResult(theta0, first, 0.0, 0.0, True, 0)
@@ -334,4 +356,4 @@ def _minimise_remainder(
         "max_iter": min(options["max_iter"], _REMAINDER_STEPS),
     }
     result = minimax_sqp(objective.problem(), np.zeros(len(theta0)), **options)
-    return objective.theta(result.y), result
+    return within_bounds(system, objective.theta(result.y)), result

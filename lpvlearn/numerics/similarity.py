@@ -233,7 +233,10 @@ def _batched_lm(
 
 
 def bilinear_fit(
-    problem: AffineProblem, theta: Array, max_iter: int
+    problem: AffineProblem,
+    theta: Array,
+    max_iter: int,
+    bounds: tuple[Array, Array],
 ) -> tuple[Array, float, int, bool]:
     """Minimise Eq. (7) over parameters and similarity from given parameters.
 
@@ -286,7 +289,12 @@ def bilinear_fit(
     J = jacobian(x)[:, : n * n]
     rhs = residuals(x)
     x[: n * n] = -np.linalg.lstsq(J, rhs, rcond=None)[0]
-    found = least_squares(residuals, x, jacobian, x_scale="jac", max_nfev=max_iter)
+    free = np.full(n * n, np.inf)
+    limits = (np.append(-free, bounds[0]), np.append(free, bounds[1]))
+    x = np.clip(x, *limits)
+    found = least_squares(
+        residuals, x, jacobian, bounds=limits, x_scale="jac", max_nfev=max_iter
+    )
     return found.x[n * n :], np.sqrt(2.0 * found.cost), found.nfev, found.status > 0
 
 
@@ -311,7 +319,9 @@ def minimise_bilinear(
     rate = 1.0 if box.dt is not None else max(float(poles.max(initial=0.0)), 1e-300)
     basis = structure.jacobian(theta)
     problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, rate)
-    theta, cost, n_iter, done = bilinear_fit(problem, theta, max(max_iter, 1))
+    theta, cost, n_iter, done = bilinear_fit(
+        problem, theta, max(max_iter, 1), (structure.lower, structure.upper)
+    )
     peaks = Peaks(
         np.array([cost]), np.zeros(0), np.zeros((1, len(theta))), np.zeros(1) > 0
     )
