@@ -234,6 +234,24 @@ def test_time_scale_and_units_do_not_matter(rate, channel):
     np.testing.assert_allclose(fitted.params_, structure.check_params(theta), rtol=1e-6)
 
 
+@pytest.mark.parametrize("units", [(1e-6, 1e6), (1e6, 1e-6), (1.0, 1e-6)])
+def test_channels_in_very_different_units(units):
+    _, params = CASES["two_masses"]
+    scaled = GrayBoxStructure.from_template(
+        [
+            [0, 0, 1, 0],
+            [0, 0, 0, 1],
+            ["-k1", "k2", "-c1", 0],
+            ["k3", "-k3", 0, "-c2"],
+        ],
+        [[0], [0], ["b"], [0]],
+        [[units[0], 0, 0, 0], [0, units[1], 0, 0]],
+    )
+    black_box = disguised(scaled.model(params), np.random.default_rng(0))
+    fitted = GrayBoxRestructurer(scaled).fit_model(black_box)
+    np.testing.assert_allclose(fitted.params_, scaled.check_params(params), rtol=1e-6)
+
+
 def test_smooth_structures_start_from_their_first_guess():
     def pendulum(p):
         length, damping = p

@@ -13,6 +13,8 @@ from .matching import ErrorSystem
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
+_BALANCED_DECADES = 1.5  # channels that differ by less are left as they are
+
 # residuals and Jacobian at a point, None where the point is not admissible
 Residuals = Callable[[Array], tuple[Array, Array] | None]
 
@@ -63,8 +65,8 @@ def levenberg_marquardt(
         rhs = np.concatenate([-(Q.T @ r), np.zeros(len(x))])
         accepted = False
         while damping < 1e12:
-            stacked = np.vstack([R * free, np.sqrt(damping) * np.diag(d)])
-            step = free * np.linalg.lstsq(stacked, rhs, rcond=None)[0]
+            stacked = np.vstack([R * (free / d), np.sqrt(damping) * np.eye(len(x))])
+            step = free / d * np.linalg.lstsq(stacked, rhs, rcond=None)[0]
             step = np.clip(x + step, lower, upper) - x
             predicted = (
                 cost
@@ -122,6 +124,7 @@ def fit_frequency_response(
     G0: Complex,
     *,
     admissible: Callable[[Array], bool],
+    balance: Array | float = 1.0,
     max_iter: int = 60,
 ) -> LeastSquaresResult | None:
     """Least-squares fit of ``G(theta)`` to `G0` over a frequency grid.
@@ -138,6 +141,8 @@ def fit_frequency_response(
     G0 : ndarray of shape (k, n_outputs, n_inputs)
     admissible : callable
         False where the model may not go (an unstable one).
+    balance : ndarray of shape (n_outputs, n_inputs), default=1.0
+        Factors of the residuals' entries, as from `channel_balance`.
     """
     W = system.weight_response(omega)[0] / np.sqrt(len(omega))
     target = W @ G0
@@ -146,8 +151,9 @@ def fit_frequency_response(
         if not admissible(theta):
             return None
         G, J = system.response_jacobian(theta, omega)
-        r = (W @ G - target).ravel()
-        J = np.einsum("kpq,kqmj->kpmj", W, J).reshape(len(r), -1)
+        r = (balance * (W @ G - target)).ravel()
+        J = np.einsum("kpq,kqmj->kpmj", W, J)
+        J = (np.asarray(balance)[..., None] * J).reshape(len(r), -1)
         if not np.isfinite(J).all():
             return None
         return np.concatenate([r.real, r.imag]), np.vstack([J.real, J.imag])
@@ -160,3 +166,30 @@ def fit_frequency_response(
         upper=structure.upper,
         max_iter=max_iter,
     )
+
+
+def channel_balance(G: Complex) -> Array | None:
+    """Factors of rows and columns that bring all channels to one size.
+
+    None where they differ little. Channels in micrometres and in percent then count
+    alike in a fit.
+
+    Parameters
+    ----------
+    G : ndarray of shape (k, n_outputs, n_inputs)
+
+    Returns
+    -------
+    ndarray of shape (n_outputs, n_inputs) or None
+    """
+    size = np.sqrt(np.mean(np.abs(G) ** 2, axis=0))
+    rows = np.linalg.norm(size, axis=1)
+    rows = np.where(rows > 0, rows, rows.max(initial=0.0))
+    if not rows.any():
+        return None
+    columns = np.linalg.norm(size / rows[:, None], axis=0)
+    columns = np.where(columns > 0, columns, columns.max())
+    spread = np.ptp(np.log10(rows)), np.ptp(np.log10(columns))
+    if max(spread) < _BALANCED_DECADES:
+        return None
+    return 1.0 / (rows[:, None] * columns)

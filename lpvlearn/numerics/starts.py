@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from .balancing import balancing_transformation
 from .leastsquares import (
     LeastSquaresResult,
+    channel_balance,
     fit_frequency_response,
     frequency_grid,
 )
 from .matching import ErrorSystem
 from .restructure import decay_rates, growth
 from .similarity import scaled_problem, similarity_starts
-from .transfer import Target
+from .transfer import Target, model_derivatives
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -88,11 +89,33 @@ def similarity_candidates(
         scales = [1.0]
     else:
         scales = [float(np.exp(np.log(poles).mean())), float(poles.max())]
+    grid = frequency_grid(np.linalg.eigvals(box.A).astype(complex), box.dt)
+    balance = channel_balance(model_derivatives(box, grid)[0])
+    if balance is not None:  # rank one: factors of the outputs and of the inputs
+        outputs, inputs = balance[:, 0] / balance[0, 0], balance[0]
+        box, offset, basis = balanced_channels(box, offset, basis, outputs, inputs)
     found = []
     for rate in scales:
         problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, rate)
         found.append(similarity_starts(problem, n_starts, rng)[0])
     return np.vstack(found)
+
+
+def balanced_channels(
+    box: Target, offset: Array, basis: Array, outputs: Array, inputs: Array
+) -> tuple[Target, Array, Array]:
+    """Black box and structure with outputs and inputs in other units."""
+    n = len(box.A)
+    left = np.concatenate([np.ones(n), outputs])[:, None]
+    right = np.concatenate([np.ones(n), inputs])
+    scaled = Target(
+        box.A,
+        box.B * inputs,
+        outputs[:, None] * box.C,
+        outputs[:, None] * box.D * inputs,
+        box.dt,
+    )
+    return scaled, left * offset * right, left * basis * right
 
 
 def perturbed_candidates(
@@ -133,14 +156,21 @@ def best_fits(
         return []
     thetas = np.array(usable)
     W = system.weight_response(omega)[0]
+    balance = channel_balance(W @ G0)
+    scale = 1.0 if balance is None else balance
     errors = np.array(
-        [np.linalg.norm(W @ (system.response(t, omega) - G0)) for t in thetas]
+        [np.linalg.norm(scale * (W @ (system.response(t, omega) - G0))) for t in thetas]
     )
     thetas = thetas[np.argsort(errors, kind="stable")]
     thetas = thetas[distinct(thetas)]
     good = GOOD_FIT * rms(W @ G0)
     fits = []
     for theta in thetas[:n_fits]:
+        if balance is not None:  # all channels alike first, then as they are
+            first = fit_frequency_response(
+                system, theta, omega, G0, admissible=admissible, balance=balance
+            )
+            theta = theta if first is None else first.x
         fit = fit_frequency_response(system, theta, omega, G0, admissible=admissible)
         fits.append(fit)
         if fit is not None and np.sqrt(fit.cost) <= good:
