@@ -20,7 +20,7 @@ from sklearn.utils.validation import check_is_fitted
 from .frequency_data import stack_response
 from .identifiability import Identifiability
 from .numerics.certificates import ACTIVE_PEAK, MinimaxResult
-from .numerics.leastsquares import fit_frequency_response
+from .numerics.leastsquares import channel_balance, fit_frequency_response
 from .numerics.starts import search_fits
 from .parameter_statistics import perturbation_table, spread_covariance
 from .restructuring_problem import (
@@ -384,6 +384,9 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             self.active_frequencies_ = np.sort(peaks.frequencies)
             self.remaining_error_ = self.error_
         J = system.response_jacobian(self.params_, problem.omega)[1]
+        balance = channel_balance(problem.response)
+        if balance is not None:  # a faint channel tells parameters, too
+            J = J * balance[..., None]
         self.identifiability_ = Identifiability.from_jacobian(
             J, structure.parameter_names
         )
