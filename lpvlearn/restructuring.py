@@ -107,12 +107,10 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
     remaining_error_ : float
         Highest peak of the error apart from the floor; equal to `error_` where there is
         no floor, or a lower one.
-    stationarity_ : float
-        Shortest vector in the convex hull of the active gradients, relative to the
-        error and in the coordinates of the least-squares fit; 0 is stationary.
-    second_order_ : float
-        Smallest eigenvalue of the reduced Hessian; positive certifies a strict
-        local minimum.
+    stationarity_, second_order_ : float
+        Shortest vector in the convex hull of the active gradients (0: stationary), and
+        smallest eigenvalue of the reduced Hessian (positive: a strict local minimum),
+        relative to the error, in the coordinates of the least-squares fit.
     identifiability_ : Identifiability
         Rank and condition of the derivative of the response to the parameters.
     dropped_feedthrough_ : ndarray of shape (n_outputs, n_inputs)
@@ -138,11 +136,6 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
     Candidates come from similarity transformations that solve the equations without
     parameters exactly (Eq. (34)); the best, judged by their frequency response, start a
     least-squares fit of the response, and that starts the minimax.
-
-    References
-    ----------
-    .. [1] "Combining analytic and experimental information for linear
-       parameter-varying model identification", Sections 2.2-2.6.
 
     Examples
     --------
@@ -202,10 +195,6 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             Models from single realizations of the noise, of which `model` is the
             average; their spread gives `params_covariance_`.
 
-        Returns
-        -------
-        self
-
         Raises
         ------
         ValueError
@@ -239,10 +228,6 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             Weight of the error at every frequency, e.g. the inverse of the standard
             deviation of the measurement.
 
-        Returns
-        -------
-        self
-
         Raises
         ------
         ValueError
@@ -263,10 +248,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         return self
 
     def start_error(self, model: StateSpace, params: ArrayLike) -> float:
-        """Error of the least-squares fit that begins at given parameters.
-
-        Comparable with `fit_error_`: a smaller one tells that the parameters lie in a
-        better basin.
+        """Error of the least-squares fit from given parameters, as `fit_error_`.
 
         Parameters
         ----------
@@ -293,10 +275,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
     def perturbation_check(
         self, model: StateSpace, n_restarts: int = 10, size: float = 0.05
     ) -> pd.DataFrame:
-        """The paper's empirical check of identifiability (Section 3.3.2).
-
-        Restarts from random perturbations of `params_`; an identifiable structure
-        returns to the same parameters.
+        """The paper's empirical check of identifiability, Section 3.3.2: restarts.
 
         Parameters
         ----------
