@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from numbers import Integral
 from typing import Any
 
@@ -69,6 +70,13 @@ def as_scalar(value: Any) -> Hashable:
     return value.item() if isinstance(value, np.generic) else value
 
 
+def _did_you_mean(key: Any, names: Sequence[Any]) -> str:
+    """A suggestion for a misspelt name, or nothing."""
+    lower = {str(name).lower(): name for name in names if name is not None}
+    close = get_close_matches(str(key).lower(), lower, n=1, cutoff=0.6)
+    return f" Did you mean {lower[close[0]]!r}?" if close else ""
+
+
 def _first_not_a_number(series: pd.Series) -> int:
     for row, value in enumerate(series):
         try:
@@ -77,6 +85,14 @@ def _first_not_a_number(series: pd.Series) -> int:
             if value is not pd.NA and value is not None:
                 return row
     return 0
+
+
+def as_list(keys: Any) -> list[Any]:
+    """The columns with a role, as a list; empty for None."""
+    if keys is None:
+        return []
+    many = isinstance(keys, (list, tuple, np.ndarray, pd.Index))
+    return list(keys) if many else [keys]
 
 
 def is_table(X: Any) -> bool:
@@ -161,7 +177,8 @@ class Table:
             named = [repr(level) for level in self.levels if level is not None]
             shown += f"; index levels: {', '.join(named)}" if named else ""
             rule = f"name a column or an index level of X ({shown})"
-        raise ValueError(f"`{role}` must {rule}. Got {key!r}.")
+        hint = _did_you_mean(key, [*self.names, *self.levels])
+        raise ValueError(f"`{role}` must {rule}. Got {key!r}.{hint}")
 
     def one(self, key: Role, role: str) -> tuple[int | None, Column] | None:
         """Find the column that has a role; None for `key=None`."""
@@ -171,8 +188,7 @@ class Table:
         """Find the columns that share a role; none for `keys=None`."""
         if keys is None:
             return []
-        many = isinstance(keys, (list, tuple, np.ndarray, pd.Index))
-        found = [self.find(key, role) for key in (keys if many else [keys])]
+        found = [self.find(key, role) for key in as_list(keys)]
         names = [column.name for _, column in found]
         if not found or len(set(names)) < len(names):
             raise ValueError(

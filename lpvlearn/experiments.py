@@ -146,7 +146,7 @@ def read_experiments(
     Y, y_names = (None, []) if y is None else read_outputs(y)
     if Y is not None:
         check_consistent_length(U, Y)
-    labels, groups = _group_rows(by_label, table.n_rows)
+    labels, groups = group_rows(by_label, table.n_rows)
     _check_finite(U, [c.name for c in u], "X", labels, groups, allow_missing)
     if K is not None:
         _check_finite(K, [c.name for _, c in kappa], "X", labels, groups)
@@ -160,7 +160,7 @@ def read_experiments(
             inputs=U[rows],
             outputs=None if Y is None else Y[rows],
             scheduling=None if K is None else K[rows],
-            operating_point=_operating_point(by_point, rows, label),
+            operating_point=operating_point_of(by_point, rows, label),
             sampling_time=step,
         )
         for label, rows, step in zip(labels, groups, steps, strict=True)
@@ -314,7 +314,7 @@ def _numbers(
     return matrix
 
 
-def _group_rows(
+def group_rows(
     found: tuple[int | None, Column] | None, n_rows: int
 ) -> tuple[list[Hashable], list[NDArray[np.intp]]]:
     """Return labels in the order of first appearance, and the rows of each."""
@@ -332,7 +332,7 @@ def _group_rows(
     return [as_scalar(label) for label in uniques], groups
 
 
-def _operating_point(
+def operating_point_of(
     found: tuple[int | None, Column] | None,
     rows: NDArray[np.intp],
     label: Hashable,

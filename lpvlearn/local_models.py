@@ -1,10 +1,10 @@
-"""Step 3 at one operating point: experiments to one continuous-time local model."""
+"""Step 3: the experiments of every operating point to a continuous-time model."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,10 @@ from sklearn.base import clone
 
 from .experiments import Experiment
 from .numerics.balancing import align_signs
+from .operating_points import OperatingPoints
+from .parallel import PointRunner
 from .statespace import StateSpace
+from .structures import GrayBoxStructure
 
 Array = NDArray[np.float64]
 
@@ -32,14 +35,62 @@ class LocalModel:
         As identified, in discrete time.
     horizon : int or None
         Horizon of the subspace step, where the estimator tells it.
-    n_models : int
-        Models that were averaged; 1 for a pooled fit.
+    realizations : list of StateSpace
+        Models that were averaged; none after a pooled fit.
     """
 
     lti: StateSpace
     order: int
     horizon: int | None
-    n_models: int
+    realizations: list[StateSpace]
+
+
+def identify_points(
+    local: Any,
+    points: OperatingPoints,
+    runner: PointRunner,
+    *,
+    structure: GrayBoxStructure | None,
+    **options: Any,
+) -> tuple[list[LocalModel], OperatingPoints]:
+    """Identify the local models of all operating points.
+
+    Parameters
+    ----------
+    local : estimator
+        As in `identify_point`.
+    points : OperatingPoints
+    runner : PointRunner
+    structure : GrayBoxStructure or None
+        Its order replaces ``order="auto"`` of the local estimator. Without one, "auto"
+        becomes the highest order that a point takes.
+    **options
+        As in `identify_point`.
+
+    Returns
+    -------
+    models : list of LocalModel
+    points : OperatingPoints
+        Those that did not fail.
+    """
+    chooses = _has_auto_order(local)
+    if chooses and isinstance(structure, GrayBoxStructure):
+        local = clone(local).set_params(order=structure.order)
+    # Where a record stood in the table does not matter: splits share their results.
+    groups = [[_bare(e) for e in group] for group in points.experiments]
+
+    def identify(estimator: Any) -> list[LocalModel | None]:
+        arguments = [(estimator, group) for group in groups]
+        return runner.run(
+            "local models", identify_point, arguments, points.kappa, **options
+        )
+
+    found = identify(local)
+    orders = {model.order for model in found if model is not None}
+    if chooses and structure is None and len(orders) > 1:
+        found = identify(clone(local).set_params(order=max(orders)))
+    kept = [k for k, model in enumerate(found) if model is not None]
+    return [model for model in found if model is not None], points.keep(kept)
 
 
 def identify_point(
@@ -69,34 +120,38 @@ def identify_point(
     ValueError
         If the identified model is unstable, so that it cannot be balanced.
     """
-    if combine == "pool" or len(experiments) == 1:
+    labels = list(dict.fromkeys(e.label for e in experiments))
+    if combine == "pool" or len(labels) == 1:
         fitted = fit_local(local, experiments, sampling_time)
         lti = _continuous(fitted.lti_, discretization)
-        return LocalModel(lti, fitted.lti_.order, _horizon(fitted), 1)
+        return LocalModel(lti, fitted.lti_.order, _horizon(fitted), [])
     # The first realisation chooses order and horizon, the others follow it.
-    fitted = fit_local(local, experiments[:1], sampling_time)
+    # A realisation with gaps is several experiments of one label.
+    realisations = [[e for e in experiments if e.label == label] for label in labels]
+    fitted = fit_local(local, realisations[0], sampling_time)
     chosen = clone(local)
     for name in ("order", "horizon"):
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
     models, failures = [], []
-    for experiment in experiments:
-        model = fit_local(chosen, [experiment], sampling_time).lti_
+    for realisation in realisations:
+        model = fit_local(chosen, realisation, sampling_time).lti_
         try:
             models.append(_continuous(model, discretization))
         except ValueError as error:
-            failures.append((experiment.label, error))
+            failures.append((realisation[0].label, error))
     if not models:
         raise failures[0][1]
     if failures:
         warnings.warn(
-            f"{len(failures)} of {len(experiments)} realisations were left out of the "
+            f"{len(failures)} of {len(labels)} realisations were left out of the "
             f"average; the first, {failures[0][0]!r}: {failures[0][1]}",
             UserWarning,
             stacklevel=2,
         )
+    models = [model for model in models if model.order == models[0].order]
     return LocalModel(
-        average_models(models), fitted.lti_.order, _horizon(fitted), len(models)
+        average_models(models), fitted.lti_.order, _horizon(fitted), models
     )
 
 
@@ -119,7 +174,13 @@ def fit_local(
     estimator = clone(local)
     known = estimator.get_params(deep=False)
     estimator.set_params(**{name: own[name] for name in own if name in known})
-    return estimator.fit(table, y)
+    fitted = estimator.fit(table, y)
+    if not isinstance(getattr(fitted, "lti_", None), StateSpace):
+        raise ValueError(
+            "`local` must be an estimator that identifies a StateSpace model, its "
+            f"attribute `lti_`, as SubspaceLTI does. Got {type(local).__name__}."
+        )
+    return fitted
 
 
 def average_models(models: Sequence[StateSpace]) -> StateSpace:
@@ -127,19 +188,41 @@ def average_models(models: Sequence[StateSpace]) -> StateSpace:
     reference = models[0]
     total = [np.zeros_like(M) for M in (reference.A, reference.B, reference.C)]
     D = np.zeros_like(reference.D)
-    used = [model for model in models if model.order == reference.order]
-    for model in used:
+    for model in models:
         s = align_signs(model.B, model.C, reference.B, reference.C)
         total[0] += s[:, None] * model.A * s
         total[1] += s[:, None] * model.B
         total[2] += model.C * s
         D += model.D
-    n = len(used)
+    n = len(models)
     return StateSpace(total[0] / n, total[1] / n, total[2] / n, D / n)
 
 
+def _has_auto_order(local: Any) -> bool:
+    order = local.get_params(deep=False).get("order")
+    return isinstance(order, str) and order == "auto"
+
+
+def _bare(experiment: Experiment) -> Experiment:
+    """An experiment without its place in the table."""
+    return replace(
+        experiment,
+        rows=np.arange(len(experiment.rows)),
+        scheduling=None,
+        operating_point=None,
+    )
+
+
 def _continuous(model: StateSpace, discretization: str) -> StateSpace:
-    return model.to_continuous(discretization).balance()
+    lti = model.to_continuous(discretization)
+    if not lti.is_stable:
+        worst = lti.poles()[np.argmax(lti.poles().real)]
+        raise ValueError(
+            f"the local model must be stable. Got a pole at {worst:.4g} 1/s. Try "
+            "local=SubspaceLTI(stability='enforce'), another `order`, a longer "
+            "`horizon` or more data, or leave the point out by on_error='skip'."
+        )
+    return lti.balance()
 
 
 def _horizon(fitted: Any) -> int | None:

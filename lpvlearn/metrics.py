@@ -45,7 +45,7 @@ class TrajectoryScorer:
     metric : {"BFT", "VAF"}
     initial_state : {"rest", "estimate"}
     burn_in : int
-    multioutput : "uniform_average" or tuple of float
+    multioutput : "uniform_average", "raw_values" or tuple of float
     average : {"pool", "experiment"}
     """
 
@@ -55,11 +55,11 @@ class TrajectoryScorer:
     multioutput: str | tuple[float, ...] = "uniform_average"
     average: Literal["pool", "experiment"] = "pool"
 
-    def __call__(self, estimator: Any, X: Any, y: Any) -> float:
+    def __call__(self, estimator: Any, X: Any, y: Any) -> float | dict[str, float]:
         """Score an estimator's simulation of `X` against `y`."""
         score = bft_score if self.metric == "BFT" else vaf_score
         simulator, X = _unwrap(estimator, X)
-        Y, _ = read_outputs(y)
+        Y, names = read_outputs(y)
         Y_pred = _simulate(simulator, X, y, self.initial_state)
         pool = self.average == "pool"
         groups = [np.arange(len(Y))]
@@ -71,14 +71,22 @@ class TrajectoryScorer:
             score(Y[rows], Y_pred[rows], multioutput=self.multioutput)
             for rows in groups
         ]
-        return float(np.mean(scores))
+        mean = np.mean(scores, axis=0)
+        if self.multioutput != "raw_values":
+            return float(mean)
+        return {
+            f"{self.metric}_{name}": float(value)
+            for name, value in zip(names, mean, strict=True)
+        }
 
 
 def make_bft_scorer(
     *,
     initial_state: InitialState = "rest",
     burn_in: int = 0,
-    multioutput: Literal["uniform_average"] | ArrayLike = "uniform_average",
+    multioutput: Literal["uniform_average", "raw_values"] | ArrayLike = (
+        "uniform_average"
+    ),
     average: Literal["pool", "experiment"] = "pool",
 ) -> TrajectoryScorer:
     """Make a scorer of the best fit ratio.
@@ -93,8 +101,10 @@ def make_bft_scorer(
     burn_in : int, default=0
         Samples at the start of each experiment that are simulated but not scored. The
         estimator's `split_experiments(X)` tells the rows of each experiment.
-    multioutput : "uniform_average" or array-like of shape (n_outputs,)
+    multioutput : {"uniform_average", "raw_values"} or array-like of shape (n_outputs,)
         Mean over the outputs, or weights: `[1, 0]` scores the first output alone.
+        "raw_values" is one score per output, ``{"BFT_y1": ..., "BFT_y2": ...}``, as
+        ``cross_validate(scoring=...)`` takes it.
     average : {"pool", "experiment"}, default="pool"
         Score all experiments as one record, as scikit-learn does, or take the mean of
         their scores, which offsets between experiments cannot flatter.
@@ -121,7 +131,9 @@ def make_vaf_scorer(
     *,
     initial_state: InitialState = "rest",
     burn_in: int = 0,
-    multioutput: Literal["uniform_average"] | ArrayLike = "uniform_average",
+    multioutput: Literal["uniform_average", "raw_values"] | ArrayLike = (
+        "uniform_average"
+    ),
     average: Literal["pool", "experiment"] = "pool",
 ) -> TrajectoryScorer:
     """Make a scorer of the variance accounted for.
@@ -130,7 +142,7 @@ def make_vaf_scorer(
     ----------
     initial_state : {"rest", "estimate"}, default="rest"
     burn_in : int, default=0
-    multioutput : "uniform_average" or array-like of shape (n_outputs,)
+    multioutput : {"uniform_average", "raw_values"} or array-like of shape (n_outputs,)
     average : {"pool", "experiment"}, default="pool"
         As in `make_bft_scorer`.
 
@@ -242,10 +254,10 @@ def _make_scorer(
     if average not in ("pool", "experiment"):
         raise ValueError(f"`average` must be 'pool' or 'experiment'. Got {average!r}.")
     if isinstance(multioutput, str):
-        if multioutput != "uniform_average":
+        if multioutput not in ("uniform_average", "raw_values"):
             raise ValueError(
-                "`multioutput` of a scorer must be 'uniform_average' or one weight per "
-                f"output, as a scorer returns one number. Got {multioutput!r}."
+                "`multioutput` of a scorer must be 'uniform_average', 'raw_values' or "
+                f"one weight per output. Got {multioutput!r}."
             )
     else:
         multioutput = tuple(np.asarray(multioutput, dtype=np.float64).tolist())
@@ -261,6 +273,19 @@ def _check_options(initial_state: str, burn_in: int) -> None:
         raise ValueError(
             f"`burn_in` must be a number of samples, an integer >= 0. Got {burn_in!r}."
         )
+
+
+def simulator_in(estimator: Any) -> Any:
+    """Return the estimator within a search, a pipeline or a transformed target."""
+    while True:
+        if hasattr(estimator, "best_estimator_"):
+            estimator = estimator.best_estimator_
+        elif isinstance(estimator, Pipeline):
+            estimator = estimator[-1]
+        elif hasattr(estimator, "regressor_"):
+            estimator = estimator.regressor_
+        else:
+            return estimator
 
 
 def _unwrap(estimator: Any, X: Any) -> tuple[Any, Any]:

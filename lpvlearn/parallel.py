@@ -2,59 +2,199 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from time import perf_counter
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Memory, Parallel, delayed, hash
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
+from sklearn.utils.validation import check_memory
+from threadpoolctl import ThreadpoolController
 from tqdm import tqdm
 
 Array = NDArray[np.float64]
 
 
-def over_points(
-    what: str,
-    function: Callable[..., Any],
-    arguments: Sequence[tuple[Any, ...]],
-    kappa: Array,
-    *,
-    n_jobs: int | None,
-    verbose: int,
-    on_error: str,
-    **shared: Any,
-) -> list[Any]:
-    """Apply a step to every operating point.
+# Methods that the steps of the pipeline need, an example, and what else is allowed.
+_STEPS = {
+    "local": (("fit",), "SubspaceLTI()", None),
+    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", "passthrough"),
+    "interpolator": (("fit", "predict"), "PolynomialLPV()", None),
+}
+
+
+@dataclass(frozen=True)
+class PointRunner:
+    """How a step is applied to the operating points.
+
+    Attributes
+    ----------
+    n_jobs : int or None
+        Points worked on at the same time.
+    verbose : int
+        1 shows a progress bar.
+    on_error : {"raise", "skip"}
+        Whether a point that fails stops the others.
+    memory : joblib.Memory
+        Where results are kept; without a location, nowhere.
+    """
+
+    n_jobs: int | None
+    verbose: int
+    on_error: str
+    memory: Memory
+
+    def run(
+        self,
+        what: str,
+        function: Callable[..., Any],
+        arguments: Sequence[tuple[Any, ...]],
+        kappa: Array,
+        **shared: Any,
+    ) -> list[Any]:
+        """Apply a step to every operating point.
+
+        Parameters
+        ----------
+        what : str
+            Label of the progress bar.
+        function : callable
+            Called with the arguments of a point and the shared keywords. The memory
+            knows its results by the values of all of them.
+        arguments : sequence of tuple
+            One for every point.
+        kappa : ndarray of shape (n_points, n_scheduling)
+            Names the points in messages.
+
+        Returns
+        -------
+        list
+            Results in order; None at the points that failed and may.
+
+        Raises
+        ------
+        ValueError
+            If a point fails and must not, or all of them do.
+        """
+        kept = self.memory.cache(function)
+        tasks = (
+            delayed(_attempt)(kept, args, shared, k, kappa[k], self.on_error)
+            for k, args in enumerate(arguments)
+        )
+        results = Parallel(n_jobs=self.n_jobs, return_as="generator")(tasks)
+        total = len(arguments)
+        found = list(tqdm(results, desc=what, total=total, disable=not self.verbose))
+        failures = [result for result in found if isinstance(result, _Failure)]
+        if len(failures) == total:
+            raise ValueError(
+                f"{what}: every operating point failed. First {failures[0].message}"
+            )
+        for failure in failures:
+            warnings.warn(f"left out {failure.message}", UserWarning, stacklevel=5)
+        return [None if isinstance(r, _Failure) else r for r in found]
+
+
+def check_steps(steps: dict[str, Any]) -> None:
+    """Refuse what cannot be a step of the method, and say what can.
 
     Parameters
     ----------
-    what : str
-        Label of the progress bar.
-    function : callable
-        Called with the arguments of a point and the shared keywords.
-    arguments : sequence of tuple
-        One for every point.
-    kappa : ndarray of shape (n_points, n_scheduling)
-        Names the points in messages.
-    on_error : {"raise", "skip"}
+    steps : dict of str to estimator or None
+        By the names of the arguments: local, restructurer, interpolator.
 
-    Returns
-    -------
-    list
-        Results in order; None at the points that failed and may.
+    Raises
+    ------
+    ValueError
     """
-    tasks = (
-        delayed(attempt)(function, args, shared, k, kappa[k], on_error)
-        for k, args in enumerate(arguments)
-    )
-    results = Parallel(n_jobs=n_jobs, return_as="generator")(tasks)
-    total = len(arguments)
-    return list(tqdm(results, desc=what, total=total, disable=not verbose))
+    for name, step in steps.items():
+        methods, example, other = _STEPS[name]
+        if step is None or (other and isinstance(step, str) and step == other):
+            continue
+        got = f"{step!r}" if isinstance(step, str) else type(step).__name__
+        if isinstance(step, type):
+            got = f"the class {step.__name__}, not an instance"
+        elif all(hasattr(step, method) for method in (*methods, "get_params")):
+            continue
+        choice = f"an estimator, {other!r} or None" if other else "an estimator or None"
+        raise ValueError(
+            f"`{name}` must be {choice}. Got {got}. Give an instance with the "
+            f"method(s) {', '.join(methods)}, such as {example}."
+        )
 
 
-def attempt(
+def checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
+    """A joblib.Memory from the argument `memory`, usable for steps.
+
+    Parameters
+    ----------
+    memory : None, str, path or object with the interface of joblib.Memory
+    steps : dict of str to estimator
+        By the names of the arguments.
+
+    Raises
+    ------
+    ValueError
+        If `memory` is none of these, or a step cannot be pickled.
+    """
+    try:
+        memory = check_memory(None if memory is None else _as_text(memory))
+    except ValueError as error:
+        raise ValueError(
+            "`memory` must be None, a folder, or a joblib.Memory. Got "
+            f"{type(memory).__name__}."
+        ) from error
+    if getattr(memory, "location", None) is None:
+        return memory
+    for name, step in steps.items():
+        try:
+            hash(step)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ValueError(
+                f"`memory` needs steps that can be pickled. Got a `{name}` that cannot "
+                f"({error}): replace lambda and nested functions by functions at the "
+                "top of a module, or leave `memory` out."
+            ) from error
+    return memory
+
+
+class Laps:
+    """Seconds between successive marks."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = perf_counter()
+
+    def mark(self, name: str) -> None:
+        """End a lap."""
+        now = perf_counter()
+        self.seconds[name] = now - self._last
+        self._last = now
+
+
+def _as_text(memory: Any) -> Any:
+    """A path as text, the only form that scikit-learn takes."""
+    return str(memory) if hasattr(memory, "__fspath__") else memory
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """Why a point that may fail did."""
+
+    message: str
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """Found once in every process: the search takes longer than a small step."""
+    return ThreadpoolController()
+
+
+def _attempt(
     function: Callable[..., Any],
     args: tuple[Any, ...],
     shared: dict[str, Any],
@@ -64,12 +204,11 @@ def attempt(
 ) -> Any:
     """Run a step at one operating point; a failure names the point."""
     try:
-        with threadpool_limits(limits=1, user_api="blas"):
+        with _blas().limit(limits=1, user_api="blas"):
             return function(*args, **shared)
     except (ValueError, np.linalg.LinAlgError) as error:
         place = ", ".join(f"{value:.4g}" for value in point)
         message = f"operating point {number} (scheduling {place}): {error}"
         if on_error == "raise":
             raise ValueError(message) from error
-        warnings.warn(f"left out {message}", UserWarning, stacklevel=2)
-        return None
+        return _Failure(message)  # a worker's warning would not reach the user

@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
-from time import perf_counter
+import warnings
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
 from sklearn.utils.validation import check_is_fitted
 
-from .experiments import Experiment, read_experiments
+from .columns import as_list
+from .exceptions import ExtrapolationWarning
+from .experiments import Experiment, read_experiments, read_outputs
 from .interpolation import PolynomialLPV
-from .local_models import LocalModel, identify_point
+from .local_models import identify_points
 from .lpv import LPVStateSpace
-from .operating_points import check_local, group_operating_points
-from .parallel import over_points
-from .reports import operating_point_report, point_label
+from .missing_data import split_at_gaps
+from .operating_points import check_outputs, local_experiments, warn_extrapolation
+from .parallel import Laps, PointRunner, check_steps, checked_memory
+from .reports import operating_point_report, parameter_report, parameter_tables
 from .restructuring import GrayBoxRestructurer
+from .simulators import ROLES, in_table_order, simulate_experiments
 from .statespace import positive_time
-from .structured_models import balanced_entries, help_neighbours, restructure_point
-from .structures import GrayBoxStructure
+from .structured_models import restructure_points
 from .subspace import SubspaceLTI
+from .summary import summarise
 
 __all__ = ["LocalLPVPipeline"]
 
 Array = NDArray[np.float64]
+
+_DEFAULTS = {
+    "local": SubspaceLTI,
+    "restructurer": GrayBoxRestructurer,
+    "interpolator": PolynomialLPV,
+}
 
 
 class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -48,8 +57,9 @@ class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
         baseline without structure.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
-        (n_points, n_params); None is ``PolynomialLPV()``, a parabola. Any scikit-learn
-        regressor with several outputs serves.
+        (n_points, n_params); None is ``PolynomialLPV()``, a parabola (a line through
+        two points). Any scikit-learn regressor with several outputs serves. One
+        operating point makes a constant, whatever the interpolator.
     inputs, scheduling, experiment, time, operating_point : column name, position or \
 list, default=None
         Roles of the columns of X. Inputs None: every column without another role.
@@ -70,6 +80,10 @@ list, default=None
     on_error : {"raise", "skip"}, default="raise"
         What a failure at one operating point does: raise an error that names it, or
         leave the point out with a warning.
+    memory : str, path or joblib.Memory, default=None
+        Where local and gray-box models are kept, as in scikit-learn's ``Pipeline``: a
+        search over the interpolator then identifies and restructures nothing twice,
+        nor do splits that share operating points. Results from it warn no more.
     n_jobs : int, default=None
         Operating points worked on at the same time.
     verbose : int, default=0
@@ -86,18 +100,31 @@ list, default=None
         The fitted restructurers, empty after "passthrough".
     parameters_ : DataFrame of shape (n_points, n_params)
         Gray-box parameters, one row per operating point.
+    parameters_std_ : DataFrame of shape (n_points, n_params)
+        Their standard deviations, from the spread of the realizations that
+        ``combine="average"`` identifies; NaN where they are not known.
     interpolator_ : fitted regressor
     lpv_ : LPVStateSpace
     report_ : DataFrame
         One row per operating point: experiments, samples, order, BFT of the local and
         of the gray-box model on the estimation data (percent, mean over the outputs),
         restructuring error and its structural floor, both relative to the black box's
-        norm, the active frequency (rad/s), stationarity, and the largest relative
-        deviation of a parameter from its interpolation.
+        norm, the active frequency (rad/s), stationarity; the distance from the gray-box
+        model to the interpolated one (H-infinity norm, relative), and the FIT (percent,
+        Eq. (36)) of its parameters; the parameters ("param_"), and their standard
+        deviations ("std_") where known.
+    parameter_report_ : DataFrame
+        One row per parameter: lowest and highest value over the points, median
+        standard deviation, RMSE and FIT (percent) of the interpolation.
     step_times_ : dict of str to float
         Seconds that each step took.
+    scheduling_range_ : ndarray of shape (2, n_scheduling)
+        Beyond which `predict` warns: the operating points, widened by how far the
+        scheduling variables moved within an experiment.
     sampling_time_ : float
+    output_names_, scheduling_names_ : list
     n_outputs_, n_features_in_ : int
+    feature_names_in_ : ndarray of str
 
     See Also
     --------
@@ -105,17 +132,27 @@ list, default=None
 
     Examples
     --------
-    >>> import warnings
-    >>> from lpvlearn import GrayBoxRestructurer, LocalLPVPipeline
-    >>> from lpvlearn.datasets import make_flexible_arm
-    >>> arm = make_flexible_arm(n_operating_points=3, duration=1.0, random_state=0)
+    A spring that stiffens with the scheduling variable, excited at three values of it:
+
+    >>> import numpy as np
+    >>> from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, LocalLPVPipeline
+    >>> from lpvlearn import from_trajectories
+    >>> spring = GrayBoxStructure.from_template(
+    ...     A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0]])
+    >>> u = np.sign(np.random.default_rng(0).standard_normal(400))
+    >>> X, y = from_trajectories(
+    ...     [(u, kappa, spring.model({"k": 4 + kappa**2, "c": 1}).simulate(
+    ...         u, sampling_time=0.1)) for kappa in (0.0, 1.0, 2.0)], sampling_time=0.1)
     >>> pipeline = LocalLPVPipeline(
-    ...     restructurer=GrayBoxRestructurer(arm.structure),
-    ...     scheduling="kappa", experiment="experiment", time="time")
-    >>> pipeline = pipeline.fit(arm.X, arm.y)
-    >>> pipeline.parameters_.shape
-    (3, 16)
-    >>> bool(pipeline.score(arm.X_sweep, arm.y_sweep) > 0.9)
+    ...     restructurer=GrayBoxRestructurer(spring),
+    ...     scheduling="kappa", experiment="experiment", time="time").fit(X, y)
+    >>> pipeline.parameters_.round(4)
+                       c    k
+    operating_point
+    0.0              1.0  4.0
+    1.0              1.0  5.0
+    2.0              1.0  8.0
+    >>> bool(pipeline.score(X, y) > 0.999)
     True
     """
 
@@ -135,6 +172,7 @@ list, default=None
         combine: str = "pool",
         discretization: str = "zoh",
         on_error: str = "raise",
+        memory: Any = None,
         n_jobs: int | None = None,
         verbose: int = 0,
     ) -> None:
@@ -151,8 +189,17 @@ list, default=None
         self.combine = combine
         self.discretization = discretization
         self.on_error = on_error
+        self.memory = memory
         self.n_jobs = n_jobs
         self.verbose = verbose
+
+    def set_params(self, **params: Any) -> LocalLPVPipeline:
+        """Set parameters, also ``step__name`` of a step left None (its default)."""
+        for step, default in _DEFAULTS.items():
+            nested = any(name.startswith(step + "__") for name in params)
+            if nested and params.get(step, getattr(self, step)) is None:
+                params[step] = default()
+        return super().set_params(**params)
 
     # -- fitting -------------------------------------------------------------------
 
@@ -176,120 +223,56 @@ list, default=None
             an operating point (which the message names).
         """
         self._check_options()
-        start = perf_counter()
+        runner, laps = self._runner(), Laps()
         experiments = self._read(X, y, reset=True)
+        self.output_names_ = read_outputs(y)[1]
+        self.n_outputs_ = len(self.output_names_)
         self._single_output = np.asarray(y).ndim == 1
+        check_outputs(experiments, self.output_names_)
         self.sampling_time_ = self._sampling_time(experiments)
-        index, kappa = group_operating_points(experiments, self.scheduling_tol)
-        if kappa.shape[1] == 0:  # no scheduling: one constant stands for it
-            kappa = np.zeros((len(kappa), 1))
-        else:
-            check_local(experiments, kappa)
-        groups = [
-            [e for e, i in zip(experiments, index, strict=True) if i == k]
-            for k in range(len(kappa))
-        ]
-        self.n_outputs_ = groups[0][0].outputs.shape[1]
-        read = perf_counter()
-        kept, models = self._identify(groups, kappa)
-        groups, kappa = [groups[k] for k in kept], kappa[kept]
-        identified = perf_counter()
-        kept, structure, theta = self._restructure(kappa)
-        restructured = perf_counter()
-        groups, kappa = [groups[k] for k in kept], kappa[kept]
-        models = [models[k] for k in kept]
-        self.operating_points_ = kappa
-        self.parameters_ = pd.DataFrame(
-            theta,
-            index=pd.Index(
-                [point_label(k) for k in kappa],
-                name="operating_point",
-                tupleize_cols=False,
-            ),
-            columns=list(structure.parameter_names),
-        )
-        self.interpolator_ = self._interpolator(len(kappa)).fit(kappa, theta)
-        bounds = np.array([kappa.min(0), kappa.max(0)])
-        self.lpv_ = LPVStateSpace(structure, self.interpolator_, bounds)
-        self.report_ = operating_point_report(
-            groups,
-            models,
-            self.structured_models_,
-            self.restructurers_,
-            self.lpv_,
-            kappa,
-            self.sampling_time_,
-        )
-        self.step_times_ = {
-            "reading of the table": read - start,
-            "local models": identified - read,
-            "restructuring": restructured - identified,
-            "interpolation and report": perf_counter() - restructured,
-        }
-        return self
 
-    def _identify(
-        self, groups: list[list[Experiment]], kappa: Array
-    ) -> tuple[list[int], list[LocalModel]]:
-        """Step 3 at every operating point, with one order where one is needed."""
-        local = SubspaceLTI() if self.local is None else self.local
+        # Steps 1 and 2: local experiments, in groups by operating point
+        points = local_experiments(experiments, self.scheduling_tol)
+        laps.mark("reading of the table")
+
+        # Step 3: a black-box model at every operating point
         restructurer = self._restructurer()
-        structure = getattr(restructurer, "structure", None)
-        if structure is not None and _has_auto_order(local):
-            local = clone(local).set_params(order=structure.order)
-        found = self._identify_all(local, groups, kappa)
-        orders = {model.order for model in found if model is not None}
-        if structure is None and _has_auto_order(local) and len(orders) > 1:
-            local = clone(local).set_params(order=max(orders))
-            found = self._identify_all(local, groups, kappa)
-        kept = [k for k, model in enumerate(found) if model is not None]
-        if not kept:
-            raise ValueError("every operating point failed; see the warnings.")
-        models = [model for model in found if model is not None]
-        self.local_models_ = [model.lti for model in models]
-        return kept, models
-
-    def _identify_all(
-        self, local: Any, groups: list[list[Experiment]], kappa: Array
-    ) -> list[LocalModel | None]:
-        return over_points(
-            "local models",
-            identify_point,
-            [(local, group) for group in groups],
-            kappa,
-            **self._parallel(),
+        local, points = identify_points(
+            SubspaceLTI() if self.local is None else self.local,
+            points,
+            runner,
+            structure=getattr(restructurer, "structure", None),
             sampling_time=self.sampling_time_,
             combine=self.combine,
             discretization=self.discretization,
         )
+        laps.mark("local models")
 
-    def _restructure(self, kappa: Array) -> tuple[list[int], GrayBoxStructure, Array]:
-        """Step 4 at every operating point, the points helping one another."""
-        restructurer = self._restructurer()
-        models = self.local_models_
-        if restructurer is None:
-            self.restructurers_: list[Any] = []
-            structure, theta = balanced_entries(models)
-            self.structured_models_ = [structure.model(row) for row in theta]
-            return list(range(len(models))), structure, theta
-        found = over_points(
-            "restructuring",
-            restructure_point,
-            [(model,) for model in models],
-            kappa,
-            **self._parallel(),
-            restructurer=restructurer,
+        # Step 4: all of them in one structure
+        structured = restructure_points(restructurer, local, points.kappa, runner)
+        local = [local[k] for k in structured.kept]
+        points = points.keep(structured.kept)
+        self.local_models_ = [model.lti for model in local]
+        self.structured_models_ = structured.models
+        self.restructurers_ = structured.restructurers
+        laps.mark("restructuring")
+
+        # Step 5: the parameters as functions of the scheduling variables
+        theta, kappa = structured.theta, points.kappa
+        self.interpolator_ = self._interpolator(len(points)).fit(kappa, theta)
+        self.lpv_ = LPVStateSpace(structured.structure, self.interpolator_, points.span)
+        self.operating_points_ = kappa
+        self.scheduling_range_ = points.identified_range
+        self.scheduling_names_ = as_list(self.scheduling)
+        self.parameters_, self.parameters_std_ = parameter_tables(structured, kappa)
+        found = (points, local, structured, self.parameters_std_, self.lpv_)
+        self.report_ = operating_point_report(*found, self.sampling_time_)
+        self.parameter_report_ = parameter_report(
+            self.parameters_, self.parameters_std_, self.lpv_.parameters(kappa)
         )
-        kept = [k for k, result in enumerate(found) if result is not None]
-        if not kept:
-            raise ValueError("every operating point failed; see the warnings.")
-        self.local_models_ = [models[k] for k in kept]
-        fitted = help_neighbours(
-            [found[k] for k in kept], self.local_models_, kappa[kept]
-        )
-        self.restructurers_ = fitted
-        self.structured_models_ = [r.lti_ for r in fitted]
-        return kept, fitted[0].structure_, np.array([r.params_ for r in fitted])
+        laps.mark("interpolation and report")
+        self.step_times_ = laps.seconds
+        return self
 
     # -- use -----------------------------------------------------------------------
 
@@ -303,6 +286,11 @@ list, default=None
         Returns
         -------
         ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Where a scheduling variable leaves `scheduling_range_`.
         """
         check_is_fitted(self, "lpv_")
         return self._simulate(self._read(X, None, reset=False), estimate=False)
@@ -330,34 +318,35 @@ list, default=None
         check_is_fitted(self, "lpv_")
         return [e.rows for e in self._read(X, None, reset=False)]
 
+    def summary(self) -> str:
+        """What was identified and how well, as text: ``print(pipeline.summary())``."""
+        check_is_fitted(self, "lpv_")
+        return summarise(self)
+
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
-        out = np.empty((sum(len(e.rows) for e in experiments), self.n_outputs_))
-        for e in experiments:
-            dt = e.sampling_time or self.sampling_time_
-            kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
-            x0 = None
-            if estimate:
-                forced = self.lpv_.simulate(e.inputs, kappa, dt)
-                columns = self.lpv_.free_responses(kappa, dt).reshape(forced.size, -1)
-                rest = (e.outputs - forced).ravel()
-                x0 = np.linalg.lstsq(columns, rest, rcond=None)[0]
-            out[e.rows] = self.lpv_.simulate(e.inputs, kappa, dt, x0)
+        if getattr(self.interpolator_, "extrapolation", None) != "clip":
+            warn_extrapolation(
+                experiments, self.scheduling_range_, self.scheduling_names_
+            )
+        with warnings.catch_warnings():  # said above, of all experiments at once
+            warnings.simplefilter("ignore", ExtrapolationWarning)
+            simulated = simulate_experiments(
+                self.lpv_, experiments, self.sampling_time_, estimate=estimate
+            )
+        out = in_table_order(experiments, simulated)
         return out[:, 0] if self._single_output else out
 
     # -- helpers -------------------------------------------------------------------
 
     def _read(self, X: Any, y: Any, *, reset: bool) -> list[Experiment]:
-        return read_experiments(
-            self,
-            X,
-            y,
-            inputs=self.inputs,
-            scheduling=self.scheduling,
-            experiment=self.experiment,
-            time=self.time,
-            operating_point=self.operating_point,
-            sampling_time=self.sampling_time if reset else None,
-            reset=reset,
+        roles: dict[str, Any] = {name: getattr(self, name) for name in ROLES}
+        options: dict[str, Any] = {"reset": reset}
+        if reset:
+            gaps = getattr(self.local, "missing", None) == "split"
+            options |= {"sampling_time": self.sampling_time, "allow_missing": gaps}
+        experiments = read_experiments(self, X, y, **roles, **options)
+        return (
+            split_at_gaps(experiments) if options.get("allow_missing") else experiments
         )
 
     def _sampling_time(self, experiments: list[Experiment]) -> float:
@@ -368,12 +357,10 @@ list, default=None
             return positive_time("sampling_time", self.sampling_time)
         return float(getattr(self.local, "sampling_time", 1.0))
 
-    def _parallel(self) -> dict[str, Any]:
-        return {
-            "n_jobs": self.n_jobs,
-            "verbose": self.verbose,
-            "on_error": self.on_error,
-        }
+    def _runner(self) -> PointRunner:
+        steps = {"local": self.local, "restructurer": self.restructurer}
+        memory = checked_memory(self.memory, steps)
+        return PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
 
     def _restructurer(self) -> Any:
         """The restructurer to clone, or None for "passthrough"."""
@@ -384,11 +371,11 @@ list, default=None
         return self.restructurer
 
     def _interpolator(self, n_points: int) -> Any:
-        if n_points == 1:  # one point carries a constant
+        if n_points == 1:
             return PolynomialLPV(degree=0)
-        return (
-            PolynomialLPV() if self.interpolator is None else clone(self.interpolator)
-        )
+        if self.interpolator is None:
+            return PolynomialLPV(degree=min(2, n_points - 1))
+        return clone(self.interpolator)
 
     def _check_options(self) -> None:
         for name, value, allowed in (
@@ -398,18 +385,9 @@ list, default=None
         ):
             if value not in allowed:
                 raise ValueError(f"`{name}` must be one of {allowed}. Got {value!r}.")
-        if isinstance(self.restructurer, str) and self.restructurer != "passthrough":
-            raise ValueError(
-                "`restructurer` must be an estimator, 'passthrough' or None. Got "
-                f"{self.restructurer!r}."
-            )
+        check_steps({name: getattr(self, name) for name in _DEFAULTS})
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
         tags.regressor_tags.poor_score = True
         return tags
-
-
-def _has_auto_order(local: Any) -> bool:
-    order = local.get_params(deep=False).get("order")
-    return isinstance(order, str) and order == "auto"

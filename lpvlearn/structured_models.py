@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
 
+from .local_models import LocalModel
 from .numerics.balancing import align_signs
+from .parallel import PointRunner
 from .statespace import StateSpace
 from .structures import GrayBoxStructure
 
@@ -20,17 +23,95 @@ _NEIGHBOURS = 2
 _BETTER = 0.98  # a neighbour's start must lower the least-squares error by that
 
 
-def restructure_point(model: StateSpace, *, restructurer: Any) -> Any:
+@dataclass(frozen=True)
+class StructuredModels:
+    """Models of one structure at the operating points.
+
+    Attributes
+    ----------
+    structure : GrayBoxStructure
+    theta : ndarray of shape (n_points, n_params)
+        Parameters.
+    models : list of StateSpace
+    restructurers : list
+        The fitted restructurers; empty without that step.
+    kept : list of int
+        The operating points, of those given, that did not fail.
+    """
+
+    structure: GrayBoxStructure
+    theta: Array
+    models: list[StateSpace]
+    restructurers: list[Any]
+    kept: list[int]
+
+
+def restructure_points(
+    restructurer: Any, local: Sequence[LocalModel], kappa: Array, runner: PointRunner
+) -> StructuredModels:
+    """Bring the local models of all operating points into one structure.
+
+    Parameters
+    ----------
+    restructurer : estimator or None
+        Like `GrayBoxRestructurer`; None takes the entries of balanced models as they
+        are.
+    local : sequence of LocalModel
+    kappa : ndarray of shape (n_points, n_scheduling)
+    runner : PointRunner
+    """
+    if restructurer is None:
+        structure, theta = balanced_entries([model.lti for model in local])
+        balanced = [structure.model(row) for row in theta]
+        return StructuredModels(structure, theta, balanced, [], list(range(len(theta))))
+    # What a fit is about: the model, and where they are known its realizations.
+    tasks = [
+        (_plain(model.lti), [_plain(other) for other in model.realizations])
+        for model in local
+    ]
+    found = runner.run(
+        "restructuring", restructure_point, tasks, kappa, restructurer=restructurer
+    )
+    kept = [k for k, result in enumerate(found) if result is not None]
+    helped = runner.memory.cache(help_neighbours, ignore=["fitted"])(
+        [found[k] for k in kept], [tasks[k] for k in kept], kappa[kept], restructurer
+    )
+    theta = np.array([fitted.params_ for fitted in helped])
+    structured = [fitted.lti_ for fitted in helped]
+    return StructuredModels(helped[0].structure_, theta, structured, helped, kept)
+
+
+def restructure_point(
+    model: StateSpace,
+    realizations: Sequence[StateSpace],
+    *,
+    restructurer: Any,
+    **options: Any,
+) -> Any:
     """A clone of the restructurer, fitted to one local model."""
-    return clone(restructurer).fit_model(model)
+    if len(realizations) > 1:
+        options["realizations"] = realizations
+    return clone(restructurer).fit_model(model, **options)
 
 
 def help_neighbours(
-    fitted: Sequence[Any], models: Sequence[StateSpace], kappa: Array
+    fitted: Sequence[Any],
+    tasks: Sequence[tuple[StateSpace, list[StateSpace]]],
+    kappa: Array,
+    restructurer: Any,
 ) -> list[Any]:
     """Try the parameters of neighbouring points as starts, until nothing improves.
 
     A point in a wrong basin is one that its neighbours' parameters lead out of.
+
+    Parameters
+    ----------
+    fitted : sequence of estimators
+        The restructurer fitted to every model: they follow from the other arguments.
+    tasks : sequence of tuple
+        Model and realizations of every point.
+    kappa : ndarray of shape (n_points, n_scheduling)
+    restructurer : estimator
     """
     fitted = list(fitted)
     span = np.ptp(kappa, axis=0)
@@ -39,7 +120,7 @@ def help_neighbours(
     tried: set[tuple[int, bytes]] = set()
     for _ in range(_SWEEPS):
         improved = False
-        for i, model in enumerate(models):
+        for i, task in enumerate(tasks):
             for j in np.argsort(distance[i], kind="stable")[1 : 1 + _NEIGHBOURS]:
                 start = fitted[j].params_
                 key = (i, start.tobytes())
@@ -47,12 +128,20 @@ def help_neighbours(
                     continue
                 tried.add(key)
                 own = fitted[i].fit_error_
-                if fitted[i].start_error(model, start) < _BETTER * own:
-                    fitted[i] = clone(fitted[i]).fit_model(model, starts=[start])
+                if fitted[i].start_error(task[0], start) < _BETTER * own:
+                    fitted[i] = restructure_point(
+                        *task, restructurer=restructurer, starts=[start]
+                    )
                     improved = True
         if not improved:
             break
     return fitted
+
+
+def _plain(model: StateSpace) -> StateSpace:
+    """The model with matrices laid out as a memory returns them, to be found there."""
+    A, B, C, D = (np.array(M, order="C") for M in (model.A, model.B, model.C, model.D))
+    return StateSpace(A, B, C, D, model.sampling_time)
 
 
 def balanced_entries(models: Sequence[StateSpace]) -> tuple[GrayBoxStructure, Array]:

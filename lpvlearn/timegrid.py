@@ -15,9 +15,9 @@ _SAMPLING_TIME_RTOL = 1e-4
 
 _USE_INSTEAD = (
     "A dynamic model needs the samples of an experiment complete and in the order of "
-    "time. Do not shuffle rows: split by experiment with GroupKFold or "
-    "LeaveOneGroupOut, or in time with TimeSeriesSplit; resample a record that was "
-    "taken unevenly."
+    "time. Do not shuffle rows: split by experiment with ExperimentSplit, GroupKFold "
+    "or LeaveOneGroupOut, or in time with BlockedTimeSeriesSplit or TimeSeriesSplit; "
+    "resample a record that was taken unevenly."
 )
 
 

@@ -4,8 +4,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    LPVStateSpace,
+    PolynomialLPV,
+)
 
+ROLES = {"scheduling": "kappa", "experiment": "run", "time": "time"}
 KAPPA = (0.0, 0.5, 1.0, 1.5)
 
 
@@ -70,6 +77,12 @@ def spring_sweep(n_samples=1500, seed=9):
         }
     )
     return X, pd.DataFrame(y, columns=["position"])
+
+
+def spring_pipeline(**options):
+    """A pipeline with the spring's structure and columns."""
+    options = {"restructurer": GrayBoxRestructurer(spring_structure()), **options}
+    return LocalLPVPipeline(**ROLES, **options)
 
 
 @pytest.fixture(scope="session")

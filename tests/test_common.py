@@ -14,7 +14,13 @@ ESTIMATORS = [SubspaceLTI, GrayBoxRestructurer, PolynomialLPV, LocalLPVPipeline]
 # The checks fit tables of independent samples, which no dynamic model explains.
 @pytest.mark.filterwarnings("ignore:The model explains next to nothing")
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
-@parametrize_with_checks([LocalLPVPipeline()])
+@parametrize_with_checks(
+    [
+        LocalLPVPipeline(),
+        LocalLPVPipeline(restructurer="passthrough"),
+        LocalLPVPipeline(combine="average", on_error="skip"),
+    ]
+)
 def test_common_checks(estimator, check):
     check(estimator)
 

@@ -205,6 +205,20 @@ def test_weights_score_a_single_output(data):
     assert make_bft_scorer(multioutput=[0, 1])(model, X, y) == pytest.approx(raw[1])
 
 
+@pytest.mark.parametrize("average", ["pool", "experiment"])
+def test_raw_values_score_every_output_by_name(data, average):
+    model, X, y = data
+    raw = make_vaf_scorer(multioutput="raw_values", average=average)
+    first, second = (
+        make_vaf_scorer(multioutput=weights, average=average)(model, X, y)
+        for weights in ([1, 0], [0, 1])
+    )
+    assert raw(model, X, y) == pytest.approx({"VAF_vx": first, "VAF_vy": second})
+    folds = {"cv": GroupKFold(3), "groups": X["run"]}
+    results = cross_validate(model, X, y, scoring=raw, **folds)
+    assert results["test_VAF_vy"].shape == (3,)
+
+
 def test_scorers_serve_scikit_learns_model_selection(data):
     model, X, y = data
     scoring = {
@@ -306,7 +320,7 @@ def test_the_report_of_any_regressor_is_one_experiment():
         (lambda: make_bft_scorer(initial_state="zero"), ["`initial_state`", "'zero'"]),
         (lambda: make_bft_scorer(burn_in=-1), ["`burn_in`", "-1"]),
         (lambda: make_vaf_scorer(burn_in=0.5), ["`burn_in`", "0.5"]),
-        (lambda: make_bft_scorer(multioutput="raw_values"), ["`multioutput`", "one"]),
+        (lambda: make_bft_scorer(multioutput="mean"), ["`multioutput`", "'mean'"]),
         (lambda: make_bft_scorer(average="mean"), ["`average`", "'mean'"]),
     ],
 )

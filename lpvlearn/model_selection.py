@@ -1,0 +1,380 @@
+"""Splits of tables of experiments that respect time.
+
+A dynamic model needs the samples of an experiment complete and in order, so that rows
+cannot be dealt out like cards. `ExperimentSplit` holds out whole experiments or whole
+operating points, `BlockedTimeSeriesSplit` the later part of every experiment.
+
+Examples
+--------
+Two experiments at each of four operating points of a spring that stiffens:
+
+>>> import numpy as np
+>>> from sklearn.model_selection import GridSearchCV, cross_validate
+>>> from lpvlearn import ExperimentSplit, GrayBoxRestructurer, GrayBoxStructure
+>>> from lpvlearn import LocalLPVPipeline, SubspaceLTI, bft_scorer, from_trajectories
+>>> spring = GrayBoxStructure.from_template(
+...     A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0]])
+>>> rng = np.random.default_rng(0)
+>>> trajectories = []
+>>> for kappa in np.repeat([0.0, 1.0, 2.0, 3.0], 2):
+...     model = spring.model({"k": 4 + kappa**2, "c": 1})
+...     u = np.sign(rng.standard_normal(200))
+...     y = model.simulate(u, sampling_time=0.1)
+...     trajectories.append((u, kappa, y + 0.002 * rng.standard_normal(y.shape)))
+>>> X, y = from_trajectories(trajectories, sampling_time=0.1)
+>>> roles = {"scheduling": "kappa", "experiment": "experiment"}
+>>> pipeline = LocalLPVPipeline(
+...     SubspaceLTI(order=2, horizon=10, feedthrough=False),
+...     GrayBoxRestructurer(spring), time="time", **roles)
+
+How well a new experiment is simulated:
+
+>>> cv = ExperimentSplit(2, **roles)
+>>> scores = cross_validate(
+...     pipeline, X, y, cv=cv, scoring={"BFT": bft_scorer, "R2": "r2"})
+>>> bool((scores["test_BFT"] > 90).all())
+True
+
+The degree that best predicts an operating point from the others. With ``memory=`` of
+the pipeline, nothing is identified twice:
+
+>>> cv = ExperimentSplit("all", hold_out="operating_point", interior=True, **roles)
+>>> search = GridSearchCV(
+...     pipeline, {"interpolator__degree": [0, 1, 2]}, cv=cv, scoring=bft_scorer)
+>>> search.fit(X, y).best_params_
+{'interpolator__degree': 2}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.model_selection import BaseCrossValidator
+from sklearn.utils import check_random_state
+from sklearn.utils.validation import check_consistent_length
+
+from .arguments import whole_number
+from .columns import Column, Table, is_table
+from .experiments import Experiment, group_rows, operating_point_of
+from .operating_points import group_operating_points
+
+__all__ = ["BlockedTimeSeriesSplit", "ExperimentSplit"]
+
+Indices = NDArray[np.intp]
+
+
+class ExperimentSplit(BaseCrossValidator):
+    """Folds of whole experiments, or of whole operating points.
+
+    Unlike scikit-learn's ``GroupKFold`` it knows the columns itself (no `groups`), and
+    deals the experiments of every operating point evenly to the folds: as long as a
+    point has an experiment left, the training set has it.
+
+    Parameters
+    ----------
+    n_splits : int or "all", default=5
+        Number of folds; "all" leaves out one experiment (one point) at a time.
+    experiment : column name or position, default=None
+        Column that tells experiments apart; None reads `groups` of ``split``.
+    scheduling : column name, position or list, default=None
+        Experiments are grouped to operating points by the mean of these columns.
+    operating_point : column name or position, default=None
+        Groups them by label instead.
+    hold_out : {"experiment", "operating_point"}, default="experiment"
+        "operating_point" predicts points that training has not seen.
+    interior : bool, default=False
+        With ``hold_out="operating_point"``: only points inside the range of the others
+        are held out, so that nothing is extrapolated.
+    shuffle : bool, default=False
+        Whether experiments (points) go to the folds at random.
+    random_state : int, RandomState instance or None, default=None
+        Of the shuffle.
+
+    Notes
+    -----
+    Training rows come experiment by experiment, one of every operating point before the
+    second of any: a prefix of them, as ``learning_curve`` takes it, covers the
+    points as evenly as it can.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from lpvlearn.model_selection import ExperimentSplit
+    >>> X = pd.DataFrame({"u": 0.0, "kappa": [0.1] * 4 + [0.9] * 4,
+    ...                   "run": [1, 1, 2, 2, 3, 3, 4, 4]})
+    >>> cv = ExperimentSplit(2, experiment="run", scheduling="kappa")
+    >>> for train, test in cv.split(X):
+    ...     print(X["run"].iloc[train].unique(), X["run"].iloc[test].unique())
+    [2 4] [1 3]
+    [1 3] [2 4]
+    """
+
+    def __init__(
+        self,
+        n_splits: int | str = 5,
+        *,
+        experiment: Any = None,
+        scheduling: Any = None,
+        operating_point: Any = None,
+        hold_out: str = "experiment",
+        interior: bool = False,
+        shuffle: bool = False,
+        random_state: Any = None,
+    ) -> None:
+        self.n_splits = n_splits
+        self.experiment = experiment
+        self.scheduling = scheduling
+        self.operating_point = operating_point
+        self.hold_out = hold_out
+        self.interior = interior
+        self.shuffle = shuffle
+        self.random_state = random_state
+
+    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
+        """Number of folds.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+            Needed with ``n_splits="all"``.
+        y : object
+            Ignored.
+        groups : array-like of shape (n_samples,), optional
+            Labels of the experiments, without the `experiment` column.
+
+        Returns
+        -------
+        int
+        """
+        if self.n_splits != "all":
+            return whole_number("n_splits", self.n_splits, 2)
+        if X is None:
+            raise ValueError("`X` must be given to count the folds of n_splits='all'.")
+        return len(self._folds(self._read(X, groups)[1]))
+
+    def split(
+        self, X: Any, y: Any = None, groups: Any = None
+    ) -> Iterator[tuple[Indices, Indices]]:
+        """Yield the rows of every training and test set.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : object
+            Ignored.
+        groups : array-like of shape (n_samples,), optional
+            Labels of the experiments, without the `experiment` column.
+
+        Yields
+        ------
+        train, test : ndarray of int
+
+        Raises
+        ------
+        ValueError
+            When there are fewer experiments (points) than folds, or a column is
+            missing.
+        """
+        experiments, point = self._read(X, groups)
+        for held_out in self._folds(point):
+            kept = np.array([k for k in range(len(point)) if k not in held_out])
+            order = kept[np.lexsort((point[kept], _turns(point[kept])))]
+            train = [experiments[k].rows for k in order]
+            test = [experiments[k].rows for k in sorted(held_out)]
+            yield np.concatenate(train), np.concatenate(test)
+
+    def _read(self, X: Any, groups: Any) -> tuple[list[Experiment], Indices]:
+        """Experiments, and the operating point of each."""
+        if self.hold_out not in ("experiment", "operating_point"):
+            raise ValueError(
+                "`hold_out` must be 'experiment' or 'operating_point'. Got "
+                f"{self.hold_out!r}."
+            )
+        by_point = self.scheduling is not None or self.operating_point is not None
+        if self.hold_out == "operating_point" and not by_point:
+            raise ValueError(
+                "`scheduling` or `operating_point` must name a column to hold out "
+                "operating points. Got None for both."
+            )
+        experiments = read_rows(X, groups, self)
+        if not by_point:
+            return experiments, np.zeros(len(experiments), dtype=np.intp)
+        return experiments, group_operating_points(experiments)[0]
+
+    def _folds(self, point: Indices) -> list[set[int]]:
+        """Numbers of the experiments that every fold holds out."""
+        # Neighbours go to different folds: the experiments of one point.
+        units = [[k] for k in np.argsort(point, kind="stable")]
+        if self.hold_out == "operating_point":
+            units = [np.flatnonzero(point == k).tolist() for k in range(max(point) + 1)]
+            units = units[1:-1] if self.interior else units
+        n_units = len(units)
+        if self.shuffle:
+            order = check_random_state(self.random_state).permutation(n_units)
+            if self.hold_out == "experiment":
+                order = order[
+                    np.argsort(point[[units[k][0] for k in order]], kind="stable")
+                ]
+            units = [units[k] for k in order]
+        n_splits = n_units
+        if self.n_splits != "all":
+            n_splits = whole_number("n_splits", self.n_splits, 2)
+        if not 0 < n_splits <= n_units or len(point) == 1:
+            what = self.hold_out.replace("_", " ")
+            inside = " inside the range of the others" if self.interior else ""
+            raise ValueError(
+                f"`n_splits` must be at most the number of {what}s{inside}. Got "
+                f"{self.n_splits!r} for {n_units}. The column `experiment` (or the "
+                "argument `groups` of split) tells experiments apart."
+            )
+        return [
+            {k for unit in units[fold::n_splits] for k in unit}
+            for fold in range(n_splits)
+        ]
+
+
+class BlockedTimeSeriesSplit(BaseCrossValidator):
+    """Folds in time, the same in every experiment: the past trains, the next tests.
+
+    Every experiment is cut into ``n_splits + 1`` blocks of successive samples. Fold k
+    trains on the first k blocks of all experiments and tests on block k + 1, after a
+    gap. scikit-learn's ``TimeSeriesSplit`` cuts the table instead, whose later rows
+    are other experiments.
+
+    Parameters
+    ----------
+    n_splits : int, default=5
+    gap : int, default=0
+        Samples left out of every experiment between training and test.
+    max_train_size : int, default=None
+        Most samples of an experiment to train on, its latest; None is all.
+    experiment : column name or position, default=None
+        Column that tells experiments apart; None reads `groups` of ``split``, else
+        takes the table as one experiment.
+
+    Notes
+    -----
+    The test parts start in the middle of an experiment, not at rest: score them with
+    ``make_bft_scorer(initial_state="estimate")``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lpvlearn.model_selection import BlockedTimeSeriesSplit
+    >>> X = np.column_stack([np.zeros(12), np.repeat([0, 1], 6)])
+    >>> for train, test in BlockedTimeSeriesSplit(2, experiment=1).split(X):
+    ...     print(train, test)
+    [0 1 6 7] [2 3 8 9]
+    [0 1 2 3 6 7 8 9] [ 4  5 10 11]
+    """
+
+    def __init__(
+        self,
+        n_splits: int = 5,
+        *,
+        gap: int = 0,
+        max_train_size: int | None = None,
+        experiment: Any = None,
+    ) -> None:
+        self.n_splits = n_splits
+        self.gap = gap
+        self.max_train_size = max_train_size
+        self.experiment = experiment
+
+    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
+        """Number of folds.
+
+        Parameters
+        ----------
+        X, y, groups : object
+            Ignored.
+
+        Returns
+        -------
+        int
+        """
+        return whole_number("n_splits", self.n_splits, 1)
+
+    def split(
+        self, X: Any, y: Any = None, groups: Any = None
+    ) -> Iterator[tuple[Indices, Indices]]:
+        """Yield the rows of every training and test set.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : object
+            Ignored.
+        groups : array-like of shape (n_samples,), optional
+            Labels of the experiments, without the `experiment` column.
+
+        Yields
+        ------
+        train, test : ndarray of int
+
+        Raises
+        ------
+        ValueError
+            When an experiment is too short for the folds and the gap.
+        """
+        n_splits, gap = self.get_n_splits(), whole_number("gap", self.gap, 0)
+        longest = self.max_train_size
+        if longest is not None:
+            longest = whole_number("max_train_size", longest, 1)
+        experiments = read_rows(X, groups, self)
+        for e in experiments:
+            block = len(e.rows) // (n_splits + 1)
+            if block <= gap:
+                raise ValueError(
+                    "`gap` must be shorter than a block of every experiment. Got "
+                    f"{gap}, and blocks of {block} samples in experiment {e.label!r} "
+                    f"({len(e.rows)} samples, n_splits={n_splits})."
+                )
+        for fold in range(1, n_splits + 1):
+            train, test = [], []
+            for e in experiments:
+                edges = np.linspace(0, len(e.rows), n_splits + 2).astype(int)
+                begin = 0 if longest is None else max(0, edges[fold] - longest)
+                train.append(e.rows[begin : edges[fold]])
+                test.append(e.rows[edges[fold] + gap : edges[fold + 1]])
+            yield np.concatenate(train), np.concatenate(test)
+
+
+def read_rows(X: Any, groups: Any, roles: Any) -> list[Experiment]:
+    """Experiments of a table for a splitter: their rows, and their operating points.
+
+    Parameters
+    ----------
+    X : DataFrame or array-like of shape (n_samples, n_features)
+    groups : array-like of shape (n_samples,) or None
+        Labels of the experiments, where `roles` names no column.
+    roles : object
+        With the attribute `experiment`, and maybe `scheduling`, `operating_point`.
+    """
+    table = Table(X if is_table(X) or hasattr(X, "dtype") else np.asarray(X, object))
+    by_label = table.one(roles.experiment, "experiment")
+    if by_label is None and groups is not None:
+        check_consistent_length(X, groups)
+        by_label = None, Column("groups", groups)
+    by_point = table.one(getattr(roles, "operating_point", None), "operating_point")
+    by_kappa = table.several(getattr(roles, "scheduling", None), "scheduling")
+    kappa = [column.numbers("X") for _, column in by_kappa]
+    labels, rows = group_rows(by_label, table.n_rows)
+    return [
+        Experiment(
+            label,
+            own,
+            inputs=np.empty((len(own), 0)),
+            scheduling=np.column_stack(kappa)[own] if kappa else None,
+            operating_point=operating_point_of(by_point, own, label),
+        )
+        for label, own in zip(labels, rows, strict=True)
+    ]
+
+
+def _turns(point: Indices) -> Indices:
+    """How many experiments of the same operating point came before each."""
+    return np.array([np.sum(point[:k] == p) for k, p in enumerate(point)])

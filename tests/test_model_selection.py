@@ -1,0 +1,450 @@
+"""Cross-validation with scikit-learn's tools, and the splitters of this library."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.compose import ColumnTransformer, TransformedTargetRegressor
+from sklearn.inspection import permutation_importance
+from sklearn.model_selection import (
+    GridSearchCV,
+    GroupKFold,
+    KFold,
+    LeaveOneGroupOut,
+    TimeSeriesSplit,
+    cross_val_predict,
+    cross_val_score,
+    cross_validate,
+    learning_curve,
+)
+from sklearn.pipeline import Pipeline
+from sklearn.preprocessing import StandardScaler
+
+from lpvlearn import (
+    BlockedTimeSeriesSplit,
+    ExperimentSplit,
+    GrayBoxRestructurer,
+    LocalLPVPipeline,
+    PolynomialLPV,
+    SubspaceLTI,
+    bft_score,
+    bft_scorer,
+    make_bft_scorer,
+    vaf_scorer,
+)
+
+from .conftest import (
+    ROLES,
+    spring_pipeline,
+    spring_structure,
+    spring_sweep,
+    spring_tables,
+)
+
+EXTRAPOLATES = pytest.mark.filterwarnings(
+    "ignore::lpvlearn.exceptions.ExtrapolationWarning"
+)
+ESTIMATE = make_bft_scorer(initial_state="estimate")
+
+
+class CountingSubspace(SubspaceLTI):
+    """Counts how often it is fitted."""
+
+    fits = 0
+
+    def fit(self, X, y):
+        type(self).fits += 1
+        return super().fit(X, y)
+
+
+class CountingRestructurer(GrayBoxRestructurer):
+    """Counts how often it is fitted to a model."""
+
+    fits = 0
+
+    def fit_model(self, *args, **options):
+        type(self).fits += 1
+        return super().fit_model(*args, **options)
+
+
+@pytest.fixture(scope="module")
+def data():
+    """Two realisations at each of four operating points, with a little noise."""
+    return spring_tables(noise=0.02, n_samples=300, n_repeats=2)
+
+
+@pytest.fixture
+def counted():
+    CountingSubspace.fits = CountingRestructurer.fits = 0
+    return {
+        "local": CountingSubspace(order=2, horizon=10),
+        "restructurer": CountingRestructurer(spring_structure()),
+    }
+
+
+def fixed_pipeline(**options):
+    """A pipeline without the search for a horizon, for speed."""
+    local = SubspaceLTI(order=2, horizon=10, feedthrough=False)
+    return spring_pipeline(local=local, **options)
+
+
+def repeat_of(X):
+    return X["run"].str[-1]
+
+
+# ----------------------------------------------------------------- scikit-learn's tools
+
+
+def test_cross_validation_by_experiment_with_several_scorers(data):
+    X, y = data
+    results = cross_validate(
+        fixed_pipeline(),
+        X,
+        y,
+        groups=repeat_of(X),
+        cv=GroupKFold(2),
+        scoring={"bft": bft_scorer, "vaf": vaf_scorer, "r2": "r2"},
+        error_score="raise",
+    )
+    assert (results["test_bft"] > 96).all()
+    assert (results["test_vaf"] > 99.8).all()
+    assert (results["test_r2"] > 0.998).all()
+
+
+@EXTRAPOLATES
+def test_every_operating_point_is_predicted_by_the_others(data):
+    X, y = data
+    scores = cross_val_score(
+        fixed_pipeline(),
+        X,
+        y,
+        groups=X["kappa"],
+        cv=LeaveOneGroupOut(),
+        scoring=bft_scorer,
+        error_score="raise",
+    )
+    assert scores.shape == (4,)
+    assert (scores > 95).all()  # the true parameters are a parabola
+
+
+def test_every_experiment_is_predicted_by_the_others(data):
+    X, y = data
+    scores = cross_val_score(
+        fixed_pipeline(), X, y, groups=X["run"], cv=LeaveOneGroupOut()
+    )
+    assert scores.shape == (8,)
+    assert (scores > 0.998).all()
+
+
+def test_out_of_fold_predictions_are_those_of_the_folds(data):
+    X, y = data
+    folds = {"groups": repeat_of(X), "cv": LeaveOneGroupOut()}
+    predicted = cross_val_predict(fixed_pipeline(), X, y, **folds)
+    held_out = (repeat_of(X) == "1").to_numpy()
+    model = fixed_pipeline().fit(X[~held_out], y[~held_out])
+    np.testing.assert_array_equal(predicted[held_out], model.predict(X[held_out]))
+    assert bft_score(y, predicted) > 96
+
+
+@EXTRAPOLATES
+def test_grid_search_over_all_three_steps_refits_the_best(data, tmp_path):
+    X, y = data
+    grid = {
+        "local__horizon": [6, 10],
+        "restructurer__norm": ["hinf", "h2"],
+        "interpolator__degree": [1, 2],
+    }
+    pipeline = fixed_pipeline(interpolator=PolynomialLPV(), memory=tmp_path)
+    cv = ExperimentSplit(
+        "all", experiment="run", scheduling="kappa", hold_out="operating_point"
+    )
+    search = GridSearchCV(pipeline, grid, scoring=bft_scorer, cv=cv).fit(X, y)
+    assert search.best_params_["interpolator__degree"] == 2
+    assert search.best_score_ > 95
+    fitted = search.best_estimator_
+    assert fitted.interpolator_.degree == 2
+    assert len(fitted.operating_points_) == 4
+    np.testing.assert_array_equal(search.predict(X), fitted.predict(X))
+
+
+@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
+def test_learning_curve_over_experiments_rises_with_their_number():
+    X, y = spring_tables(noise=0.3, n_samples=100, n_repeats=6)
+    sizes, _, scores = learning_curve(
+        fixed_pipeline(),
+        X,
+        y,
+        train_sizes=[4 * 100, 16 * 100],
+        cv=ExperimentSplit(3, experiment="run", scheduling="kappa"),
+        scoring=bft_scorer,
+        error_score="raise",
+    )
+    assert list(sizes) == [400, 1600]  # one, and four experiments at every point
+    mean = scores.mean(axis=1)
+    assert mean[1] > mean[0]
+
+
+def test_importance_of_inputs_by_permutation(data):
+    """Roles kept in the index are not permuted: only inputs are columns."""
+    X, y = data
+    rng = np.random.default_rng(0)
+    X = X.assign(idle=rng.choice([-1.0, 1.0], len(X)))
+    X = X.set_index(["run", "time", "kappa"])
+    model = LocalLPVPipeline(SubspaceLTI(order=2, horizon=10), **ROLES).fit(X, y)
+    assert list(model.feature_names_in_) == ["force", "idle"]
+    importance = permutation_importance(
+        model, X, y, scoring=bft_scorer, n_repeats=2, random_state=0
+    )
+    force, idle = importance["importances_mean"]
+    assert force > 90
+    assert abs(idle) < 1
+
+
+def test_a_transformed_target_is_transformed_back(data):
+    X, y = data
+    scaled = TransformedTargetRegressor(
+        LocalLPVPipeline(SubspaceLTI(order=2, horizon=10), **ROLES),
+        transformer=StandardScaler(with_mean=False),
+    ).fit(X, y)
+    plain = LocalLPVPipeline(SubspaceLTI(order=2, horizon=10), **ROLES).fit(X, y)
+    np.testing.assert_allclose(scaled.predict(X), plain.predict(X), atol=1e-3)
+    assert make_bft_scorer(burn_in=20)(scaled, X, y) > 96
+
+
+@pytest.mark.parametrize("output", ["pandas", "default"])
+def test_a_column_transformer_stands_in_front(data, output):
+    X, y = data
+    front = ColumnTransformer(
+        [("scale", StandardScaler(with_mean=False), ["force"])],
+        remainder="passthrough",
+        verbose_feature_names_out=False,
+    ).set_output(transform=output)
+    roles = (
+        ROLES if output == "pandas" else {"scheduling": 1, "experiment": 2, "time": 3}
+    )
+    model = Pipeline(
+        [
+            ("columns", front),
+            (
+                "lpv",
+                LocalLPVPipeline(
+                    SubspaceLTI(order=2, horizon=10, feedthrough=False),
+                    GrayBoxRestructurer(spring_structure()),
+                    **roles,
+                ),
+            ),
+        ]
+    ).fit(X, y)
+    direct = fixed_pipeline().fit(X, y)
+    np.testing.assert_allclose(model.predict(X), direct.predict(X), atol=1e-5)
+    assert ESTIMATE(model, X, y) > 97
+
+
+def test_two_processes_score_the_same(data):
+    X, y = data
+    options = {"groups": repeat_of(X), "cv": GroupKFold(2), "scoring": bft_scorer}
+    one = cross_val_score(fixed_pipeline(), X, y, **options)
+    two = cross_val_score(fixed_pipeline(), X, y, n_jobs=2, **options)
+    np.testing.assert_array_equal(two, one)
+
+
+@pytest.mark.parametrize("cv", [KFold(3, shuffle=True, random_state=0), KFold(3)])
+def test_splits_that_tear_experiments_raise_and_teach(data, cv):
+    X, y = data
+    if not cv.shuffle:  # contiguous blocks of a table in the order of time
+        X = X.sort_values("run", kind="stable").sort_values("time", kind="stable")
+    with pytest.raises(ValueError, match="split by experiment with ExperimentSplit"):
+        cross_val_score(fixed_pipeline(), X, y.loc[X.index], cv=cv, error_score="raise")
+
+
+# ---------------------------------------------------------------------------- memory
+
+
+def test_a_search_over_the_degree_identifies_nothing_twice(data, counted, tmp_path):
+    X, y = data
+    pipeline = LocalLPVPipeline(
+        **counted, interpolator=PolynomialLPV(), memory=tmp_path, **ROLES
+    )
+    grid = {"interpolator__degree": [0, 1, 2]}
+    cv = ExperimentSplit(2, experiment="run", scheduling="kappa")
+    search = GridSearchCV(pipeline, grid, cv=cv).fit(X, y)
+    # Two folds and the refit, four operating points each.
+    assert CountingSubspace.fits == 3 * 4
+    assert CountingRestructurer.fits == 3 * 4
+    again = LocalLPVPipeline(**counted, memory=str(tmp_path), **ROLES).fit(X, y)
+    assert CountingSubspace.fits == CountingRestructurer.fits == 3 * 4
+    pd.testing.assert_frame_equal(again.parameters_, search.best_estimator_.parameters_)
+    plain = LocalLPVPipeline(**counted, **ROLES).fit(X, y)
+    pd.testing.assert_frame_equal(again.parameters_, plain.parameters_)
+
+
+@EXTRAPOLATES
+def test_folds_share_the_operating_points_they_have_in_common(data, counted, tmp_path):
+    X, y = data
+    pipeline = LocalLPVPipeline(
+        **counted, interpolator=PolynomialLPV(), memory=tmp_path, **ROLES
+    )
+    cv = ExperimentSplit(
+        "all", experiment="run", scheduling="kappa", hold_out="operating_point"
+    )
+    cross_val_score(pipeline, X, y, cv=cv, error_score="raise")
+    assert CountingSubspace.fits == CountingRestructurer.fits == 4
+
+
+def test_another_solver_restructures_anew_but_does_not_identify(
+    data, counted, tmp_path
+):
+    X, y = data
+    pipeline = LocalLPVPipeline(**counted, memory=tmp_path, **ROLES).fit(X, y)
+    pipeline.set_params(restructurer__tol=1e-9).fit(X, y)
+    assert CountingSubspace.fits == 4
+    assert CountingRestructurer.fits == 8
+    pipeline.set_params(local__horizon=12).fit(X, y)
+    assert CountingSubspace.fits == 8
+    pipeline.fit(X, y + 1e-3)
+    assert CountingSubspace.fits == 12
+
+
+# -------------------------------------------------------------------------- splitters
+
+
+@pytest.fixture
+def table():
+    """Three operating points with 2, 3 and 1 experiments of 4 samples."""
+    runs = ["a", "b", "c", "d", "e", "f"]
+    kappa = [0.0, 1.0, 0.0, 2.0, 1.0, 1.0]
+    return pd.DataFrame(
+        {
+            "u": np.arange(24.0),
+            "run": np.repeat(runs, 4),
+            "kappa": np.repeat(kappa, 4),
+        }
+    )
+
+
+def runs_of(X, rows):
+    return list(X["run"].iloc[rows].unique())
+
+
+def test_experiments_are_held_out_whole_and_each_once(table):
+    for shuffle in (False, True):
+        cv = ExperimentSplit(3, experiment="run", shuffle=shuffle, random_state=0)
+        tested = []
+        for train, test in cv.split(table):
+            assert set(runs_of(table, train)).isdisjoint(runs_of(table, test))
+            assert sorted([*train, *test]) == list(range(24))
+            tested += runs_of(table, test)
+        assert sorted(tested) == list("abcdef")
+        assert cv.get_n_splits() == 3
+
+
+def test_experiments_of_a_point_are_dealt_evenly(table):
+    cv = ExperimentSplit(2, experiment="run", scheduling="kappa")
+    for cv.shuffle in (False, True):
+        for train, _ in cv.split(table):
+            seen = table["kappa"].iloc[train]
+            assert {0.0, 1.0} <= set(seen)
+
+
+def test_operating_points_are_held_out_whole(table):
+    cv = ExperimentSplit(
+        "all", experiment="run", scheduling="kappa", hold_out="operating_point"
+    )
+    held_out = [sorted(runs_of(table, test)) for _, test in cv.split(table)]
+    assert held_out == [["a", "c"], ["b", "e", "f"], ["d"]]
+    assert cv.get_n_splits(table) == 3
+    inner = ExperimentSplit(
+        "all",
+        experiment="run",
+        scheduling="kappa",
+        hold_out="operating_point",
+        interior=True,
+    )
+    ((train, test),) = inner.split(table)
+    assert runs_of(table, test) == ["b", "e", "f"]
+    assert len(train) == 12
+
+
+def test_a_prefix_of_the_training_rows_covers_the_points(table):
+    cv = ExperimentSplit("all", experiment="run", scheduling="kappa")
+    for train, _ in cv.split(table):
+        points = set(table["kappa"].iloc[train])
+        first = train[: 4 * len(points)]
+        assert set(table["kappa"].iloc[first]) == points
+
+
+def test_labels_of_experiments_may_come_as_groups(table):
+    named = ExperimentSplit(3, experiment="run").split(table)
+    given = ExperimentSplit(3).split(table[["u"]], groups=table["run"])
+    for (train, test), (train2, test2) in zip(named, given, strict=True):
+        np.testing.assert_array_equal(train, train2)
+        np.testing.assert_array_equal(test, test2)
+
+
+def test_blocks_test_what_comes_after_the_training_in_every_experiment(table):
+    X = pd.concat([table, table]).sort_values("run", kind="stable")  # 8 samples each
+    cv = BlockedTimeSeriesSplit(3, gap=1, experiment="run")
+    for fold, (train, test) in enumerate(cv.split(X), start=1):
+        for run in "abcdef":
+            own = np.flatnonzero(X["run"] == run)
+            assert [r for r in train if r in own] == list(own[: 2 * fold])
+            assert [r for r in test if r in own] == list(
+                own[2 * fold + 1 : 2 * fold + 2]
+            )
+    rolling = BlockedTimeSeriesSplit(3, max_train_size=3, experiment="run")
+    train, _ = list(rolling.split(X))[-1]
+    assert len(train) == 6 * 3
+
+
+def test_blocks_without_experiments_are_one_record():
+    cv = BlockedTimeSeriesSplit(4)
+    X = np.zeros((50, 1))
+    for (train, test), (ours, own) in zip(
+        TimeSeriesSplit(4).split(X), cv.split(X), strict=True
+    ):
+        np.testing.assert_array_equal(train, ours)
+        np.testing.assert_array_equal(test, own)
+
+
+def test_later_parts_of_experiments_are_predicted_from_estimated_states(data):
+    X, y = data
+    cv = BlockedTimeSeriesSplit(2, gap=10, experiment="run")
+    scores = {
+        "rest": bft_scorer,
+        "estimate": ESTIMATE,
+        "burnt": make_bft_scorer(burn_in=40),
+    }
+    results = cross_validate(
+        fixed_pipeline(), X, y, cv=cv, scoring=scores, error_score="raise"
+    )
+    assert (results["test_estimate"] > 95).all()
+    assert (results["test_rest"] < results["test_estimate"] - 5).all()
+    assert (results["test_burnt"] > results["test_rest"]).all()
+
+
+# -------------------------------------------------------------------- choosing a degree
+
+
+def test_points_left_out_choose_the_degree_that_the_sweep_confirms(tmp_path):
+    """The arm at full size: tests/benchmarks/choose_degree.py."""
+    kappas = np.linspace(0, 1.5, 6)
+    X, y = spring_tables(noise=0.05, n_samples=200, n_repeats=2, kappas=kappas)
+    X_sweep, y_sweep = spring_sweep()
+    pipeline = fixed_pipeline(interpolator=PolynomialLPV(), memory=tmp_path)
+    cv = ExperimentSplit(
+        "all",
+        experiment="run",
+        scheduling="kappa",
+        hold_out="operating_point",
+        interior=True,
+    )
+    degrees = [0, 1, 2, 3, 4]
+    search = GridSearchCV(
+        pipeline, {"interpolator__degree": degrees}, scoring=bft_scorer, cv=cv
+    ).fit(X, y)
+    sweep = [
+        bft_scorer(
+            pipeline.set_params(interpolator__degree=d).fit(X, y), X_sweep, y_sweep
+        )
+        for d in degrees
+    ]
+    assert search.best_params_["interpolator__degree"] == np.argmax(sweep) == 2
