@@ -12,6 +12,7 @@ from sklearn.base import clone
 
 from .local_models import LocalModel
 from .numerics.balancing import align_signs
+from .numerics.starts import GOOD_FIT
 from .parallel import PointRunner
 from .statespace import StateSpace
 from .structures import GrayBoxStructure
@@ -102,7 +103,8 @@ def help_neighbours(
 ) -> list[Any]:
     """Try the parameters of neighbouring points as starts, until nothing improves.
 
-    A point in a wrong basin is one that its neighbours' parameters lead out of.
+    A point in a wrong basin is one that its neighbours' parameters lead out of. Points
+    that fit well need no help.
 
     Parameters
     ----------
@@ -121,6 +123,8 @@ def help_neighbours(
     for _ in range(_SWEEPS):
         improved = False
         for i, task in enumerate(tasks):
+            if fitted[i].fit_error_ <= GOOD_FIT:
+                continue
             for j in np.argsort(distance[i], kind="stable")[1 : 1 + _NEIGHBOURS]:
                 start = fitted[j].params_
                 key = (i, start.tobytes())
