@@ -1,6 +1,7 @@
 """Local linear parameter-varying (LPV) identification."""
 
 from .experiments import from_trajectories
+from .innovation_model import InnovationModel
 from .interpolation import PolynomialLPV
 from .lpv import LPVStateSpace
 from .metrics import (
@@ -28,6 +29,7 @@ __all__ = [
     "ExperimentSplit",
     "GrayBoxRestructurer",
     "GrayBoxStructure",
+    "InnovationModel",
     "LPVStateSpace",
     "LocalLPVPipeline",
     "PolynomialLPV",

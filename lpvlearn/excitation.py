@@ -137,7 +137,7 @@ def reduce_inputs(pairs: Pairs) -> tuple[Pairs, Array]:
         "effects are not identifiable and the smallest solution was taken. Excite the "
         "inputs independently.",
         RankWarning,
-        stacklevel=4,
+        stacklevel=5,
     )
     return [(u @ basis, y) for u, y in pairs], basis
 

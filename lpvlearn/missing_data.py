@@ -16,6 +16,14 @@ Pairs = list[tuple[Array, Array]]
 DETRENDS = (None, "constant", "linear")
 
 
+def has_gaps(experiment: Experiment) -> bool:
+    """Whether an input or an output of an experiment is missing."""
+    found = np.isnan(experiment.inputs).any()
+    if experiment.outputs is not None:
+        found |= np.isnan(experiment.outputs).any()
+    return bool(found)
+
+
 def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
     """Cut experiments where an input or an output is missing.
 
@@ -43,21 +51,26 @@ def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
     >>> [part.rows.tolist() for part in split_at_gaps([whole])]
     [[0, 1], [3, 4, 5]]
     """
-    parts = []
-    for experiment in experiments:
-        complete = np.isfinite(experiment.inputs).all(axis=1)
-        if experiment.outputs is not None:
-            complete &= np.isfinite(experiment.outputs).all(axis=1)
-        edges = np.flatnonzero(np.diff(complete, prepend=False, append=False))
-        for start, stop in edges.reshape(-1, 2):
-            if stop - start >= 2:
-                parts.append(_rows(experiment, slice(start, stop)))
+    parts = [part for e in experiments for part in complete_runs(e)]
     if not parts:
         raise ValueError(
             "missing='split' needs runs of at least 2 consecutive complete samples. "
             "Got none: check X and y for columns that are NaN throughout."
         )
     return parts
+
+
+def complete_runs(experiment: Experiment) -> list[Experiment]:
+    """Runs of at least two consecutive samples of which nothing is missing."""
+    complete = np.isfinite(experiment.inputs).all(axis=1)
+    if experiment.outputs is not None:
+        complete &= np.isfinite(experiment.outputs).all(axis=1)
+    edges = np.flatnonzero(np.diff(complete, prepend=False, append=False))
+    return [
+        _rows(experiment, slice(start, stop))
+        for start, stop in edges.reshape(-1, 2)
+        if stop - start >= 2
+    ]
 
 
 def _rows(experiment: Experiment, part: slice) -> Experiment:

@@ -2,36 +2,40 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
-from .exceptions import RankWarning
-from .excitation import check_excitation, check_size, reduce_inputs
 from .experiments import Experiment, read_experiments
-from .numerics.identification import (
-    Identified,
-    identify,
-    scale_records,
-)
-from .numerics.realization import METHODS
-from .numerics.selection import Candidate, Selection, select
+from .missing_data import split_at_gaps
 from .numerics.simulationfit import estimate_initial_state
-from .statespace import StateSpace
+from .subspace_fit import LocalFit, find_better_horizon, fit_pairs
+from .subspace_options import (
+    Choices,
+    check_options,
+    selection_table,
+    selection_text,
+    warn_about,
+    warn_about_horizon,
+)
+from .subspace_statistics import SimulationErrorStatistics, outputs_of
+from .subspace_streaming import StreamedFit
 
 Array = NDArray[np.float64]
-
-# A model that explains less than this share of the outputs' size is reported.
-_USELESS_FIT = 0.1
+Pairs = list[tuple[Array, Array]]
 
 
-class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class SubspaceLTI(
+    StreamedFit,
+    SimulationErrorStatistics,
+    MultiOutputMixin,
+    RegressorMixin,
+    BaseEstimator,
+):
     """Linear time-invariant state-space model by subspace identification.
 
     The observability matrix is estimated from compressed block-Hankel data by one of
@@ -55,13 +59,26 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     sampling_time : float, default=1.0
         Seconds between samples. With a `time` column the default stands for the
         column's own step; any other value must agree with it.
-    feedthrough : bool, default=True
-        Whether the input acts on the output at once; False fixes ``D = 0``.
+    feedthrough : bool or array-like of bool, default=True
+        Whether an input acts on an output at once; False fixes ``D = 0``, a table of
+        shape (n_outputs, n_inputs) single entries of D.
     refine : bool, default=True
         Whether to minimise the simulation error after the subspace step.
     stability : {"warn", "enforce"}, default="warn"
         "warn" keeps an unstable model, with a warning, where a stable one fits
-        clearly worse; "enforce" reflects unstable poles into the unit circle.
+        clearly worse; "enforce" returns a stable one and reports in
+        `stability_loss_` what that cost.
+    n_noise_states : int or "auto", default="auto"
+        States of the noise model in `predictor_`. A number also raises the order of
+        the subspace step by that much, which makes "po-moesp" consistent under
+        coloured noise without refinement; only states that the inputs reach are
+        kept in `lti_`.
+    detrend : {None, "constant", "linear"}, default=None
+        Subtract its mean or straight line from every channel of every experiment.
+        Predictions are then about the means of all training samples.
+    missing : {"raise", "split"}, default="raise"
+        "split" ends an experiment before a sample with NaN and starts another after
+        it, with an initial state of its own.
     inputs : str, int or list of them, default=None
         Input columns of X. None: all columns without another role.
     experiment : str or int, default=None
@@ -80,13 +97,22 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     singular_values_ : ndarray of shape (horizon_ * n_outputs,)
         Of the estimated observability subspace, descending.
     initial_states_ : ndarray of shape (n_experiments, order_)
-        Initial state of every experiment, in the order of first appearance.
+        Initial state of every experiment, in the order of first appearance; after
+        `partial_fit` of a long stream, of its last stretch only.
     selection_ : DataFrame
         What was tried: columns order, horizon, criterion (relative simulation error
         before refinement on the estimation part), validation_bft (percent, on
         the held-out part; NaN for horizons that lost within their order), chosen.
     residual_ : float
         Simulation error on the data relative to the outputs, root mean square.
+    stability_loss_ : float
+        Increase of `residual_` that enforced stability cost; 0 where it cost nothing.
+    predictor_ : InnovationModel
+        `lti_` with a noise model, Kalman gain and innovation covariance.
+    poles_std_ : ndarray of complex, shape (order_,)
+        Standard deviations of the real and imaginary parts of ``lti_.poles()``.
+    input_offset_, output_offset_ : ndarray
+        Means subtracted with `detrend`, else zero.
     n_outputs_ : int
     n_features_in_ : int
     feature_names_in_ : ndarray of str
@@ -96,6 +122,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     `predict` simulates from rest; `predict_with_initial_state` estimates the
     initial state from outputs first, as a split in the middle of an experiment
     needs. Models of different fits do not share a state basis.
+
+    `fit` keeps its samples for the attributes and methods that are statistics of the
+    simulation error, which are computed when first asked for.
 
     References
     ----------
@@ -128,9 +157,12 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         method: str = "po-moesp",
         horizon: int | str = "auto",
         sampling_time: float = 1.0,
-        feedthrough: bool = True,
+        feedthrough: Any = True,
         refine: bool = True,
         stability: str = "warn",
+        n_noise_states: int | str = "auto",
+        detrend: str | None = None,
+        missing: str = "raise",
         inputs: Any = None,
         experiment: Any = None,
         time: Any = None,
@@ -144,6 +176,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.feedthrough = feedthrough
         self.refine = refine
         self.stability = stability
+        self.n_noise_states = n_noise_states
+        self.detrend = detrend
+        self.missing = missing
         self.inputs = inputs
         self.experiment = experiment
         self.time = time
@@ -177,43 +212,51 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         UserWarning
             If the model is unstable or explains next to nothing of the outputs.
         """
-        order, horizon = self._check_options()
-        experiments = self._read(X, y, reset=True)
-        pairs = [(e.inputs, _outputs(e)) for e in experiments]
-        check_excitation(pairs)
-        pairs, basis = reduce_inputs(pairs)
-        check_size(pairs, order, horizon, self.method)
-        options: dict[str, Any] = {
+        choices = check_options(self)
+        experiments, _ = self._read(X, y, reset=True)
+        self._stream = None
+        self._single_output = np.asarray(y).ndim == 1
+        self._set_step(experiments)
+        fitted = self._fit_pairs(
+            [(e.inputs, outputs_of(e)) for e in experiments], choices
+        )
+        warn_about(fitted.found)
+        if choices.order is not None and choices.horizon is not None:
+            better = find_better_horizon(fitted, self._fit_options())
+            warn_about_horizon(fitted.found.residual, choices.horizon, better)
+        return self
+
+    def _fit_pairs(self, pairs: Pairs, choices: Choices) -> LocalFit:
+        """Identify on experiments and set the fitted attributes."""
+        fitted = fit_pairs(
+            pairs,
+            choices,
+            feedthrough=self.feedthrough,
+            detrend=self.detrend,
+            options=self._fit_options(),
+        )
+        self.order_ = fitted.selection.order
+        self.horizon_ = fitted.selection.horizon
+        self.selection_ = selection_table(fitted.selection)
+        self.n_outputs_ = pairs[0][1].shape[1]
+        self.input_offset_ = fitted.input_offset
+        self.output_offset_ = fitted.output_offset
+        self.stability_loss_ = fitted.found.stability_loss
+        self._keep_evidence(fitted.evidence)
+        found = fitted.found
+        self._set_model(found.scaled_model, found.singular_values, found.residual)
+        return fitted
+
+    def _fit_options(self) -> dict[str, Any]:
+        return {
             "method": self.method,
-            "feedthrough": self.feedthrough,
             "refine": self.refine,
             "enforce_stability": self.stability == "enforce",
         }
-        if order is None or horizon is None:
-            chosen = select(scale_records(pairs).records, order, horizon, **options)
-            found = identify(pairs, chosen.order, chosen.horizon, **options)
-        else:
-            found = identify(pairs, order, horizon, **options)
-            only = Candidate(order, horizon, found.residual, np.nan)
-            chosen = Selection(order, horizon, [only])
 
+    def _set_step(self, experiments: Sequence[Experiment]) -> None:
         step = next((e.sampling_time for e in experiments if e.sampling_time), None)
-        self.lti_ = StateSpace(
-            found.A,
-            found.B @ basis.T,
-            found.C,
-            found.D @ basis.T,
-            float(self.sampling_time) if step is None else step,
-        )
-        self.order_, self.horizon_ = chosen.order, chosen.horizon
-        self.singular_values_ = found.singular_values
-        self.initial_states_ = found.initial_states
-        self.residual_ = found.residual
-        self.selection_ = _selection_table(chosen)
-        self.n_outputs_ = pairs[0][1].shape[1]
-        self._single_output = np.asarray(y).ndim == 1
-        self._warn_about(found)
-        return self
+        self._step = float(self.sampling_time) if step is None else step
 
     def predict(self, X: Any) -> Array:
         """Simulate the outputs of every experiment from rest.
@@ -226,9 +269,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         -------
         ndarray of shape (n_samples,) or (n_samples, n_outputs)
         """
-        check_is_fitted(self)
-        experiments = self._read(X, None, reset=False)
-        return self._simulate(experiments, [None] * len(experiments))
+        check_is_fitted(self, "lti_")
+        experiments, n_samples = self._read(X, None, reset=False)
+        return self._simulate(experiments, [None] * len(experiments), n_samples)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate the outputs from initial states estimated on measured outputs.
@@ -244,14 +287,15 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         -------
         ndarray of shape (n_samples,) or (n_samples, n_outputs)
         """
-        check_is_fitted(self)
-        experiments = self._read(X, y, reset=False)
-        states: list[Array | None] = []
-        for experiment in experiments:
-            forced = self.lti_.simulate(experiment.inputs)
-            free = _outputs(experiment) - forced
-            states.append(estimate_initial_state(self.lti_.A, self.lti_.C, free))
-        return self._simulate(experiments, states)
+        check_is_fitted(self, "lti_")
+        experiments, n_samples = self._read(X, y, reset=False)
+        states = [self._initial_state(e) for e in experiments]
+        return self._simulate(experiments, states, n_samples)
+
+    def selection_text(self) -> str:
+        """`selection_` as a text table, the choice marked."""
+        check_is_fitted(self, "lti_")
+        return selection_text(self.selection_)
 
     def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
         """Rows of every experiment of a table, in the order of time.
@@ -264,18 +308,23 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         -------
         list of ndarray of int
         """
-        check_is_fitted(self)
-        return [e.rows for e in self._read(X, None, reset=False)]
+        check_is_fitted(self, "lti_")
+        return [e.rows for e in self._read(X, None, reset=False)[0]]
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
         # Tables of independent samples, as in the common tests, have no dynamics.
         tags.regressor_tags.poor_score = True
+        tags.input_tags.allow_nan = self.missing == "split"
         return tags
 
-    def _read(self, X: Any, y: Any, *, reset: bool) -> list[Experiment]:
+    def _read(
+        self, X: Any, y: Any, *, reset: bool, split: bool = True
+    ) -> tuple[list[Experiment], int]:
         declared = self.sampling_time if self.sampling_time != 1.0 else None
-        return read_experiments(
+        # A simulation needs every input; gaps are for what has outputs beside them.
+        gaps = self.missing == "split" and y is not None
+        experiments = read_experiments(
             self,
             X,
             y,
@@ -286,87 +335,27 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             operating_point=self.operating_point,
             sampling_time=declared,
             reset=reset,
+            allow_missing=gaps,
         )
+        n_samples = sum(len(e.rows) for e in experiments)
+        if gaps and split:
+            experiments = split_at_gaps(experiments)
+        return experiments, n_samples
+
+    def _initial_state(self, experiment: Experiment) -> Array:
+        forced = self.lti_.simulate(experiment.inputs - self.input_offset_)
+        free = outputs_of(experiment) - self.output_offset_ - forced
+        return estimate_initial_state(self.lti_.A, self.lti_.C, free)
 
     def _simulate(
-        self, experiments: Sequence[Experiment], states: Sequence[Array | None]
+        self,
+        experiments: Sequence[Experiment],
+        states: Sequence[Array | None],
+        n_samples: int,
     ) -> Array:
-        n_samples = sum(len(e.rows) for e in experiments)
-        out = np.empty((n_samples, self.n_outputs_))
+        out = np.full((n_samples, self.n_outputs_), np.nan)
         for experiment, x0 in zip(experiments, states, strict=True):
-            out[experiment.rows] = self.lti_.simulate(
-                experiment.inputs, initial_state=x0
-            )
+            u = experiment.inputs - self.input_offset_
+            simulated = self.lti_.simulate(u, initial_state=x0)
+            out[experiment.rows] = simulated + self.output_offset_
         return out[:, 0] if self._single_output else out
-
-    def _check_options(self) -> tuple[int | None, int | None]:
-        """Order and horizon as integers, None for "auto"."""
-        if self.method not in METHODS:
-            raise ValueError(
-                f"`method` must be one of {', '.join(METHODS)}. Got {self.method!r}."
-            )
-        if self.stability not in ("warn", "enforce"):
-            raise ValueError(
-                f"`stability` must be 'warn' or 'enforce'. Got {self.stability!r}."
-            )
-        if not self.sampling_time > 0.0:
-            raise ValueError(
-                "`sampling_time` must be a positive number of seconds. Got "
-                f"{self.sampling_time}."
-            )
-        order = _integer_or_auto("order", self.order, 0)
-        return order, _integer_or_auto("horizon", self.horizon, 1)
-
-    def _warn_about(self, found: Identified) -> None:
-        if found.rank_deficit:
-            warnings.warn(
-                f"The data leave {found.rank_deficit} directions of B and D "
-                "undetermined; the smallest solution was taken. Excite the inputs "
-                "more richly, or lower `order`.",
-                RankWarning,
-                stacklevel=3,
-            )
-        radius = float(np.abs(self.lti_.poles()).max(initial=0.0))
-        if radius > 1.0:
-            warnings.warn(
-                f"The identified model is unstable: a pole has modulus {radius:.6g}. "
-                "Use stability='enforce' for a stable one, another `order`, or a "
-                "longer `horizon`.",
-                UserWarning,
-                stacklevel=3,
-            )
-        if found.residual > 1.0 - _USELESS_FIT:
-            warnings.warn(
-                "The model explains next to nothing of the outputs: its simulation "
-                f"error is {100.0 * found.residual:.0f} % of their size. Try a longer "
-                "`horizon` or order='auto', and check that inputs and outputs belong "
-                "together and in the order of time.",
-                UserWarning,
-                stacklevel=3,
-            )
-
-
-def _outputs(experiment: Experiment) -> Array:
-    if experiment.outputs is None:
-        raise ValueError("`y` must hold the measured outputs. Got None.")
-    return experiment.outputs
-
-
-def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:
-    if isinstance(value, str) and value == "auto":
-        return None
-    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not is_integer or value < lowest:
-        raise ValueError(
-            f"`{name}` must be 'auto' or an integer of at least {lowest}. "
-            f"Got {value!r}."
-        )
-    return int(value)
-
-
-def _selection_table(selection: Selection) -> pd.DataFrame:
-    table = pd.DataFrame(selection.candidates, columns=Candidate._fields)
-    table["chosen"] = (table["order"] == selection.order) & (
-        table["horizon"] == selection.horizon
-    )
-    return table

@@ -1,13 +1,14 @@
-"""What the simulation errors of an identified model tell: prediction and uncertainty."""
+"""What the simulation errors of a model tell: prediction and uncertainty."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
+from .experiments import Experiment
 from .innovation_model import InnovationModel
 from .numerics.innovations import NoiseModel, autoregression, reduce_noise_model
 from .numerics.refinement import in_sections
@@ -56,6 +57,13 @@ class Evidence(NamedTuple):
     share: float
 
 
+def outputs_of(experiment: Experiment) -> Array:
+    """Outputs of an experiment, which must be there."""
+    if experiment.outputs is None:
+        raise ValueError("`y` must hold the measured outputs. Got None.")
+    return experiment.outputs
+
+
 def shorten(records: list[Record]) -> tuple[list[Record], float]:
     """Heads of the records, some 30,000 samples in total, and their share."""
     total = sum(record.u.shape[1] for record in records)
@@ -91,11 +99,23 @@ class SimulationErrorStatistics:
     _evidence: Evidence
     _noise: NoiseModel | None
     _parameters_covariance: Array | None
+    _single_output: bool
+    _step: float
+    n_outputs_: int
+    input_offset_: Array
+    output_offset_: Array
+
+    if TYPE_CHECKING:  # of the estimator
+
+        def _read(
+            self, X: Any, y: Any, *, reset: bool, split: bool = True
+        ) -> tuple[list[Experiment], int]: ...
+        def _initial_state(self, experiment: Experiment) -> Array: ...
 
     @property
     def predictor_(self) -> InnovationModel:
         """Innovation model: `lti_`, the noise model, K and innovation covariance."""
-        check_is_fitted(self)
+        check_is_fitted(self, "lti_")
         model = self._scaled_noise()
         if self.n_noise_states != "auto":
             model = reduce_noise_model(model, int(self.n_noise_states))
@@ -115,7 +135,7 @@ class SimulationErrorStatistics:
         The real part is that of a pole's real part, the imaginary part that of its
         imaginary part.
         """
-        check_is_fitted(self)
+        check_is_fitted(self, "lti_")
         try:
             covariance = self._covariance()
         except ValueError as error:
@@ -125,6 +145,46 @@ class SimulationErrorStatistics:
         std = _deviations(J.real, covariance) + 1j * _deviations(J.imag, covariance)
         order = np.lexsort((poles.imag, poles.real, np.abs(poles)))
         return std[order]
+
+    def predict_ahead(
+        self, X: Any, y: Any, steps: int = 1, *, initial_state: str = "estimate"
+    ) -> Array:
+        """Predict every sample from the outputs up to `steps` samples before it.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Measured outputs.
+        steps : int, default=1
+            Prediction horizon in samples.
+        initial_state : {"estimate", "rest"}, default="estimate"
+            "estimate" takes the deterministic initial state from the whole experiment,
+            as `predict_with_initial_state` does; "rest" uses no later output.
+
+        Returns
+        -------
+        ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            By `predictor_`; for white noise the simulation.
+        """
+        check_is_fitted(self, "lti_")
+        if initial_state not in ("estimate", "rest"):
+            raise ValueError(
+                f"`initial_state` must be 'estimate' or 'rest'. Got {initial_state!r}."
+            )
+        experiments, n_samples = self._read(X, y, reset=False)
+        predictor = self.predictor_
+        out = np.full((n_samples, self.n_outputs_), np.nan)
+        for e in experiments:
+            x0 = self._initial_state(e) if initial_state == "estimate" else None
+            predicted = predictor.predict(
+                e.inputs - self.input_offset_,
+                outputs_of(e) - self.output_offset_,
+                steps=steps,
+                initial_state=x0,
+            )
+            out[e.rows] = predicted + self.output_offset_
+        return out[:, 0] if self._single_output else out
 
     def frequency_response_covariance(self, omega: ArrayLike) -> Array:
         """Covariance of the frequency response at every frequency.
@@ -149,7 +209,7 @@ class SimulationErrorStatistics:
         ValueError
             If the model does not minimise the simulation error (``refine=False``).
         """
-        check_is_fitted(self)
+        check_is_fitted(self, "lti_")
         covariance = self._covariance()
         J = self._frequency_jacobian(omega)
         flat = J.reshape(len(J), -1, J.shape[-1])
@@ -180,10 +240,32 @@ class SimulationErrorStatistics:
         -----
         A 95 % band of a real part is 1.96 standard deviations to both sides.
         """
-        check_is_fitted(self)
+        check_is_fitted(self, "lti_")
         covariance = self._covariance()
         J = self._frequency_jacobian(omega)
         return _deviations(J.real, covariance) + 1j * _deviations(J.imag, covariance)
+
+    def _keep_evidence(self, evidence: Evidence) -> None:
+        self._evidence = evidence
+        self._noise = None
+        self._parameters_covariance = None
+
+    def _set_model(
+        self, model: Realization, singular_values: Array, residual: float
+    ) -> None:
+        """Fitted attributes of a model of scaled samples."""
+        evidence = self._evidence
+        su, sy = evidence.input_scale, evidence.output_scale[:, None]
+        self.lti_ = StateSpace(
+            model.A,
+            model.B / su @ evidence.basis.T,
+            sy * model.C,
+            sy * model.D / su @ evidence.basis.T,
+            self._step,
+        )
+        self.initial_states_ = model.initial_states
+        self.singular_values_ = singular_values
+        self.residual_ = residual
 
     def _frequency_jacobian(self, omega: ArrayLike) -> NDArray[np.complex128]:
         evidence = self._evidence

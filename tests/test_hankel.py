@@ -124,3 +124,14 @@ def test_triangular_factor_has_the_gram_of_the_data(rng):
     R = triangularize(columns.copy())
     np.testing.assert_allclose(R.T @ R, columns @ columns.T, atol=1e-12)
     assert triangularize(rng.standard_normal((5, 3))).shape == (3, 5)
+
+
+def test_known_correlations_serve_every_horizon(rng):
+    records = [rng.standard_normal((n, 3)) for n in (200, 150)]
+    known = [correlation_sequence(z, 40) for z in records]
+    for horizon in (2, 11, 20):
+        np.testing.assert_allclose(
+            data_factor(records, 2, horizon, correlations=known),
+            data_factor(records, 2, horizon),
+            atol=1e-9,
+        )

@@ -160,6 +160,7 @@ def test_resonant_system_in_noise_reaches_the_accuracy_of_maximum_likelihood(hor
     assert np.median(scores) > 99.7
 
 
+@pytest.mark.filterwarnings("ignore:horizon=.* ends in a poor model:UserWarning")
 @pytest.mark.parametrize("method", ["po-moesp", "pi-moesp"])
 @pytest.mark.parametrize("refine", [True, False])
 def test_automatic_horizon_is_as_good_as_the_best_of_a_full_scan(method, refine):

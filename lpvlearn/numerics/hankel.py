@@ -86,7 +86,7 @@ def hankel_matrix(z: Array, n_rows: int) -> Array:
     return windows[: n - n_rows + 1].T
 
 
-def hankel_gram(z: Array, n_rows: int) -> Array:
+def hankel_gram(z: Array, n_rows: int, correlations: Array | None = None) -> Array:
     """Gram matrix ``H H.T`` of a block-Hankel matrix, without forming ``H``.
 
     The first block row follows from the correlation sequence minus the products that
@@ -99,6 +99,9 @@ def hankel_gram(z: Array, n_rows: int) -> Array:
         The record; ``n_samples >= n_rows``.
     n_rows : int
         Number of block rows.
+    correlations : ndarray of shape (>= n_rows, n_channels, n_channels), default=None
+        `correlation_sequence` of ``z``, where it is known: with it the cost does not
+        depend on the number of samples.
 
     Returns
     -------
@@ -114,7 +117,10 @@ def hankel_gram(z: Array, n_rows: int) -> Array:
     """
     n, c = z.shape
     n_cols = n - n_rows + 1
-    first = correlation_sequence(z, n_rows)
+    if correlations is None:
+        first = correlation_sequence(z, n_rows)
+    else:
+        first = correlations[:n_rows].copy()
     last = np.zeros((2 * n_rows - 2, c))
     last[: n_rows - 1] = z[n_cols:]
     for d in range(n_rows - 1):
@@ -297,7 +303,12 @@ def qr_factor(records: Sequence[Array], n_rows: int, rows: NDArray[np.intp]) -> 
     return factor if factor.shape[1] else np.zeros((len(rows), len(rows)))
 
 
-def gram_factor(records: Sequence[Array], n_rows: int, rows: NDArray[np.intp]) -> Array:
+def gram_factor(
+    records: Sequence[Array],
+    n_rows: int,
+    rows: NDArray[np.intp],
+    correlations: Sequence[Array] | None = None,
+) -> Array:
     """Triangular factor of the pooled Hankel columns by correlations and Cholesky.
 
     Falls back to `qr_factor` where the Gram matrix is too ill conditioned (data
@@ -307,15 +318,19 @@ def gram_factor(records: Sequence[Array], n_rows: int, rows: NDArray[np.intp]) -
     ----------
     records, n_rows, rows
         As in `qr_factor`.
+    correlations : sequence of ndarray, default=None
+        One `correlation_sequence` per record, of `n_rows` lags at least where the
+        record is long enough.
 
     Returns
     -------
     ndarray of shape (len(rows), len(rows))
     """
     gram = np.zeros((n_rows * records[0].shape[1],) * 2)
-    for z in records:
+    for i, z in enumerate(records):
         if len(z) >= n_rows:
-            gram += hankel_gram(z, n_rows)
+            known = None if correlations is None else correlations[i]
+            gram += hankel_gram(z, n_rows, known)
     lower = cholesky_factor(gram[np.ix_(rows, rows)])
     return qr_factor(records, n_rows, rows) if lower is None else lower
 
@@ -327,6 +342,7 @@ def data_factor(
     *,
     past_outputs: bool = True,
     engine: str = "cholesky",
+    correlations: Sequence[Array] | None = None,
 ) -> Array:
     """Lower triangular factor of ``[U_f; U_p; Y_p; Y_f]`` of pooled experiments.
 
@@ -343,6 +359,8 @@ def data_factor(
     engine : {"cholesky", "qr"}, default="cholesky"
         "cholesky" builds the Gram matrix from correlations and falls back to "qr"
         where that would lose accuracy; both give the same factor.
+    correlations : sequence of ndarray, default=None
+        As in `gram_factor`; one computation serves all horizons.
 
     Returns
     -------
@@ -364,5 +382,6 @@ def data_factor(
     """
     n_outputs = records[0].shape[1] - n_inputs
     rows = past_future_rows(n_inputs, n_outputs, horizon, past_outputs=past_outputs)
-    compress = gram_factor if engine == "cholesky" else qr_factor
-    return compress(records, 2 * horizon, rows)
+    if engine == "qr":
+        return qr_factor(records, 2 * horizon, rows)
+    return gram_factor(records, 2 * horizon, rows, correlations)

@@ -7,12 +7,12 @@ refinement in sequence: the function core of `lpvlearn.subspace.SubspaceLTI`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .hankel import data_factor
+from .hankel import correlation_sequence, data_factor
 from .realization import (
     ObservabilitySubspace,
     dominant_pair,
@@ -27,8 +27,10 @@ from .simulationfit import Realization, freedom, simulation_fit
 
 Array = NDArray[np.float64]
 
-# A reflected (stable) start is preferred unless it fits this much worse.
+# A reflected (stable) start is preferred unless it fits this much worse, and by more
+# than growing states explain of the last samples' noise.
 _STABLE_LOSS = 1.01
+_BY_CHANCE = 10.0
 # Enforced stability keeps this distance from the unit circle, where rounding could
 # bring a pole back.
 _MARGIN = 1e-8
@@ -162,6 +164,18 @@ def max_order(horizon: int, n_inputs: int, n_outputs: int, method: str) -> int:
     return min(order, horizon * n_inputs) if method == "pi-moesp" else order
 
 
+def samples_of(records: Sequence[Record]) -> list[Array]:
+    """Samples ``[u, y]`` of records, one row per time instant."""
+    return [np.ascontiguousarray(np.vstack(record).T) for record in records]
+
+
+def correlations_of(records: Sequence[Record], horizon: int) -> list[Array]:
+    """Correlation sequences that serve all horizons up to the one given."""
+    return [
+        correlation_sequence(z, min(2 * horizon, len(z))) for z in samples_of(records)
+    ]
+
+
 def subspace_of(
     records: Sequence[Record],
     horizon: int,
@@ -169,6 +183,7 @@ def subspace_of(
     *,
     method: str = "po-moesp",
     engine: str = "cholesky",
+    correlations: Sequence[Array] | None = None,
 ) -> ObservabilitySubspace:
     """Compress records and find the observability subspace of every order.
 
@@ -179,15 +194,22 @@ def subspace_of(
     horizon, highest_order : int
     method : {"po-moesp", "pi-moesp", "n4sid", "cva"}
     engine : {"cholesky", "qr"}
+    correlations : sequence of ndarray, default=None
+        From `correlations_of`, to be shared by several horizons.
 
     Returns
     -------
     ObservabilitySubspace
     """
     m, ny = len(records[0].u), len(records[0].y)
-    samples = [np.ascontiguousarray(np.vstack(record).T) for record in records]
-    past_outputs = method != "pi-moesp"
-    factor = data_factor(samples, m, horizon, past_outputs=past_outputs, engine=engine)
+    factor = data_factor(
+        samples_of(records),
+        m,
+        horizon,
+        past_outputs=method != "pi-moesp",
+        engine=engine,
+        correlations=correlations,
+    )
     return observability_subspace(factor, m, ny, horizon, highest_order, method)
 
 
@@ -227,7 +249,10 @@ def realize(
     if stable_A is A or enforce_stability:
         return stable
     as_found = simulation_fit(A, C, records, free)
-    return as_found if as_found.loss * _STABLE_LOSS < stable.loss else stable
+    n_values = sum(record.y.size for record in records)
+    n_parameters = order * (len(records[0].u) + len(C) + len(records))
+    limit = max(_STABLE_LOSS, 1.0 + _BY_CHANCE * n_parameters / n_values)
+    return as_found if as_found.loss * limit < stable.loss else stable
 
 
 def _state_pair(
@@ -261,6 +286,7 @@ def identify(
     enforce_stability: bool = False,
     n_noise_states: int = 0,
     engine: str = "cholesky",
+    scaled: ScaledRecords | None = None,
 ) -> Identified:
     """Identify a discrete-time state-space model of given order and horizon.
 
@@ -282,6 +308,8 @@ def identify(
         Additional states of the subspace step, for coloured noise.
     engine : {"cholesky", "qr"}, default="cholesky"
         How the data are compressed.
+    scaled : ScaledRecords, default=None
+        The experiments scaled, where that has been done.
 
     Returns
     -------
@@ -298,35 +326,31 @@ def identify(
     >>> round(model.A.item(), 9)
     0.8
     """
-    scaled = scale_records(experiments)
+    scaled = scale_records(experiments) if scaled is None else scaled
     subspace = subspace_of(
         scaled.records, horizon, order + n_noise_states, method=method, engine=engine
     )
     free = freedom(len(scaled.output_scale), len(scaled.input_scale), feedthrough)
-    options: dict[str, Any] = {"n_noise_states": n_noise_states}
-    model = realize(
-        subspace,
-        scaled.records,
-        order,
-        free,
-        enforce_stability=enforce_stability,
-        **options,
-    )
-    n_iter, best_loss = 0, model.loss
-    if refine:
-        model, n_iter = refine_simulation(model, scaled.records, free)
-    if enforce_stability:
-        # What the best model would have reached, stable or not.
-        other = realize(subspace, scaled.records, order, free, **options)
-        if refine:
-            other, _ = refine_simulation(other, scaled.records, free)
-        best_loss = other.loss
-        if other.loss < model.loss and _radius(other.A) < 1.0 - _MARGIN:
-            model = other
+
+    def best(enforce: bool) -> tuple[Realization, int]:
+        start = realize(
+            subspace,
+            scaled.records,
+            order,
+            free,
+            enforce_stability=enforce,
+            n_noise_states=n_noise_states,
+        )
+        return refine_simulation(start, scaled.records, free) if refine else (start, 0)
+
+    model, n_iter = best(False)
+    best_loss = model.loss
+    if enforce_stability and not _radius(model.A) < 1.0 - _MARGIN:
+        model, n_iter = best(True)
     found = unscale(model, scaled, subspace.singular_values, n_iter)
-    if not enforce_stability or not best_loss < model.loss:
-        return found
     energy = sum(float((record.y**2).sum()) for record in scaled.records)
+    if not 0.0 < best_loss < model.loss:
+        return found
     lost = found.residual - float(np.sqrt(best_loss / energy))
     return found._replace(stability_loss=lost)
 

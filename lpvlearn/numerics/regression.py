@@ -1,4 +1,4 @@
-"""Least squares in compressed form: simulated outputs as functions of the parameters."""
+"""Least squares in compressed form: simulated outputs by their parameters."""
 
 from __future__ import annotations
 

@@ -10,12 +10,18 @@ taken.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .identification import max_horizon, max_order, realize, subspace_of
+from .identification import (
+    correlations_of,
+    max_horizon,
+    max_order,
+    realize,
+    subspace_of,
+)
 from .refinement import refine_simulation
 from .signals import Record
 from .simulation import lti_response
@@ -35,6 +41,8 @@ _MAX_SAMPLES = 12_000
 _PATIENCE = 3
 _NOTICEABLE = 0.99
 _NEGLIGIBLE_GAIN = 3e-3
+# An F statistic that does not come about by chance.
+_CERTAIN = 20.0
 # A start this close to the best one ends in the same minimum when it is refined; the
 # shorter horizon is then the cheaper one. Unrefined, a horizon must be as good.
 _LOSS_SLACK = {True: 1.05, False: 1.005}
@@ -205,6 +213,45 @@ def smallest_good_order(orders: Sequence[int], blocks: Sequence[Array]) -> int:
     return orders[best]
 
 
+def lowest_order(
+    orders: Sequence[int], losses: Sequence[float], n_values: int, per_state: int
+) -> int:
+    """Lowest order that the data it was estimated on do not rule out.
+
+    Held-out parts may be silent, as after an impulse or a step.
+
+    Parameters
+    ----------
+    orders : sequence of int
+        Ascending.
+    losses : sequence of float
+        Sums of squared simulation errors on the estimation part.
+    n_values : int
+        Samples times outputs.
+    per_state : int
+        Parameters that a state adds.
+
+    Returns
+    -------
+    int
+        Every lower order has at least twice the error (root mean square) of a higher
+        one, and many times more than its missing parameters would explain.
+
+    Examples
+    --------
+    >>> lowest_order([0, 1, 2], [1.0, 1e-3, 0.9e-3], n_values=500, per_state=2)
+    1
+    """
+    lowest = orders[0]
+    for i, low in enumerate(orders):
+        for high, loss in zip(orders[i + 1 :], losses[i + 1 :], strict=True):
+            degrees = n_values - high * per_state
+            excess = _CERTAIN * (high - low) * per_state * loss / max(degrees, 1)
+            if losses[i] > max(4.0 * loss, loss + excess):
+                lowest = max(lowest, orders[i + 1])
+    return lowest
+
+
 def _best_horizon(losses: dict[int, float], refine: bool) -> int:
     """Smallest horizon whose loss is near the best."""
     limit = min(losses.values()) * _LOSS_SLACK[refine]
@@ -247,22 +294,24 @@ def select(
     energy = sum(float((part.y**2).sum()) for part in parts) or 1.0
     horizons = _horizons(cuts, m, ny, order, horizon, method)
     highest = _highest_order(parts, m, ny, horizons, method) if order is None else order
+    shared = correlations_of(parts, max(horizons))
     spaces = {
         h: subspace_of(
             parts,
             h,
             min(highest + n_noise_states, max_order(h, m, ny, method)),
             method=method,
+            correlations=shared,
         )
         for h in horizons
     }
     free = freedom(ny, m, feedthrough)
-    options = {
+    options: dict[str, Any] = {
         "free": free,
         "enforce_stability": enforce_stability,
         "n_noise_states": n_noise_states,
     }
-    candidates, tried, held_out, chosen = [], [], [], {}
+    candidates, tried, held_out, reached, chosen = [], [], [], [], {}
     best_loss, stale = np.inf, 0
     for n in [order] if order is not None else range(highest + 1):
         models = {
@@ -283,20 +332,31 @@ def select(
                     tried.append(n)
                     held_out.append(blocks)
                     refined_loss = model.loss
+                    reached.append(refined_loss)
             criterion = float(np.sqrt(losses[h] / energy))
             candidates.append(Candidate(n, h, criterion, bft))
         stale = 0 if refined_loss < _NOTICEABLE * best_loss else stale + 1
         best_loss = min(best_loss, refined_loss)
         if stale > _PATIENCE or best_loss <= 1e-18 * energy:
             break
-    best = order if order is not None else smallest_good_order(tried, held_out)
+    if order is None:
+        n_values = sum(part.y.size for part in parts)
+        lowest = lowest_order(tried, reached, n_values, m + ny + len(parts))
+        allowed = [k for k, n in enumerate(tried) if n >= lowest]
+        best = smallest_good_order(
+            [tried[k] for k in allowed], [held_out[k] for k in allowed]
+        )
+    else:
+        best = order
     if refine or horizon is not None:
         return Selection(best, chosen[best], candidates)
     # Nothing corrects the horizon afterwards: compare on the whole records.
-    losses = {}
+    losses, shared = {}, correlations_of(records, max(horizons))
     for h in horizons:
         if best <= max_order(h, m, ny, method):
-            space = subspace_of(records, h, best + n_noise_states, method=method)
+            space = subspace_of(
+                records, h, best + n_noise_states, method=method, correlations=shared
+            )
             losses[h] = realize(space, records, best, **options).loss
     return Selection(best, _best_horizon(losses, refine), candidates)
 

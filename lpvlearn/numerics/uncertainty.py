@@ -62,8 +62,9 @@ def parameter_covariance(
             H, S = keep.T @ H @ keep, keep.T @ S @ keep
         information, score = information + H, score + S
     H, S = np.asarray(information), np.asarray(score)
-    scale = np.sqrt(np.diagonal(H))
-    scale = np.where(scale > 0.0, scale, 1.0)
+    # Rounding may leave a vanishing diagonal negative.
+    scale = np.sqrt(np.maximum(np.diagonal(H), 0.0))
+    scale[scale == 0.0] = 1.0
     values, vectors = np.linalg.eigh(H / scale[:, None] / scale)
     n_gauge = sum(block.size for block in model.blocks)
     kept = np.arange(len(values)) >= n_gauge
@@ -183,7 +184,7 @@ def pole_jacobian(
     jacobian = np.zeros((len(model.A), n_parameters), dtype=complex)
     row = 0
     for block in model.blocks:
-        values, right = np.linalg.eig(block + 0j)
+        values, right = np.linalg.eig(block)
         left = np.linalg.pinv(right)
         for i, value in enumerate(values):
             poles[row] = value
