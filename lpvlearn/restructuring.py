@@ -297,8 +297,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         self, model: StateSpace | Sequence[StateSpace]
     ) -> RestructuringProblem:
         check_options(self)
-        several = isinstance(model, Sequence) and len(model) > 0
-        models = list(model) if several else [model]  # type: ignore[arg-type, list-item]
+        models = list(model) if isinstance(model, Sequence) and model else [model]
         return problem_from_models(self.structure, models, self.frequency_weight)
 
     def _solve(self, problem: RestructuringProblem, given: list[Array]) -> None:

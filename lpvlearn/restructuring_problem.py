@@ -92,7 +92,7 @@ class RepeatedOutputs:
 
 
 def problem_from_models(
-    structure: GrayBoxStructure | None, models: Sequence[StateSpace], weight: Any
+    structure: GrayBoxStructure | None, models: Sequence[Any], weight: Any
 ) -> RestructuringProblem:
     """Match state-space models with the exact H-infinity norm.
 
@@ -129,9 +129,7 @@ def problem_from_models(
     system = ErrorSystem(structure, boxes[0], filter_)
     if len(boxes) > 1:
         if filter_ is not None and filter_.D.shape != (1, 1):
-            eye = np.eye(len(boxes))
-            parts = (np.kron(eye, getattr(filter_, name)) for name in "ABCD")
-            filter_ = Target(*parts, filter_.dt)
+            filter_ = filter_.repeated(len(boxes))
         copies = RepeatedOutputs(structure, len(boxes))
         system = ErrorSystem(copies, _stacked(boxes), filter_)
     omega, margin = grid_and_margin(system.target)

@@ -63,7 +63,7 @@ def levenberg_marquardt(
         held = ((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0))
         free = np.where(held, 0.0, 1.0)
         rhs = np.concatenate([-(Q.T @ r), np.zeros(len(x))])
-        accepted = False
+        accepted: tuple[Array, Array] | None = None
         while damping < 1e12:
             stacked = np.vstack([R * (free / d), np.sqrt(damping) * np.eye(len(x))])
             step = free / d * np.linalg.lstsq(stacked, rhs, rcond=None)[0]
@@ -79,15 +79,15 @@ def levenberg_marquardt(
             if trial is not None:
                 new = float(trial[0] @ trial[0])
                 if new < cost:
-                    accepted = True
+                    accepted = trial
                     gain = (cost - new) / predicted
                     damping = max(damping * (0.1 if gain > 0.75 else 1.0), 1e-12)
                     break
             damping *= 4.0
-        if not accepted:
+        if accepted is None:
             break
         small = small + 1 if cost - new <= tol * cost else 0
-        x, (r, J), cost = x + step, trial, new
+        x, (r, J), cost = x + step, accepted, new
         Q, R = np.linalg.qr(J)
         if small >= 2 or cost == 0.0:
             break

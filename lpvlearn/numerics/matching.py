@@ -27,9 +27,11 @@ class Structure(Protocol):
 
     order: int
     n_params: int
-    lower: Array
-    upper: Array
 
+    @property
+    def lower(self) -> Array: ...
+    @property
+    def upper(self) -> Array: ...
     def system_matrix(self, theta: Array) -> Array: ...
     def jacobian(self, theta: Array) -> Array: ...
     def curvature(self, theta: Array) -> Array | None: ...
@@ -62,9 +64,7 @@ class ErrorSystem:
         self.n_outputs, self.n_inputs = target.D.shape
         self.weight = weight
         if weight is not None and weight.D.shape == (1, 1) and self.n_outputs > 1:
-            eye = np.eye(self.n_outputs)
-            blocks = (np.kron(eye, M) for M in (weight.A, weight.B, weight.C, weight.D))
-            self.weight = Target(*blocks, weight.dt)
+            self.weight = weight.repeated(self.n_outputs)
 
     def split(self, S: Array) -> tuple[Array, Array, Array, Array]:
         """Blocks ``A, B, C, D`` of a system matrix."""
@@ -95,10 +95,8 @@ class ErrorSystem:
     def reweighted(self, weight: Target) -> ErrorSystem:
         """The same error behind one more weight (a scalar one)."""
         if self.weight is not None:
-            eye = np.eye(self.n_outputs)
-            parts = (np.kron(eye, M) for M in (weight.A, weight.B, weight.C, weight.D))
-            old = self.weight
-            total = series(old.A, old.B, old.C, old.D, Target(*parts, weight.dt))
+            old, new = self.weight, weight.repeated(self.n_outputs)
+            total = series(old.A, old.B, old.C, old.D, new)
             weight = Target(*total, weight.dt)
         return ErrorSystem(self.structure, self.target, weight)
 
@@ -129,13 +127,15 @@ class ErrorSystem:
 
     def response_jacobian(self, theta: Array, omega: Array) -> tuple[Complex, Complex]:
         """Response and its derivatives, shapes (k, p, m) and (k, p, m, n_params)."""
-        at = self._point(theta, omega, np.zeros((self.n_outputs, self.n_inputs)))
+        at = self._point(
+            theta, omega, np.zeros((1, self.n_outputs, self.n_inputs), complex)
+        )
         S = self.structure.jacobian(theta)
         # contract the short axes first: (k, p, a) (j, a, b) -> (k, p, j, b)
         left = np.tensordot(at.L, S, axes=(2, 1))
         return at.E, np.einsum("kpjb,kbm->kpmj", left, at.R)
 
-    def _point(self, theta: Array, omega: Array, G0: Complex | Array) -> _Point:
+    def _point(self, theta: Array, omega: Array, G0: Complex) -> _Point:
         A, B, C, D = self.split(self.structure.system_matrix(theta))
         Phi = resolvent(A, laplace_variable(omega, self.dt)[0])
         k, p, m = len(omega), self.n_outputs, self.n_inputs

@@ -172,7 +172,7 @@ class HinfObjective:
                 self.floor_frequency = float(found.frequencies[flat])
         if not steep.any():  # nothing is left that the parameters could lower
             none = np.zeros(1)
-            return Peaks(none, none, np.zeros((1, len(y))), none > 0)
+            return Peaks(none, none, np.zeros((1, len(y))), np.zeros(1, bool))
         peaks = Peaks(
             found.values[steep],
             found.frequencies[steep],
@@ -296,7 +296,8 @@ def minimise_hinf(
     start = system.peaks(theta0)
     if start.norm <= negligible:  # exact already
         flat = np.zeros((len(start.values), len(theta0)))
-        peaks = Peaks(start.values, start.frequencies, flat, flat.any(1))
+        still = np.zeros(len(start.values), bool)
+        peaks = Peaks(start.values, start.frequencies, flat, still)
         return theta0, MinimaxResult(theta0, peaks, 0.0, np.inf, True, 0), 0.0
     origin = np.zeros(len(theta0))
     T = metric_coordinates(R, max(start.norm, 1e-300))

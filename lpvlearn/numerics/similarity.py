@@ -9,6 +9,7 @@ structure is minimised over z by a Levenberg-Marquardt method, from many starts 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from .certificates import MinimaxResult, Peaks
 from .matching import Structure
 from .transfer import Target
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 _NULL_TOLERANCE = 1e-6
 
@@ -81,7 +82,8 @@ def linear_equations(problem: AffineProblem) -> tuple[Array, Array]:
     n, m, p = len(problem.A), problem.B.shape[1], problem.C.shape[0]
     free = (problem.basis != 0).any(0)
     S, eye = problem.offset, np.eye(n)
-    M, b = [np.zeros((0, n * n))], [np.zeros(0)]
+    M: list[Array] = [np.zeros((0, n * n))]
+    b: list[Array] = [np.zeros(0)]
     for i in range(n):
         row = eye[i : i + 1]
         if not free[i, :n].any():  # e_i T A - S_i T = 0
@@ -182,7 +184,7 @@ def _batched_lm(
     def cost_of(z: Array) -> Array:
         T = matrices(z)
         with np.errstate(all="ignore"):
-            good = np.isfinite(T).all((1, 2))
+            good = np.asarray(np.isfinite(T).all((1, 2)), dtype=bool)
             good[good] = np.abs(np.linalg.det(T[good])) > 0
             cost = np.full(len(z), np.inf)
             if good.any():

@@ -21,13 +21,23 @@ class Target:
     D: Array
     dt: float | None = None
 
+    def repeated(self, copies: int) -> Target:
+        """The model side by side, once for every channel: block-diagonal."""
+        eye = np.eye(copies)
+        A, B, C, D = (
+            np.asarray(np.kron(eye, M), dtype=float)
+            for M in (self.A, self.B, self.C, self.D)
+        )
+        return Target(A, B, C, D, self.dt)
+
 
 def laplace_variable(
     omega: Array, dt: float | None
 ) -> tuple[Complex, Complex, Complex]:
     """``s(omega)`` and its two derivatives: ``j omega`` or ``exp(j omega dt)``."""
     if dt is None:
-        return 1j * omega, np.full(omega.shape, 1j), np.zeros(omega.shape, complex)
+        zero = np.zeros(len(omega), complex)
+        return zero + 1j * omega, zero + 1j, zero
     z = np.exp(1j * omega * dt)
     return z, 1j * dt * z, -(dt**2) * z
 
@@ -38,7 +48,7 @@ def resolvent(A: Array, s: Complex) -> Complex:
     M = np.where(finite, s, 0.0)[:, None, None] * np.eye(len(A)) - A
     if not finite.all():
         M[~finite] = np.eye(len(A))
-    inverse = np.linalg.inv(M)
+    inverse: Complex = np.linalg.inv(M.astype(complex))
     inverse[~finite] = 0.0
     return inverse
 
