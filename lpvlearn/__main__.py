@@ -130,8 +130,8 @@ def report(experiment: PaperExperiment, tables: dict[str, pd.DataFrame]) -> str:
         f"Table 1, the same by {experiment.other_method.upper()}\n\n"
         + local_text(tables["table1_other"], n_points),
         "Table 2. H-infinity error of the restructuring, relative to the analytic "
-        "model's norm.\nThe structure fixes the gain at standstill; the floor is the "
-        "part of the error due to it,\nwhich no parameter can lower\n\n"
+        "model\n(the structure fixes the gain at standstill; the floor is the part of "
+        "the error\nthat is due to it, which no parameter can lower)\n\n"
         + restructuring_text(tables["table2"], n_points),
         "Table 3. FIT of the interpolated matrices, in percent "
         "(d: degree of the polynomial)\n\n" + interpolation_text(tables["table3"]),

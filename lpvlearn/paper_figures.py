@@ -61,6 +61,9 @@ def save_figures(experiment: PaperExperiment, directory: Path) -> list[Path]:
     for number, draw in FIGURES.items():
         figure, title = draw(experiment)
         entitle(figure, f"Figure {number}. {title}")
+        # Saving would lay the figure out twice: do it once, and keep it.
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
         path = directory / f"figure{number:02d}.png"
         figure.savefig(path, dpi=DOTS_PER_INCH)
         plt.close(figure)

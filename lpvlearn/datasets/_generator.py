@@ -104,7 +104,9 @@ def make_flexible_arm(
         structure : GrayBoxStructure
             ``arm.structure()``.
         arm : FlexibleArm
+            The simulated arm.
         sampling_time : float
+            Sampling period in s.
         operating_points : ndarray of shape (n_operating_points,)
             Scheduling values cos(theta2) of the points.
         theta2 : ndarray of shape (n_operating_points,)
@@ -112,6 +114,7 @@ def make_flexible_arm(
         analytic_models : list of StateSpace
             ``arm.linearize`` at each point (continuous time).
         DESCR : str
+            What the data are.
 
     Raises
     ------

@@ -1,0 +1,154 @@
+r"""
+.. _guide_local:
+
+Local models
+============
+
+Step 3. At each operating point :math:`\kappa_i` a black-box model
+
+.. math::
+
+   x_{k+1} = \mathfrak{A} x_k + \mathfrak{B} u_k, \qquad
+   y_k = \mathfrak{C} x_k + \mathfrak{D} u_k
+
+is identified by a subspace method: no starting values, no iterations that may fail, and
+any number of inputs and outputs.
+"""
+
+# %%
+# How it works
+# ------------
+# Stack :math:`h` consecutive outputs. With the *observability matrix*
+# :math:`\mathcal{O} = [\mathfrak{C};\, \mathfrak{C}\mathfrak{A};\, \dots;\,
+# \mathfrak{C}\mathfrak{A}^{h-1}]` they are
+#
+# .. math::
+#
+#    \begin{bmatrix} y_k \\ \vdots \\ y_{k+h-1} \end{bmatrix}
+#    = \mathcal{O}\, x_k + \mathcal{T}
+#    \begin{bmatrix} u_k \\ \vdots \\ u_{k+h-1} \end{bmatrix} + \text{noise}.
+#
+# Project the future inputs away, and correlate with past data, in which the present
+# noise is not contained: what remains has the range of :math:`\mathcal{O}`. A singular
+# value decomposition gives it; :math:`\mathfrak{C}` is its first block and
+# :math:`\mathfrak{A}` maps it on itself, shifted by one block. With these two the
+# simulated output is linear in :math:`\mathfrak{B}, \mathfrak{D}` and :math:`x_0`,
+# which follow by least squares; a few Gauss-Newton steps on the simulation error polish
+# everything (``refine=True``).
+#
+# ``method`` says what serves as past data: inputs and outputs (``"po-moesp"``, the
+# default; ``"n4sid"`` and ``"cva"`` weight them differently), or inputs alone
+# (``"pi-moesp"``, the paper's choice, which coloured measurement noise does not
+# disturb).
+
+from lpvlearn import SubspaceLTI
+from lpvlearn.datasets import load_flexible_arm
+
+data = load_flexible_arm()
+here = data.X["experiment"] == 0
+X, y = data.X[here], data.y[here]
+roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+
+local = SubspaceLTI(feedthrough=False, **roles).fit(X, y)
+local.lti_
+
+# %%
+# Order and horizon
+# -----------------
+# Both are chosen by what validates: the last part of the record is held out, every
+# candidate simulates it, and the smallest order that is not significantly worse than
+# the best one wins. For each order, the horizon that did best and what it predicts of
+# the held-out samples:
+
+table = local.selection_.dropna(subset="validation_bft").set_index("order")
+table.round({"criterion": 4, "validation_bft": 2})
+
+# %%
+# Up to order 5 a mode is missing, from 6 on nothing is gained. ``selection_`` holds all
+# candidates. The horizon
+# matters too (relative simulation error in percent, before the polishing steps):
+
+table = local.selection_.query("order == 6").set_index("horizon")
+100 * table[["criterion"]].round(4)
+
+# %%
+# The singular values tell the same story. A gap marks the order that the data support:
+
+from lpvlearn.inspection import BodeDisplay, SingularValueDisplay
+
+display = SingularValueDisplay.from_estimator(local)
+
+# %%
+# To continuous time
+# ------------------
+# Physics is written in continuous time, so that the model is converted:
+# ``to_continuous("zoh")`` by the matrix logarithm, exact for inputs that are held
+# between samples, which is how a computer drives a system; ``to_continuous("tustin")``
+# by the bilinear approximation of the paper, which warps the frequencies.
+
+continuous = local.lti_.to_continuous("zoh")
+continuous.poles().round(2)
+
+# %%
+# Here the truth is known, as the arm is simulated:
+
+truth = data.arm.linearize(data.theta2[0])
+display = BodeDisplay.from_models({"truth": truth, "identified": continuous})
+
+# %%
+# .. _guide_balanced:
+#
+# Balanced, and why that is not enough
+# ------------------------------------
+# ``balance()`` brings a model into coordinates in which each state is as controllable
+# as it is observable. They are unique up to signs, so that models of several noise
+# realizations at *one* point can be averaged (``combine="average"``). But from one
+# operating point to the next the order of the states may change, and with it the
+# meaning of each:
+
+import pandas as pd
+
+from lpvlearn import LocalLPVPipeline
+
+baseline = LocalLPVPipeline(
+    SubspaceLTI(6, feedthrough=False), "passthrough", **roles
+).fit(data.X, data.y)
+entry = [model.A[0, 1] for model in baseline.structured_models_]
+pd.Series(entry, index=baseline.operating_points_[:, 0].round(2), name="A[1, 2]").round(
+    1
+)
+
+# %%
+# The entry jumps between two neighbouring points. No polynomial passes through that,
+# and none should: the two numbers describe different things. The :ref:`next page
+# <guide_restructuring>` removes the ambiguity.
+#
+# What a model knows about itself
+# -------------------------------
+# Standard deviations of the poles, from the curvature of the simulation error and the
+# noise that it left:
+
+std = local.poles_std_
+pd.DataFrame(
+    {
+        "pole": local.lti_.poles().round(4),
+        "std of the real part": std.real,
+        "std of the imaginary part": std.imag,
+    }
+)
+
+# %%
+# Long records, gaps, drifts
+# --------------------------
+# * ``partial_fit`` takes a record batch by batch, in memory that does not grow with it.
+# * ``missing="split"`` ends an experiment before a sample with NaN and starts another
+#   one after it.
+# * ``detrend="constant"`` or ``"linear"`` subtracts what an experiment drifts about.
+# * ``stability="enforce"`` returns a stable model and says in ``stability_loss_`` what
+#   that cost.
+
+streamed = SubspaceLTI(6, horizon=40, feedthrough=False, **roles)
+for batch in range(3):
+    rows = slice(1000 * batch, 1000 * (batch + 1))
+    streamed.partial_fit(X.iloc[rows], y.iloc[rows])
+streamed.lti_.to_continuous().poles().round(2)

@@ -1,0 +1,252 @@
+r"""
+.. _guide_restructuring:
+
+Restructuring
+=============
+
+Step 4, the heart of the method. Given the black box :math:`\mathfrak{G}(s) =
+\mathfrak{C}(sI - \mathfrak{A})^{-1}\mathfrak{B}` of one operating point and a
+structure :math:`(A(\vartheta), B(\vartheta), C(\vartheta))` that physics gives, find
+the parameters :math:`\vartheta`. This page derives how, from the problem to the
+certificate, with one worked example.
+"""
+
+# %%
+# The structure
+# -------------
+# A structure is a template: numbers where physics knows them, names where it does not.
+# The arm's, Eq. (32) of the paper: positions integrate rates (zeros and ones), forces
+# divided by masses are sixteen unknown numbers ``p1``, ..., ``p16``.
+
+import numpy as np
+import pandas as pd
+
+from lpvlearn.datasets import load_flexible_arm
+
+data = load_flexible_arm()
+structure = data.structure
+theta = np.arange(1.0, 17.0)  # to see where each parameter stands
+structure.matrices(theta)[0]
+
+# %%
+# It is written as ``GrayBoxStructure.from_template([[0, 0, 0, 0, 1, 0], ..., ["p1",
+# "p5", "p9", "p13", 0, 0], ...], B, C)``; entries may be affine, such as ``"-p9"`` or
+# ``"2*k - 1"``. Anything smooth goes into ``GrayBoxStructure.from_function(f,
+# initial)``.
+#
+# The problem
+# -----------
+# If the black box were exact, some change of the state variables :math:`T` would turn
+# it into the structure:
+#
+# .. math::
+#
+#    \mathfrak{A} T = T A(\vartheta), \qquad \mathfrak{B} = T B(\vartheta), \qquad
+#    \mathfrak{C} T = C(\vartheta).
+#    \tag{3}
+#
+# The unknowns multiply each other, the equations only hold approximately for an
+# identified model, and *how* approximately says little: a small residual in (3) can be
+# a large error near a resonance, since
+#
+# .. math::
+#
+#    \Sigma(s, \vartheta)
+#    &= C(\vartheta)(sI - A(\vartheta))^{-1}B(\vartheta) - \mathfrak{G}(s) \\
+#    &= \mathfrak{C}(sI - \mathfrak{A})^{-1}(T B(\vartheta) - \mathfrak{B})
+#     + (C(\vartheta) - \mathfrak{C}T)(sI - A(\vartheta))^{-1}B(\vartheta) \\
+#    &\quad + \mathfrak{C}(sI - \mathfrak{A})^{-1}
+#      (T A(\vartheta) - \mathfrak{A}T)(sI - A(\vartheta))^{-1}B(\vartheta)
+#
+# multiplies the residuals by both resolvents :math:`(sI - \cdot)^{-1}`, which peak at
+# the poles. So drop :math:`T` and compare what can be measured, the transfer functions:
+#
+# .. math::
+#
+#    \min_\vartheta \ \|\Sigma(\cdot, \vartheta)\|_\infty
+#    = \min_\vartheta \ \max_{\omega \in [0, \infty]} \
+#      \sigma_1\big(\Sigma(j\omega, \vartheta)\big).
+#    \tag{6}
+#
+# :math:`\sigma_1` is the largest singular value: the greatest gain, over all directions
+# of the input, of the error. Two consequences. The orders of the two models may differ.
+# And the optimum *is* an error bound: for every input, the energy of the difference of
+# the two outputs is at most :math:`\|\Sigma\|_\infty^2` times that of the input.
+#
+# The start
+# ---------
+# The objective (6) is not convex, and a search needs a place to begin. Users are not
+# asked for one. The equations of (3) without a parameter are linear in :math:`T`, for
+# instance the rows of zeros and ones; they are solved exactly, :math:`T = T_0 + \sum_k
+# z_k N_k`, and what is left is a small nonlinear least-squares problem in :math:`z`. It
+# is solved from ``n_starts`` random points at each of two time scales; every candidate
+# is judged by its *frequency response*, and the best start a least-squares fit of the
+# response. At the first operating point:
+
+from lpvlearn import GrayBoxRestructurer, SubspaceLTI
+
+here = data.X["experiment"] == 0
+roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+local = SubspaceLTI(6, feedthrough=False, **roles).fit(data.X[here], data.y[here])
+black_box = local.lti_.to_continuous().balance()
+
+restructurer = GrayBoxRestructurer(structure).fit_model(black_box)
+restructurer.starts_
+
+# %%
+# Relative errors of the fits, best first: a good one ends the search. Wrong basins
+# exist, and their fits end ten times as far from the black box; that is why there are
+# many starts. A pipeline has one more means against them: every point is fitted also
+# from its neighbours' parameters, until nothing improves.
+#
+# The norm, and all of its peaks
+# ------------------------------
+# :math:`\gamma > 0` is a singular value of :math:`\Sigma(j\omega)` exactly if the
+# Hamiltonian matrix
+#
+# .. math::
+#
+#    H(\gamma) = \begin{bmatrix}
+#      \mathscr{A} & \gamma^{-1} \mathscr{B}\mathscr{B}^{\mathsf T} \\
+#      -\gamma^{-1} \mathscr{C}^{\mathsf T}\mathscr{C} & -\mathscr{A}^{\mathsf T}
+#    \end{bmatrix}
+#
+# of the realization :math:`(\mathscr{A}, \mathscr{B}, \mathscr{C})` of :math:`\Sigma`
+# has the eigenvalue :math:`j\omega`. So the set of frequencies where the curve is above
+# a level is read off eigenvalues, and raising the level until it is empty gives the
+# norm, to ten digits, without a frequency grid. One more eigenvalue problem just below
+# the top gives
+# *every* peak, not only the highest. That is what makes the minimisation work: at an
+# optimum several peaks are equally high, and a step that lowers one raises another
+# unless it knows of both.
+#
+# The minimisation
+# ----------------
+# Each peak :math:`f_i(\vartheta) = \sigma_1(\Sigma(j\omega_i(\vartheta), \vartheta))`
+# is a smooth function, with the gradient
+#
+# .. math::
+#
+#    \frac{\partial f_i}{\partial \vartheta_k}
+#    = \mathrm{Re}\; u_i^H \frac{\partial \Sigma(j\omega_i)}{\partial \vartheta_k} v_i,
+#
+# :math:`u_i, v_i` the singular vectors; their maximum is not smooth. Both solvers take
+# steps :math:`h` from a model of all peaks at once,
+#
+# .. math::
+#
+#    \min_{h,\, t} \ t + \tfrac12 h^{\mathsf T} Q\, h \quad\text{subject to}\quad
+#    f_i + \nabla f_i^{\mathsf T} h \le t \ \text{ for all } i.
+#
+# With ``solver="sqp"`` (default) :math:`Q` is the exact Hessian of the Lagrangian,
+# including the motion of the peaks, in a trust region, and convergence is quadratic.
+# With ``solver="bundle"`` it is the paper's proximity control: :math:`Q` is a multiple
+# of the identity and the planes of earlier points are kept, Eq. (18)-(21). Both end at
+# the same optimum.
+#
+# Not every error matters alike: ``frequency_weight`` takes a band in rad/s or a
+# weighting model. And ``norm="h2"`` minimises the mean square over frequency instead of
+# the largest value.
+#
+# The worked figure
+# -----------------
+# :class:`~lpvlearn.inspection.ErrorDisplay` draws :math:`\sigma_1(\Sigma(j\omega))`.
+# For a clear picture, a case in which the structure cannot be exact: a mass on a spring
+# is driven by an actuator with a lag of 0.03 s, and the model that we want has no
+# actuator.
+
+from lpvlearn import GrayBoxStructure, StateSpace
+from lpvlearn.inspection import ErrorDisplay
+
+driven = StateSpace(
+    A=[[0, 1, 0], [-1, -0.1, 1], [0, 0, -30]], B=[[0], [0], [30]], C=[[1, 0, 0]]
+)
+spring = GrayBoxStructure.from_template(
+    A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]]
+)
+start = spring.check_params({"k": 1.0, "c": 0.1, "b": 1.0})  # forget the actuator
+
+reduced = GrayBoxRestructurer(spring, init=start).fit_model(driven)
+display = ErrorDisplay.from_estimator(
+    reduced, driven, start=start, omega=np.geomspace(0.7, 1.4, 500)
+)
+
+# %%
+# Before (dash-dotted), with the mass's true parameters: the lag turns the phase at the
+# resonance. After (solid): the norm has been pressed down until several peaks are
+# equally high, the *active* ones, marked. To lower any of them, another must rise. The
+# parameters moved to take over a part of what the lag does:
+
+pd.DataFrame(
+    {"start": start, "optimum": reduced.params_}, index=spring.parameter_names
+).round(4)
+
+# %%
+# The certificate
+# ---------------
+# How do we know that this is an optimum? The shortest vector in the convex hull of the
+# active gradients, relative to the error, is ``stationarity_``: zero means that no
+# direction lowers all active peaks. A positive ``second_order_`` (smallest
+# eigenvalue of the reduced Hessian) makes it a strict local minimum. That there is no
+# better one far away is not certified; ``lower_bound_`` is what no model of this order
+# can do better than (a Hankel singular value of the black box).
+
+pd.Series(
+    {
+        "norm of the error": reduced.error_,
+        "relative to the black box": reduced.relative_error_,
+        "lower bound": reduced.lower_bound_,
+        "stationarity": reduced.stationarity_,
+        "second order": reduced.second_order_,
+        "iterations": reduced.n_iter_,
+    }
+)
+
+# %%
+# Its course: objective, predicted decrease, size of the trust region and number of
+# active peaks at each iteration. The last steps converge quadratically.
+
+reduced.history_
+
+# %%
+# When the structure fixes a gain
+# -------------------------------
+# Back to the arm. At standstill its outputs equal its references, whatever the
+# parameters: :math:`G(0) = I`. The black box was identified from 3 s of noisy data, in
+# which the slowest mode (0.7 rad/s) just about moves, so that :math:`\mathfrak{G}(0)`
+# is off by a little. No parameter can lower that part of the error: it is a *floor*. A
+# minimisation that ignored this would stop at once, since everything below the floor is
+# invisible to the norm. So the floor is recognised (a peak whose gradient is zero),
+# reported, and set aside by a weight that vanishes at its frequency; the weighted error
+# is minimised among all parameters that keep the norm at the floor:
+
+display = ErrorDisplay.from_estimator(restructurer, black_box)
+pd.Series(
+    {
+        "norm of the error": restructurer.error_,
+        "structural floor": restructurer.structural_floor_,
+        "highest peak apart from it": restructurer.remaining_error_,
+    }
+)
+
+# %%
+# The dashed line is the floor. A dot marks each frequency at which the weighted error
+# has one of its equally high peaks.
+#
+# The result
+# ----------
+# Sixteen numbers from 3 s of noisy data, no initial guess, beside the truth:
+
+truth = data.arm.parameters(data.theta2[0])
+pd.DataFrame(
+    {"found": restructurer.params_, "truth": truth}, index=structure.parameter_names
+).round(2)
+
+# %%
+# Is the structure identifiable?
+# ------------------------------
+# Two parameters that only appear as a product cannot be told apart by any experiment.
+# The derivative of the frequency response tells: its rank, and which combination is
+# weakest.
+
+restructurer.identifiability_
