@@ -436,7 +436,12 @@ def test_hankel_singular_value_bounds_the_error_from_below(rough):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"solver": "bundle", "max_iter": 1000}, {"norm": "h2"}, {"norm": "similarity"}],
+    [
+        {},
+        {"solver": "bundle", "max_iter": 1000},
+        {"norm": "h2"},
+        {"norm": "similarity"},
+    ],
     ids=["sqp", "bundle", "h2", "similarity"],
 )
 def test_bounds_are_respected_and_touched(options, rough):
