@@ -116,11 +116,8 @@ def problem_from_models(
                 f"{model.n_outputs} and {model.n_inputs} (sampling time "
                 f"{model.sampling_time}). They must agree."
             )
-    start = np.zeros(structure.n_params)
-    start = start if structure.initial is None else structure.initial
-    n = structure.order
-    free = (structure.jacobian(start)[:, n:, n:] != 0).any(0)
-    fixed = structure.matrices(start)[3]
+    free = structure.free_feedthrough
+    fixed = structure.matrices(structure.reference)[3]
     boxes = [
         Target(m.A, m.B, m.C, np.where(free, m.D, fixed), m.sampling_time)
         for m in models

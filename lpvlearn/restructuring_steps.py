@@ -15,7 +15,12 @@ from .numerics.h2 import minimise_h2
 from .numerics.leastsquares import LeastSquaresResult
 from .numerics.restructure import SOLVERS, minimise_hinf
 from .numerics.similarity import minimise_bilinear
-from .numerics.starts import perturbed_candidates, rms, similarity_candidates
+from .numerics.starts import (
+    continuation_candidates,
+    perturbed_candidates,
+    rms,
+    similarity_candidates,
+)
 from .restructuring_problem import RestructuringProblem
 
 Array = NDArray[np.float64]
@@ -79,7 +84,12 @@ def candidates(
     if drawn is not None and isinstance(init, str):
         known = [] if structure.initial is None else [structure.initial[None]]
         rows += [*known, drawn]
-    return np.clip(np.vstack(rows), structure.lower, structure.upper)
+    found = np.vstack(rows)
+    if number == 1 and isinstance(init, str) and structure.order > 0:
+        # the second round begins elsewhere: far away, on a smoother response
+        continued = continuation_candidates(structure, problem.box, found, rng)
+        found = continued if len(continued) else found
+    return np.clip(found, structure.lower, structure.upper)
 
 
 def minimise(

@@ -117,10 +117,13 @@ class ImplicitSystem:
     order: int
 
     def _solved(self, theta: Array) -> tuple[Array, Array]:
-        """``M^-1`` and ``X``."""
+        """``M^-1`` and ``X``; NaN where M is singular, for a search to step back."""
         M = self.M[0] + np.tensordot(theta, self.M[1:], 1)
         N = self.N[0] + np.tensordot(theta, self.N[1:], 1)
-        inverse = np.linalg.inv(M)
+        try:
+            inverse = np.linalg.inv(M)
+        except np.linalg.LinAlgError:
+            inverse = np.full_like(M, np.nan)
         return inverse, inverse @ N
 
     def __call__(self, theta: Array) -> Blocks:

@@ -225,6 +225,12 @@ def test_structures_without_a_guess_have_a_regular_reference():
     assert_array_equal(other.system_matrix(theta), guessed.system_matrix(theta))
 
 
+def test_a_model_without_mass_is_refused():
+    structure = MECHANICAL(M2, D2, K2, [[1], [0]])
+    with pytest.raises(ValueError, match="`A` must be finite"):
+        structure.model({**VALUES, "m1": 0.0})
+
+
 @pytest.mark.parametrize(
     "change, message",
     [

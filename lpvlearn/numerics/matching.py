@@ -72,8 +72,11 @@ class ErrorSystem:
         return S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
 
     def poles(self, theta: Array) -> Complex:
-        """Poles of the gray-box model."""
-        A = self.split(self.structure.system_matrix(theta))[0]
+        """Poles of the gray-box model; infinite where its matrices are not finite."""
+        with np.errstate(all="ignore"):
+            A = self.split(self.structure.system_matrix(theta))[0]
+        if not np.isfinite(A).all():
+            return np.full(self.n, np.inf + 0j)
         return np.linalg.eigvals(A).astype(complex)
 
     def peaks(self, theta: Array, within: float | None = None) -> PeakSet:

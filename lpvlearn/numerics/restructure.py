@@ -226,7 +226,7 @@ def polished_sqp(
     """
     best = minimax_sqp(problem, y0, max_iter=max_iter, tol=tol, negligible=negligible)
     for _ in range(_POLISH_ROUNDS):
-        if best.stationarity <= _STATIONARY or best.n_iter >= max_iter:
+        if best.stationarity <= _STATIONARY or best.peaks.top <= negligible:
             break
         helped = proximal_bundle(
             problem, best.y, max_iter=_POLISH_STEPS, tol=tol, negligible=negligible

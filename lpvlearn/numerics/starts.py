@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .balancing import balancing_transformation
+from .continuation import continued_fits
 from .leastsquares import (
     LeastSquaresResult,
     channel_balance,
@@ -24,6 +26,7 @@ Complex = NDArray[np.complex128]
 
 GOOD_FIT = 3e-3  # relative least-squares error that needs no further starts
 _ROUNDS = 3
+_N_SEEDS = 6
 _MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
 _SPREAD = 0.3  # standard deviation of log-parameters around a given first guess
 
@@ -99,6 +102,47 @@ def similarity_candidates(
         problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, rate)
         found.append(similarity_starts(problem, n_starts, rng)[0])
     return np.vstack(found)
+
+
+def continuation_candidates(
+    structure: Any, box: Target | None, seeds: Array, rng: np.random.Generator
+) -> Array:
+    """Fits of the blurred response, carried to the response; see `continuation`.
+
+    Seeds are given parameters, stable or not, and random ones of a natural size where
+    bounds or ranges tell signs. Continuous time only.
+
+    Parameters
+    ----------
+    structure : GrayBoxStructure
+    box : Target or None
+    seeds : ndarray of shape (k, n_params)
+    """
+    nothing = np.zeros((0, structure.n_params))
+    if box is None or box.dt is not None or len(box.A) == 0:
+        return nothing
+    lower, upper = structure.lower, structure.upper
+    ranges = structure.ranges
+    signed = (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
+    rows = [seeds[~(seeds == 0).any(1)][:_N_SEEDS]]
+    if structure.is_affine and signed.any():
+        poles = np.abs(np.linalg.eigvals(box.A))
+        rate = float(np.exp(np.log(poles[poles > 0]).mean())) if poles.any() else 1.0
+        full = same_order(box, structure.order, rng)
+        problem = scaled_problem(
+            full.A, full.B, full.C, full.D, structure.offset, structure.basis, rate
+        )
+        size = 1.0 / np.abs(problem.basis).max((1, 2))
+        drawn = size * np.exp(rng.normal(size=(_N_SEEDS, len(size))))
+        sign = np.where(signed, np.where(upper <= 0, -1.0, 1.0), 0.0)
+        free = rng.choice([-1.0, 1.0], drawn.shape)
+        rows = [drawn * np.where(sign == 0, free, sign)]
+    if structure.initial is not None:
+        rows.insert(0, structure.initial[None])
+    starts = np.vstack(rows)
+    if len(starts) == 0:
+        return nothing
+    return continued_fits(structure, box, starts, signed)[0]
 
 
 def balanced_channels(
@@ -206,6 +250,9 @@ def search_fits(
         )
         fits.sort(key=lambda fit: fit.cost)
         if fits and np.sqrt(fits[0].cost) <= GOOD_FIT * size:
+            break
+        # the structure comes no nearer: different starts end at the same best cost
+        if number and len(fits) > 1 and fits[1].cost <= fits[0].cost * (1 + 1e-6):
             break
     return fits
 
