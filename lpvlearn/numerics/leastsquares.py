@@ -56,7 +56,8 @@ def levenberg_marquardt(
     scale = np.zeros(len(x))
     n_iter = 0
     Q, R = np.linalg.qr(J)
-    for n_iter in range(1, max_iter + 1):  # noqa: B007
+    while n_iter < max_iter:
+        n_iter += 1
         scale = np.maximum(scale, np.linalg.norm(R, axis=0))
         d = np.where(scale > 0, scale, 1.0)
         g = R.T @ (Q.T @ r)
