@@ -75,7 +75,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         Weight W of the error, ``W (G - G0)``: a stable model with one output for all
         outputs alike, or a square one; or a band in rad/s, None leaving a side open.
     max_iter : int, default=300
-        Iterations of the solver.
+        Iterations of the solver; a search that stalls is helped by some more.
     tol : float, default=1e-10
         Relative decrease of the norm below which the solver stops.
     random_state : int, RandomState instance or None, default=0

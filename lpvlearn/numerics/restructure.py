@@ -225,16 +225,17 @@ def polished_sqp(
     the bundle pass them, and the second-order method finishes.
     """
     best = minimax_sqp(problem, y0, max_iter=max_iter, tol=tol, negligible=negligible)
+    steps = min(max_iter, _POLISH_STEPS)
     for _ in range(_POLISH_ROUNDS):
         if best.stationarity <= _STATIONARY or best.peaks.top <= negligible:
             break
         helped = proximal_bundle(
-            problem, best.y, max_iter=_POLISH_STEPS, tol=tol, negligible=negligible
+            problem, best.y, max_iter=steps, tol=tol, negligible=negligible
         )
         after = minimax_sqp(
             problem,
             helped.y,
-            max_iter=max_iter,
+            max_iter=steps,
             tol=tol,
             radius=0.01,
             negligible=negligible,

@@ -1,9 +1,9 @@
 """Subspace identification beside its peers: accuracy, time, size of data.
 
 Run with ``OPENBLAS_NUM_THREADS=1 python tests/benchmarks/bench_subspace.py``. The
-peers ``ctrlsys`` (SLICOT IB01) and ``sippy-unipi`` are compared where they are
-installed. Nothing here is asserted: times belong to a machine. They are processor
-times, so that other load does not count.
+peers ``ctrlsys`` (SLICOT IB01), ``sippy-unipi``, ``nfoursid``, ``llsi`` and ``mdof``
+are compared where they are installed. Nothing here is asserted: times belong to a
+machine. They are processor times, so that other load does not count.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import contextlib
 import io
 import time
 from collections.abc import Callable
+from unittest import mock
 
 import numpy as np
 from scipy.linalg import block_diag, expm
@@ -30,6 +31,19 @@ try:
     import sippy_unipi
 except ImportError:
     sippy_unipi = None
+try:
+    import pandas
+    from nfoursid.nfoursid import NFourSID
+except ImportError:
+    NFourSID = None
+try:
+    import llsi
+except ImportError:
+    llsi = None
+try:
+    from mdof import realize as mdof_realize
+except ImportError:
+    mdof_realize = None
 
 Array = np.ndarray
 System = tuple[Array, Array, Array, Array]
@@ -103,6 +117,33 @@ def sippy(u: Array, y: Array, order: int, horizon: int) -> System:
     return found.A, found.B, found.C, found.D
 
 
+def nfoursid(u: Array, y: Array, order: int, horizon: int) -> System:
+    inputs = [f"u{i}" for i in range(u.shape[1])]
+    outputs = [f"y{i}" for i in range(y.shape[1])]
+    frame = pandas.DataFrame(np.hstack([u, y]), columns=inputs + outputs)
+    fit = NFourSID(frame, outputs, inputs, num_block_rows=horizon)
+    fit.subspace_identification()
+    model, _ = fit.system_identification(rank=order)
+    return model.a, model.b, model.c, model.d
+
+
+def llsi_po_moesp(u: Array, y: Array, order: int, horizon: int) -> System:
+    """PO-MOESP of llsi, which sets its horizon from the order: (2 n + 1) n_u."""
+    inputs = {f"u{i}": column for i, column in enumerate(u.T)}
+    outputs = {f"y{i}": column for i, column in enumerate(y.T)}
+    data = llsi.SysIdData(Ts=1.0, **inputs, **outputs)
+    model = llsi.sysid(data, list(outputs), list(inputs), order, method="po-moesp")
+    return model.A, model.B, model.C, model.D
+
+
+def mdof_n4sid(u: Array, y: Array, order: int, horizon: int) -> System:
+    """N4SID of mdof. It takes no order (its own holds 99 % of the squared singular
+    values), so the one search that counts them is made to answer ``order``."""
+    n_columns = len(u) - 2 * horizon + 1
+    with mock.patch("numpy.searchsorted", return_value=order - 1):
+        return mdof_realize.n4sid(u.T, y.T, horizon, n_columns)[:4]
+
+
 def contenders() -> dict[str, Callable[..., System]]:
     table: dict[str, Callable[..., System]] = {
         "lpvlearn po-moesp": ours("po-moesp", True),
@@ -115,6 +156,12 @@ def contenders() -> dict[str, Callable[..., System]]:
         table["ctrlsys MOESP + IB01CD"] = slicot
     if sippy_unipi is not None:
         table["sippy-unipi MOESP"] = sippy
+    if NFourSID is not None:
+        table["nfoursid"] = nfoursid
+    if llsi is not None:
+        table["llsi PO-MOESP, own horizon"] = llsi_po_moesp
+    if mdof_realize is not None:
+        table["mdof N4SID, order forced"] = mdof_n4sid
     return table
 
 
