@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from .certificates import MinimaxResult, Peaks
 from .leastsquares import LeastSquaresResult
 from .matching import ErrorSystem
-from .restructure import decay_rates, metric_coordinates, within_bounds
+from .restructure import keeps_margin, metric_coordinates, within_bounds
 from .transfer import series
 
 Array = NDArray[np.float64]
@@ -105,8 +105,7 @@ def minimise_h2(
 
     def objective(y: Array) -> tuple[float, Array]:
         theta = theta_of(y)
-        rate = decay_rates(system, theta)[0]
-        if not np.isfinite(rate).all() or rate.max(initial=-np.inf) > -margin:
+        if not keeps_margin(system, theta, margin):
             return _REFUSED, np.zeros_like(y)
         J, gradient = squared_h2(system, theta)
         return J / scale**2, (gradient[active] @ T) / scale**2

@@ -39,10 +39,10 @@ _MAX_CAPS = 12
 _HARD_STEPS = (0.99, 0.9999)
 
 
-def decay_rates(system: ErrorSystem, theta: Array) -> tuple[Array, Complex]:
-    """Growth rate of every mode, ``Re lambda`` or ``log |lambda| / dt``, and poles."""
-    poles = system.poles(theta)
-    return growth(poles, system.dt), poles
+def keeps_margin(system: ErrorSystem, theta: Array, margin: float) -> bool:
+    """Whether every mode of the gray-box model decays faster than `margin` (1/s)."""
+    rate = growth(system.poles(theta), system.dt)
+    return bool(np.isfinite(rate).all() and rate.max(initial=-np.inf) <= -margin)
 
 
 def growth(poles: Complex, dt: float | None) -> Array:
@@ -135,11 +135,7 @@ class HinfObjective:
 
     def admissible(self, theta: Array) -> bool:
         """Whether the gray-box model keeps (most of) the margin, and the cap."""
-        rate = decay_rates(self.system, theta)[0]
-        if (
-            not np.isfinite(rate).all()
-            or rate.max(initial=-np.inf) > -0.8 * self.margin
-        ):
+        if not keeps_margin(self.system, theta, 0.8 * self.margin):
             return False
         if self.capped is None:
             return True

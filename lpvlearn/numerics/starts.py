@@ -17,7 +17,7 @@ from .leastsquares import (
     frequency_grid,
 )
 from .matching import ErrorSystem
-from .restructure import decay_rates, growth
+from .restructure import growth, keeps_margin
 from .similarity import scaled_problem, similarity_starts
 from .transfer import Target, model_derivatives
 
@@ -267,12 +267,7 @@ def grid_and_margin(target: Target) -> tuple[Array, float]:
 
 def stability_test(system: ErrorSystem, margin: float) -> Callable[[Array], bool]:
     """Whether parameters give a model that keeps the stability margin."""
-
-    def stable(theta: Array) -> bool:
-        rate = decay_rates(system, theta)[0]
-        return bool(np.isfinite(rate).all() and rate.max(initial=-np.inf) <= -margin)
-
-    return stable
+    return lambda theta: keeps_margin(system, theta, margin)
 
 
 def rms(G: Complex) -> float:
