@@ -64,8 +64,9 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         bilinear equations of a similarity transformation, Eq. (7), for affine
         structures of the black box's order.
     solver : {"sqp", "bundle"}, default="sqp"
-        Minimax sequential quadratic programming with exact second derivatives, or the
-        paper's proximity control with cutting planes, Eq. (18)-(21).
+        What ends the search: minimax sequential quadratic programming with exact
+        second derivatives, or the paper's proximity control with cutting planes,
+        Eq. (18)-(21).
     init : "similarity" or array-like of shape (n_params,), default="similarity"
         Where the search begins: from nothing, by similarity transformations of the
         black box, or from a physical guess.
@@ -74,8 +75,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
     frequency_weight : StateSpace, (low, high) or None, default=None
         Weight W of the error, ``W (G - G0)``: a stable model with one output for all
         outputs alike, or a square one; or a band in rad/s, None leaving a side open.
-    max_iter : int, default=300
-        Iterations of the solver; a search that stalls is helped by some more.
+    max_iter : int, default=1000
+        Newton steps on the central path and iterations of the solver, in all.
     tol : float, default=1e-10
         Relative decrease of the norm below which the solver stops.
     random_state : int, RandomState instance or None, default=0
@@ -117,25 +118,27 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         What the black box has in D where the structure has no parameter: left out of
         the comparison, as in Eq. (4).
     fit_error_ : float
-        Relative root-mean-square error over frequency of the least-squares fit that the
-        solver started from.
+        Relative root-mean-square error over frequency of the best least-squares fit.
     params_covariance_ : ndarray of shape (n_params, n_params)
         Covariance of the parameters from the spread of the `realizations` given to
         `fit_model`; absent without them.
     start_params_ : ndarray of shape (n_params,)
-        Least-squares fit that the solver started from.
+        Least-squares fit that the search started from.
     starts_ : DataFrame
-        Relative error of the least-squares fits that the solver could start from.
+        Relative error of the least-squares fits that the search could start from.
     n_iter_ : int
     history_ : DataFrame
-        Objective, predicted decrease, step bound and number of active peaks by
-        iteration.
+        Objective, and mu and Newton steps for each stage of the central path;
+        predicted decrease, step bound and number of active peaks by iteration of the
+        solver.
 
     Notes
     -----
     Candidates come from similarity transformations that solve the equations without
     parameters exactly (Eq. (34)); the best, judged by their frequency response, start a
-    least-squares fit of the response, and that starts the minimax.
+    least-squares fit of the response. From there a smooth path of minimisers leads to
+    the least maximum over frequency (:mod:`lpvlearn.numerics.central_path`), and the
+    solver ends it.
 
     Examples
     --------
@@ -158,7 +161,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         init: str | ArrayLike = "similarity",
         n_starts: int = 16,
         frequency_weight: FrequencyWeight = None,
-        max_iter: int = 300,
+        max_iter: int = 1000,
         tol: float = 1e-10,
         random_state: Any = 0,
     ) -> None:
@@ -326,7 +329,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         self.fit_error_, self.start_params_ = relative[0], fits[0].x
         self.params_, result, floor = minimise(
             problem,
-            fits[0],
+            fits,
             norm=self.norm,
             solver=self.solver,
             max_iter=self.max_iter,

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from .frequency_data import read_frequency_data
 from .numerics.frf_realization import realize_response
 from .numerics.hinf import hinf_norm
+from .numerics.limits import growth
 from .numerics.matching import ErrorSystem, MeasuredErrorSystem
-from .numerics.restructure import growth
 from .numerics.starts import grid_and_margin, stability_test
 from .numerics.transfer import Target, series
 from .statespace import StateSpace

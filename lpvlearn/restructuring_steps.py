@@ -13,7 +13,7 @@ from .exceptions import RankWarning
 from .numerics.certificates import MinimaxResult
 from .numerics.h2 import minimise_h2
 from .numerics.leastsquares import LeastSquaresResult
-from .numerics.restructure import SOLVERS, minimise_hinf
+from .numerics.restructure import SOLVERS, minimise_hinf, promising
 from .numerics.similarity import minimise_bilinear
 from .numerics.starts import (
     continuation_candidates,
@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 _NORMS = ("hinf", "h2", "similarity")
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about
+_AGREE = 1e-3  # relative difference of the errors of fits in one basin
 _ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
 
 
@@ -94,14 +95,14 @@ def candidates(
 
 def minimise(
     problem: RestructuringProblem,
-    fit: LeastSquaresResult,
+    fits: list[LeastSquaresResult],
     *,
     norm: str,
     solver: str,
     max_iter: int,
     tol: float,
 ) -> tuple[Array, MinimaxResult, float]:
-    """Minimise the norm of the error from a least-squares fit.
+    """Minimise the norm of the error from least-squares fits.
 
     Returns
     -------
@@ -117,11 +118,12 @@ def minimise(
     }
     system, margin = problem.system, problem.margin
     if norm == "h2":
-        return *minimise_h2(system, fit, margin, **options), 0.0
+        runs = [minimise_h2(system, fit, margin, **options) for fit in promising(fits)]
+        return *min(runs, key=lambda run: run[1].peaks.top), 0.0
     if norm == "similarity":
-        found = minimise_bilinear(problem.structure, problem.box, fit.x, max_iter)
+        found = minimise_bilinear(problem.structure, problem.box, fits[0].x, max_iter)
         return *found, 0.0
-    return minimise_hinf(system, fit, margin, SOLVERS[solver], **options)
+    return minimise_hinf(system, fits, margin, SOLVERS[solver], **options)
 
 
 def relative_error(fit: LeastSquaresResult, problem: RestructuringProblem) -> float:
@@ -145,11 +147,19 @@ def warn_about(
     error = restructurer.fit_error_
     floor = restructurer.structural_floor_ / max(problem.reference, 1e-300)
     if error - floor > _POOR_FIT:
+        costs = restructurer.starts_["relative_error"].to_numpy()
+        agreeing = int((costs <= costs.min() * (1.0 + _AGREE)).sum())
         warnings.warn(
             f"the structure comes no nearer than {100 * error:.2g} % (root mean square "
-            f"over frequency) to the black box in {len(restructurer.starts_)} fits: "
-            "either it cannot represent the model, or the search ended in a wrong "
-            "basin. Give `init`, or raise `n_starts`.",
+            f"over frequency) to the black box; {agreeing} of {len(costs)} fits from "
+            "different starts end there. "
+            + (
+                "It probably cannot represent the model any better."
+                if agreeing > 1
+                else "Either it cannot represent the model, or the search ended in a "
+                "wrong basin."
+            )
+            + " Give `init`, or raise `n_starts`, to search elsewhere.",
             ConvergenceWarning,
             stacklevel=4,
         )

@@ -62,7 +62,7 @@ def two_lags():
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 def test_restructurer_minimises_the_h2_norm():
     box = StateSpace(
-        [[0, 1, 0], [-2, -3, 0], [0, 0, -30]], [[0], [2], [1]], [[1, 0, 3]]
+        [[0, 1, 0], [-2, -3, 0], [0, 0, -30]], [[0], [2], [1]], [[1, 0, 0.3]]
     )
     structure = two_lags()
     fitted = GrayBoxRestructurer(structure, norm="h2").fit_model(box)

@@ -120,10 +120,33 @@ restructurer.starts_
 # optimum several peaks are equally high, and a step that lowers one raises another
 # unless it knows of both.
 #
+# The path from least squares
+# ---------------------------
+# The least-squares fit is a good start in a good basin, but its highest peak may be twice
+# as high as it must be, and the way down is no straight line: a search on the maximum
+# itself follows the ridge on which several peaks are equal, and where the ridge bends its
+# steps are tiny. So the first part of the way leads over a smooth function. With a level
+# :math:`t` above the error at all frequencies :math:`\omega_k` of a grid, and
+# :math:`\mu > 0`,
+#
+# .. math::
+#
+#    \psi_\mu(\vartheta) = \min_t \ \log t
+#    - \mu \sum_k \log\det \left( I - t^{-2} \Sigma_k^H \Sigma_k \right),
+#    \qquad \Sigma_k = \Sigma(j\omega_k, \vartheta).
+#
+# For :math:`\mu \to \infty` its minimiser is the least-squares fit, for
+# :math:`\mu \to 0` that of the highest singular value; between them runs the *central
+# path* of interior-point methods. Newton's method with exact second derivatives follows
+# it while :math:`\mu` shrinks and the peaks that are met join the grid. Where the
+# structure is far from the black box, the path is followed from the best fit of each of
+# several basins.
+#
 # The minimisation
 # ----------------
-# Each peak :math:`f_i(\vartheta) = \sigma_1(\Sigma(j\omega_i(\vartheta), \vartheta))`
-# is a smooth function, with the gradient
+# From its end the optimum is a few steps away. Each peak :math:`f_i(\vartheta) =
+# \sigma_1(\Sigma(j\omega_i(\vartheta), \vartheta))` is a smooth function, with the
+# gradient
 #
 # .. math::
 #
@@ -231,7 +254,8 @@ pd.Series(
 
 # %%
 # The dashed line is the floor. A dot marks each frequency at which the weighted error
-# has one of its equally high peaks.
+# has one of its equally high peaks. Grey: the least-squares fit that the minimisation
+# began with, whose peaks near the resonances are higher.
 #
 # The result
 # ----------

@@ -60,6 +60,7 @@ class MinimaxProblem:
     samples: Callable[[Array, Array], Peaks]
     hessians: Callable[[Array, Array, Flags], Array]
     constraints: Callable[[Array], tuple[Array, Array]]
+    grid: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,11 @@ class Structure(Protocol):
 
 
 @dataclass(frozen=True)
-class _Point:
-    """Quantities at one theta and several frequencies (leading axis k)."""
+class ErrorPoint:
+    """Quantities at one theta and several frequencies (leading axis k).
+
+    ``E = G(theta) - G0``, ``dE_j = L S_j R``, and ``Phi = (s I - A)^-1``.
+    """
 
     L: Complex  # (k, n_outputs, n + n_outputs)
     R: Complex  # (k, n + n_inputs, n_inputs)
@@ -62,6 +65,7 @@ class ErrorSystem:
         self.structure, self.target, self.dt = structure, target, target.dt
         self.n = structure.order
         self.n_outputs, self.n_inputs = target.D.shape
+        self.fastest = float(np.abs(np.linalg.eigvals(target.A)).max(initial=0.0))
         self.weight = weight
         if weight is not None and weight.D.shape == (1, 1) and self.n_outputs > 1:
             self.weight = weight.repeated(self.n_outputs)
@@ -130,7 +134,7 @@ class ErrorSystem:
 
     def response_jacobian(self, theta: Array, omega: Array) -> tuple[Complex, Complex]:
         """Response and its derivatives, shapes (k, p, m) and (k, p, m, n_params)."""
-        at = self._point(
+        at = self.point(
             theta, omega, np.zeros((1, self.n_outputs, self.n_inputs), complex)
         )
         S = self.structure.jacobian(theta)
@@ -138,7 +142,8 @@ class ErrorSystem:
         left = np.tensordot(at.L, S, axes=(2, 1))
         return at.E, np.einsum("kpjb,kbm->kpmj", left, at.R)
 
-    def _point(self, theta: Array, omega: Array, G0: Complex) -> _Point:
+    def point(self, theta: Array, omega: Array, G0: Complex) -> ErrorPoint:
+        """The error without its weight, and what its derivatives are made of."""
         A, B, C, D = self.split(self.structure.system_matrix(theta))
         Phi = resolvent(A, laplace_variable(omega, self.dt)[0])
         k, p, m = len(omega), self.n_outputs, self.n_inputs
@@ -146,7 +151,7 @@ class ErrorSystem:
         L[:, :, : self.n], L[:, :, self.n :] = C @ Phi, np.eye(p)
         R = np.empty((k, self.n + m, m), complex)
         R[:, : self.n], R[:, self.n :] = Phi @ B, np.eye(m)
-        return _Point(L, R, C @ R[:, : self.n] + D - G0, Phi)
+        return ErrorPoint(L, R, C @ R[:, : self.n] + D - G0, Phi)
 
     def gradients(self, theta: Array, omega: Array) -> tuple[Array, Array]:
         """Largest singular values and their gradients, Eq. (20) for sigma itself.
@@ -156,7 +161,7 @@ class ErrorSystem:
         sigma : ndarray of shape (k,)
         gradients : ndarray of shape (k, n_params)
         """
-        at = self._point(theta, omega, self.target_response(omega))
+        at = self.point(theta, omega, self.target_response(omega))
         W = self.weight_response(omega)[0]
         U, sigma, Vh = np.linalg.svd(W @ at.E)
         left = np.einsum("kp,kpq,kqa->ka", U[:, :, 0].conj(), W, at.L)
@@ -192,7 +197,7 @@ class ErrorSystem:
         p, m = self.n_outputs, self.n_inputs
         _, s1, s2 = laplace_variable(omega, self.dt)
         G0, G0_1, G0_2 = self._target_derivatives(omega)
-        at = self._point(theta, omega, G0)
+        at = self.point(theta, omega, G0)
         A, B, C, _ = self.split(self.structure.system_matrix(theta))
         W, W1, W2 = self.weight_response(omega)
         U, sigma, Vh = np.linalg.svd(W @ at.E)
@@ -272,6 +277,7 @@ class MeasuredErrorSystem(ErrorSystem):
         super().__init__(structure, target)
         order = np.argsort(omega)
         self.omega, self.G = omega[order], G[order]
+        self.fastest = float(self.omega[-1])
         unit = np.broadcast_to(np.eye(n_outputs), (len(omega), n_outputs, n_outputs))
         self.W = (unit if weight is None else weight[order]).astype(complex)
 

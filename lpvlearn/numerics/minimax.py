@@ -1,8 +1,9 @@
-"""Trust-region sequential quadratic programming for a maximum of peak functions.
+"""Trust-region sequential quadratic programming for a maximum over frequency.
 
-Minimises ``f(y) = max_i phi_i(y)``, where the ``phi_i`` are the local maxima over
-frequency of the largest singular value of the error, Eq. (16). All peaks near the
-norm enter the local model, with the exact Hessian of the Lagrangian.
+Minimises ``f(y) = max_omega sigma(y, omega)``, the largest singular value of the error,
+Eq. (16). The local model holds all local maxima near the norm, with the exact Hessian
+of the Lagrangian, and beside them the singular value at fixed frequencies: where two
+maxima merge, or a new one rises, only these are smooth.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ from .quadratic import epigraph_step
 
 Array = NDArray[np.float64]
 
-_MAX_ENTRIES = 60
+_MAX_EXTRA = 40  # frequencies beside the grid: those at which a step failed
 _PATIENCE = 25  # iterations without progress that end the search
 _NOTHING = 1e-8
+_CORRECTIONS = 3
+_SAME = 1e-6  # relative distance of frequencies that are the same
+_SURPRISE = 0.2  # part of the decrease that a peak between the frequencies took away
 
 
 def minimax_sqp(
@@ -60,31 +64,28 @@ def minimax_sqp(
     own = problem.peaks(y0)
     if own is None:
         raise ValueError("the starting point of the minimax is not admissible.")
-    y, peaks = y0.copy(), own
-    model: _Model | None = None
+    y, extra = y0.copy(), np.zeros(0)
+    local: _Local | None = None
     history: list[dict[str, float]] = []
     converged, n_iter = False, 0
-    shoulders = _Shoulders(np.zeros(0), np.zeros(0))
     while n_iter < max_iter and not converged:
-        if own.top <= negligible:
+        f = own.top
+        if f <= negligible:
             converged = True
             break
         n_iter += 1
-        f = own.top
-        c, dc = shoulders.constraints(problem, y)
-        if model is None:
-            model = _model(problem, y, peaks, c, dc, radius)
-        step = model.step(peaks, c, dc, radius)
+        if local is None:
+            omega = np.concatenate([problem.grid, extra])
+            local = _local_model(problem, y, own, omega, radius)
+        step = local.step(radius)
         if step is None:
             radius *= 0.25
-            model = model.stiffer()
+            local = local.stiffer()
             converged = radius < 1e-14
             continue
         d, multipliers = step
-        slack = peaks.values / f - 1.0
-        linear = -float(np.max(slack + peaks.gradients @ d / f))
-        predicted = linear - 0.5 * float(d @ model.H @ d)
-        if stalled(history, f):  # peaks that merge and split: no smooth functions
+        linear, predicted = local.decrease(d)
+        if stalled(history, f):
             converged = True
             break
         history.append(
@@ -98,17 +99,18 @@ def minimax_sqp(
         if linear <= tol or radius < 1e-14:
             converged = True
             break
-        trial = problem.peaks(y + d)
-        ratio = (f - trial.top) / f / predicted if trial and predicted > 0 else -1.0
-        if trial is not None and ratio < 0.3:
-            corrected = _second_order_correction(
-                problem, y, peaks, trial, d, model, c, dc, radius
-            )
-            if corrected is not None and corrected[1].top < trial.top:
-                d, trial = corrected
-                ratio = (f - trial.top) / f / predicted
+        d, high = _corrected(problem, y, local, d, radius)
+        trial = problem.peaks(y + d) if high < f else None
+        ratio = -1.0
+        if trial is not None and predicted > 0:
+            ratio = (f - trial.top) / f / predicted
+            if trial.top > high + _SURPRISE * (f - high):
+                new = trial.frequencies[trial.values > high]
+                new = new[~_among(new, omega)]
+                extra = np.concatenate([extra, new])[-_MAX_EXTRA:]
+                local = None if new.size else local
         if trial is not None and ratio > 1e-4 and trial.top < f:
-            y, own, peaks, model = y + d, trial, trial, None
+            y, own, local = y + d, trial, None
             if ratio > 0.75 and np.abs(d).max() > 0.8 * radius:
                 radius = min(2.5 * radius, 10.0)
             elif ratio < 0.25:
@@ -117,16 +119,8 @@ def minimax_sqp(
             converged = True
         else:
             radius = 0.35 * min(radius, float(np.abs(d).max()))
-            if trial is not None:
-                high = trial.frequencies[trial.values >= 0.98 * trial.top]
-                enriched, shoulders = _with_cuts(
-                    problem, y, peaks, shoulders, own.top, high
-                )
-                if enriched is not None:
-                    peaks, model = enriched, None
-    stationarity, second_order = certificate(
-        problem, y, own, shoulders.constraints(problem, y), negligible
-    )
+    constraints = problem.constraints(y)
+    stationarity, second_order = certificate(problem, y, own, constraints, negligible)
     return MinimaxResult(y, own, stationarity, second_order, converged, n_iter, history)
 
 
@@ -138,161 +132,123 @@ def stalled(history: list[dict[str, float]], f: float) -> bool:
 
 
 @dataclass(frozen=True)
-class _Model:
-    """Convexified Hessian of the Lagrangian, relative to the objective."""
+class _Local:
+    """The quadratic program at one point, relative to the objective.
 
+    Attributes
+    ----------
+    entries : Peaks
+        Local maxima, and singular values at fixed frequencies.
+    H : ndarray of shape (q, q)
+        Convexified Hessian of the Lagrangian.
+    c, dc : ndarray
+        Constraints ``c + dc d <= 0``.
+    """
+
+    entries: Peaks
     H: Array
+    c: Array
+    dc: Array
 
-    def stiffer(self) -> _Model:
+    def stiffer(self) -> _Local:
         shift = 0.1 * max(float(np.trace(self.H)) / len(self.H), 1e-8)
-        return _Model(self.H + shift * np.eye(len(self.H)))
+        H = self.H + shift * np.eye(len(self.H))
+        return _Local(self.entries, H, self.c, self.dc)
 
     def step(
-        self,
-        peaks: Peaks,
-        c: Array,
-        dc: Array,
-        radius: float,
-        slack: Array | None = None,
+        self, radius: float, ends: Array | None = None, d: Array | None = None
     ) -> tuple[Array, Array] | None:
-        """Solution of the quadratic program, or None; `slack` replaces the values."""
-        f = peaks.top
-        values = peaks.values / f - 1.0 if slack is None else slack
+        """Step and multipliers of the entries, or None.
+
+        With the values `ends` that the entries have after the step `d`, corrected for
+        their curvature.
+        """
+        f, slopes = self.entries.top, self.entries.gradients
+        values = self.entries.values
+        if ends is not None and d is not None:
+            values = ends - slopes @ d
         solution = epigraph_step(
-            self.H, values, peaks.gradients / f, np.minimum(c, 0.0), dc, radius
+            self.H, values / f - 1.0, slopes / f, self.c, self.dc, radius
         )
         return None if solution is None else (solution[0], solution[1])
 
+    def decrease(self, d: Array) -> tuple[float, float]:
+        """Relative decrease that the linear and the quadratic model promise."""
+        f = self.entries.top
+        ends = self.entries.values + self.entries.gradients @ d
+        linear = 1.0 - float(ends.max()) / f
+        return linear, linear - 0.5 * float(d @ self.H @ d)
 
-def _model(
-    problem: MinimaxProblem, y: Array, peaks: Peaks, c: Array, dc: Array, radius: float
-) -> _Model:
-    """Hessian of the Lagrangian with the multipliers of a first-order step."""
-    f, q = peaks.top, len(y)
-    G = peaks.gradients / f
-    first_order = 1e-2 * np.linalg.norm(G, axis=1).max() * np.eye(q) / max(radius, 1e-6)
-    solution = epigraph_step(
-        first_order, peaks.values / f - 1.0, G, np.minimum(c, 0.0), dc, radius
+
+def _corrected(
+    problem: MinimaxProblem, y: Array, local: _Local, d: Array, radius: float
+) -> tuple[Array, float]:
+    """The step, bent by the curvature of the entries, and their highest value there."""
+    omega, f = local.entries.frequencies, local.entries.top
+    ends = problem.samples(y + d, omega).values
+    for _ in range(_CORRECTIONS):
+        if not np.isfinite(ends).all():
+            break
+        step = local.step(radius, ends, d)
+        if step is None:
+            break
+        new = problem.samples(y + step[0], omega).values
+        gain = float(ends.max() - new.max())
+        if not gain > 0:
+            break
+        d, ends = step[0], new
+        if gain < 0.1 * (f - float(ends.max())):
+            break
+    return d, float(ends.max())
+
+
+def _local_model(
+    problem: MinimaxProblem, y: Array, own: Peaks, omega: Array, radius: float
+) -> _Local:
+    """Entries, constraints, and the Hessian with the multipliers of a first step."""
+    c, dc = problem.constraints(y)
+    cuts = problem.samples(y, omega[~_among(omega, own.frequencies)])
+    # Above the objective is only the shoulder of a constant peak that has been set
+    # aside: there the error shall not grow, or a new peak would rise on the shoulder.
+    below = cuts.values <= own.top * (1.0 + 1e-9)
+    caps = cuts.values[~below]
+    c = np.concatenate([np.minimum(c, 0.0), np.zeros(len(caps))])
+    dc = np.vstack([dc, cuts.gradients[~below] / caps[:, None]])
+    entries = Peaks(
+        np.concatenate([own.values, cuts.values[below]]),
+        np.concatenate([own.frequencies, cuts.frequencies[below]]),
+        np.vstack([own.gradients, cuts.gradients[below]]),
+        np.concatenate([own.moving, cuts.moving[below]]),
     )
-    if solution is None:
-        return _Model(first_order)
-    H = None
+    f, q = own.top, len(y)
+    G = entries.gradients / f
+    H = 1e-2 * np.linalg.norm(G, axis=1).max() * np.eye(q) / max(radius, 1e-6)
+    first = _Local(entries, H, c, dc)
+    solution = epigraph_step(H, entries.values / f - 1.0, G, c, dc, radius)
     for _ in range(2):  # the multipliers of the second-order model refine themselves
+        if solution is None:
+            break
         _, multipliers, mu = solution
         active = multipliers > ACTIVE_MULTIPLIER
         if not active.any():
-            return _Model(first_order)
+            return first
         weights = multipliers[active] / multipliers[active].sum()
-        hessians = problem.hessians(y, peaks.frequencies[active], peaks.moving[active])
+        hessians = problem.hessians(
+            y, entries.frequencies[active], entries.moving[active]
+        )
         L = np.tensordot(weights, hessians, axes=1) / f
         H = convexified(L, G[active], dc[mu > ACTIVE_MULTIPLIER])
-        solution = epigraph_step(
-            H, peaks.values / f - 1.0, G, np.minimum(c, 0.0), dc, radius
-        )
-        if solution is None or ((solution[1] > ACTIVE_MULTIPLIER) == active).all():
+        solution = epigraph_step(H, entries.values / f - 1.0, G, c, dc, radius)
+        if solution is not None and ((solution[1] > ACTIVE_MULTIPLIER) == active).all():
             break
-    assert H is not None
-    return _Model(H)
+    return _Local(entries, H, c, dc)
 
 
-def _second_order_correction(
-    problem: MinimaxProblem,
-    y: Array,
-    peaks: Peaks,
-    trial: Peaks,
-    d: Array,
-    model: _Model,
-    c: Array,
-    dc: Array,
-    radius: float,
-) -> tuple[Array, Peaks] | None:
-    """Solve again with the peaks' values at the trial point, matched by frequency."""
-    f = peaks.top
-    slack = peaks.values / f - 1.0
-    for i, (omega, g) in enumerate(
-        zip(peaks.frequencies, peaks.gradients, strict=True)
-    ):
-        j = nearest_peak(trial.frequencies, omega)
-        if j is not None:
-            slack[i] = (trial.values[j] - g @ d) / f - 1.0
-    step = model.step(peaks, c, dc, radius, slack)
-    if step is None:
-        return None
-    corrected = problem.peaks(y + step[0])
-    return None if corrected is None else (step[0], corrected)
-
-
-@dataclass(frozen=True)
-class _Shoulders:
-    """Frequencies beside a constant peak, where the error shall not grow.
-
-    There the singular value is above the objective, because a peak that no parameter
-    changes has been set aside. A step that would raise a new peak on its shoulder is
-    forbidden by a constraint at that frequency, ``sigma(y) <= cap``.
-    """
-
-    frequencies: Array
-    caps: Array
-
-    def constraints(self, problem: MinimaxProblem, y: Array) -> tuple[Array, Array]:
-        """Constraints of the problem and of the shoulders, and their gradients."""
-        c, dc = problem.constraints(y)
-        if self.caps.size == 0:
-            return c, dc
-        found = problem.samples(y, self.frequencies)
-        return (
-            np.concatenate([c, found.values / self.caps - 1.0]),
-            np.vstack([dc, found.gradients / self.caps[:, None]]),
-        )
-
-
-def _with_cuts(
-    problem: MinimaxProblem,
-    y: Array,
-    peaks: Peaks,
-    shoulders: _Shoulders,
-    f: float,
-    frequencies: Array,
-) -> tuple[Peaks | None, _Shoulders]:
-    """Add the singular value at fixed frequencies, those at which a trial step failed.
-
-    A peak that is about to split, or that a resonance carries quickly along the
-    frequency axis, is a bad local model of itself; its value at the frequency where
-    it hurt is a smooth function. None where there is nothing to add.
-    """
-    known = np.concatenate([peaks.frequencies, shoulders.frequencies])
-    new = [w for w in frequencies if nearest_peak(known, w, 1 + 1e-6) is None]
-    if not new or len(known) > _MAX_ENTRIES:
-        return None, shoulders
-    cuts = problem.samples(y, np.array(new))
-    below = cuts.values <= f * (1.0 + 1e-9)
-    if not below.all():
-        shoulders = _Shoulders(
-            np.concatenate([shoulders.frequencies, cuts.frequencies[~below]]),
-            np.concatenate([shoulders.caps, cuts.values[~below]]),
-        )
-    return (
-        Peaks(
-            np.concatenate([peaks.values, cuts.values[below]]),
-            np.concatenate([peaks.frequencies, cuts.frequencies[below]]),
-            np.vstack([peaks.gradients, cuts.gradients[below]]),
-            np.concatenate([peaks.moving, cuts.moving[below]]),
-        ),
-        shoulders,
-    )
-
-
-def nearest_peak(frequencies: Array, omega: float, ratio: float = 1.25) -> int | None:
-    """Index of the frequency nearest to `omega` within `ratio`, else None."""
-    same = np.flatnonzero(frequencies == omega)
-    if same.size:
-        return int(same[0])
-    if omega == 0 or not np.isfinite(omega):
-        return None
-    usable = (frequencies > 0) & np.isfinite(frequencies)
-    if not usable.any():
-        return None
-    distance = np.full(len(frequencies), np.inf)
-    distance[usable] = np.abs(np.log(frequencies[usable] / omega))
-    j = int(np.argmin(distance))
-    return j if distance[j] <= np.log(ratio) else None
+def _among(omega: Array, known: Array) -> NDArray[np.bool_]:
+    """Which frequencies are, nearly, among the known ones."""
+    if known.size == 0 or omega.size == 0:
+        return np.zeros(len(omega), bool)
+    with np.errstate(invalid="ignore"):  # inf - inf
+        apart = np.abs(omega[:, None] - known)
+        near = apart <= _SAME * np.abs(known)
+    return ((omega[:, None] == known) | near & np.isfinite(known)).any(1)

@@ -16,8 +16,8 @@ from .leastsquares import (
     fit_frequency_response,
     frequency_grid,
 )
+from .limits import growth, keeps_margin
 from .matching import ErrorSystem
-from .restructure import growth, keeps_margin
 from .similarity import scaled_problem, similarity_starts
 from .transfer import Target, model_derivatives
 

@@ -37,7 +37,9 @@ def laplace_variable(
     """``s(omega)`` and its two derivatives: ``j omega`` or ``exp(j omega dt)``."""
     if dt is None:
         zero = np.zeros(len(omega), complex)
-        return zero + 1j * omega, zero + 1j, zero
+        s = zero.copy()
+        s.imag = omega  # 1j * inf is not a number
+        return s, zero + 1j, zero
     z = np.exp(1j * omega * dt)
     return z, 1j * dt * z, -(dt**2) * z
 

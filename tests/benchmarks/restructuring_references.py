@@ -12,6 +12,8 @@ from scipy.optimize import minimize
 
 from lpvlearn import GrayBoxStructure, StateSpace
 from lpvlearn.numerics.hinf import linf_norm
+from lpvlearn.numerics.starts import grid_and_margin
+from lpvlearn.numerics.transfer import Target
 
 UNSTABLE = 1e300
 
@@ -23,6 +25,8 @@ class Objective:
         self, structure: GrayBoxStructure, model: StateSpace, theta: np.ndarray
     ) -> None:
         self.structure, self.model = structure, model
+        target = Target(model.A, model.B, model.C, model.D)
+        self.margin = grid_and_margin(target)[1]  # the library's set of models
         self.theta0, self.T = theta, np.eye(len(theta))
         omega = self.grid()
         _, L, R = self.error(theta, omega)
@@ -45,12 +49,15 @@ class Objective:
     def growth(self, theta: np.ndarray) -> float:
         return float(np.linalg.eigvals(self.structure.matrices(theta)[0]).real.max())
 
+    def stable(self, theta: np.ndarray) -> bool:
+        return self.growth(theta) < -0.8 * self.margin
+
     def norm(self, theta: np.ndarray, within: float) -> tuple[float, np.ndarray]:
         """The norm and the frequencies of the peaks near it."""
         A, B, C, D = self.structure.matrices(theta)
         lower, upper = self.structure.lower, self.structure.upper
         outside = (theta < lower).any() or (theta > upper).any()
-        if outside or not np.isfinite(A).all() or self.growth(theta) >= 0:
+        if outside or not np.isfinite(A).all() or not self.stable(theta):
             return UNSTABLE, np.zeros(0)
         m = self.model
         zero = np.zeros((len(A), m.order))
@@ -109,7 +116,7 @@ def exchange(
         return np.hstack([slope, np.ones((len(omega), 1))])
 
     def stable(x: np.ndarray) -> np.ndarray:
-        return np.array([-objective.growth(objective.theta(x[:-1])) - 1e-4])
+        return np.array([-objective.growth(objective.theta(x[:-1])) - objective.margin])
 
     for _ in range(rounds):
         start = np.r_[y, objective.peaks(y, omega)[0].max() / scale]
