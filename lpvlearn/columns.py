@@ -184,6 +184,33 @@ class Table:
         """Find the column that has a role; None for `key=None`."""
         return None if key is None else self.find(key, role)
 
+    def inputs(
+        self, keys: Any, others: Sequence[tuple[int | None, Column] | None]
+    ) -> list[Column]:
+        """Find the inputs: the columns named, else those without another role.
+
+        Parameters
+        ----------
+        keys : column name, position, list or None
+        others : sequence of (position, column) or None
+            Columns that have another role.
+
+        Raises
+        ------
+        ValueError
+            When there is no input.
+        """
+        if keys is not None:
+            return [column for _, column in self.several(keys, "inputs")]
+        taken = {found[0] for found in others if found}
+        free = [p for p in range(len(self.names)) if p not in taken]
+        if taken and not free:
+            raise ValueError(
+                "`inputs` must leave or name at least one column of X. Got None, and "
+                "every column has another role."
+            )
+        return [self.at(p) for p in free]
+
     def several(self, keys: Any, role: str) -> list[tuple[int | None, Column]]:
         """Find the columns that share a role; none for `keys=None`."""
         if keys is None:

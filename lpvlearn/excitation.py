@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,13 +81,15 @@ def independent_inputs(inputs: Sequence[Array]) -> Array | None:
     return None if rank == n_inputs else (right[:rank] / scale).T
 
 
-def check_excitation(pairs: Pairs) -> None:
+def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> None:
     """Refuse a single sample and inputs that never change.
 
     Parameters
     ----------
     pairs : list of (u, y)
         Arrays (n_samples, n_inputs) and (n_samples, n_outputs), one per experiment.
+    names : sequence, default=None
+        Of the inputs; None numbers them.
 
     Raises
     ------
@@ -103,7 +105,8 @@ def check_excitation(pairs: Pairs) -> None:
     if len(constant):
         k = constant[0]
         raise ValueError(
-            f"Every input must vary. Got input {k} constant at {inputs[0][0, k]:g}: "
+            f"Every input must vary. Got input {k if names is None else names[k]!r} "
+            f"constant at {inputs[0][0, k]:g}: "
             "its effect cannot be told from the initial state. Leave it out of "
             "`inputs` or excite it."
         )

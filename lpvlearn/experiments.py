@@ -43,6 +43,8 @@ class Experiment:
         The value of the operating-point column, constant within an experiment.
     sampling_time : float or None
         Time step in seconds read from the time column; None without such a column.
+    input_names : tuple
+        Names of the input columns, or their positions.
     """
 
     label: Hashable
@@ -52,6 +54,7 @@ class Experiment:
     scheduling: NDArray[np.float64] | None = None
     operating_point: Hashable = None
     sampling_time: float | None = None
+    input_names: tuple[Hashable, ...] = ()
 
 
 def read_experiments(
@@ -129,17 +132,7 @@ def read_experiments(
     by_time = table.one(time, "time")
     by_point = table.one(operating_point, "operating_point")
     kappa = table.several(scheduling, "scheduling")
-    if inputs is None:
-        taken = {found[0] for found in (by_label, by_time, by_point, *kappa) if found}
-        u = [table.at(p) for p in range(len(table.names)) if p not in taken]
-        if taken and not u:
-            raise ValueError(
-                "`inputs` must leave or name at least one column of X. Got None, and "
-                "every column has another role."
-            )
-    else:
-        u = [column for _, column in table.several(inputs, "inputs")]
-
+    u = table.inputs(inputs, [by_label, by_time, by_point, *kappa])
     U = _numbers(u, table.n_rows, "X")
     check_array(U, ensure_all_finite=False, estimator=estimator, input_name="X")
     K = _numbers([c for _, c in kappa], table.n_rows, "X") if kappa else None
@@ -162,6 +155,7 @@ def read_experiments(
             scheduling=None if K is None else K[rows],
             operating_point=operating_point_of(by_point, rows, label),
             sampling_time=step,
+            input_names=tuple(column.name for column in u),
         )
         for label, rows, step in zip(labels, groups, steps, strict=True)
     ]

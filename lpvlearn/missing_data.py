@@ -60,8 +60,8 @@ def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
     return parts
 
 
-def complete_runs(experiment: Experiment) -> list[Experiment]:
-    """Runs of at least two consecutive samples of which nothing is missing."""
+def complete_runs(experiment: Experiment, shortest: int = 2) -> list[Experiment]:
+    """Runs of at least `shortest` consecutive samples of which nothing is missing."""
     complete = np.isfinite(experiment.inputs).all(axis=1)
     if experiment.outputs is not None:
         complete &= np.isfinite(experiment.outputs).all(axis=1)
@@ -69,7 +69,7 @@ def complete_runs(experiment: Experiment) -> list[Experiment]:
     return [
         _rows(experiment, slice(start, stop))
         for start, stop in edges.reshape(-1, 2)
-        if stop - start >= 2
+        if stop - start >= shortest
     ]
 
 

@@ -73,6 +73,9 @@ class SubspaceLTI(
         the subspace step by that much, which makes "po-moesp" consistent under
         coloured noise without refinement; only states that the inputs reach are
         kept in `lti_`.
+    initial_state : {"estimate", "rest"}, default="estimate"
+        State in which every experiment of `fit` starts: estimated along with B and D,
+        or zero, which is worth knowing of short experiments that start at rest.
     detrend : {None, "constant", "linear"}, default=None
         Subtract its mean or straight line from every channel of every experiment.
         Predictions are then about the means of all training samples.
@@ -123,6 +126,16 @@ class SubspaceLTI(
     initial state from outputs first, as a split in the middle of an experiment
     needs. Models of different fits do not share a state basis.
 
+    Without refinement, "po-moesp" with as many noise states as the noise has and
+    "pi-moesp" at the order of the system are consistent under coloured noise, others
+    under white noise only. Their error falls as ``1 / sqrt(n_samples)`` once the
+    horizon resolves the modes, and faster before: at a signal-to-noise ratio of 10 dB
+    under strongly coloured noise some ten thousand samples may be needed. The refined
+    error does so from the start, under any noise.
+
+    Of a table of more than 131,072 samples the first ones choose order and horizon;
+    the others are added in one pass, as `partial_fit` does.
+
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.
 
@@ -161,6 +174,7 @@ class SubspaceLTI(
         refine: bool = True,
         stability: str = "warn",
         n_noise_states: int | str = "auto",
+        initial_state: str = "estimate",
         detrend: str | None = None,
         missing: str = "raise",
         inputs: Any = None,
@@ -177,6 +191,7 @@ class SubspaceLTI(
         self.refine = refine
         self.stability = stability
         self.n_noise_states = n_noise_states
+        self.initial_state = initial_state
         self.detrend = detrend
         self.missing = missing
         self.inputs = inputs
@@ -217,22 +232,27 @@ class SubspaceLTI(
         self._stream = None
         self._single_output = np.asarray(y).ndim == 1
         self._set_step(experiments)
-        fitted = self._fit_pairs(
-            [(e.inputs, outputs_of(e)) for e in experiments], choices
-        )
+        pairs = [(e.inputs, outputs_of(e)) for e in experiments]
+        fitted = self._fit_in_one_pass(pairs, choices)
+        if fitted is None:
+            fitted = self._fit_pairs(pairs, choices, self.detrend)
         warn_about(fitted.found)
         if choices.order is not None and choices.horizon is not None:
             better = find_better_horizon(fitted, self._fit_options())
             warn_about_horizon(fitted.found.residual, choices.horizon, better)
         return self
 
-    def _fit_pairs(self, pairs: Pairs, choices: Choices) -> LocalFit:
+    def _fit_pairs(
+        self, pairs: Pairs, choices: Choices, detrend: str | None
+    ) -> LocalFit:
         """Identify on experiments and set the fitted attributes."""
         fitted = fit_pairs(
             pairs,
             choices,
             feedthrough=self.feedthrough,
-            detrend=self.detrend,
+            initial_states=self.initial_state == "estimate",
+            detrend=detrend,
+            names=self._input_names,
             options=self._fit_options(),
         )
         self.order_ = fitted.selection.order
@@ -337,6 +357,8 @@ class SubspaceLTI(
             reset=reset,
             allow_missing=gaps,
         )
+        if reset:
+            self._input_names = experiments[0].input_names
         n_samples = sum(len(e.rows) for e in experiments)
         if gaps and split:
             experiments = split_at_gaps(experiments)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,7 +46,9 @@ def fit_pairs(
     choices: Choices,
     *,
     feedthrough: Any,
+    initial_states: bool,
     detrend: str | None,
+    names: Sequence[Hashable] | None,
     options: dict[str, Any],
 ) -> LocalFit:
     """Check, detrend, choose and identify.
@@ -56,7 +59,11 @@ def fit_pairs(
         One per experiment.
     choices : Choices
     feedthrough : bool or array-like of bool
+    initial_states : bool
+        False starts every experiment from rest.
     detrend : {None, "constant", "linear"}
+    names : sequence or None
+        Of the inputs, for messages.
     options : dict
         `method`, `refine`, `enforce_stability` of `identify`.
 
@@ -69,14 +76,19 @@ def fit_pairs(
     ValueError
         If an input is constant or the samples are too few.
     """
-    check_excitation(pairs)
+    check_excitation(pairs, names)
     n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
     pairs, u_offset, y_offset = remove_trends(pairs, detrend)
     pairs, basis = reduce_inputs(pairs)
     mask = feedthrough_mask(feedthrough, n_outputs, n_inputs, basis)
     order, horizon, n_noise_states = choices
     check_size(pairs, order, horizon, options["method"])
-    settings = {**options, "feedthrough": mask, "n_noise_states": n_noise_states}
+    settings = {
+        **options,
+        "feedthrough": mask,
+        "n_noise_states": n_noise_states,
+        "initial_states": initial_states,
+    }
     scaled = scale_records(pairs)
     chosen = None
     if order is None or horizon is None:
@@ -93,7 +105,7 @@ def fit_pairs(
         found.input_scale,
         found.output_scale,
         basis,
-        Freedom(mask),
+        Freedom(mask, initial_states),
         bool(options["refine"]) and found.stability_loss == 0.0,
         share,
     )

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 # A model that explains less than this share of the outputs' size is reported.
 _USELESS_FIT = 0.1
+# Enforced stability that takes the model more than this share of the outputs' energy.
+_HALF = 0.5
 # An integrator's pole may lie this far outside the unit circle by rounding.
 _ROUNDING = 1e-8
 
@@ -57,6 +59,7 @@ def check_options(estimator: Any) -> Choices:
     allowed = {
         "method": METHODS,
         "stability": ("warn", "enforce"),
+        "initial_state": ("estimate", "rest"),
         "missing": ("raise", "split"),
         "detrend": DETRENDS,
     }
@@ -71,6 +74,11 @@ def check_options(estimator: Any) -> Choices:
         raise ValueError(
             "`sampling_time` must be a positive number of seconds. Got "
             f"{estimator.sampling_time}."
+        )
+    if estimator.initial_state == "rest" and estimator.missing == "split":
+        raise ValueError(
+            "`initial_state` must be 'estimate' with missing='split': what follows a "
+            "gap does not start from rest. Got 'rest'."
         )
     order = _integer_or_auto("order", estimator.order, 0)
     horizon = _integer_or_auto("horizon", estimator.horizon, 1)
@@ -175,7 +183,18 @@ def warn_about(found: Identified) -> None:
             stacklevel=3,
         )
     warn_about_pole(found.A, stacklevel=4)
-    if found.residual > 1.0 - _USELESS_FIT:
+    as_found = found.residual - found.stability_loss
+    if found.residual**2 - as_found**2 > _HALF:
+        warnings.warn(
+            "No stable model explains these outputs: the simulation error is "
+            f"{100.0 * found.residual:.0f} % of their size with stability='enforce', "
+            f"{100.0 * as_found:.3g} % without. The system seems to be unstable: "
+            "identify it with stability='warn', or from a record of bounded outputs, "
+            "with the controller's reference as input.",
+            UserWarning,
+            stacklevel=3,
+        )
+    elif found.residual > 1.0 - _USELESS_FIT:
         warnings.warn(
             "The model explains next to nothing of the outputs: its simulation "
             f"error is {100.0 * found.residual:.0f} % of their size. Try a longer "

@@ -1,4 +1,4 @@
-"""`SubspaceLTI.partial_fit`: identification from a stream of batches."""
+"""`SubspaceLTI.partial_fit`, and `fit` of long tables: one pass over the samples."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from .columns import Column, Table, is_table
+from .excitation import constant_inputs, independent_inputs
 from .experiments import Experiment
+from .missing_data import remove_trends
 from .stream import BUFFER, Pairs, SampleStream
+from .stream_summary import Piece, StreamedModel
 from .subspace_fit import LocalFit
 from .subspace_options import Choices, check_options, warn_about, warn_about_pole
 from .subspace_statistics import SimulationErrorStatistics
@@ -19,13 +23,18 @@ class StreamedFit(SimulationErrorStatistics):
 
     detrend: str | None
     experiment: Any
+    time: Any
+    missing: str
     order_: int
     horizon_: int
+    stability_loss_: float
     _stream: SampleStream | None
 
     if TYPE_CHECKING:  # of the estimator
 
-        def _fit_pairs(self, pairs: Pairs, choices: Choices) -> LocalFit: ...
+        def _fit_pairs(
+            self, pairs: Pairs, choices: Choices, detrend: str | None
+        ) -> LocalFit: ...
         def _fit_options(self) -> dict[str, Any]: ...
         def _set_step(self, experiments: Sequence[Experiment]) -> None: ...
 
@@ -50,19 +59,19 @@ class StreamedFit(SimulationErrorStatistics):
         ------
         ValueError
             If an option is unknown, or `detrend` is set: a trend needs the whole
-            experiment.
+            experiment. If the `time` column repeats or leaves out samples between
+            two batches of an experiment, or its step changes.
 
         Notes
         -----
-        The first 131,072 samples are kept, and the model is that of `fit` on them. Then
-        order and horizon stay, and only summaries grow: the compressed Hankel
-        data, exact to rounding, and (``refine=True``) the simulation error
-        linearised around the model of the moment, each sample once, a recursive
-        Gauss-Newton method whose estimate agrees with that of `fit` up to a small part
-        of its standard deviation. With ``refine=False``, A and C are those that `fit`
-        would find; B and D follow from the compressed data alone, less accurately
-        than by the simulation least squares of `fit`, which needs the samples
-        again.
+        The model is the one that `fit` finds from all batches as one table, however
+        they are cut. The first 131,072 samples are kept. Then order and
+        horizon stay, and only summaries grow: the compressed Hankel data, and
+        the simulation error linearised around the model of the moment, each sample
+        once. Of a longer table `fit` makes the same summaries in the same order. It
+        alone can go back to the samples, and does so where the linearisation turns out
+        to be poor: the first 131,072 samples hardly excite what comes later, outputs
+        drift, or (``refine=False``) the order is higher than the data support.
 
         Examples
         --------
@@ -88,33 +97,108 @@ class StreamedFit(SimulationErrorStatistics):
         stream = getattr(self, "_stream", None)
         experiments, _ = self._read(X, y, reset=stream is None, split=False)
         if stream is None:
-            stream = self._stream = SampleStream()
+            stream = SampleStream(gaps=self.missing == "split")
             self._single_output = np.asarray(y).ndim == 1
             self._set_step(experiments)
-        pieces = stream.pieces(experiments, named=self.experiment is not None)
-        if not stream.buffered:
-            stream.extend(pieces)
-            self._take_summaries(stream)
+        pieces = stream.pieces(experiments, self.experiment is not None, self._times(X))
+        self._stream = stream
+        if stream.clock.step is not None:
+            self._step = stream.clock.step
+        if stream.buffered:
+            pieces = self._fit_kept(stream, pieces, choices)
+        if pieces and not stream.buffered:
+            self._take_summaries(stream, stream.extend(pieces))
             warn_about_pole(self.lti_.A)
-            return self
-        stream.keep(pieces)
+        return self
+
+    def _fit_kept(
+        self, stream: SampleStream, pieces: Sequence[Piece], choices: Choices
+    ) -> list[Piece]:
+        """Fit while all samples are still there; what they leave no room for."""
+        left = stream.keep(pieces)
         if not stream.pairs:  # nothing but gaps so far
-            return self
+            return left
         full = stream.n_samples >= BUFFER
         try:
-            fitted = self._fit_pairs(stream.pairs, choices)
+            fitted = self._fit_pairs(stream.pairs, choices, None)
         except ValueError:
             if full:
                 raise
-            return self  # more samples may come
+            return left  # more samples may come
         warn_about(fitted.found)
         if full:
-            chosen = {"order": self.order_, "horizon": self.horizon_}
-            stream.summarise(fitted, self._fit_options() | chosen)
-        return self
+            self._summarise(stream, fitted, choices)
+        return left
 
-    def _take_summaries(self, stream: SampleStream) -> None:
-        model, singular_values = stream.model()
-        self._set_model(model, singular_values, stream.relative_error())
+    def _summarise(
+        self, stream: SampleStream, fitted: LocalFit, choices: Choices
+    ) -> None:
+        chosen = {
+            "order": self.order_,
+            "horizon": self.horizon_,
+            "n_noise_states": choices.n_noise_states,
+        }
+        stream.summarise(fitted, self._fit_options() | chosen)
+
+    def _fit_in_one_pass(self, pairs: Pairs, choices: Choices) -> LocalFit | None:
+        """Fit a long table as a stream of its samples.
+
+        None where that would not do: few samples, or first ones that say too little.
+        """
+        if sum(len(u) for u, _ in pairs) <= BUFFER:
+            return None
+        pairs, u_offset, y_offset = remove_trends(pairs, self.detrend)
+        stream = SampleStream()
+        left = stream.keep([Piece(u, y, True) for u, y in pairs])
+        first = [Piece(u, y, True) for u, y in stream.pairs]
+        if not _as_independent(stream.pairs, pairs):
+            return None
+        try:
+            fitted = self._fit_pairs(stream.pairs, choices, None)
+            self._summarise(stream, fitted, choices)
+            found = stream.extend(left)
+        except ValueError:
+            return None
+        states = stream.summary.initial_states(found, first, left)
+        if states is None:
+            return None
+        self.input_offset_, self.output_offset_ = u_offset, y_offset
+        self._take_summaries(stream, found)
+        self.initial_states_ = states
+        pilot = fitted.found
+        return fitted._replace(
+            found=pilot._replace(
+                A=self.lti_.A,
+                residual=self.residual_,
+                stability_loss=self.stability_loss_,
+            )
+        )
+
+    def _take_summaries(self, stream: SampleStream, found: StreamedModel) -> None:
+        self._set_model(found.model, found.singular_values, found.residual)
+        self.stability_loss_ = found.stability_loss
         kept = sum(record.u.shape[1] for record in self._evidence.records)
-        self._keep_evidence(self._evidence._replace(share=kept / stream.n_samples))
+        self._keep_evidence(
+            self._evidence._replace(
+                share=kept / stream.n_samples,
+                refined=self._evidence.refined and found.stability_loss == 0.0,
+            )
+        )
+
+    def _times(self, X: Any) -> Column | None:
+        if self.time is None:
+            return None
+        found = Table(X if is_table(X) else np.asarray(X)).one(self.time, "time")
+        return None if found is None else found[1]
+
+
+def _as_independent(first: Pairs, pairs: Pairs) -> bool:
+    """Whether the inputs of the first samples vary as independently as those of all."""
+    inputs = [u for u, _ in first]
+    if len(constant_inputs(inputs)):
+        return False
+    basis = independent_inputs(inputs)
+    if basis is None:
+        return True
+    others = independent_inputs([u for u, _ in pairs])
+    return others is not None and others.shape == basis.shape

@@ -21,6 +21,15 @@ _USE_INSTEAD = (
 )
 
 
+_RESTARTS = (
+    "Where a table holds several experiments, `experiment` must name the column that "
+    "tells them apart. "
+)
+# Share of the steps that go back in time, up to which a table looks like experiments
+# one after the other rather than shuffled.
+_FEW = 0.05
+
+
 def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
     """Convert a time column to seconds.
 
@@ -125,9 +134,14 @@ def check_uniform_time(
     where = f"Time column {column!r} of experiment {experiment!r}"
     if steps.min() <= 0:
         k = int(np.argmin(steps > 0))
+        remedy = _USE_INSTEAD
+        if steps[k] == 0:
+            remedy = "Drop rows that stand twice (drop_duplicates of pandas). " + remedy
+        elif np.sum(steps <= 0) <= _FEW * n_samples:
+            remedy = _RESTARTS + remedy
         raise ValueError(
             f"{where} must increase. Got {t[k]:.9g} s followed by {t[k + 1]:.9g} s at "
-            f"its samples {k} and {k + 1}. {_USE_INSTEAD}"
+            f"its samples {k} and {k + 1}. {remedy}"
         )
     step = float(t[-1] - t[0]) / (n_samples - 1)
     unit = _decimal_unit(t)

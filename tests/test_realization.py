@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
+from lpvlearn.numerics.holdout import held_out_errors
 from lpvlearn.numerics.identification import identify, max_horizon, max_order
 from lpvlearn.numerics.realization import (
     METHODS,
@@ -14,7 +15,6 @@ from lpvlearn.numerics.refinement import refine_simulation
 from lpvlearn.numerics.regression import linear_regression, solve_regressions
 from lpvlearn.numerics.sections import block_sections, section_signals
 from lpvlearn.numerics.selection import (
-    held_out_errors,
     horizon_grid,
     select,
     smallest_good_order,

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from lpvlearn import StateSpace
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.missing_data import remove_trends
 from lpvlearn.numerics.simulation import lti_response
@@ -113,6 +114,80 @@ def test_enforced_stability_is_guaranteed_and_its_price_reported(rng):
     assert model.stability_loss_ > 0.01
     u, y = record(rng)
     assert SubspaceLTI(2, horizon=5, stability="enforce").fit(u, y).stability_loss_ == 0
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_enforced_stability_keeps_the_order_of_an_unstable_system(rng, refine):
+    u = rng.standard_normal((500, 1))
+    unstable = tuple(np.array([[v]]) for v in (1.05, 1.0, 1.0, 0.0))
+    y = lti_response(*unstable, u)
+    model = SubspaceLTI(stability="enforce", refine=refine)
+    with pytest.warns(UserWarning, match="seems to be unstable"):
+        model.fit(u, y)
+    assert model.order_ == 1
+    assert model.lti_.is_stable
+    assert model.stability_loss_ == pytest.approx(model.residual_, abs=1e-6)
+    chosen = model.selection_[model.selection_["chosen"]]
+    assert len(chosen) == 1
+    assert chosen["order"].item() == 1
+
+
+def test_experiments_that_start_at_rest_have_zero_initial_states(rng):
+    """B and D minimise the simulation error from rest: it is orthogonal to them."""
+    u, y = record(rng, 300)
+    y = y + 0.3 * rng.standard_normal(y.shape)
+    model = SubspaceLTI(2, horizon=6, refine=False, initial_state="rest").fit(u, y)
+    assert not model.initial_states_.any()
+    error, lti = y - model.predict(u), model.lti_
+    weight = 1.0 / np.mean(y**2, axis=0)
+    for shape, name in ((lti.B.shape, "B"), (lti.D.shape, "D")):
+        for entry in np.ndindex(shape):
+            part = {"B": np.zeros_like(lti.B), "D": np.zeros_like(lti.D)}
+            part[name][entry] = 1.0
+            effect = lti_response(lti.A, part["B"], lti.C, part["D"], u)
+            cosine = (weight * effect * error).sum()
+            cosine /= np.sqrt((weight * effect**2).sum() * (weight * error**2).sum())
+            assert abs(cosine) < 1e-9
+    refined = SubspaceLTI(2, horizon=6, initial_state="rest").fit(u, y)
+    assert refined.residual_ <= model.residual_
+    assert not refined.initial_states_.any()
+    assert np.isfinite(refined.poles_std_).all()
+
+
+def test_knowing_that_short_experiments_start_at_rest_helps(rng):
+    errors = {"rest": [], "estimate": []}
+    truth, omega = StateSpace(*SYSTEM, 1.0), np.linspace(0.05, 3.0, 20)
+    for _ in range(15):
+        runs = [record(rng, 4) for _ in range(60)]
+        X = np.vstack(
+            [np.column_stack([u, np.full(4, k)]) for k, (u, _) in enumerate(runs)]
+        )
+        y = np.vstack([y for _, y in runs])
+        y = y + 0.5 * rng.standard_normal(y.shape)
+        for start, found in errors.items():
+            model = SubspaceLTI(2, horizon=2, experiment=2, initial_state=start)
+            gap = model.fit(X, y).lti_.frequency_response(omega)
+            found.append(np.linalg.norm(gap - truth.frequency_response(omega)))
+    assert np.mean(errors["rest"]) < 0.9 * np.mean(errors["estimate"])
+
+
+def test_what_follows_a_gap_does_not_start_at_rest():
+    model = SubspaceLTI(missing="split", initial_state="rest")
+    with pytest.raises(ValueError, match="`initial_state` must be 'estimate' with"):
+        model.fit(np.zeros((9, 1)), np.zeros(9))
+    with pytest.raises(ValueError, match="must be 'estimate' or 'rest'. Got 'zero'"):
+        SubspaceLTI(initial_state="zero").fit(np.zeros((9, 1)), np.zeros(9))
+
+
+def test_constant_inputs_are_called_by_their_names(rng):
+    u, y = record(rng, 50)
+    X = pd.DataFrame({"t": 0.1 * np.arange(50), "pump": u[:, 0], "valve": 2.0})
+    with pytest.raises(ValueError, match="Got input 'valve' constant at 2:"):
+        SubspaceLTI(time="t").fit(X, y)
+    with pytest.raises(ValueError, match="Got input 'valve' constant at 2:"):
+        SubspaceLTI(inputs=["valve", "pump"]).fit(X, y)
+    with pytest.raises(ValueError, match="Got input 2 constant at 2:"):
+        SubspaceLTI(time=0).fit(X.to_numpy(), y)
 
 
 def test_a_given_horizon_that_ends_in_a_poor_minimum_warns():

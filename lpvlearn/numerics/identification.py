@@ -29,11 +29,11 @@ Array = NDArray[np.float64]
 
 # A reflected (stable) start is preferred unless it fits this much worse, and by more
 # than growing states explain of the last samples' noise.
-_STABLE_LOSS = 1.01
+STABLE_LOSS = 1.01
 _BY_CHANCE = 10.0
 # Enforced stability keeps this distance from the unit circle, where rounding could
 # bring a pole back.
-_MARGIN = 1e-8
+STABLE_MARGIN = 1e-8
 
 
 class ScaledRecords(NamedTuple):
@@ -244,14 +244,14 @@ def realize(
     Realization
     """
     A, C = _state_pair(subspace, records, order, free, n_noise_states)
-    stable_A = reflect_unstable(A, 1.0 - _MARGIN if enforce_stability else 1.0)
+    stable_A = reflect_unstable(A, 1.0 - STABLE_MARGIN if enforce_stability else 1.0)
     stable = simulation_fit(stable_A, C, records, free)
     if stable_A is A or enforce_stability:
         return stable
     as_found = simulation_fit(A, C, records, free)
     n_values = sum(record.y.size for record in records)
     n_parameters = order * (len(records[0].u) + len(C) + len(records))
-    limit = max(_STABLE_LOSS, 1.0 + _BY_CHANCE * n_parameters / n_values)
+    limit = max(STABLE_LOSS, 1.0 + _BY_CHANCE * n_parameters / n_values)
     return as_found if as_found.loss * limit < stable.loss else stable
 
 
@@ -285,6 +285,7 @@ def identify(
     refine: bool = True,
     enforce_stability: bool = False,
     n_noise_states: int = 0,
+    initial_states: bool = True,
     engine: str = "cholesky",
     scaled: ScaledRecords | None = None,
 ) -> Identified:
@@ -306,6 +307,8 @@ def identify(
         Return a stable model whatever it costs.
     n_noise_states : int, default=0
         Additional states of the subspace step, for coloured noise.
+    initial_states : bool, default=True
+        False starts every experiment from rest.
     engine : {"cholesky", "qr"}, default="cholesky"
         How the data are compressed.
     scaled : ScaledRecords, default=None
@@ -330,7 +333,8 @@ def identify(
     subspace = subspace_of(
         scaled.records, horizon, order + n_noise_states, method=method, engine=engine
     )
-    free = freedom(len(scaled.output_scale), len(scaled.input_scale), feedthrough)
+    sizes = len(scaled.output_scale), len(scaled.input_scale)
+    free = freedom(*sizes, feedthrough, initial_states)
 
     def best(enforce: bool) -> tuple[Realization, int]:
         start = realize(
@@ -345,7 +349,7 @@ def identify(
 
     model, n_iter = best(False)
     best_loss = model.loss
-    if enforce_stability and not _radius(model.A) < 1.0 - _MARGIN:
+    if enforce_stability and not _radius(model.A) < 1.0 - STABLE_MARGIN:
         model, n_iter = best(True)
     found = unscale(model, scaled, subspace.singular_values, n_iter)
     energy = sum(float((record.y**2).sum()) for record in scaled.records)

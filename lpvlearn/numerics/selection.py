@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .holdout import held_out_errors, split_record, thin_records
 from .identification import (
     correlations_of,
     max_horizon,
@@ -24,13 +25,10 @@ from .identification import (
 )
 from .refinement import refine_simulation
 from .signals import Record
-from .simulation import lti_response
-from .simulationfit import Realization, freedom
+from .simulationfit import freedom
 
 Array = NDArray[np.float64]
 
-_ESTIMATION_SHARE = 0.7
-_N_BLOCKS = 20
 # Rows of the largest block-Hankel matrix tried, and ratio between horizons.
 _MAX_ROWS = 1000
 _HORIZON_RATIO = 1.5
@@ -98,79 +96,6 @@ def horizon_grid(lowest: int, highest: int) -> list[int]:
     if grid[-1] > lowest:
         grid.append(lowest)
     return sorted(set(grid))
-
-
-def split_record(record: Record) -> tuple[Record, int]:
-    """First part of a record, for estimation, and its length."""
-    n = record.u.shape[1]
-    cut = n if n < 8 else int(np.ceil(_ESTIMATION_SHARE * n))
-    return Record(record.u[:, :cut].copy(), record.y[:, :cut].copy()), cut
-
-
-def thin_records(records: Sequence[Record], n_samples: int) -> list[Record]:
-    """Evenly spread experiments of about `n_samples` in total, at least one.
-
-    Experiments beyond that length are cut to it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
-    >>> [run.u.shape[1] for run in thin_records(runs, 120)]
-    [50, 60]
-    """
-    lengths = [record.u.shape[1] for record in records]
-    keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
-    spread = [i * len(records) // keep for i in range(keep)]
-    return [
-        Record(
-            np.ascontiguousarray(records[i].u[:, :n_samples]),
-            np.ascontiguousarray(records[i].y[:, :n_samples]),
-        )
-        for i in spread
-    ]
-
-
-def held_out_errors(
-    model: Realization, records: Sequence[Record], cuts: Sequence[int]
-) -> tuple[Array, float]:
-    """Simulation errors after the cuts.
-
-    Parameters
-    ----------
-    model : Realization
-        Identified on the parts before the cuts, with their initial states.
-    records : sequence of Record
-        Whole records.
-    cuts : sequence of int
-        Where the held-out part of each begins.
-
-    Returns
-    -------
-    blocks : ndarray of shape (n_blocks,)
-        Sums of squared errors over consecutive blocks of time.
-    bft : float
-        Best fit over the held-out parts, percent, the mean over outputs.
-    """
-    blocks, errors, outputs = [], [], []
-    for record, cut, x0 in zip(records, cuts, model.initial_states, strict=True):
-        if cut == record.u.shape[1]:
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):
-            fitted = lti_response(model.A, model.B, model.C, model.D, record.u.T, x0)
-        error = record.y.T[cut:] - fitted[cut:]
-        errors.append(error)
-        outputs.append(record.y.T[cut:])
-        n_blocks = min(_N_BLOCKS, len(error))
-        blocks += [float((b**2).sum()) for b in np.array_split(error, n_blocks)]
-    if not errors:
-        return np.zeros(0), np.nan
-    error, output = np.vstack(errors), np.vstack(outputs)
-    spread = np.sqrt(((output - output.mean(axis=0)) ** 2).sum(axis=0))
-    spread[spread == 0.0] = 1.0
-    miss = np.sqrt((error**2).sum(axis=0)) / spread
-    bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
-    return np.array(blocks), bft if np.isfinite(bft) else 0.0
 
 
 def smallest_good_order(orders: Sequence[int], blocks: Sequence[Array]) -> int:
@@ -268,6 +193,7 @@ def select(
     refine: bool = True,
     enforce_stability: bool = False,
     n_noise_states: int = 0,
+    initial_states: bool = True,
 ) -> Selection:
     """Choose the order, the horizon or both.
 
@@ -277,7 +203,7 @@ def select(
         Scaled.
     order, horizon : int or None
         None is to be chosen.
-    method, feedthrough, refine, enforce_stability, n_noise_states
+    method, feedthrough, refine, enforce_stability, n_noise_states, initial_states
         As in `identify`.
 
     Returns
@@ -285,6 +211,23 @@ def select(
     Selection
     """
     m, ny = len(records[0].u), len(records[0].y)
+    if order is None and enforce_stability:
+        # The order is that of the system, whatever a stable model can show of it.
+        shared_options: dict[str, Any] = {
+            "method": method,
+            "feedthrough": feedthrough,
+            "refine": refine,
+            "n_noise_states": n_noise_states,
+            "initial_states": initial_states,
+        }
+        as_found = select(records, None, horizon, **shared_options)
+        order = as_found.order
+        stable = select(
+            records, order, horizon, enforce_stability=True, **shared_options
+        )
+        others = [row for row in as_found.candidates if row.order != order]
+        candidates = sorted(others + stable.candidates)
+        return stable._replace(candidates=candidates)
     records = thin_records(records, _MAX_SAMPLES)
     splits = [split_record(record) for record in records]
     parts, cuts = [part for part, _ in splits], [cut for _, cut in splits]
@@ -305,7 +248,7 @@ def select(
         )
         for h in horizons
     }
-    free = freedom(ny, m, feedthrough)
+    free = freedom(ny, m, feedthrough, initial_states)
     options: dict[str, Any] = {
         "free": free,
         "enforce_stability": enforce_stability,

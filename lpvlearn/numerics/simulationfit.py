@@ -59,11 +59,14 @@ class Realization(NamedTuple):
 
 
 def freedom(
-    n_outputs: int, n_inputs: int, feedthrough: bool | NDArray[np.bool_] = True
+    n_outputs: int,
+    n_inputs: int,
+    feedthrough: bool | NDArray[np.bool_] = True,
+    initial_states: bool = True,
 ) -> Freedom:
-    """All initial states free, and D as `feedthrough` says: all, none or a mask."""
+    """Initial states free or zero, and D as `feedthrough` says: all, none or a mask."""
     direct = np.broadcast_to(np.asarray(feedthrough, dtype=bool), (n_outputs, n_inputs))
-    return Freedom(np.array(direct))
+    return Freedom(np.array(direct), initial_states)
 
 
 def general_regression(A: Array, C: Array, record: Record, free: Freedom) -> Array:

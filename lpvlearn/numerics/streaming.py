@@ -1,14 +1,9 @@
-"""Identification of records that never fit into memory, batch after batch.
+"""Identification of records that never fit into memory: the compressed Hankel data.
 
-Two summaries of bounded size grow with the stream. The first is the Gram matrix (or the
-triangular factor) of the block-Hankel data, to which the windows of every new batch
-are added, those across the border to the previous batch included: the
-subspace step of the whole stream is the same as that of one table. The second is a
-triangular factor of the linearised simulation error. Every stretch of data is
-linearised at the model of that moment, in fixed local coordinates around a pilot
-model, and stacked: a Gauss-Newton method that sees each sample once, as efficient as
-the batch one in the limit (Ljung and Soderstrom, 1983), because the pilot is already
-close. A stretch has an initial state of its own, which costs next to nothing.
+The Gram matrix (or the triangular factor) of the block-Hankel data grows with the
+stream: the windows of every new stretch are added, those across the border to the
+stretch before included, so that the subspace step of the whole stream is the same as
+that of one table. What B and D need besides is in `recursion`.
 """
 
 from __future__ import annotations
@@ -22,24 +17,9 @@ from scipy import linalg
 
 from .hankel import cholesky_factor, hankel_gram, past_future_rows, qr_factor
 from .hankel import stack_factors as stack
-from .regression import (
-    Freedom,
-    Point,
-    jacobian_regression,
-    linear_regression,
-    n_own,
-    project_out,
-    scaled_lstsq,
-    stack_regressions,
-)
-from .sections import state_coefficients
-from .signals import Record, signal_factor
-from .simulationfit import Realization
+from .regression import Freedom, scaled_lstsq
 
 Array = NDArray[np.float64]
-
-# Directions of the scaled parameters that the pilot data do not determine.
-_RCOND = 1e-9
 
 
 class HankelSum(NamedTuple):
@@ -80,9 +60,11 @@ class HankelSum(NamedTuple):
         if self.gram is None:
             return np.zeros((0, 0)) if self.factor is None else self.factor
         lower = cholesky_factor(self.gram)
-        if lower is None:  # cannot happen to a sum of well conditioned parts
-            raise linalg.LinAlgError("The summed Gram matrix lost its rank.")
-        return lower
+        if lower is not None:
+            return lower
+        # Later samples of another size may hide what the first ones showed.
+        values, vectors = np.linalg.eigh(self.gram)
+        return stack([vectors * np.sqrt(np.maximum(values, 0.0))])
 
 
 def start_hankel_sum(
@@ -152,144 +134,6 @@ def extend_hankel_sum(state: HankelSum, samples: Array, *, starts: bool) -> Hank
     assert state.factor is not None
     factor = stack([state.factor, qr_factor([z], n_rows, state.rows)])
     return state._replace(factor=factor, tail=tail)
-
-
-class Recursion(NamedTuple):
-    """Accumulated linearised simulation errors around a pilot model.
-
-    Attributes
-    ----------
-    pilot : Realization
-        In section form.
-    directions : ndarray of shape (n_parameters, k)
-        Local coordinates: parameters (B, D, A, C) are those of the pilot plus
-        ``directions @ position``.
-    information : ndarray of shape (k + 1, k + 1)
-        Triangular factor of ``[J, J position - error]``, summed up.
-    position : ndarray of shape (k,)
-    """
-
-    pilot: Realization
-    directions: Array
-    information: Array
-    position: Array
-
-
-def start_recursion(
-    pilot: Realization, regressions: Sequence[Array], free: Freedom
-) -> Recursion:
-    """Local coordinates and first information, from the data of the pilot model.
-
-    Parameters
-    ----------
-    pilot : Realization
-    regressions : sequence of ndarray
-        One per experiment, from `jacobian_regression` at the pilot model.
-    free : Freedom
-
-    Returns
-    -------
-    Recursion
-    """
-    own = n_own(len(pilot.A), free)
-    stacked = stack_regressions(regressions, own)
-    jacobian = stacked[:, :-1]
-    scale = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
-    scale[scale == 0.0] = 1.0
-    _, s, right = linalg.svd(jacobian / scale, full_matrices=False, check_finite=False)
-    directions = right[s > _RCOND * s[0]].T / scale[:, None]
-    k = directions.shape[1]
-    rows = np.column_stack([jacobian @ directions, stacked[:, -1]])
-    information = _triangle(rows, k + 1)
-    return Recursion(pilot, directions, information, _solve(information))
-
-
-def _triangle(rows: Array, size: int) -> Array:
-    """Upper triangular factor of shape (size, size)."""
-    out = np.zeros((size, size))
-    upper = np.linalg.qr(rows, mode="r")
-    out[: len(upper)] = upper
-    return out
-
-
-def _solve(information: Array) -> Array:
-    return scaled_lstsq(information[:-1, :-1], information[:-1, -1])[0]
-
-
-def current_model(recursion: Recursion, free: Freedom) -> Realization:
-    """Model at the present position.
-
-    Returns
-    -------
-    Realization
-        Its loss is the sum of squared errors of the linearised problem.
-    """
-    pilot, blocks = recursion.pilot, []
-    assert pilot.blocks is not None
-    step = recursion.directions @ recursion.position
-    n_b, n_d = pilot.B.size, int(free.direct.sum())
-    D = pilot.D.copy()
-    D[free.direct] += step[n_b : n_b + n_d]
-    start = n_b + n_d
-    for block in pilot.blocks:
-        blocks.append(block + step[start : start + block.size].reshape(block.shape))
-        start += block.size
-    residual = recursion.information[:, -1].copy()
-    residual[:-1] -= recursion.information[:-1, :-1] @ recursion.position
-    return pilot._replace(
-        A=linalg.block_diag(*blocks) if blocks else pilot.A,
-        B=pilot.B + step[:n_b].reshape(pilot.B.shape),
-        C=pilot.C + step[start:].reshape(pilot.C.shape),
-        D=D,
-        loss=float(residual @ residual),
-        blocks=tuple(blocks),
-    )
-
-
-def extend_recursion(
-    recursion: Recursion, record: Record, free: Freedom
-) -> tuple[Recursion, Array]:
-    """Add a stretch of data, linearised at the present model.
-
-    Parameters
-    ----------
-    recursion : Recursion
-    record : Record
-        Scaled as the pilot's data.
-    free : Freedom
-
-    Returns
-    -------
-    recursion : Recursion
-        Unchanged where the responses overflow.
-    initial_state : ndarray of shape (order,)
-        Of the stretch.
-    """
-    model = current_model(recursion, free)
-    assert model.blocks is not None
-    n, own = len(model.A), n_own(len(model.A), free)
-    x0 = np.zeros(n)
-    R = signal_factor(model.blocks, record)
-    if R is None:
-        return recursion, x0
-    if own:
-        M = linear_regression(R, model.blocks, model.C, free)
-        known = np.concatenate([model.B.ravel(), model.D[free.direct]])
-        x0 = scaled_lstsq(M[:, :n], M[:, -1] - M[:, n:-1] @ known)[0]
-    driven = np.column_stack([x0, model.B])
-    state_map = state_coefficients(model.blocks, driven)
-    R = signal_factor(model.blocks, record, state_map)
-    if R is None:
-        return recursion, x0
-    point = Point(model.C, model.D, driven)
-    M = project_out(jacobian_regression(R, model.blocks, point, free), own)
-    J = M[:, :-1] @ recursion.directions
-    rows = np.column_stack([J, M[:, -1] + J @ recursion.position])
-    information = _triangle(
-        np.vstack([recursion.information, rows]), len(recursion.information)
-    )
-    moved = recursion._replace(information=information, position=_solve(information))
-    return moved, x0
 
 
 def factor_input_matrices(

@@ -3,8 +3,9 @@
 Run with ``OPENBLAS_NUM_THREADS=1 python tests/benchmarks/bench_uncertainty.py``. What
 is printed is the share of runs in which the truth lies within 1.96 standard deviations,
 of real and imaginary parts of the frequency response at 12 frequencies and of the
-poles: the average, and the lowest and the highest of any single entry (300 runs alone
-scatter one entry by 1.3 %).
+poles: the average, and the lowest and the highest of any single entry (one of 300 runs
+has a standard deviation of 1.3 % by chance alone; it takes 1000 runs to tell whether
+an entry is off).
 """
 
 from __future__ import annotations

@@ -3,7 +3,9 @@
 Run with ``OPENBLAS_NUM_THREADS=1 python tests/benchmarks/stream_subspace.py``;
 ``--samples 1e8`` for the large run. Data of two inputs and two outputs come from a
 generator and are never stored; the peak of the resident memory is printed as it grows,
-and the errors of the frequency response beside what they should be.
+and the errors of the frequency response beside what they should be. ``--compare`` puts
+the stream beside `fit` on the same samples as one table, which must agree to the last
+digit, and beside the simulation least squares on all samples at once.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import numpy as np
 from bench_subspace import resonant_system
 
 from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn.numerics.identification import identify
 from lpvlearn.numerics.simulation import state_trajectory
 
 Array = np.ndarray
@@ -41,13 +44,47 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
+def compare(n_samples: int, batch: int, refine: bool) -> None:
+    """Differences of the frequency response, relative to its norm."""
+    truth = StateSpace(*resonant_system(np.random.default_rng(0), 6, 2), 1.0)
+    omega = np.linspace(0.01, 3.0, 200)
+    G = truth.frequency_response(omega)
+    u, y = map(np.vstack, zip(*stream(n_samples, batch), strict=True))
+    start = time.process_time()
+    streamed = SubspaceLTI(6, horizon=30, refine=refine)
+    for k in range(0, n_samples, batch):
+        streamed.partial_fit(u[k : k + batch], y[k : k + batch])
+    middle = time.process_time()
+    whole = SubspaceLTI(6, horizon=30, refine=refine).fit(u, y)
+    stop = time.process_time()
+    at_once = StateSpace(*identify([(u, y)], 6, 30, refine=refine)[:4], 1.0)
+    end = time.process_time()
+    H = streamed.lti_.frequency_response(omega)
+
+    def gap(model: StateSpace) -> float:
+        return np.linalg.norm(H - model.frequency_response(omega)) / np.linalg.norm(G)
+
+    error = np.linalg.norm(at_once.frequency_response(omega) - G) / np.linalg.norm(G)
+    print(
+        f"{n_samples} samples, refine={refine}: partial_fit {gap(truth):.2e} from the "
+        f"truth ({middle - start:.2f} s), {gap(whole.lti_):.1e} from fit "
+        f"({stop - middle:.2f} s), {gap(at_once):.1e} from all samples at once "
+        f"({end - stop:.2f} s), which are {error:.2e} from the truth"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--samples", type=float, default=1e7)
     parser.add_argument("--batch", type=int, default=100_000)
     parser.add_argument("--unrefined", action="store_true")
+    parser.add_argument("--compare", action="store_true")
     options = parser.parse_args()
     n_samples = int(options.samples)
+    if options.compare:
+        for refine in (True, False):
+            compare(n_samples, options.batch, refine)
+        return
     truth = StateSpace(*resonant_system(np.random.default_rng(0), 6, 2), 1.0)
     omega = np.linspace(0.01, 3.0, 200)
     G = truth.frequency_response(omega)
