@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import clone
 
 from .experiments import Experiment
+from .local_uncertainty import ModelPair, deviated_models
 from .numerics.balancing import align_signs
 from .operating_points import OperatingPoints
 from .parallel import PointRunner
@@ -19,6 +21,9 @@ from .statespace import StateSpace
 from .structures import GrayBoxStructure
 
 Array = NDArray[np.float64]
+
+# Mean of an output in standard deviations, from which it looks like an offset.
+_OFFSET = 5.0
 
 _ROLES = ("inputs", "scheduling", "experiment", "time", "operating_point")
 
@@ -37,12 +42,16 @@ class LocalModel:
         Horizon of the subspace step, where the estimator tells it.
     realizations : list of StateSpace
         Models that were averaged; none after a pooled fit.
+    deviated : list of (StateSpace, StateSpace)
+        Continuous-time models to either side of a pooled fit, as `deviated_models`
+        has them.
     """
 
     lti: StateSpace
     order: int
     horizon: int | None
-    realizations: list[StateSpace]
+    realizations: list[StateSpace] = field(default_factory=list)
+    deviated: list[ModelPair] = field(default_factory=list)
 
 
 def identify_points(
@@ -118,13 +127,20 @@ def identify_point(
     Raises
     ------
     ValueError
-        If the identified model is unstable, so that it cannot be balanced.
+        If no output varies, or the identified model is unstable, so that it cannot be
+        balanced.
     """
+    advice = _look_at_outputs(experiments)
     labels = list(dict.fromkeys(e.label for e in experiments))
     if combine == "pool" or len(labels) == 1:
         fitted = fit_local(local, experiments, sampling_time)
-        lti = _continuous(fitted.lti_, discretization)
-        return LocalModel(lti, fitted.lti_.order, _horizon(fitted), [])
+        lti = _continuous(fitted.lti_, discretization, advice)
+        deviated = deviated_models(
+            fitted,
+            [(e.inputs, e.outputs) for e in experiments if e.outputs is not None],
+            lambda model: model.to_continuous(discretization),
+        )
+        return LocalModel(lti, fitted.lti_.order, _horizon(fitted), deviated=deviated)
     # The first realisation chooses order and horizon, the others follow it.
     # A realisation with gaps is several experiments of one label.
     realisations = [[e for e in experiments if e.label == label] for label in labels]
@@ -137,7 +153,7 @@ def identify_point(
     for realisation in realisations:
         model = fit_local(chosen, realisation, sampling_time).lti_
         try:
-            models.append(_continuous(model, discretization))
+            models.append(_continuous(model, discretization, advice))
         except ValueError as error:
             failures.append((realisation[0].label, error))
     if not models:
@@ -162,13 +178,13 @@ def fit_local(
     u = np.vstack([e.inputs for e in experiments])
     y = np.vstack([e.outputs for e in experiments if e.outputs is not None])
     label = np.repeat(np.arange(len(experiments)), [len(e.rows) for e in experiments])
-    table = np.column_stack([u, label])
-    n_inputs = u.shape[1]
+    names = _column_names(experiments[0].input_names, u.shape[1])
+    table = pd.DataFrame(np.column_stack([u, label]), columns=names)
     roles = dict.fromkeys(_ROLES)
     own: dict[str, Any] = {
         **roles,
-        "inputs": list(range(n_inputs)),
-        "experiment": n_inputs,
+        "inputs": names[:-1],
+        "experiment": names[-1],
         "sampling_time": sampling_time,
     }
     estimator = clone(local)
@@ -181,6 +197,15 @@ def fit_local(
             f"attribute `lti_`, as SubspaceLTI does. Got {type(local).__name__}."
         )
     return fitted
+
+
+def _column_names(inputs: Sequence[Hashable], n_inputs: int) -> list[str]:
+    """Names of the inputs as the user knows them, and of a column of labels."""
+    names = [str(name) for name in inputs or range(n_inputs)]
+    label = "experiment"
+    while label in names:
+        label += "_"
+    return [*names, label]
 
 
 def average_models(models: Sequence[StateSpace]) -> StateSpace:
@@ -213,12 +238,29 @@ def _bare(experiment: Experiment) -> Experiment:
     )
 
 
-def _continuous(model: StateSpace, discretization: str) -> StateSpace:
+def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
+    """What to try first if the model turns out unstable."""
+    outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    spread = outputs.std(axis=0)
+    if len(outputs) > len(experiments) and not np.ptp(outputs, axis=0).any():
+        raise ValueError(
+            f"An output must vary. Got {outputs[0].tolist()} throughout: no dynamics "
+            "can be identified from it."
+        )
+    if (np.abs(outputs.mean(axis=0)) > _OFFSET * spread).any():
+        return (
+            "The outputs stand far from zero: subtract their value at rest from y (a "
+            "simulation begins there). Else try "
+        )
+    return "Try "
+
+
+def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpace:
     lti = model.to_continuous(discretization)
     if not lti.is_stable:
         worst = lti.poles()[np.argmax(lti.poles().real)]
         raise ValueError(
-            f"the local model must be stable. Got a pole at {worst:.4g} 1/s. Try "
+            f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
             "local=SubspaceLTI(stability='enforce'), another `order`, a longer "
             "`horizon` or more data, or leave the point out by on_error='skip'."
         )

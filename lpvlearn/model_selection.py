@@ -12,6 +12,7 @@ Two experiments at each of four operating points of a spring that stiffens:
 >>> from sklearn.model_selection import GridSearchCV, cross_validate
 >>> from lpvlearn import ExperimentSplit, GrayBoxRestructurer, GrayBoxStructure
 >>> from lpvlearn import LocalLPVPipeline, SubspaceLTI, bft_scorer, from_trajectories
+>>> from lpvlearn import make_bft_scorer
 >>> spring = GrayBoxStructure.from_template(
 ...     A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0]])
 >>> rng = np.random.default_rng(0)
@@ -35,12 +36,14 @@ How well a new experiment is simulated:
 >>> bool((scores["test_BFT"] > 90).all())
 True
 
-The degree that best predicts an operating point from the others. With ``memory=`` of
-the pipeline, nothing is identified twice:
+The degree, from models that lack one operating point each, scored over the whole range.
+With ``memory=`` of the pipeline, nothing is identified twice:
 
->>> cv = ExperimentSplit("all", hold_out="operating_point", interior=True, **roles)
+>>> cv = ExperimentSplit("all", hold_out="operating_point", interior=True,
+...                      test_on="all", **roles)
 >>> search = GridSearchCV(
-...     pipeline, {"interpolator__degree": [0, 1, 2]}, cv=cv, scoring=bft_scorer)
+...     pipeline, {"interpolator__degree": [0, 1, 2]}, cv=cv,
+...     scoring=make_bft_scorer(average="experiment"))
 >>> search.fit(X, y).best_params_
 {'interpolator__degree': 2}
 """
@@ -88,6 +91,9 @@ class ExperimentSplit(BaseCrossValidator):
     interior : bool, default=False
         With ``hold_out="operating_point"``: only points inside the range of the others
         are held out, so that nothing is extrapolated.
+    test_on : {"held_out", "all"}, default="held_out"
+        What a model is scored on: on what it has not seen, or on all experiments. "all"
+        is for choosing a degree (see Notes), not for reporting how good a model is.
     shuffle : bool, default=False
         Whether experiments (points) go to the folds at random.
     random_state : int, RandomState instance or None, default=None
@@ -98,6 +104,13 @@ class ExperimentSplit(BaseCrossValidator):
     Training rows come experiment by experiment, one of every operating point before the
     second of any: a prefix of them, as ``learning_curve`` takes it, covers the
     points as evenly as it can.
+
+    The score of a point left out is taken in a gap twice as wide as any in which the
+    model will be used: of few points it favours degrees too low. With ``test_on="all"``
+    the gap counts for one place of n, and the mean over the experiments
+    (``make_bft_scorer(average="experiment")``) stands for that over the scheduling
+    range. Most test samples are training samples then, which flatters high degrees
+    where noise in the local models, not interpolation, limits.
 
     Examples
     --------
@@ -121,6 +134,7 @@ class ExperimentSplit(BaseCrossValidator):
         operating_point: Any = None,
         hold_out: str = "experiment",
         interior: bool = False,
+        test_on: str = "held_out",
         shuffle: bool = False,
         random_state: Any = None,
     ) -> None:
@@ -130,6 +144,7 @@ class ExperimentSplit(BaseCrossValidator):
         self.operating_point = operating_point
         self.hold_out = hold_out
         self.interior = interior
+        self.test_on = test_on
         self.shuffle = shuffle
         self.random_state = random_state
 
@@ -183,16 +198,21 @@ class ExperimentSplit(BaseCrossValidator):
             kept = np.array([k for k in range(len(point)) if k not in held_out])
             order = kept[np.lexsort((point[kept], _turns(point[kept])))]
             train = [experiments[k].rows for k in order]
-            test = [experiments[k].rows for k in sorted(held_out)]
+            tested = held_out if self.test_on == "held_out" else range(len(point))
+            test = [experiments[k].rows for k in sorted(tested)]
             yield np.concatenate(train), np.concatenate(test)
 
     def _read(self, X: Any, groups: Any) -> tuple[list[Experiment], Indices]:
         """Experiments, and the operating point of each."""
-        if self.hold_out not in ("experiment", "operating_point"):
-            raise ValueError(
-                "`hold_out` must be 'experiment' or 'operating_point'. Got "
-                f"{self.hold_out!r}."
-            )
+        for name, allowed in (
+            ("hold_out", ("experiment", "operating_point")),
+            ("test_on", ("held_out", "all")),
+        ):
+            value = getattr(self, name)
+            if value not in allowed:
+                raise ValueError(
+                    f"`{name}` must be {allowed[0]!r} or {allowed[1]!r}. Got {value!r}."
+                )
         by_point = self.scheduling is not None or self.operating_point is not None
         if self.hold_out == "operating_point" and not by_point:
             raise ValueError(

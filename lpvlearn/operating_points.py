@@ -109,7 +109,7 @@ def local_experiments(
 
 
 def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:
-    """Refuse outputs that have one and the same value everywhere.
+    """Refuse outputs that are constant, or stand among the inputs.
 
     Parameters
     ----------
@@ -130,6 +130,15 @@ def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) ->
             "no dynamics can be identified from it. Leave it out of `y`, or check the "
             "sensor and its column."
         )
+    own = experiments[0].input_names
+    for name in set(own) & set(names):
+        k, j = own.index(name), list(names).index(name)
+        inputs = np.concatenate([e.inputs[:, k] for e in experiments])
+        if isinstance(name, str) and np.array_equal(inputs, outputs[:, j]):
+            raise ValueError(
+                f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
+                "drop it from X, or list the inputs in `inputs`."
+            )
 
 
 def warn_extrapolation(
@@ -162,9 +171,11 @@ def warn_extrapolation(
     if not outside:
         return
     row, j = np.unravel_index(np.argmax(excess), excess.shape)
+    digits = 3 - int(np.floor(np.log10(width[j])))
+    shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
     warnings.warn(
         f"Scheduling variable {names[int(j)]!r} must be within the identified range, "
-        f"{low[j]:.4g} to {high[j]:.4g}. Got {outside} of {len(kappa)} samples "
+        f"{shown[0]} to {shown[1]}. Got {outside} of {len(kappa)} samples "
         f"outside, the farthest at {kappa[row, j]:.4g}: the model is extrapolated. "
         "Identify a model there too, or hold the border's with "
         "interpolator=PolynomialLPV(extrapolation='clip').",
@@ -285,11 +296,17 @@ def check_local(
         worst = int(np.argmax(excess))
         if excess[worst] > 0:
             compared = "range of the operating points" if extent[worst] else "magnitude"
+            several = (
+                " Where the table holds several experiments, `experiment` must name "
+                "the column that tells them apart."
+                if len(experiments) == 1
+                else ""
+            )
             raise ValueError(
                 f"Experiment {run.label!r} must be local. Its scheduling variable "
                 f"{worst + 1} spreads over {spread[worst]:.4g}, more than "
                 f"{max_spread:g} times the {compared} ({scale[worst]:.4g}). Keep such "
-                "a record for validation, or cut it into local experiments."
+                f"a record for validation, or cut it into local experiments.{several}"
             )
 
 

@@ -20,6 +20,8 @@ from tqdm import tqdm
 Array = NDArray[np.float64]
 
 
+_SKIP = " (Mend the experiments there, or leave the point out by on_error='skip'.)"
+
 # Methods that the steps of the pipeline need, an example, and what else is allowed.
 _STEPS = {
     "local": (("fit",), "SubspaceLTI()", None),
@@ -79,23 +81,45 @@ class PointRunner:
         Raises
         ------
         ValueError
-            If a point fails and must not, or all of them do.
+            If a point fails and must not, or all of them do. The message names the
+            point, unless another one fails in the same words: the cause is an option
+            then.
         """
         kept = self.memory.cache(function)
+        stop = self.on_error == "raise"
         tasks = (
-            delayed(_attempt)(kept, args, shared, k, kappa[k], self.on_error)
+            delayed(_attempt)(kept, args, shared, k if stop else None)
             for k, args in enumerate(arguments)
         )
         results = Parallel(n_jobs=self.n_jobs, return_as="generator")(tasks)
         total = len(arguments)
-        found = list(tqdm(results, desc=what, total=total, disable=not self.verbose))
-        failures = [result for result in found if isinstance(result, _Failure)]
-        if len(failures) == total:
-            raise ValueError(
-                f"{what}: every operating point failed. First {failures[0].message}"
+        try:
+            found = list(
+                tqdm(results, desc=what, total=total, disable=not self.verbose)
             )
-        for failure in failures:
-            warnings.warn(f"left out {failure.message}", UserWarning, stacklevel=5)
+        except _Stopped as stopped:
+            k, error = stopped.args
+            # The point, or an option? A neighbour (the last for the first) tells.
+            other = _attempt(kept, arguments[k - 1], shared, None)
+            if isinstance(other, _Failure) and other.text == str(error):
+                raise ValueError(str(error)) from error
+            skip = "" if "on_error" in str(error) else _SKIP
+            raise ValueError(f"{_place(k, kappa)}: {error}{skip}") from error
+        failures = {k: r for k, r in enumerate(found) if isinstance(r, _Failure)}
+        if len(failures) == total:
+            first = found[0]
+            if all(failure.text == first.text for failure in failures.values()):
+                raise ValueError(first.text) from first.error
+            raise ValueError(
+                f"{what}: every operating point failed. First {_place(0, kappa)}: "
+                f"{first.text}"
+            ) from first.error
+        for k, failure in failures.items():
+            warnings.warn(
+                f"left out {_place(k, kappa)}: {failure.text}",
+                UserWarning,
+                stacklevel=5,
+            )
         return [None if isinstance(r, _Failure) else r for r in found]
 
 
@@ -183,9 +207,13 @@ def _as_text(memory: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Failure:
-    """Why a point that may fail did."""
+    """Why a point failed."""
 
-    message: str
+    error: Exception
+
+    @property
+    def text(self) -> str:
+        return str(self.error)
 
 
 @cache
@@ -194,21 +222,26 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
+class _Stopped(Exception):
+    """A failure that ends the step: number of the point, and error."""
+
+
 def _attempt(
     function: Callable[..., Any],
     args: tuple[Any, ...],
     shared: dict[str, Any],
-    number: int,
-    point: Array,
-    on_error: str,
+    stop_as: int | None,
 ) -> Any:
-    """Run a step at one operating point; a failure names the point."""
+    """Run a step at one operating point; `stop_as` is its number if it must succeed."""
     try:
         with _blas().limit(limits=1, user_api="blas"):
             return function(*args, **shared)
     except (ValueError, np.linalg.LinAlgError) as error:
-        place = ", ".join(f"{value:.4g}" for value in point)
-        message = f"operating point {number} (scheduling {place}): {error}"
-        if on_error == "raise":
-            raise ValueError(message) from error
-        return _Failure(message)  # a worker's warning would not reach the user
+        if stop_as is not None:
+            raise _Stopped(stop_as, error) from error
+        return _Failure(error)  # told by the runner, who knows the other points
+
+
+def _place(number: int, kappa: Array) -> str:
+    values = ", ".join(f"{value:.4g}" for value in kappa[number])
+    return f"operating point {number} (scheduling {values})"

@@ -101,8 +101,11 @@ list, default=None
     parameters_ : DataFrame of shape (n_points, n_params)
         Gray-box parameters, one row per operating point.
     parameters_std_ : DataFrame of shape (n_points, n_params)
-        Their standard deviations, from the spread of the realizations that
-        ``combine="average"`` identifies; NaN where they are not known.
+        Their standard deviations, to first order: from the covariance of the pooled
+        black box, or from the spread of the realizations that ``combine="average"``
+        identifies. NaN where that is not known: a local model that does not minimise
+        the simulation error (``refine=False``, a stability that had to be enforced),
+        collinear inputs, or "passthrough".
     interpolator_ : fitted regressor
     lpv_ : LPVStateSpace
     report_ : DataFrame

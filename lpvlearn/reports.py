@@ -80,7 +80,7 @@ def parameter_tables(
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Parameters and their standard deviations, one row per operating point.
 
-    A deviation that its restructurer does not tell is NaN.
+    A deviation that is not known is NaN.
 
     Parameters
     ----------
@@ -90,10 +90,9 @@ def parameter_tables(
     index, names = point_index(kappa), list(structured.structure.parameter_names)
     parameters = pd.DataFrame(structured.theta, index, names)
     deviations = pd.DataFrame(np.nan, index, names)
-    for k, restructurer in enumerate(structured.restructurers):
-        covariance = getattr(restructurer, "params_covariance_", None)
+    for k, covariance in enumerate(structured.covariances):
         if covariance is not None:
-            deviations.iloc[k] = np.sqrt(np.diag(np.asarray(covariance)))
+            deviations.iloc[k] = np.sqrt(np.diag(covariance))
     return parameters, deviations
 
 

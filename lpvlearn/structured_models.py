@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 
 from .local_models import LocalModel
+from .local_uncertainty import covariance_of_parameters
 from .numerics.balancing import align_signs
 from .numerics.starts import GOOD_FIT
 from .parallel import PointRunner
@@ -38,6 +39,8 @@ class StructuredModels:
         The fitted restructurers; empty without that step.
     kept : list of int
         The operating points, of those given, that did not fail.
+    covariances : list of ndarray or None
+        Of the parameters, where they are known.
     """
 
     structure: GrayBoxStructure
@@ -45,6 +48,7 @@ class StructuredModels:
     models: list[StateSpace]
     restructurers: list[Any]
     kept: list[int]
+    covariances: list[Array | None]
 
 
 def restructure_points(
@@ -64,7 +68,10 @@ def restructure_points(
     if restructurer is None:
         structure, theta = balanced_entries([model.lti for model in local])
         balanced = [structure.model(row) for row in theta]
-        return StructuredModels(structure, theta, balanced, [], list(range(len(theta))))
+        every = list(range(len(theta)))
+        return StructuredModels(
+            structure, theta, balanced, [], every, [None] * len(theta)
+        )
     # What a fit is about: the model, and where they are known its realizations.
     tasks = [
         (_plain(model.lti), [_plain(other) for other in model.realizations])
@@ -79,7 +86,29 @@ def restructure_points(
     )
     theta = np.array([fitted.params_ for fitted in helped])
     structured = [fitted.lti_ for fitted in helped]
-    return StructuredModels(helped[0].structure_, theta, structured, helped, kept)
+    covariances = [
+        point_covariance(fitted, local[k], runner)
+        for k, fitted in zip(kept, helped, strict=True)
+    ]
+    return StructuredModels(
+        helped[0].structure_, theta, structured, helped, kept, covariances
+    )
+
+
+def point_covariance(
+    fitted: Any, local: LocalModel, runner: PointRunner
+) -> Array | None:
+    """Covariance of the parameters at one point: the restructurer's, else our own."""
+    told = getattr(fitted, "params_covariance_", None)
+    if told is not None or not local.deviated:
+        return None if told is None else np.asarray(told)
+    return runner.memory.cache(covariance_of_parameters)(
+        fitted.structure_,
+        fitted.params_,
+        getattr(fitted, "frequency_weight", None),
+        _plain(local.lti),
+        local.deviated,
+    )
 
 
 def restructure_point(

@@ -123,6 +123,12 @@ def summarise(pipeline: Any) -> str:
         ]
         if floor.max() > 1e-6:
             lines.append(f"    of which no parameter can change {_span(floor)} %")
+        unknown = int(pipeline.parameters_std_.isna().all(axis=1).sum())
+        if unknown:
+            lines.append(
+                f"    standard deviations of the parameters are not known at {unknown} "
+                "point(s): see `parameters_std_`"
+            )
     else:
         lines.append(
             "Restructuring: none; the entries of balanced models are interpolated, "

@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lpvlearn import GrayBoxRestructurer, LocalLPVPipeline
 from lpvlearn.datasets import (
     FlexibleArm,
     _reference,
     load_flexible_arm,
+    load_varying_spring,
     make_flexible_arm,
     prbs,
 )
@@ -529,6 +531,21 @@ def test_writing_twice_gives_the_same_bytes(tmp_path, monkeypatch, reference):
 def test_data_card_names_every_file(reference):
     for name in _reference.TABLES:
         assert name in reference.DESCR
+
+
+def test_the_stored_spring_is_identified_as_what_it_is():
+    data = load_varying_spring()
+    pipeline = LocalLPVPipeline(
+        restructurer=GrayBoxRestructurer(data.structure),
+        scheduling="kappa",
+        experiment="run",
+        time="time",
+    ).fit(data.X, data.y)
+    assert pipeline.sampling_time_ == pytest.approx(data.sampling_time)
+    names = list(pipeline.parameters_)
+    error = pipeline.parameters_ - data.true_parameters[names].to_numpy()
+    assert (error.abs() < 4 * pipeline.parameters_std_).all(axis=None)
+    assert "varying_spring.csv" in data.DESCR
 
 
 def test_missing_files_are_explained(monkeypatch, tmp_path):

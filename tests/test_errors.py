@@ -117,6 +117,43 @@ TABLES = {
             "BlockedTimeSeriesSplit",
         ],
     ),
+    "a row that stands twice": (
+        lambda: fit(X.assign(time=X["time"].mask(X.index == 7, 0.12))),
+        ["must increase", "0.12 s followed by 0.12 s", "Drop rows that stand twice"],
+    ),
+    "a forgotten role of the experiment column": (
+        lambda: fit(experiment=None, inputs="force"),
+        ["must increase", "followed by 0 s", "`experiment` must name the column"],
+    ),
+    "forgotten roles of experiment and time": (
+        lambda: LocalLPVPipeline(inputs="force", scheduling="kappa").fit(X, Y),
+        ["Experiment 0 must be local", "`experiment` must name the column"],
+    ),
+    "an output left among the inputs": (
+        lambda: fit(X.assign(position=Y["position"])),
+        ["`inputs` must not hold an output", "'position' in X and in y", "drop it"],
+    ),
+    "an experiment that is too short": (
+        lambda: fit(
+            X[(X["run"] != "p1r0") | (X["time"] < 0.5)],
+            Y[(X["run"] != "p1r0") | (X["time"] < 0.5)],
+            local=SubspaceLTI(2, horizon=20),
+        ),
+        [
+            "operating point 1 (scheduling 0.5)",
+            "`horizon` must be at most",
+            "25 samples",
+            "on_error='skip'",
+        ],
+    ),
+    "an output that stands still at one point": (
+        lambda: fit(y=Y.mask(X["kappa"] == 0.5, 0.5)),
+        ["operating point 1", "An output must vary. Got [0.5]", "on_error='skip'"],
+    ),
+    "an output far from zero": (
+        lambda: fit(y=Y + 1000.0),
+        ["must be stable", "subtract their value at rest from y"],
+    ),
     "a missing sample": (
         lambda: fit(X.drop(index=50), Y.drop(index=50)),
         ["Time column 'time' of experiment 'p0r0' must be evenly spaced", "0.04 s"],
@@ -159,7 +196,17 @@ TABLES = {
     ),
     "an input that never moves": (
         lambda: fit(X.assign(force=1.0)),
-        ["operating point 0", "Every input must vary", "constant at 1", "`inputs`"],
+        ["Every input must vary", "'force' constant at 1", "`inputs`"],
+    ),
+    "an input that does not move at one point": (
+        lambda: fit(X.assign(force=X["force"].where(X["kappa"] != 0.5, 1.0))),
+        ["operating point 1 (scheduling 0.5): Every input must vary", "'force'"],
+    ),
+    "an input of an array that does not move": (
+        lambda: LocalLPVPipeline(scheduling=2, experiment=3).fit(
+            X[["force", "time", "kappa", "run"]].assign(time=0.0).to_numpy(), Y
+        ),
+        ["Every input must vary", "'1' constant at 0"],
     ),
     "an output that never moves": (
         lambda: fit(y=0 * Y + 2),
@@ -226,7 +273,7 @@ TABLES = {
 STEPS = {
     "a structure with other inputs": (
         lambda: fit(restructurer=GrayBoxRestructurer(TWO_INPUTS)),
-        ["operating point 0", "`structure` has 1 outputs and 2 inputs", "agree"],
+        ["`structure` has 1 outputs and 2 inputs", "agree"],
     ),
     "a list as structure": (
         lambda: fit(restructurer=GrayBoxRestructurer([[0, 1], ["-k", "-c"]])),
@@ -336,6 +383,10 @@ SPLITS = {
         ),
         ["`scheduling` or `operating_point` must name a column", "Got None"],
     ),
+    "an unknown thing scored": (
+        lambda: list(ExperimentSplit(2, experiment="run", test_on="train").split(X)),
+        ["`test_on` must be 'held_out' or 'all'", "Got 'train'"],
+    ),
     "an unknown thing held out": (
         lambda: list(ExperimentSplit(2, hold_out="points").split(X)),
         ["`hold_out` must be 'experiment' or 'operating_point'", "Got 'points'"],
@@ -444,6 +495,22 @@ def check_answer(call, words):
 
 
 ALL = TABLES | STEPS | SPLITS
+
+
+OPTIONS = (
+    "an unknown subspace method",
+    "an unknown norm",
+    "a structure with other inputs",
+)
+
+
+@pytest.mark.parametrize("case", OPTIONS)
+@pytest.mark.parametrize("on_error", ["raise", "skip"])
+def test_wrong_options_of_a_step_are_not_blamed_on_a_point(case, on_error, monkeypatch):
+    monkeypatch.setitem(globals(), "ROLES", {**ROLES, "on_error": on_error})
+    with pytest.raises(ValueError, match="^`") as raised:
+        ALL[case][0]()
+    assert "operating point" not in str(raised.value)
 
 
 @pytest.mark.filterwarnings("ignore:The (identified )?model")

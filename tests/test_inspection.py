@@ -653,6 +653,11 @@ def test_error_of_a_restructurer_is_what_it_minimised():
     assert_allclose(display.error, expected, rtol=1e-8)
     assert_allclose(display.start, display.error)
     assert_allclose(display.norms["error"], fitted.error_, rtol=1e-6)
+    assert ErrorDisplay.from_estimator(fitted, black, start=None).start is None
+    began = ErrorDisplay.from_estimator(fitted, black)
+    start = fitted.structure_.model(fitted.start_params_)
+    assert_allclose(began.start, largest_singular_value(start - compared, began.omega))
+    assert began.norms["start"] >= began.norms["error"] * (1 - 1e-9)
     assert_allclose(display.active_values.max(initial=0.0), fitted.error_, rtol=1e-3)
 
 
@@ -704,6 +709,8 @@ def test_error_display_refuses_another_black_box(pipeline):
         ErrorDisplay.from_estimator(fitted, random_model(0))
     with pytest.raises(ValueError, match="`model` must be a StateSpace. Got list"):
         ErrorDisplay.from_estimator(fitted, [1])
+    with pytest.raises(ValueError, match="`start` must be 'auto', .* Got 'fit'"):
+        ErrorDisplay.from_estimator(fitted, ONE, start="fit")
 
 
 # -- singular values -------------------------------------------------------------------

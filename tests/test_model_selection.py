@@ -28,9 +28,11 @@ from lpvlearn import (
     SubspaceLTI,
     bft_score,
     bft_scorer,
+    from_trajectories,
     make_bft_scorer,
     vaf_scorer,
 )
+from lpvlearn.datasets import make_flexible_arm
 
 from .conftest import (
     ROLES,
@@ -44,6 +46,7 @@ EXTRAPOLATES = pytest.mark.filterwarnings(
     "ignore::lpvlearn.exceptions.ExtrapolationWarning"
 )
 ESTIMATE = make_bft_scorer(initial_state="estimate")
+EVEN = make_bft_scorer(average="experiment")
 
 
 class CountingSubspace(SubspaceLTI):
@@ -448,3 +451,92 @@ def test_points_left_out_choose_the_degree_that_the_sweep_confirms(tmp_path):
         for d in degrees
     ]
     assert search.best_params_["interpolator__degree"] == np.argmax(sweep) == 2
+
+
+@pytest.mark.filterwarnings("ignore::lpvlearn.exceptions.ExtrapolationWarning")
+def test_on_the_arm_models_that_lack_a_point_choose_what_the_sweep_confirms(tmp_path):
+    """Shorter and fewer experiments than in tests/benchmarks/choose_degree.py."""
+    arm = make_flexible_arm(
+        5, duration=1.0, sweep_duration=1.5, integration_step=5e-4, random_state=0
+    )
+    columns = {"scheduling": "kappa", "experiment": "experiment"}
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(6, horizon=40, feedthrough=False),
+        GrayBoxRestructurer(arm.structure, norm="h2"),
+        PolynomialLPV(),
+        time="time",
+        memory=tmp_path,
+        **columns,
+    )
+    cv = ExperimentSplit(
+        "all", hold_out="operating_point", interior=True, test_on="all", **columns
+    )
+    degrees = [1, 2, 3]
+    search = GridSearchCV(
+        pipeline, {"interpolator__degree": degrees}, scoring=EVEN, cv=cv
+    ).fit(arm.X, arm.y)
+    sweep = [
+        bft_scorer(
+            pipeline.set_params(interpolator__degree=d).fit(arm.X, arm.y),
+            arm.X_sweep,
+            arm.y_sweep,
+        )
+        for d in degrees
+    ]
+    assert search.best_params_["interpolator__degree"] == degrees[np.argmax(sweep)]
+    assert min(sweep) < max(sweep) - 5  # there is something to choose
+
+
+def test_models_that_lack_a_point_are_scored_on_all_experiments(table):
+    options = {
+        "experiment": "run",
+        "scheduling": "kappa",
+        "hold_out": "operating_point",
+    }
+    on_all = ExperimentSplit("all", test_on="all", **options)
+    held_out = ExperimentSplit("all", **options)
+    for (train, test), (same, _) in zip(
+        on_all.split(table), held_out.split(table), strict=True
+    ):
+        np.testing.assert_array_equal(train, same)
+        assert sorted(test) == list(range(24))
+    assert on_all.get_n_splits(table) == 3
+
+
+def test_a_gap_of_few_points_misjudges_the_degree(tmp_path):
+    """A resonance between the points: only the whole range tells what it costs."""
+    kappas = np.linspace(0, 1.5, 7)
+    stiffness = 40 + 60 / (1 + (4 * (kappas - 0.75)) ** 2)
+    rng = np.random.default_rng(0)
+    runs = []
+    for kappa, k in zip(kappas, stiffness, strict=True):
+        u = rng.choice([-1.0, 1.0], (60, 1)).repeat(5, axis=0)
+        model = spring_structure().model({"b": 30, "c": 1.2, "k": k})
+        runs.append((u, kappa, model.simulate(u, sampling_time=0.02)))
+    X, y = from_trajectories(runs, sampling_time=0.02)
+    columns = {"scheduling": "kappa", "experiment": "experiment"}
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(2, horizon=10, feedthrough=False),
+        GrayBoxRestructurer(spring_structure(), norm="h2"),
+        PolynomialLPV(),
+        time="time",
+        memory=tmp_path,
+        **columns,
+    )
+
+    def chosen(test_on):
+        cv = ExperimentSplit(
+            "all", hold_out="operating_point", interior=True, test_on=test_on, **columns
+        )
+        grid = {"interpolator__degree": [2, 4, 5]}
+        search = GridSearchCV(pipeline, grid, scoring=EVEN, cv=cv).fit(X, y)
+        return search.best_params_["interpolator__degree"]
+
+    def worst(degree):
+        """Error of the stiffness between the points."""
+        fine = np.linspace(0, 1.5, 200)[:, None]
+        found = PolynomialLPV(degree).fit(kappas[:, None], stiffness).predict(fine)
+        truth = 40 + 60 / (1 + (4 * (fine[:, 0] - 0.75)) ** 2)
+        return np.sqrt(np.mean((found - truth) ** 2))
+
+    assert worst(chosen("all")) < 0.7 * worst(chosen("held_out"))

@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 
 from lpvlearn import published
-from lpvlearn.__main__ import aligned_text, main, with_step
+from lpvlearn.__main__ import main, with_step
+from lpvlearn.paper_text import aligned_text
 
 COLUMNS = {
     "table1": ["theta2", "metric", "output", "ours", "paper"],

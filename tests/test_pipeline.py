@@ -288,7 +288,7 @@ def test_leaving_the_identified_range_warns_once_for_all_experiments(fitted, spr
     (warning,) = caught
     text = str(warning.message)
     outside = int((beyond["kappa"] > 1.5 + 1e-5).sum())
-    assert "'kappa' must be within the identified range, -1.5e-06 to 1.5." in text
+    assert "'kappa' must be within the identified range, 0 to 1.5." in text
     assert f"Got {outside} of 3000 samples outside, the farthest at 3.5" in text
     assert warning.filename == __file__
 
@@ -441,13 +441,25 @@ def test_gaps_are_split_where_the_local_estimator_splits(spring, combine):
     assert (pipeline.report_["n_experiments"] == 2).all()
 
 
-def test_a_failure_everywhere_tells_the_first(spring):
+@pytest.mark.parametrize("n_jobs", [None, 2])
+@pytest.mark.parametrize("on_error", ["raise", "skip"])
+def test_a_failure_that_all_points_share_names_none(spring, on_error, n_jobs):
     X, y, _, _ = spring
+    pipeline = spring_pipeline(
+        local=SubspaceLTI(order=400), on_error=on_error, n_jobs=n_jobs
+    )
+    with pytest.raises(ValueError, match="^`order` must be at most .*400"):
+        pipeline.fit(X, y)
+
+
+def test_different_failures_everywhere_tell_the_first(spring):
+    X, y, _, _ = spring
+    unequal = (X["kappa"] < 0.2) | (X["time"] < 4 + X["kappa"])
     pipeline = spring_pipeline(local=SubspaceLTI(order=400), on_error="skip")
     with pytest.raises(
         ValueError, match="every .* failed. First operating point 0 .*400"
     ):
-        pipeline.fit(X, y)
+        pipeline.fit(X[unequal], y[unequal])
 
 
 def test_deviations_of_averaged_parameters_cover_their_errors():

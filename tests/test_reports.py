@@ -8,6 +8,7 @@ from lpvlearn import (
     LPVStateSpace,
     PolynomialLPV,
     StateSpace,
+    SubspaceLTI,
     bft_score,
     compare_models,
     fit_report,
@@ -96,7 +97,7 @@ def test_parameters_are_reported_one_by_one(fitted):
     rmse = np.sqrt(((theta - met) ** 2).mean())
     np.testing.assert_allclose(report["interpolation_RMSE"], rmse)
     assert report.loc["k", "interpolation_FIT"] > 99
-    assert report["std"].isna().all()
+    np.testing.assert_array_equal(report["std"], fitted.parameters_std_.median())
 
 
 def test_standard_deviations_are_reported_where_they_are_known(uncertain):
@@ -106,9 +107,14 @@ def test_standard_deviations_are_reported_where_they_are_known(uncertain):
     assert " std" in uncertain.summary()
 
 
-def test_deviations_are_missing_where_they_are_not_known(fitted):
-    assert fitted.parameters_std_.isna().all(axis=None)
-    assert not [name for name in fitted.report_ if name.startswith("std_")]
+def test_deviations_are_missing_where_they_are_not_known():
+    rough = SubspaceLTI(order=2, horizon=10, refine=False)
+    pipeline = spring_pipeline(local=rough).fit(*spring_tables(0.05, n_samples=200))
+    assert pipeline.parameters_std_.isna().all(axis=None)
+    assert not [name for name in pipeline.report_ if name.startswith("std_")]
+    assert "standard deviations of the parameters are not known at 4" in (
+        pipeline.summary()
+    )
 
 
 def test_the_summary_tells_what_was_found(fitted, balanced):

@@ -21,9 +21,9 @@ experiment = run_paper_experiment(n_realizations=2, degree=2, random_state=0)
 # calibrated so that the *analytic* rows come out near the paper's. Compare the
 # differences between the models, not single figures.
 
-from lpvlearn.__main__ import report
+from lpvlearn.paper_text import tables_text
 
-print(report(experiment, experiment.tables))
+print(tables_text(experiment))
 
 # %%
 # What the local models hold: Bode magnitudes at the first angle, where the arm is
@@ -52,14 +52,15 @@ figure, title = draw_balanced(experiment)
 # linearisations, the balanced one drifts away.
 
 from lpvlearn.inspection import SimulationDisplay
-from lpvlearn.reproduce import simulate_sweep
 
-data = experiment.data
+sweep = experiment.data.X_sweep
 display = SimulationDisplay.from_predictions(
-    data.X_sweep["time"],
-    data.y_sweep,
+    sweep["time"],
+    experiment.data.y_sweep,
     {
-        name: simulate_sweep(experiment.lpv[name], data)
+        name: experiment.lpv[name].simulate(
+            sweep[["u1", "u2"]], sweep["kappa"], experiment.data.sampling_time
+        )
         for name in ("restructured", "balanced")
     },
     units="rad/s",

@@ -81,11 +81,10 @@ display = BodeDisplay(
 
 # %%
 # It is a regressor: ``predict`` gives the response at other frequencies, ``score`` the
-# usual :math:`R^2`.
+# usual :math:`R^2`, with ``y`` as real columns:
 
-from lpvlearn.frequency_data import stack_response
-
-print(f"R2 = {fits[2].score(omega, stack_response(measured[2])):.5f}")
+flat = measured[2].reshape(len(omega), -1)
+print(f"R2 = {fits[2].score(omega, np.hstack([flat.real, flat.imag])):.5f}")
 print(f"relative error = {fits[2].relative_error_:.4f}")
 
 # %%

@@ -94,7 +94,8 @@ pd.DataFrame(scores).filter(like="test").round(3)
 # Points that training has not seen
 # ---------------------------------
 # scikit-learn's ``LeaveOneGroupOut``, a group for each load. The two outermost loads
-# are extrapolated; the library warns of that, as it should.
+# are extrapolated; the library warns of that, as it should. To choose a degree, leave
+# out the others only (below).
 
 from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
 
@@ -114,7 +115,9 @@ pd.Series(left_out, index=X["load"].round(2).unique(), name="BFT (%)").round(1)
 # A grid over all three steps
 # ---------------------------
 # Nested parameters are named with two underscores. Local and gray-box models are kept
-# on disk (``memory=``), so that a further degree costs next to nothing.
+# on disk (``memory=``), so that a further degree costs next to nothing. Interior points
+# only are left out, and the models scored over the whole range: see
+# :ref:`guide_validation` for both.
 
 from sklearn.model_selection import GridSearchCV
 
@@ -124,12 +127,13 @@ inside = ExperimentSplit(
     scheduling="load",
     hold_out="operating_point",
     interior=True,
+    test_on="all",
 )
 search = GridSearchCV(
     model,
     {"local__horizon": [10, 20], "interpolator__degree": [1, 2, 3, 4]},
     cv=inside,
-    scoring=bft_scorer,
+    scoring=make_bft_scorer(average="experiment"),
 ).fit(X, y)
 pd.DataFrame(search.cv_results_).pivot_table(
     "mean_test_score", "param_interpolator__degree", "param_local__horizon"

@@ -95,6 +95,17 @@ except ValueError as error:
     print(error)
 
 # %%
+# Columns that are not numbers
+# ----------------------------
+# Labels may be text, times may be dates; inputs and scheduling variables are numbers. A
+# smaller set than the arm, as it comes from a CSV file:
+
+from lpvlearn.datasets import load_varying_spring
+
+spring = load_varying_spring()
+spring.X.groupby("run").head(1)
+
+# %%
 # Lists of trajectories
 # ---------------------
 # Records that come as a list of arrays become a table by

@@ -122,10 +122,11 @@ restructurer.starts_
 #
 # The path from least squares
 # ---------------------------
-# The least-squares fit is a good start in a good basin, but its highest peak may be twice
-# as high as it must be, and the way down is no straight line: a search on the maximum
-# itself follows the ridge on which several peaks are equal, and where the ridge bends its
-# steps are tiny. So the first part of the way leads over a smooth function. With a level
+# The least-squares fit is a good start in a good basin, but its highest peak may be
+# twice as high as it must be, and the way down is no straight line: a search on the
+# maximum itself follows the ridge on which several peaks are equal, and where the ridge
+# bends its steps are tiny. So the first part of the way leads over a smooth function.
+# With a level
 # :math:`t` above the error at all frequencies :math:`\omega_k` of a grid, and
 # :math:`\mu > 0`,
 #

@@ -41,6 +41,13 @@ pipeline.fit(data.X, data.y)
 pipeline.parameters_.loc[:, "p1":"p6"].round(1)
 
 # %%
+# Their standard deviations, to first order, from the covariance of the black boxes
+# (of averaged realizations: from their spread). Where a black box does not minimise the
+# simulation error, its covariance is not known, and they are NaN.
+
+pipeline.parameters_std_.loc[:, "p1":"p6"].round(1)
+
+# %%
 # Points: identified parameters. Line: the interpolation. The truth is known here and
 # drawn beside them.
 

@@ -8,10 +8,16 @@ import numpy as np
 import pandas as pd
 from sklearn.utils import Bunch
 
+from ..structures import GrayBoxStructure
 from ._flexible_arm import FlexibleArm
 from ._generator import INPUTS, OUTPUTS, describe_arm, make_flexible_arm
 
-__all__ = ["REFERENCE_SEED", "load_flexible_arm", "write_reference"]
+__all__ = [
+    "REFERENCE_SEED",
+    "load_flexible_arm",
+    "load_varying_spring",
+    "write_reference",
+]
 
 REFERENCE_SEED = 0
 SAMPLING_TIME = 1e-3
@@ -75,6 +81,60 @@ def load_flexible_arm() -> Bunch:
     return Bunch(
         **parts,
         **describe_arm(FlexibleArm(), theta2, SAMPLING_TIME),
+        DESCR=(folder / "README.md").read_text(encoding="utf-8"),
+    )
+
+
+def load_varying_spring() -> Bunch:
+    """Load four local experiments on a mass whose spring stiffens with `kappa`.
+
+    The smallest LPV system: one input, one output, one scheduling variable; the table
+    of the README.
+
+    Returns
+    -------
+    data : Bunch
+        X : DataFrame
+            Columns `run`, `time` (s), `kappa` (scheduling) and `force` (input); 4 runs
+            of 600 samples.
+        y : DataFrame
+            Column `position`.
+        structure : GrayBoxStructure
+            ``position'' = -k position - c position' + b force``.
+        sampling_time : float
+            0.02 s.
+        true_parameters : DataFrame
+            b, c and k at the four values of `kappa`.
+        DESCR : str
+            The data card.
+
+    Examples
+    --------
+    >>> from lpvlearn.datasets import load_varying_spring
+    >>> data = load_varying_spring()
+    >>> data.X.shape, list(data.X)
+    ((2400, 4), ['run', 'time', 'kappa', 'force'])
+    >>> data.true_parameters
+              b    c     k
+    kappa
+    0.0    30.0  1.2  40.0
+    0.5    30.0  1.2  45.0
+    1.0    30.0  1.2  60.0
+    1.5    30.0  1.2  85.0
+    """
+    folder = data_folder()
+    table = pd.read_csv(folder / "varying_spring.csv")
+    kappa = pd.Index(table["kappa"].unique(), name="kappa")
+    return Bunch(
+        X=table.drop(columns="position"),
+        y=table[["position"]],
+        structure=GrayBoxStructure.from_template(
+            A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]]
+        ),
+        sampling_time=0.02,
+        true_parameters=pd.DataFrame(
+            {"b": 30.0, "c": 1.2, "k": 40.0 + 20.0 * kappa.to_numpy() ** 2}, kappa
+        ),
         DESCR=(folder / "README.md").read_text(encoding="utf-8"),
     )
 

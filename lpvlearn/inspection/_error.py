@@ -173,7 +173,7 @@ class ErrorDisplay:
         restructurer: Any,
         model: StateSpace,
         *,
-        start: StateSpace | ArrayLike | None = None,
+        start: StateSpace | ArrayLike | str | None = "auto",
         omega: ArrayLike | None = None,
         ax: Any = None,
     ) -> ErrorDisplay:
@@ -184,8 +184,10 @@ class ErrorDisplay:
         restructurer : fitted GrayBoxRestructurer
         model : StateSpace
             The black box that it was fitted to.
-        start : StateSpace or array-like of shape (n_params,), default=None
-            The gray-box model, or its parameters, to compare with.
+        start : "auto", StateSpace, array-like of shape (n_params,) or None
+            The gray-box model, or its parameters, to compare with. "auto" (default):
+            the least-squares fit that the minimisation began with, where the
+            restructurer tells it.
         omega : array-like of shape (n_freq,), default=None
             None: around the poles of the models.
         ax : Axes, default=None
@@ -225,6 +227,13 @@ class ErrorDisplay:
         compared = StateSpace(
             model.A, model.B, model.C, model.D - dropped, model.sampling_time
         )
+        if isinstance(start, str):
+            if start != "auto":
+                raise ValueError(
+                    "`start` must be 'auto', a StateSpace, parameters or None. Got "
+                    f"{start!r}."
+                )
+            start = getattr(restructurer, "start_params_", None)
         if start is None or isinstance(start, StateSpace):
             before = start
         else:
