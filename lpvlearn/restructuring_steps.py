@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 _NORMS = ("hinf", "h2", "similarity")
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about
+_N_SEEDS = 6  # starts at each time scale of which continuation makes use
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
 _ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
 
@@ -60,7 +61,9 @@ def candidates(
 ) -> Array:
     """Parameters to start from in a round of the search, shape (k, n_params)."""
     structure = problem.structure
-    n_starts = n_starts * (1 + number)
+    # the second round begins elsewhere: far away, on a smoother response
+    smoother = number == 1 and isinstance(init, str) and structure.order > 0
+    n_starts = min(n_starts, _N_SEEDS) if smoother else n_starts * (1 + number)
     rows = [np.zeros((0, structure.n_params))]
     if number == 0 and given:
         rows.append(np.array(given))
@@ -86,8 +89,7 @@ def candidates(
         known = [] if structure.initial is None else [structure.initial[None]]
         rows += [*known, drawn]
     found = np.vstack(rows)
-    if number == 1 and isinstance(init, str) and structure.order > 0:
-        # the second round begins elsewhere: far away, on a smoother response
+    if smoother:
         continued = continuation_candidates(structure, problem.box, found, rng)
         found = continued if len(continued) else found
     return np.clip(found, structure.lower, structure.upper)

@@ -9,7 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arguments import real_array
-from .numerics.differentiation import numerical_curvature, numerical_jacobian
+from .numerics.differentiation import (
+    numerical_curvature,
+    numerical_jacobian,
+    symmetric_differences,
+)
 from .parameter_domain import ParameterDomain
 from .parametrized import Parametrized
 from .statespace import StateSpace
@@ -58,6 +62,7 @@ class StructureMap(Parametrized):
         self.offset = offset if self.is_affine else None
         self.basis = basis
         self.function, self._jacobian, self._curvature = function, jacobian, curvature
+        self._memory: tuple[bytes, Array] | None = None  # the last Jacobian
         super().__init__(ParameterDomain.free(parameter_names, initial))
         for array in (offset, basis):
             if array is not None:
@@ -195,6 +200,14 @@ class StructureMap(Parametrized):
         if self.function is None:
             assert self.basis is not None
             return self.basis
+        key = np.asarray(theta).tobytes()
+        if self._memory is None or self._memory[0] != key:  # asked for again and again
+            derivatives = self._derivatives(theta)
+            derivatives.setflags(write=False)
+            self._memory = key, derivatives
+        return self._memory[1]
+
+    def _derivatives(self, theta: Array) -> Array:
         if self._jacobian is not None:
             derivatives = self._jacobian(theta)
             shape = (self.n_params,)
@@ -217,7 +230,9 @@ class StructureMap(Parametrized):
             return None
         if self._curvature is not None:
             return self._curvature(theta)
-        return numerical_curvature(self.jacobian, theta, self.initial)
+        if self._jacobian is not None:
+            return symmetric_differences(self._derivatives, theta, self.initial)
+        return numerical_curvature(self.system_matrix, theta, self.initial)
 
     def matrices(self, theta: ArrayLike) -> Blocks:
         """Matrices ``(A, B, C, D)`` at `theta`, stacked over its leading axes.

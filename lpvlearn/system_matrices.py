@@ -164,19 +164,19 @@ def stack_system(
         If a block has another shape.
     """
     n, m, p = shape
-    arrays = []
-    for i, block_shape in enumerate(((n, n), (n, m), (p, n), (p, m))):
-        expected = lead + block_shape
-        if i < len(blocks) and blocks[i] is not None:
-            array = np.asarray(blocks[i])
+    given = [np.asarray(block) for block in blocks if block is not None]
+    S = np.zeros((*lead, n + p, n + m), np.result_type(float, *given))
+    corners = ((0, 0, n, n), (0, n, n, m), (n, 0, p, n), (n, n, p, m))
+    for i, (row, column, height, width) in enumerate(corners):
+        if i >= len(blocks) or blocks[i] is None:
+            continue
+        array, expected = np.asarray(blocks[i]), (*lead, height, width)
+        if array.shape != expected:
             if array.size != np.prod(expected):
                 raise ValueError(
                     f"`{source}` must return `{'ABCD'[i]}` of shape {expected}. Got "
                     f"{array.shape}."
                 )
-            arrays.append(array.reshape(expected))
-        else:
-            arrays.append(np.zeros(expected))
-    A, B, C, D = arrays
-    upper, lower = np.concatenate([A, B], -1), np.concatenate([C, D], -1)
-    return np.concatenate([upper, lower], -2)
+            array = array.reshape(expected)
+        S[..., row : row + height, column : column + width] = array
+    return S

@@ -208,7 +208,7 @@ class _Stage:
         theta = self.theta(y)
         if not np.isfinite(theta).all() or not self.limits.admissible(theta):
             return np.inf
-        c = self.limits.rows(theta)[0]
+        c = self.limits.values(theta)
         s = self._squares(theta)
         if c.max(initial=-1.0) >= 0 or not np.isfinite(s).all():
             return np.inf

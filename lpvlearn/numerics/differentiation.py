@@ -63,34 +63,53 @@ def numerical_jacobian(
            [0., 0.]])
     """
     scale = parameter_scale(theta, typical)
-    central = _central(f, theta, _CENTRAL_STEP * scale)
+    exact = _analytic_jacobian(f, theta, scale)
+    return _central(f, theta, _CENTRAL_STEP * scale) if exact is None else exact
+
+
+def _complex_step(f: Callable[[Any], Any], theta: Array, scale: Array) -> Array:
+    columns = [
+        np.imag(f(theta + 1j * step)) / step.max()
+        for step in np.diag(_COMPLEX_STEP * scale)
+    ]
+    return np.array(columns, dtype=float)
+
+
+def _analytic_jacobian(
+    f: Callable[[Any], Any], theta: Array, scale: Array
+) -> Array | None:
+    """The derivative by complex steps; None where `f` is not analytic.
+
+    A function that is not (abs, real, conj) fails the complex step in silence. Its
+    change along one direction, in which no two parameters change alike, tells, entry
+    by entry.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", ComplexWarning)
-            columns = [
-                np.imag(f(theta + 1j * step)) / step.max()
-                for step in np.diag(_COMPLEX_STEP * scale)
-            ]
-        exact = np.array(columns, dtype=float)
+            exact = _complex_step(f, theta, scale)
     except (TypeError, ValueError, NotImplementedError, ComplexWarning):
-        return central
-    # A function that is not analytic (abs, real, conj) fails the complex step in
-    # silence. The change per relative change of a parameter tells, entry by entry.
-    size = scale.reshape(-1, *[1] * (central.ndim - 1))
-    change, rounding = np.abs(central) * size, 1e-8 * np.abs(f(theta))
-    agrees = np.abs(exact - central) * size <= _AGREEMENT * change + rounding
-    return exact if agrees.all() else central
+        return None
+    direction = scale * np.cos(1.0 + np.arange(len(theta)) ** 2)
+    step = _CENTRAL_STEP * direction
+    up, down = np.asarray(f(theta + step)), np.asarray(f(theta - step))
+    change = (up - down) / (2.0 * _CENTRAL_STEP)
+    size = np.abs(exact * scale.reshape(-1, *[1] * (exact.ndim - 1))).sum(0)
+    rounding = 1e-8 * (np.abs(up) + np.abs(down))
+    error = np.abs(np.tensordot(direction, exact, axes=1) - change)
+    agrees = error <= _AGREEMENT * np.maximum(np.abs(change), size) + rounding
+    return exact if agrees.all() else None
 
 
 def numerical_curvature(
-    jacobian: Callable[[Array], Array], theta: Array, typical: Array | None = None
+    f: Callable[[Any], Any], theta: Array, typical: Array | None = None
 ) -> Array:
-    """Second derivatives, by central differences of a Jacobian, symmetrised.
+    """Second derivatives, by central differences of the first ones, symmetrised.
 
     Parameters
     ----------
-    jacobian : callable
-        Maps (n_params,) to (n_params, ...).
+    f : callable
+        Maps (n_params,) to an array of any shape, as for `numerical_jacobian`.
     theta : ndarray of shape (n_params,)
     typical : ndarray of shape (n_params,), default=None
         Usual sizes of the parameters.
@@ -102,10 +121,26 @@ def numerical_curvature(
     Examples
     --------
     >>> import numpy as np
-    >>> H = numerical_curvature(lambda t: np.array([3 * t[0] ** 2]), np.array([2.0]))
+    >>> H = numerical_curvature(lambda t: t[0] ** 3 * t[1], np.array([2.0, 1.0]))
     >>> H.round(6)
-    array([[12.]])
+    array([[12., 12.],
+           [12.,  0.]])
     """
+    scale = parameter_scale(theta, typical)
+
+    def jacobian(point: Array) -> Array:
+        if analytic:
+            return _complex_step(f, point, scale)
+        return numerical_jacobian(f, point, typical)
+
+    analytic = _analytic_jacobian(f, theta, scale) is not None
+    return symmetric_differences(jacobian, theta, typical)
+
+
+def symmetric_differences(
+    jacobian: Callable[[Array], Array], theta: Array, typical: Array | None = None
+) -> Array:
+    """Second derivatives from a Jacobian that maps (n_params,) to (n_params, ...)."""
     H = _central(jacobian, theta, _CURVATURE_STEP * parameter_scale(theta, typical))
     return 0.5 * (H + H.swapaxes(0, 1))
 

@@ -67,7 +67,7 @@ class Limits:
 
     def strict(self, theta: Array) -> bool:
         """Whether `theta` is off all limits."""
-        return self.admissible(theta) and bool((self.rows(theta)[0] < 0).all())
+        return self.admissible(theta) and bool((self.values(theta) < 0).all())
 
     def rows(self, theta: Array) -> tuple[Array, Array, Array]:
         """Constraints in their own units, gradients (k, n_params), and typical sizes.
@@ -82,26 +82,37 @@ class Limits:
         W = np.linalg.pinv(V)
         dA = structure.jacobian(theta)[:, :n, :n]
         d = np.einsum("ia,jab,bi->ij", W, dA, V)
-        rate, size = growth(poles, system.dt), np.abs(poles)
+        size = np.abs(poles)
         if system.dt is not None:
             safe = np.where(poles == 0, 1.0, poles)
             d, size = d / safe[:, None] / system.dt, np.abs(np.log(np.abs(safe)))
             size = size / system.dt
-        c, dc = [rate + self.margin], [np.real(d)]
-        sizes = [np.maximum(size, self.margin)]
+        dc, sizes = [np.real(d)], [np.maximum(size, self.margin)]
         if np.isfinite(self.speed):
             unit, safe = self.speed / _FASTEST, np.maximum(size, 1e-300)
-            c.append(1.0 / _FASTEST - unit / safe)
             turn = np.real(poles.conj()[:, None] * d) / safe[:, None]
             dc.append(unit / safe[:, None] ** 2 * turn)
             sizes.append(np.ones(n))
         eye, low, high = np.eye(len(theta)), self._low, self._high
         span = np.maximum(np.abs(theta), 1e-300)
         span = np.maximum(span, 1e-3 * span.max(initial=0.0))
-        c += [(structure.lower - theta)[low], (theta - structure.upper)[high]]
         dc += [-eye[low], eye[high]]
         sizes += [span[low], span[high]]
-        return np.concatenate(c), np.vstack(dc), np.concatenate(sizes)
+        return self._values(theta, poles), np.vstack(dc), np.concatenate(sizes)
+
+    def values(self, theta: Array) -> Array:
+        """The constraints alone."""
+        return self._values(theta, self.system.poles(theta))
+
+    def _values(self, theta: Array, poles: Complex) -> Array:
+        structure = self.system.structure
+        c = [growth(poles, self.system.dt) + self.margin]
+        if np.isfinite(self.speed):
+            size = np.maximum(np.abs(poles), 1e-300)
+            c.append(1.0 / _FASTEST - self.speed / _FASTEST / size)
+        c.append((structure.lower - theta)[self._low])
+        c.append((theta - structure.upper)[self._high])
+        return np.concatenate(c)
 
     def inside(self, theta: Array) -> Array:
         """`theta` moved a little off its bounds."""

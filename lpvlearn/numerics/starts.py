@@ -252,7 +252,8 @@ def search_fits(
         if fits and np.sqrt(fits[0].cost) <= GOOD_FIT * size:
             break
         # the structure comes no nearer: different starts end at the same best cost
-        if number and len(fits) > 1 and fits[1].cost <= fits[0].cost * (1 + 1e-6):
+        agreeing = sum(fit.cost <= fits[0].cost * (1 + 1e-6) for fit in fits)
+        if agreeing >= (2 if number else n_fits):
             break
     return fits
 
