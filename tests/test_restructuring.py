@@ -591,3 +591,32 @@ def test_result_is_reproducible():
     first = GrayBoxRestructurer(structure, random_state=1).fit_model(black_box)
     second = GrayBoxRestructurer(structure, random_state=1).fit_model(black_box)
     np.testing.assert_array_equal(first.params_, second.params_)
+
+
+@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
+def test_neighbours_on_a_measured_grid_are_both_active():
+    driven = StateSpace(
+        [[0, 1, 0], [-1, -0.1, 1], [0, 0, -30]], [[0], [0], [30]], [[1, 0, 0]]
+    )
+    spring = GrayBoxStructure.from_template(
+        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
+    )
+    omega = np.geomspace(0.1, 100, 60)
+    G = driven.frequency_response(omega)
+    fitted = GrayBoxRestructurer(spring).fit(omega, G)
+
+    def error(params):
+        E = spring.model(params).frequency_response(omega) - G
+        return np.abs(E).max()
+
+    assert np.isclose(fitted.error_, error(fitted.params_), rtol=1e-12)
+    assert fitted.stationarity_ < 1e-6 and fitted.second_order_ > 0
+    places = np.searchsorted(omega, fitted.active_frequencies_)
+    assert np.diff(places).tolist() == [1]
+    exact = GrayBoxRestructurer(spring).fit_model(driven)
+    assert fitted.error_ < error(exact.params_)
+    rng = np.random.default_rng(0)
+    for size in (1e-2, 1e-4, 1e-6):
+        for _ in range(20):
+            near = fitted.params_ * (1 + size * rng.normal(size=3))
+            assert error(near) >= fitted.error_ * (1 - 1e-9)

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
+_BESIDE = 1e-3  # relative difference of measured neighbours that are equally high
+
+
 class Structure(Protocol):
     """What this room needs of a gray-box structure."""
 
@@ -300,14 +303,18 @@ class MeasuredErrorSystem(ErrorSystem):
         return G0, np.zeros_like(G0), np.zeros_like(G0)
 
     def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
-        """Local maxima of the error over the measured frequencies."""
+        """Local maxima of the error over the measured frequencies.
+
+        And their neighbours that are as high: at an optimum two often are equal.
+        """
         E = self.W @ (self.response(theta, self.omega) - self.G)
         sigma = np.linalg.norm(E, 2, axis=(1, 2))
         top = float(sigma.max())
         rising = np.r_[True, sigma[1:] >= sigma[:-1]]
         falling = np.r_[sigma[:-1] >= sigma[1:], True]
         level = top if within is None else (1.0 - within) * top
-        index = np.flatnonzero(rising & falling & (sigma >= level))
+        beside = sigma >= (1.0 - _BESIDE) * top
+        index = np.flatnonzero((rising & falling | beside) & (sigma >= level))
         index = index[np.argsort(-sigma[index], kind="stable")]
         return PeakSet(top, self.omega[index], sigma[index])
 
