@@ -12,7 +12,11 @@ from lpvlearn.numerics.frequency import (
     balanced,
     frequency_response,
 )
-from lpvlearn.numerics.singular_values import sigma_max, square_derivatives
+from lpvlearn.numerics.singular_values import (
+    sigma_max,
+    square_derivatives,
+    square_jet,
+)
 
 Matrices = tuple[NDArray, NDArray, NDArray, NDArray]
 
@@ -119,9 +123,12 @@ def test_derivatives_are_those_of_the_resolvent(
         assert_allclose(G, C @ R @ B + D, atol=1e-11 * abs(G).max())
         assert_allclose(G1, slope, atol=1e-11 * abs(slope).max())
         assert_allclose(G2, bend, atol=1e-11 * abs(bend).max())
-        solved, solved_slope = engine.solved(np.array([w]))
+        solved = engine.solved(np.array([w]))
         assert_allclose(solved[:, :, 0], G, atol=1e-11 * abs(G).max())
-        assert_allclose(solved_slope[:, :, 0], slope, atol=1e-11 * abs(slope).max())
+        jets = [engine.jet(w)] + ([engine.modal_jet(w)] if engine.is_modal else [])
+        for jet in jets:
+            for found, expected in zip(jet, (G, slope, bend), strict=True):
+                assert_allclose(found, expected, atol=1e-11 * abs(expected).max())
 
 
 def test_fast_sampling_loses_no_digits() -> None:
@@ -144,8 +151,9 @@ def test_solves_are_refined_at_a_nearly_undamped_mode() -> None:
     mix = np.eye(3) + np.array([[0, 0, 1], [0, 0, 0], [0, 0, 0]])
     back = 2.0 * np.eye(3) - mix
     engine = FrequencyEngine(mix @ A @ back, mix @ B, C @ back, np.zeros((1, 1)))
-    G = engine.solved(np.array([w]))[0][0, 0, 0]
+    G = engine.solved(np.array([w]))[0, 0, 0]
     assert_allclose(G, -1j, rtol=1e-8)
+    assert_allclose(engine.jet(w)[0], [[-1j]], rtol=1e-8)
 
 
 def test_balancing_leaves_the_response_alone() -> None:
@@ -172,6 +180,9 @@ def test_derivatives_of_the_singular_value_match_differences(
     f = np.array([sigma_max(engine.response(w + step)) ** 2 for step in steps])
     first = np.array([-1, 9, -45, 0, 45, -9, 1]) / (60.0 * h)
     second = np.array([2, -27, 270, -490, 270, -27, 2]) / (180.0 * h * h)
+    for k, at in enumerate(w):
+        jet = square_jet(*engine.jet(at))
+        assert_allclose(jet, [value[k], slope[k], bend[k]], rtol=1e-9, atol=1e-12)
     assert_allclose(value, f[3], rtol=1e-13)
     assert_allclose(slope, first @ f, rtol=1e-6, atol=1e-8 * f.max())
     assert_allclose(bend, second @ f, rtol=1e-6, atol=1e-6 * f.max())

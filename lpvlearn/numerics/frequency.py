@@ -113,30 +113,35 @@ class FrequencyEngine:
         self._size = np.sqrt((self.F * self.F).sum())
         real, imag, _, vectors, info = lapack.dgeev(self.F, compute_vl=0)
         self.poles = real + 1j * imag
-        self.is_modal = False
-        if info == 0:
-            self._to_modal_form(vectors, imag)
+        self.is_modal = info == 0 and self._to_modal_form(vectors, imag)
         if not self.is_modal:
             self._to_schur_form()
 
-    def _to_modal_form(self, vectors: NDArray, imag: NDArray) -> None:
-        V = vectors.astype(complex)
-        first = np.flatnonzero(imag > 0)
-        V[:, first] += 1j * vectors[:, first + 1]
-        V[:, first + 1] = V[:, first].conj()
-        try:
-            W = np.linalg.inv(V)
-        except np.linalg.LinAlgError:
-            return
-        condition = np.sqrt(np.vdot(V, V).real * np.vdot(W, W).real)
+    def _to_modal_form(self, vectors: NDArray, imag: NDArray) -> bool:
+        """Residues from the real form of the eigenvectors, if well conditioned.
+
+        A pair of conjugate eigenvectors v, v* stands as Re v, Im v: of the real
+        inverse, the rows of the pair are then twice those of the complex one.
+        """
+        lu, pivots, info = lapack.dgetrf(vectors)
+        if info:
+            return False
+        inverse, _ = lapack.dgetri(lu, pivots)
+        # All eigenvectors have length one; pairs make this too large by at most 2.
+        condition = (self.order * float(np.vdot(inverse, inverse))) ** 0.5
         if not condition <= _MODAL_CONDITION:
-            return
-        self.is_modal = True
+            return False
         # G = D + sum_k residue_k / (x - pole_k), one column per pole.
-        left, right = self.C @ V, W @ self.B
-        self._residues = (left[:, None, :] * right.T).reshape(-1, self.order)
+        factors = np.concatenate((self.C @ vectors, (inverse @ self.B).T))
+        sign, column = np.sign(imag), np.arange(self.order)
+        real_part = factors[:, column - (sign < 0.0)]
+        factors = real_part + 1j * sign * factors[:, column + (sign > 0.0)]
+        n_outputs = len(self.C)
+        left, right = factors[:n_outputs], factors[n_outputs:].conj()
+        right *= 1.0 / (1.0 + sign * sign)
+        self._residues = (left[:, None, :] * right).reshape(-1, self.order)
         self._condition = condition
-        self._terms = np.sqrt((np.abs(self._residues) ** 2).sum(0))
+        return True
 
     def _to_schur_form(self) -> None:
         T, Q = schur(self.F, output="complex")
@@ -187,44 +192,67 @@ class FrequencyEngine:
         z = x + 1.0
         return 1j * z * Gx, -z * (z * Gxx + Gx)
 
-    def solved(self, omega: NDArray) -> tuple[NDArray, NDArray]:
-        """Return G and its derivative by one LU factorisation per frequency.
+    def modal_jet(self, omega: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Return `derivatives` at one frequency, from the modal form in use."""
+        x = self.points(np.asarray(omega))
+        X = 1.0 / (x - self.poles)
+        X2 = X * X
+        values = (self._residues @ np.array((X, X2, X2 * X)).T).T
+        G, G1, G2 = values.reshape(3, *self.D.shape)
+        return G + self.D, *self._chain(x, -G1, 2.0 * G2)
+
+    def jet(self, omega: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Return G and its two derivatives at one frequency, as accurate as `solved`.
+
+        Shapes (n_outputs, n_inputs): where there is a single frequency, the
+        overhead of the stacked forms would cost more than the arithmetic.
+        """
+        x = self.points(np.asarray(omega))
+        M = np.array(-self.F, complex, order="F")
+        M.T.reshape(-1)[:: self.order + 1] += x
+        lu, pivots, info = lapack.zgetrf(M)
+        if info:
+            raise np.linalg.LinAlgError("A pole lies on the boundary.")
+        right = lapack.zgetrs(lu, pivots, self.B)[0]
+        left = lapack.zgetrs(lu, pivots, self.C.T, trans=1)[0].T
+        G = self.C @ right + self.D
+        square = np.vdot(left, left).real * np.vdot(right, right).real
+        noise = _EPS * square**0.5 * (abs(x) + self._size)
+        if noise > _SOLVED_ACCURACY * np.vdot(G, G).real ** 0.5:
+            stacks = np.array([x]), M[None], right[None], left[None]
+            right, left, G = (P[0] for P in self._polished(*stacks))
+        again = lapack.zgetrs(lu, pivots, right)[0]
+        return G, *self._chain(x, -(left @ right), 2.0 * (left @ again))
+
+    def solved(self, omega: NDArray) -> NDArray:
+        """Return G by one LU factorisation per frequency.
 
         Where the resolvent is so large that G would lose digits, the solutions
         are refined on residuals in extended precision (where the platform's
         long double has it), so that G is that of the matrices as given.
         """
-        n, k = self.order, len(omega)
-        n_outputs, n_inputs = self.D.shape
-        G = np.empty((n_outputs, n_inputs, k), complex)
-        G1 = np.empty_like(G)
-        step = max(1, _STACK_ELEMENTS // max(1, n * n))
-        for start in range(0, k, step):
+        G = np.empty((*self.D.shape, len(omega)), complex)
+        step = max(1, _STACK_ELEMENTS // max(1, self.order**2))
+        for start in range(0, len(omega), step):
             part = slice(start, start + step)
-            x = self.points(omega[part])
-            values, slopes = self._solved_stack(x)
-            G[:, :, part] = values.transpose(1, 2, 0)
-            velocity = 1j * (x + 1.0) if self.discrete else 1j
-            G1[:, :, part] = slopes.transpose(1, 2, 0) * velocity
-        return G, G1
+            G[:, :, part] = self._solved_stack(self.points(omega[part]))
+        return G
 
-    def _solved_stack(self, x: NDArray) -> tuple[NDArray, NDArray]:
+    def _solved_stack(self, x: NDArray) -> NDArray:
         M = np.empty((len(x), self.order, self.order), complex)
         M[:] = -self.F
         M.reshape(len(x), -1)[:, :: self.order + 1] += x[:, None]
-        right = np.linalg.solve(M, self.B.astype(complex))
-        left = np.linalg.solve(M.swapaxes(1, 2), self.C.T.astype(complex))
+        right = np.linalg.solve(M, self.B.astype(complex)[None])
+        left = np.linalg.solve(M.swapaxes(1, 2), self.C.T.astype(complex)[None])
         left = left.swapaxes(1, 2)
         G = self.C @ right + self.D
         # First-order effect of the backward error of the factorisation on G.
         noise = _norms(left) * _norms(right) * (np.abs(x) + self._size)
         poor = _EPS * noise > _SOLVED_ACCURACY * _norms(G)
         if poor.any():
-            right, left, G = right.copy(), left.copy(), G.copy()
-            right[poor], left[poor], G[poor] = self._polished(
-                x[poor], M[poor], right[poor], left[poor]
-            )
-        return G, -(left @ right)
+            stacks = x[poor], M[poor], right[poor], left[poor]
+            G[poor] = self._polished(*stacks)[2]
+        return G.transpose(1, 2, 0)
 
     def _polished(
         self, x: NDArray, M: NDArray, right: NDArray, left: NDArray
@@ -268,7 +296,8 @@ class FrequencyEngine:
             return np.full(len(omega), np.inf)
         X = 1.0 / np.abs(self.points(omega) - self.poles[:, None])
         amplification = 1.0 + self._size * X.max(0)
-        return _EPS * self._condition * amplification * (self._terms @ X)
+        terms = np.sqrt((np.abs(self._residues) ** 2).sum(0))
+        return _EPS * self._condition * amplification * (terms @ X)
 
     def accurate(self, omega: NDArray) -> NDArray:
         """Return G, solved where modes would lose digits; infinite at poles."""
@@ -283,7 +312,7 @@ class FrequencyEngine:
         size = np.sqrt((G.real**2 + G.imag**2).sum((0, 1)))
         lost = self.uncertainty(omega) > _MODAL_ACCURACY * size
         if lost.any():
-            G[:, :, lost] = self.solved(omega[lost])[0]
+            G[:, :, lost] = self.solved(omega[lost])
         return G
 
 

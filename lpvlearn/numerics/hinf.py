@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lpvlearn.numerics.frequency import FrequencyEngine
 from lpvlearn.numerics.level_sets import LevelSets
-from lpvlearn.numerics.peaks import PeakRefiner
+from lpvlearn.numerics.peaks import Peak, PeakRefiner
 from lpvlearn.numerics.singular_values import sigma_max
 
 __all__ = ["PeakSet", "hinf_norm", "linf_norm"]
@@ -23,7 +23,8 @@ _EPS = float(np.finfo(float).eps)
 _POLE_ON_AXIS = 1e-13
 _MAX_LEVELS = 40
 # Samples around a pole, in units of its distance from the boundary.
-_OFFSETS = np.array([-8.0, -3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0, 8.0])
+_OFFSETS = np.array([[-8.0, -3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0, 8.0]]).T
+_ENDS = np.array([0.0, np.inf])
 _FRACTIONS = (np.arange(10) + 0.5) / 10
 
 
@@ -194,77 +195,91 @@ class _Search:
     def run(self, within: float | None) -> PeakSet:
         """Find the norm, then, if asked, the other peaks."""
         engine = self.engine
-        if not engine.B.any() or not engine.C.any():
-            return _constant(engine.D)
         bad = np.abs(self.depth) <= self.on_boundary
         if bad.any():
+            if not engine.B.any() or not engine.C.any():
+                return _constant(engine.D)
             angle = np.abs(self.angles[bad][:1])
             return PeakSet(np.inf, angle / self.unit, np.array([np.inf]))
         w, s = self.refiner.sampled(self._grid())
+        top = int(s.argmax())
+        if s[top] == 0.0:
+            return PeakSet(0.0, w[[top]] / self.unit, s[[top]])
         levels = LevelSets(engine)
-        peaks, values = self._highest(w, s, levels)
-        if within is None or values.max() == 0.0:
-            top = [values.argmax()]
-            return self._result(peaks[top], values[top])
-        level = values.max() * (1.0 - within)
-        inner = _between(
-            levels.crossings(level * (1.0 - 1e-6)), self.refiner.end, _FRACTIONS
-        )
-        w, s = self.refiner.sampled(np.concatenate((w, inner, peaks)))
-        peaks, values = self.refiner.every(w, s, level * (1.0 - 1e-3))
-        if len(values) == 0:  # only slopes of rounding noise: a plateau is one peak
-            peaks, values = w[[s.argmax()]], s[[s.argmax()]]
-        above = values >= min(level, values.max()) * (1.0 - 1e-12)
-        return self._result(peaks[above], values[above])
+        if within is None:
+            peaks = self.refiner.highest(w, s, 0.8 * s[top])
+            return self._result(self._raised(peaks, levels)[:1])
+        level = self.refiner.value(float(w[top])) * (1.0 - within)
+        crossings = levels.crossings(level * (1.0 - 1e-6))
+        inner = _between(crossings, self.refiner.end, _FRACTIONS)
+        w, s = self.refiner.sampled(np.concatenate((w, inner)))
+        peaks = self._every(w, s, level)
+        raised = self._raised(peaks, levels)
+        if len(raised) > len(peaks):
+            known = [peak.frequency for peak in raised]
+            w, s = self.refiner.sampled(np.append(w, known))
+            level = raised[0].value * (1.0 - within)
+            peaks = self._every(w, s, level)
+        least = peaks[0].value * (1.0 - within) * (1.0 - 1e-12)
+        return self._result([peak for peak in peaks if peak.value >= least])
 
-    def _result(self, peaks: NDArray, values: NDArray) -> PeakSet:
-        order = np.argsort(-values, kind="stable")
-        values = values[order]
-        return PeakSet(float(values[0]), peaks[order] / self.unit, values)
+    def _result(self, peaks: list[Peak]) -> PeakSet:
+        frequencies = np.array([peak.frequency for peak in peaks]) / self.unit
+        values = np.array([peak.value for peak in peaks])
+        return PeakSet(peaks[0].value, frequencies, values)
 
-    def _highest(
-        self, w: NDArray, s: NDArray, levels: LevelSets
-    ) -> tuple[NDArray, NDArray]:
-        """Raise the bound by refined peaks until the level set above is empty."""
-        peaks, values, widths = self.refiner.highest(w, s, 0.8 * s.max())
-        if values.max() == 0.0:
-            return peaks, values
+    def _every(self, w: NDArray, s: NDArray, level: float) -> list[Peak]:
+        """Every peak above the level, the highest first."""
+        peaks = self.refiner.every(w, s, level * (1.0 - 1e-3))
+        if not peaks:  # only slopes of rounding noise: a plateau is one peak
+            return [Peak(float(w[s.argmax()]), float(s.max()), 0.0)]
+        return sorted(peaks, key=_value, reverse=True)
+
+    def _raised(self, peaks: list[Peak], levels: LevelSets) -> list[Peak]:
+        """Raise the bound by refined peaks until the level set above is empty.
+
+        Returns the peaks with those found on the way, the highest first.
+        """
+        peaks = sorted(peaks, key=_value, reverse=True)
         for _ in range(_MAX_LEVELS):
-            best = values.max()
+            best = peaks[0].value
+            if best == 0.0:
+                break
             crossings = levels.crossings(best * (1.0 + 2.0 * self.rtol))
             # Just above a peak the level set is empty, but nearly tangent.
-            away = np.abs(crossings[:, None] - peaks) > 1e-3 * widths
-            if not away.all(1).any():
+            if all(any(p.covers(w) for p in peaks) for w in crossings.tolist()):
                 break
             w, s = self.refiner.sampled(_between(crossings, self.refiner.end, 0.5))
-            new = self.refiner.highest(w, s, best * (1.0 - 1e-6))
-            if len(new[1]) == 0 or new[1].max() <= best * (1.0 + self.rtol):
+            new = self.refiner.highest(w, s, best * (1.0 - 1e-6), peaks)
+            if not any(peak.value > best * (1.0 + self.rtol) for peak in new):
                 break
-            peaks, values, widths = (
-                np.append(old, add)
-                for old, add in zip((peaks, values, widths), new, strict=True)
-            )
-        return peaks, values
+            peaks = sorted(peaks + new, key=_value, reverse=True)
+        return peaks
 
     def _grid(self) -> NDArray:
         """Frequencies resolved in units of every pole's distance."""
-        upper = self.engine.poles.imag >= 0
+        upper = np.flatnonzero(self.engine.poles.imag >= 0.0)
         depth = np.abs(self.depth[upper])
         centre = np.abs(self.angles[upper])
         if self.engine.discrete:
             depth = np.minimum(depth, 1.0)
-        size = np.hypot(centre, depth)
-        near = np.abs((centre + depth * _OFFSETS[:, None]).ravel())
-        resonance = np.sqrt(np.maximum(centre**2 - depth**2, 0.0))
+        near = np.abs((centre + depth * _OFFSETS).ravel())
+        square = centre * centre
+        resonance = np.sqrt(np.maximum(square - depth * depth, 0.0))
+        size = np.sqrt(square + depth * depth)
         if not self.engine.discrete:
             span = _ladder(0.01 * size.min(), 1e3 * size.max(), 24)
-            return np.concatenate(([0.0], near, size, resonance, span, [np.inf]))
+            return np.concatenate((_ENDS, near, size, resonance, span))
         near = np.abs(np.remainder(near + np.pi, 2.0 * np.pi) - np.pi)
         rest = np.hypot(np.pi - centre, depth).min()
         low = _ladder(0.01 * min(size.min(), np.pi), np.pi, 20)
         high = np.pi - _ladder(0.01 * rest, 1.0, 12)
         w = np.concatenate(([0.0], near, resonance, low, high, [np.pi]))
         return np.minimum(w, np.pi)
+
+
+def _value(peak: Peak) -> float:
+    return peak.value
 
 
 def _ladder(low: float, high: float, count: int) -> NDArray:

@@ -21,7 +21,7 @@ _CLEARANCE = 0.05
 
 @dataclass(frozen=True)
 class _Mapped:
-    """A continuous-time system whose feedthrough has singular values `gains`."""
+    """A continuous-time system whose feedthrough is diagonal, with these gains."""
 
     A: NDArray
     B: NDArray
@@ -73,7 +73,7 @@ class LevelSets:
         """
         end = self._end(level)
         eta = _imaginary_eigenvalues(_hamiltonian(self._mapped(end), level))
-        if np.isinf(end):
+        if end == np.inf:
             omega = eta
         elif self.engine.discrete:
             # zeta = j eta = -j cot((omega - end) / 2), folded to [0, pi].
@@ -87,8 +87,8 @@ class LevelSets:
         first = np.pi if self.engine.discrete else np.inf
         clearance = {}
         for end in (first, 0.0):
-            gains = self._mapped(end).gains
-            clearance[end] = np.abs(gains - level).min() / level
+            gains = self._mapped(end).gains.tolist()
+            clearance[end] = min(abs(gain - level) for gain in gains) / level
             if clearance[end] > _CLEARANCE:
                 return end
         return max(clearance, key=clearance.__getitem__)
@@ -102,7 +102,7 @@ class LevelSets:
         engine = self.engine
         A, B, C, D = engine.F, engine.B, engine.C, engine.D
         scale = 1.0
-        if np.isfinite(end):
+        if end < np.inf:
             identity = np.eye(len(A))
             inverse = np.linalg.inv(A + 2.0 * identity if end else A)
             size = np.abs(engine.poles)
@@ -114,7 +114,7 @@ class LevelSets:
                 A = identity + scale * inverse
             left, B = C @ inverse, inverse @ B
             C, D = -scale * left, D - C @ B
-        U, gains, Vt = np.linalg.svd(D)
+        U, gains, Vt, _ = lapack.dgesdd(D)
         return _Mapped(A, B @ Vt.T, U.T @ C, gains, scale)
 
 
@@ -122,18 +122,23 @@ def _hamiltonian(system: _Mapped, level: float) -> NDArray:
     """Hamiltonian of a level; the feedthrough is diagonal in these channels."""
     A, B, C, gains = system.A, system.B, system.C, system.gains
     n, k = len(A), len(gains)
+    square = level * level
     gap = (level - gains) * (level + gains)
-    gap = np.where(gap == 0.0, _EPS * level * level, gap)
-    right = np.full(B.shape[1], level * level)
-    left = np.full(C.shape[0], level * level)
-    right[:k] = left[:k] = gap
+    gap[gap == 0.0] = _EPS * square
     M = A + (B[:, :k] * (gains / gap)) @ C[:k]
     H = np.empty((2 * n, 2 * n), order="F")
     H[:n, :n] = M
-    H[:n, n:] = (B * (level / right)) @ B.T
-    H[n:, :n] = -(C.T * (level / left)) @ C
+    H[:n, n:] = (B * _padded(level / gap, B.shape[1], 1.0 / level)) @ B.T
+    H[n:, :n] = (C.T * _padded(-level / gap, C.shape[0], -1.0 / level)) @ C
     H[n:, n:] = -M.T
     return H
+
+
+def _padded(weights: NDArray, length: int, rest: float) -> NDArray:
+    """Weights of all channels: those beyond the gains have no feedthrough."""
+    if len(weights) == length:
+        return weights
+    return np.append(weights, np.full(length - len(weights), rest))
 
 
 def _imaginary_eigenvalues(H: NDArray) -> NDArray:
@@ -141,5 +146,4 @@ def _imaginary_eigenvalues(H: NDArray) -> NDArray:
     real, imag, _, _, info = lapack.dgeev(H, compute_vl=0, compute_vr=0, overwrite_a=1)
     if info:
         raise np.linalg.LinAlgError("The QR iteration did not converge.")
-    near = np.abs(real) <= _CROSSING_AXIS * np.abs(imag)
-    return imag[near & (imag >= 0.0)]
+    return imag[np.abs(real) <= _CROSSING_AXIS * imag]

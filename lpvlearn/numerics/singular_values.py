@@ -6,10 +6,12 @@ channels on either side everything is closed form along the last axis.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["sigma_max", "square_derivatives", "square_slope"]
+__all__ = ["sigma_max", "square_derivatives", "square_jet"]
 
 _TINY = float(np.finfo(float).tiny)
 # Relative gap below which two singular values count as one.
@@ -131,28 +133,54 @@ def _derivatives_by_svd(
     return s[:, 0] ** 2, 2.0 * s[:, 0] * P[:, 0, 0].real, 2.0 * curvature
 
 
-def square_slope(G: NDArray, G1: NDArray) -> tuple[NDArray, NDArray]:
-    """Square of the largest singular value and its derivative.
+def square_jet(G: NDArray, G1: NDArray, G2: NDArray) -> tuple[float, float, float]:
+    """`square_derivatives` at one frequency, in scalars where they are faster.
 
     Parameters
     ----------
-    G, G1 : ndarrays of shape (n_outputs, n_inputs, n_frequencies)
-        The response and its derivative in frequency.
+    G, G1, G2 : ndarrays of shape (n_outputs, n_inputs)
+        The response and its first and second derivative in frequency.
 
     Returns
     -------
-    value, slope : ndarrays of shape (n_frequencies,)
+    value, slope, curvature : floats
 
     Examples
     --------
     >>> import numpy as np
-    >>> value, slope = square_slope(np.array([[[2.0j]]]), np.array([[[1.0j]]]))
-    >>> float(value[0]), float(slope[0])
-    (4.0, 4.0)
+    >>> square_jet(*(np.diag([k, 1.0]) for k in (3.0, 2.0, 1.0)))
+    (9.0, 12.0, 14.0)
     """
-    if min(G.shape[:2]) == 1:
-        value = (G.real**2 + G.imag**2).sum((0, 1))
-        return value, 2.0 * (G.conj() * G1).real.sum((0, 1))
-    U, s, Vh = np.linalg.svd(G.transpose(2, 0, 1), full_matrices=False)
-    bilinear = np.einsum("ki,ijk,kj->k", U[:, :, 0].conj(), G1, Vh[:, 0].conj())
-    return s[:, 0] ** 2, 2.0 * s[:, 0] * bilinear.real
+    smaller = min(G.shape)
+    if smaller > 2:
+        value, slope, bend = square_derivatives(*(M[:, :, None] for M in (G, G1, G2)))
+        return float(value[0]), float(slope[0]), float(bend[0])
+    if smaller == 1:
+        bend = np.vdot(G1, G1).real + np.vdot(G, G2).real
+        value, slope = np.vdot(G, G).real, np.vdot(G, G1).real
+        return float(value), 2.0 * float(slope), 2.0 * float(bend)
+    if G.shape[1] > 2:
+        G, G1, G2 = G.conj().T, G1.conj().T, G2.conj().T
+    stacked = np.concatenate((G, G1, G2), axis=1)
+    K = (stacked.conj().T @ stacked).tolist()
+    m, p, q, r = _pauli(K, 0, 0)
+    m1, p1, q1, r1 = (2.0 * k for k in _pauli(K, 0, 2))
+    bends = zip(_pauli(K, 0, 4), _pauli(K, 2, 2), strict=True)
+    m2, p2, q2, r2 = (2.0 * (one + two) for one, two in bends)
+    radius = math.sqrt(p * p + q * q + r * r)
+    safe = max(radius, _TIE * m) + _TINY
+    radius1 = (p * p1 + q * q1 + r * r1) / safe
+    radius2 = p1 * p1 + q1 * q1 + r1 * r1 + p * p2 + q * q2 + r * r2
+    radius2 = (radius2 - radius1 * radius1) / safe
+    return m + radius, m1 + radius1, m2 + radius2
+
+
+def _pauli(K: list[list[complex]], i: int, j: int) -> tuple[float, ...]:
+    """Half the trace and the Pauli coordinates of a block's Hermitian part."""
+    (a, b), (c, d) = K[i][j : j + 2], K[i + 1][j : j + 2]
+    return (
+        0.5 * (a.real + d.real),
+        0.5 * (a.real - d.real),
+        0.5 * (b.real + c.real),
+        0.5 * (b.imag - c.imag),
+    )
