@@ -92,6 +92,9 @@ def candidates(
     if smoother:
         continued = continuation_candidates(structure, problem.box, found, rng)
         found = continued if len(continued) else found
+    elif number == 2 and isinstance(init, str) and structure.order > 0:
+        more = continuation_candidates(structure, problem.box, found, rng, True)
+        found = np.vstack([found, more])
     return np.clip(found, structure.lower, structure.upper)
 
 

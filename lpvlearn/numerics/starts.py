@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 GOOD_FIT = 3e-3  # relative least-squares error that needs no further starts
+_FAR_FIT = 0.1  # a worse one is searched on for, even where starts agree on it
 _ROUNDS = 3
 _N_SEEDS = 6
 _MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
@@ -105,7 +106,11 @@ def similarity_candidates(
 
 
 def continuation_candidates(
-    structure: Any, box: Target | None, seeds: Array, rng: np.random.Generator
+    structure: Any,
+    box: Target | None,
+    seeds: Array,
+    rng: np.random.Generator,
+    positive: bool = False,
 ) -> Array:
     """Fits of the blurred response, carried to the response; see `continuation`.
 
@@ -117,6 +122,8 @@ def continuation_candidates(
     structure : GrayBoxStructure
     box : Target or None
     seeds : ndarray of shape (k, n_params)
+    positive : bool, default=False
+        Begin with positive parameters where no sign is known, as physical ones are.
     """
     nothing = np.zeros((0, structure.n_params))
     if box is None or box.dt is not None or len(box.A) == 0:
@@ -125,7 +132,7 @@ def continuation_candidates(
     ranges = structure.ranges
     signed = (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
     rows = [seeds[~(seeds == 0).any(1)][:_N_SEEDS]]
-    if structure.is_affine and signed.any():
+    if structure.is_affine and (positive or signed.any()):
         poles = np.abs(np.linalg.eigvals(box.A))
         rate = float(np.exp(np.log(poles[poles > 0]).mean())) if poles.any() else 1.0
         full = same_order(box, structure.order, rng)
@@ -135,14 +142,17 @@ def continuation_candidates(
         size = 1.0 / np.abs(problem.basis).max((1, 2))
         drawn = size * np.exp(rng.normal(size=(_N_SEEDS, len(size))))
         sign = np.where(signed, np.where(upper <= 0, -1.0, 1.0), 0.0)
-        free = rng.choice([-1.0, 1.0], drawn.shape)
+        free = 1.0 if positive else rng.choice([-1.0, 1.0], drawn.shape)
         rows = [drawn * np.where(sign == 0, free, sign)]
     if structure.initial is not None:
         rows.insert(0, structure.initial[None])
     starts = np.vstack(rows)
     if len(starts) == 0:
         return nothing
-    return continued_fits(structure, box, starts, signed)[0]
+    found = [continued_fits(structure, box, starts, signed)[0]]
+    if positive and not signed.all():
+        found.append(continued_fits(structure, box, starts, np.ones_like(signed))[0])
+    return np.vstack(found)
 
 
 def balanced_channels(
@@ -253,7 +263,8 @@ def search_fits(
             break
         # the structure comes no nearer: different starts end at the same best cost
         agreeing = sum(fit.cost <= fits[0].cost * (1 + 1e-6) for fit in fits)
-        if agreeing >= (2 if number else n_fits):
+        near = bool(fits) and np.sqrt(fits[0].cost) <= _FAR_FIT * size
+        if near and agreeing >= (2 if number else n_fits):
             break
     return fits
 
