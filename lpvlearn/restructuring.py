@@ -135,10 +135,9 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
     Notes
     -----
     Candidates come from similarity transformations that solve the equations without
-    parameters exactly (Eq. (34)); the best, judged by their frequency response, start a
-    least-squares fit of the response. From there a smooth path of minimisers leads to
-    the least maximum over frequency (:mod:`lpvlearn.numerics.central_path`), and the
-    solver ends it.
+    parameters exactly (Eq. (34)); the best ones in frequency response start
+    least-squares fits. From there a smooth path of minimisers leads to the least
+    maximum over frequency (:mod:`lpvlearn.numerics.central_path`); the solver ends it.
 
     Examples
     --------
@@ -315,8 +314,9 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             ),
             problem.omega,
             problem.response,
-            problem.stable,
-            _N_FITS + len(given),
+            admissible=problem.stable,
+            n_fits=_N_FITS + len(given),
+            rng=rng,
         )
         if not fits:
             raise ValueError(

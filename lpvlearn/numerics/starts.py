@@ -26,6 +26,10 @@ Complex = NDArray[np.complex128]
 
 GOOD_FIT = 3e-3  # relative least-squares error that needs no further starts
 _FAR_FIT = 0.1  # a worse one is searched on for, even where starts agree on it
+_HOP_FIT = 0.03  # error of a fit whose neighbouring basins are looked at
+_HOPS = (0.1, 0.3, 1.0) * 4  # sizes of the hops, of logarithms of the parameters
+_HOP_RETURNS = 5
+_HOP_ROUNDS = 4
 _ROUNDS = 3
 _N_SEEDS = 6
 _MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
@@ -237,8 +241,10 @@ def search_fits(
     candidates: Callable[[int], Array],
     omega: Array,
     G0: Complex,
+    *,
     admissible: Callable[[Array], bool],
     n_fits: int,
+    rng: np.random.Generator,
 ) -> list[LeastSquaresResult]:
     """Rounds of candidates and fits, until one is good; by ascending cost.
 
@@ -248,6 +254,8 @@ def search_fits(
         Round number to parameters of shape (k, n_params).
     n_fits : int
         Least-squares fits in a round.
+    rng : Generator
+        For the hops to neighbouring basins, where no fit is near.
     """
     size = rms(system.weight_response(omega)[0] @ G0)
     fits: list[LeastSquaresResult] = []
@@ -265,6 +273,42 @@ def search_fits(
         agreeing = sum(fit.cost <= fits[0].cost * (1 + 1e-6) for fit in fits)
         near = bool(fits) and np.sqrt(fits[0].cost) <= _FAR_FIT * size
         if near and agreeing >= (2 if number else n_fits):
+            break
+    if fits and np.sqrt(fits[0].cost) > _HOP_FIT * size:
+        fits = hopped_fits(system, fits, omega, G0, admissible, rng)
+    return fits
+
+
+def hopped_fits(
+    system: ErrorSystem,
+    fits: list[LeastSquaresResult],
+    omega: Array,
+    G0: Complex,
+    admissible: Callable[[Array], bool],
+    rng: np.random.Generator,
+) -> list[LeastSquaresResult]:
+    """Fits from perturbations of the best one, as long as they find a better basin.
+
+    Far from the black box the least-squares error has many minima beside each other.
+    """
+    lower, upper = system.structure.lower, system.structure.upper
+    for _ in range(_HOP_ROUNDS):
+        best, returned = fits[0], 0
+        for size in _HOPS:
+            if returned == _HOP_RETURNS:  # a wide basin
+                break
+            theta = best.x * np.exp(size * rng.normal(size=len(best.x)))
+            theta = np.clip(theta, lower, upper)
+            if not admissible(theta):
+                continue
+            fit = fit_frequency_response(
+                system, theta, omega, G0, admissible=admissible
+            )
+            if fit is not None:
+                fits = [*fits, fit]
+                returned += abs(fit.cost - best.cost) <= 1e-6 * best.cost
+        fits = sorted(fits, key=lambda fit: fit.cost)
+        if fits[0].cost > best.cost * (1.0 - 1e-3):
             break
     return fits
 
