@@ -22,6 +22,7 @@ from .transfer import Target
 
 Array = NDArray[Any]
 
+_EXACT = 4  # starts that reach the structure exactly; no more are needed
 _NULL_TOLERANCE = 1e-6
 
 
@@ -229,8 +230,10 @@ def _batched_lm(
         damping[rows] = np.where(
             better, np.maximum(damping[rows] * 0.3, 1e-12), damping[rows] * 4.0
         )
-        tiny = cost[rows] <= 1e-24 * (1.0 + np.abs(problem.offset).sum()) ** 2
-        active[rows] = (stalled[rows] < 12) & ~tiny
+        tiny = cost <= 1e-24 * (1.0 + np.abs(problem.offset).sum()) ** 2
+        active[rows] = (stalled[rows] < 12) & ~tiny[rows]
+        if tiny.sum() >= _EXACT:
+            break
     return Z, cost
 
 
