@@ -14,14 +14,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from .frequency_data import stack_response
 from .identifiability import Identifiability
 from .numerics.certificates import ACTIVE_PEAK, MinimaxResult
 from .numerics.leastsquares import channel_balance, fit_frequency_response
-from .numerics.starts import search_fits
 from .parameter_statistics import perturbation_table, spread_covariance
 from .restructuring_problem import (
     RestructuringProblem,
@@ -29,10 +27,10 @@ from .restructuring_problem import (
     problem_from_response,
 )
 from .restructuring_steps import (
-    candidates,
     check_options,
     minimise,
     relative_error,
+    search,
     warn_about,
 )
 from .statespace import StateSpace
@@ -42,8 +40,6 @@ from .weights import FrequencyWeight
 __all__ = ["GrayBoxRestructurer"]
 
 Array = NDArray[np.float64]
-
-_N_FITS = 3  # least-squares fits from the best candidates
 
 
 class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
@@ -304,26 +300,9 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
 
     def _solve(self, problem: RestructuringProblem, given: list[Array]) -> None:
         """Candidates, least-squares fits, and the minimisation from the best."""
+        self.__dict__.pop("params_covariance_", None)  # of an earlier fit
         self.structure_ = problem.structure
-        seed = check_random_state(self.random_state).randint(2**31)
-        rng = np.random.default_rng(seed)
-        fits = search_fits(
-            problem.system,
-            lambda number: candidates(
-                problem, self.init, self.n_starts, given, number, rng
-            ),
-            problem.omega,
-            problem.response,
-            admissible=problem.stable,
-            n_fits=_N_FITS + len(given),
-            rng=rng,
-        )
-        if not fits:
-            raise ValueError(
-                "no stable starting point was found for `structure`. Give `init`, a "
-                "vector of parameters of a stable model, or raise `n_starts` "
-                f"(got {self.n_starts})."
-            )
+        problem, fits = search(self, problem, given)
         relative = [relative_error(fit, problem) for fit in fits]
         self.starts_ = pd.DataFrame({"relative_error": relative})
         self.fit_error_, self.start_params_ = relative[0], fits[0].x

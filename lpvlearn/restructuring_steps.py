@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
+from functools import partial
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import check_random_state
 
 from .exceptions import RankWarning
 from .numerics.certificates import MinimaxResult
@@ -19,6 +23,7 @@ from .numerics.starts import (
     continuation_candidates,
     perturbed_candidates,
     rms,
+    search_fits,
     similarity_candidates,
 )
 from .restructuring_problem import RestructuringProblem
@@ -27,6 +32,8 @@ Array = NDArray[np.float64]
 
 _NORMS = ("hinf", "h2", "similarity")
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about
+_N_FITS = 3  # least-squares fits from the best candidates
+_LEAST_MARGIN = 1e-6
 _N_SEEDS = 6  # starts at each time scale of which continuation makes use
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
 _ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
@@ -43,11 +50,16 @@ def check_options(restructurer: Any) -> None:
         raise ValueError(
             f"`init` must be 'similarity' or a vector of parameters. Got {init!r}."
         )
-    n_starts, max_iter = restructurer.n_starts, restructurer.max_iter
-    if n_starts < 1 or max_iter < 0:
+    for name, least in (("n_starts", 1), ("max_iter", 0)):
+        value = getattr(restructurer, name)
+        if not isinstance(value, Integral) or value < least:
+            raise ValueError(
+                f"`{name}` must be an integer of at least {least}. Got {value!r}."
+            )
+    tol = restructurer.tol
+    if not isinstance(tol, Real) or not 0.0 <= float(tol) < 1.0:
         raise ValueError(
-            "`n_starts` must be at least 1 and `max_iter` at least 0. Got "
-            f"{n_starts} and {max_iter}."
+            f"`tol` must be a relative decrease, at least 0 and below 1. Got {tol!r}."
         )
 
 
@@ -67,7 +79,7 @@ def candidates(
     rows = [np.zeros((0, structure.n_params))]
     if number == 0 and given:
         rows.append(np.array(given))
-    if structure.order == 0:  # a gain: linear in the parameters
+    if structure.order == 0 and structure.is_affine:  # a gain, linear in them
         rows.append(np.zeros((1, structure.n_params)))
     elif not isinstance(init, str):
         guess = structure.check_params(init)
@@ -96,6 +108,48 @@ def candidates(
         more = continuation_candidates(structure, problem.box, found, rng, True)
         found = np.vstack([found, more])
     return np.clip(found, structure.lower, structure.upper)
+
+
+def search(
+    restructurer: Any, problem: RestructuringProblem, given: list[Array]
+) -> tuple[RestructuringProblem, list[LeastSquaresResult]]:
+    """Least-squares fits, by ascending cost, and the problem that they solve.
+
+    Where no model of the structure decays as fast as the black box lets expect, its
+    stability margin is given up.
+
+    Raises
+    ------
+    ValueError
+        If no stable starting point is found.
+    """
+    seed = check_random_state(restructurer.random_state).randint(2**31)
+    for share in (1.0, _LEAST_MARGIN):
+        problem = replace(problem, margin=share * problem.margin)
+        rng = np.random.default_rng(seed)
+        fits = search_fits(
+            problem.system,
+            partial(
+                candidates,
+                problem,
+                restructurer.init,
+                restructurer.n_starts,
+                given,
+                rng=rng,
+            ),
+            problem.omega,
+            problem.response,
+            admissible=problem.stable,
+            n_fits=_N_FITS + len(given),
+            rng=rng,
+        )
+        if fits:
+            return problem, fits
+    raise ValueError(
+        "no stable starting point was found for `structure`. Give `init`, a vector of "
+        "parameters of a stable model, or raise `n_starts` (got "
+        f"{restructurer.n_starts})."
+    )
 
 
 def minimise(
@@ -142,10 +196,14 @@ def warn_about(
 ) -> None:
     """Warnings about a fitted GrayBoxRestructurer."""
     if not result.converged:
+        spent = restructurer.n_iter_ >= restructurer.max_iter
         warnings.warn(
-            f"`max_iter`={restructurer.max_iter} iterations ended before the solver "
-            f"converged to `tol`={restructurer.tol}; the best point is kept. Raise "
-            "`max_iter`.",
+            f"the search {'ended at' if spent else 'stalled before'} "
+            f"`max_iter`={restructurer.max_iter} steps, with `stationarity_` "
+            f"{restructurer.stationarity_:.1g} (0 at an optimum): a lower norm may be "
+            "near. The best point is kept. "
+            + ("Raise `max_iter`" if spent else "Try another `random_state`")
+            + ", or take a structure of fewer parameters.",
             ConvergenceWarning,
             stacklevel=4,
         )

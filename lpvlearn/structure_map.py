@@ -193,7 +193,14 @@ class StructureMap(Parametrized):
             stack = np.array([self.system_matrix(row) for row in rows])
             shape = (self.order + self.n_outputs, self.order + self.n_inputs)
             return stack.reshape(np.shape(theta)[:-1] + shape)
-        return stack_system("function", self.function(theta), self._dimensions, ())
+        try:
+            with np.errstate(all="ignore"):
+                blocks = self.function(theta)
+        except (ValueError, ArithmeticError):  # no model there: "mass must be positive"
+            return np.full(
+                [self.order + k for k in (self.n_outputs, self.n_inputs)], np.nan
+            )
+        return stack_system("function", blocks, self._dimensions, ())
 
     def jacobian(self, theta: Array) -> Array:
         """``dS / dtheta``, shape (n_params, order + n_outputs, order + n_inputs)."""
@@ -201,11 +208,15 @@ class StructureMap(Parametrized):
             assert self.basis is not None
             return self.basis
         key = np.asarray(theta).tobytes()
-        if self._memory is None or self._memory[0] != key:  # asked for again and again
+        memory = self._memory
+        if memory is None or memory[0] != key:  # asked for again and again
             derivatives = self._derivatives(theta)
             derivatives.setflags(write=False)
-            self._memory = key, derivatives
-        return self._memory[1]
+            self._memory = memory = key, derivatives
+        return memory[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_memory": None}
 
     def _derivatives(self, theta: Array) -> Array:
         if self._jacobian is not None:

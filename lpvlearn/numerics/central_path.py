@@ -39,12 +39,14 @@ def metric_coordinates(R: Array, size: float) -> Array:
     """`T` with ``|R T y| = size |y|`` on the directions that `R` sees.
 
     `R` is the triangular factor of the response Jacobian. Directions that it does not
-    see (unidentifiable ones) are capped.
+    see (unidentifiable ones) are capped, in units in which all parameters count alike.
     """
-    _, s, Vt = np.linalg.svd(R)
+    unit = np.linalg.norm(R, axis=0)
+    unit = np.where(unit > 0, unit, max(float(unit.max(initial=0.0)), 1e-300))
+    _, s, Vt = np.linalg.svd(R / unit)
     s = np.maximum(s, _METRIC_CAP * s.max(initial=0.0))
     s = np.where(s > 0, s, 1.0)
-    return Vt.T * (size / s)
+    return Vt.T * (size / s) / unit[:, None]
 
 
 def response_metric(
@@ -125,10 +127,10 @@ def central_path(
         Local maxima that are known already.
     """
     grid = search_grid(system)
-    if not limits.strict(theta):
-        theta = limits.inside(theta)
-    if not limits.strict(theta):  # at the margin: nothing to follow
+    inside = theta if limits.strict(theta) else limits.inside(theta)
+    if not limits.strict(inside):  # at the margin: nothing to follow
         return PathPoint(theta, mu, np.zeros(0), 0, [])
+    theta = inside
     found = system.peaks(theta, _DEPTH)
     best, best_norm = theta, found.norm
     seen = np.zeros(0) if frequencies is None else frequencies

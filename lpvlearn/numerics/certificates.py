@@ -73,7 +73,7 @@ class MinimaxResult:
     peaks : Peaks
     stationarity : float
         Shortest vector in the convex hull of the active gradients, relative to the
-        objective; constraint gradients are projected out.
+        objective; what binding constraints hold back is left out.
     second_order : float
         Smallest eigenvalue of the Hessian of the Lagrangian on the subspace along
         which all active peaks stay equal, relative to the objective; positive for a
@@ -145,11 +145,7 @@ def certificate(
     G = peaks.gradients[active] / f
     c, dc = constraints
     binding = dc[c >= -1e-9]
-    projected = G
-    if len(binding):
-        basis = np.linalg.qr(binding.T)[0]
-        projected = G - (G @ basis) @ basis.T
-    distance, weights = shortest_in_hull(projected)
+    distance, weights = shortest_in_hull(G, binding)
     hessians = problem.hessians(y, peaks.frequencies[active], peaks.moving[active])
     L = np.tensordot(weights, hessians, axes=1) / f
     Z = tangent_spaces(G[weights > ACTIVE_MULTIPLIER], binding)[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -16,6 +17,7 @@ _COMPLEX_STEP = 1e-30
 _CENTRAL_STEP = 6e-6  # about eps^(1/3): rounding and truncation balance
 _CURVATURE_STEP = 1e-5
 _AGREEMENT = 1e-4
+_FILTERS = threading.RLock()
 
 
 def parameter_scale(theta: Array, typical: Array | None = None) -> Array:
@@ -85,7 +87,8 @@ def _analytic_jacobian(
     by entry.
     """
     try:
-        with warnings.catch_warnings():
+        # the filters are those of all threads
+        with _FILTERS, warnings.catch_warnings():
             warnings.simplefilter("error", ComplexWarning)
             exact = _complex_step(f, theta, scale)
     except (TypeError, ValueError, NotImplementedError, ComplexWarning):

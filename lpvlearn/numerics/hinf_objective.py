@@ -87,13 +87,16 @@ class HinfObjective:
             _, gradients = self.system.gradients(theta, found.frequencies)
             gradients = gradients @ self.T
             steep = np.linalg.norm(gradients, axis=1) > _FLAT * found.values
+            if not steep.all():
+                flat = found.frequencies[~steep]
+                steep[~steep] = ~self.system.constant_at(theta, flat)
             if found.norm == 0.0 or steep.any():
                 break
         if not steep.all():
-            flat = int(np.argmax(np.where(steep, -np.inf, found.values)))
-            if found.values[flat] > self.floor:
-                self.floor = float(found.values[flat])
-                self.floor_frequency = float(found.frequencies[flat])
+            high = int(np.argmax(np.where(steep, -np.inf, found.values)))
+            if found.values[high] > self.floor:
+                self.floor = float(found.values[high])
+                self.floor_frequency = float(found.frequencies[high])
         if not steep.any():  # nothing is left that the parameters could lower
             none = np.zeros(1)
             return Peaks(none, none, np.zeros((1, len(y))), np.zeros(1, bool))

@@ -94,8 +94,7 @@ class Limits:
             dc.append(unit / safe[:, None] ** 2 * turn)
             sizes.append(np.ones(n))
         eye, low, high = np.eye(len(theta)), self._low, self._high
-        span = np.maximum(np.abs(theta), 1e-300)
-        span = np.maximum(span, 1e-3 * span.max(initial=0.0))
+        span = self.sizes(theta)
         dc += [-eye[low], eye[high]]
         sizes += [span[low], span[high]]
         return self._values(theta, poles), np.vstack(dc), np.concatenate(sizes)
@@ -114,10 +113,17 @@ class Limits:
         c.append((theta - structure.upper)[self._high])
         return np.concatenate(c)
 
+    def sizes(self, theta: Array) -> Array:
+        """Size of every parameter in its own units: its value, or that of a bound."""
+        lower, upper = self.system.structure.lower, self.system.structure.upper
+        ends = np.where(np.isfinite([lower, upper]), np.abs([lower, upper]), 0.0)
+        size = np.maximum(np.abs(theta), 1e-3 * ends.max(0))
+        usual = float(size.max(initial=0.0))
+        return np.where(size > 0, size, 1e-3 * usual if usual > 0 else 1.0)
+
     def inside(self, theta: Array) -> Array:
         """`theta` moved a little off its bounds."""
         lower, upper = self.system.structure.lower, self.system.structure.upper
-        size = np.abs(theta)
-        size = np.maximum(size, 1e-3 * size.max(initial=0.0))
+        size = self.sizes(theta)
         gap = np.minimum(1e-3 * size, 0.25 * (upper - lower))
         return np.clip(theta, lower + gap, upper - gap)

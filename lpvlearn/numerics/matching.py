@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
+_CONSTANT = 1e-7  # relative change of an error that no parameter changes
 _BESIDE = 1e-3  # relative difference of measured neighbours that are equally high
 
 
@@ -80,8 +81,7 @@ class ErrorSystem:
 
     def poles(self, theta: Array) -> Complex:
         """Poles of the gray-box model; infinite where its matrices are not finite."""
-        with np.errstate(all="ignore"):
-            A = self.split(self.structure.system_matrix(theta))[0]
+        A = self.split(self.structure.system_matrix(theta))[0]
         if not np.isfinite(A).all():
             return np.full(self.n, np.inf + 0j)
         return np.linalg.eigvals(A).astype(complex)
@@ -169,9 +169,32 @@ class ErrorSystem:
         U, sigma, Vh = np.linalg.svd(W @ at.E)
         left = np.einsum("kp,kpq,kqa->ka", U[:, :, 0].conj(), W, at.L)
         right = np.einsum("kbm,km->kb", at.R, Vh[:, 0].conj())
-        outer = np.real(left[:, :, None] * right[:, None, :]).reshape(len(omega), -1)
+        outer = np.real(left[:, :, None] * right[:, None, :])
+        outer = outer.reshape(len(omega), left.shape[1] * right.shape[1])
         S = self.structure.jacobian(theta).reshape(self.structure.n_params, -1)
         return sigma[:, 0], outer @ S.T
+
+    def constant_at(self, theta: Array, omega: Array) -> NDArray[np.bool_]:
+        """Whether the error at these frequencies is one that no parameter changes.
+
+        Told from two other points: a gradient that vanishes may be that of a minimum.
+        """
+        structure = self.structure
+        size = np.abs(theta)
+        size = np.maximum(size, 1e-3 * size.max(initial=0.0))
+        size = np.where(size > 0, size, 1.0)
+        G0 = self.target_response(omega)
+        here = self.point(theta, omega, G0).E
+        top = np.abs(here).max((1, 2))
+        same = np.ones(len(omega), bool)
+        for turn in (1.0, 2.0):
+            step = 0.1 * size * np.cos(turn + np.arange(len(theta)) ** 2)
+            other = np.clip(theta + step, structure.lower, structure.upper)
+            if not np.isfinite(self.poles(other)).all():
+                continue
+            change = np.abs(self.point(other, omega, G0).E - here).max((1, 2))
+            same &= change <= _CONSTANT * top + 1e-12 * np.abs(G0).max((1, 2))
+        return same
 
     def hessians(self, theta: Array, omega: Array, moving: NDArray[np.bool_]) -> Array:
         """Second derivatives of the singular values at the given frequencies.

@@ -64,13 +64,19 @@ def epigraph_step(
     return np.asarray(x[:q]), multipliers[:k], multipliers[k:]
 
 
-def shortest_in_hull(G: Array) -> tuple[float, Array]:
+def shortest_in_hull(G: Array, normals: Array | None = None) -> tuple[float, Array]:
     """Norm of the shortest vector in the convex hull of the rows of `G`.
 
     Zero certifies a stationary point of a maximum of smooth functions with these
     active gradients. Solved as a non-negative least-squares problem:
-    ``min |G^T x|^2 + (1 - sum x)^2``, ``x >= 0``, whose solution is proportional to
-    the weights.
+    ``min |G^T x + N^T y|^2 + (1 - sum x)^2``, ``x, y >= 0``, whose solution is
+    proportional to the weights.
+
+    Parameters
+    ----------
+    G : ndarray of shape (k, q)
+    normals : ndarray of shape (c, q), default=None
+        Gradients N of binding constraints, of which any non-negative multiple is added.
 
     Returns
     -------
@@ -79,10 +85,18 @@ def shortest_in_hull(G: Array) -> tuple[float, Array]:
         Non-negative, adding up to one.
     """
     scale = max(float(np.linalg.norm(G, axis=1).max()), 1e-300)
-    stacked = np.vstack([G.T / scale, np.ones(len(G))])
+    N = np.zeros((0, G.shape[1])) if normals is None else normals
+    length = np.linalg.norm(N, axis=1, keepdims=True)
+    N = N / np.where(length > 0, length, 1.0)
+    stacked = np.zeros((G.shape[1] + 1, len(G) + len(N)))
+    stacked[:-1] = np.hstack([G.T / scale, N.T])
+    stacked[-1, : len(G)] = 1.0
     rhs = np.zeros(len(stacked))
     rhs[-1] = 1.0
-    weights = nnls(stacked, rhs)[0]
-    total = weights.sum()
-    weights = weights / total if total > 0 else np.full(len(G), 1.0 / len(G))
-    return float(np.linalg.norm(G.T @ weights)), weights
+    solution = nnls(stacked, rhs)[0]
+    weights, total = solution[: len(G)], solution[: len(G)].sum()
+    if total == 0:
+        weights, total = np.ones(len(G)), float(len(G))
+    force = scale * (N.T @ solution[len(G) :])
+    distance = float(np.linalg.norm(G.T @ weights + force)) / total
+    return distance, weights / total

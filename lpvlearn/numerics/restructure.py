@@ -31,6 +31,7 @@ from .minimax import minimax_sqp
 Array = NDArray[np.float64]
 
 _STATIONARY = 1e-6
+_NEARLY = 1e-3  # stationarity up to which no more is said
 # mu at the end of a round on the central path, what ends Newton's method at each mu,
 # and iterations of the solver from there; the next round if these do not converge
 _ROUNDS = ((1e-4, 1e-1, 40), (1e-6, 1e-2, 40), (1e-8, 1e-2, 60))
@@ -171,7 +172,8 @@ def _from_least_squares(
         inner = best[0] if ahead else path.theta
         path = replace(path, theta=inner, mu=mu_end)
     assert best is not None
-    converged = best[1].converged or used < max_iter
+    exact = best[1].peaks.top <= options["negligible"]
+    converged = exact or idle or best[1].stationarity <= _NEARLY
     result = replace(best[1], n_iter=used, history=history, converged=converged)
     return best[0], result, floor
 

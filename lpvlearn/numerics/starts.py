@@ -60,7 +60,7 @@ def same_order(target: Target, order: int, rng: np.random.Generator) -> Target:
         return target
     extra = order - n
     rates = growth(np.linalg.eigvals(target.A).astype(complex), target.dt)
-    fast = 3.0 * max(float(np.abs(rates).max(initial=0.0)), 1e-300)
+    fast = 3.0 * float(np.abs(rates).max(initial=0.0)) or 1.0
     decay = -fast * (1.0 + np.arange(extra))
     A = np.zeros((order, order))
     A[:n, :n] = target.A
