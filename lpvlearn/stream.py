@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from copy import copy
+from copy import copy, deepcopy
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,8 @@ class SampleStream:
 
     Parameters
     ----------
+    options : dict, default=None
+        Of the estimator, which must not change in mid-stream.
     gaps : bool, default=False
         Whether experiments end at missing samples; single ones between two gaps are
         then left out.
@@ -36,12 +38,22 @@ class SampleStream:
     Attributes
     ----------
     n_samples : int
-        Taken in total.
+        Taken in total, but for those left out.
     clock : StreamClock
+    told : set of str
+        Kinds of warnings that were given.
+    first_residual : float
+        Relative simulation error of the model that the summaries began with.
     """
 
-    def __init__(self, *, gaps: bool = False) -> None:
+    def __init__(
+        self, options: dict[str, Any] | None = None, *, gaps: bool = False
+    ) -> None:
         self.n_samples = 0
+        self.told: set[str] = set()
+        self.first_residual = np.nan
+        self._options = deepcopy(options)
+        self._n_outputs: int | None = None
         self._gaps = gaps
         self.clock = StreamClock()
         self._kept: list[Piece] = []
@@ -64,6 +76,46 @@ class SampleStream:
     def pairs(self) -> Pairs:
         """Experiments that are kept."""
         return [(u, y) for u, y, _ in self._kept if len(u) > self._gaps]
+
+    def branch(self) -> SampleStream:
+        """A stream that goes on from here and leaves this one as it is."""
+        # Arrays are replaced, never changed in place: both may hold them.
+        other = copy(self)
+        other.told, other.clock = set(self.told), copy(self.clock)
+        other._kept, other._summary = list(self._kept), copy(self._summary)
+        return other
+
+    def check_options(self, options: dict[str, Any]) -> None:
+        """Refuse options other than those the stream began with.
+
+        Raises
+        ------
+        ValueError
+        """
+        began = self._options or options
+        for name, value in options.items():
+            if not _same(value, began[name]):
+                raise ValueError(
+                    f"`{name}` must stay as it was when the stream began: "
+                    f"{began[name]!r}. Got {value!r}. Begin anew with `fit`, or go on "
+                    "with a `clone` of the estimator, which knows no samples yet."
+                )
+
+    def check_outputs(self, n_outputs: int) -> None:
+        """Refuse a batch with another number of outputs than the first one.
+
+        Raises
+        ------
+        ValueError
+        """
+        if self._n_outputs is None:
+            self._n_outputs = n_outputs
+        if n_outputs != self._n_outputs:
+            raise ValueError(
+                "`y` must have the same columns in all batches of a stream. Got "
+                f"{n_outputs} output(s), after {self._n_outputs}. Feed all outputs in "
+                "every batch, or begin anew with `fit`."
+            )
 
     def pieces(
         self, experiments: Sequence[Experiment], named: bool, time: Column | None
@@ -120,12 +172,15 @@ class SampleStream:
         list of Piece
             What is left over.
         """
-        left = []
+        left: list[Piece] = []
         for u, y, starts in pieces:
             if starts and self._gaps and self._kept and len(self._kept[-1].u) == 1:
                 self._kept.pop()
                 self.n_samples -= 1
             n = min(len(u), BUFFER - self.n_samples)
+            if left or (starts and self.n_samples == BUFFER - 1):
+                # A first sample that is cut off from what follows tells nothing.
+                n = 0
             if n > 0 and (starts or not self._kept):
                 self._kept.append(Piece(u[:n], y[:n], True))
             elif n > 0:
@@ -138,9 +193,24 @@ class SampleStream:
             self.n_samples += n
         return left
 
+    def slide(self, left: Sequence[Piece]) -> list[Piece]:
+        """Make room for what is left over by leaving out the oldest samples.
+
+        Always as many, so that it does not matter how the stream is cut.
+        """
+        surplus = BUFFER // 8
+        self.n_samples -= surplus
+        while surplus:
+            u, y, _ = self._kept[0]
+            n = min(surplus, len(u))
+            self._kept[:1] = [Piece(u[n:], y[n:], True)] if n < len(u) else []
+            surplus -= n
+        return self.keep(left)
+
     def summarise(self, fitted: LocalFit, options: dict[str, Any]) -> None:
         """Replace the samples by their summaries around the model fitted to them."""
         self._summary = StreamSummary(fitted, options)
+        self.first_residual = fitted.found.residual
         self._kept = []
 
     def extend(self, pieces: Sequence[Piece]) -> StreamedModel:
@@ -149,3 +219,9 @@ class SampleStream:
             self.summary.add(piece)
             self.n_samples += len(piece.u)
         return self.summary.model()
+
+
+def _same(first: Any, other: Any) -> bool:
+    if hasattr(first, "__array__") or hasattr(other, "__array__"):
+        return np.array_equal(first, other)
+    return bool(first == other)

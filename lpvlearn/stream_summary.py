@@ -49,6 +49,8 @@ Array = NDArray[np.float64]
 
 # Samples that are taken up together; fewer wait for the next batch.
 STRETCH = 16_384
+# Latest samples that a model is simulated on.
+_LATEST = 4_096
 # Inputs outside the span of the first ones, relative to their size.
 _OUTSIDE = 1e-8
 # Difference of the simulation error from its linearisation that is accepted: in
@@ -129,7 +131,7 @@ class StreamSummary:
             options["horizon"],
             past_outputs=options["method"] != "pi-moesp",
         )
-        self._waiting = np.zeros((0, samples[0].shape[1]))
+        self._waiting = self._latest = np.zeros((0, samples[0].shape[1]))
         self._starts = False
         pilot = in_sections(found.scaled_model)
         recursion = None
@@ -162,6 +164,7 @@ class StreamSummary:
             stop = start + STRETCH - len(self._waiting)
             part = self._scaled(piece.u[start:stop], piece.y[start:stop])
             self._waiting = np.vstack([self._waiting, part])
+            self._latest = self._waiting[-_LATEST:]
             if len(self._waiting) == STRETCH:
                 self._taken = self._take(self._taken, self._waiting, self._starts)
                 self._waiting, self._starts = np.empty_like(part[:0]), False
@@ -191,6 +194,28 @@ class StreamSummary:
                 found = stable
         residual = float(np.sqrt(found.loss / energy))
         return StreamedModel(found, subspace.singular_values, residual, float(lost))
+
+    def latest_error(self, model: Realization) -> float:
+        """Simulation error of the latest samples themselves, relative to the outputs.
+
+        Parameters
+        ----------
+        model : Realization
+            From `model`.
+
+        Returns
+        -------
+        float
+            Root mean square, relative to that of all outputs or, where these are
+            larger, of the latest ones; NaN where it is not known.
+        """
+        n, m = len(self._latest), len(self._su)
+        if model.blocks is None or n == 0:
+            return np.nan
+        loss, _ = stretch_error(model, self._record(self._latest), self._freed(False))
+        power = self._taken.energy[m:].sum() / self._taken.n_samples
+        power = max(power, (self._latest[:, m:] ** 2).sum() / n)
+        return float(np.sqrt(loss / n / (power or 1.0)))
 
     def initial_states(
         self,
@@ -239,7 +264,7 @@ class StreamSummary:
     def size(self) -> int:
         """Numbers that are kept."""
         taken = self._taken
-        parts = [self._waiting, taken.hankel.gram, taken.hankel.factor]
+        parts = [self._waiting, self._latest, taken.hankel.gram, taken.hankel.factor]
         parts.append(taken.hankel.tail)
         if taken.recursion is not None:
             parts += [taken.recursion.information, taken.recursion.directions]

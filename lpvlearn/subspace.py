@@ -243,7 +243,11 @@ class SubspaceLTI(
         return self
 
     def _fit_pairs(
-        self, pairs: Pairs, choices: Choices, detrend: str | None
+        self,
+        pairs: Pairs,
+        choices: Choices,
+        detrend: str | None,
+        told: set[str] | None = None,
     ) -> LocalFit:
         """Identify on experiments and set the fitted attributes."""
         fitted = fit_pairs(
@@ -254,6 +258,7 @@ class SubspaceLTI(
             detrend=detrend,
             names=self._input_names,
             options=self._fit_options(),
+            told=told,
         )
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon

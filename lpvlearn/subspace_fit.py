@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .excitation import check_excitation, check_size, reduce_inputs
+from .excitation import (
+    check_excitation,
+    check_size,
+    independent_inputs,
+    reduce_inputs,
+)
 from .missing_data import remove_trends
 from .numerics.horizons import better_horizon
 from .numerics.identification import Identified, ScaledRecords, identify, scale_records
@@ -19,6 +25,10 @@ from .subspace_statistics import Evidence, shorten
 
 Array = NDArray[np.float64]
 Pairs = list[tuple[Array, Array]]
+
+
+class TooFewSamples(ValueError):
+    """The samples do not tell enough for a model; more of them may."""
 
 
 class LocalFit(NamedTuple):
@@ -50,6 +60,7 @@ def fit_pairs(
     detrend: str | None,
     names: Sequence[Hashable] | None,
     options: dict[str, Any],
+    told: set[str] | None = None,
 ) -> LocalFit:
     """Check, detrend, choose and identify.
 
@@ -66,6 +77,8 @@ def fit_pairs(
         Of the inputs, for messages.
     options : dict
         `method`, `refine`, `enforce_stability` of `identify`.
+    told : set of str, default=None
+        Kinds of warnings that were given and are not repeated.
 
     Returns
     -------
@@ -73,16 +86,21 @@ def fit_pairs(
 
     Raises
     ------
-    ValueError
+    TooFewSamples
         If an input is constant or the samples are too few.
     """
-    check_excitation(pairs, names)
+    with _more_may_help():
+        check_excitation(pairs, names)
     n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
     pairs, u_offset, y_offset = remove_trends(pairs, detrend)
-    pairs, basis = reduce_inputs(pairs)
-    mask = feedthrough_mask(feedthrough, n_outputs, n_inputs, basis)
+    known = told is not None and "collinear" in told
+    pairs, basis = _reduce_quietly(pairs) if known else reduce_inputs(pairs)
+    if told is not None and basis.shape[0] > basis.shape[1]:
+        told.add("collinear")
     order, horizon, n_noise_states = choices
-    check_size(pairs, order, horizon, options["method"])
+    with _more_may_help():
+        mask = feedthrough_mask(feedthrough, n_outputs, n_inputs, basis)
+        check_size(pairs, order, horizon, options["method"])
     settings = {
         **options,
         "feedthrough": mask,
@@ -110,6 +128,56 @@ def fit_pairs(
         share,
     )
     return LocalFit(found, chosen, evidence, scaled, u_offset, y_offset)
+
+
+def check_for_all_samples(
+    n_samples: int,
+    n_inputs: int,
+    n_outputs: int,
+    choices: Choices,
+    feedthrough: Any,
+    method: str,
+) -> None:
+    """Refuse what no table of these channels, up to this length, can carry.
+
+    Parameters
+    ----------
+    n_samples, n_inputs, n_outputs : int
+    choices : Choices
+    feedthrough : bool or array-like of bool
+    method : str
+
+    Raises
+    ------
+    ValueError
+
+    Examples
+    --------
+    >>> check_for_all_samples(900, 1, 1, Choices(9, 5, 0), True, "po-moesp")
+    Traceback (most recent call last):
+    ValueError: `order` must be at most 4 for 900 samples and horizon 5. Got 9.
+    """
+    feedthrough_mask(feedthrough, n_outputs, n_inputs, np.eye(n_inputs))
+    # Only the shapes are looked at.
+    u, y = (np.broadcast_to(0.0, (n_samples, k)) for k in (n_inputs, n_outputs))
+    check_size([(u, y)], choices.order, choices.horizon, method)
+
+
+def _reduce_quietly(pairs: Pairs) -> tuple[Pairs, Array]:
+    """`reduce_inputs` where the user was told already."""
+    found = independent_inputs([u for u, _ in pairs])
+    if found is None:
+        return pairs, np.eye(pairs[0][0].shape[1])
+    return [(u @ found, y) for u, y in pairs], found
+
+
+@contextmanager
+def _more_may_help() -> Iterator[None]:
+    """Tell refusals of this table from those of any table."""
+    try:
+        yield
+    except ValueError as error:
+        raise TooFewSamples(str(error)) from None
 
 
 def find_better_horizon(

@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 
 # A model that explains less than this share of the outputs' size is reported.
 _USELESS_FIT = 0.1
+# A stream that fits worse than its first samples by this factor, and by more than this
+# share of the outputs' size.
+_MUCH_WORSE = 5.0
+_POOR_FIT = 0.2
 # Enforced stability that takes the model more than this share of the outputs' energy.
 _HALF = 0.5
 # An integrator's pole may lie this far outside the unit circle by rounding.
@@ -167,24 +171,33 @@ def selection_text(table: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def warn_about(found: Identified) -> None:
+def warn_about(
+    found: Identified, told: set[str] | None = None, stacklevel: int = 3
+) -> None:
     """Tell the user what is wrong with a model that is returned all the same.
 
     Parameters
     ----------
     found : Identified
+    told : set of str, default=None
+        Kinds of warnings that were given and are not repeated; grows by these.
+    stacklevel : int, default=3
+        Of the caller's caller.
     """
-    if found.rank_deficit:
+    if found.rank_deficit and _is_new("rank", told):
         warnings.warn(
             f"The data leave {found.rank_deficit} directions of B and D "
             "undetermined; the smallest solution was taken. Excite the inputs "
             "more richly, or lower `order`.",
             RankWarning,
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
-    warn_about_pole(found.A, stacklevel=4)
+    warn_about_pole(found.A, told, stacklevel + 1)
     as_found = found.residual - found.stability_loss
+    useless = found.residual > 1.0 - _USELESS_FIT
     if found.residual**2 - as_found**2 > _HALF:
+        if not _is_new("enforced", told):
+            return
         warnings.warn(
             "No stable model explains these outputs: the simulation error is "
             f"{100.0 * found.residual:.0f} % of their size with stability='enforce', "
@@ -192,29 +205,79 @@ def warn_about(found: Identified) -> None:
             "identify it with stability='warn', or from a record of bounded outputs, "
             "with the controller's reference as input.",
             UserWarning,
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
-    elif found.residual > 1.0 - _USELESS_FIT:
+    elif useless and _is_new("useless", told):
         warnings.warn(
             "The model explains next to nothing of the outputs: its simulation "
             f"error is {100.0 * found.residual:.0f} % of their size. Try a longer "
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
             UserWarning,
-            stacklevel=3,
+            stacklevel=stacklevel,
         )
 
 
-def warn_about_pole(A: Array, stacklevel: int = 3) -> None:
+def _is_new(kind: str, told: set[str] | None) -> bool:
+    """Whether a kind of warning was not given before; from now on it was."""
+    if told is None:
+        return True
+    new = kind not in told
+    told.add(kind)
+    return new
+
+
+def warn_about_pole(
+    A: Array, told: set[str] | None = None, stacklevel: int = 3
+) -> None:
     """Tell the user that a model is unstable."""
     radius = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
-    if radius > 1.0 + _ROUNDING:
+    if radius > 1.0 + _ROUNDING and _is_new("pole", told):
         warnings.warn(
             f"The identified model is unstable: a pole has modulus {radius:.6g}. "
             "Use stability='enforce' for a stable one, another `order`, or a "
             "longer `horizon`.",
             UserWarning,
             stacklevel=stacklevel,
+        )
+
+
+def warn_about_waiting(n_samples: int, error: Exception, told: set[str]) -> None:
+    """Tell the user that a stream has no model yet though its buffer is full."""
+    if _is_new("waiting", told):
+        warnings.warn(
+            f"The first {n_samples:,} samples of the stream leave it without a model, "
+            f"and its oldest samples are left out until it has one. {error}",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def warn_about_drift(
+    error: float, first: float, n_samples: int, told: set[str]
+) -> None:
+    """Tell the user where a stream does not go on as its first samples began.
+
+    Parameters
+    ----------
+    error, first : float
+        Relative simulation error, of the stream and of its first samples.
+    n_samples : int
+        How many those were.
+    told : set of str
+    """
+    useless = 1.0 - _USELESS_FIT
+    poor = error > min(useless, max(_POOR_FIT, _MUCH_WORSE * first))
+    # What began as poor was reported then, unless it has become worse than no model.
+    if poor and error > 1.1 * first and _is_new("drift", told):
+        warnings.warn(
+            f"The simulation error of the stream is {100.0 * error:.3g} % of the "
+            f"outputs, after {100.0 * first:.3g} % over its first {n_samples:,} "
+            "samples: these excite the system too little to go on from their model, "
+            "or the system or its noise has changed. Begin a stream with samples that "
+            "excite what comes later, or `fit` the whole table.",
+            UserWarning,
+            stacklevel=3,
         )
 
 

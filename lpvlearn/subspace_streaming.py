@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -13,8 +14,15 @@ from .experiments import Experiment
 from .missing_data import remove_trends
 from .stream import BUFFER, Pairs, SampleStream
 from .stream_summary import Piece, StreamedModel
-from .subspace_fit import LocalFit
-from .subspace_options import Choices, check_options, warn_about, warn_about_pole
+from .subspace_fit import LocalFit, TooFewSamples, check_for_all_samples
+from .subspace_options import (
+    Choices,
+    check_options,
+    warn_about,
+    warn_about_drift,
+    warn_about_pole,
+    warn_about_waiting,
+)
 from .subspace_statistics import SimulationErrorStatistics
 
 
@@ -23,6 +31,9 @@ class StreamedFit(SimulationErrorStatistics):
 
     detrend: str | None
     experiment: Any
+    feedthrough: Any
+    initial_state: str
+    method: str
     time: Any
     missing: str
     order_: int
@@ -33,8 +44,13 @@ class StreamedFit(SimulationErrorStatistics):
     if TYPE_CHECKING:  # of the estimator
 
         def _fit_pairs(
-            self, pairs: Pairs, choices: Choices, detrend: str | None
+            self,
+            pairs: Pairs,
+            choices: Choices,
+            detrend: str | None,
+            told: set[str] | None = None,
         ) -> LocalFit: ...
+        def get_params(self, deep: bool = True) -> dict[str, Any]: ...
         def _fit_options(self) -> dict[str, Any]: ...
         def _set_step(self, experiments: Sequence[Experiment]) -> None: ...
 
@@ -58,14 +74,24 @@ class StreamedFit(SimulationErrorStatistics):
         Raises
         ------
         ValueError
-            If an option is unknown, or `detrend` is set: a trend needs the whole
-            experiment. If the `time` column repeats or leaves out samples between
-            two batches of an experiment, or its step changes.
+            If an option is unknown or not the one that the stream began with, or
+            `detrend` is set: a trend needs the whole experiment. If the `time` column
+            repeats or leaves out samples between two batches of an experiment, or
+            its step changes. If a batch has other columns than the first one.
+            Everything is then as before the batch, and the right one may follow.
+
+        Warns
+        -----
+        UserWarning, RankWarning
+            As `fit`, once per stream. If the first 131,072 samples are too few for a
+            model, such as with a constant input, and if the simulation error grows
+            far above that of the first samples.
 
         Notes
         -----
         The model is the one that `fit` finds from all batches as one table, however
-        they are cut. The first 131,072 samples are kept. Then order and
+        they are cut. The first 131,072 samples are kept (the last ones where the first
+        do not make a model). Then order and
         horizon stay, and only summaries grow: the compressed Hankel data, and
         the simulation error linearised around the model of the moment, each sample
         once. Of a longer table `fit` makes the same summaries in the same order. It
@@ -94,22 +120,46 @@ class StreamedFit(SimulationErrorStatistics):
                 "`detrend` must be None in partial_fit, which never sees a whole "
                 f"experiment. Got {self.detrend!r}."
             )
-        stream = getattr(self, "_stream", None)
-        experiments, _ = self._read(X, y, reset=stream is None, split=False)
-        if stream is None:
-            stream = SampleStream(gaps=self.missing == "split")
+        with _unchanged_where_refused(self):
+            stream, pieces = self._begin_batch(X, y, choices)
+            if stream.clock.step is not None:
+                self._step = stream.clock.step
+            if stream.buffered:
+                pieces = self._fit_kept(stream, pieces, choices)
+            if pieces and not stream.buffered:
+                found = stream.extend(pieces)
+                self._take_summaries(stream, found)
+                warn_about_pole(self.lti_.A, stream.told)
+                # A linearisation may not see itself how far off it is.
+                latest = stream.summary.latest_error(found.model)
+                error = float(np.fmax(found.residual, latest))
+                warn_about_drift(error, stream.first_residual, BUFFER, stream.told)
+            self._stream = stream
+        return self
+
+    def _begin_batch(
+        self, X: Any, y: Any, choices: Choices
+    ) -> tuple[SampleStream, list[Piece]]:
+        """The stream with the clock of a checked batch, and the batch's samples."""
+        before, options = getattr(self, "_stream", None), self.get_params(deep=False)
+        if before is not None:
+            before.check_options(options)
+        experiments, _ = self._read(X, y, reset=before is None, split=False)
+        outputs = experiments[0].outputs
+        assert outputs is not None
+        if before is None:
+            n_inputs, n_outputs = experiments[0].inputs.shape[1], outputs.shape[1]
+            check_for_all_samples(
+                BUFFER, n_inputs, n_outputs, choices, self.feedthrough, self.method
+            )
+            stream = SampleStream(options, gaps=self.missing == "split")
             self._single_output = np.asarray(y).ndim == 1
             self._set_step(experiments)
-        pieces = stream.pieces(experiments, self.experiment is not None, self._times(X))
-        self._stream = stream
-        if stream.clock.step is not None:
-            self._step = stream.clock.step
-        if stream.buffered:
-            pieces = self._fit_kept(stream, pieces, choices)
-        if pieces and not stream.buffered:
-            self._take_summaries(stream, stream.extend(pieces))
-            warn_about_pole(self.lti_.A)
-        return self
+        else:
+            stream = before.branch()
+        stream.check_outputs(outputs.shape[1])
+        named = self.experiment is not None
+        return stream, stream.pieces(experiments, named, self._times(X))
 
     def _fit_kept(
         self, stream: SampleStream, pieces: Sequence[Piece], choices: Choices
@@ -118,14 +168,19 @@ class StreamedFit(SimulationErrorStatistics):
         left = stream.keep(pieces)
         if not stream.pairs:  # nothing but gaps so far
             return left
-        full = stream.n_samples >= BUFFER
-        try:
-            fitted = self._fit_pairs(stream.pairs, choices, None)
-        except ValueError:
-            if full:
-                raise
-            return left  # more samples may come
-        warn_about(fitted.found)
+        while True:
+            full = bool(left) or stream.n_samples >= BUFFER
+            try:
+                fitted = self._fit_pairs(stream.pairs, choices, None, stream.told)
+                break
+            except TooFewSamples as error:
+                if not full:
+                    return left  # more samples may come
+                if self.initial_state == "rest":
+                    raise  # what is cut off at its start did not start from rest
+                warn_about_waiting(BUFFER, error, stream.told)
+                left = stream.slide(left)
+        warn_about(fitted.found, stream.told, stacklevel=4)
         if full:
             self._summarise(stream, fitted, choices)
         return left
@@ -148,7 +203,7 @@ class StreamedFit(SimulationErrorStatistics):
         if sum(len(u) for u, _ in pairs) <= BUFFER:
             return None
         pairs, u_offset, y_offset = remove_trends(pairs, self.detrend)
-        stream = SampleStream()
+        stream = SampleStream(gaps=self.missing == "split")
         left = stream.keep([Piece(u, y, True) for u, y in pairs])
         first = [Piece(u, y, True) for u, y in stream.pairs]
         if not _as_independent(stream.pairs, pairs):
@@ -190,6 +245,18 @@ class StreamedFit(SimulationErrorStatistics):
             return None
         found = Table(X if is_table(X) else np.asarray(X)).one(self.time, "time")
         return None if found is None else found[1]
+
+
+@contextmanager
+def _unchanged_where_refused(estimator: Any) -> Iterator[None]:
+    """Put the attributes back where a batch ends in an error."""
+    before = dict(vars(estimator))
+    try:
+        yield
+    except BaseException:
+        vars(estimator).clear()
+        vars(estimator).update(before)
+        raise
 
 
 def _as_independent(first: Pairs, pairs: Pairs) -> bool:

