@@ -111,8 +111,9 @@ list, default=None
     report_ : DataFrame
         One row per operating point: experiments, samples, order, BFT of the local and
         of the gray-box model on the estimation data (percent, mean over the outputs),
-        restructuring error and its structural floor, both relative to the black box's
-        norm, the active frequency (rad/s), stationarity; the distance from the gray-box
+        restructuring error, its structural floor and what remains apart from that, all
+        relative to the black box's norm, the active frequency (rad/s) of what
+        remains, stationarity; the distance from the gray-box
         model to the interpolated one (H-infinity norm, relative), and the FIT (percent,
         Eq. (36)) of its parameters; the parameters ("param_"), and their standard
         deviations ("std_") where known.

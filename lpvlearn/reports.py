@@ -138,6 +138,7 @@ def _restructuring(restructurer: Any) -> dict[str, float]:
     return {
         "relative_error": r.relative_error_,
         "relative_floor": r.structural_floor_ / size,
+        "remaining_error": r.remaining_error_ / size,
         "active_frequency": np.max(r.active_frequencies_, initial=0.0),
         "stationarity": r.stationarity_,
     }

@@ -29,6 +29,7 @@ _READABLE = {
     "structured_BFT": ("gray-box BFT", "{:.2f}"),
     "relative_error": ("relative error", "{:.2e}"),
     "relative_floor": ("floor", "{:.2e}"),
+    "remaining_error": ("remaining error", "{:.2e}"),
     "active_frequency": ("active at rad/s", "{:.4g}"),
     "stationarity": ("stationarity", "{:.0e}"),
     "interpolation_error": ("interpolation error", "{:.2e}"),
@@ -38,6 +39,9 @@ _READABLE = {
     "highest": ("highest", "{:.4g}"),
     "std": ("std", "{:.2g}"),
 }
+
+# Share of the black box's norm below which a floor is none.
+_NO_FLOOR = 1e-8
 
 
 def readable_report(report: pd.DataFrame) -> pd.DataFrame:
@@ -54,6 +58,12 @@ def readable_report(report: pd.DataFrame) -> pd.DataFrame:
     DataFrame
         Of strings: prints well, and so do its ``to_latex``, ``to_markdown`` and
         ``style``.
+
+    Notes
+    -----
+    pandas needs jinja2 for ``to_latex`` and ``style``, and tabulate for
+    ``to_markdown``. ``to_latex(escape=True)`` takes labels such as ``run_1`` into a
+    document; ``to_markdown(disable_numparse=True)`` leaves ``98.00`` as it is.
 
     Examples
     --------
@@ -113,16 +123,24 @@ def summarise(pipeline: Any) -> str:
     ]
     if pipeline.restructurers_:
         error, floor = 100 * report["relative_error"], 100 * report["relative_floor"]
-        worst = _largest(error)
+        remaining = 100 * report["remaining_error"]
+        has_floor = report["relative_floor"].max() > _NO_FLOOR
+        worst = _largest(remaining)
+        place = (
+            f"the largest at {_place(report, worst)} near "
+            f"{report['active_frequency'].iloc[worst]:.4g} rad/s"
+        )
         lines += [
             f"Restructuring: {_name(pipeline.restructurer, 'GrayBoxRestructurer')}, "
             f"simulation fit (BFT) {_span(report['structured_BFT'])} %",
-            f"    H-infinity error {_span(error)} % of the black box's norm, the "
-            f"largest at {_place(report, worst)} near "
-            f"{report['active_frequency'].iloc[worst]:.4g} rad/s",
+            f"    H-infinity error {_span(error)} % of the black box's norm"
+            + ("" if has_floor else f", {place}"),
         ]
-        if floor.max() > 1e-6:
-            lines.append(f"    of which no parameter can change {_span(floor)} %")
+        if has_floor:
+            lines += [
+                f"    of which no parameter can change {_span(floor)} %",
+                f"    apart from that, {_span(remaining)} %, {place}",
+            ]
         unknown = int(pipeline.parameters_std_.isna().all(axis=1).sum())
         if unknown:
             lines.append(
@@ -182,5 +200,11 @@ def _span(values: pd.Series) -> str:
 
 
 def _shown(report: pd.DataFrame) -> list[str]:
-    hidden = ("param_", "std_", "n_", "stationarity", "horizon", "order")
-    return [name for name in report.columns if not name.startswith(hidden)]
+    """Columns for people: without a floor, all of the error remains."""
+    hidden = ["param_", "std_", "n_", "stationarity", "horizon", "order"]
+    if "relative_floor" in report:
+        has_floor = report["relative_floor"].max() > _NO_FLOOR
+        hidden += (
+            ["relative_error"] if has_floor else ["relative_floor", "remaining_error"]
+        )
+    return [name for name in report.columns if not name.startswith(tuple(hidden))]

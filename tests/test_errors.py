@@ -182,6 +182,17 @@ TABLES = {
         lambda: fit(y=put(np.nan, 7, "position", Y)),
         ["y contains NaN", "'position' of experiment 'p0r0', at row 7"],
     ),
+    "a start at rest after a gap": (
+        lambda: fit(
+            y=put(np.nan, 70, "position", Y),
+            local=SubspaceLTI(2, missing="split", initial_state="rest"),
+        ),
+        [
+            "`initial_state` must be 'estimate' with missing='split'",
+            "what follows a gap does not start from rest",
+            "Got 'rest'",
+        ],
+    ),
     "a missing label": (
         lambda: fit(X.assign(run=X["run"].where(X.index != 3))),
         ["`experiment` column 'run' must label every row", "row 3"],
@@ -498,6 +509,7 @@ ALL = TABLES | STEPS | SPLITS
 
 
 OPTIONS = (
+    "a start at rest after a gap",
     "an unknown subspace method",
     "an unknown norm",
     "a structure with other inputs",

@@ -262,6 +262,28 @@ def test_bands_are_two_standard_deviations_wide():
     assert_allclose(start.min(), 20 * np.log10(0.8))
 
 
+@pytest.mark.parametrize("phase", [False, True])
+def test_bode_of_an_identified_model_shows_what_it_knows_of_its_error(tables, phase):
+    X, y = (table.iloc[:300] for table in tables)
+    y = y + 0.01 * np.random.default_rng(0).standard_normal(y.shape)
+    fitted = SubspaceLTI(
+        order=2, horizon=8, inputs="u", experiment="run", time="time"
+    ).fit(X, y)
+    truth = {"truth": spring(KAPPA[0]).to_discrete(STEP)}
+    display = BodeDisplay.from_estimator(
+        fitted, uncertainty=True, others=truth, phase=phase
+    )
+    assert list(display.std) == ["SubspaceLTI"]
+    std = fitted.frequency_response_std(display.omega)
+    assert_allclose(
+        display.std["SubspaceLTI"] ** 2, (std.real**2 + std.imag**2) / 2, rtol=1e-12
+    )
+    assert len(display.axes_[0, 0].collections) == 1
+    error = np.abs(display.responses["SubspaceLTI"] - display.responses["truth"])
+    known = np.isfinite(error)
+    assert (error < 4 * display.std["SubspaceLTI"])[known].mean() > 0.9
+
+
 def test_bode_divides_a_subplot_into_its_grid(plt):
     figure, (left, right) = plt.subplots(1, 2)
     display = BodeDisplay.from_models({"a": random_model(0)}, ax=right)
@@ -331,6 +353,12 @@ ONE = StateSpace([[-1.0]], [[1.0]], [[1.0]])
         (
             lambda: BodeDisplay.from_models({"a": ONE}, ax=[None, None]),
             r"`ax` must be None, one subplot or an array of 1 Axes .* Got 2",
+        ),
+        (
+            lambda: BodeDisplay.from_estimator(
+                SimpleNamespace(lti_=ONE), uncertainty=True
+            ),
+            "`uncertainty` must be False .* Got True with SimpleNamespace; .*`std`",
         ),
         (
             lambda: BodeDisplay.from_estimator(SubspaceLTI()),

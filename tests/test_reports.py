@@ -5,6 +5,9 @@ import pandas as pd
 import pytest
 
 from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
     LPVStateSpace,
     PolynomialLPV,
     StateSpace,
@@ -12,6 +15,7 @@ from lpvlearn import (
     bft_score,
     compare_models,
     fit_report,
+    from_trajectories,
     parameter_fit,
     readable_report,
 )
@@ -68,6 +72,9 @@ def test_the_report_of_a_pipeline_covers_all_three_steps(fitted):
         norm = fitted.local_models_[k].hinf_norm()
         floor = restructurer.structural_floor_
         assert row["relative_floor"] == pytest.approx(floor / norm, rel=1e-2, abs=1e-9)
+        assert row["remaining_error"] == pytest.approx(
+            restructurer.remaining_error_ / norm, rel=1e-2
+        )
 
 
 def test_the_report_holds_the_parameters_and_their_interpolation(fitted):
@@ -115,6 +122,37 @@ def test_deviations_are_missing_where_they_are_not_known():
     assert "standard deviations of the parameters are not known at 4" in (
         pipeline.summary()
     )
+
+
+def test_the_summary_does_not_lay_the_floor_to_a_frequency_of_the_rest():
+    """The structure fixes the gain at standstill, from which the data are 2 % off."""
+    unit = GrayBoxStructure.from_template(
+        [[0, 1], ["-k", "-c"]], [[0], ["k"]], [[1, 0]]
+    )
+    rng = np.random.default_rng(0)
+    runs = []
+    for kappa in (0.0, 1.0, 2.0):
+        u = rng.choice([-1.0, 1.0], 80).repeat(5)
+        y = unit.model({"c": 12.0, "k": 40 + 10 * kappa}).simulate(
+            u, sampling_time=0.02
+        )
+        runs.append((u, kappa, 1.02 * y + 0.01 * rng.standard_normal(y.shape)))
+    X, y = from_trajectories(runs, sampling_time=0.02)
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(2, horizon=10, feedthrough=False),
+        GrayBoxRestructurer(unit),
+        scheduling="kappa",
+        experiment="experiment",
+        time="time",
+    ).fit(X, y)
+    report, text = pipeline.report_, pipeline.summary()
+    assert (report["relative_floor"] > 1e-3).all()
+    assert (report["remaining_error"] < report["relative_floor"]).all()
+    error, floor, rest = text[text.index("    H-infinity error") :].splitlines()[:3]
+    assert "rad/s" not in error
+    assert "no parameter can change" in floor and "rad/s" not in floor
+    worst = report["active_frequency"].iloc[report["remaining_error"].argmax()]
+    assert f"near {worst:.4g} rad/s" in rest
 
 
 def test_the_summary_tells_what_was_found(fitted, balanced):
@@ -253,12 +291,16 @@ def test_reports_are_written_to_latex(fitted):
     assert "local BFT" in latex and "95." in latex
     assert "active at rad/s" in latex
     assert fitted.report_.style.format(precision=2).to_html()
+    labelled = readable_report(pd.DataFrame({"experiment": ["run_1"], "BFT": [98.0]}))
+    assert r"run\_1 & 98.00" in labelled.to_latex(escape=True)
 
 
 def test_reports_are_written_to_markdown(fitted):
     pytest.importorskip("tabulate")
     lines = readable_report(fitted.report_).to_markdown().splitlines()
     assert len(lines) == 2 + len(KAPPA)
+    text = readable_report(pd.DataFrame({"BFT": [98.0]}))
+    assert "98.00" in text.to_markdown(disable_numparse=True)
 
 
 def test_the_analytic_model_may_be_any_lpv_model(spring):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..statespace import StateSpace
 from ._drawing import axes_grid, figure_legend, line_style, named, names_of, tidy
 from ._frequency import check_frequencies, frequency_axis, response_up_to_nyquist
-from ._models import models_of, with_others
+from ._models import models_of, unwrapped, with_others
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -32,7 +32,10 @@ class BodeDisplay:
     responses : dict from str to complex array of shape (n_freq, n_outputs, n_inputs)
         NaN is not drawn.
     std : dict from str to array of shape (n_freq, n_outputs, n_inputs), default=None
-        Standard deviations of the responses of some of the names.
+        Standard deviations of the responses of some of the names, in any direction of
+        the complex plane. Complex ones, of real and of imaginary parts, as
+        `SubspaceLTI.frequency_response_std` has them, are drawn as their root mean
+        square.
     output_names, input_names : sequence of str, default=None
         None is y1, y2, ... and u1, u2, ...
 
@@ -97,7 +100,10 @@ class BodeDisplay:
                     f"`std` must be a dict with names among {list(self.responses)}. "
                     f"Got {name!r}."
                 )
-            array = np.asarray(value, dtype=float)
+            array = np.asarray(value)
+            if np.iscomplexobj(array):
+                array = np.abs(array) / np.sqrt(2.0)
+            array = array.astype(float)
             shape = self.responses[name].shape
             if array.shape != shape or not (array >= 0).all():
                 raise ValueError(
@@ -132,7 +138,8 @@ class BodeDisplay:
             Angular frequencies, rad/s. None: from a decade below the slowest to a
             decade above the fastest pole, denser around resonances.
         std : dict from str to array, default=None
-            Standard deviations of the responses at `omega`, which is then needed.
+            Standard deviations of the responses at `omega`, which is then needed;
+            as in the constructor.
         output_names, input_names : sequence of str, default=None
         phase : bool, default=False
             Whether to draw the phases below the magnitudes.
@@ -185,6 +192,7 @@ class BodeDisplay:
         kappa: float | ArrayLike | None = None,
         others: Mapping[str, StateSpace] | None = None,
         omega: ArrayLike | None = None,
+        uncertainty: bool = False,
         phase: bool = False,
         ax: Any = None,
     ) -> BodeDisplay:
@@ -201,6 +209,9 @@ class BodeDisplay:
         others : dict from str to StateSpace, default=None
             Models to compare with, drawn first: the truth, an analytic model.
         omega : array-like of shape (n_freq,), default=None
+        uncertainty : bool, default=False
+            Whether to draw the band of two standard deviations, which `SubspaceLTI`
+            knows of its model.
         phase : bool, default=False
         ax : Axes or array of Axes, default=None
 
@@ -211,12 +222,24 @@ class BodeDisplay:
         Raises
         ------
         ValueError
-            If the estimator holds no state-space model, or the pipeline is not told
-            `kappa`.
+            If the estimator holds no state-space model, the pipeline is not told
+            `kappa`, or the uncertainty is not known.
         """
-        both = with_others(models_of(estimator, kappa), others or {})
+        own = models_of(estimator, kappa)
+        both = with_others(own, others or {})
         models = {name: both[name] for name in [*(others or {}), *both]}
-        return cls.from_models(models, omega=omega, phase=phase, ax=ax)
+        std = None
+        if uncertainty:
+            owner = unwrapped(estimator)
+            if not hasattr(owner, "frequency_response_std"):
+                raise ValueError(
+                    "`uncertainty` must be False for an estimator that does not know "
+                    f"it, as SubspaceLTI does. Got True with {type(owner).__name__}; "
+                    "BodeDisplay.from_models takes standard deviations as `std`."
+                )
+            omega = frequency_axis(list(models.values())) if omega is None else omega
+            std = {name: owner.frequency_response_std(omega) for name in own}
+        return cls.from_models(models, omega=omega, std=std, phase=phase, ax=ax)
 
     def plot(
         self, ax: Any = None, *, phase: bool = False, n_std: float = 2.0
