@@ -368,7 +368,10 @@ def test_read_only_and_memory_mapped_arrays(fitted, spring, tmp_path):
 
 def test_polars_tables(fitted, spring):
     polars = pytest.importorskip("polars")
-    X, y, X_sweep, y_sweep = (polars.from_pandas(table) for table in spring)
+    X, y, X_sweep, y_sweep = (
+        polars.DataFrame({name: table[name].tolist() for name in table})
+        for table in spring
+    )
     pipeline = spring_pipeline().fit(X, y)
     # scikit-learn 1.6 does not see the names of the newest polars' columns
     names = getattr(pipeline, "feature_names_in_", X.columns)
