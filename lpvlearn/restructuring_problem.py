@@ -13,7 +13,8 @@ from .frequency_data import read_frequency_data
 from .numerics.frf_realization import realize_response
 from .numerics.hinf import hinf_norm
 from .numerics.limits import growth
-from .numerics.matching import ErrorSystem, MeasuredErrorSystem
+from .numerics.matching import ErrorSystem
+from .numerics.measured import MeasuredErrorSystem
 from .numerics.starts import grid_and_margin, stability_test
 from .numerics.transfer import Target, series
 from .statespace import StateSpace

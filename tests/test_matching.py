@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxStructure, StateSpace
-from lpvlearn.numerics.matching import ErrorSystem, MeasuredErrorSystem
+from lpvlearn.numerics.matching import ErrorSystem
+from lpvlearn.numerics.measured import MeasuredErrorSystem
 from lpvlearn.numerics.transfer import Target, resolvent
 
 

@@ -28,6 +28,9 @@ def problem_of(functions, gradients, hessians, constraint=None):
             np.zeros(len(chosen), bool),
         )
 
+    def at(y, frequencies):
+        return samples(y, frequencies).values
+
     def second(y, frequencies, moving):
         return np.array([hessians[int(k) - 1](y) for k in frequencies])
 
@@ -37,7 +40,7 @@ def problem_of(functions, gradients, hessians, constraint=None):
         c, dc = constraint(y)
         return np.array([c]), np.array([dc])
 
-    return MinimaxProblem(peaks, samples, second, constraints)
+    return MinimaxProblem(peaks, samples, at, second, constraints)
 
 
 def charalambous_bandler():
@@ -122,7 +125,7 @@ def test_rounding_noise_is_not_minimised(solver):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_an_inadmissible_start_is_refused(solver):
-    problem = MinimaxProblem(lambda y: None, None, None, None)
+    problem = MinimaxProblem(lambda y: None, None, None, None, None)
     with pytest.raises(ValueError, match="not admissible"):
         solver(problem, np.zeros(2))
 

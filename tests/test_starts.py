@@ -81,6 +81,6 @@ def test_positive_parameters_lead_to_a_chain_of_masses():
     box = target_of(chain.model(truth))
     nothing = np.zeros((0, len(truth)))
     found = continuation_candidates(
-        chain, box, nothing, np.random.default_rng(0), positive=True
+        chain, box, nothing, np.random.default_rng(0), thorough=True
     )
     assert np.isclose(found, truth, rtol=1e-3).all(1).any()

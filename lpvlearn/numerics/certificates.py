@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,16 @@ class Peaks:
         return float(self.values.max())
 
 
+class Curve(Protocol):
+    """Curves through one point along which the functions of a problem bend least."""
+
+    def step(self, d: Array) -> Array:
+        """End, relative to the point, of the curve that leaves along `d`."""
+
+    def curvature(self, gradient: Array) -> Array:
+        """What the curves add to a Hessian of that gradient, shape (q, q)."""
+
+
 @dataclass(frozen=True)
 class MinimaxProblem:
     """What the minimax solvers ask of a problem.
@@ -50,17 +61,25 @@ class MinimaxProblem:
         ``y -> Peaks``, or None where `y` is not admissible (an unstable model).
     samples : callable
         ``(y, frequencies) -> Peaks``: the singular value at fixed frequencies.
+    values : callable
+        The same without gradients; infinite where there is no model.
     hessians : callable
         ``(y, frequencies, moving) -> (k, q, q)``, second derivatives of the values.
     constraints : callable
         ``y -> (c, dc)``: smooth constraints ``c(y) <= 0`` and their gradients.
+    grid : ndarray
+        Frequencies to watch beside the peaks.
+    curve : callable, default=None
+        ``y -> Curve``; by default steps are straight.
     """
 
     peaks: Callable[[Array], Peaks | None]
     samples: Callable[[Array, Array], Peaks]
+    values: Callable[[Array, Array], Array]
     hessians: Callable[[Array, Array, Flags], Array]
     constraints: Callable[[Array], tuple[Array, Array]]
     grid: Array = field(default_factory=lambda: np.zeros(0))
+    curve: Callable[[Array], Curve] | None = None
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 from scipy.optimize import minimize
 
-from .central_path import metric_coordinates
 from .certificates import MinimaxResult, Peaks
 from .leastsquares import LeastSquaresResult
 from .limits import keeps_margin, within_bounds
 from .matching import ErrorSystem
+from .response_geometry import metric_coordinates
 from .transfer import series
 
 Array = NDArray[np.float64]

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .certificates import Flags, MinimaxProblem, Peaks
-from .limits import Limits
+from .limits import Limits, within_bounds
 from .matching import ErrorSystem
+from .response_geometry import ResponseGeometry
 
 Array = NDArray[np.float64]
 
@@ -21,6 +22,7 @@ _DEPTH = 0.6  # peaks down to that fraction below the objective enter the local 
 _FLAT = 1e-7  # a peak with a smaller relative gradient does not depend on theta
 _CAP_TOLERANCE = 1e-7
 _MAX_CAPS = 12
+_BENT = 1.0  # part of a step that its bend may be at most
 _HARD_STEPS = (0.99, 0.9999)
 
 
@@ -110,17 +112,16 @@ class HinfObjective:
         return peaks
 
     def samples(self, y: Array, omega: Array) -> Peaks:
-        """Singular values at fixed frequencies, and their gradients.
+        """Singular values at fixed frequencies, and their gradients."""
+        values, gradients = self.system.gradients(self.theta(y), omega)
+        return Peaks(values, omega, gradients @ self.T, np.zeros(len(omega), bool))
 
-        Infinite values where there is no such model.
-        """
+    def values(self, y: Array, omega: Array) -> Array:
+        """Singular values at fixed frequencies, infinite where there is no model."""
         theta = self.theta(y)
         if not np.isfinite(self.system.poles(theta)).all():
-            nothing = np.zeros((len(omega), len(y)))
-            still = np.zeros(len(omega), bool)
-            return Peaks(np.full(len(omega), np.inf), omega, nothing, still)
-        values, gradients = self.system.gradients(theta, omega)
-        return Peaks(values, omega, gradients @ self.T, np.zeros(len(omega), bool))
+            return np.full(len(omega), np.inf)
+        return self.system.values(theta, omega)
 
     def hessians(self, y: Array, omega: Array, moving: Flags) -> Array:
         """Second derivatives of the peaks in the coordinates y."""
@@ -140,8 +141,43 @@ class HinfObjective:
             np.vstack([dc, slopes @ self.T / self.cap]),
         )
 
+    def curve(self, y: Array) -> Geodesics:
+        """Geodesics of the response through `y`."""
+        return Geodesics(self, self.theta(y))
+
     def problem(self) -> MinimaxProblem:
         """The callbacks of the minimax solvers."""
         return MinimaxProblem(
-            self.peaks, self.samples, self.hessians, self.constraints, self.grid
+            self.peaks,
+            self.samples,
+            self.values,
+            self.hessians,
+            self.constraints,
+            self.grid,
+            self.curve,
         )
+
+
+class Geodesics:
+    """Geodesics of the response through one theta, in the coordinates of a problem."""
+
+    def __init__(self, objective: HinfObjective, theta: Array) -> None:
+        self._geometry = ResponseGeometry(objective.system, theta, objective.grid, 1.0)
+        self._system, self._theta, self._T = objective.system, theta, objective.T
+        self._inverse = np.linalg.inv(objective.T)
+        self._local = self._geometry.inverse @ objective.T
+
+    def step(self, d: Array) -> Array:
+        """End of the geodesic that leaves along `d`, within the parameters' bounds."""
+        local = self._local @ d
+        a = self._geometry.acceleration(local)
+        most = _BENT * float(np.linalg.norm(local))
+        a *= min(1.0, most / max(float(np.linalg.norm(a)), 1e-300))
+        end = self._theta + self._T @ d + 0.5 * self._geometry.T @ a
+        return self._inverse @ (within_bounds(self._system, end) - self._theta)
+
+    def curvature(self, gradient: Array) -> Array:
+        """What the bend of the geodesics adds to a Hessian of that gradient."""
+        local = np.asarray(np.linalg.solve(self._local.T, gradient))
+        normal = -self._geometry.tangential(local)
+        return self._local.T @ self._geometry.second_derivatives(normal) @ self._local

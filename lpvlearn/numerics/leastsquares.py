@@ -36,7 +36,7 @@ def levenberg_marquardt(
     lower: Array | float = -np.inf,
     upper: Array | float = np.inf,
     max_iter: int = 50,
-    tol: float = 1e-9,
+    tol: float = 1e-6,
 ) -> LeastSquaresResult | None:
     """Minimise ``|r(x)|^2`` with Marquardt's scaling; None if `x0` is not admissible.
 

@@ -67,7 +67,10 @@ class Limits:
 
     def strict(self, theta: Array) -> bool:
         """Whether `theta` is off all limits."""
-        return self.admissible(theta) and bool((self.values(theta) < 0).all())
+        poles = self.system.poles(theta)
+        if not np.isfinite(poles).all():
+            return False
+        return bool((self.values(theta, poles) < 0).all())
 
     def rows(self, theta: Array) -> tuple[Array, Array, Array]:
         """Constraints in their own units, gradients (k, n_params), and typical sizes.
@@ -97,13 +100,10 @@ class Limits:
         span = self.sizes(theta)
         dc += [-eye[low], eye[high]]
         sizes += [span[low], span[high]]
-        return self._values(theta, poles), np.vstack(dc), np.concatenate(sizes)
+        return self.values(theta, poles), np.vstack(dc), np.concatenate(sizes)
 
-    def values(self, theta: Array) -> Array:
-        """The constraints alone."""
-        return self._values(theta, self.system.poles(theta))
-
-    def _values(self, theta: Array, poles: Complex) -> Array:
+    def values(self, theta: Array, poles: Complex) -> Array:
+        """The constraints alone, at parameters and poles of their gray-box model."""
         structure = self.system.structure
         c = [growth(poles, self.system.dt) + self.margin]
         if np.isfinite(self.speed):

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .hinf import PeakSet, linf_norm
+from .memory import remembering
 from .transfer import Target, laplace_variable, model_derivatives, resolvent, series
 
 Array = NDArray[np.float64]
@@ -23,7 +24,6 @@ Complex = NDArray[np.complex128]
 
 
 _CONSTANT = 1e-7  # relative change of an error that no parameter changes
-_BESIDE = 1e-3  # relative difference of measured neighbours that are equally high
 
 
 class Structure(Protocol):
@@ -54,6 +54,17 @@ class ErrorPoint:
     Phi: Complex  # (k, n, n)
 
 
+class _Remembered:
+    """A structure that is not affine, with what it gave at the last parameters."""
+
+    def __init__(self, structure: Structure) -> None:
+        self.order, self.n_params = structure.order, structure.n_params
+        self.lower, self.upper = structure.lower, structure.upper
+        self.system_matrix = remembering(structure.system_matrix)
+        self.jacobian = remembering(structure.jacobian)
+        self.curvature = remembering(structure.curvature)
+
+
 class ErrorSystem:
     """``W (G(theta) - G0)`` for a structure, a black-box model and a weight.
 
@@ -66,8 +77,12 @@ class ErrorSystem:
     def __init__(
         self, structure: Structure, target: Target, weight: Target | None = None
     ) -> None:
-        self.structure, self.target, self.dt = structure, target, target.dt
+        affine = getattr(structure, "is_affine", False)
+        self.structure = structure if affine else _Remembered(structure)
+        self.target, self.dt = target, target.dt
         self.n = structure.order
+        # steps and trial steps watch the same frequencies
+        self.target_response = remembering(self._target_response)
         self.n_outputs, self.n_inputs = target.D.shape
         self.fastest = float(np.abs(np.linalg.eigvals(target.A)).max(initial=0.0))
         self.weight = weight
@@ -85,6 +100,13 @@ class ErrorSystem:
         if not np.isfinite(A).all():
             return np.full(self.n, np.inf + 0j)
         return np.linalg.eigvals(A).astype(complex)
+
+    def resonances(self, poles: Complex) -> Array:
+        """Frequencies (rad/s) at which the error may have a narrow peak."""
+        turns = np.imag(poles)
+        if self.dt is not None:
+            turns = np.angle(poles) / self.dt
+        return turns[turns > 0]
 
     def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
         """H-infinity norm of the error and its local maxima over frequency.
@@ -120,7 +142,7 @@ class ErrorSystem:
             return eye.astype(complex), zero.astype(complex), zero.astype(complex)
         return model_derivatives(self.weight, omega)
 
-    def target_response(self, omega: Array) -> Complex:
+    def _target_response(self, omega: Array) -> Complex:
         """``G0`` at the frequencies, shape (k, n_outputs, n_inputs)."""
         t = self.target
         s = laplace_variable(omega, self.dt)[0]
@@ -155,6 +177,12 @@ class ErrorSystem:
         R = np.empty((k, self.n + m, m), complex)
         R[:, : self.n], R[:, self.n :] = Phi @ B, np.eye(m)
         return ErrorPoint(L, R, C @ R[:, : self.n] + D - G0, Phi)
+
+    def values(self, theta: Array, omega: Array) -> Array:
+        """Largest singular values at the frequencies, shape (k,)."""
+        E = self.response(theta, omega) - self.target_response(omega)
+        W = self.weight_response(omega)[0]
+        return np.asarray(np.linalg.norm(W @ E, 2, axis=(1, 2)))
 
     def gradients(self, theta: Array, omega: Array) -> tuple[Array, Array]:
         """Largest singular values and their gradients, Eq. (20) for sigma itself.
@@ -278,68 +306,6 @@ def vanishing_weight(system: ErrorSystem, omega: float) -> Target | None:
         return Target(a * one, (a - 1.0) * one, one, one, dt)
     c = float(size.min())
     return Target(-c * one, c * one, one, 0 * one)
-
-
-class MeasuredErrorSystem(ErrorSystem):
-    """The error of a structure against a measured frequency response.
-
-    The maximum runs over the measured frequencies only: a lower bound of the
-    H-infinity norm.
-    """
-
-    peaks_move = False
-
-    def __init__(
-        self,
-        structure: Structure,
-        omega: Array,
-        G: Complex,
-        weight: Complex | None = None,
-    ) -> None:
-        n_outputs, n_inputs = G.shape[1:]
-        empty = np.zeros((0, 0))
-        D = np.zeros((n_outputs, n_inputs))
-        target = Target(empty, np.zeros((0, n_inputs)), np.zeros((n_outputs, 0)), D)
-        super().__init__(structure, target)
-        order = np.argsort(omega)
-        self.omega, self.G = omega[order], G[order]
-        self.fastest = float(self.omega[-1])
-        unit = np.broadcast_to(np.eye(n_outputs), (len(omega), n_outputs, n_outputs))
-        self.W = (unit if weight is None else weight[order]).astype(complex)
-
-    def reweighted(self, weight: Target) -> ErrorSystem:
-        """The same error behind one more weight (a scalar one)."""
-        factor = model_derivatives(weight, self.omega)[0][:, :1, :1]
-        return MeasuredErrorSystem(self.structure, self.omega, self.G, factor * self.W)
-
-    def weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
-        """The weight at some of the measured frequencies."""
-        W = self.W[np.searchsorted(self.omega, omega)]
-        return W, np.zeros_like(W), np.zeros_like(W)
-
-    def target_response(self, omega: Array) -> Complex:
-        """The measured response at some of the measured frequencies."""
-        return self.G[np.searchsorted(self.omega, omega)]
-
-    def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
-        G0 = self.target_response(omega)
-        return G0, np.zeros_like(G0), np.zeros_like(G0)
-
-    def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
-        """Local maxima of the error over the measured frequencies.
-
-        And their neighbours that are as high: at an optimum two often are equal.
-        """
-        E = self.W @ (self.response(theta, self.omega) - self.G)
-        sigma = np.linalg.norm(E, 2, axis=(1, 2))
-        top = float(sigma.max())
-        rising = np.r_[True, sigma[1:] >= sigma[:-1]]
-        falling = np.r_[sigma[:-1] >= sigma[1:], True]
-        level = top if within is None else (1.0 - within) * top
-        beside = sigma >= (1.0 - _BESIDE) * top
-        index = np.flatnonzero((rising & falling | beside) & (sigma >= level))
-        index = index[np.argsort(-sigma[index], kind="stable")]
-        return PeakSet(top, self.omega[index], sigma[index])
 
 
 def _frequency_derivatives(

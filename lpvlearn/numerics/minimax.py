@@ -8,13 +8,14 @@ maxima merge, or a new one rises, only these are smooth.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .certificates import (
     ACTIVE_MULTIPLIER,
+    Curve,
     MinimaxProblem,
     MinimaxResult,
     Peaks,
@@ -143,17 +144,20 @@ class _Local:
         Convexified Hessian of the Lagrangian.
     c, dc : ndarray
         Constraints ``c + dc d <= 0``.
+    curve : Curve or None
+        That of the steps.
     """
 
     entries: Peaks
     H: Array
     c: Array
     dc: Array
+    curve: Curve | None = None
 
     def stiffer(self) -> _Local:
         shift = 0.1 * max(float(np.trace(self.H)) / len(self.H), 1e-8)
         H = self.H + shift * np.eye(len(self.H))
-        return _Local(self.entries, H, self.c, self.dc)
+        return replace(self, H=H)
 
     def step(
         self, radius: float, ends: Array | None = None, d: Array | None = None
@@ -172,6 +176,10 @@ class _Local:
         )
         return None if solution is None else (solution[0], solution[1])
 
+    def end(self, d: Array) -> Array:
+        """Where the step along `d` ends."""
+        return d if self.curve is None else self.curve.step(d)
+
     def decrease(self, d: Array) -> tuple[float, float]:
         """Relative decrease that the linear and the quadratic model promise."""
         f = self.entries.top
@@ -183,23 +191,25 @@ class _Local:
 def _corrected(
     problem: MinimaxProblem, y: Array, local: _Local, d: Array, radius: float
 ) -> tuple[Array, float]:
-    """The step, bent by the curvature of the entries, and their highest value there."""
+    """The step's end, bent by the curvature of the entries, and their highest value."""
     omega, f = local.entries.frequencies, local.entries.top
-    ends = problem.samples(y + d, omega).values
+    end = local.end(d)
+    ends = problem.values(y + end, omega)
     for _ in range(_CORRECTIONS):
         if not np.isfinite(ends).all():
             break
         step = local.step(radius, ends, d)
         if step is None:
             break
-        new = problem.samples(y + step[0], omega).values
+        new_end = local.end(step[0])
+        new = problem.values(y + new_end, omega)
         gain = float(ends.max() - new.max())
         if not gain > 0:
             break
-        d, ends = step[0], new
+        d, end, ends = step[0], new_end, new
         if gain < 0.1 * (f - float(ends.max())):
             break
-    return d, float(ends.max())
+    return end, float(ends.max())
 
 
 def _local_model(
@@ -223,7 +233,8 @@ def _local_model(
     f, q = own.top, len(y)
     G = entries.gradients / f
     H = 1e-2 * np.linalg.norm(G, axis=1).max() * np.eye(q) / max(radius, 1e-6)
-    first = _Local(entries, H, c, dc)
+    curve = None if problem.curve is None else problem.curve(y)
+    first = _Local(entries, H, c, dc, curve)
     solution = epigraph_step(H, entries.values / f - 1.0, G, c, dc, radius)
     for _ in range(2):  # the multipliers of the second-order model refine themselves
         if solution is None:
@@ -237,11 +248,13 @@ def _local_model(
             y, entries.frequencies[active], entries.moving[active]
         )
         L = np.tensordot(weights, hessians, axes=1) / f
+        if curve is not None:
+            L = L + curve.curvature(weights @ G[active])
         H = convexified(L, G[active], dc[mu > ACTIVE_MULTIPLIER])
         solution = epigraph_step(H, entries.values / f - 1.0, G, c, dc, radius)
         if solution is not None and ((solution[1] > ACTIVE_MULTIPLIER) == active).all():
             break
-    return _Local(entries, H, c, dc)
+    return replace(first, H=H)
 
 
 def _among(omega: Array, known: Array) -> NDArray[np.bool_]:

@@ -14,32 +14,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bundle import proximal_bundle
-from .central_path import (
-    PathPoint,
-    central_path,
-    metric_coordinates,
-    response_metric,
-    search_grid,
-)
+from .central_path import PathPoint, central_path, search_grid
 from .certificates import MinimaxResult, Peaks
 from .hinf_objective import HinfObjective
 from .leastsquares import LeastSquaresResult, fit_frequency_response
 from .limits import Limits, within_bounds
 from .matching import ErrorSystem, vanishing_weight
 from .minimax import minimax_sqp
+from .response_geometry import ResponseGeometry
 
 Array = NDArray[np.float64]
 
-_STATIONARY = 1e-6
+_STATIONARY = 1e-8
 _NEARLY = 1e-3  # stationarity up to which no more is said
 # mu at the end of a round on the central path, what ends Newton's method at each mu,
 # and iterations of the solver from there; the next round if these do not converge
-_ROUNDS = ((1e-4, 1e-1, 40), (1e-6, 1e-2, 40), (1e-8, 1e-2, 60))
+_ROUNDS = ((1e-4, 1e-1, 8), (1e-5, 1e-1, 12), (1e-6, 1e-1, 15), (1e-8, 1e-1, 60))
+_BUNDLE_PACE = 10  # as many iterations of a first-order method
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
 _PROGRESS = 1e-9  # a round that brings less is the last one
 _AHEAD = 0.98  # the path is left for a point that much below it
-_EXPLORED = 1e-3  # mu to which the path is followed from several fits
-_FITS = 3
+# mu to which the path is followed from several fits, how many are kept there, and the
+# most steps of each: its norm soon tells more of a basin than the least-squares error
+_EXPLORED = ((1e-2, 2, 40), (1e-3, 1, 60))
+_FITS = 6
 _APART = 1e-4  # relative difference of the costs of different basins
 _ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
 _RADIUS = 0.1  # first trust-region radius of the solver
@@ -99,9 +97,9 @@ def minimise_hinf(
         peaks = Peaks(start.values, start.frequencies, flat, still)
         return theta0, MinimaxResult(theta0, peaks, 0.0, np.inf, True, 0), 0.0
     origin = np.zeros(len(theta0))
-    T = metric_coordinates(fits[0].R, max(start.norm, 1e-300))
-    limits = Limits(system, margin)
-    objective = HinfObjective(system, theta0, T, limits, search_grid(system))
+    limits, grid = Limits(system, margin), search_grid(system)
+    T = ResponseGeometry(system, theta0, grid, start.norm).T
+    objective = HinfObjective(system, theta0, T, limits, grid)
     first = objective.peaks(origin)
     options: dict[str, Any] = {"tol": tol, "negligible": negligible}
     if first is None or objective.floor < first.top:
@@ -135,6 +133,7 @@ def _from_least_squares(
     grid = search_grid(system)
     path, used = _best_path(system, fits, limits, max_iter)
     history, floor = list(path.history), 0.0
+    pace = 1 if solver is minimax_sqp else _BUNDLE_PACE
     best: tuple[Array, MinimaxResult] | None = None
     for mu_end, decrement, solver_iter in _ROUNDS:
         path = central_path(
@@ -149,12 +148,12 @@ def _from_least_squares(
         )
         used, history = used + path.n_iter, history + path.history
         size = max(system.peaks(path.theta).norm, 1e-300)
-        T = response_metric(system, path.theta, grid, size)
+        T = ResponseGeometry(system, path.theta, grid, size).T
         objective = HinfObjective(system, path.theta, T, limits, grid)
         result = solver(
             objective.problem(),
             np.zeros(len(path.theta)),
-            max_iter=min(solver_iter, max_iter - used),
+            max_iter=min(pace * solver_iter, max_iter - used),
             radius=_RADIUS,
             **options,
         )
@@ -165,7 +164,7 @@ def _from_least_squares(
             best = within_bounds(system, objective.theta(result.y)), result
         settled = result.stationarity <= _STATIONARY and result.converged
         settled |= best[1].peaks.top <= options["negligible"]
-        idle = best[1].peaks.top >= (1.0 - _PROGRESS) * top
+        idle = result.converged and best[1].peaks.top >= (1.0 - _PROGRESS) * top
         if settled or idle or used >= max_iter:
             break
         ahead = best[1].peaks.top < _AHEAD * size and limits.strict(best[0])
@@ -199,19 +198,27 @@ def _best_path(
     max_iter: int,
 ) -> tuple[PathPoint, int]:
     """The best point at a moderate mu, from several fits, and the steps of all."""
-    chosen = promising(fits)
-    if len(chosen) == 1:
-        return PathPoint(fits[0].x, None, np.zeros(0), 0, []), 0
-    found: list[PathPoint] = []
+    paths = [PathPoint(fit.x, None, np.zeros(0), 0, []) for fit in promising(fits)]
     used = 0
-    for fit in chosen:
-        path = central_path(
-            system, fit.x, limits, mu_end=_EXPLORED, max_iter=(max_iter - used) // 4
-        )
-        used += path.n_iter
-        found.append(path)
-    norms = [system.peaks(path.theta).norm for path in found]
-    return found[int(np.argmin(norms))], used
+    for mu_end, kept, steps in _EXPLORED:
+        if len(paths) == 1:
+            break
+        paths = [
+            central_path(
+                system,
+                path.theta,
+                limits,
+                mu_end=mu_end,
+                max_iter=min(steps, max_iter // 10),
+                mu=path.mu,
+                frequencies=path.frequencies,
+            )
+            for path in paths
+        ]
+        used += sum(path.n_iter for path in paths)
+        norms = [system.peaks(path.theta).norm for path in paths]
+        paths = [paths[i] for i in np.argsort(norms, kind="stable")[:kept]]
+    return paths[0], used
 
 
 def _minimise_remainder(
@@ -234,7 +241,8 @@ def _minimise_remainder(
         admissible=bound.admissible,
     )
     assert fit is not None  # theta0 is admissible
-    T = metric_coordinates(fit.R, max(remainder.peaks(fit.x).norm, 1e-300))
+    size = max(remainder.peaks(fit.x).norm, 1e-300)
+    T = ResponseGeometry(remainder, fit.x, grid, size).T
     objective = HinfObjective(remainder, fit.x, T, limits, grid, floor, system)
     # the optimum is certified by the floor; what follows chooses among optimal points
     options = options | {

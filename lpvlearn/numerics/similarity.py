@@ -106,7 +106,7 @@ def similarity_starts(
     n_starts: int,
     rng: np.random.Generator,
     *,
-    max_iter: int = 150,
+    max_iter: int = 30,
 ) -> tuple[Array, Array]:
     """Parameter vectors from random similarities, all starts in one batch.
 

@@ -30,8 +30,11 @@ _HOP_FIT = 0.03  # error of a fit whose neighbouring basins are looked at
 _HOPS = (0.1, 0.3, 1.0) * 4  # sizes of the hops, of logarithms of the parameters
 _HOP_RETURNS = 5
 _HOP_ROUNDS = 4
+_SAME = 1e-4  # relative difference of the costs of fits in one basin
 _ROUNDS = 3
-_N_SEEDS = 6
+_N_SEEDS = 6  # of the continuation
+_N_QUICK_SEEDS = 3
+_QUICK = {"shifts": (1.0, 0.2, 0.05, 0.0), "n_points": 18, "max_iter": 10}
 _MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
 _SPREAD = 0.3  # standard deviation of log-parameters around a given first guess
 
@@ -114,7 +117,7 @@ def continuation_candidates(
     box: Target | None,
     seeds: Array,
     rng: np.random.Generator,
-    positive: bool = False,
+    thorough: bool = False,
 ) -> Array:
     """Fits of the blurred response, carried to the response; see `continuation`.
 
@@ -126,37 +129,49 @@ def continuation_candidates(
     structure : GrayBoxStructure
     box : Target or None
     seeds : ndarray of shape (k, n_params)
-    positive : bool, default=False
-        Begin with positive parameters where no sign is known, as physical ones are.
+    thorough : bool, default=False
+        More seeds and smaller steps, and positive parameters where no sign is known,
+        as physical ones are.
     """
-    nothing = np.zeros((0, structure.n_params))
     if box is None or box.dt is not None or len(box.A) == 0:
-        return nothing
+        return np.zeros((0, structure.n_params))
+    count = _N_SEEDS if thorough else _N_QUICK_SEEDS
     lower, upper = structure.lower, structure.upper
     ranges = structure.ranges
     signed = (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
-    rows = [seeds[~(seeds == 0).any(1)][:_N_SEEDS]]
-    if structure.is_affine and (positive or signed.any()):
-        poles = np.abs(np.linalg.eigvals(box.A))
-        rate = float(np.exp(np.log(poles[poles > 0]).mean())) if poles.any() else 1.0
-        full = same_order(box, structure.order, rng)
-        problem = scaled_problem(
-            full.A, full.B, full.C, full.D, structure.offset, structure.basis, rate
-        )
-        size = 1.0 / np.abs(problem.basis).max((1, 2))
-        drawn = size * np.exp(rng.normal(size=(_N_SEEDS, len(size))))
+    rows = [] if structure.initial is None else [structure.initial[None]]
+    physical = np.zeros((0, structure.n_params))
+    if structure.is_affine and (thorough or signed.any()):
         sign = np.where(signed, np.where(upper <= 0, -1.0, 1.0), 0.0)
-        free = 1.0 if positive else rng.choice([-1.0, 1.0], drawn.shape)
-        rows = [drawn * np.where(sign == 0, free, sign)]
-    if structure.initial is not None:
-        rows.insert(0, structure.initial[None])
-    starts = np.vstack(rows)
-    if len(starts) == 0:
-        return nothing
-    found = [continued_fits(structure, box, starts, signed)[0]]
-    if positive and not signed.all():
-        found.append(continued_fits(structure, box, starts, np.ones_like(signed))[0])
+        drawn = _natural_sizes(structure, box, count, rng)
+        physical = drawn * np.where(sign == 0, 1.0, sign)
+        free = rng.choice([-1.0, 1.0], drawn.shape)
+        rows.append(drawn * np.where(sign == 0, free, sign))
+    if thorough or not (structure.is_affine and signed.any()):
+        rows.append(seeds[~(seeds == 0).any(1)][:count])
+    options: dict[str, Any] = {} if thorough else _QUICK
+    found = [np.zeros((0, structure.n_params))]
+    starts = np.vstack(rows) if rows else found[0]
+    if len(starts):
+        found.append(continued_fits(structure, box, starts, signed, **options)[0])
+    if thorough and len(physical) and not signed.all():
+        every = np.ones_like(signed)
+        found.append(continued_fits(structure, box, physical, every)[0])
     return np.vstack(found)
+
+
+def _natural_sizes(
+    structure: Any, box: Target, count: int, rng: np.random.Generator
+) -> Array:
+    """Random sizes of parameters that bring all entries of the structure near one."""
+    poles = np.abs(np.linalg.eigvals(box.A))
+    rate = float(np.exp(np.log(poles[poles > 0]).mean())) if poles.any() else 1.0
+    full = same_order(box, structure.order, rng)
+    problem = scaled_problem(
+        full.A, full.B, full.C, full.D, structure.offset, structure.basis, rate
+    )
+    size = 1.0 / np.abs(problem.basis).max((1, 2))
+    return np.asarray(size * np.exp(rng.normal(size=(count, len(size)))))
 
 
 def balanced_channels(
@@ -270,7 +285,7 @@ def search_fits(
         if fits and np.sqrt(fits[0].cost) <= GOOD_FIT * size:
             break
         # the structure comes no nearer: different starts end at the same best cost
-        agreeing = sum(fit.cost <= fits[0].cost * (1 + 1e-6) for fit in fits)
+        agreeing = sum(fit.cost <= fits[0].cost * (1 + _SAME) for fit in fits)
         near = bool(fits) and np.sqrt(fits[0].cost) <= _FAR_FIT * size
         if near and agreeing >= (2 if number else n_fits):
             break
@@ -306,7 +321,7 @@ def hopped_fits(
             )
             if fit is not None:
                 fits = [*fits, fit]
-                returned += abs(fit.cost - best.cost) <= 1e-6 * best.cost
+                returned += abs(fit.cost - best.cost) <= _SAME * best.cost
         fits = sorted(fits, key=lambda fit: fit.cost)
         if fits[0].cost > best.cost * (1.0 - 1e-3):
             break
