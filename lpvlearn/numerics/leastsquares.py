@@ -153,7 +153,8 @@ def fit_frequency_response(
             return None
         G, J = system.response_jacobian(theta, omega)
         r = (balance * (W @ G - target)).ravel()
-        J = np.einsum("kpq,kqmj->kpmj", W, J)
+        k, p, m, q = J.shape
+        J = (W @ J.reshape(k, p, m * q)).reshape(k, p, m, q)
         J = (np.asarray(balance)[..., None] * J).reshape(len(r), -1)
         if not np.isfinite(J).all():
             return None

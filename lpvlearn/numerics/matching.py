@@ -163,9 +163,11 @@ class ErrorSystem:
             theta, omega, np.zeros((1, self.n_outputs, self.n_inputs), complex)
         )
         S = self.structure.jacobian(theta)
+        k, p, _ = at.L.shape
         # contract the short axes first: (k, p, a) (j, a, b) -> (k, p, j, b)
-        left = np.tensordot(at.L, S, axes=(2, 1))
-        return at.E, np.einsum("kpjb,kbm->kpmj", left, at.R)
+        left = np.tensordot(at.L, S, axes=(2, 1)).reshape(k, p * len(S), -1)
+        J = (left @ at.R).reshape(k, p, len(S), -1)
+        return at.E, J.swapaxes(2, 3)
 
     def point(self, theta: Array, omega: Array, G0: Complex) -> ErrorPoint:
         """The error without its weight, and what its derivatives are made of."""

@@ -41,8 +41,8 @@ _FITS = 6
 _APART = 1e-4  # relative difference of the costs of different basins
 _ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
 _RADIUS = 0.1  # first trust-region radius of the solver
-_REMAINDER_TOLERANCE = 1e-4
-_REMAINDER_STEPS = 60
+_REMAINDER_TOLERANCE = 1e-3
+_REMAINDER_STEPS = 20
 
 Solver = Callable[..., MinimaxResult]
 SOLVERS: dict[str, Solver] = {"sqp": minimax_sqp, "bundle": proximal_bundle}
