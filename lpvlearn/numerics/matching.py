@@ -124,6 +124,10 @@ class ErrorSystem:
             Ae, Be, Ce, De = series(Ae, Be, Ce, De, self.weight)
         return linf_norm(Ae, Be, Ce, De, dt=self.dt, within=within)
 
+    def restructured(self, structure: Structure) -> ErrorSystem:
+        """The error of another structure."""
+        return ErrorSystem(structure, self.target, self.weight)
+
     def reweighted(self, weight: Target) -> ErrorSystem:
         """The same error behind one more weight (a scalar one)."""
         if self.weight is not None:

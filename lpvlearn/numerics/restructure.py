@@ -19,6 +19,7 @@ from .certificates import MinimaxResult, Peaks
 from .hinf_objective import HinfObjective
 from .leastsquares import LeastSquaresResult, fit_frequency_response
 from .limits import Limits, within_bounds
+from .local_chart import CanonicalForm, view_at
 from .matching import ErrorSystem, vanishing_weight
 from .minimax import minimax_sqp
 from .response_geometry import ResponseGeometry
@@ -130,38 +131,37 @@ def _from_least_squares(
     options: dict[str, Any],
 ) -> tuple[Array, MinimaxResult, float]:
     """Rounds of the central path and a solver; parameters, result and floor."""
-    grid = search_grid(system)
-    path, used = _best_path(system, fits, limits, max_iter)
+    form = CanonicalForm.of(system, fits[0].x)
+    path, used = _best_path(system, fits, limits, form, max_iter)
     history, floor = list(path.history), 0.0
     pace = 1 if solver is minimax_sqp else _BUNDLE_PACE
     best: tuple[Array, MinimaxResult] | None = None
     for mu_end, decrement, solver_iter in _ROUNDS:
-        path = central_path(
+        path = _followed(
             system,
-            path.theta,
+            path,
             limits,
+            form,
             mu_end=mu_end,
             max_iter=int(_PATH_SHARE * (max_iter - used)),
             decrement=decrement,
-            mu=path.mu,
-            frequencies=path.frequencies,
         )
         used, history = used + path.n_iter, history + path.history
         size = max(system.peaks(path.theta).norm, 1e-300)
-        T = ResponseGeometry(system, path.theta, grid, size).T
-        objective = HinfObjective(system, path.theta, T, limits, grid)
-        result = solver(
-            objective.problem(),
-            np.zeros(len(path.theta)),
+        theta, result, high = _ended(
+            system,
+            path.theta,
+            limits,
+            form,
+            solver,
             max_iter=min(pace * solver_iter, max_iter - used),
-            radius=_RADIUS,
             **options,
         )
         used, history = used + result.n_iter, history + result.history
-        floor = max(floor, objective.floor)
+        floor = max(floor, high)
         top = np.inf if best is None else best[1].peaks.top
         if best is None or result.peaks.top < top:
-            best = within_bounds(system, objective.theta(result.y)), result
+            best = theta, result
         settled = result.stationarity <= _STATIONARY and result.converged
         settled |= best[1].peaks.top <= options["negligible"]
         idle = result.converged and best[1].peaks.top >= (1.0 - _PROGRESS) * top
@@ -195,6 +195,7 @@ def _best_path(
     system: ErrorSystem,
     fits: list[LeastSquaresResult],
     limits: Limits,
+    form: CanonicalForm | None,
     max_iter: int,
 ) -> tuple[PathPoint, int]:
     """The best point at a moderate mu, from several fits, and the steps of all."""
@@ -204,14 +205,13 @@ def _best_path(
         if len(paths) == 1:
             break
         paths = [
-            central_path(
+            _followed(
                 system,
-                path.theta,
+                path,
                 limits,
+                form,
                 mu_end=mu_end,
                 max_iter=min(steps, max_iter // 10),
-                mu=path.mu,
-                frequencies=path.frequencies,
             )
             for path in paths
         ]
@@ -219,6 +219,52 @@ def _best_path(
         norms = [system.peaks(path.theta).norm for path in paths]
         paths = [paths[i] for i in np.argsort(norms, kind="stable")[:kept]]
     return paths[0], used
+
+
+def _followed(
+    system: ErrorSystem,
+    path: PathPoint,
+    limits: Limits,
+    form: CanonicalForm | None,
+    **options: Any,
+) -> PathPoint:
+    """The central path from where it was left, in suitable coordinates."""
+    view = view_at(system, path.theta, limits, form)
+    end = central_path(
+        view.system,
+        view.theta,
+        view.limits,
+        mu=path.mu,
+        frequencies=path.frequencies,
+        **options,
+    )
+    theta = view.back(end.theta)
+    if theta is None:  # the form has no parameters for that model
+        return _followed(system, path, limits, None, **options)
+    return replace(end, theta=theta)
+
+
+def _ended(
+    system: ErrorSystem,
+    theta: Array,
+    limits: Limits,
+    form: CanonicalForm | None,
+    solver: Solver,
+    **options: Any,
+) -> tuple[Array, MinimaxResult, float]:
+    """End of a solver that starts at `theta`, its result, and the highest floor met."""
+    view = view_at(system, theta, limits, form)
+    grid = search_grid(system)
+    size = max(view.system.peaks(view.theta).norm, 1e-300)
+    T = ResponseGeometry(view.system, view.theta, grid, size).T
+    objective = HinfObjective(view.system, view.theta, T, view.limits, grid)
+    result = solver(
+        objective.problem(), np.zeros(len(view.theta)), radius=_RADIUS, **options
+    )
+    end = view.back(within_bounds(view.system, objective.theta(result.y)))
+    if end is None:
+        return _ended(system, theta, limits, None, solver, **options)
+    return end, result, objective.floor
 
 
 def _minimise_remainder(

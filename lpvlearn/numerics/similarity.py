@@ -130,10 +130,18 @@ def similarity_starts(
     directions = np.linalg.qr(flat.T)[0]
     Z, cost = _batched_lm(problem, T0, N, Z, directions, max_iter)
     d = _transformed(problem, (T0 + Z @ N.T).reshape(-1, n, n))[0]
-    theta = np.linalg.lstsq(flat.T, d.T, rcond=None)[0].T
+    theta = nearest_parameters(problem, d)
     good = np.isfinite(cost) & np.isfinite(theta).all(1)
     order = np.argsort(cost[good], kind="stable")
     return theta[good][order], np.sqrt(cost[good][order])
+
+
+def nearest_parameters(problem: AffineProblem, d: Array) -> Array:
+    """Parameters of the structure nearest to ``offset + d``, for each row of `d`."""
+    flat = problem.basis.reshape(len(problem.basis), -1)
+    size = np.linalg.norm(flat, axis=1, keepdims=True)
+    size = np.where(size > 0, size, 1.0)
+    return np.asarray((np.linalg.lstsq((flat / size).T, d.T, rcond=None)[0] / size).T)
 
 
 def _transformed(problem: AffineProblem, T: Array) -> tuple[Array, Array, Array]:
