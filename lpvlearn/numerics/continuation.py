@@ -149,19 +149,27 @@ class _Search:
         n, q = self.structure.order, theta.shape[1]
         S = self.structure.system_matrix(theta)
         A, B, C, D = S[:, :n, :n], S[:, :n, n:], S[:, n:, :n], S[:, n:, n:]
-        M = self.s[:, None, None] * np.eye(n) - A[:, None]
-        inverse = np.linalg.inv(M)
-        left = C[:, None] @ inverse  # (k, f, p, n)
-        E = self.weight * (left @ B[:, None] + D[:, None] - self.G0)
+        good = np.asarray(np.isfinite(S).all((1, 2)))
+        poles, V = np.linalg.eig(np.where(good[:, None, None], A, 0.0).astype(complex))
+        try:
+            inverse = np.linalg.inv(V)
+        except np.linalg.LinAlgError:  # a defective matrix among them
+            inverse = np.linalg.pinv(V)
+        CV, VB = C @ V, inverse @ B
+        modes = 1.0 / (self.s[:, None] - poles[:, None])  # (k, f, n)
+        CVm = CV[:, None] * modes[:, :, None]
+        E = self.weight * (CVm @ VB[:, None] + D[:, None] - self.G0)
+        E[~good] = np.nan
         flat = E.reshape(len(X), -1)
         pull = self.hold * (X - self.center[rows])
         r = np.concatenate([flat.real, flat.imag, pull], 1)
         if not jacobian:
             return r, np.zeros((0, 0, 0))
+        left = CVm @ inverse[:, None]  # C (s I - A)^-1, (k, f, p, n)
         k, f, p = left.shape[:3]
         L = np.concatenate([left, np.broadcast_to(np.eye(p), (k, f, p, p))], 3)
         m = B.shape[2]
-        R = inverse @ B[:, None]
+        R = V[:, None] @ (modes[..., None] * VB[:, None])
         R = np.concatenate([R, np.broadcast_to(np.eye(m), (k, f, m, m))], 2)
         J = np.empty((k, f, p, m, q), complex)
         slope = np.where(self.signed, theta, self.size[rows])
