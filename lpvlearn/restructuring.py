@@ -105,9 +105,10 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         Highest peak of the error apart from the floor; equal to `error_` where there is
         no floor, or a lower one.
     stationarity_, second_order_ : float
-        Shortest vector in the convex hull of the active gradients (0: stationary), and
-        smallest eigenvalue of the reduced Hessian (positive: a strict local minimum),
-        relative to the error, in the coordinates of the least-squares fit.
+        Shortest vector in the convex hull of the active gradients (0: stationary, or
+        proven optimal by `lower_bound_`), and smallest eigenvalue of the reduced
+        Hessian (positive: a strict local minimum), relative to the error, in the metric
+        of the response.
     identifiability_ : Identifiability
         Rank and condition of the derivative of the response to the parameters.
     dropped_feedthrough_ : ndarray of shape (n_outputs, n_inputs)

@@ -27,6 +27,7 @@ from .numerics.starts import (
     similarity_candidates,
 )
 from .restructuring_problem import RestructuringProblem
+from .structure_forms import ImplicitSystem
 
 Array = NDArray[np.float64]
 
@@ -36,6 +37,7 @@ _N_FITS = 3  # least-squares fits from the best candidates
 _LEAST_MARGIN = 1e-6
 _N_SEEDS = 6  # starts at each time scale of which continuation makes use
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
+_PROVEN = 1e-8  # an error that much above its lower bound is optimal
 _ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
 
 
@@ -97,6 +99,8 @@ def candidates(
             )
         )
     drawn = structure.draw(n_starts, rng)
+    if drawn is None and structure.implicit is not None:
+        drawn = natural_candidates(problem, structure.implicit, n_starts, rng)
     if drawn is not None and isinstance(init, str):
         known = [] if structure.initial is None else [structure.initial[None]]
         rows += [*known, drawn]
@@ -108,6 +112,24 @@ def candidates(
         more = continuation_candidates(structure, problem.box, found, rng, True)
         found = np.vstack([found, more])
     return np.clip(found, structure.lower, structure.upper)
+
+
+def natural_candidates(
+    problem: RestructuringProblem,
+    equations: ImplicitSystem,
+    n_starts: int,
+    rng: np.random.Generator,
+) -> Array:
+    """Positive parameters of physical equations of which no size is known."""
+    omega, box = problem.omega, problem.box
+    times = omega if box is None else np.abs(np.linalg.eigvals(box.A))
+    times = times[times > 0]
+    rate = float(np.exp(np.log(times).mean())) if times.size else 1.0
+    near = np.abs(np.log(np.maximum(omega, 1e-300) / rate)) < 1.0
+    G = np.abs(problem.response[near if near.any() else slice(None)])
+    gains = np.sqrt(np.mean(G**2, axis=0)).max(1)
+    sizes = equations.natural_sizes(rate, gains)
+    return np.asarray(sizes * np.exp(rng.normal(size=(n_starts, len(sizes)))))
 
 
 def search(
@@ -182,7 +204,14 @@ def minimise(
     if norm == "similarity":
         found = minimise_bilinear(problem.structure, problem.box, fits[0].x, max_iter)
         return *found, 0.0
-    return minimise_hinf(system, fits, margin, SOLVERS[solver], **options)
+    theta, result, floor = minimise_hinf(
+        system, fits, margin, SOLVERS[solver], **options
+    )
+    if result.peaks.top <= problem.lower_bound * (1.0 + _PROVEN):
+        # no model is nearer; where the error is equally high everywhere, its peaks
+        # could not tell
+        result = replace(result, stationarity=0.0, converged=True)
+    return theta, result, floor
 
 
 def relative_error(fit: LeastSquaresResult, problem: RestructuringProblem) -> float:

@@ -158,6 +158,46 @@ class ImplicitSystem:
         S = self.W @ X + 0.0  # no negative zeros
         return self.offset + S[0], S[1:]
 
+    def natural_sizes(self, rate: float, gains: Array) -> Array:
+        """Sizes of the parameters, up to a factor, that make all terms alike.
+
+        Parameters
+        ----------
+        rate : float
+            1 / s, at which the states move.
+        gains : ndarray of shape (n_outputs,)
+            Sizes of the outputs for inputs of size one.
+
+        Returns
+        -------
+        ndarray of shape (n_params,)
+            Positive.
+        """
+        n, dof = self.order, len(self.M[0])
+        # x_i' = a x_j: log s_j - log s_i = log rate - log |a|; the same for X
+        columns = np.hstack([self.offset[:, :n], self.W])
+        rows, values = [], []
+        for i, j in np.argwhere(columns[:n]):
+            row = np.zeros(n + dof)
+            row[j] += 1.0
+            row[i] -= 1.0
+            rows.append(row)
+            values.append(np.log(rate) - np.log(abs(columns[i, j])))
+        s = np.ones(n + dof)
+        if rows:
+            s = np.exp(np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0])
+        outputs = (np.abs(columns[n:]) * s).max(1, initial=0.0)
+        seen = (outputs > 0) & (gains > 0)
+        if seen.any():
+            s = s * np.median(gains[seen] / outputs[seen])
+        inputs = np.ones(self.N.shape[2] - n)
+        terms = np.concatenate(
+            [np.abs(self.M) * s[n:], np.abs(self.N) * np.concatenate([s[:n], inputs])],
+            axis=2,
+        ).max((1, 2))
+        level = terms[0] if terms[0] > 0 else 1.0  # that of what holds no parameter
+        return np.asarray(level / np.where(terms[1:] > 0, terms[1:], level))
+
     def regular_point(self) -> Array:
         """Parameters that bring M near the identity, so that S exists there."""
         q, n = len(self.M) - 1, len(self.M[0])

@@ -152,3 +152,60 @@ def test_options_are_checked(options):
     (name,) = options
     with pytest.raises(ValueError, match=f"`{name}` must be"):
         GrayBoxRestructurer(LAG, **options).fit_model(LAG.model([1.0, 2.0]))
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("outputs", ["position", "velocity", "acceleration"])
+def test_unknown_masses_are_found_from_nothing(unit, outputs):
+    """Neither ranges, nor bounds, nor a first guess tell the size of a parameter."""
+    structure = GrayBoxStructure.mechanical(
+        M=[["m1", 0], [0, "m2"]],
+        D=[["c1 + c2", "-c2"], ["-c2", "c2"]],
+        K=[["k1 + k2", "-k2"], ["-k2", "k2"]],
+        F=[[1], [0]],
+        outputs=outputs,
+    )
+    values = {"m1": 2.0, "m2": 0.5, "c1": 0.4, "c2": 0.05, "k1": 9.0, "k2": 3.0}
+    truth = np.array([unit * values[name] for name in structure.parameter_names])
+    found = GrayBoxRestructurer(structure).fit_model(structure.model(truth))
+    assert np.allclose(found.params_, truth, rtol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
+def test_h2_optima_at_bounds_are_certified():
+    spring = GrayBoxStructure.from_template(
+        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
+    )
+    names = spring.parameter_names
+    truth = np.array([{"k": 4.0, "c": 0.5, "b": 2.0}[name] for name in names])
+    box = spring.model(truth)
+    bounded = spring.with_bounds({"k": (None, 3.0), "c": (0, None)})
+    start = np.array([{"k": 2.0, "c": 1.0, "b": 1.0}[name] for name in names])
+    found = GrayBoxRestructurer(bounded, norm="h2", init=start).fit_model(box)
+    assert np.isclose(found.params_[names.index("k")], 3.0)
+    assert found.stationarity_ < 1e-4
+    for j in range(3):  # no small step within the bounds is better
+        for step in (-1e-3, 1e-3):
+            other = found.params_.copy()
+            other[j] = np.clip(other[j] + step, bounded.lower[j], bounded.upper[j])
+            assert h2_of(bounded.model(other), box) >= found.objective_ * (1 - 1e-7)
+
+
+def h2_of(one, two):
+    """H2 norm of the difference by a dense grid."""
+    omega = np.linspace(0, 200, 200001)
+    E = one.frequency_response(omega) - two.frequency_response(omega)
+    return np.sqrt(np.trapezoid(np.abs(E[:, 0, 0]) ** 2, omega) / np.pi)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_error_at_its_lower_bound_is_optimal(seed):
+    """Reduction by one order, with D free: Glover's bound is attained, all-pass."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(6, 6))
+    A -= (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(6)
+    box = StateSpace(A, rng.normal(size=(6, 2)), rng.normal(size=(2, 6)))
+    structure = GrayBoxStructure.observable_canonical(5, 2, 2, feedthrough=True)
+    found = GrayBoxRestructurer(structure).fit_model(box)
+    assert np.isclose(found.error_, box.hankel_singular_values()[5], rtol=1e-7)
+    assert found.stationarity_ == 0.0

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from .certificates import MinimaxResult, Peaks
 from .leastsquares import LeastSquaresResult
-from .limits import keeps_margin, within_bounds
+from .limits import Limits, keeps_margin, within_bounds
 from .matching import ErrorSystem
 from .response_geometry import metric_coordinates
 from .transfer import series
@@ -96,7 +96,7 @@ def minimise_h2(
     T = metric_coordinates(fit.R[:, active], max(np.sqrt(fit.cost), negligible, 1e-300))
     bounded = np.isfinite([system.structure.lower, system.structure.upper]).any()
     if bounded:  # coordinates in which the bounds stay bounds
-        T = np.diag(np.maximum(np.abs(theta0[active]), 1e-300))
+        T = np.diag(Limits(system, margin).sizes(theta0)[active])
     history: list[dict[str, float]] = []
 
     def theta_of(y: Array) -> Array:
@@ -112,18 +112,17 @@ def minimise_h2(
         return J / scale**2, (gradient[active] @ T) / scale**2
 
     y, found = np.zeros(len(T)), None
+    low, high = np.full((2, len(y)), [[-np.inf], [np.inf]])
+    if bounded:
+        low = (system.structure.lower - theta0)[active] / np.diag(T)
+        high = (system.structure.upper - theta0)[active] / np.diag(T)
     if J0 > negligible**2:
-        size = np.diag(T)
-        room = [
-            (system.structure.lower - theta0)[active] / size,
-            (system.structure.upper - theta0)[active] / size,
-        ]
         found = minimize(
             objective,
             y,
             jac=True,
             method="L-BFGS-B" if bounded else "BFGS",
-            bounds=np.transpose(room) if bounded else None,
+            bounds=np.transpose([low, high]) if bounded else None,
             options={"maxiter": max_iter, "gtol": max(tol, 1e-12) ** 0.75},
             callback=lambda z: history.append(
                 {"objective": scale * np.sqrt(max(objective(z)[0], 0.0))}
@@ -134,7 +133,10 @@ def minimise_h2(
     value, gradient = objective(y)
     size = scale * np.sqrt(value)
     peaks = Peaks(np.array([size]), np.zeros(0), gradient[None], np.zeros(1, bool))
-    slope = float(np.linalg.norm(gradient)) / max(value, 1e-300) if J0 > 0 else 0.0
+    held = ((y <= low) & (gradient > 0)) | ((y >= high) & (gradient < 0))
+    slope = (
+        float(np.linalg.norm(gradient[~held])) / max(value, 1e-300) if J0 > 0 else 0.0
+    )
     done = found is None or found.nit < max_iter
     n_iter = 0 if found is None else int(found.nit)
     result = MinimaxResult(theta, peaks, slope, np.nan, done, n_iter, history)

@@ -141,6 +141,9 @@ def continuation_candidates(
     signed = (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
     rows = [] if structure.initial is None else [structure.initial[None]]
     physical = np.zeros((0, structure.n_params))
+    equations = getattr(structure, "implicit", None) is not None
+    if equations and not signed.all():
+        physical = seeds[(seeds > 0).all(1)][:count]
     if structure.is_affine and (thorough or signed.any()):
         sign = np.where(signed, np.where(upper <= 0, -1.0, 1.0), 0.0)
         drawn = _natural_sizes(structure, box, count, rng)
@@ -154,7 +157,7 @@ def continuation_candidates(
     starts = np.vstack(rows) if rows else found[0]
     if len(starts):
         found.append(continued_fits(structure, box, starts, signed, **options)[0])
-    if thorough and len(physical) and not signed.all():
+    if (thorough or equations) and len(physical) and not signed.all():
         every = np.ones_like(signed)
         found.append(continued_fits(structure, box, physical, every)[0])
     return np.vstack(found)
