@@ -154,8 +154,9 @@ restructurer.starts_
 #    a = -J^{+}\, G''[h, h], \quad J = \partial G / \partial \vartheta,
 #
 # with the *geodesic acceleration* :math:`a` (Transtrum and Sethna, 2012) and a Hessian
-# to match. In canonical forms, whose valleys are the most curved, the path then takes a
-# third of the steps, and leads to lower norms.
+# to match. Canonical forms, which hold every model of their order and have the worst
+# coordinates of all, are searched in local coordinates of the set of these models; their
+# parameters are read off the result.
 #
 # The minimisation
 # ----------------
