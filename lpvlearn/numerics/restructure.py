@@ -28,12 +28,12 @@ Array = NDArray[np.float64]
 
 _STATIONARY = 1e-8
 _NEARLY = 1e-3  # stationarity up to which no more is said
-# mu at the end of a round on the central path, what ends Newton's method at each mu,
-# and iterations of the solver from there; the next round if these do not converge
-_ROUNDS = ((1e-4, 1e-1, 8), (1e-5, 1e-1, 12), (1e-6, 1e-1, 15), (1e-8, 1e-1, 60))
+# mu at the end of a round on the central path, and iterations of the solver from there;
+# the next round if these do not converge
+_ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
 _BUNDLE_PACE = 10  # as many iterations of a first-order method
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
-_PROGRESS = 1e-9  # a round that brings less is the last one
+_PROGRESS = 1e-9  # a round that converged and brings less is the last one
 _AHEAD = 0.98  # the path is left for a point that much below it
 # mu to which the path is followed from several fits, how many are kept there, and the
 # most steps of each: its norm soon tells more of a basin than the least-squares error
@@ -42,7 +42,7 @@ _FITS = 6
 _APART = 1e-4  # relative difference of the costs of different basins
 _ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
 _RADIUS = 0.1  # first trust-region radius of the solver
-_REMAINDER_TOLERANCE = 1e-3
+_REMAINDER_TOLERANCE = 1e-3  # the choice among optimal points is soon good enough
 _REMAINDER_STEPS = 20
 
 Solver = Callable[..., MinimaxResult]
@@ -136,7 +136,7 @@ def _from_least_squares(
     history, floor = list(path.history), 0.0
     pace = 1 if solver is minimax_sqp else _BUNDLE_PACE
     best: tuple[Array, MinimaxResult] | None = None
-    for mu_end, decrement, solver_iter in _ROUNDS:
+    for mu_end, solver_iter in _ROUNDS:
         path = _followed(
             system,
             path,
@@ -144,7 +144,6 @@ def _from_least_squares(
             form,
             mu_end=mu_end,
             max_iter=int(_PATH_SHARE * (max_iter - used)),
-            decrement=decrement,
         )
         used, history = used + path.n_iter, history + path.history
         size = max(system.peaks(path.theta).norm, 1e-300)
