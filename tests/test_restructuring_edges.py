@@ -167,8 +167,10 @@ def test_unknown_masses_are_found_from_nothing(unit, outputs):
     )
     values = {"m1": 2.0, "m2": 0.5, "c1": 0.4, "c2": 0.05, "k1": 9.0, "k2": 3.0}
     truth = np.array([unit * values[name] for name in structure.parameter_names])
-    found = GrayBoxRestructurer(structure).fit_model(structure.model(truth))
-    assert np.allclose(found.params_, truth, rtol=1e-5)
+    model = structure.model(truth)
+    for given in (model, [model, model]):
+        found = GrayBoxRestructurer(structure).fit_model(given)
+        assert np.allclose(found.params_, truth, rtol=1e-5)
 
 
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
@@ -209,3 +211,22 @@ def test_an_error_at_its_lower_bound_is_optimal(seed):
     found = GrayBoxRestructurer(structure).fit_model(box)
     assert np.isclose(found.error_, box.hankel_singular_values()[5], rtol=1e-7)
     assert found.stationarity_ == 0.0
+
+
+@pytest.mark.filterwarnings("ignore:the response determines")
+@pytest.mark.parametrize("order", [3, 5, 6])
+def test_a_black_box_of_lower_order_is_matched_exactly(order):
+    """The structure has states to spare; its parameters are not unique."""
+    box = StateSpace(
+        [[0, 1, 0], [0, 0, 1], [-6, -11, -6]], [[0], [0], [1]], [[6, 5, 1]]
+    )
+    n = order
+    A = [[0.0] * n for _ in range(n)]
+    for i in range(n - 1):
+        A[i][i + 1] = 1.0
+    A[-1] = [f"-a{i}" for i in range(n)]
+    controllable = GrayBoxStructure.from_template(
+        A, [[0.0]] * (n - 1) + [[1.0]], [[f"b{i}" for i in range(n)]]
+    )
+    for structure in (controllable, GrayBoxStructure.observable_canonical(n)):
+        assert GrayBoxRestructurer(structure).fit_model(box).relative_error_ < 1e-9

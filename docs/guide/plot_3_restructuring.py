@@ -144,9 +144,9 @@ restructurer.starts_
 # several basins.
 #
 # Coefficients are seldom good coordinates. Along a straight step :math:`h` in them the
-# response :math:`G(\vartheta)` soon leaves its tangent, though most of that bend belongs
-# to the coordinates alone: it lies *within* the tangent space. Steps are therefore taken
-# along geodesics of the response,
+# response :math:`G(\vartheta)` soon leaves its tangent, though most of that bend
+# belongs to the coordinates alone: it lies *within* the tangent space. Steps are taken
+# along geodesics of the response instead,
 #
 # .. math::
 #
@@ -155,8 +155,8 @@ restructurer.starts_
 #
 # with the *geodesic acceleration* :math:`a` (Transtrum and Sethna, 2012) and a Hessian
 # to match. Canonical forms, which hold every model of their order and have the worst
-# coordinates of all, are searched in local coordinates of the set of these models; their
-# parameters are read off the result.
+# coordinates of all, are searched in local coordinates of the set of these models;
+# their parameters are read off the result.
 #
 # The minimisation
 # ----------------

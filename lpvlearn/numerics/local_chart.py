@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 
 _EXACT = 1e-7  # relative residual of a realisation in a canonical form
 _NUDGE = 1e-2
+_MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
 _SAME_NORM = 1e-7  # relative difference that rounding may make
 
 
@@ -51,9 +52,9 @@ class LocalChart:
     def __init__(self, S: Array, order: int, dt: float | None, feedthrough: bool):
         n = self.order = order
         A, B, C, D = S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
-        left, right = balancing_transformation(A, B, C, discrete=dt is not None)[1:]
-        if len(left) < n:
-            raise ValueError("the model is not minimal.")
+        hankel, left, right = balancing_transformation(A, B, C, discrete=dt is not None)
+        if len(left) < n or hankel[-1] <= _MINIMAL * hankel[0]:
+            raise ValueError("the model is not minimal, or nearly so.")
         A, B, C = left @ A @ right, left @ B, C @ right
         self.offset = np.block([[A, B], [C, D]])
         # in units of time and gain in which all entries are about one

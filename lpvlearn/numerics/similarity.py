@@ -129,9 +129,12 @@ def similarity_starts(
     flat = problem.basis.reshape(len(problem.basis), -1)
     directions = np.linalg.qr(flat.T)[0]
     Z, cost = _batched_lm(problem, T0, N, Z, directions, max_iter)
+    Z, cost = Z[np.isfinite(cost)], cost[np.isfinite(cost)]  # regular ones
+    if len(Z) == 0:
+        return np.zeros((0, len(flat))), cost
     d = _transformed(problem, (T0 + Z @ N.T).reshape(-1, n, n))[0]
     theta = nearest_parameters(problem, d)
-    good = np.isfinite(cost) & np.isfinite(theta).all(1)
+    good = np.isfinite(theta).all(1)
     order = np.argsort(cost[good], kind="stable")
     return theta[good][order], np.sqrt(cost[good][order])
 

@@ -32,6 +32,7 @@ _HOP_RETURNS = 5
 _HOP_ROUNDS = 4
 _SAME = 1e-4  # relative difference of the costs of fits in one basin
 _ROUNDS = 3
+_FAINT = 0.03  # of modes that only fill the order, relative to the black box
 _N_SEEDS = 6  # of the continuation
 _N_QUICK_SEEDS = 3
 _QUICK = {"shifts": (1.0, 0.2, 0.05, 0.0), "n_points": 18, "max_iter": 10}
@@ -39,26 +40,31 @@ _MARGIN = 0.02  # stability margin, relative to the slowest decay of the black b
 _SPREAD = 0.3  # standard deviation of log-parameters around a given first guess
 
 
-def same_order(target: Target, order: int, rng: np.random.Generator) -> Target:
-    """The black box with `order` states: truncated, or padded with faint fast modes."""
+def reduced(target: Target, order: int) -> Target:
+    """The black box without states that do nothing, and with `order` at most."""
+    _, left, right = balancing_transformation(
+        target.A, target.B, target.C, discrete=target.dt is not None
+    )
+    if len(left) in (0, len(target.A)) and len(target.A) <= order:
+        return target
+    left, right = left[:order], right[:, :order]
+    A, B, C = left @ target.A @ right, left @ target.B, target.C @ right
+    return Target(A, B, C, target.D, target.dt)
+
+
+def same_order(
+    target: Target,
+    order: int,
+    rng: np.random.Generator,
+    faint: tuple[float, float] = (_FAINT, _FAINT),
+) -> Target:
+    """The black box with `order` states: truncated, or padded with faint fast modes.
+
+    `faint` are the sizes of the inputs and outputs of these modes; with one of them
+    zero the transfer function does not change.
+    """
+    target = reduced(target, order)
     n = len(target.A)
-    discrete = target.dt is not None
-    if n > order:
-        _, left, right = balancing_transformation(
-            target.A, target.B, target.C, discrete=discrete
-        )
-        left, right = left[:order], right[:, :order]
-        if len(left) == order:
-            A, B, C = left @ target.A @ right, left @ target.B, target.C @ right
-            return Target(A, B, C, target.D, target.dt)
-        target = Target(
-            left @ target.A @ right,
-            left @ target.B,
-            target.C @ right,
-            target.D,
-            target.dt,
-        )
-        n = len(target.A)
     if n == order:
         return target
     extra = order - n
@@ -70,8 +76,8 @@ def same_order(target: Target, order: int, rng: np.random.Generator) -> Target:
     A[n:, n:] = np.diag(np.exp(decay * target.dt) if target.dt else decay)
     size_B = np.abs(target.B).max(initial=1e-300)
     size_C = np.abs(target.C).max(initial=1e-300)
-    faint_B = 0.03 * size_B * rng.normal(size=(extra, target.B.shape[1]))
-    faint_C = 0.03 * size_C * rng.normal(size=(target.C.shape[0], extra))
+    faint_B = faint[0] * size_B * rng.normal(size=(extra, target.B.shape[1]))
+    faint_C = faint[1] * size_C * rng.normal(size=(target.C.shape[0], extra))
     return Target(
         A,
         np.vstack([target.B, faint_B]),
@@ -93,10 +99,25 @@ def similarity_candidates(
 
     Two time scales: the geometric mean and the maximum of the pole sizes.
     """
-    box = same_order(target, order, rng)
+    faint = [(_FAINT, _FAINT)]
+    if (
+        len(reduced(target, order).A) < order
+    ):  # also modes that no input moves, or no output shows
+        faint += [(0.0, 1.0), (1.0, 0.0)]
+    found = []
+    for sizes in faint:
+        box = same_order(target, order, rng, sizes)
+        found.append(_similar(box, offset, basis, n_starts, rng))
+    return np.vstack(found)
+
+
+def _similar(
+    box: Target, offset: Array, basis: Array, n_starts: int, rng: np.random.Generator
+) -> Array:
+    """Parameters from random similarities of a black box of the structure's order."""
     poles = np.abs(np.linalg.eigvals(box.A))
     poles = poles[poles > 1e-9 * poles.max(initial=0.0)]
-    if target.dt is not None or poles.size == 0:
+    if box.dt is not None or poles.size == 0:
         scales = [1.0]
     else:
         scales = [float(np.exp(np.log(poles).mean())), float(poles.max())]
