@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from lpvlearn import GrayBoxStructure
-from lpvlearn.datasets._reference import write_reference
+from lpvlearn.datasets.reference import write_reference
 
 SAMPLING_TIME = 0.02
 STIFFNESS = {0.0: 40.0, 0.5: 45.0, 1.0: 60.0, 1.5: 85.0}  # 40 + 20 kappa^2

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from .paper_figures import save_figures
-from .paper_text import tables_text
-from .reproduce import PaperExperiment, Stopwatch, run_paper_experiment
+from .paper.experiment import PaperExperiment, Stopwatch, run_paper_experiment
+from .paper.figures import save_figures
+from .paper.text import tables_text
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -59,10 +59,10 @@ from sklearn.model_selection import BaseCrossValidator
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_consistent_length
 
-from .arguments import whole_number
-from .columns import Column, Table, is_table
-from .experiments import Experiment, group_rows, operating_point_of
-from .operating_points import group_operating_points
+from .data.columns import Column, Table, is_table
+from .data.experiments import Experiment, group_rows, operating_point_of
+from .data.operating_points import group_operating_points
+from .validation import whole_number
 
 __all__ = ["BlockedTimeSeriesSplit", "ExperimentSplit"]
 

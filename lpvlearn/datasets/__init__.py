@@ -1,10 +1,10 @@
 """The built-in flexible arm: simulator and experiments; stored data sets."""
 
-from ._excitation import prbs
-from ._flexible_arm import FlexibleArm
-from ._generator import make_flexible_arm
-from ._reference import load_flexible_arm, load_varying_spring
-from ._response import ArmResponse
+from .excitation import prbs
+from .flexible_arm import FlexibleArm
+from .generator import make_flexible_arm
+from .reference import load_flexible_arm, load_varying_spring
+from .response import ArmResponse
 
 __all__ = [
     "ArmResponse",

@@ -4,12 +4,12 @@ Each class has class methods ``from_...`` that draw at once and return the displ
 ``plot`` to draw it again. Matplotlib is imported when something is drawn, not before.
 """
 
-from ._bode import BodeDisplay
-from ._error import ErrorDisplay
-from ._parameters import ParameterDisplay
-from ._poles import PoleDisplay
-from ._simulation import SimulationDisplay
-from ._singular_values import SingularValueDisplay
+from .bode import BodeDisplay
+from .error import ErrorDisplay
+from .parameters import ParameterDisplay
+from .poles import PoleDisplay
+from .simulation import SimulationDisplay
+from .singular_values import SingularValueDisplay
 
 __all__ = [
     "BodeDisplay",

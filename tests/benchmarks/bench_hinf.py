@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from lpvlearn.numerics.hinf import hinf_norm
+from lpvlearn.systems.hinf_norm import hinf_norm
 
 Matrices = tuple[NDArray, NDArray, NDArray, NDArray]
 

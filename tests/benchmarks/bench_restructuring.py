@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxRestructurer
-from lpvlearn.numerics.continuation import continued_fits
-from lpvlearn.numerics.transfer import Target
+from lpvlearn.restructuring.continuation import continued_fits
+from lpvlearn.restructuring.transfer import Target
 
 sys.path.insert(0, str(Path(__file__).parent))
 

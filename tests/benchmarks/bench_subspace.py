@@ -18,10 +18,10 @@ from unittest import mock
 import numpy as np
 from scipy.linalg import block_diag, expm
 
-from lpvlearn.numerics.hankel import data_factor, hankel_matrix
-from lpvlearn.numerics.identification import identify, scale_records
-from lpvlearn.numerics.selection import select
-from lpvlearn.numerics.simulation import lti_response
+from lpvlearn.subspace.hankel import data_factor, hankel_matrix
+from lpvlearn.subspace.identification import identify, scale_records
+from lpvlearn.subspace.selection import select
+from lpvlearn.systems.simulation import lti_response
 
 try:
     import ctrlsys

@@ -18,7 +18,7 @@ from bench_subspace import arm_system, resonant_system
 from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.numerics.simulation import lti_response
+from lpvlearn.systems.simulation import lti_response
 
 
 def case(name: str) -> tuple[StateSpace, int, float, int, float]:

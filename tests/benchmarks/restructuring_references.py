@@ -11,9 +11,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from lpvlearn import GrayBoxStructure, StateSpace
-from lpvlearn.numerics.hinf import linf_norm
-from lpvlearn.numerics.starts import grid_and_margin
-from lpvlearn.numerics.transfer import Target
+from lpvlearn.restructuring.least_squares import grid_and_margin
+from lpvlearn.restructuring.transfer import Target
+from lpvlearn.systems.hinf_norm import linf_norm
 
 UNSTABLE = 1e300
 

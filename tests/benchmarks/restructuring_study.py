@@ -28,8 +28,7 @@ from restructuring_problems import (
 )
 from restructuring_references import exchange, nonsmooth_bfgs
 
-from lpvlearn import GrayBoxRestructurer
-from lpvlearn.metrics import parameter_fit
+from lpvlearn import GrayBoxRestructurer, parameter_fit
 
 RIGHT = 95.0  # percent of parameter fit that is the right basin
 SAME = 1e-6  # relative difference of equal optima

@@ -19,8 +19,8 @@ import numpy as np
 from bench_subspace import resonant_system
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.numerics.identification import identify
-from lpvlearn.numerics.simulation import state_trajectory
+from lpvlearn.subspace.identification import identify
+from lpvlearn.systems.simulation import state_trajectory
 
 Array = np.ndarray
 

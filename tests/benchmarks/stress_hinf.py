@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.signal import cont2discrete
 
-from lpvlearn.numerics.hinf import linf_norm
+from lpvlearn.systems.hinf_norm import linf_norm
 
 WITHIN = 0.6
 TOLERANCE = 1e-8

@@ -1,0 +1,361 @@
+"""Operating points: experiments grouped by where the scheduling variable stood."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from ..exceptions import ExtrapolationWarning
+from .experiments import Experiment
+
+# A single record tells a sweep from noise and from oscillations about a point by the
+# means of its parts: those of a sweep differ by that share of the whole spread. (White
+# noise: below 0.2 of 600 samples; the flexible arm at one point: 0.54 to 0.66.)
+_PARTS = 10
+
+_SWEEP = 0.8
+
+
+@dataclass(frozen=True)
+class OperatingPoints:
+    """Local experiments by operating point.
+
+    Attributes
+    ----------
+    kappa : ndarray of shape (n_points, n_scheduling)
+        Scheduling values; one column of zeros where no variable is scheduled.
+    experiments : list of lists of Experiment
+    """
+
+    kappa: NDArray[np.float64]
+    experiments: list[list[Experiment]]
+
+    def __len__(self) -> int:
+        return len(self.kappa)
+
+    def keep(self, index: Sequence[int]) -> OperatingPoints:
+        """Some of the points."""
+        chosen = list(index)
+        return OperatingPoints(
+            self.kappa[chosen], [self.experiments[k] for k in chosen]
+        )
+
+    @property
+    def span(self) -> NDArray[np.float64]:
+        """Smallest and largest scheduling values of the points, (2, n_scheduling)."""
+        return np.array([self.kappa.min(axis=0), self.kappa.max(axis=0)])
+
+    @property
+    def identified_range(self) -> NDArray[np.float64]:
+        """The span, widened by how far the variables moved within an experiment."""
+        moved = _motion([run for group in self.experiments for run in group])
+        low, high = self.span
+        slack = moved + 1e-6 * np.maximum(high - low, np.abs(high))
+        return np.array([low - slack, high + slack])
+
+
+def local_experiments(
+    experiments: Sequence[Experiment], tol: ArrayLike | None = None
+) -> OperatingPoints:
+    """Local experiments by operating point, checked.
+
+    Parameters
+    ----------
+    experiments : list of Experiment
+    tol : float or array-like of shape (n_scheduling,), optional
+        As in `group_operating_points`.
+
+    Raises
+    ------
+    ValueError
+        As `group_operating_points` and `check_local`.
+
+    Warns
+    -----
+    UserWarning
+        When all experiments with a scheduling variable are at one point.
+    """
+    index, kappa = group_operating_points(experiments, tol)
+    groups: list[list[Experiment]] = [[] for _ in kappa]
+    for run, k in zip(experiments, index, strict=True):
+        groups[k].append(run)
+    if kappa.shape[1] == 0:
+        if len(kappa) > 1:
+            raise ValueError(
+                "`scheduling` must name the variables that the operating points differ "
+                f"in. Got None, with {len(kappa)} values of `operating_point`."
+            )
+        return OperatingPoints(np.zeros((1, 1)), groups)
+    check_local(experiments, kappa)
+    if len(kappa) == 1:
+        place = ", ".join(
+            f"{value:.4g}, moving by {spread:.2g}"
+            for value, spread in zip(kappa[0], _motion(experiments), strict=True)
+        )
+        warnings.warn(
+            f"All experiments are at one operating point (scheduling {place}): the "
+            "model is time-invariant. Identify at further points for a model that "
+            "follows the scheduling variable, or leave `scheduling` out.",
+            UserWarning,
+            stacklevel=3,
+        )
+    return OperatingPoints(kappa, groups)
+
+
+def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:
+    """Refuse outputs that are constant, or stand among the inputs.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    names : sequence
+        Names of the outputs.
+
+    Raises
+    ------
+    ValueError
+    """
+    outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    constant = np.ptp(outputs, axis=0) == 0
+    if len(outputs) > len(experiments) and constant.any():
+        j = int(np.argmax(constant))
+        raise ValueError(
+            f"Every output must vary. Got {names[j]!r} constant at {outputs[0, j]:g}: "
+            "no dynamics can be identified from it. Leave it out of `y`, or check the "
+            "sensor and its column."
+        )
+    own = experiments[0].input_names
+    for name in set(own) & set(names):
+        k, j = own.index(name), list(names).index(name)
+        inputs = np.concatenate([e.inputs[:, k] for e in experiments])
+        if isinstance(name, str) and np.array_equal(inputs, outputs[:, j]):
+            raise ValueError(
+                f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
+                "drop it from X, or list the inputs in `inputs`."
+            )
+
+
+def warn_extrapolation(
+    experiments: Sequence[Experiment],
+    identified_range: NDArray[np.float64],
+    names: Sequence[object],
+) -> None:
+    """Warn, once, of scheduling values outside the range of identification.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    identified_range : ndarray of shape (2, n_scheduling)
+    names : sequence
+        Names of the scheduling variables.
+
+    Warns
+    -----
+    ExtrapolationWarning
+        With the variable, its range and the farthest value.
+    """
+    signals = [e.scheduling for e in experiments if e.scheduling is not None]
+    if not signals:
+        return
+    kappa = np.vstack(signals)
+    low, high = identified_range
+    width = np.where(high > low, high - low, 1.0)
+    excess = np.maximum(low - kappa, kappa - high) / width
+    outside = int((excess > 0).any(axis=1).sum())
+    if not outside:
+        return
+    row, j = np.unravel_index(np.argmax(excess), excess.shape)
+    digits = 3 - int(np.floor(np.log10(width[j])))
+    shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
+    warnings.warn(
+        f"Scheduling variable {names[int(j)]!r} must be within the identified range, "
+        f"{shown[0]} to {shown[1]}. Got {outside} of {len(kappa)} samples "
+        f"outside, the farthest at {kappa[row, j]:.4g}: the model is extrapolated. "
+        "Identify a model there too, or hold the border's with "
+        "interpolator=PolynomialLPV(extrapolation='clip').",
+        ExtrapolationWarning,
+        stacklevel=4,
+    )
+
+
+def group_operating_points(
+    experiments: Sequence[Experiment], tol: ArrayLike | None = None
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Group experiments by operating point.
+
+    Experiments with an operating-point label are grouped by it; the others by the mean
+    of their scheduling variable.
+
+    Parameters
+    ----------
+    experiments : list of Experiment
+    tol : float or array-like of shape (n_scheduling,), optional
+        Largest distance, in units of each scheduling variable, between the means of
+        experiments of one point. Default: the larger of 1 % of the range of the means
+        and the median spread of the variable within an experiment.
+
+    Returns
+    -------
+    index : ndarray of int, shape (n_experiments,)
+        Operating point of each experiment.
+    kappa : ndarray of shape (n_points, n_scheduling)
+        Scheduling value of each point, the mean of its experiments' means, in
+        lexicographic order; `n_scheduling` is 0 without scheduling columns (points are
+        then in the order of first appearance).
+
+    Raises
+    ------
+    ValueError
+        When experiments form a chain closer than `tol`, so that groups are not clear.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from sklearn.base import BaseEstimator
+    >>> from lpvlearn.data.experiments import read_experiments
+    >>> from lpvlearn.data.operating_points import group_operating_points
+    >>> X = pd.DataFrame({"u": 1.0, "kappa": [0.9, 0.1, 0.9], "run": [7, 8, 9]})
+    >>> runs = read_experiments(
+    ...     BaseEstimator(), X, scheduling="kappa", experiment="run"
+    ... )
+    >>> index, kappa = group_operating_points(runs)
+    >>> index, kappa.ravel()
+    (array([1, 0, 1]), array([0.1, 0.9]))
+    """
+    signals = [run.scheduling for run in experiments if run.scheduling is not None]
+    means = None
+    if len(signals) == len(experiments):
+        means = np.array([signal.mean(axis=0) for signal in signals])
+    if all(run.operating_point is not None for run in experiments):
+        group, _ = pd.factorize(
+            pd.Series([run.operating_point for run in experiments], dtype=object)
+        )
+    elif means is None:
+        group = np.zeros(len(experiments), dtype=np.intp)
+    else:
+        group = _cluster(means, _tolerance(signals, means, tol))
+    n_points = int(group.max()) + 1
+    if means is None:
+        return group, np.empty((n_points, 0))
+    kappa = np.array([means[group == k].mean(axis=0) for k in range(n_points)])
+    order = np.lexsort(kappa.T[::-1])
+    return np.argsort(order)[group], kappa[order]
+
+
+def check_local(
+    experiments: Sequence[Experiment],
+    kappa: NDArray[np.float64],
+    *,
+    max_spread: float = 0.25,
+) -> None:
+    """Check that the scheduling variable barely moves within each experiment.
+
+    Parameters
+    ----------
+    experiments : list of Experiment
+    kappa : ndarray of shape (n_points, n_scheduling)
+        Operating points, as `group_operating_points` returns them.
+    max_spread : float, default=0.25
+        Largest spread (maximum minus minimum) of a scheduling variable within an
+        experiment, relative to its range over the operating points. Where the range is
+        zero: relative to its largest magnitude, and only if the variable travels; noise
+        and oscillations about one point have no scale to compare with.
+
+    Raises
+    ------
+    ValueError
+        When an experiment is not local.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lpvlearn.data.experiments import Experiment
+    >>> from lpvlearn.data.operating_points import check_local
+    >>> sweep = Experiment(
+    ...     "sweep", np.arange(2), np.ones((2, 1)), scheduling=np.array([[0.0], [1.0]])
+    ... )
+    >>> check_local([sweep], np.array([[0.0], [1.0]]))
+    Traceback (most recent call last):
+        ...
+    ValueError: Experiment 'sweep' must be local. Its scheduling variable 1 spreads ...
+    """
+    extent = np.ptp(kappa, axis=0)
+    for run in experiments:
+        if run.scheduling is None or run.scheduling.shape[1] == 0:
+            continue
+        spread = np.ptp(run.scheduling, axis=0)
+        scale = np.where(extent > 0, extent, np.abs(run.scheduling).max(axis=0))
+        travels = (extent > 0) | (_travel(run.scheduling) > _SWEEP * spread)
+        excess = np.where(travels, spread - max_spread * scale, 0.0)
+        worst = int(np.argmax(excess))
+        if excess[worst] > 0:
+            compared = "range of the operating points" if extent[worst] else "magnitude"
+            several = (
+                " Where the table holds several experiments, `experiment` must name "
+                "the column that tells them apart."
+                if len(experiments) == 1
+                else ""
+            )
+            raise ValueError(
+                f"Experiment {run.label!r} must be local. Its scheduling variable "
+                f"{worst + 1} spreads over {spread[worst]:.4g}, more than "
+                f"{max_spread:g} times the {compared} ({scale[worst]:.4g}). Keep such "
+                f"a record for validation, or cut it into local experiments.{several}"
+            )
+
+
+def _motion(experiments: Sequence[Experiment]) -> NDArray[np.float64]:
+    """How far each scheduling variable moves within an experiment, at most."""
+    signals = [run.scheduling for run in experiments if run.scheduling is not None]
+    if not signals:
+        return np.zeros(1)
+    return np.max([np.ptp(signal, axis=0) for signal in signals], axis=0)
+
+
+def _travel(scheduling: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far the mean of a part of the record is from that of another part."""
+    parts = np.array_split(scheduling, min(_PARTS, len(scheduling)))
+    return np.ptp([part.mean(axis=0) for part in parts], axis=0)
+
+
+def _tolerance(
+    signals: Sequence[NDArray[np.float64]],
+    means: NDArray[np.float64],
+    tol: ArrayLike | None,
+) -> NDArray[np.float64]:
+    if tol is None:
+        spreads = [np.ptp(signal, axis=0) for signal in signals]
+        return np.maximum(0.01 * np.ptp(means, axis=0), np.median(spreads, axis=0))
+    given = np.asarray(tol, dtype=np.float64)
+    if given.shape not in ((), (means.shape[1],)) or not (given >= 0).all():
+        raise ValueError(
+            "`scheduling_tol` must be a non-negative number, or one per scheduling "
+            f"variable ({means.shape[1]}). Got {tol!r}."
+        )
+    return np.broadcast_to(given, means.shape[1:])
+
+
+def _cluster(means: NDArray[np.float64], tol: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Group means that are within `tol`, whatever their order."""
+    distance = np.abs(means[:, None, :] - means[None, :, :])
+    near = (distance <= tol).all(axis=2)
+    _, group = connected_components(csr_array(near), directed=False)
+    for k in range(group.max() + 1):
+        extent = np.ptp(means[group == k], axis=0)
+        if (extent > 3 * tol).any():
+            j = int(np.argmax(extent - 3 * tol))
+            raise ValueError(
+                "`scheduling_tol` must separate the operating points. With "
+                f"{tol[j]:.4g}, {int((group == k).sum())} experiments form one chain "
+                f"over {extent[j]:.4g} of scheduling variable {j + 1}. Give a smaller "
+                "`scheduling_tol` (0: every experiment is a point), or label the "
+                "points with an `operating_point` column."
+            )
+    return group.astype(np.intp)

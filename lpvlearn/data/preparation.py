@@ -1,0 +1,263 @@
+"""Records with gaps and with offsets: what is done to samples before identification."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..exceptions import RankWarning
+from .experiments import Experiment
+
+Array = NDArray[np.float64]
+
+Pairs = list[tuple[Array, Array]]
+
+DETRENDS = (None, "constant", "linear")
+
+
+def has_gaps(experiment: Experiment) -> bool:
+    """Whether an input or an output of an experiment is missing."""
+    found = np.isnan(experiment.inputs).any()
+    if experiment.outputs is not None:
+        found |= np.isnan(experiment.outputs).any()
+    return bool(found)
+
+
+def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Cut experiments where an input or an output is missing.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+        Inputs and outputs may hold NaN.
+
+    Returns
+    -------
+    list of Experiment
+        Every run of at least two complete samples, with the label it had. It starts
+        from an initial state of its own.
+
+    Raises
+    ------
+    ValueError
+        If no two consecutive samples are complete.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> u = np.array([[1.0], [2.0], [np.nan], [4.0], [5.0], [6.0]])
+    >>> whole = Experiment("a", np.arange(6), u, np.zeros((6, 1)))
+    >>> [part.rows.tolist() for part in split_at_gaps([whole])]
+    [[0, 1], [3, 4, 5]]
+    """
+    parts = [part for e in experiments for part in complete_runs(e)]
+    if not parts:
+        raise ValueError(
+            "missing='split' needs runs of at least 2 consecutive complete samples. "
+            "Got none: check X and y for columns that are NaN throughout."
+        )
+    return parts
+
+
+def complete_runs(experiment: Experiment, shortest: int = 2) -> list[Experiment]:
+    """Runs of at least `shortest` consecutive samples of which nothing is missing."""
+    complete = np.isfinite(experiment.inputs).all(axis=1)
+    if experiment.outputs is not None:
+        complete &= np.isfinite(experiment.outputs).all(axis=1)
+    edges = np.flatnonzero(np.diff(complete, prepend=False, append=False))
+    return [
+        _rows(experiment, slice(start, stop))
+        for start, stop in edges.reshape(-1, 2)
+        if stop - start >= shortest
+    ]
+
+
+def _rows(experiment: Experiment, part: slice) -> Experiment:
+    def cut(values: Array | None) -> Array | None:
+        return None if values is None else values[part]
+
+    return replace(
+        experiment,
+        rows=experiment.rows[part],
+        inputs=experiment.inputs[part],
+        outputs=cut(experiment.outputs),
+        scheduling=cut(experiment.scheduling),
+    )
+
+
+def remove_trends(pairs: Pairs, detrend: str | None) -> tuple[Pairs, Array, Array]:
+    """Subtract its mean or its straight line from every channel of every experiment.
+
+    Parameters
+    ----------
+    pairs : list of (u, y)
+    detrend : {None, "constant", "linear"}
+
+    Returns
+    -------
+    pairs : list of (u, y)
+    input_offset : ndarray of shape (n_inputs,)
+        Mean over all samples; zero with ``detrend=None``.
+    output_offset : ndarray of shape (n_outputs,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.arange(4.0)[:, None]
+    >>> pairs, u0, y0 = remove_trends([(t, 2.0 * t + 1.0)], "linear")
+    >>> u0, y0, np.abs(pairs[0][1]).max() < 1e-12
+    (array([1.5]), array([4.]), np.True_)
+    """
+    if detrend is None:
+        return pairs, np.zeros(pairs[0][0].shape[1]), np.zeros(pairs[0][1].shape[1])
+    degree = 0 if detrend == "constant" else 1
+    cleaned = [(u - _trend(u, degree), y - _trend(y, degree)) for u, y in pairs]
+    total = sum(len(u) for u, _ in pairs)
+    offsets = [
+        np.asarray(sum(pair[k].sum(axis=0) for pair in pairs)) / total for k in (0, 1)
+    ]
+    return cleaned, offsets[0], offsets[1]
+
+
+def _trend(values: Array, degree: int) -> Array:
+    mean = values.mean(axis=0)
+    if degree == 0 or len(values) < 3:
+        return np.broadcast_to(mean, values.shape)
+    t = np.linspace(-1.0, 1.0, len(values))
+    slope = t @ values / (t @ t)
+    return mean + t[:, None] * slope
+
+
+# Relative singular value below which inputs count as collinear.
+_COLLINEAR = 1e-10
+
+
+def constant_inputs(inputs: Sequence[Array]) -> NDArray[np.intp]:
+    """Inputs that have one and the same value in all samples of all experiments.
+
+    Parameters
+    ----------
+    inputs : sequence of ndarray of shape (n_samples, n_inputs)
+        One per experiment.
+
+    Returns
+    -------
+    ndarray of int
+        Their column numbers.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> constant_inputs([np.array([[1.0, 2.0], [3.0, 2.0]])])
+    array([1])
+    """
+    low = np.min([u.min(axis=0) for u in inputs], axis=0)
+    high = np.max([u.max(axis=0) for u in inputs], axis=0)
+    return np.flatnonzero(low == high)
+
+
+def independent_inputs(inputs: Sequence[Array]) -> Array | None:
+    """Combinations that make collinear inputs independent.
+
+    Parameters
+    ----------
+    inputs : sequence of ndarray of shape (n_samples, n_inputs)
+        One per experiment; no column zero.
+
+    Returns
+    -------
+    ndarray of shape (n_inputs, rank) or None
+        P such that the columns of ``u P`` are independent; a model of these inputs
+        with input matrix ``B`` is the smallest one of the original inputs with
+        ``B P.T``, inputs scaled to their largest value. None where the inputs are
+        independent as they are, or the samples too few to tell.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> u = np.array([[1.0], [2.0], [-1.0]])
+    >>> independent_inputs([u]) is None
+    True
+    >>> independent_inputs([np.hstack([u, u])]).shape
+    (2, 1)
+    """
+    stacked = np.vstack(inputs)
+    n_samples, n_inputs = stacked.shape
+    scale = np.abs(stacked).max(axis=0)
+    gram = stacked / scale
+    # Rounding of the Gram matrix hides ratios below 1e-8: only a suspicion is checked
+    # on the samples themselves.
+    values = np.linalg.eigvalsh(gram.T @ gram)
+    if n_samples < n_inputs or values[0] > 1e-12 * values[-1]:
+        return None
+    _, s, right = np.linalg.svd(np.linalg.qr(gram)[1])
+    rank = int(np.sum(s > _COLLINEAR * s[0]))
+    return None if rank == n_inputs else (right[:rank] / scale).T
+
+
+def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> None:
+    """Refuse a single sample and inputs that never change.
+
+    Parameters
+    ----------
+    pairs : list of (u, y)
+        Arrays (n_samples, n_inputs) and (n_samples, n_outputs), one per experiment.
+    names : sequence, default=None
+        Of the inputs; None numbers them.
+
+    Raises
+    ------
+    ValueError
+    """
+    inputs = [u for u, _ in pairs]
+    if max(len(u) for u in inputs) < 2:
+        raise ValueError(
+            "A dynamic model needs an experiment of at least 2 samples. Got n_samples "
+            f"= {len(inputs)} in {len(inputs)} experiment(s) of 1 sample."
+        )
+    constant = constant_inputs(inputs)
+    if len(constant):
+        k = constant[0]
+        raise ValueError(
+            f"Every input must vary. Got input {k if names is None else names[k]!r} "
+            f"constant at {inputs[0][0, k]:g}: "
+            "its effect cannot be told from the initial state. Leave it out of "
+            "`inputs` or excite it."
+        )
+
+
+def reduce_inputs(pairs: Pairs) -> tuple[Pairs, Array]:
+    """Replace collinear inputs by independent combinations of them, and say so.
+
+    Parameters
+    ----------
+    pairs : list of (u, y)
+
+    Returns
+    -------
+    pairs : list of (u, y)
+    basis : ndarray of shape (n_inputs, rank)
+        The input matrix in the original inputs is that of the new ones times
+        ``basis.T``; the identity in the usual case.
+
+    Warns
+    -----
+    RankWarning
+        If inputs are collinear.
+    """
+    n_inputs = pairs[0][0].shape[1]
+    basis = independent_inputs([u for u, _ in pairs])
+    if basis is None:
+        return pairs, np.eye(n_inputs)
+    warnings.warn(
+        f"The {n_inputs} inputs are collinear (rank {basis.shape[1]}): their separate "
+        "effects are not identifiable and the smallest solution was taken. Excite the "
+        "inputs independently.",
+        RankWarning,
+        stacklevel=5,
+    )
+    return [(u @ basis, y) for u, y in pairs], basis

@@ -1,0 +1,260 @@
+"""Equations of motion of the two-link flexible arm, as pure functions on arrays.
+
+In the complex plane, with the absolute angles ``a1 = theta1`` and
+``a2 = theta1 + theta2 + 2 l1 v1``, a point of link k at abscissa x lies at
+``base_k + exp(i a_k) z(x, v_k)``, where
+``z(x, v) = x - (2/3) x^3 v^2 + i x^2 v`` (Eq. (28) of the paper, with the
+foreshortening of a bent beam). The principle of virtual power gives
+``M = sum m Re(conj(J) J')`` and ``F = -sum m Re(conj(J) a)`` over all masses m,
+J the partial derivatives of their positions and a their acceleration at zero
+second derivatives of the coordinates. A link enters these sums only through the
+moments ``int x^k dm`` of its mass, and every sum is linear in the monomials
+``{1, w^2, w v', v'^2} x {1, v, v^2, v^3, v^4}`` of its bending v, its bending rate
+v' and its turning rate w = a'. One constant matrix per link therefore holds all of
+its mechanics (`link_table`), and no quadrature remains at run time.
+
+The coordinates are ``r = (a1, v1, a2, v2) = T q`` with ``q = (theta1, theta2, v1,
+v2)`` and the constant T of `coordinate_change`, so ``M_q = T' M_r T`` and
+``F_q = T' F_r``. Arrays of coordinates are shaped (2 links, 2 kinds, n): kind 0 the
+angle, kind 1 the bending, n the number of experiments.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+# Half the integral of the squared slope: 1/2 int_0^x (2 xi v)^2 dxi = 2/3 x^3 v^2.
+SHORTENING = 2.0 / 3.0
+
+# Monomial (i, j) is RATES[i] * v^j and stands in column N_POWERS * i + j.
+N_POWERS = 5
+
+ONE, TURNING2, CORIOLIS, BENDING2 = 0, 1, 2, 3
+
+
+def link_moments(length: float, density: float, end_mass: float) -> FloatArray:
+    """Moments ``int x^k dm``, k = 0..6, of a uniform link with a mass at its end.
+
+    Parameters
+    ----------
+    length : float
+        Length in metres.
+    density : float
+        Mass per length in kg/m.
+    end_mass : float
+        Point mass at the end in kg.
+
+    Returns
+    -------
+    moments : ndarray of shape (7,)
+        In kg m^k.
+
+    Examples
+    --------
+    >>> link_moments(1.0, 2.0, 0.5)[:3].round(4)
+    array([2.5   , 1.5   , 1.1667])
+    """
+    k = np.arange(7)
+    return density * length ** (k + 1) / (k + 1) + end_mass * length**k
+
+
+def link_table(
+    moments: FloatArray, lever: FloatArray, hub_inertia: float, conjugate: bool
+) -> FloatArray:
+    """Matrix from the monomials of one link to its share of M, F and the coupling.
+
+    Parameters
+    ----------
+    moments : ndarray of shape (7,)
+        Moments of everything that moves with the link, in kg m^k.
+    lever : ndarray of shape (4,)
+        Coefficients ``(., x, x^2, x^3)`` of the vector z through which the link
+        couples with the other one.
+    hub_inertia : float
+        Moment of inertia that turns with the link, in kg m^2.
+    conjugate : bool
+        Whether the coupling vectors are stored conjugated.
+
+    Returns
+    -------
+    table : ndarray of shape (12, 20)
+        Rows 0-3: own mass matrix over (angle, bending), row-major. Rows 4-5: own
+        Coriolis and centrifugal force. Rows 6-8 and 9-11: real and imaginary parts
+        of ``dz/da``, ``dz/dv`` and the acceleration of the lever, all three in the
+        frame of the link.
+    """
+    s, m = SHORTENING, moments
+    table = np.zeros((12, 4, N_POWERS))
+    # |z|^2, Im(conj(z) dz/dv) and |dz/dv|^2, integrated
+    table[0, ONE, [0, 2, 4]] = m[2] + hub_inertia, (1 - 2 * s) * m[4], s**2 * m[6]
+    table[1, ONE, [0, 2]] = table[2, ONE, [0, 2]] = m[3], s * m[5]
+    table[3, ONE, [0, 2]] = m[4], 4 * s**2 * m[6]
+    # Half of d|z|^2/dv makes both the Coriolis torque and the centrifugal bending.
+    half_slope = (1 - 2 * s) * m[4], 2 * s**2 * m[6]
+    table[4, CORIOLIS, [1, 3]] = -2 * half_slope[0], -2 * half_slope[1]
+    table[4, BENDING2, 1] = -2 * s * m[5]
+    table[5, TURNING2, [1, 3]] = half_slope
+    table[5, BENDING2, 1] = -4 * s**2 * m[6]
+
+    z = np.array([lever[1], 1j * lever[2], -s * lever[3]])
+    vectors = np.zeros((3, 4, N_POWERS), dtype=complex)
+    vectors[0, ONE, :3] = 1j * z
+    vectors[1, ONE, :2] = z[1], 2 * z[2]
+    vectors[2, TURNING2, :3] = -z
+    vectors[2, CORIOLIS, :2] = 2j * z[1], 4j * z[2]
+    vectors[2, BENDING2, 0] = 2 * z[2]
+    table[6:9] = vectors.real
+    table[9:12] = -vectors.imag if conjugate else vectors.imag
+    return table.reshape(12, 4 * N_POWERS)
+
+
+def arm_tables(
+    l1: float,
+    l2: float,
+    rho1: float,
+    rho2: float,
+    J1: float,
+    J2: float,
+    elbow_mass: float,
+    tip_mass: float,
+) -> FloatArray:
+    """Tables of both links, shape (2, 12, 20): all that M and F need.
+
+    Link 1 carries the whole of link 2 as a point mass at its end, as far as the
+    motion of that point goes; the rest is the coupling of the chord of link 1 with
+    the first moment of link 2.
+    """
+    second = link_moments(l2, rho2, tip_mass)
+    first = link_moments(l1, rho1, elbow_mass + second[0])
+    return np.stack(
+        [
+            link_table(first, l1 ** np.arange(4.0), J1, conjugate=True),
+            link_table(second, second[:4], J2, conjugate=False),
+        ]
+    )
+
+
+def coordinate_change(l1: float) -> FloatArray:
+    """Matrix T of ``(a1, v1, a2, v2) = T (theta1, theta2, v1, v2)``.
+
+    Examples
+    --------
+    >>> coordinate_change(0.5)
+    array([[1., 0., 0., 0.],
+           [0., 0., 1., 0.],
+           [1., 1., 1., 0.],
+           [0., 0., 0., 1.]])
+    """
+    return np.array(
+        [
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 0.0],
+            [1.0, 1.0, 2.0 * l1, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def inertial_terms(
+    position: FloatArray, rate: FloatArray, tables: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mass matrix and Coriolis and centrifugal forces in the coordinates r.
+
+    Parameters
+    ----------
+    position, rate : ndarray of shape (2, 2, n)
+        Coordinates r and their time derivatives.
+    tables : ndarray of shape (2, 12, 20)
+        From `arm_tables`.
+
+    Returns
+    -------
+    mass : ndarray of shape (4, 4, n)
+    force : ndarray of shape (2, 2, n)
+    """
+    n = position.shape[-1]
+    powers = np.empty((2, N_POWERS, n))
+    powers[:, 0] = 1.0
+    powers[:, 1] = v = position[:, 1]
+    powers[:, 2] = v * v
+    powers[:, 3:] = powers[:, 1:3] * powers[:, 2:3]
+    rates = np.empty((2, 4, 1, n))
+    rates[:, ONE] = 1.0
+    rates[:, TURNING2::2, 0] = rate * rate
+    rates[:, CORIOLIS, 0] = rate[:, 0] * rate[:, 1]
+    monomials = (rates * powers[:, np.newaxis]).reshape(2, 4 * N_POWERS, n)
+    values = tables @ monomials
+
+    # The coupling is Re(conj(J_1) J_2), Re(conj(J_1) a_2) and Re(conj(a_1) J_2).
+    vectors = values[:, 6:9] + 1j * values[:, 9:]
+    vectors[1] *= np.exp(1j * (position[1, 0] - position[0, 0]))
+    coupling = (vectors[0, :, np.newaxis] * vectors[1]).real
+
+    mass = np.empty((4, 4, n))
+    own = values[:, :4].reshape(2, 2, 2, n)
+    mass[:2, :2] = own[0]
+    mass[2:, 2:] = own[1]
+    mass[:2, 2:] = coupling[:2, :2]
+    mass[2:, :2] = coupling[:2, :2].swapaxes(0, 1)
+    force = values[:, 4:6].copy()
+    force[0] -= coupling[:2, 2]
+    force[1] -= coupling[2, :2]
+    return mass, force
+
+
+def integrate(
+    state: FloatArray,
+    inputs: FloatArray,
+    linear_force: FloatArray,
+    tables: FloatArray,
+    step: float,
+    n_substeps: int,
+) -> FloatArray:
+    """Integrate several experiments together by Runge-Kutta 4 with a fixed step.
+
+    Parameters
+    ----------
+    state : ndarray of shape (8, n)
+        Initial r and r'.
+    inputs : ndarray of shape (n_samples, 4, n)
+        Generalised forces due to the velocity references, held over each sample.
+    linear_force : ndarray of shape (4, 8)
+        Elastic and velocity-loop forces as a linear function of the state.
+    tables : ndarray of shape (2, 12, 20)
+        From `arm_tables`.
+    step : float
+        Integration step in seconds.
+    n_substeps : int
+        Integration steps per sample.
+
+    Returns
+    -------
+    states : ndarray of shape (n_samples, 8, n)
+        The states at the sampling instants, before the input of that sample acts.
+    """
+    n = state.shape[1]
+    states = np.empty((len(inputs), 8, n))
+    slopes = np.empty((4, 8, n))
+
+    def derivative(x: FloatArray, held: FloatArray, out: FloatArray) -> None:
+        r = x.reshape(2, 2, 2, n)
+        mass, force = inertial_terms(r[0], r[1], tables)
+        total = linear_force @ x
+        total += held
+        total += force.reshape(4, n)
+        out[:4] = x[4:]
+        out[4:] = np.linalg.solve(mass.T, total.T[..., np.newaxis])[..., 0].T
+
+    for k, held in enumerate(inputs):
+        states[k] = state
+        for _ in range(n_substeps):
+            derivative(state, held, slopes[0])
+            derivative(state + (step / 2) * slopes[0], held, slopes[1])
+            derivative(state + (step / 2) * slopes[1], held, slopes[2])
+            derivative(state + step * slopes[2], held, slopes[3])
+            slopes[1:3] *= 2.0
+            state = state + (step / 6) * slopes.sum(axis=0)
+    return states

@@ -1,0 +1,121 @@
+"""Excitation signals and measurement noise of identification experiments."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.random import Generator, RandomState
+from sklearn.utils import check_random_state
+
+from .dynamics import FloatArray
+
+__all__ = ["measurement_noise", "prbs"]
+
+
+def spawn_generators(
+    random_state: int | RandomState | None, n_generators: int
+) -> list[Generator]:
+    """Independent generators, so that one draw never shifts another one."""
+    seeds = check_random_state(random_state).randint(2**31 - 1, size=n_generators)
+    return [np.random.default_rng(seed) for seed in seeds]
+
+
+def prbs(
+    n_samples: int,
+    n_channels: int = 1,
+    *,
+    amplitude: float = 1.0,
+    clock: int = 1,
+    balance: int | None = None,
+    random_state: int | RandomState | Generator | None = None,
+) -> FloatArray:
+    """Pseudo-random binary sequences, independent between channels.
+
+    Parameters
+    ----------
+    n_samples : int
+        Length of the sequences.
+    n_channels : int, default=1
+        Number of sequences.
+    amplitude : float, default=1.0
+        The two levels are ``+amplitude`` and ``-amplitude``.
+    clock : int, default=1
+        Samples for which each bit is held. The spectrum of independent bits is flat
+        up to about ``2.8 / clock`` rad/sample (half the power) and zero at
+        ``2 pi / clock``.
+    balance : int, default=None
+        If given (even), every window of that many bits holds as many bits of one
+        level as of the other, so that the integral of the sequence returns to zero at
+        the end of each window: frequencies below ``2 pi / (balance * clock)`` are
+        hardly excited and an integrating system does not drift.
+        None draws independent bits.
+    random_state : int, RandomState, Generator or None, default=None
+        Seed of the sequences.
+
+    Returns
+    -------
+    u : ndarray of shape (n_samples, n_channels)
+
+    Raises
+    ------
+    ValueError
+        If a number is out of its range.
+
+    Examples
+    --------
+    >>> from lpvlearn.datasets import prbs
+    >>> prbs(8, clock=2, balance=2, random_state=0).ravel().tolist()
+    [1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, -1.0]
+    """
+    for name, value in (
+        ("n_samples", n_samples),
+        ("n_channels", n_channels),
+        ("clock", clock),
+    ):
+        if value != int(value) or value < 1:
+            raise ValueError(f"`{name}` must be an integer of at least 1. Got {value}.")
+    if not (np.isfinite(amplitude) and amplitude > 0):
+        raise ValueError(f"`amplitude` must be finite and positive. Got {amplitude}.")
+    if balance is not None and (balance < 2 or balance % 2):
+        raise ValueError(
+            "`balance` must be None or an even number of bits, at least 2. "
+            f"Got {balance}."
+        )
+    rng = (
+        random_state
+        if isinstance(random_state, Generator)
+        else spawn_generators(random_state, 1)[0]
+    )
+    n_bits = -(-n_samples // clock)
+    if balance is None:
+        bits = rng.integers(0, 2, size=(n_channels, n_bits)) * 2.0 - 1.0
+    else:
+        windows = np.ones((n_channels, -(-n_bits // balance), balance))
+        windows[..., balance // 2 :] = -1.0
+        bits = rng.permuted(windows, axis=-1).reshape(n_channels, -1)
+    return amplitude * np.repeat(bits, clock, axis=1)[:, :n_samples].T
+
+
+def measurement_noise(
+    y: FloatArray, snr_db: float, n_realizations: int, rng: Generator
+) -> FloatArray:
+    """White Gaussian noise at a signal-to-noise ratio for each channel.
+
+    Parameters
+    ----------
+    y : ndarray of shape (..., n_samples, n_outputs)
+        Noise-free outputs.
+    snr_db : float
+        ``10 log10(cov(y_k) / cov(v_k))`` in dB (footnote 5 of the paper), for each
+        output and experiment; infinity is no noise.
+    n_realizations : int
+        Number of independent draws.
+    rng : numpy.random.Generator
+        Source of the draws.
+
+    Returns
+    -------
+    noise : ndarray of shape (..., n_realizations, n_samples, n_outputs)
+    """
+    scale = y.std(axis=-2, keepdims=True) * 10.0 ** (-snr_db / 20.0)
+    shape = (*y.shape[:-2], n_realizations, *y.shape[-2:])
+    return scale[..., np.newaxis, :, :] * rng.standard_normal(shape)

@@ -1,0 +1,400 @@
+"""The two-link flexible arm: physical parameters, equations, linearisation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..models.statespace import StateSpace
+from ..structures.structure import GrayBoxStructure
+from .dynamics import (
+    FloatArray,
+    arm_tables,
+    coordinate_change,
+    inertial_terms,
+    integrate,
+)
+from .kinematics import check_coordinates, rigid_joint_rates
+from .response import ArmResponse, pair_experiments
+
+__all__ = ["FlexibleArm"]
+
+
+@dataclass(frozen=True)
+class FlexibleArm:
+    """Planar two-link arm with bending links and joint velocity loops.
+
+    One assumed bending mode a link, ``delta_k(x, t) = x^2 v_k(t)``, so that the
+    coordinates are ``q = (theta1, theta2, v1, v2)`` and
+    ``M(q) q'' = F(q, q') + G u`` (Eq. (26)), with the torques
+    ``u = Lambda (reference - (theta1', theta2'))`` of the velocity loops (Eq. (29)).
+    The input of the closed loop is the velocity reference of the two joints, the
+    output y the joint rates of a rigid arm whose end-effector is at the same place,
+    the scheduling variable ``kappa = cos(theta2)``.
+
+    Parameters
+    ----------
+    l1, l2 : float
+        Lengths of the links in m.
+    rho1, rho2 : float
+        Masses per length in kg/m.
+    EI1, EI2 : float
+        Bending stiffnesses in N m2.
+    J1, J2 : float
+        Hub inertias in kg m2.
+    elbow_mass, tip_mass : float
+        Point masses at the ends of link 1 and link 2 in kg.
+    gains : sequence of two floats
+        Diagonal of Lambda in N m s/rad.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not a finite positive number (masses and gains may be 0).
+
+    Notes
+    -----
+    Stands for the arm of Section 3 of the paper. Its defaults are this library's
+    own: the published text gives none. They are calibrated so that the analytic
+    rows of the paper's tables come out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lpvlearn.datasets import FlexibleArm
+    >>> arm = FlexibleArm()
+    >>> arm.linearize(np.pi / 2).order
+    6
+    >>> step = np.full((500, 2), 0.1)
+    >>> response = arm.simulate(step, np.pi / 2, 1e-3)
+    >>> response.y.shape, response.kappa.shape
+    ((500, 2), (500,))
+    """
+
+    l1: float = 0.3
+    l2: float = 0.3
+    rho1: float = 0.77
+    rho2: float = 0.77
+    EI1: float = 89.0
+    EI2: float = 12.0
+    J1: float = 0.104
+    J2: float = 0.109
+    elbow_mass: float = 0.98
+    tip_mass: float = 1.95
+    gains: Sequence[float] = (0.774, 2.75)
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            name, value = field.name, getattr(self, field.name)
+            if name == "gains":
+                continue
+            rule = "non-negative" if name.endswith("mass") else "positive"
+            if (
+                not np.isfinite(value)
+                or value < 0
+                or (rule == "positive" and not value)
+            ):
+                raise ValueError(f"`{name}` must be finite and {rule}. Got {value}.")
+        gains = np.asarray(self.gains, dtype=float)
+        if gains.shape != (2,) or not np.all(np.isfinite(gains) & (gains >= 0)):
+            raise ValueError(
+                "`gains` must be two finite non-negative numbers, one a joint. "
+                f"Got {self.gains}."
+            )
+        object.__setattr__(self, "gains", (float(gains[0]), float(gains[1])))
+
+    @cached_property
+    def _tables(self) -> FloatArray:
+        inertia = (self.J1, self.J2, self.elbow_mass, self.tip_mass)
+        return arm_tables(self.l1, self.l2, self.rho1, self.rho2, *inertia)
+
+    @cached_property
+    def _stiffness(self) -> FloatArray:
+        """Elastic stiffness K over q."""
+        return np.diag([0.0, 0.0, 4 * self.EI1 * self.l1, 4 * self.EI2 * self.l2])
+
+    @cached_property
+    def _damping(self) -> FloatArray:
+        """``G Lambda G'`` over q: the passive part of the velocity loops."""
+        return np.diag([*self.gains, 0.0, 0.0])
+
+    def mass_matrix(self, q: ArrayLike) -> FloatArray:
+        """Mass matrix M(q) of Eq. (26).
+
+        Parameters
+        ----------
+        q : array-like of shape (..., 4)
+            ``(theta1, theta2, v1, v2)``.
+
+        Returns
+        -------
+        M : ndarray of shape (..., 4, 4)
+            Symmetric positive definite, in kg m2 (angles), kg m3 and kg m4 (bending).
+
+        Examples
+        --------
+        >>> M = FlexibleArm().mass_matrix([0.0, 1.0, 0.0, 0.0])
+        >>> bool((M == M.T).all())
+        True
+        """
+        q = check_coordinates("q", q)
+        mass, _ = self._inertial_terms(q, np.zeros_like(q))
+        T = coordinate_change(self.l1)
+        M = T.T @ np.moveaxis(mass, -1, 0) @ T
+        return (0.5 * (M + M.swapaxes(1, 2))).reshape(*q.shape, 4)
+
+    def forces(self, q: ArrayLike, qdot: ArrayLike) -> FloatArray:
+        """Coriolis, centrifugal and elastic forces F(q, q') of Eq. (26).
+
+        Parameters
+        ----------
+        q, qdot : array-like of shape (..., 4)
+            Coordinates and their rates; leading axes are broadcast.
+
+        Returns
+        -------
+        F : ndarray of shape (..., 4)
+            Such that ``M q'' = F + G u`` with the joint torques u.
+
+        Examples
+        --------
+        >>> FlexibleArm().forces([0.0, 1.0, 0.1, 0.0], [0.0, 0.0, 0.0, 0.0])
+        array([  0.  ,   0.  , -10.68,   0.  ])
+        """
+        q, qdot = np.broadcast_arrays(
+            check_coordinates("q", q), check_coordinates("qdot", qdot)
+        )
+        _, force = self._inertial_terms(q, qdot)
+        F = force.reshape(4, -1).T @ coordinate_change(self.l1)
+        return F.reshape(q.shape) - q @ self._stiffness
+
+    def _inertial_terms(
+        self, q: FloatArray, qdot: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        T = coordinate_change(self.l1)
+        r, rdot = (T @ x.reshape(-1, 4).T for x in (q, qdot))
+        return inertial_terms(r.reshape(2, 2, -1), rdot.reshape(2, 2, -1), self._tables)
+
+    def linearize(self, theta2: float) -> StateSpace:
+        """Linear model at rest at the elbow angle `theta2`, Eq. (30)-(31).
+
+        Parameters
+        ----------
+        theta2 : float
+            Elbow angle in rad.
+
+        Returns
+        -------
+        model : StateSpace
+            Continuous, of order 6, from the velocity references to y, in the state
+            ``(v1, v2, theta1', theta2', v1', v2')``.
+
+        Examples
+        --------
+        >>> FlexibleArm().linearize(1.0).dc_gain().round(9) + 0.0
+        array([[1., 0.],
+               [0., 1.]])
+        """
+        M = self._rest_mass(theta2)
+        loops = np.linalg.solve(M, self._damping[:, :2])
+        A, B = np.zeros((6, 6)), np.zeros((6, 2))
+        A[:2, 4:] = np.eye(2)
+        A[2:, :2] = -np.linalg.solve(M, self._stiffness[:, 2:])
+        A[2:, 2:4] = -loops
+        B[2:] = loops
+        return StateSpace(A, B, self._output_matrix())
+
+    def rigid(self, theta2: float) -> StateSpace:
+        """Linear model of the arm with rigid links (the rigid arm of Fig. 4).
+
+        Parameters
+        ----------
+        theta2 : float
+            Elbow angle in rad.
+
+        Returns
+        -------
+        model : StateSpace
+            Continuous, of order 2, in the state ``(theta1', theta2')``.
+
+        Examples
+        --------
+        >>> FlexibleArm().rigid(1.0).order
+        2
+        """
+        M = self._rest_mass(theta2)[:2, :2]
+        loops = np.linalg.solve(M, self._damping[:2, :2])
+        return StateSpace(-loops, loops, np.eye(2))
+
+    def structure(self) -> GrayBoxStructure:
+        """Gray-box structure of `linearize`, Eq. (32) corrected: p1, ..., p16.
+
+        The parameters fill rows 3 to 6 of A column by column; B repeats columns 3
+        and 4 with the opposite sign; C holds the lengths of the links and is known.
+
+        Examples
+        --------
+        >>> FlexibleArm().structure().n_params
+        16
+        """
+        p = np.array([f"p{i}" for i in range(1, 17)]).reshape(4, 4).T
+        A: list[list[float | str]] = [[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]]
+        A += [[*map(str, row), 0, 0] for row in p]
+        B: list[list[float | str]] = [[0, 0], [0, 0]]
+        B += [[f"-{name}" for name in row] for row in p[:, 2:]]
+        return GrayBoxStructure.from_template(A, B, self._output_matrix().tolist())
+
+    def parameters(self, theta2: float) -> FloatArray:
+        """True values of the parameters of `structure` at the elbow angle `theta2`.
+
+        Parameters
+        ----------
+        theta2 : float
+            Elbow angle in rad.
+
+        Returns
+        -------
+        parameters : ndarray of shape (16,)
+
+        Examples
+        --------
+        >>> arm = FlexibleArm()
+        >>> model = arm.structure().model(arm.parameters(1.0))
+        >>> bool((model.A == arm.linearize(1.0).A).all())
+        True
+        """
+        return self.linearize(theta2).A[2:, :4].T.ravel()
+
+    def _rest_mass(self, theta2: float) -> FloatArray:
+        if np.ndim(theta2) != 0 or not np.isfinite(theta2):
+            raise ValueError(f"`theta2` must be one finite angle in rad. Got {theta2}.")
+        return self.mass_matrix([0.0, theta2, 0.0, 0.0])
+
+    def _output_matrix(self) -> FloatArray:
+        C1 = [[1.0, 0.0, self.l1, 0.0], [0.0, 1.0, self.l1, self.l2]]
+        return np.hstack([np.zeros((2, 2)), C1])
+
+    def simulate(
+        self,
+        velocity_reference: ArrayLike,
+        theta2: ArrayLike,
+        sampling_time: float,
+        *,
+        integration_step: float = 1e-4,
+    ) -> ArmResponse:
+        """Integrate the non-linear equations in closed loop, from rest.
+
+        Runge-Kutta 4 with a fixed step; all experiments are integrated together.
+
+        Parameters
+        ----------
+        velocity_reference : array-like, (n_samples, 2) or (n_experiments, n_samples, 2)
+            Joint velocity references in rad/s, held over each sampling period.
+        theta2 : float or array-like of shape (n_experiments,)
+            Initial elbow angle in rad; theta1 starts at 0, the links unbent.
+        sampling_time : float
+            Sampling period of reference and response in s.
+        integration_step : float, default=1e-4
+            Largest integration step in s; the sampling period is divided into equal
+            steps of at most this length.
+
+        Returns
+        -------
+        response : ArmResponse
+            With a leading axis of experiments unless a single reference is given
+            with a single angle.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, the step is too long for the fastest pole, or the
+            arm comes to a singular position (stretched or folded), where y does not
+            exist.
+
+        Examples
+        --------
+        >>> arm = FlexibleArm()
+        >>> arm.simulate(np.zeros((10, 2)), [1.0, 2.0], 1e-3).theta2[:, -1]
+        array([1., 2.])
+        """
+        reference, angles = pair_experiments(velocity_reference, theta2)
+        single = np.ndim(velocity_reference) == 2 and np.ndim(theta2) == 0
+        n = len(angles)
+        n_substeps = self._substeps(angles, sampling_time, integration_step)
+
+        T = coordinate_change(self.l1)
+        inverse = np.linalg.inv(T)
+        q0 = np.zeros((4, n))
+        q0[1] = angles
+        states = integrate(
+            np.concatenate([T @ q0, np.zeros((4, n))]),
+            (inverse.T @ self._damping[:, :2]) @ np.moveaxis(reference, 0, -1),
+            -inverse.T
+            @ np.hstack([self._stiffness @ inverse, self._damping @ inverse]),
+            self._tables,
+            sampling_time / n_substeps,
+            n_substeps,
+        )
+        states = np.moveaxis(states, -1, 0).reshape(n, -1, 2, 4)
+        q, qdot = states[..., 0, :] @ inverse.T, states[..., 1, :] @ inverse.T
+        y = self.rigid_rates(q, qdot)
+        return ArmResponse(y[0], q[0], qdot[0]) if single else ArmResponse(y, q, qdot)
+
+    def _substeps(
+        self, angles: FloatArray, sampling_time: float, integration_step: float
+    ) -> int:
+        for name, value in (
+            ("sampling_time", sampling_time),
+            ("integration_step", integration_step),
+        ):
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"`{name}` must be finite and positive. Got {value}.")
+        n_substeps = max(1, int(np.ceil(sampling_time / integration_step - 1e-9)))
+        fastest = max(
+            np.abs(self.linearize(a).poles()).max() for a in np.unique(angles)
+        )
+        # Runge-Kutta 4 is stable up to 2.78 / |pole|; beyond 2 it is also useless.
+        if fastest * sampling_time / n_substeps > 2.0:
+            raise ValueError(
+                f"`integration_step` must be at most {2.0 / fastest:.3g} s for the "
+                f"fastest pole ({fastest:.4g} rad/s). Got {integration_step}."
+            )
+        return n_substeps
+
+    def rigid_rates(self, q: ArrayLike, qdot: ArrayLike) -> FloatArray:
+        """Joint rates of the rigid arm whose end-effector moves like this one's.
+
+        Exact inverse kinematics of Eq. (28); to first order in v and v' this is
+        ``(theta1' + l1 v1', theta2' + l1 v1' + l2 v2')``, the matrix C of Eq. (31c).
+
+        Parameters
+        ----------
+        q, qdot : array-like of shape (..., 4)
+            Coordinates and their rates.
+
+        Returns
+        -------
+        y : ndarray of shape (..., 2)
+            In rad/s.
+
+        Raises
+        ------
+        ValueError
+            If the end-effector is out of the rigid arm's reach, or the arm is
+            stretched or folded.
+
+        Examples
+        --------
+        >>> FlexibleArm().rigid_rates([0.0, 1.0, 0.0, 0.0], [0.3, 0.2, 0.0, 0.0])
+        array([0.3, 0.2])
+        """
+        return rigid_joint_rates(
+            check_coordinates("q", q),
+            check_coordinates("qdot", qdot),
+            self.l1,
+            self.l2,
+        )

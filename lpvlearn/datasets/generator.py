@@ -1,0 +1,324 @@
+"""Identification experiments on the flexible arm: the paper's protocol."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.random import Generator, RandomState
+from numpy.typing import ArrayLike
+from sklearn.utils import Bunch
+
+from .dynamics import FloatArray
+from .excitation import measurement_noise, prbs, spawn_generators
+from .flexible_arm import FlexibleArm
+from .response import ArmResponse
+
+__all__ = ["make_flexible_arm"]
+
+INPUTS, OUTPUTS = ["u1", "u2"], ["y1", "y2"]
+
+DESCR = """\
+Two-link flexible arm: simulated local experiments
+--------------------------------------------------
+{n_points} operating points theta2 = i pi / {denominator}, {n_realizations} \
+realization(s) of the noise at {snr_db} dB,
+{duration} s sampled at {sampling_time} s.
+
+X: u1, u2 (joint velocity references, rad/s), kappa (cos(theta2), the scheduling
+variable), experiment (label), time (s). y: y1, y2 (joint rates of the rigid arm with
+the same end-effector, rad/s). X_local, y_local: one new noise-free experiment at each
+operating point. X_sweep, y_sweep: one noise-free experiment in which the elbow turns
+through the whole range.
+"""
+
+
+def make_flexible_arm(
+    n_operating_points: int = 7,
+    n_realizations: int = 1,
+    snr_db: float = 30.0,
+    duration: float = 3.0,
+    sampling_time: float = 1e-3,
+    random_state: int | RandomState | None = None,
+    *,
+    amplitude: float = 0.1,
+    clock: ArrayLike = (0.02, 0.01),
+    balance_time: float | None = 0.5,
+    integration_step: float = 1e-4,
+    sweep_duration: float = 3.0,
+    sweep_amplitude: float = 1.87,
+    sweep_clock: float = 0.005,
+    arm: FlexibleArm | None = None,
+) -> Bunch:
+    """Simulate local experiments on the flexible arm (Section 3 of the paper).
+
+    At each operating point ``theta2 = i pi / (n_operating_points + 1)`` the arm starts
+    at rest and both joints follow binary pseudo-random velocity references. The
+    non-linear equations are integrated once for each point; white noise is drawn
+    `n_realizations` times for the same noise-free experiment.
+
+    Parameters
+    ----------
+    n_operating_points : int, default=7
+        Number of elbow angles.
+    n_realizations : int, default=1
+        Noise realizations of each experiment, each with its own label.
+    snr_db : float, default=30.0
+        ``10 log10(cov(y_k) / cov(v_k))`` of every output; infinity is no noise.
+    duration : float, default=3.0
+        Length of each local experiment in s.
+    sampling_time : float, default=1e-3
+        Sampling period in s.
+    random_state : int, RandomState or None, default=None
+        Seed of references and noise. The noise does not shift the references:
+        more realizations leave the noise-free data as they are.
+    amplitude : float, default=0.1
+        Amplitude of the references in rad/s.
+    clock : float or pair of floats, default=(0.02, 0.01)
+        Time in s for which each bit is held, joint by joint; a multiple of the
+        sampling period.
+    balance_time : float or None, default=0.5
+        Window in s over which the binary reference of joint 2 integrates to zero, in
+        the sweep that of both joints (None: independent bits). In local experiments
+        the bits of joint 1 are always independent.
+    integration_step : float, default=1e-4
+        Largest Runge-Kutta step in s.
+    sweep_duration, sweep_amplitude, sweep_clock : float, default=3.0, 1.87, 0.005
+        Length (s), amplitude (rad/s) and bit time (s) of the validation sweep, in
+        which joint 2 turns by a ramp of (6 pi / 8) / 3 rad/s from theta2 = pi / 8.
+    arm : FlexibleArm or None, default=None
+        The arm; None takes the default parameters.
+
+    Returns
+    -------
+    data : Bunch
+        X, y : DataFrame
+            Estimation data: columns ``u1, u2, kappa, experiment, time`` and
+            ``y1, y2``. `experiment` counts the realizations, point by point; `kappa`
+            is cos(theta2) as it moves. `time` restarts in each experiment.
+        X_local, y_local : DataFrame
+            New noise-free experiments, one at each operating point.
+        X_sweep, y_sweep : DataFrame
+            Noise-free experiment through the whole range of theta2.
+        structure : GrayBoxStructure
+            ``arm.structure()``.
+        arm : FlexibleArm
+            The simulated arm.
+        sampling_time : float
+            Sampling period in s.
+        operating_points : ndarray of shape (n_operating_points,)
+            Scheduling values cos(theta2) of the points.
+        theta2 : ndarray of shape (n_operating_points,)
+            Elbow angles of the points in rad.
+        analytic_models : list of StateSpace
+            ``arm.linearize`` at each point (continuous time).
+        DESCR : str
+            What the data are.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of its range or a bit time is no multiple of
+        `sampling_time`.
+
+    Notes
+    -----
+    The published text leaves the bit time open. Two demands pull apart. The slowest
+    pole (-0.7 to -2.2 rad/s, mostly a motion of joint 1) asks for power at low
+    frequency, or the static gain stays uncertain. But whatever moves the elbow biases
+    the local model in proportion to the amplitude, and no averaging of noise
+    realizations removes that. Turning joint 1 changes nothing in the dynamics:
+    joint 1 therefore carries the low frequencies (long, independent bits), while
+    joint 2, whose own poles are fast, returns every `balance_time`.
+
+    Measured at 30 dB. (i) Fisher information of the discrete black-box model of order
+    6 at theta2 = i pi / 8, i = 1, 3, 5, 7, four seeds, and the noise-free residual
+    projected on its sensitivities: with independent bits of 5 ms on both joints the
+    elbow moves by up to 0.039 rad, the non-linear bias of the frequency response
+    comes to 4.8e-2 of its peak at worst, and the analytic linear model fits the
+    experiment to 97.5 % (BFT) at worst; with the default to 0.012 rad, 1.0e-2 and
+    99.7 %. The price is the standard deviation of the static gain in one realization,
+    7.6e-3 instead of 4.8e-3 (median). (ii) Distance of the static gain from the
+    identity, relative to the peak of the response, after averaging 40 PO-MOESP models
+    at all seven points, four seeds: median and worst 1.5e-3 and 5.1e-3 with the
+    default, 2.1e-3 and 6.7e-3 with independent bits of 5 ms on both joints, 4.4e-3
+    and 3.1e-2 with independent bits of 20 ms. Bits of 30 or 50 ms on joint 1, of 20 ms
+    on joint 2, or a window of 1 s, came out between these.
+
+    Examples
+    --------
+    >>> from lpvlearn.datasets import make_flexible_arm
+    >>> data = make_flexible_arm(
+    ...     n_operating_points=2, n_realizations=3, duration=0.2, sweep_duration=0.1,
+    ...     integration_step=1e-3, random_state=0)
+    >>> data.X.shape, data.y.shape, data.X_sweep.shape
+    ((1200, 5), (1200, 2), (100, 5))
+    >>> list(data.X.columns)
+    ['u1', 'u2', 'kappa', 'experiment', 'time']
+    """
+    for name, value in (
+        ("n_operating_points", n_operating_points),
+        ("n_realizations", n_realizations),
+    ):
+        if value != int(value) or value < 1:
+            raise ValueError(f"`{name}` must be an integer of at least 1. Got {value}.")
+    if np.isnan(snr_db):
+        raise ValueError("`snr_db` must be a number of decibels or infinity. Got nan.")
+    arm = FlexibleArm() if arm is None else arm
+    n_points = int(n_operating_points)
+    theta2 = np.pi * np.arange(1, n_points + 1) / (n_points + 1)
+    n_samples = _count("duration", duration, sampling_time)
+    n_sweep = _count("sweep_duration", sweep_duration, sampling_time)
+    clocks = _clock_samples("clock", clock, sampling_time)
+    sweep_clocks = _clock_samples("sweep_clock", sweep_clock, sampling_time)
+    if balance_time is not None and not balance_time > 0:
+        raise ValueError(
+            f"`balance_time` must be positive or None. Got {balance_time}."
+        )
+
+    input_rng, noise_rng, local_rng, sweep_rng = spawn_generators(random_state, 4)
+
+    def balance(samples: int) -> int | None:
+        if balance_time is None:
+            return None
+        return 2 * max(1, round(balance_time / sampling_time / samples / 2))
+
+    def local_reference(rng: Generator) -> FloatArray:
+        windows = (None, balance(clocks[1]))
+        return np.hstack(
+            [
+                prbs(
+                    n_samples,
+                    amplitude=amplitude,
+                    clock=samples,
+                    balance=window,
+                    random_state=rng,
+                )
+                for samples, window in zip(clocks, windows, strict=True)
+            ]
+        )
+
+    # All experiments are integrated together, shorter ones padded with rest.
+    references = np.zeros((2 * n_points + 1, max(n_samples, n_sweep), 2))
+    for i in range(n_points):
+        references[i, :n_samples] = local_reference(input_rng)
+        references[n_points + i, :n_samples] = local_reference(local_rng)
+    references[-1, :n_sweep] = np.hstack(
+        [
+            prbs(
+                n_sweep,
+                amplitude=sweep_amplitude,
+                clock=samples,
+                balance=balance(samples),
+                random_state=sweep_rng,
+            )
+            for samples in sweep_clocks
+        ]
+    )
+    references[-1, :n_sweep, 1] += (6 * np.pi / 8) / 3
+    response = arm.simulate(
+        references,
+        np.concatenate([theta2, theta2, [np.pi / 8]]),
+        sampling_time,
+        integration_step=integration_step,
+    )
+
+    def tables(
+        rows: slice, length: int, n_repeats: int = 1, snr: float = np.inf
+    ) -> tuple[pd.DataFrame, pd.DataFrame]:
+        part = ArmResponse(
+            *(a[rows, :length] for a in (response.y, response.q, response.qdot))
+        )
+        noise = measurement_noise(part.y, snr, n_repeats, noise_rng)
+        y = part.y[:, np.newaxis] + noise
+        X = _input_table(
+            references[rows, :length], part.kappa, n_repeats, sampling_time
+        )
+        return X, pd.DataFrame(y.reshape(-1, 2), columns=OUTPUTS)
+
+    X, y = tables(slice(0, n_points), n_samples, int(n_realizations), snr_db)
+    X_local, y_local = tables(slice(n_points, 2 * n_points), n_samples)
+    X_sweep, y_sweep = tables(slice(2 * n_points, None), n_sweep)
+    return Bunch(
+        X=X,
+        y=y,
+        X_local=X_local,
+        y_local=y_local,
+        X_sweep=X_sweep,
+        y_sweep=y_sweep,
+        **describe_arm(arm, theta2, sampling_time),
+        DESCR=DESCR.format(
+            n_points=n_points,
+            denominator=n_points + 1,
+            n_realizations=n_realizations,
+            snr_db=snr_db,
+            duration=duration,
+            sampling_time=sampling_time,
+        ),
+    )
+
+
+def describe_arm(
+    arm: FlexibleArm, theta2: FloatArray, sampling_time: float
+) -> dict[str, Any]:
+    """Entries of the Bunch that hold the truth about the arm."""
+    return {
+        "structure": arm.structure(),
+        "arm": arm,
+        "sampling_time": sampling_time,
+        "operating_points": np.cos(theta2),
+        "theta2": theta2,
+        "analytic_models": [arm.linearize(angle) for angle in theta2],
+    }
+
+
+def _input_table(
+    references: FloatArray, kappa: FloatArray, n_repeats: int, sampling_time: float
+) -> pd.DataFrame:
+    """One row a sample, the experiments below each other, each `n_repeats` times."""
+    n_experiments, n_samples = kappa.shape
+    n_labels = n_experiments * n_repeats
+    columns = [references[..., 0], references[..., 1], kappa]
+    table = {
+        name: np.repeat(column, n_repeats, axis=0).ravel()
+        for name, column in zip([*INPUTS, "kappa"], columns, strict=True)
+    }
+    table["experiment"] = np.repeat(np.arange(n_labels), n_samples)
+    table["time"] = np.tile(np.arange(n_samples) * sampling_time, n_labels)
+    return pd.DataFrame(table)
+
+
+def _count(name: str, duration: float, sampling_time: float) -> int:
+    """Number of samples in a duration."""
+    if not (np.isfinite(sampling_time) and sampling_time > 0):
+        raise ValueError(
+            f"`sampling_time` must be finite and positive. Got {sampling_time}."
+        )
+    if not (np.isfinite(duration) and duration >= sampling_time):
+        raise ValueError(
+            f"`{name}` must be finite and at least `sampling_time` "
+            f"({sampling_time} s). Got {duration}."
+        )
+    return round(duration / sampling_time)
+
+
+def _clock_samples(
+    name: str, clock: ArrayLike, sampling_time: float
+) -> tuple[int, int]:
+    """Bit times of both joints in samples."""
+    seconds = np.asarray(clock, dtype=float)
+    if seconds.shape not in ((), (2,)):
+        raise ValueError(
+            f"`{name}` must be one time in s or one a joint. Got {seconds}."
+        )
+    samples = np.broadcast_to(seconds / sampling_time, (2,))
+    rounded = np.round(samples)
+    if not np.all(np.isfinite(samples) & (rounded >= 1)) or not np.allclose(
+        samples, rounded, rtol=1e-6
+    ):
+        raise ValueError(
+            f"`{name}` must be a positive multiple of `sampling_time` "
+            f"({sampling_time} s). Got {seconds}."
+        )
+    return int(rounded[0]), int(rounded[1])

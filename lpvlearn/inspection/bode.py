@@ -1,0 +1,370 @@
+"""Bode diagrams of several models side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..models.statespace import StateSpace
+from .drawing import axes_grid, figure_legend, line_style, named, names_of, tidy
+from .frequency import check_frequencies, frequency_axis, response_up_to_nyquist
+from .models import models_of, unwrapped, with_others
+
+Array = NDArray[np.float64]
+
+Complex = NDArray[np.complex128]
+
+_RANGE = 140.0  # dB below the highest gain that are shown
+
+
+class BodeDisplay:
+    """Magnitude, and phase if wanted, of every transfer from input to output.
+
+    Make it with `from_models` or `from_estimator`; the constructor takes frequency
+    responses, also measured ones.
+
+    Parameters
+    ----------
+    omega : array-like of shape (n_freq,)
+        Angular frequencies, rad/s, increasing.
+    responses : dict from str to complex array of shape (n_freq, n_outputs, n_inputs)
+        NaN is not drawn.
+    std : dict from str to array of shape (n_freq, n_outputs, n_inputs), default=None
+        Standard deviations of the responses of some of the names, in any direction of
+        the complex plane. Complex ones, of real and of imaginary parts, as
+        `SubspaceLTI.frequency_response_std` has them, are drawn as their root mean
+        square.
+    output_names, input_names : sequence of str, default=None
+        None is y1, y2, ... and u1, u2, ...
+
+    Attributes
+    ----------
+    axes_ : ndarray of Axes of shape (n_outputs, n_inputs)
+        Axes of the magnitudes.
+    phase_axes_ : ndarray of Axes of shape (n_outputs, n_inputs), or None
+    figure_ : Figure
+    lines_ : dict from str to ndarray of Line2D of shape (n_outputs, n_inputs)
+        Lines of the magnitudes.
+    phase_lines_ : dict likewise, empty without phase
+
+    Examples
+    --------
+    >>> from lpvlearn import StateSpace
+    >>> from lpvlearn.inspection import BodeDisplay
+    >>> flexible = StateSpace([[0, 1], [-100, -1]], [[0], [100]], [[1, 0]])
+    >>> rigid = StateSpace([[-10.0]], [[10.0]], [[1.0]])
+    >>> display = BodeDisplay.from_models({"flexible": flexible, "rigid": rigid})
+    >>> display.axes_.shape
+    (1, 1)
+    """
+
+    def __init__(
+        self,
+        omega: ArrayLike,
+        responses: Mapping[str, ArrayLike],
+        *,
+        std: Mapping[str, ArrayLike] | None = None,
+        output_names: Sequence[Hashable] | None = None,
+        input_names: Sequence[Hashable] | None = None,
+    ) -> None:
+        self.omega = check_frequencies(omega)
+        self.responses = {
+            name: np.asarray(response, dtype=complex)
+            for name, response in named("responses", responses, "responses").items()
+        }
+        first = next(iter(self.responses.values())).shape
+        for name, response in self.responses.items():
+            if response.ndim != 3 or len(response) != len(self.omega):
+                raise ValueError(
+                    f"`responses[{name!r}]` must have shape ({len(self.omega)}, "
+                    f"n_outputs, n_inputs), a row for each frequency. Got "
+                    f"{response.shape}."
+                )
+            if response.shape != first:
+                raise ValueError(
+                    "all models must have the same inputs and outputs. Got "
+                    f"{first[1:]} and, for {name!r}, {response.shape[1:]} (outputs, "
+                    "inputs)."
+                )
+        self.std = self._check_std(std)
+        self.output_names = names_of("output_names", output_names, first[1], "y")
+        self.input_names = names_of("input_names", input_names, first[2], "u")
+
+    def _check_std(self, std: Mapping[str, ArrayLike] | None) -> dict[str, Array]:
+        found = {}
+        for name, value in (std or {}).items():
+            if name not in self.responses:
+                raise ValueError(
+                    f"`std` must be a dict with names among {list(self.responses)}. "
+                    f"Got {name!r}."
+                )
+            array = np.asarray(value)
+            if np.iscomplexobj(array):
+                array = np.abs(array) / np.sqrt(2.0)
+            array = array.astype(float)
+            shape = self.responses[name].shape
+            if array.shape != shape or not (array >= 0).all():
+                raise ValueError(
+                    f"`std[{name!r}]` must hold non-negative standard deviations, "
+                    f"shape {shape}, one for each frequency in `omega`. Got shape "
+                    f"{array.shape}."
+                )
+            found[name] = array
+        return found
+
+    @classmethod
+    def from_models(
+        cls,
+        models: Mapping[str, StateSpace],
+        *,
+        omega: ArrayLike | None = None,
+        std: Mapping[str, ArrayLike] | None = None,
+        output_names: Sequence[Hashable] | None = None,
+        input_names: Sequence[Hashable] | None = None,
+        phase: bool = False,
+        ax: Any = None,
+    ) -> BodeDisplay:
+        """Draw the responses of state-space models.
+
+        Parameters
+        ----------
+        models : dict from str to StateSpace
+            Models with the same inputs and outputs, in continuous or discrete time;
+            sampled ones are drawn up to their Nyquist frequency. The first is drawn
+            solid and black: the reference.
+        omega : array-like of shape (n_freq,), default=None
+            Angular frequencies, rad/s. None: from a decade below the slowest to a
+            decade above the fastest pole, denser around resonances.
+        std : dict from str to array, default=None
+            Standard deviations of the responses at `omega`, which is then needed;
+            as in the constructor.
+        output_names, input_names : sequence of str, default=None
+        phase : bool, default=False
+            Whether to draw the phases below the magnitudes.
+        ax : Axes or array of Axes, default=None
+
+        Returns
+        -------
+        BodeDisplay
+
+        Raises
+        ------
+        ValueError
+            If models differ in inputs or outputs, or shapes do not fit.
+        """
+        models = named("models", models, "StateSpace models")
+        for name, model in models.items():
+            if not isinstance(model, StateSpace):
+                raise ValueError(
+                    f"`models[{name!r}]` must be a StateSpace. Got "
+                    f"{type(model).__name__}; a fitted estimator holds one in `lti_`, "
+                    "an LPVStateSpace gives one by `at(kappa)`."
+                )
+        if std and omega is None:
+            raise ValueError(
+                "`omega` must be given with `std`, which belongs to frequencies. Got "
+                "None."
+            )
+        grid = (
+            frequency_axis(list(models.values()))
+            if omega is None
+            else check_frequencies(omega)
+        )
+        responses = {
+            name: response_up_to_nyquist(model, grid) for name, model in models.items()
+        }
+        display = cls(
+            grid,
+            responses,
+            std=std,
+            output_names=output_names,
+            input_names=input_names,
+        )
+        return display.plot(ax, phase=phase)
+
+    @classmethod
+    def from_estimator(
+        cls,
+        estimator: Any,
+        *,
+        kappa: float | ArrayLike | None = None,
+        others: Mapping[str, StateSpace] | None = None,
+        omega: ArrayLike | None = None,
+        uncertainty: bool = False,
+        phase: bool = False,
+        ax: Any = None,
+    ) -> BodeDisplay:
+        """Draw what an estimator has identified.
+
+        Parameters
+        ----------
+        estimator : fitted estimator
+            `SubspaceLTI` and `GrayBoxRestructurer` show their model. The pipeline
+            shows the local (black-box) and the gray-box model of the operating point
+            nearest to `kappa`, and the interpolated model there.
+        kappa : float or array-like of shape (n_scheduling,), default=None
+            Scheduling value; needed by the pipeline.
+        others : dict from str to StateSpace, default=None
+            Models to compare with, drawn first: the truth, an analytic model.
+        omega : array-like of shape (n_freq,), default=None
+        uncertainty : bool, default=False
+            Whether to draw the band of two standard deviations, which `SubspaceLTI`
+            knows of its model.
+        phase : bool, default=False
+        ax : Axes or array of Axes, default=None
+
+        Returns
+        -------
+        BodeDisplay
+
+        Raises
+        ------
+        ValueError
+            If the estimator holds no state-space model, the pipeline is not told
+            `kappa`, or the uncertainty is not known.
+        """
+        own = models_of(estimator, kappa)
+        both = with_others(own, others or {})
+        models = {name: both[name] for name in [*(others or {}), *both]}
+        std = None
+        if uncertainty:
+            owner = unwrapped(estimator)
+            if not hasattr(owner, "frequency_response_std"):
+                raise ValueError(
+                    "`uncertainty` must be False for an estimator that does not know "
+                    f"it, as SubspaceLTI does. Got True with {type(owner).__name__}; "
+                    "BodeDisplay.from_models takes standard deviations as `std`."
+                )
+            omega = frequency_axis(list(models.values())) if omega is None else omega
+            std = {name: owner.frequency_response_std(omega) for name in own}
+        return cls.from_models(models, omega=omega, std=std, phase=phase, ax=ax)
+
+    def plot(
+        self, ax: Any = None, *, phase: bool = False, n_std: float = 2.0
+    ) -> BodeDisplay:
+        """Draw the diagram.
+
+        Parameters
+        ----------
+        ax : Axes or array of Axes, default=None
+            None makes a figure. Of an array, rows are outputs (with phases, magnitude
+            and phase in turn), columns are inputs.
+        phase : bool, default=False
+        n_std : float, default=2.0
+            Half-width of the bands, in standard deviations.
+
+        Returns
+        -------
+        BodeDisplay
+        """
+        n_outputs, n_inputs = len(self.output_names), len(self.input_names)
+        kinds = 2 if phase else 1
+        self.figure_, axes = axes_grid(
+            ax,
+            kinds * n_outputs,
+            n_inputs,
+            height=0.9 + n_outputs * (2.1 + 1.3 * phase) + 0.5 * (n_outputs == 1),
+            sharex=True,
+            sharey="row",
+            height_ratios=[1.6, 1.0] * n_outputs if phase else None,
+        )
+        self.axes_ = axes[::kinds]
+        self.phase_axes_ = axes[1::2] if phase else None
+        self.lines_ = self._draw(self.axes_, magnitude, n_std)
+        self.phase_lines_: dict[str, Any] = {}
+        if self.phase_axes_ is not None:
+            self.phase_lines_ = self._draw(self.phase_axes_, aligned_phases, n_std)
+        self._dress(axes)
+        handles = [lines[0, 0] for lines in self.lines_.values()]
+        self.figure_.align_ylabels(axes[:, 0])
+        figure_legend(self.figure_, axes[0, 0], handles, own=ax is None)
+        return self
+
+    def _draw(self, axes: Any, curves: Any, n_std: float) -> dict[str, Any]:
+        lines = {name: np.empty(axes.shape, dtype=object) for name in self.responses}
+        for i, j in np.ndindex(*axes.shape):
+            entries = {name: G[:, i, j] for name, G in self.responses.items()}
+            spread = {name: n_std * s[:, i, j] for name, s in self.std.items()}
+            drawn = curves(entries, spread)
+            for k, (name, (middle, low, high)) in enumerate(drawn.items()):
+                style = line_style(k, len(self.omega))
+                (lines[name][i, j],) = axes[i, j].plot(
+                    self.omega, middle, label=name, **style
+                )
+                if name in spread:
+                    axes[i, j].fill_between(
+                        self.omega, low, high, color=style["color"], alpha=0.2, lw=0
+                    )
+        return lines
+
+    def _dress(self, axes: Any) -> None:
+        from matplotlib.ticker import MultipleLocator
+
+        for ax in axes.flat:
+            ax.set_xscale("log")
+            ax.set_xlim(self.omega[0], self.omega[-1])
+            tidy(ax)
+        for j, name in enumerate(self.input_names):
+            if len(self.input_names) > 1:
+                axes[0, j].set_title(f"from {name}", fontsize=9)
+            axes[-1, j].set_xlabel("Frequency (rad/s)")
+        for i, name in enumerate(self.output_names):
+            several = len(self.output_names) > 1 or len(self.input_names) > 1
+            prefix = f"to {name}\n" if several else ""
+            self.axes_[i, 0].set_ylabel(f"{prefix}Magnitude (dB)")
+            top = max(ax.dataLim.y1 for ax in self.axes_[i])
+            low = min(ax.dataLim.y0 for ax in self.axes_[i])
+            if top - low > _RANGE:
+                self.axes_[i, 0].set_ylim(top - _RANGE, top + 0.05 * _RANGE)
+            if self.phase_axes_ is not None:
+                row = self.phase_axes_[i]
+                row[0].set_ylabel("Phase (deg)")
+                span = np.ptp([(a.dataLim.y0, a.dataLim.y1) for a in row])
+                step = next((s for s in (45, 90, 180, 360) if span <= 5 * s), 720)
+                row[0].yaxis.set_major_locator(MultipleLocator(step))
+
+
+def magnitude(
+    entries: Mapping[str, Complex], spread: Mapping[str, Array]
+) -> dict[str, tuple[Array, Array, Array]]:
+    """Magnitudes in dB with their bands, by name; NaN where a gain is zero."""
+    found = {}
+    for name, G in entries.items():
+        size, width = np.abs(G), spread.get(name, 0.0)
+        # A band that reaches down to zero ends far below the picture.
+        low = np.maximum(size - width, 1e-3 * size)
+        found[name] = (decibels(size), decibels(low), decibels(size + width))
+    return found
+
+
+def decibels(size: Array) -> Array:
+    """``20 log10`` of gains; NaN for zero."""
+    return 20.0 * np.log10(np.where(size > 0, size, np.nan))
+
+
+def aligned_phases(
+    entries: Mapping[str, Complex], spread: Mapping[str, Array]
+) -> dict[str, tuple[Array, Array, Array]]:
+    """Unwrapped phases in degrees with their bands, by name.
+
+    A phase is known up to full turns: those of the first name are taken as they
+    come, the others turned next to it.
+    """
+    found: dict[str, tuple[Array, Array, Array]] = {}
+    reference: Array | None = None
+    for name, G in entries.items():
+        seen = np.isfinite(G) & (G != 0)
+        phase = np.full(len(G), np.nan)
+        phase[seen] = np.rad2deg(np.unwrap(np.angle(G[seen])))
+        if reference is None:
+            reference = phase
+        both = np.isfinite(phase) & np.isfinite(reference)
+        if both.any():
+            phase += 360.0 * np.round(np.median((reference - phase)[both]) / 360.0)
+        ratio = spread.get(name, 0.0) / np.where(seen, np.abs(G), np.nan)
+        width = np.rad2deg(np.arcsin(np.minimum(ratio, 1.0)))
+        found[name] = (phase, phase - width, phase + width)
+    return found

@@ -1,0 +1,186 @@
+"""What all pictures share: styles of lines, axes, grids, legends, units."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+WIDTH = 8.0  # inches: 800 pixels at matplotlib's 100 dots per inch
+
+LABEL_SIZE = 9.0
+
+TEXT_SIZE = 8.5
+
+INK, MUTED, ACCENT = "#000000", "#767676", "#D55E00"
+
+# The palette of Okabe and Ito, told apart with any colour vision; dashes and markers
+# tell the lines apart without colour too.
+_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": INK, "linestyle": "-", "linewidth": 1.5},
+    {"color": ACCENT, "linestyle": (0, (4, 1.6)), "linewidth": 1.6},
+    {"color": "#0072B2", "linestyle": "-", "linewidth": 1.1, "marker": "o"},
+    {"color": "#009E73", "linestyle": (0, (6, 1.5, 1.2, 1.5)), "linewidth": 1.5},
+    {"color": "#CC79A7", "linestyle": (0, (1.2, 1.2)), "linewidth": 1.8},
+    {"color": "#E69F00", "linestyle": "-", "linewidth": 1.1, "marker": "s"},
+    {"color": "#56B4E9", "linestyle": (0, (4, 1.6)), "linewidth": 1.1, "marker": "^"},
+)
+
+_POINTS: tuple[dict[str, Any], ...] = (
+    {"color": ACCENT, "marker": "o", "markersize": 4.5},
+    {"color": INK, "marker": "s", "markersize": 6.5, "markerfacecolor": "none"},
+    {"color": "#0072B2", "marker": "^", "markersize": 6.0, "markerfacecolor": "none"},
+    {"color": "#009E73", "marker": "x", "markersize": 5.5},
+    {"color": "#CC79A7", "marker": "D", "markersize": 5.0, "markerfacecolor": "none"},
+)
+
+
+def line_style(k: int, n_points: int = 0) -> dict[str, Any]:
+    """Keywords of the k-th line; markers, where it has them, stand about 20 times."""
+    style = dict(_STYLES[k % len(_STYLES)])
+    if "marker" in style:
+        step = max(1, n_points // 20)
+        # Lines with markers do not put them at the same places.
+        style |= {
+            "markersize": 4.0,
+            "markerfacecolor": "white",
+            "markevery": (k * step // len(_STYLES), step),
+        }
+    return style
+
+
+def point_style(k: int) -> dict[str, Any]:
+    """Keywords of the k-th set of points: filled or hollow, of different shapes."""
+    return dict(_POINTS[k % len(_POINTS)]) | {"linestyle": "none"}
+
+
+def axes_grid(
+    ax: Any,
+    n_rows: int,
+    n_columns: int,
+    *,
+    height: float,
+    sharex: bool | str = False,
+    sharey: bool | str = False,
+    height_ratios: Sequence[float] | None = None,
+) -> tuple[Any, Any]:
+    """A figure and an array of axes of shape (n_rows, n_columns) to draw in.
+
+    Parameters
+    ----------
+    ax : None, Axes or array of Axes
+        None makes a figure; a single Axes is divided where more than one is needed.
+    n_rows, n_columns : int
+    height : float
+        Of a new figure, in inches.
+    sharex, sharey : bool or {"row", "col", "all"}, default=False
+    height_ratios : sequence of float, default=None
+
+    Raises
+    ------
+    ValueError
+        If `ax` holds another number of axes.
+    """
+    from matplotlib import pyplot as plt
+    from matplotlib.axes import Axes
+
+    share: dict[str, Any] = {"sharex": sharex, "sharey": sharey, "squeeze": False}
+    n_axes = n_rows * n_columns
+    if ax is None:
+        return plt.subplots(
+            n_rows,
+            n_columns,
+            figsize=(WIDTH, height),
+            layout="constrained",
+            height_ratios=height_ratios,
+            **share,
+        )
+    if isinstance(ax, Axes) and n_axes > 1 and ax.get_subplotspec() is not None:
+        ax.set_axis_off()
+        spec: Any = ax.get_subplotspec()
+        cells = spec.subgridspec(n_rows, n_columns, height_ratios=height_ratios)
+        return ax.figure, cells.subplots(**share)
+    axes = np.atleast_1d(np.asarray(ax, dtype=object))
+    if axes.size != n_axes:
+        raise ValueError(
+            f"`ax` must be None, one subplot or an array of {n_axes} Axes "
+            f"({n_rows} x {n_columns}). Got {axes.size}."
+        )
+    return axes.flat[0].figure, axes.reshape(n_rows, n_columns)
+
+
+def tidy(ax: Any) -> None:
+    """A light grid below the data, no box, small tick labels."""
+    ax.grid(True, which="major", color="0.9", linewidth=0.7)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color("0.5")
+    ax.tick_params(which="both", labelsize=TEXT_SIZE, color="0.5")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.get_offset_text().set_fontsize(TEXT_SIZE)
+        axis.label.set_fontsize(LABEL_SIZE)
+
+
+def legend_above(
+    ax: Any, handles: Sequence[Any], *, n_columns: int = 3, title: str | None = None
+) -> Any:
+    """A legend in a row above the axes, where it hides no data."""
+    return ax.legend(
+        handles=list(handles),
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=min(n_columns, len(handles)),
+        title=title,
+        alignment="left",
+        frameon=False,
+        borderaxespad=0.1,
+        handlelength=2.6,
+        columnspacing=1.6,
+        fontsize=TEXT_SIZE,
+        title_fontsize=TEXT_SIZE,
+    )
+
+
+def figure_legend(figure: Any, ax: Any, handles: Sequence[Any], own: bool) -> Any:
+    """One legend for several axes: above the figure if it is ours, else within `ax`."""
+    if not own:
+        legend = ax.legend(handles=list(handles), fontsize=8, framealpha=0.8)
+        # A legend wider than its panel would squeeze the panels.
+        legend.set_in_layout(False)
+        return legend
+    return figure.legend(
+        handles=list(handles),
+        loc="outside upper left",
+        ncols=min(4, len(handles)),
+        frameon=False,
+        handlelength=3.0,
+        fontsize=TEXT_SIZE,
+    )
+
+
+def named(argument: str, values: Any, what: str) -> dict[str, Any]:
+    """`values` as a dict from names to things to draw, or a ValueError."""
+    if not isinstance(values, Mapping) or len(values) == 0:
+        got = "an empty dict" if isinstance(values, Mapping) else type(values).__name__
+        raise ValueError(
+            f"`{argument}` must be a dict from names to {what}, with at least one "
+            f"entry, for instance {{'estimated': ...}}. Got {got}."
+        )
+    return {str(name): value for name, value in values.items()}
+
+
+def with_unit(name: Hashable, unit: str | None) -> str:
+    """A quantity's label with its unit in parentheses."""
+    return f"{name} ({unit})" if unit else str(name)
+
+
+def names_of(
+    argument: str, names: Sequence[Hashable] | None, n: int, letter: str
+) -> list[str]:
+    """Given names, else the letter with numbers from 1."""
+    if names is None:
+        return [f"{letter}{k + 1}" for k in range(n)]
+    if isinstance(names, str) or len(names) != n:
+        raise ValueError(f"`{argument}` must hold {n} names. Got {names!r}.")
+    return [str(name) for name in names]

@@ -1,0 +1,354 @@
+"""The error of a restructured model over frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..models.statespace import StateSpace
+from .drawing import ACCENT, INK, MUTED, axes_grid, legend_above, tidy
+from .frequency import (
+    check_frequencies,
+    frequency_axis,
+    nyquist_frequency,
+    response_up_to_nyquist,
+)
+
+Array = NDArray[np.float64]
+
+
+class ErrorDisplay:
+    r"""Largest singular value of the error :math:`G - \mathfrak{G}` over frequency.
+
+    Its maximum is the H-infinity norm that the restructuring minimises, Eq. (6). At an
+    optimum several peaks are equally high: the active ones. Make it with
+    `from_estimator` or `from_models`.
+
+    Parameters
+    ----------
+    omega : array-like of shape (n_freq,)
+        Angular frequencies, rad/s.
+    error : array-like of shape (n_freq,)
+        Largest singular value of the error.
+    start : array-like of shape (n_freq,), default=None
+        The same before the minimisation.
+    active_frequencies, active_values : array-like of shape (n_active,), default=None
+        The peaks that support the optimum. A frequency of 0 or infinity is drawn at
+        the end of the axis, as an arrow head.
+    floor : float, default=0.0
+        Part of the error that no parameter changes; 0 is not drawn.
+    norms : dict from str to float, default=None
+        H-infinity norms of "error" and "start" for the legend.
+
+    Attributes
+    ----------
+    ax_ : Axes
+    axes_ : ndarray of Axes of shape (1,)
+    figure_ : Figure
+    lines_ : dict from str to Line2D
+        "error", and those drawn of "start" and "floor".
+    active_points_ : list of Line2D
+
+    Examples
+    --------
+    >>> from lpvlearn import StateSpace
+    >>> from lpvlearn.inspection import ErrorDisplay
+    >>> slow = StateSpace([[-1.0]], [[1.0]], [[1.0]])
+    >>> fast = StateSpace([[-2.0]], [[2.0]], [[1.0]])
+    >>> display = ErrorDisplay.from_models(slow, fast)
+    >>> float(display.error.max().round(2))
+    0.33
+    """
+
+    def __init__(
+        self,
+        omega: ArrayLike,
+        error: ArrayLike,
+        *,
+        start: ArrayLike | None = None,
+        active_frequencies: ArrayLike | None = None,
+        active_values: ArrayLike | None = None,
+        floor: float = 0.0,
+        norms: Mapping[str, float] | None = None,
+    ) -> None:
+        self.omega = check_frequencies(omega)
+        self.error = self._curve("error", error)
+        self.start = None if start is None else self._curve("start", start)
+        self.active_frequencies = _vector(active_frequencies)
+        self.active_values = _vector(active_values)
+        if self.active_values.shape != self.active_frequencies.shape:
+            raise ValueError(
+                "`active_values` must hold a value for each of "
+                f"{len(self.active_frequencies)} `active_frequencies`. Got "
+                f"{len(self.active_values)}."
+            )
+        if not np.isfinite(floor) or floor < 0:
+            raise ValueError(
+                f"`floor` must be a finite number of at least 0. Got {floor}."
+            )
+        self.floor = float(floor)
+        self.norms = dict(norms or {})
+
+    def _curve(self, name: str, values: ArrayLike) -> Array:
+        curve = np.asarray(values, dtype=float)
+        if curve.shape != self.omega.shape:
+            raise ValueError(
+                f"`{name}` must have shape {self.omega.shape}, a value for each "
+                f"frequency in `omega`. Got {curve.shape}."
+            )
+        return curve
+
+    @classmethod
+    def from_models(
+        cls,
+        gray_box: StateSpace,
+        black_box: StateSpace,
+        *,
+        start: StateSpace | None = None,
+        active_frequencies: ArrayLike | None = None,
+        floor: float = 0.0,
+        omega: ArrayLike | None = None,
+        ax: Any = None,
+    ) -> ErrorDisplay:
+        """Draw the error between two models.
+
+        Parameters
+        ----------
+        gray_box, black_box : StateSpace
+            With the same inputs, outputs and sampling time.
+        start : StateSpace, default=None
+            The gray-box model before the minimisation.
+        active_frequencies : array-like of shape (n_active,), default=None
+            Frequencies (rad/s) to mark; may hold 0 and infinity.
+        floor : float, default=0.0
+            Part of the error that no parameter changes.
+        omega : array-like of shape (n_freq,), default=None
+            None: around the poles of the models.
+        ax : Axes, default=None
+
+        Returns
+        -------
+        ErrorDisplay
+
+        Raises
+        ------
+        ValueError
+            If the models do not fit together.
+        """
+        for name, model in (("gray_box", gray_box), ("black_box", black_box)):
+            if not isinstance(model, StateSpace):
+                raise ValueError(
+                    f"`{name}` must be a StateSpace. Got {type(model).__name__}."
+                )
+        difference = gray_box - black_box
+        active = _vector(active_frequencies)
+        marked = np.minimum(active, nyquist_frequency(difference))
+        if omega is None:
+            grid = frequency_axis([gray_box, black_box])
+            inside = (marked > grid[0]) & (marked < grid[-1])
+            grid = np.unique(np.concatenate([grid, marked[inside]]))
+        else:
+            grid = check_frequencies(omega)
+        before = None if start is None else start - black_box
+        norms = {"error": difference.hinf_norm()}
+        if before is not None:
+            norms["start"] = before.hinf_norm()
+        display = cls(
+            grid,
+            _sigma(difference, grid),
+            start=None if before is None else _sigma(before, grid),
+            active_frequencies=active,
+            active_values=_sigma(difference, marked),
+            floor=floor,
+            norms=norms,
+        )
+        return display.plot(ax)
+
+    @classmethod
+    def from_estimator(
+        cls,
+        restructurer: Any,
+        model: StateSpace,
+        *,
+        start: StateSpace | ArrayLike | str | None = "auto",
+        omega: ArrayLike | None = None,
+        ax: Any = None,
+    ) -> ErrorDisplay:
+        """Draw the error of a fitted restructurer.
+
+        Parameters
+        ----------
+        restructurer : fitted GrayBoxRestructurer
+        model : StateSpace
+            The black box that it was fitted to.
+        start : "auto", StateSpace, array-like of shape (n_params,) or None
+            The gray-box model, or its parameters, to compare with. "auto" (default):
+            the least-squares fit that the minimisation began with, where the
+            restructurer tells it.
+        omega : array-like of shape (n_freq,), default=None
+            None: around the poles of the models.
+        ax : Axes, default=None
+
+        Returns
+        -------
+        ErrorDisplay
+
+        Raises
+        ------
+        ValueError
+            If the restructurer is not fitted, or `model` does not fit it.
+
+        Notes
+        -----
+        A feedthrough that the structure lacks is left out of the black box, as in the
+        fit.
+        """
+        if not hasattr(restructurer, "lti_") or not hasattr(restructurer, "structure_"):
+            raise ValueError(
+                "`restructurer` must be a fitted GrayBoxRestructurer. Got "
+                f"{type(restructurer).__name__} without `lti_`; call fit_model() "
+                "first. A fitted pipeline holds its own in `restructurers_`."
+            )
+        gray_box = restructurer.lti_
+        if not isinstance(model, StateSpace):
+            raise ValueError(
+                f"`model` must be a StateSpace. Got {type(model).__name__}."
+            )
+        dropped = restructurer.dropped_feedthrough_
+        if dropped.shape != model.D.shape:
+            raise ValueError(
+                "`model` must be the black box of the fit, with "
+                f"{dropped.shape[0]} outputs and {dropped.shape[1]} inputs. Got "
+                f"{model}."
+            )
+        compared = StateSpace(
+            model.A, model.B, model.C, model.D - dropped, model.sampling_time
+        )
+        if isinstance(start, str):
+            if start != "auto":
+                raise ValueError(
+                    "`start` must be 'auto', a StateSpace, parameters or None. Got "
+                    f"{start!r}."
+                )
+            start = getattr(restructurer, "start_params_", None)
+        if start is None or isinstance(start, StateSpace):
+            before = start
+        else:
+            before = restructurer.structure_.model(start, model.sampling_time)
+        return cls.from_models(
+            gray_box,
+            compared,
+            start=before,
+            active_frequencies=restructurer.active_frequencies_,
+            floor=restructurer.structural_floor_,
+            omega=omega,
+            ax=ax,
+        )
+
+    def plot(self, ax: Any = None) -> ErrorDisplay:
+        """Draw the error.
+
+        Parameters
+        ----------
+        ax : Axes, default=None
+            None makes a figure.
+
+        Returns
+        -------
+        ErrorDisplay
+        """
+        self.figure_, axes = axes_grid(ax, 1, 1, height=3.6)
+        self.axes_ = axes.ravel()
+        self.ax_ = one = self.axes_[0]
+        self.lines_: dict[str, Any] = {}
+        (self.lines_["error"],) = one.loglog(
+            self.omega,
+            _positive(self.error),
+            color=INK,
+            linewidth=1.6,
+            zorder=2.5,
+            label=self._label("error"),
+        )
+        if self.start is not None:
+            (self.lines_["start"],) = one.loglog(
+                self.omega,
+                _positive(self.start),
+                color=MUTED,
+                linewidth=1.1,
+                linestyle=(0, (6, 1.5, 1.2, 1.5)),
+                label=self._label("start"),
+            )
+        if self.floor > 0:
+            self.lines_["floor"] = one.axhline(
+                self.floor,
+                color="#0072B2",
+                linewidth=1.2,
+                linestyle="--",
+                label=f"structural floor {self.floor:.3g}",
+            )
+        self._mark_active(one)
+        one.set_xlim(self.omega[0], self.omega[-1])
+        self._limit(one)
+        tidy(one)
+        one.set_xlabel("Frequency (rad/s)")
+        one.set_ylabel("Largest singular value of the error")
+        handles = [*self.lines_.values(), *self.active_points_[:1]]
+        legend_above(one, handles, n_columns=4 if len(handles) < 4 else 2)
+        return self
+
+    def _label(self, name: str) -> str:
+        if name not in self.norms:
+            return name
+        return f"{name}, H∞ norm {self.norms[name]:.3g}"
+
+    def _mark_active(self, ax: Any) -> None:
+        """Peaks as dots; beyond the ends of the axis, arrow heads that point there."""
+        low, high = self.omega[[0, -1]]
+        label = "active peak" + ("s" if len(self.active_values) > 1 else "")
+        self.active_points_ = []
+        for frequency, value in zip(
+            self.active_frequencies, self.active_values, strict=True
+        ):
+            marker = "<" if frequency < low else ">" if frequency > high else "o"
+            (point,) = ax.plot(
+                np.clip(frequency, low, high),
+                value,
+                color=ACCENT,
+                marker=marker,
+                markersize=7,
+                linestyle="none",
+                clip_on=False,
+                zorder=4,
+                label=label,
+            )
+            self.active_points_.append(point)
+
+    def _limit(self, ax: Any) -> None:
+        """No more than six decades: below them there is nothing to see."""
+        curves = [c for c in (self.error, self.start) if c is not None]
+        top = max(c.max() for c in curves)
+        low = min(c[c > 0].min(initial=np.inf) for c in curves)
+        if np.isfinite(low) and low < 1e-6 * top:
+            ax.set_ylim(1e-6 * top, 2.0 * top)
+
+
+def _sigma(model: StateSpace, omega: Array) -> Array:
+    """Largest singular values of a response; NaN above the Nyquist frequency."""
+    if omega.size == 0:
+        return np.zeros(0)
+    response = response_up_to_nyquist(model, omega)
+    values = np.full(len(omega), np.nan)
+    seen = np.isfinite(response).all((1, 2))
+    values[seen] = np.linalg.norm(response[seen], 2, axis=(1, 2))
+    return values
+
+
+def _positive(values: Array) -> Array:
+    return np.where(values > 0, values, np.nan)
+
+
+def _vector(values: ArrayLike | None) -> Array:
+    return np.zeros(0) if values is None else np.asarray(values, float).reshape(-1)

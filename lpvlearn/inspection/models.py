@@ -1,0 +1,83 @@
+"""The models that a fitted estimator holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..models.statespace import StateSpace
+
+
+def unwrapped(estimator: Any) -> Any:
+    """The best estimator of a fitted search, else the estimator itself."""
+    return getattr(estimator, "best_estimator_", estimator)
+
+
+def models_of(
+    estimator: Any, kappa: float | ArrayLike | None = None
+) -> dict[str, StateSpace]:
+    """State-space models of a fitted estimator, by name.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or the scheduling value is missing.
+    """
+    estimator = unwrapped(estimator)
+    if hasattr(estimator, "lti_"):
+        return {type(estimator).__name__: estimator.lti_}
+    if not hasattr(estimator, "lpv_"):
+        raise ValueError(
+            "`estimator` must be a fitted SubspaceLTI, GrayBoxRestructurer or "
+            f"LocalLPVPipeline. Got {type(estimator).__name__} without `lti_` or "
+            "`lpv_`; call fit() first."
+        )
+    points = estimator.operating_points_
+    if kappa is None:
+        shown = ", ".join(np.array2string(k, precision=4) for k in points)
+        raise ValueError(
+            "`kappa` must tell at which scheduling value to draw the pipeline's "
+            f"models. Got None; its operating points are {shown}."
+        )
+    place = np.reshape(np.asarray(kappa, dtype=float), -1)
+    if place.shape != points.shape[1:]:
+        raise ValueError(
+            f"`kappa` must hold {points.shape[1]} scheduling value(s). Got {kappa!r}."
+        )
+    nearest = int(np.argmin(np.linalg.norm(points - place, axis=1)))
+    found = {"local": estimator.local_models_[nearest]}
+    if estimator.restructurers_:
+        found["gray-box"] = estimator.structured_models_[nearest]
+    return found | {"interpolated": estimator.lpv_.at(place)}
+
+
+def with_others(own: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """An estimator's things and further ones to compare with, by name."""
+    for name in others:
+        if name in own:
+            raise ValueError(
+                f"`others` must not use the estimator's own names, {', '.join(own)}. "
+                f"Got {name!r}."
+            )
+    return {**own, **others}
+
+
+def check_one_scheduling(n_scheduling: int, what: str) -> None:
+    """A ValueError that teaches, unless there is one scheduling variable."""
+    if n_scheduling != 1:
+        raise ValueError(
+            f"{what} needs one scheduling variable as its axis. Got {n_scheduling}. "
+            "Fix all but one: draw the frozen models of a line through the scheduling "
+            "space with BodeDisplay.from_models."
+        )
+
+
+def scheduling_name(estimator: Any) -> str:
+    """The name of a pipeline's only scheduling column, else kappa."""
+    name = getattr(estimator, "scheduling", None)
+    if isinstance(name, (list, tuple)) and len(name) == 1:
+        name = name[0]
+    return name if isinstance(name, str) and name != "kappa" else "κ"

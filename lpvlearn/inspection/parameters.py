@@ -1,0 +1,312 @@
+"""Parameters of local models over the scheduling variable."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import clone
+
+from .drawing import axes_grid, figure_legend, named, names_of, point_style, tidy
+from .models import check_one_scheduling, scheduling_name, unwrapped, with_others
+
+Array = NDArray[np.float64]
+
+_N_CURVE = 200  # points of a curve
+
+_CONSTANT = 1e-6  # a parameter that varies less, relative to its size, is drawn flat
+
+
+class ParameterDisplay:
+    """Small multiples: each parameter over the scheduling variable.
+
+    Points are local models, lines the interpolation through them. Make it with
+    `from_estimator` or `from_parameters`.
+
+    Parameters
+    ----------
+    kappa : array-like of shape (n_points,)
+        Scheduling values of the operating points.
+    parameters : dict from str to array-like of shape (n_points, n_params)
+        Sets of parameters, by name.
+    names : sequence of str, default=None
+        Names of the parameters. None is the columns of a DataFrame, else p1, p2, ...
+        The names of columns may be fewer than these: a selection.
+    interpolators : dict from str to fitted regressor, default=None
+        Curves for some of the sets: regressors that predict all parameters from
+        scheduling values of shape (n, 1).
+    scheduling_label : str, default="κ"
+        Label of the horizontal axes.
+
+    Attributes
+    ----------
+    axes_ : ndarray of Axes of shape (n_params,)
+    figure_ : Figure
+    lines_ : dict from str to list of Line2D
+        Points of each set, one entry a parameter.
+    curves_ : dict from str to list of Line2D
+        Curves of each set that has an interpolator.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lpvlearn import PolynomialLPV
+    >>> from lpvlearn.inspection import ParameterDisplay
+    >>> kappa = np.linspace(-1, 1, 5)
+    >>> theta = np.column_stack([kappa, 1 - kappa**2])
+    >>> display = ParameterDisplay.from_parameters(
+    ...     kappa, {"local": theta}, interpolator=PolynomialLPV(degree=2))
+    >>> [ax.get_title() for ax in display.axes_]
+    ['p1', 'p2']
+    """
+
+    def __init__(
+        self,
+        kappa: ArrayLike,
+        parameters: Mapping[str, ArrayLike],
+        *,
+        names: Sequence[Hashable] | None = None,
+        interpolators: Mapping[str, Any] | None = None,
+        scheduling_label: str = "κ",
+    ) -> None:
+        points = np.asarray(kappa, dtype=float)
+        if points.ndim == 2:
+            check_one_scheduling(points.shape[1], "ParameterDisplay")
+            points = points[:, 0]
+        self.kappa = points
+        sets = named("parameters", parameters, "tables of parameters")
+        self.all_names, self.chosen = _names_and_choice(sets, names)
+        self.parameters = {}
+        shape = (len(points), len(self.all_names))
+        for name, table in sets.items():
+            if hasattr(table, "columns"):
+                table = _in_order(name, table, self.all_names)
+            values = np.asarray(table, dtype=float)
+            if values.shape != shape:
+                raise ValueError(
+                    f"`parameters[{name!r}]` must have shape {shape}: a row for each "
+                    "scheduling value in `kappa`, a column for each parameter. Got "
+                    f"{values.shape}."
+                )
+            self.parameters[name] = values
+        self.interpolators = dict(interpolators or {})
+        self.scheduling_label = scheduling_label
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the parameters that are drawn."""
+        return [self.all_names[k] for k in self.chosen]
+
+    @classmethod
+    def from_parameters(
+        cls,
+        kappa: ArrayLike,
+        parameters: Mapping[str, ArrayLike],
+        *,
+        names: Sequence[Hashable] | None = None,
+        interpolator: Any = None,
+        scheduling_label: str = "κ",
+        n_columns: int = 4,
+        ax: Any = None,
+    ) -> ParameterDisplay:
+        """Draw sets of parameters, and a fitted curve through each.
+
+        Parameters
+        ----------
+        kappa : array-like of shape (n_points,) or (n_points, 1)
+        parameters : dict from str to array-like of shape (n_points, n_params)
+            DataFrames bring the names of the parameters.
+        names : sequence of str, default=None
+            Names of the columns of arrays; a selection of columns of DataFrames.
+        interpolator : regressor, default=None
+            Fitted (a clone) to each set for its curve. None draws points only.
+        scheduling_label : str, default="κ"
+        n_columns : int, default=4
+        ax : Axes or array of Axes, default=None
+
+        Returns
+        -------
+        ParameterDisplay
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, or there are several scheduling variables.
+        """
+        display = cls(kappa, parameters, names=names, scheduling_label=scheduling_label)
+        if interpolator is not None:
+            X = display.kappa[:, None]
+            display.interpolators = {
+                name: clone(interpolator).fit(X, theta)
+                for name, theta in display.parameters.items()
+            }
+        return display.plot(ax, n_columns=n_columns)
+
+    @classmethod
+    def from_estimator(
+        cls,
+        pipeline: Any,
+        *,
+        others: Mapping[str, ArrayLike] | None = None,
+        names: Sequence[Hashable] | None = None,
+        name: str | None = None,
+        scheduling_label: str | None = None,
+        n_columns: int = 4,
+        ax: Any = None,
+    ) -> ParameterDisplay:
+        """Draw a pipeline's local parameters and their interpolation.
+
+        Parameters
+        ----------
+        pipeline : fitted LocalLPVPipeline
+            With one scheduling variable.
+        others : dict from str to array-like of shape (n_points, n_params), default=None
+            Parameters at the same operating points to compare with, drawn as points:
+            the truth, an analytic model.
+        names : sequence of str, default=None
+            Parameters to draw; None is all.
+        name : str, default=None
+            Of the pipeline's parameters in the legend. None is "restructured", or
+            "balanced" without a restructurer.
+        scheduling_label : str, default=None
+            None is the name of the scheduling column.
+        n_columns : int, default=4
+        ax : Axes or array of Axes, default=None
+
+        Returns
+        -------
+        ParameterDisplay
+
+        Raises
+        ------
+        ValueError
+            If the pipeline is not fitted or has several scheduling variables, or
+            `others` has other shapes.
+        """
+        pipeline = unwrapped(pipeline)
+        if not hasattr(pipeline, "parameters_"):
+            raise ValueError(
+                "`pipeline` must be a fitted LocalLPVPipeline. Got "
+                f"{type(pipeline).__name__} without `parameters_`; call fit() first."
+            )
+        check_one_scheduling(pipeline.operating_points_.shape[1], "ParameterDisplay")
+        if name is None:
+            name = "restructured" if pipeline.restructurers_ else "balanced"
+        table = pipeline.parameters_
+        display = cls(
+            pipeline.operating_points_[:, 0],
+            with_others({name: table}, others or {}),
+            names=names,
+            interpolators={name: pipeline.interpolator_},
+            scheduling_label=scheduling_label or scheduling_name(pipeline),
+        )
+        return display.plot(ax, n_columns=n_columns)
+
+    def plot(self, ax: Any = None, *, n_columns: int = 4) -> ParameterDisplay:
+        """Draw a panel for each parameter.
+
+        Parameters
+        ----------
+        ax : Axes or array of Axes, default=None
+            None makes a figure. Of an array, as many as there are places in the grid.
+        n_columns : int, default=4
+            Panels in a row.
+
+        Returns
+        -------
+        ParameterDisplay
+        """
+        names = self.names
+        n_columns = min(n_columns, len(names))
+        n_rows = -(-len(names) // n_columns)
+        height = 0.6 + (1.45 if n_rows > 1 else 2.4) * n_rows
+        self.figure_, axes = axes_grid(ax, n_rows, n_columns, height=height)
+        for spare in axes.flat[len(names) :]:
+            spare.set_axis_off()
+        self.axes_ = axes.ravel()[: len(names)]
+        self.lines_: dict[str, list[Any]] = {name: [] for name in self.parameters}
+        self.curves_: dict[str, list[Any]] = {name: [] for name in self.interpolators}
+        fine = np.linspace(self.kappa.min(), self.kappa.max(), _N_CURVE)
+        curves = {
+            name: np.reshape(model.predict(fine[:, None]), (_N_CURVE, -1))
+            for name, model in self.interpolators.items()
+        }
+        for k, (name, theta) in enumerate(self.parameters.items()):
+            style = point_style(k)
+            for one, column in zip(self.axes_, self.chosen, strict=True):
+                (points,) = one.plot(
+                    self.kappa, theta[:, column], label=name, zorder=3 + k, **style
+                )
+                self.lines_[name].append(points)
+                if name in curves:
+                    (curve,) = one.plot(
+                        fine,
+                        curves[name][:, column],
+                        color=style["color"],
+                        label=f"{name}, interpolated",
+                        linewidth=1.2,
+                        linestyle=("-", "--", "-.", ":")[k % 4],
+                    )
+                    self.curves_[name].append(curve)
+        for number, one in enumerate(self.axes_):
+            self._dress(one, names[number], number >= len(names) - n_columns)
+        handles = [
+            lines[name][0]
+            for name in self.parameters
+            for lines in (self.lines_, self.curves_)
+            if name in lines
+        ]
+        figure_legend(self.figure_, self.axes_[0], handles, own=ax is None)
+        return self
+
+    def _dress(self, ax: Any, name: str, lowest: bool) -> None:
+        from matplotlib.ticker import MaxNLocator, ScalarFormatter
+
+        tidy(ax)
+        ax.margins(0.08, 0.12)
+        ax.set_title(name, fontsize=9, pad=3)
+        ax.xaxis.set_major_locator(MaxNLocator(4))
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+        formatter = ScalarFormatter(useMathText=True, useOffset=False)
+        formatter.set_powerlimits((-3, 4))
+        ax.yaxis.set_major_formatter(formatter)
+        if lowest:
+            ax.set_xlabel(self.scheduling_label)
+        low, high = ax.dataLim.y0, ax.dataLim.y1
+        size = max(abs(low), abs(high))
+        # Else the axis magnifies rounding errors of a constant.
+        if high - low < _CONSTANT * size:
+            ax.set_ylim(low - 0.1 * size, high + 0.1 * size)
+
+
+def _names_and_choice(
+    sets: Mapping[str, Any], names: Sequence[Hashable] | None
+) -> tuple[list[str], list[int]]:
+    """Names of all parameters, and the positions of those to draw."""
+    tables = [table for table in sets.values() if hasattr(table, "columns")]
+    if not tables:
+        n_params = np.shape(next(iter(sets.values())))[-1]
+        return names_of("names", names, n_params, "p"), list(range(n_params))
+    known = [str(column) for column in tables[0].columns]
+    wanted = known if names is None else [str(name) for name in names]
+    for name in wanted:
+        if name not in known:
+            raise ValueError(
+                f"`names` must be among the parameters {', '.join(known[:20])}. Got "
+                f"{name!r}."
+            )
+    return known, [known.index(name) for name in wanted]
+
+
+def _in_order(name: str, table: Any, names: list[str]) -> Any:
+    """The columns of a DataFrame by name, in the common order."""
+    columns = [str(column) for column in table.columns]
+    missing = [one for one in names if one not in columns]
+    if missing:
+        raise ValueError(
+            f"`parameters[{name!r}]` must have the columns of the first set. Got none "
+            f"named {missing[0]!r}."
+        )
+    return table.iloc[:, [columns.index(one) for one in names]]

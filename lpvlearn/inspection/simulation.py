@@ -1,0 +1,326 @@
+"""Measured and simulated outputs over time."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..data.columns import Table, is_table
+from ..data.experiments import read_outputs
+from ..data.timestamps import time_in_seconds
+from ..metrics.scores import bft_score
+from .drawing import (
+    ACCENT,
+    axes_grid,
+    legend_above,
+    line_style,
+    names_of,
+    tidy,
+    with_unit,
+)
+from .models import unwrapped
+
+Array = NDArray[np.float64]
+
+# Dense signals hide each other whatever their dashes: a broad pale line for the
+# measurement stays visible under thin dark ones.
+_MEASURED = {"color": "0.68", "linestyle": "-", "linewidth": 2.6}
+
+_FIRST = {"color": ACCENT, "linestyle": "-", "linewidth": 1.0}
+
+
+class SimulationDisplay:
+    """Measured and simulated outputs, one below the other, with their fit.
+
+    Make it with `from_estimator` or `from_predictions`.
+
+    Parameters
+    ----------
+    time : ndarray of shape (n_samples,)
+        Seconds (or sample numbers, with another `time_label`).
+    y_true : ndarray of shape (n_samples, n_outputs)
+        Measured outputs.
+    predictions : dict from str to ndarray of shape (n_samples, n_outputs)
+        Simulated outputs, by name of the model.
+    output_names : sequence of str, default=None
+        None is y1, y2, ...
+    units : str or sequence of str, default=None
+        Unit of all outputs, or one for each.
+    time_label : str, default="Time (s)"
+
+    Attributes
+    ----------
+    bft_ : dict from str to ndarray of shape (n_outputs,)
+        Best fit ratios, percent, over the whole record.
+    axes_ : ndarray of Axes of shape (n_outputs,)
+    figure_ : Figure
+    lines_ : dict from str to list of Line2D
+        By "measured" and the names of the models; one line for each output.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lpvlearn.inspection import SimulationDisplay
+    >>> time = np.linspace(0.0, 1.0, 101)
+    >>> y = np.sin(10 * time)
+    >>> display = SimulationDisplay.from_predictions(
+    ...     time, y, {"model": 0.9 * y}, units="rad/s")
+    >>> [text.get_text() for text in display.axes_[0].get_legend().get_texts()]
+    ['measured', 'model: BFT 89.6 %']
+    """
+
+    def __init__(
+        self,
+        time: ArrayLike,
+        y_true: ArrayLike,
+        predictions: Mapping[str, ArrayLike],
+        *,
+        output_names: Sequence[Hashable] | None = None,
+        units: str | Sequence[str] | None = None,
+        time_label: str = "Time (s)",
+    ) -> None:
+        self.y_true, names = read_outputs(y_true)
+        n_outputs = self.y_true.shape[1]
+        self.time = np.asarray(time, dtype=float)
+        if self.time.shape != (len(self.y_true),):
+            raise ValueError(
+                f"`time` must have shape ({len(self.y_true)},), a value for each row "
+                f"of `y_true`. Got {self.time.shape}."
+            )
+        self.predictions = {
+            str(name): read_outputs(y)[0] for name, y in predictions.items()
+        }
+        if "measured" in self.predictions:
+            raise ValueError(
+                "`y_pred` must not name a simulation 'measured', which names `y_true`."
+            )
+        self.bft_ = {}
+        for name, y_pred in self.predictions.items():
+            if y_pred.shape != self.y_true.shape:
+                raise ValueError(
+                    f"the simulation {name!r} must have the shape of `y_true`, "
+                    f"{self.y_true.shape}. Got {y_pred.shape}."
+                )
+            self.bft_[name] = bft_score(self.y_true, y_pred, multioutput="raw_values")
+        given = names if output_names is None else output_names
+        self.output_names = names_of("output_names", given, n_outputs, "y")
+        if units is None or isinstance(units, str):
+            self.units: list[str | None] = [units] * n_outputs
+        else:
+            self.units = list(names_of("units", units, n_outputs, ""))
+        self.time_label = time_label
+
+    @classmethod
+    def from_predictions(
+        cls,
+        time: ArrayLike,
+        y_true: ArrayLike,
+        y_pred: Mapping[str, ArrayLike] | ArrayLike,
+        *,
+        output_names: Sequence[Hashable] | None = None,
+        units: str | Sequence[str] | None = None,
+        zoom: tuple[float, float] | None = None,
+        ax: Any = None,
+    ) -> SimulationDisplay:
+        """Draw simulated outputs beside measured ones.
+
+        Parameters
+        ----------
+        time : array-like of shape (n_samples,)
+            Seconds.
+        y_true : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        y_pred : dict from str to array-like of the shape of `y_true`, or one of these
+        output_names : sequence of str, default=None
+            None is the columns of `y_true`, else y1, y2, ...
+        units : str or sequence of str, default=None
+        zoom : tuple (t_start, t_stop), default=None
+            Part of the record to draw, in seconds; the fit stays that of the whole.
+        ax : Axes or array of Axes, default=None
+
+        Returns
+        -------
+        SimulationDisplay
+
+        Raises
+        ------
+        ValueError
+            If shapes differ, a value is not finite, or `zoom` holds no samples.
+        """
+        named = y_pred if isinstance(y_pred, Mapping) else {"simulated": y_pred}
+        display = cls(time, y_true, named, output_names=output_names, units=units)
+        return display.plot(ax, zoom=zoom)
+
+    @classmethod
+    def from_estimator(
+        cls,
+        estimator: Any,
+        X: Any,
+        y: Any,
+        *,
+        experiment: Hashable = None,
+        initial_state: str = "rest",
+        name: str = "simulated",
+        units: str | Sequence[str] | None = None,
+        zoom: tuple[float, float] | None = None,
+        ax: Any = None,
+    ) -> SimulationDisplay:
+        """Simulate an experiment of a table and draw it beside the measurement.
+
+        Parameters
+        ----------
+        estimator : fitted estimator, or a fitted search over one
+            With `split_experiments`, as `SubspaceLTI` and `LocalLPVPipeline`.
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+        experiment : hashable, default=None
+            Label of the experiment; None is the first in the table.
+        initial_state : {"rest", "estimate"}, default="rest"
+            "estimate" fits the initial state to `y` by least squares, for tables that
+            start in the middle of an experiment.
+        name : str, default="simulated"
+            Of the model, in the legend.
+        units : str or sequence of str, default=None
+            Of the outputs.
+        zoom : tuple (t_start, t_stop), default=None
+            Part of the experiment to draw, in seconds.
+        ax : Axes or array of Axes, default=None
+
+        Returns
+        -------
+        SimulationDisplay
+
+        Raises
+        ------
+        ValueError
+            If there is no such experiment, or an option is unknown.
+        """
+        if initial_state not in ("rest", "estimate"):
+            raise ValueError(
+                f"`initial_state` must be 'rest' or 'estimate'. Got {initial_state!r}."
+            )
+        estimator = unwrapped(estimator)
+        if not hasattr(estimator, "split_experiments"):
+            raise ValueError(
+                "`estimator` must tell the experiments of a table by "
+                f"split_experiments(X). Got {type(estimator).__name__}; simulate with "
+                "it and use from_predictions()."
+            )
+        X = X if is_table(X) else np.asarray(X)
+        outputs, names = read_outputs(y)
+        rows = _rows_of(estimator, X, experiment)
+        part = X.iloc[rows] if hasattr(X, "iloc") else X[rows]
+        if initial_state == "rest":
+            y_pred = estimator.predict(part)
+        else:
+            y_pred = estimator.predict_with_initial_state(part, outputs[rows])
+        time, label = _time_of(estimator, Table(part))
+        display = cls(
+            time,
+            outputs[rows],
+            {name: y_pred},
+            output_names=names,
+            units=units,
+            time_label=label,
+        )
+        return display.plot(ax, zoom=zoom)
+
+    def plot(
+        self, ax: Any = None, *, zoom: tuple[float, float] | None = None
+    ) -> SimulationDisplay:
+        """Draw the outputs, one below the other.
+
+        Parameters
+        ----------
+        ax : Axes or array of Axes, default=None
+            None makes a figure.
+        zoom : tuple (t_start, t_stop), default=None
+            Part of the record to draw, in seconds.
+
+        Returns
+        -------
+        SimulationDisplay
+        """
+        shown = self._window(zoom)
+        n_outputs = len(self.output_names)
+        height = 0.5 + (2.9 if n_outputs == 1 else 2.0 * n_outputs)
+        self.figure_, axes = axes_grid(ax, n_outputs, 1, height=height, sharex=True)
+        self.axes_ = axes[:, 0]
+        self.lines_: dict[str, list[Any]] = {"measured": []}
+        self.lines_ |= {name: [] for name in self.predictions}
+        title = None
+        if zoom is not None:
+            title = f"BFT of the whole record, {self.time[0]:g} to {self.time[-1]:g} s"
+        for i, one in enumerate(self.axes_):
+            signals = {"measured": (self.y_true, "measured")}
+            for name, y_pred in self.predictions.items():
+                signals[name] = (y_pred, f"{name}: BFT {self.bft_[name][i]:.1f} %")
+            for k, (name, (signal, label)) in enumerate(signals.items()):
+                style = _style(k, int(shown.sum()))
+                (line,) = one.plot(
+                    self.time[shown], signal[shown, i], label=label, **style
+                )
+                self.lines_[name].append(line)
+            tidy(one)
+            one.set_ylabel(with_unit(self.output_names[i], self.units[i]))
+            one.set_xlim(self.time[shown][0], self.time[shown][-1])
+            legend_above(one, [lines[i] for lines in self.lines_.values()], title=title)
+            title = None
+        self.axes_[-1].set_xlabel(self.time_label)
+        return self
+
+    def _window(self, zoom: tuple[float, float] | None) -> NDArray[np.bool_]:
+        if zoom is None:
+            return np.ones(len(self.time), dtype=bool)
+        shown = (self.time >= zoom[0]) & (self.time <= zoom[1])
+        if shown.sum() < 2:
+            raise ValueError(
+                "`zoom` must be (t_start, t_stop) with at least 2 samples between, "
+                f"within {self.time[0]:g} to {self.time[-1]:g}. Got {zoom}."
+            )
+        return shown
+
+
+def _style(k: int, n_samples: int) -> dict[str, Any]:
+    """Keywords of the measurement (0), of the first simulation, of further ones."""
+    if k < 2:
+        return dict((_MEASURED, _FIRST)[k])
+    return line_style(k, n_samples) | {"linewidth": 1.2}
+
+
+def _rows_of(estimator: Any, X: Any, label: Hashable) -> NDArray[np.intp]:
+    """Rows of an experiment of the table."""
+    groups = estimator.split_experiments(X)
+    if label is None:
+        return groups[0]
+    column = Table(X).one(getattr(estimator, "experiment", None), "experiment")
+    if column is None:
+        raise ValueError(
+            "`experiment` must be None, as the estimator takes the table for one "
+            f"experiment. Got {label!r}."
+        )
+    labels = column[1].labels([rows[0] for rows in groups])
+    if label not in labels:
+        shown = ", ".join(map(repr, labels[:10]))
+        shown += ", ..." if len(labels) > 10 else ""
+        raise ValueError(
+            f"`experiment` must be the label of an experiment in X: {shown}. Got "
+            f"{label!r}."
+        )
+    return groups[labels.index(label)]
+
+
+def _time_of(estimator: Any, table: Table) -> tuple[Array, str]:
+    """Time of every row in seconds, else sample numbers; and the axis label."""
+    column = table.one(getattr(estimator, "time", None), "time")
+    if column is not None:
+        seconds = time_in_seconds(column[1].values, column[1].name)
+        return np.asarray(seconds, dtype=float), "Time (s)"
+    step = getattr(estimator, "sampling_time_", None)
+    if step is None and hasattr(estimator, "lti_"):
+        step = estimator.lti_.sampling_time
+    if step is None:
+        return np.arange(table.n_rows, dtype=float), "Sample"
+    return float(step) * np.arange(table.n_rows, dtype=np.float64), "Time (s)"

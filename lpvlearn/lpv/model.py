@@ -1,0 +1,316 @@
+"""Linear parameter-varying models: matrices that follow the scheduling variables."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..exceptions import ExtrapolationWarning
+from ..models.statespace import StateSpace
+from ..models.system_matrix import sorted_poles
+from ..structures.structure import GrayBoxStructure
+from ..systems.simulation import sample_zoh, state_trajectory, tabulate
+from ..validation import input_samples, positive_time, real_array, state_vector
+
+Array = NDArray[np.float64]
+
+__all__ = ["LPVStateSpace"]
+
+_BLOCK = 32_768  # samples whose matrices are held at once
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LPVStateSpace:
+    """A continuous-time state-space model scheduled by measured variables, Eq. (1).
+
+    ``dx/dt = A(kappa) x + B(kappa) u``, ``y = C(kappa) x + D(kappa) u`` with static
+    dependence on the scheduling variables kappa.
+
+    Parameters
+    ----------
+    structure : GrayBoxStructure
+        From parameters to matrices.
+    interpolator : fitted regressor
+        From scheduling values (n_points, n_scheduling) to parameters (n_points,
+        n_params). Says itself what it makes of values outside of the range.
+    scheduling_range : array-like of shape (2, n_scheduling)
+        Smallest and largest scheduling values that the model was identified on.
+
+    Raises
+    ------
+    ValueError
+        If `scheduling_range` is not two rows of finite numbers, the first not above
+        the second.
+
+    Examples
+    --------
+    A spring that stiffens with the scheduling variable:
+
+    >>> import numpy as np
+    >>> from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV
+    >>> structure = GrayBoxStructure.from_template(
+    ...     A=[[0, 1], ["-k", -0.5]], B=[[0], [1]], C=[[1, 0]])
+    >>> kappa = np.array([[0.0], [1.0]])
+    >>> stiffness = PolynomialLPV(degree=1).fit(kappa, [[4.0], [9.0]])
+    >>> lpv = LPVStateSpace(structure, stiffness, kappa)
+    >>> lpv.at(0.5).A
+    array([[ 0. ,  1. ],
+           [-6.5, -0.5]])
+    >>> lpv.parameters([0.0, 0.5]).round(9).ravel()
+    array([4. , 6.5])
+    >>> np.abs(lpv.frozen_poles([0.0, 1.0])).round(9)
+    array([[2., 2.],
+           [3., 3.]])
+
+    A simulation along a trajectory, and the part that an initial state adds:
+
+    >>> trajectory = np.linspace(0, 1, 500)
+    >>> y = lpv.simulate(np.ones(500), trajectory, sampling_time=0.1)
+    >>> moved = lpv.simulate(np.ones(500), trajectory, 0.1, initial_state=[1, 0])
+    >>> free = lpv.free_responses(trajectory, sampling_time=0.1)
+    >>> np.allclose(moved - y, free @ [1, 0])
+    True
+    """
+
+    structure: GrayBoxStructure
+    interpolator: Any
+    scheduling_range: Array
+
+    def __post_init__(self) -> None:
+        bounds = real_array("scheduling_range", self.scheduling_range)
+        if bounds.ndim != 2 or len(bounds) != 2 or not (bounds[0] <= bounds[1]).all():
+            raise ValueError(
+                "`scheduling_range` must have shape (2, n_scheduling), smallest values "
+                f"first. Got {bounds.tolist()}."
+            )
+        bounds.setflags(write=False)
+        object.__setattr__(self, "scheduling_range", bounds)
+
+    def __repr__(self) -> str:
+        return (
+            f"LPVStateSpace(order={self.order}, n_inputs={self.n_inputs}, "
+            f"n_outputs={self.n_outputs}, n_scheduling={self.n_scheduling})"
+        )
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return self.structure.order
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return self.structure.n_inputs
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return self.structure.n_outputs
+
+    @property
+    def n_scheduling(self) -> int:
+        """Number of scheduling variables."""
+        return self.scheduling_range.shape[1]
+
+    def parameters(self, kappa: ArrayLike) -> Array:
+        """Parameters at scheduling values.
+
+        Parameters
+        ----------
+        kappa : array-like of shape (n_points, n_scheduling), or (n_points,) for one
+            scheduling variable
+
+        Returns
+        -------
+        ndarray of shape (n_points, n_params)
+
+        Raises
+        ------
+        ValueError
+            If `kappa` has another shape or is not finite.
+        """
+        kappa = self._scheduling(kappa)
+        values = np.asarray(self.interpolator.predict(kappa), dtype=float)
+        return values.reshape(len(kappa), self.structure.n_params)
+
+    def at(self, kappa: ArrayLike) -> StateSpace:
+        """The frozen model at one scheduling value, Eq. (2).
+
+        Parameters
+        ----------
+        kappa : float or array-like of shape (n_scheduling,)
+
+        Returns
+        -------
+        StateSpace
+            In continuous time.
+
+        Raises
+        ------
+        ValueError
+            If `kappa` is not one finite value of every scheduling variable.
+        """
+        theta = self.parameters(np.reshape(kappa, (1, -1)))[0]
+        return self.structure.model(theta)
+
+    def frozen_poles(self, kappa: ArrayLike) -> NDArray[np.complex128]:
+        """Poles (rad/s) of the frozen models, each row by modulus.
+
+        Parameters
+        ----------
+        kappa : array-like of shape (n_points, n_scheduling) or (n_points,)
+
+        Returns
+        -------
+        ndarray of shape (n_points, order)
+
+        Raises
+        ------
+        ValueError
+            If `kappa` has another shape or is not finite.
+        """
+        return sorted_poles(self.structure.matrices(self.parameters(kappa))[0])
+
+    def simulate(
+        self,
+        u: ArrayLike,
+        scheduling: ArrayLike,
+        sampling_time: float,
+        initial_state: ArrayLike | None = None,
+    ) -> Array:
+        """Simulate along a measured scheduling trajectory.
+
+        Input and scheduling are held over each sampling period, so that a constant
+        scheduling gives exactly the sampled LTI model.
+
+        Parameters
+        ----------
+        u : array-like of shape (n_samples, n_inputs)
+        scheduling : array-like of shape (n_samples, n_scheduling) or (n_samples,)
+        sampling_time : float
+            Seconds.
+        initial_state : array-like of shape (order,), default=None
+            None is rest.
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_outputs)
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, a value is not finite, or the structure gives no
+            finite matrices at a scheduling value.
+        """
+        u = input_samples(u, self.n_inputs)
+        x = np.zeros(self.order)
+        if initial_state is not None:
+            x = state_vector(initial_state, self.order)
+        y = np.empty((len(u), self.n_outputs))
+        for rows, (A, B, C, D) in self._sampled(scheduling, sampling_time, len(u)):
+            forcing = np.einsum("kij,kj->ki", B, u[rows])
+            states = state_trajectory(A, forcing, x)
+            y[rows] = np.einsum("kij,kj->ki", C, states)
+            y[rows] += np.einsum("kij,kj->ki", D, u[rows])
+            x = A[-1] @ states[-1] + forcing[-1]
+        return y
+
+    def free_responses(self, scheduling: ArrayLike, sampling_time: float) -> Array:
+        """Outputs that each unit initial state causes without input.
+
+        Parameters
+        ----------
+        scheduling : array-like of shape (n_samples, n_scheduling) or (n_samples,)
+        sampling_time : float
+            Seconds.
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_outputs, order)
+            ``y = free_responses @ x0`` for ``u = 0``: regressors of an initial state.
+
+        Raises
+        ------
+        ValueError
+            As `simulate`.
+        """
+        kappa = self._scheduling(scheduling)
+        X = np.eye(self.order)
+        y = np.empty((len(kappa), self.n_outputs, self.order))
+        for rows, (A, _, C, _) in self._sampled(kappa, sampling_time, len(kappa)):
+            rest = np.zeros((len(A), self.order, self.order))
+            states = state_trajectory(A, rest, X)
+            y[rows] = C @ states
+            X = A[-1] @ states[-1]
+        return y
+
+    def _sampled(
+        self, scheduling: ArrayLike, sampling_time: float, n_samples: int
+    ) -> Iterator[tuple[slice, tuple[Array, Array, Array, Array]]]:
+        """Zero-order-hold matrices of successive blocks of samples."""
+        dt = positive_time("sampling_time", sampling_time)
+        kappa = self._scheduling(scheduling)
+        if len(kappa) != n_samples:
+            raise ValueError(
+                f"`scheduling` must have one row for each of the {n_samples} samples "
+                f"of `u`. Got {len(kappa)}."
+            )
+        low, high = self.scheduling_range
+        if ((kappa < low) | (kappa > high)).any():
+            self.interpolator.predict(kappa)  # which says how far out the samples are
+        n, m = self.order, self.n_inputs
+        for start in range(0, n_samples, _BLOCK):
+            block = kappa[start : start + _BLOCK]
+            rows = slice(start, start + len(block))
+            with warnings.catch_warnings():
+                # said above, of the samples: not once more, of the table's nodes
+                warnings.simplefilter("ignore", ExtrapolationWarning)
+                S = self._held_matrices(block, dt)
+            yield (
+                rows,
+                (S[:, :n, :n], S[:, :n, n : n + m], S[:, n:, :n], S[:, n:, n:]),
+            )
+
+    def _held_matrices(self, kappa: Array, dt: float) -> Array:
+        """``[[Ad, Bd], [C, D]]`` at every row of `kappa`."""
+
+        def held(points: Array) -> Array:
+            points = points.reshape(-1, self.n_scheduling)
+            A, B, C, D = self.structure.matrices(self.parameters(points))
+            finite = np.isfinite(A).all((1, 2)) & np.isfinite(B).all((1, 2))
+            if not finite.all():
+                raise ValueError(
+                    "`structure` must give finite matrices along `scheduling`. Got a "
+                    f"NaN or infinity at {points[~finite][0]}."
+                )
+            Ad, Bd = sample_zoh(A, B, dt)
+            upper, lower = np.concatenate([Ad, Bd], 2), np.concatenate([C, D], 2)
+            return np.concatenate([upper, lower], 1)
+
+        if self.n_scheduling == 1:
+            return tabulate(held, kappa[:, 0])
+        if (kappa == kappa[0]).all():
+            S = held(kappa[:1])
+            return np.broadcast_to(S[0], (len(kappa), *S.shape[1:]))
+        return held(kappa)
+
+    def _scheduling(self, kappa: ArrayLike) -> Array:
+        values = real_array("scheduling", kappa)
+        if values.ndim < 2:
+            values = values.reshape(-1, 1)
+        if values.ndim != 2 or values.shape[1] != self.n_scheduling:
+            raise ValueError(
+                f"`scheduling` must have {self.n_scheduling} columns. Got shape "
+                f"{np.shape(kappa)}."
+            )
+        if not np.isfinite(values).all():
+            k = int(np.argwhere(~np.isfinite(values))[0, 0])
+            raise ValueError(
+                f"`scheduling` must be finite. Got {values[k]} in row {k}."
+            )
+        return values

@@ -1,0 +1,307 @@
+"""Reports of fits as tables: one model, several side by side, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..data.columns import ROLES, Table, is_table
+from ..data.experiments import read_outputs
+from ..lpv.model import LPVStateSpace
+from ..models.statespace import StateSpace
+from .scorers import (
+    InitialState,
+    _check_options,
+    _drop_start,
+    _owner_of_experiments,
+    _simulate,
+    _split,
+    _unwrap,
+    simulator_in,
+)
+from .scores import bft_score, r2_ratio, vaf_score
+from .simulation import TableSimulator
+
+
+def fit_report(
+    estimator: Any,
+    X: Any,
+    y: Any,
+    *,
+    initial_state: InitialState = "rest",
+    burn_in: int = 0,
+) -> pd.DataFrame:
+    """Report the fit of every output in every experiment.
+
+    Parameters
+    ----------
+    estimator : fitted estimator
+        Anything with `predict`; without `split_experiments(X)`, the table is taken as
+        one experiment.
+    X : DataFrame or array-like of shape (n_samples, n_features)
+    y : DataFrame, Series or array-like of shape (n_samples,) or (n_samples, n_outputs)
+        Measured outputs.
+    initial_state : {"rest", "estimate"}, default="rest"
+    burn_in : int, default=0
+        As in `make_bft_scorer`.
+
+    Returns
+    -------
+    DataFrame
+        One row per experiment and output; columns `experiment`, `operating_point` (the
+        label, else the mean of the scheduling variable, a tuple for several),
+        `output`, `BFT` and `VAF` (percent), `RMSE` (units of the output) and `R2`.
+
+    Raises
+    ------
+    ValueError
+        When shapes differ, or `burn_in` leaves nothing of an experiment.
+    TypeError
+        When the estimator lacks the method that an option needs.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sklearn.linear_model import LinearRegression
+    >>> from lpvlearn import fit_report
+    >>> u = np.array([[0.0], [1.0], [2.0]])
+    >>> fit_report(LinearRegression().fit(u, [0, 1, 2]), u, [0, 1, 3]).round(3)
+       experiment operating_point output     BFT     VAF   RMSE     R2
+    0           0            None     y1  53.709  85.714  0.577  0.786
+    """
+    _check_options(initial_state, burn_in)
+    simulator, X = _unwrap(estimator, X)
+    Y, names = read_outputs(y)
+    Y_pred = _simulate(simulator, X, y, initial_state)
+    groups = [np.arange(len(Y))]
+    labels: list[tuple[Hashable, Hashable]] = [(0, None)]
+    if burn_in or _owner_of_experiments(simulator) is not None:
+        groups = _split(simulator, X)
+        labels = _labels(simulator, X, groups)
+    table = []
+    for rows, (experiment, operating_point) in zip(
+        _drop_start(groups, burn_in), labels, strict=True
+    ):
+        true, pred = Y[rows], Y_pred[rows]
+        bft = bft_score(true, pred, multioutput="raw_values")
+        vaf = vaf_score(true, pred, multioutput="raw_values")
+        rmse = np.sqrt(np.mean((true - pred) ** 2, axis=0))
+        r2 = r2_ratio(true, pred)
+        for k, name in enumerate(names):
+            table.append(
+                {
+                    "experiment": experiment,
+                    "operating_point": operating_point,
+                    "output": name,
+                    "BFT": float(bft[k]),
+                    "VAF": float(vaf[k]),
+                    "RMSE": float(rmse[k]),
+                    "R2": float(r2[k]),
+                }
+            )
+    return pd.DataFrame(table)
+
+
+def _labels(
+    estimator: Any, X: Any, groups: Sequence[NDArray[np.intp]]
+) -> list[tuple[Hashable, Hashable]]:
+    """Return the experiment's and operating point's label for each group of rows."""
+    roles = _owner_of_experiments(estimator).get_params(deep=False)
+    table = Table(X if is_table(X) else np.asarray(X, dtype=object))
+    label = table.one(roles.get("experiment"), "experiment")
+    point = table.one(roles.get("operating_point"), "operating_point")
+    kappa = table.several(roles.get("scheduling"), "scheduling")
+    names: list[Hashable] = [0] * len(groups)
+    points: list[Hashable] = [None] * len(groups)
+    if label is not None:
+        names = label[1].labels([rows[0] for rows in groups])
+    if point is not None:
+        points = point[1].labels([rows[0] for rows in groups])
+    elif kappa:
+        values = np.column_stack([column.numbers("X") for _, column in kappa])
+        means = [tuple(values[rows].mean(axis=0).tolist()) for rows in groups]
+        points = [mean if len(mean) > 1 else mean[0] for mean in means]
+    return list(zip(names, points, strict=True))
+
+
+# Heading and format of the columns of the reports, for people.
+_READABLE = {
+    "model": ("model", "{}"),
+    "experiment": ("experiment", "{}"),
+    "operating_point": ("operating point", "{}"),
+    "output": ("output", "{}"),
+    "BFT": ("BFT", "{:.2f}"),
+    "VAF": ("VAF", "{:.2f}"),
+    "RMSE": ("RMSE", "{:.3g}"),
+    "R2": ("R2", "{:.4f}"),
+    "n_experiments": ("experiments", "{:.0f}"),
+    "n_samples": ("samples", "{:.0f}"),
+    "order": ("order", "{:.0f}"),
+    "horizon": ("horizon", "{:.0f}"),
+    "local_BFT": ("local BFT", "{:.2f}"),
+    "structured_BFT": ("gray-box BFT", "{:.2f}"),
+    "relative_error": ("relative error", "{:.2e}"),
+    "relative_floor": ("floor", "{:.2e}"),
+    "remaining_error": ("remaining error", "{:.2e}"),
+    "active_frequency": ("active at rad/s", "{:.4g}"),
+    "stationarity": ("stationarity", "{:.0e}"),
+    "interpolation_error": ("interpolation error", "{:.2e}"),
+    "interpolation_FIT": ("interpolation FIT", "{:.2f}"),
+    "interpolation_RMSE": ("interpolation RMSE", "{:.2g}"),
+    "lowest": ("lowest", "{:.4g}"),
+    "highest": ("highest", "{:.4g}"),
+    "std": ("std", "{:.2g}"),
+}
+
+# Share of the black box's norm below which a floor is none.
+_NO_FLOOR = 1e-8
+
+
+def readable_report(report: pd.DataFrame) -> pd.DataFrame:
+    """A report with headings and rounded numbers, as text.
+
+    Parameters
+    ----------
+    report : DataFrame
+        From `fit_report`, `compare_models`, or `report_` and `parameter_report_` of a
+        pipeline. Other columns are shown with four digits.
+
+    Returns
+    -------
+    DataFrame
+        Of strings: prints well, and so do its ``to_latex``, ``to_markdown`` and
+        ``style``.
+
+    Notes
+    -----
+    pandas needs jinja2 for ``to_latex`` and ``style``, and tabulate for
+    ``to_markdown``. ``to_latex(escape=True)`` takes labels such as ``run_1`` into a
+    document; ``to_markdown(disable_numparse=True)`` leaves ``98.00`` as it is.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from lpvlearn import readable_report
+    >>> readable_report(pd.DataFrame({"local_BFT": [96.83157], "param_k": [3.0]}))
+      local BFT  k
+    0     96.83  3
+    """
+    headings, columns = [], []
+    for name, column in report.items():
+        heading, style = _READABLE.get(str(name), (str(name), "{:.4g}"))
+        heading = heading.removeprefix("param_").replace("std_", "std ", 1)
+        headings.append(heading)
+        columns.append([_as_shown(value, style) for value in column])
+    index = pd.Index([_as_shown(value, "{:.4g}") for value in report.index])
+    index.name = _READABLE.get(str(report.index.name), (report.index.name,))[0]
+    return pd.DataFrame(
+        dict(enumerate(columns)), index=index if len(index) else None
+    ).set_axis(headings, axis=1)
+
+
+def _as_shown(value: Any, style: str) -> str:
+    if isinstance(value, (bool, str)) or value is None:
+        return "" if value is None else str(value)
+    if isinstance(value, tuple):
+        return ", ".join(_as_shown(part, "{:.4g}") for part in value)
+    if isinstance(value, (int, np.integer)):
+        return str(value)
+    if isinstance(value, (float, np.floating)):
+        return (
+            ""
+            if np.isnan(value)
+            else ("{:.4g}" if style == "{}" else style).format(value)
+        )
+    return str(value)
+
+
+def compare_models(
+    models: Mapping[str, Any],
+    X: Any,
+    y: Any,
+    *,
+    initial_state: InitialState = "rest",
+    burn_in: int = 0,
+    **roles: Any,
+) -> pd.DataFrame:
+    """Compare models on one table, as MATLAB's ``compare`` does.
+
+    Parameters
+    ----------
+    models : dict of str to fitted estimator, LPVStateSpace or StateSpace
+    X : DataFrame or array-like of shape (n_samples, n_features)
+    y : DataFrame, Series or array-like of shape (n_samples,) or (n_samples, n_outputs)
+    initial_state : {"rest", "estimate"}, default="rest"
+    burn_in : int, default=0
+        As in `fit_report`.
+    **roles : column name, position or list
+        `inputs`, `scheduling`, `experiment`, `time`, `operating_point` and
+        `sampling_time` of the state-space models, as in `LocalLPVPipeline`. Those not
+        given are taken from the first estimator in `models` that has them.
+
+    Returns
+    -------
+    DataFrame
+        One row per model, experiment and output: the column `model`, and those of
+        `fit_report`.
+
+    Raises
+    ------
+    ValueError
+        When a model does not fit the table, or is none of the above.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lpvlearn import StateSpace, compare_models
+    >>> u = np.sign(np.sin(np.arange(100.0)))
+    >>> true = StateSpace([[0.9]], [[0.1]], [[1.0]], sampling_time=1.0)
+    >>> faster = StateSpace([[0.88]], [[0.12]], [[1.0]], sampling_time=1.0)
+    >>> report = compare_models(
+    ...     {"true": true, "faster": faster}, u[:, None], true.simulate(u))
+    >>> report.pivot_table("BFT", "output", "model").round(1)
+    model   faster   true
+    output
+    y1        79.8  100.0
+    """
+    if not isinstance(models, Mapping) or not models:
+        raise ValueError(
+            "`models` must be a dict from names to models, not empty. Got "
+            f"{type(models).__name__}."
+        )
+    allowed = (*ROLES, "sampling_time")
+    for name in roles:
+        if name not in allowed:
+            raise ValueError(f"a role must be one of {allowed}. Got {name!r}.")
+    known = _roles_of(models.values()) | roles
+    parts = []
+    for name, model in models.items():
+        if isinstance(model, (LPVStateSpace, StateSpace)):
+            model = TableSimulator(model, **known)
+        elif not hasattr(model, "predict"):
+            raise ValueError(
+                f"`models[{name!r}]` must be a fitted estimator, an LPVStateSpace or a "
+                f"StateSpace. Got {type(model).__name__}."
+            )
+        try:
+            part = fit_report(model, X, y, initial_state=initial_state, burn_in=burn_in)
+        except ValueError as error:
+            raise ValueError(f"model {name!r}: {error}") from error
+        parts.append(part.assign(model=name))
+    table = pd.concat(parts, ignore_index=True)
+    return table[["model", *table.columns.drop("model")]]
+
+
+def _roles_of(models: Any) -> dict[str, Any]:
+    """Roles and sampling time of the first estimator that has them."""
+    for model in models:
+        owner = simulator_in(model)
+        if hasattr(owner, "split_experiments"):
+            roles = {name: getattr(owner, name, None) for name in ROLES}
+            step = getattr(owner, "sampling_time_", owner.sampling_time)
+            return {**roles, "sampling_time": step}
+    return {}

@@ -1,0 +1,258 @@
+"""Scorers and reports of fit for estimators that simulate.
+
+The measures `bft_score`, `vaf_score` and `parameter_fit` are pure functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.pipeline import Pipeline
+
+from ..data.experiments import read_outputs
+from .scores import bft_score, vaf_score
+
+InitialState = Literal["rest", "estimate"]
+
+
+@dataclass(frozen=True)
+class TrajectoryScorer:
+    """A scorer, `scorer(estimator, X, y) -> float`, for estimators that simulate.
+
+    Made by `make_bft_scorer` and `make_vaf_scorer`; usable as `scoring=` wherever
+    scikit-learn takes a callable.
+
+    Attributes
+    ----------
+    metric : {"BFT", "VAF"}
+    initial_state : {"rest", "estimate"}
+    burn_in : int
+    multioutput : "uniform_average", "raw_values" or tuple of float
+    average : {"pool", "experiment"}
+    """
+
+    metric: Literal["BFT", "VAF"]
+    initial_state: InitialState = "rest"
+    burn_in: int = 0
+    multioutput: str | tuple[float, ...] = "uniform_average"
+    average: Literal["pool", "experiment"] = "pool"
+
+    def __call__(self, estimator: Any, X: Any, y: Any) -> float | dict[str, float]:
+        """Score an estimator's simulation of `X` against `y`."""
+        score = bft_score if self.metric == "BFT" else vaf_score
+        simulator, X = _unwrap(estimator, X)
+        Y, names = read_outputs(y)
+        Y_pred = _simulate(simulator, X, y, self.initial_state)
+        pool = self.average == "pool"
+        groups = [np.arange(len(Y))]
+        if self.burn_in or not pool:
+            groups = _drop_start(_split(simulator, X), self.burn_in)
+        if pool:
+            groups = [np.concatenate(groups)]
+        scores = [
+            score(Y[rows], Y_pred[rows], multioutput=self.multioutput)
+            for rows in groups
+        ]
+        mean = np.mean(scores, axis=0)
+        if self.multioutput != "raw_values":
+            return float(mean)
+        return {
+            f"{self.metric}_{name}": float(value)
+            for name, value in zip(names, mean, strict=True)
+        }
+
+
+def make_bft_scorer(
+    *,
+    initial_state: InitialState = "rest",
+    burn_in: int = 0,
+    multioutput: Literal["uniform_average", "raw_values"] | ArrayLike = (
+        "uniform_average"
+    ),
+    average: Literal["pool", "experiment"] = "pool",
+) -> TrajectoryScorer:
+    """Make a scorer of the best fit ratio.
+
+    Parameters
+    ----------
+    initial_state : {"rest", "estimate"}, default="rest"
+        State at the start of each experiment. "rest" scores `estimator.predict(X)`;
+        "estimate" scores `estimator.predict_with_initial_state(X, y)`, which fits the
+        initial state to the outputs by least squares: use it when a split starts in
+        mid-trajectory, as `TimeSeriesSplit` does.
+    burn_in : int, default=0
+        Samples at the start of each experiment that are simulated but not scored. The
+        estimator's `split_experiments(X)` tells the rows of each experiment.
+    multioutput : {"uniform_average", "raw_values"} or array-like of shape (n_outputs,)
+        Mean over the outputs, or weights: `[1, 0]` scores the first output alone.
+        "raw_values" is one score per output, ``{"BFT_y1": ..., "BFT_y2": ...}``, as
+        ``cross_validate(scoring=...)`` takes it.
+    average : {"pool", "experiment"}, default="pool"
+        Score all experiments as one record, as scikit-learn does, or take the mean of
+        their scores, which offsets between experiments cannot flatter.
+
+    Returns
+    -------
+    TrajectoryScorer
+
+    Raises
+    ------
+    ValueError
+        When an option is not one of those above.
+
+    Examples
+    --------
+    >>> from lpvlearn import make_bft_scorer
+    >>> make_bft_scorer(burn_in=20).burn_in
+    20
+    """
+    return _make_scorer("BFT", initial_state, burn_in, multioutput, average)
+
+
+def make_vaf_scorer(
+    *,
+    initial_state: InitialState = "rest",
+    burn_in: int = 0,
+    multioutput: Literal["uniform_average", "raw_values"] | ArrayLike = (
+        "uniform_average"
+    ),
+    average: Literal["pool", "experiment"] = "pool",
+) -> TrajectoryScorer:
+    """Make a scorer of the variance accounted for.
+
+    Parameters
+    ----------
+    initial_state : {"rest", "estimate"}, default="rest"
+    burn_in : int, default=0
+    multioutput : {"uniform_average", "raw_values"} or array-like of shape (n_outputs,)
+    average : {"pool", "experiment"}, default="pool"
+        As in `make_bft_scorer`.
+
+    Returns
+    -------
+    TrajectoryScorer
+
+    Raises
+    ------
+    ValueError
+        When an option is not one of those above.
+
+    Examples
+    --------
+    >>> from lpvlearn import make_vaf_scorer
+    >>> make_vaf_scorer(multioutput=[1, 0]).multioutput
+    (1.0, 0.0)
+    """
+    return _make_scorer("VAF", initial_state, burn_in, multioutput, average)
+
+
+def _make_scorer(
+    metric: Literal["BFT", "VAF"],
+    initial_state: InitialState,
+    burn_in: int,
+    multioutput: Any,
+    average: Literal["pool", "experiment"],
+) -> TrajectoryScorer:
+    _check_options(initial_state, burn_in)
+    if average not in ("pool", "experiment"):
+        raise ValueError(f"`average` must be 'pool' or 'experiment'. Got {average!r}.")
+    if isinstance(multioutput, str):
+        if multioutput not in ("uniform_average", "raw_values"):
+            raise ValueError(
+                "`multioutput` of a scorer must be 'uniform_average', 'raw_values' or "
+                f"one weight per output. Got {multioutput!r}."
+            )
+    else:
+        multioutput = tuple(np.asarray(multioutput, dtype=np.float64).tolist())
+    return TrajectoryScorer(metric, initial_state, burn_in, multioutput, average)
+
+
+def _check_options(initial_state: str, burn_in: int) -> None:
+    if initial_state not in ("rest", "estimate"):
+        raise ValueError(
+            f"`initial_state` must be 'rest' or 'estimate'. Got {initial_state!r}."
+        )
+    if not isinstance(burn_in, (int, np.integer)) or burn_in < 0:
+        raise ValueError(
+            f"`burn_in` must be a number of samples, an integer >= 0. Got {burn_in!r}."
+        )
+
+
+def simulator_in(estimator: Any) -> Any:
+    """Return the estimator within a search, a pipeline or a transformed target."""
+    while True:
+        if hasattr(estimator, "best_estimator_"):
+            estimator = estimator.best_estimator_
+        elif isinstance(estimator, Pipeline):
+            estimator = estimator[-1]
+        elif hasattr(estimator, "regressor_"):
+            estimator = estimator.regressor_
+        else:
+            return estimator
+
+
+def _unwrap(estimator: Any, X: Any) -> tuple[Any, Any]:
+    """Return the simulating estimator within a search or pipeline, and its input."""
+    while True:
+        if hasattr(estimator, "best_estimator_"):
+            estimator = estimator.best_estimator_
+        elif isinstance(estimator, Pipeline):
+            X = estimator[:-1].transform(X) if len(estimator) > 1 else X
+            estimator = estimator[-1]
+        else:
+            return estimator, X
+
+
+def _simulate(
+    estimator: Any, X: Any, y: Any, initial_state: InitialState
+) -> NDArray[np.float64]:
+    if initial_state == "rest":
+        return read_outputs(estimator.predict(X))[0]
+    if not hasattr(estimator, "predict_with_initial_state"):
+        raise TypeError(
+            "`initial_state='estimate'` needs an estimator with the method "
+            f"predict_with_initial_state(X, y). Got {type(estimator).__name__}; use "
+            "`initial_state='rest'`, with `burn_in` to leave out the transient."
+        )
+    return read_outputs(estimator.predict_with_initial_state(X, y))[0]
+
+
+def _owner_of_experiments(estimator: Any) -> Any:
+    """Return who knows the experiments: the estimator, or what it wraps."""
+    for owner in (estimator, getattr(estimator, "regressor_", None)):
+        if hasattr(owner, "split_experiments"):
+            return owner
+    return None
+
+
+def _split(estimator: Any, X: Any) -> list[NDArray[np.intp]]:
+    """Return the rows of each experiment."""
+    owner = _owner_of_experiments(estimator)
+    if owner is None:
+        raise TypeError(
+            "`burn_in` and `average='experiment'` need an estimator with the method "
+            f"split_experiments(X). Got {type(estimator).__name__}; use `burn_in=0` "
+            "and `average='pool'`."
+        )
+    return list(owner.split_experiments(X))
+
+
+def _drop_start(
+    groups: Sequence[NDArray[np.intp]], burn_in: int
+) -> list[NDArray[np.intp]]:
+    shortest = min(len(rows) for rows in groups)
+    if burn_in >= shortest:
+        raise ValueError(
+            "`burn_in` must be less than the number of samples of each experiment, "
+            f"{shortest} in the shortest. Got {burn_in}."
+        )
+    return [rows[burn_in:] for rows in groups]
+
+
+bft_scorer = make_bft_scorer()
+
+vaf_scorer = make_vaf_scorer()

@@ -1,0 +1,231 @@
+"""Measures of fit of the paper: BFT and VAF of outputs, FIT of parameters."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..data.experiments import read_outputs
+
+Multioutput = Literal["raw_values", "uniform_average"] | ArrayLike
+
+
+def bft_score(
+    y_true: ArrayLike,
+    y_pred: ArrayLike,
+    *,
+    multioutput: Multioutput = "uniform_average",
+) -> Any:
+    """Best fit ratio of simulated outputs, in percent.
+
+    Parameters
+    ----------
+    y_true, y_pred : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        Measured and simulated outputs.
+    multioutput : {"raw_values", "uniform_average"} or array-like of shape (n_outputs,)
+        One score per output, their mean, or their weighted mean.
+
+    Returns
+    -------
+    float, or ndarray of shape (n_outputs,) for "raw_values"
+        100 for a perfect simulation, 0 for one that is no better than the mean.
+
+    Raises
+    ------
+    ValueError
+        When shapes differ or a value is not finite.
+
+    Notes
+    -----
+    Equation (33a) of the paper,
+
+    .. math:: BFT = 100 \\max(1 - \\|y - \\hat y\\| / \\|y - mean(y)\\|, 0).
+
+    An output that does not vary scores 100 if it is simulated exactly, else 0, as in
+    :func:`sklearn.metrics.r2_score`.
+
+    Examples
+    --------
+    >>> from lpvlearn import bft_score
+    >>> bft_score([1.0, 2.0, 3.0, 4.0], [1.5, 2.5, 2.5, 3.5])
+    55.27...
+    """
+    true, pred = _read_pair(y_true, y_pred)
+    ratio = _fit_ratio(_norm(true - pred), _norm(_centred(true)))
+    return _aggregate(100 * np.maximum(ratio, 0), multioutput)
+
+
+def vaf_score(
+    y_true: ArrayLike,
+    y_pred: ArrayLike,
+    *,
+    multioutput: Multioutput = "uniform_average",
+) -> Any:
+    """Variance of the outputs that a simulation accounts for, in percent.
+
+    Parameters
+    ----------
+    y_true, y_pred : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        Measured and simulated outputs.
+    multioutput : {"raw_values", "uniform_average"} or array-like of shape (n_outputs,)
+        One score per output, their mean, or their weighted mean.
+
+    Returns
+    -------
+    float, or ndarray of shape (n_outputs,) for "raw_values"
+        100 for a simulation that is perfect up to a constant.
+
+    Raises
+    ------
+    ValueError
+        When shapes differ or a value is not finite.
+
+    Notes
+    -----
+    Equation (33b) of the paper,
+
+    .. math:: VAF = 100 \\max(1 - var(y - \\hat y) / var(y), 0).
+
+    An output that does not vary scores 100 if the error does not either, else 0.
+
+    Examples
+    --------
+    >>> from lpvlearn import vaf_score
+    >>> vaf_score([1.0, 2.0, 3.0, 4.0], [1.5, 2.5, 2.5, 3.5])
+    80.0
+    """
+    true, pred = _read_pair(y_true, y_pred)
+    ratio = _fit_ratio(_norm(_centred(true - pred)) ** 2, _norm(_centred(true)) ** 2)
+    return _aggregate(100 * np.maximum(ratio, 0), multioutput)
+
+
+def parameter_fit(params_true: ArrayLike, params_pred: ArrayLike) -> float:
+    """Fit of the parameters of a set of models, in percent.
+
+    Parameters
+    ----------
+    params_true, params_pred : array-like of equal shape
+        All parameters of all models, in any arrangement.
+
+    Returns
+    -------
+    float
+        100 for equal parameters; negative for parameters worse than their mean.
+
+    Raises
+    ------
+    ValueError
+        When shapes differ, or a value is not finite.
+
+    Notes
+    -----
+    Equation (36) of the paper, with eta the vector of all parameters,
+
+    .. math:: FIT = 100 (1 - \\|\\eta - \\hat\\eta\\| / \\|\\eta - mean(\\eta)\\|).
+
+    Parameters that are all equal score 100 if they are met exactly, else 0.
+
+    Examples
+    --------
+    >>> from lpvlearn import parameter_fit
+    >>> parameter_fit([[1.0, 2.0], [3.0, 4.0]], [[1.0, 2.0], [3.0, 4.0]])
+    100.0
+    """
+    eta = np.asarray(params_true, dtype=np.float64)
+    eta_hat = np.asarray(params_pred, dtype=np.float64)
+    names = ("params_true", "params_pred")
+    if eta.shape != eta_hat.shape or eta.size == 0:
+        raise ValueError(
+            f"`{names[0]}` and `{names[1]}` must have the same shape, not empty. Got "
+            f"{eta.shape} and {eta_hat.shape}."
+        )
+    true, pred = _read_pair(eta.ravel(), eta_hat.ravel(), names)
+    return float(100 * _fit_ratio(_norm(true - pred), _norm(_centred(true)))[0])
+
+
+def r2_ratio(y_true: ArrayLike, y_pred: ArrayLike) -> NDArray[np.float64]:
+    """Coefficient of determination of each output, for any number of samples.
+
+    Parameters
+    ----------
+    y_true, y_pred : array-like of shape (n_samples,) or (n_samples, n_outputs)
+
+    Returns
+    -------
+    ndarray of shape (n_outputs,)
+        As :func:`sklearn.metrics.r2_score`, but defined for a single sample too.
+
+    Examples
+    --------
+    >>> from lpvlearn.metrics.scores import r2_ratio
+    >>> r2_ratio([1.0, 2.0, 3.0, 4.0], [1.5, 2.5, 2.5, 3.5])
+    array([0.8])
+    """
+    true, pred = _read_pair(y_true, y_pred)
+    with np.errstate(over="ignore"):
+        error = np.sum((true - pred) ** 2, axis=0)
+    return _fit_ratio(error, np.sum(_centred(true) ** 2, axis=0))
+
+
+def _read_pair(
+    y_true: Any, y_pred: Any, names: tuple[str, str] = ("y_true", "y_pred")
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return two matrices of equal shape, (n_samples, n_outputs)."""
+    true, pred = read_outputs(y_true)[0], read_outputs(y_pred)[0]
+    if true.shape != pred.shape or len(true) == 0:
+        raise ValueError(
+            f"`{names[0]}` and `{names[1]}` must have the same shape, with at least 1 "
+            f"sample. Got {true.shape} and {pred.shape}."
+        )
+    for array, name in ((true, names[0]), (pred, names[1])):
+        finite = np.isfinite(array)
+        if not finite.all():
+            row, column = np.argwhere(~finite)[0]
+            raise ValueError(
+                f"`{name}` must be finite. Got {array[row, column]} at row {row} of "
+                f"column {column}; a simulation that diverges comes from an unstable "
+                "model."
+            )
+    return true, pred
+
+
+def _centred(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Subtract the mean of each column, exactly zero where it does not vary."""
+    # The rounded mean of equal numbers may differ from them in the last digit.
+    return np.where(np.ptp(values, axis=0) == 0, 0.0, values - values.mean(axis=0))
+
+
+def _norm(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    with np.errstate(over="ignore"):
+        return np.linalg.norm(values, axis=0)
+
+
+def _fit_ratio(
+    error: NDArray[np.float64], spread: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return 1 - error / spread; for a spread of zero, 1 without error, else 0."""
+    varies = spread > 0
+    ratio = 1 - error / np.where(varies, spread, 1.0)
+    return np.where(varies, ratio, error == 0)
+
+
+def _aggregate(scores: NDArray[np.float64], multioutput: Multioutput) -> Any:
+    """Average the outputs' scores as asked."""
+    if isinstance(multioutput, str):
+        if multioutput == "raw_values":
+            return scores
+        if multioutput == "uniform_average":
+            return float(scores.mean())
+        raise ValueError(
+            "`multioutput` must be 'raw_values', 'uniform_average' or one weight per "
+            f"output. Got {multioutput!r}."
+        )
+    weights = np.asarray(multioutput, dtype=np.float64)
+    if weights.shape != scores.shape or weights.min() < 0 or weights.sum() == 0:
+        raise ValueError(
+            "`multioutput` must hold one non-negative weight for each of "
+            f"{len(scores)} output(s), not all zero. Got {multioutput!r}."
+        )
+    return float(np.average(scores, weights=weights))

@@ -1,0 +1,162 @@
+"""Models simulated along the experiments of a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator
+
+from ..data.columns import ROLES
+from ..data.experiments import Experiment, read_experiments
+from ..lpv.model import LPVStateSpace
+from ..models.statespace import StateSpace
+from ..systems.simulation import (
+    estimate_initial_state,
+    free_responses,
+    state_trajectory,
+)
+from .scores import bft_score
+
+Array = NDArray[np.float64]
+
+
+def fit_of(
+    model: StateSpace, group: Sequence[Experiment], sampling_time: float
+) -> float:
+    """BFT (percent, mean over the outputs) of a continuous model on experiments.
+
+    The initial state of every experiment is estimated by least squares. Experiments of
+    one length are simulated together; realizations of one input, once.
+    """
+    sampled = model.to_discrete(sampling_time)
+    true, simulated = [], []
+    for length in sorted({len(e.rows) for e in group}):
+        part = [e for e in group if len(e.rows) == length]
+        inputs = [e.inputs for e in part]
+        if all(np.array_equal(u, inputs[0]) for u in inputs[1:]):
+            inputs = inputs[:1]
+        u = np.stack(inputs, axis=-1)
+        y = np.stack([_outputs(e, model.n_outputs) for e in part], axis=-1)
+        x = state_trajectory(
+            sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
+        )
+        forced = sampled.C @ x + sampled.D @ u
+        free = free_responses(sampled.A, sampled.C, length)
+        found = forced + free @ estimate_initial_state(free, y - forced)
+        true.append(np.moveaxis(y, -1, 0).reshape(-1, model.n_outputs))
+        simulated.append(np.moveaxis(found, -1, 0).reshape(-1, model.n_outputs))
+    return float(bft_score(np.vstack(true), np.vstack(simulated)))
+
+
+def simulate_experiments(
+    model: StateSpace | LPVStateSpace,
+    experiments: Sequence[Experiment],
+    sampling_time: float,
+    *,
+    estimate: bool,
+) -> list[Array]:
+    """Simulate a model along experiments.
+
+    Parameters
+    ----------
+    model : StateSpace or LPVStateSpace
+    experiments : sequence of Experiment
+    sampling_time : float
+        Of experiments that do not tell it themselves.
+    estimate : bool
+        Whether to begin in initial states estimated on the outputs by least squares
+        (else at rest).
+
+    Returns
+    -------
+    list of ndarray of shape (n_samples, n_outputs)
+    """
+    simulated = []
+    for e in experiments:
+        dt = e.sampling_time or sampling_time
+        x0 = None
+        if isinstance(model, LPVStateSpace):
+            kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
+            if estimate:
+                forced = model.simulate(e.inputs, kappa, dt)
+                free = model.free_responses(kappa, dt)
+                x0 = estimate_initial_state(free, _outputs(e, model.n_outputs) - forced)
+            simulated.append(model.simulate(e.inputs, kappa, dt, x0))
+        else:
+            sampled = model.to_discrete(dt) if model.is_continuous else model
+            if estimate:
+                error = _outputs(e, model.n_outputs) - sampled.simulate(e.inputs)
+                free = free_responses(sampled.A, sampled.C, len(e.rows))
+                x0 = estimate_initial_state(free, error)
+            simulated.append(sampled.simulate(e.inputs, initial_state=x0))
+    return simulated
+
+
+def in_table_order(experiments: Sequence[Experiment], parts: Sequence[Array]) -> Array:
+    """The rows of all experiments where they stood in the table."""
+    table = np.empty((sum(len(part) for part in parts), parts[0].shape[1]))
+    for e, part in zip(experiments, parts, strict=True):
+        table[e.rows] = part
+    return table
+
+
+def _outputs(experiment: Experiment, n_outputs: int) -> Array:
+    if experiment.outputs is None or experiment.outputs.shape[1] != n_outputs:
+        got = 0 if experiment.outputs is None else experiment.outputs.shape[1]
+        raise ValueError(
+            f"`y` must have the {n_outputs} output(s) of the model. Got {got}."
+        )
+    return experiment.outputs
+
+
+class TableSimulator(BaseEstimator):
+    """A state-space model that simulates tables, with their roles of columns."""
+
+    def __init__(
+        self,
+        model: Any,
+        sampling_time: float = 1.0,
+        inputs: Any = None,
+        scheduling: Any = None,
+        experiment: Any = None,
+        time: Any = None,
+        operating_point: Any = None,
+    ) -> None:
+        self.model = model
+        self.sampling_time = sampling_time
+        self.inputs = inputs
+        self.scheduling = scheduling
+        self.experiment = experiment
+        self.time = time
+        self.operating_point = operating_point
+
+    def predict(self, X: Any) -> Array:
+        """Simulate from rest."""
+        return self._simulate(self._read(X, None), estimate=False)
+
+    def predict_with_initial_state(self, X: Any, y: Any) -> Array:
+        """Simulate from initial states estimated on the outputs."""
+        return self._simulate(self._read(X, y), estimate=True)
+
+    def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
+        """Rows of every experiment."""
+        return [e.rows for e in self._read(X, None)]
+
+    def _read(self, X: Any, y: Any) -> list[Experiment]:
+        is_lpv = isinstance(self.model, LPVStateSpace)
+        if is_lpv and self.scheduling is None and self.model.scheduling_range.any():
+            raise ValueError(
+                f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
+                "that the LPV model follows. Got None."
+            )
+        roles = {name: getattr(self, name) for name in ROLES}
+        return read_experiments(self, X, y, **roles)
+
+    def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
+        simulated = simulate_experiments(
+            self.model, experiments, self.sampling_time, estimate=estimate
+        )
+        return in_table_order(experiments, simulated)

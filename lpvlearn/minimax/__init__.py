@@ -1,0 +1,1 @@
+"""Minimisation of a largest value: what the problem is, and its solvers."""

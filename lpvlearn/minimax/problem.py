@@ -1,0 +1,269 @@
+"""Minimax problems: peaks, their geometry, and certificates of an optimum.
+
+The objective is ``f(y) = max_i phi_i(y)``; the ``phi_i`` are the local maxima over
+frequency of the largest singular value of the error, Eq. (16).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+Array = NDArray[np.float64]
+
+_INFINITY = 1e30
+
+# The solver wants a positive definite Hessian. A little curvature of t makes the
+# multipliers add up to 1 + 1e-3 t: exact where t, the promised decrease, vanishes.
+_EPIGRAPH_CURVATURE = 1e-3
+
+
+def epigraph_step(
+    H: Array,
+    values: Array,
+    G: Array,
+    constraint_values: Array,
+    constraint_gradients: Array,
+    radius: float,
+) -> tuple[Array, Array, Array] | None:
+    """Minimise ``t + d^T H d / 2`` over steps below the linearised peaks.
+
+    Subject to ``values_i + G_i d <= t``, ``constraint_values_j + gradients_j d <= 0``
+    and ``|d|_inf <= radius``, for a positive definite `H`.
+
+    Returns
+    -------
+    d : ndarray of shape (q,)
+    multipliers : ndarray of shape (k,)
+        Of the peaks; non-negative, they add up to one at a stationary point.
+    constraint_multipliers : ndarray
+        None instead of the triple where the program has no solution.
+    """
+    q, k, c = len(H), len(values), len(constraint_values)
+    P = np.zeros((q + 1, q + 1))
+    P[:q, :q] = H
+    P[q, q] = _EPIGRAPH_CURVATURE
+    f = np.zeros(q + 1)
+    f[q] = 1.0
+    A = np.zeros((k + c, q + 1))
+    A[:k, :q], A[:k, q] = G, -1.0
+    A[k:, :q] = constraint_gradients
+    span = 1.0 + np.abs(values).max() + radius * np.abs(G).sum(1).max()
+    upper = np.concatenate([np.full(q, radius), [span], -values, -constraint_values])
+    lower = np.concatenate([-upper[: q + 1], np.full(k + c, -_INFINITY)])
+    x, _, flag, info = daqp.solve(
+        P,
+        f,
+        A,
+        upper,
+        lower,
+        np.zeros(q + 1 + k + c, dtype=np.int32),
+        primal_tol=1e-11,
+        dual_tol=1e-12,
+    )
+    if flag < 1 or not np.isfinite(x).all():
+        return None
+    multipliers = np.maximum(np.asarray(info["lam"])[q + 1 :], 0.0)
+    return np.asarray(x[:q]), multipliers[:k], multipliers[k:]
+
+
+def shortest_in_hull(G: Array, normals: Array | None = None) -> tuple[float, Array]:
+    """Norm of the shortest vector in the convex hull of the rows of `G`.
+
+    Zero certifies a stationary point of a maximum of smooth functions with these
+    active gradients. Solved as a non-negative least-squares problem:
+    ``min |G^T x + N^T y|^2 + (1 - sum x)^2``, ``x, y >= 0``, whose solution is
+    proportional to the weights.
+
+    Parameters
+    ----------
+    G : ndarray of shape (k, q)
+    normals : ndarray of shape (c, q), default=None
+        Gradients N of binding constraints, of which any non-negative multiple is added.
+
+    Returns
+    -------
+    distance : float
+    weights : ndarray of shape (k,)
+        Non-negative, adding up to one.
+    """
+    scale = max(float(np.linalg.norm(G, axis=1).max()), 1e-300)
+    N = np.zeros((0, G.shape[1])) if normals is None else normals
+    length = np.linalg.norm(N, axis=1, keepdims=True)
+    N = N / np.where(length > 0, length, 1.0)
+    stacked = np.zeros((G.shape[1] + 1, len(G) + len(N)))
+    stacked[:-1] = np.hstack([G.T / scale, N.T])
+    stacked[-1, : len(G)] = 1.0
+    rhs = np.zeros(len(stacked))
+    rhs[-1] = 1.0
+    solution = nnls(stacked, rhs)[0]
+    weights, total = solution[: len(G)], solution[: len(G)].sum()
+    if total == 0:
+        weights, total = np.ones(len(G)), float(len(G))
+    force = scale * (N.T @ solution[len(G) :])
+    distance = float(np.linalg.norm(G.T @ weights + force)) / total
+    return distance, weights / total
+
+
+Flags = NDArray[np.bool_]
+
+ACTIVE_PEAK = 1e-6  # peaks within that fraction of the highest one are active
+
+ACTIVE_MULTIPLIER = 1e-8  # smaller multipliers do not count
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """Values, frequencies (rad/s) and gradients of the peaks at one point.
+
+    Where `moving` is False, the entry is the singular value at a fixed frequency, a
+    lower bound of the objective everywhere, and no local maximum.
+    """
+
+    values: Array
+    frequencies: Array
+    gradients: Array
+    moving: Flags
+
+    @property
+    def top(self) -> float:
+        """The objective: the highest peak."""
+        return float(self.values.max())
+
+
+class Curve(Protocol):
+    """Curves through one point along which the functions of a problem bend least."""
+
+    def step(self, d: Array) -> Array:
+        """End, relative to the point, of the curve that leaves along `d`."""
+
+    def curvature(self, gradient: Array) -> Array:
+        """What the curves add to a Hessian of that gradient, shape (q, q)."""
+
+
+@dataclass(frozen=True)
+class MinimaxProblem:
+    """What the minimax solvers ask of a problem.
+
+    Attributes
+    ----------
+    peaks : callable
+        ``y -> Peaks``, or None where `y` is not admissible (an unstable model).
+    samples : callable
+        ``(y, frequencies) -> Peaks``: the singular value at fixed frequencies.
+    values : callable
+        The same without gradients; infinite where there is no model.
+    hessians : callable
+        ``(y, frequencies, moving) -> (k, q, q)``, second derivatives of the values.
+    constraints : callable
+        ``y -> (c, dc)``: smooth constraints ``c(y) <= 0`` and their gradients.
+    grid : ndarray
+        Frequencies to watch beside the peaks.
+    curve : callable, default=None
+        ``y -> Curve``; by default steps are straight.
+    """
+
+    peaks: Callable[[Array], Peaks | None]
+    samples: Callable[[Array, Array], Peaks]
+    values: Callable[[Array, Array], Array]
+    hessians: Callable[[Array, Array, Flags], Array]
+    constraints: Callable[[Array], tuple[Array, Array]]
+    grid: Array = field(default_factory=lambda: np.zeros(0))
+    curve: Callable[[Array], Curve] | None = None
+
+
+@dataclass(frozen=True)
+class MinimaxResult:
+    """Best point, its peaks, and what certifies it.
+
+    Attributes
+    ----------
+    y : ndarray of shape (q,)
+    peaks : Peaks
+    stationarity : float
+        Shortest vector in the convex hull of the active gradients, relative to the
+        objective; what binding constraints hold back is left out.
+    second_order : float
+        Smallest eigenvalue of the Hessian of the Lagrangian on the subspace along
+        which all active peaks stay equal, relative to the objective; positive for a
+        strict local minimum, NaN where the solver has no second-order model.
+    converged : bool
+    n_iter : int
+    history : list of dict
+        One row per iteration: objective, predicted decrease, radius, active peaks.
+    """
+
+    y: Array
+    peaks: Peaks
+    stationarity: float
+    second_order: float
+    converged: bool
+    n_iter: int
+    history: list[dict[str, float]] = field(default_factory=list)
+
+
+def tangent_spaces(G: Array, dc: Array) -> tuple[Array, Array]:
+    """Bases of the span of active gradient differences and constraints, and its
+    complement, along which all active peaks stay equal to first order."""
+    rows = [G[1:] - G[0], dc]
+    D = np.vstack(rows).T
+    if D.size == 0:
+        return np.zeros((G.shape[1], 0)), np.eye(G.shape[1])
+    U, s, _ = np.linalg.svd(D, full_matrices=True)
+    r = int((s > 1e-10 * s.max(initial=0.0)).sum())
+    return U[:, :r], U[:, r:]
+
+
+def convexified(L: Array, G: Array, dc: Array) -> Array:
+    """Positive definite Hessian that agrees with `L` where curvature matters.
+
+    Negative curvature is mirrored on the tangent space of the active peaks, and a
+    multiple of the projector on its complement, where the peaks themselves bend the
+    objective, makes the rest positive.
+    """
+    scale = max(float(np.abs(np.linalg.eigvalsh(L)).max()), 1e-12)
+    Y, Z = tangent_spaces(G, dc)
+    H = L.copy()
+    if Z.shape[1]:
+        values, vectors = np.linalg.eigh(Z.T @ L @ Z)
+        positive = np.maximum(np.abs(values), 1e-9 * scale)
+        W = Z @ vectors
+        H += (W * (positive - values)) @ W.T
+    if Y.shape[1]:
+        S = Y.T @ H @ Y
+        if Z.shape[1]:
+            C = Y.T @ H @ Z
+            S = S - C @ np.linalg.solve(Z.T @ H @ Z, C.T)
+        low = float(np.linalg.eigvalsh(0.5 * (S + S.T)).min())
+        H += (max(0.0, -low) + 1e-8 * scale) * Y @ Y.T
+    return 0.5 * (H + H.T) + 1e-11 * scale * np.eye(len(H))
+
+
+def certificate(
+    problem: MinimaxProblem,
+    y: Array,
+    peaks: Peaks,
+    constraints: tuple[Array, Array],
+    negligible: float,
+) -> tuple[float, float]:
+    """Stationarity and second-order measure at a point, see `MinimaxResult`."""
+    f = peaks.top
+    if f <= negligible:
+        return 0.0, np.inf
+    active = peaks.values >= f * (1.0 - ACTIVE_PEAK)
+    G = peaks.gradients[active] / f
+    c, dc = constraints
+    binding = dc[c >= -1e-9]
+    distance, weights = shortest_in_hull(G, binding)
+    hessians = problem.hessians(y, peaks.frequencies[active], peaks.moving[active])
+    L = np.tensordot(weights, hessians, axes=1) / f
+    Z = tangent_spaces(G[weights > ACTIVE_MULTIPLIER], binding)[1]
+    if Z.shape[1] == 0:
+        return distance, np.inf
+    return distance, float(np.linalg.eigvalsh(Z.T @ L @ Z).min())

@@ -1,0 +1,272 @@
+"""Trust-region sequential quadratic programming for a maximum over frequency.
+
+Minimises ``f(y) = max_omega sigma(y, omega)``, the largest singular value of the error,
+Eq. (16). The local model holds all local maxima near the norm, with the exact Hessian
+of the Lagrangian, and beside them the singular value at fixed frequencies: where two
+maxima merge, or a new one rises, only these are smooth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .problem import (
+    ACTIVE_MULTIPLIER,
+    Curve,
+    MinimaxProblem,
+    MinimaxResult,
+    Peaks,
+    certificate,
+    convexified,
+    epigraph_step,
+)
+
+Array = NDArray[np.float64]
+
+_MAX_EXTRA = 40  # frequencies beside the grid: those at which a step failed
+
+_PATIENCE = 25  # iterations without progress that end the search
+
+_NOTHING = 1e-8
+
+_CORRECTIONS = 3
+
+_SAME = 1e-6  # relative distance of frequencies that are the same
+
+_SURPRISE = 0.2  # part of the decrease that a peak between the frequencies took away
+
+
+def minimax_sqp(
+    problem: MinimaxProblem,
+    y0: Array,
+    *,
+    max_iter: int = 200,
+    tol: float = 1e-10,
+    radius: float = 0.5,
+    negligible: float = 0.0,
+) -> MinimaxResult:
+    """Minimise the highest peak from an admissible point.
+
+    Parameters
+    ----------
+    problem : MinimaxProblem
+        In coordinates where a unit step changes the response by about the objective.
+    y0 : ndarray of shape (q,)
+    tol : float
+        Stop when the linear model predicts a relative decrease below it.
+    radius : float
+        First trust-region radius (maximum norm).
+    negligible : float
+        An objective at or below it is rounding noise: nothing is left to minimise.
+
+    Raises
+    ------
+    ValueError
+        If `y0` is not admissible.
+    """
+    own = problem.peaks(y0)
+    if own is None:
+        raise ValueError("the starting point of the minimax is not admissible.")
+    y, extra = y0.copy(), np.zeros(0)
+    local: _Local | None = None
+    history: list[dict[str, float]] = []
+    converged, n_iter = False, 0
+    while n_iter < max_iter and not converged:
+        f = own.top
+        if f <= negligible:
+            converged = True
+            break
+        n_iter += 1
+        if local is None:
+            omega = np.concatenate([problem.grid, extra])
+            local = _local_model(problem, y, own, omega, radius)
+        step = local.step(radius)
+        if step is None:
+            radius *= 0.25
+            local = local.stiffer()
+            converged = radius < 1e-14
+            continue
+        d, multipliers = step
+        linear, predicted = local.decrease(d)
+        if stalled(history, f):
+            converged = True
+            break
+        history.append(
+            {
+                "objective": f,
+                "predicted": linear,
+                "radius": radius,
+                "active": float((multipliers > ACTIVE_MULTIPLIER).sum()),
+            }
+        )
+        if linear <= tol or radius < 1e-14:
+            converged = True
+            break
+        d, high = _corrected(problem, y, local, d, radius)
+        trial = problem.peaks(y + d) if high < f else None
+        ratio = -1.0
+        if trial is not None and predicted > 0:
+            ratio = (f - trial.top) / f / predicted
+            if trial.top > high + _SURPRISE * (f - high):
+                new = trial.frequencies[trial.values > high]
+                new = new[~_among(new, omega)]
+                extra = np.concatenate([extra, new])[-_MAX_EXTRA:]
+                local = None if new.size else local
+        if trial is not None and ratio > 1e-4 and trial.top < f:
+            y, own, local = y + d, trial, None
+            if ratio > 0.75 and np.abs(d).max() > 0.8 * radius:
+                radius = min(2.5 * radius, 10.0)
+            elif ratio < 0.25:
+                radius *= 0.5
+        elif predicted < 1e-12:
+            converged = True
+        else:
+            radius = 0.35 * min(radius, float(np.abs(d).max()))
+    constraints = problem.constraints(y)
+    stationarity, second_order = certificate(problem, y, own, constraints, negligible)
+    return MinimaxResult(y, own, stationarity, second_order, converged, n_iter, history)
+
+
+def stalled(history: list[dict[str, float]], f: float) -> bool:
+    """Whether the last iterations lowered the objective by next to nothing."""
+    if len(history) < _PATIENCE:
+        return False
+    return history[-_PATIENCE]["objective"] - f <= _NOTHING * f
+
+
+@dataclass(frozen=True)
+class _Local:
+    """The quadratic program at one point, relative to the objective.
+
+    Attributes
+    ----------
+    entries : Peaks
+        Local maxima, and singular values at fixed frequencies.
+    H : ndarray of shape (q, q)
+        Convexified Hessian of the Lagrangian.
+    c, dc : ndarray
+        Constraints ``c + dc d <= 0``.
+    curve : Curve or None
+        That of the steps.
+    """
+
+    entries: Peaks
+    H: Array
+    c: Array
+    dc: Array
+    curve: Curve | None = None
+
+    def stiffer(self) -> _Local:
+        shift = 0.1 * max(float(np.trace(self.H)) / len(self.H), 1e-8)
+        H = self.H + shift * np.eye(len(self.H))
+        return replace(self, H=H)
+
+    def step(
+        self, radius: float, ends: Array | None = None, d: Array | None = None
+    ) -> tuple[Array, Array] | None:
+        """Step and multipliers of the entries, or None.
+
+        With the values `ends` that the entries have after the step `d`, corrected for
+        their curvature.
+        """
+        f, slopes = self.entries.top, self.entries.gradients
+        values = self.entries.values
+        if ends is not None and d is not None:
+            values = ends - slopes @ d
+        solution = epigraph_step(
+            self.H, values / f - 1.0, slopes / f, self.c, self.dc, radius
+        )
+        return None if solution is None else (solution[0], solution[1])
+
+    def end(self, d: Array) -> Array:
+        """Where the step along `d` ends."""
+        return d if self.curve is None else self.curve.step(d)
+
+    def decrease(self, d: Array) -> tuple[float, float]:
+        """Relative decrease that the linear and the quadratic model promise."""
+        f = self.entries.top
+        ends = self.entries.values + self.entries.gradients @ d
+        linear = 1.0 - float(ends.max()) / f
+        return linear, linear - 0.5 * float(d @ self.H @ d)
+
+
+def _corrected(
+    problem: MinimaxProblem, y: Array, local: _Local, d: Array, radius: float
+) -> tuple[Array, float]:
+    """The step's end, bent by the curvature of the entries, and their highest value."""
+    omega, f = local.entries.frequencies, local.entries.top
+    end = local.end(d)
+    ends = problem.values(y + end, omega)
+    for _ in range(_CORRECTIONS):
+        if not np.isfinite(ends).all():
+            break
+        step = local.step(radius, ends, d)
+        if step is None:
+            break
+        new_end = local.end(step[0])
+        new = problem.values(y + new_end, omega)
+        gain = float(ends.max() - new.max())
+        if not gain > 0:
+            break
+        d, end, ends = step[0], new_end, new
+        if gain < 0.1 * (f - float(ends.max())):
+            break
+    return end, float(ends.max())
+
+
+def _local_model(
+    problem: MinimaxProblem, y: Array, own: Peaks, omega: Array, radius: float
+) -> _Local:
+    """Entries, constraints, and the Hessian with the multipliers of a first step."""
+    c, dc = problem.constraints(y)
+    cuts = problem.samples(y, omega[~_among(omega, own.frequencies)])
+    # Above the objective is only the shoulder of a constant peak that has been set
+    # aside: there the error shall not grow, or a new peak would rise on the shoulder.
+    below = cuts.values <= own.top * (1.0 + 1e-9)
+    caps = cuts.values[~below]
+    c = np.concatenate([np.minimum(c, 0.0), np.zeros(len(caps))])
+    dc = np.vstack([dc, cuts.gradients[~below] / caps[:, None]])
+    entries = Peaks(
+        np.concatenate([own.values, cuts.values[below]]),
+        np.concatenate([own.frequencies, cuts.frequencies[below]]),
+        np.vstack([own.gradients, cuts.gradients[below]]),
+        np.concatenate([own.moving, cuts.moving[below]]),
+    )
+    f, q = own.top, len(y)
+    G = entries.gradients / f
+    H = 1e-2 * np.linalg.norm(G, axis=1).max() * np.eye(q) / max(radius, 1e-6)
+    curve = None if problem.curve is None else problem.curve(y)
+    first = _Local(entries, H, c, dc, curve)
+    solution = epigraph_step(H, entries.values / f - 1.0, G, c, dc, radius)
+    for _ in range(2):  # the multipliers of the second-order model refine themselves
+        if solution is None:
+            break
+        _, multipliers, mu = solution
+        active = multipliers > ACTIVE_MULTIPLIER
+        if not active.any():
+            return first
+        weights = multipliers[active] / multipliers[active].sum()
+        hessians = problem.hessians(
+            y, entries.frequencies[active], entries.moving[active]
+        )
+        L = np.tensordot(weights, hessians, axes=1) / f
+        if curve is not None:
+            L = L + curve.curvature(weights @ G[active])
+        H = convexified(L, G[active], dc[mu > ACTIVE_MULTIPLIER])
+        solution = epigraph_step(H, entries.values / f - 1.0, G, c, dc, radius)
+        if solution is not None and ((solution[1] > ACTIVE_MULTIPLIER) == active).all():
+            break
+    return replace(first, H=H)
+
+
+def _among(omega: Array, known: Array) -> NDArray[np.bool_]:
+    """Which frequencies are, nearly, among the known ones."""
+    if known.size == 0 or omega.size == 0:
+        return np.zeros(len(omega), bool)
+    with np.errstate(invalid="ignore"):  # inf - inf
+        apart = np.abs(omega[:, None] - known)
+        near = apart <= _SAME * np.abs(known)
+    return ((omega[:, None] == known) | near & np.isfinite(known)).any(1)

@@ -1,0 +1,153 @@
+"""A deterministic model with a noise model: prediction from past outputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
+
+from ..systems.simulation import state_trajectory
+from .statespace import StateSpace
+
+Array = NDArray[np.float64]
+
+
+class NoiseModel(NamedTuple):
+    """``x[t+1] = A x[t] + K e[t]``, ``v[t] = C x[t] + e[t]``.
+
+    Attributes
+    ----------
+    A : ndarray of shape (n_states, n_states)
+    C : ndarray of shape (n_outputs, n_states)
+    K : ndarray of shape (n_states, n_outputs)
+        Innovation gain; ``A - K C`` is stable.
+    covariance : ndarray of shape (n_outputs, n_outputs)
+        Of the innovations e.
+    """
+
+    A: Array
+    C: Array
+    K: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class InnovationModel:
+    """Innovation form of an identified model.
+
+    ``x[t+1] = A x[t] + B u[t] + K e[t]``, ``y[t] = C x[t] + D u[t] + e[t]`` with white
+    innovations e. The states are those of the deterministic model, then those of the
+    noise model, which the inputs do not reach.
+
+    Parameters
+    ----------
+    lti : StateSpace
+        Deterministic part, discrete time.
+    noise : NoiseModel
+        Of the simulation error; ``A - K C`` stable.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lpvlearn import StateSpace
+    >>> from lpvlearn.models.innovation import NoiseModel
+    >>> one = np.ones((1, 1))
+    >>> lti = StateSpace([[0.5]], [[1.0]], [[1.0]], sampling_time=1.0)
+    >>> model = InnovationModel(lti, NoiseModel(0.9 * one, 0.9 * one, one, one))
+    >>> model.K
+    array([[0.],
+           [1.]])
+    >>> y = 0.9 ** np.arange(4.0)[:, None]
+    >>> model.predict(np.zeros((4, 1)), y).round(3).ravel()
+    array([0.   , 0.9  , 0.81 , 0.729])
+    """
+
+    lti: StateSpace
+    noise: NoiseModel
+
+    def __repr__(self) -> str:
+        return (
+            f"InnovationModel(order={self.lti.order}, "
+            f"n_noise_states={self.n_noise_states}, n_inputs={self.lti.n_inputs}, "
+            f"n_outputs={self.lti.n_outputs})"
+        )
+
+    @property
+    def n_noise_states(self) -> int:
+        """Number of states of the noise model; 0 is white noise."""
+        return len(self.noise.A)
+
+    @property
+    def A(self) -> Array:
+        """State matrix of both parts."""
+        return block_diag(self.lti.A, self.noise.A)
+
+    @property
+    def B(self) -> Array:
+        """Input matrix."""
+        zero = np.zeros((self.n_noise_states, self.lti.n_inputs))
+        return np.vstack([self.lti.B, zero])
+
+    @property
+    def C(self) -> Array:
+        """Output matrix."""
+        return np.hstack([self.lti.C, self.noise.C])
+
+    @property
+    def D(self) -> Array:
+        """Feedthrough."""
+        return self.lti.D
+
+    @property
+    def K(self) -> Array:
+        """Innovation (Kalman) gain, shape (order + n_noise_states, n_outputs)."""
+        zero = np.zeros((self.lti.order, self.lti.n_outputs))
+        return np.vstack([zero, self.noise.K])
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the innovations, shape (n_outputs, n_outputs)."""
+        return self.noise.covariance
+
+    def predict(
+        self,
+        u: ArrayLike,
+        y: ArrayLike,
+        *,
+        steps: int = 1,
+        initial_state: ArrayLike | None = None,
+    ) -> Array:
+        """Predict every sample from the outputs up to `steps` samples before it.
+
+        Parameters
+        ----------
+        u : array-like of shape (n_samples, n_inputs)
+        y : array-like of shape (n_samples, n_outputs)
+        steps : int, default=1
+            Prediction horizon in samples.
+        initial_state : array-like of shape (order,), default=None
+            Of the deterministic part; None is rest.
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_outputs)
+            Row t uses the inputs up to t and the outputs up to ``t - steps``.
+        """
+        is_integer = isinstance(steps, (int, np.integer))
+        if not is_integer or isinstance(steps, bool) or steps < 1:
+            raise ValueError(f"`steps` must be an integer of at least 1. Got {steps}.")
+        simulated = self.lti.simulate(u, initial_state=initial_state)
+        if self.n_noise_states == 0:
+            return simulated
+        A, C, K, _ = self.noise
+        error = np.asarray(y, dtype=float).reshape(simulated.shape) - simulated
+        ahead = state_trajectory(A - K @ C, error @ K.T)
+        out = simulated.copy()
+        delay = int(steps) - 1
+        if delay < len(error):
+            decay = C @ np.linalg.matrix_power(A, delay)
+            out[delay:] += ahead[: len(error) - delay] @ decay.T
+        return out

@@ -1,0 +1,504 @@
+"""Linear state-space models as small immutable value objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..systems.balancing import balancing_transformation
+from ..systems.hinf_norm import hinf_norm
+from ..systems.response import frequency_response
+from ..systems.sampling import c2d_tustin, c2d_zoh, d2c_tustin, d2c_zoh
+from ..systems.simulation import lti_response
+from ..validation import (
+    input_samples,
+    matrix,
+    positive_time,
+    real_array,
+    state_vector,
+    whole_number,
+)
+from .system_matrix import sorted_poles
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, repr=False, init=False)
+class SystemMatrices:
+    """Matrices A, B, C, D that fit together, and a sampling time.
+
+    Parameters
+    ----------
+    A : array-like of shape (order, order)
+    B : array-like of shape (order, n_inputs)
+    C : array-like of shape (n_outputs, order)
+    D : array-like of shape (n_outputs, n_inputs), default=None
+    sampling_time : float, default=None
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit together, or an entry is not a finite real number.
+
+    Examples
+    --------
+    >>> SystemMatrices([[0, 1], [-4, -1]], [[0], [1]], [[1, 0]]).order
+    2
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    sampling_time: float | None
+
+    def __init__(
+        self,
+        A: ArrayLike,
+        B: ArrayLike,
+        C: ArrayLike,
+        D: ArrayLike | None = None,
+        sampling_time: float | None = None,
+    ) -> None:
+        A, B, C = matrix("A", A), matrix("B", B), matrix("C", C)
+        n = len(A)
+        if A.shape != (n, n):
+            raise ValueError(f"`A` must be square. Got shape {A.shape}.")
+        if D is not None:
+            D = matrix("D", D)
+            if n == 0:  # a pure gain: `[]` for B and C takes its shape from D
+                B = np.zeros((0, D.shape[1])) if B.shape == (0, 0) else B
+                C = np.zeros((D.shape[0], 0)) if C.shape == (0, 0) else C
+        if B.shape[0] != n or C.shape[1] != n:
+            raise ValueError(
+                f"`B` needs {n} rows and `C` {n} columns to fit `A` of shape "
+                f"{A.shape}. Got B {B.shape}, C {C.shape}."
+            )
+        shape = (C.shape[0], B.shape[1])
+        D = np.zeros(shape) if D is None else D
+        if D.shape != shape:
+            raise ValueError(
+                f"`D` must have shape {shape} to fit B and C. Got {D.shape}."
+            )
+        if 0 in shape:
+            raise ValueError(
+                "a model needs at least one input and one output; a pure gain takes "
+                f"them from `D`. Got {shape[1]} inputs and {shape[0]} outputs."
+            )
+        for name, value in zip("ABCD", (A, B, C, D), strict=True):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        if sampling_time is not None:
+            sampling_time = positive_time("sampling_time", sampling_time)
+        object.__setattr__(self, "sampling_time", sampling_time)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Copies and pickles are built anew, so that their arrays are read-only too.
+        return type(self), (self.A, self.B, self.C, self.D, self.sampling_time)
+
+    def __repr__(self) -> str:
+        time = (
+            "continuous time"
+            if self.sampling_time is None
+            else f"sampling_time={self.sampling_time:g}"
+        )
+        return (
+            f"{type(self).__name__}(order={self.order}, n_inputs={self.n_inputs}, "
+            f"n_outputs={self.n_outputs}, {time})"
+        )
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return self.A.shape[0]
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return self.D.shape[1]
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return self.D.shape[0]
+
+    @property
+    def is_continuous(self) -> bool:
+        """True for a continuous-time model."""
+        return self.sampling_time is None
+
+
+__all__ = ["StateSpace"]
+
+
+@dataclass(frozen=True, eq=False, repr=False, init=False)
+class StateSpace(SystemMatrices):
+    """A linear time-invariant model in state-space form.
+
+    Continuous time, ``dx/dt = A x + B u, y = C x + D u``, or discrete time,
+    ``x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k]``.
+
+    Parameters
+    ----------
+    A : array-like of shape (order, order)
+    B : array-like of shape (order, n_inputs)
+    C : array-like of shape (n_outputs, order)
+    D : array-like of shape (n_outputs, n_inputs), default=None
+        None is no feedthrough.
+    sampling_time : float, default=None
+        Seconds between samples; None is continuous time.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit together, or an entry is not a finite real number.
+
+    Notes
+    -----
+    A pure gain has order 0: ``StateSpace([], [], [], D)``. The arrays of a model are
+    read-only; a change makes a new model.
+
+    Examples
+    --------
+    >>> from lpvlearn import StateSpace
+    >>> lag = StateSpace([[-2.0]], [[2.0]], [[1.0]])
+    >>> lag.poles()
+    array([-2.+0.j])
+    >>> lag.to_discrete(0.1).dc_gain()
+    array([[1.]])
+    """
+
+    @property
+    def is_stable(self) -> bool:
+        """True if all poles are strictly inside the stability region."""
+        poles = self.poles()
+        margin = -poles.real if self.is_continuous else 1.0 - np.abs(poles)
+        return bool((margin > 0).all())
+
+    def poles(self) -> NDArray[np.complex128]:
+        """Eigenvalues of A (rad/s in continuous time), by increasing modulus.
+
+        Examples
+        --------
+        >>> StateSpace([[0, 1], [-4, 0]], [[0], [1]], [[1, 0]]).poles()
+        array([0.-2.j, 0.+2.j])
+        """
+        return sorted_poles(self.A)
+
+    def frequency_response(self, omega: ArrayLike) -> NDArray[np.complex128]:
+        """Response ``C (s I - A)^-1 B + D`` on the imaginary axis or unit circle.
+
+        Parameters
+        ----------
+        omega : array-like of shape (n_freq,)
+            Angular frequencies, rad/s; may hold infinity in continuous time.
+
+        Returns
+        -------
+        ndarray of shape (n_freq, n_outputs, n_inputs)
+            Infinite at a pole.
+
+        Raises
+        ------
+        ValueError
+            If `omega` is not a vector of real numbers, or is infinite for a
+            discrete-time model.
+
+        Examples
+        --------
+        >>> StateSpace(-2, 2, 1).frequency_response([0.0, 2.0])[:, 0, 0]
+        array([1. +0.j , 0.5-0.5j])
+        """
+        omega = np.atleast_1d(real_array("omega", omega))
+        if omega.ndim != 1 or np.isnan(omega).any():
+            raise ValueError(
+                "`omega` must have shape (n_freq,) and hold no NaN. Got "
+                f"shape {omega.shape} with {np.isnan(omega).sum()} NaN."
+            )
+        dt = self.sampling_time
+        return frequency_response(self.A, self.B, self.C, self.D, omega, dt=dt)
+
+    def dc_gain(self) -> Array:
+        """Gain at zero frequency, shape (n_outputs, n_inputs); infinite at a pole.
+
+        Examples
+        --------
+        >>> StateSpace(-2, 1, 1).dc_gain()
+        array([[0.5]])
+        """
+        return np.real(self.frequency_response([0.0])[0])
+
+    def hinf_norm(self) -> float:
+        """H-infinity norm: the largest singular value over all frequencies.
+
+        Infinite for an unstable model. Computed from Hamiltonian eigenvalues (level
+        sets), Eq. (15)-(17), to a relative accuracy of 1e-10.
+
+        Examples
+        --------
+        >>> StateSpace(-2, 1, 1).hinf_norm()
+        0.5
+        """
+        dt = self.sampling_time
+        return hinf_norm(self.A, self.B, self.C, self.D, dt=dt).norm
+
+    def simulate(
+        self,
+        u: ArrayLike,
+        *,
+        sampling_time: float | None = None,
+        initial_state: ArrayLike | None = None,
+    ) -> Array:
+        """Simulate the response to a sampled input.
+
+        Parameters
+        ----------
+        u : array-like of shape (n_samples, n_inputs) or (n_samples,)
+        sampling_time : float, default=None
+            Seconds between the samples of `u`; needed by a continuous-time model, whose
+            input is held between samples (zero-order hold, exact).
+        initial_state : array-like of shape (order,), default=None
+            None is rest.
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_outputs)
+
+        Raises
+        ------
+        ValueError
+            If a shape does not fit, a value is not finite, or `sampling_time` is
+            missing or not that of the discrete-time model.
+
+        Examples
+        --------
+        >>> StateSpace(0.5, 1, 1, sampling_time=1.0).simulate([1, 1, 1]).ravel()
+        array([0. , 1. , 1.5])
+        """
+        u = input_samples(u, self.n_inputs)
+        x0 = None if initial_state is None else state_vector(initial_state, self.order)
+        if self.is_continuous:
+            A, B = c2d_zoh(
+                self.A, self.B, positive_time("sampling_time", sampling_time)
+            )
+        else:
+            if sampling_time is not None and not _same_time(
+                positive_time("sampling_time", sampling_time), self.sampling_time
+            ):
+                raise ValueError(
+                    f"`sampling_time` must be {self.sampling_time} s, the model's own. "
+                    f"Got {sampling_time}. Convert with to_continuous() first."
+                )
+            A, B = self.A, self.B
+        return lti_response(A, B, self.C, self.D, u, x0)
+
+    def transform(self, T: ArrayLike) -> StateSpace:
+        """Change the state basis: ``(T A T^-1, T B, C T^-1, D)``.
+
+        Parameters
+        ----------
+        T : array-like of shape (order, order)
+            Invertible; the new state is ``T x``.
+
+        Raises
+        ------
+        ValueError
+            If T has another shape or is singular.
+
+        Examples
+        --------
+        >>> StateSpace(-1, 2, 3).transform(2).B
+        array([[4.]])
+        """
+        T = matrix("T", T)
+        if T.shape != self.A.shape:
+            raise ValueError(f"`T` must have shape {self.A.shape}. Got {T.shape}.")
+        # Units may differ by any factor: only directions tell that T is singular.
+        scaled = T / np.maximum(np.abs(T).max(1, keepdims=True, initial=0), 1e-300)
+        scaled /= np.maximum(np.abs(scaled).max(0, initial=0), 1e-300)
+        if self.order and not np.linalg.cond(scaled) < 1e14:
+            raise ValueError("`T` must be invertible. Got a singular matrix.")
+        A, C = (np.linalg.solve(T.T, M.T).T for M in (T @ self.A, self.C))
+        return StateSpace(A, T @ self.B, C, self.D, self.sampling_time)
+
+    def __sub__(self, other: StateSpace) -> StateSpace:
+        """The error system ``G - G_other``, whose norms are distances (Eq. (8))."""
+        if not isinstance(other, StateSpace):
+            return NotImplemented
+        same_time = _same_time(other.sampling_time, self.sampling_time)
+        if other.D.shape != self.D.shape or not same_time:
+            raise ValueError(
+                "models to subtract must have the same inputs, outputs and sampling "
+                f"time. Got {self} and {other}."
+            )
+        n, k = self.order, other.order
+        A = np.zeros((n + k, n + k))
+        A[:n, :n], A[n:, n:] = self.A, other.A
+        B, C = np.vstack([self.B, other.B]), np.hstack([self.C, -other.C])
+        return StateSpace(A, B, C, self.D - other.D, self.sampling_time)
+
+    def hankel_singular_values(self) -> Array:
+        """Hankel singular values of a stable model, descending, shape (order,).
+
+        Examples
+        --------
+        >>> StateSpace(-2, 2, 1).hankel_singular_values()
+        array([0.5])
+        """
+        self._require_stable("hankel_singular_values")
+        return balancing_transformation(
+            self.A, self.B, self.C, discrete=not self.is_continuous
+        )[0]
+
+    def balance(self, order: int | None = None) -> StateSpace:
+        """Balanced realisation: both Gramians equal and diagonal.
+
+        Parameters
+        ----------
+        order : int, default=None
+            Keep at most that many states (balanced truncation). States that are not
+            controllable or not observable to rounding are never kept.
+
+        Raises
+        ------
+        ValueError
+            If the model is unstable (its Gramians do not exist).
+
+        Examples
+        --------
+        >>> model = StateSpace([[-1, 0], [0, -5]], [[1], [1]], [[1, 1e-3]])
+        >>> model.balance(order=1)
+        StateSpace(order=1, n_inputs=1, n_outputs=1, continuous time)
+        """
+        self._require_stable("balance")
+        if order is not None:
+            order = whole_number("order", order, 0, self.order)
+        _, left, right = balancing_transformation(
+            self.A, self.B, self.C, discrete=not self.is_continuous
+        )
+        left, right = left[:order], right[:, :order]
+        A, B, C = left @ self.A @ right, left @ self.B, self.C @ right
+        signs = np.where(B.sum(1) < 0, -1.0, 1.0)
+        A, B, C = signs[:, None] * A * signs, signs[:, None] * B, C * signs
+        return StateSpace(A, B, C, self.D, self.sampling_time)
+
+    def _require_stable(self, what: str) -> None:
+        if not self.is_stable:
+            poles = self.poles()
+            worst = poles[
+                np.argmax(poles.real if self.is_continuous else np.abs(poles))
+            ]
+            raise ValueError(
+                f"`{what}` needs a stable model. Got a pole at {worst:.4g}."
+            )
+
+    def to_discrete(self, sampling_time: float, method: str = "zoh") -> StateSpace:
+        """Sample a continuous-time model.
+
+        Parameters
+        ----------
+        sampling_time : float
+            Seconds.
+        method : {"zoh", "tustin"}, default="zoh"
+            Zero-order hold is exact for inputs held between samples; Tustin is the
+            bilinear approximation.
+
+        Raises
+        ------
+        ValueError
+            If the model is discrete, a pole is at 2 / sampling_time for "tustin", or
+            the sampled model overflows.
+
+        Examples
+        --------
+        >>> StateSpace(0, 1, 1).to_discrete(0.5).B
+        array([[0.5]])
+        """
+        if not self.is_continuous:
+            raise ValueError(
+                f"`to_discrete` needs a continuous-time model. Got {self}. Convert "
+                "with to_continuous() first."
+            )
+        dt = positive_time("sampling_time", sampling_time)
+        _check_method(method)
+        if method == "zoh":
+            A, B = c2d_zoh(self.A, self.B, dt)
+            return StateSpace(A, B, self.C, self.D, dt)
+        return StateSpace(*c2d_tustin(self.A, self.B, self.C, self.D, dt), dt)
+
+    def to_continuous(self, method: str = "zoh") -> StateSpace:
+        """Convert a discrete-time model to continuous time.
+
+        Parameters
+        ----------
+        method : {"zoh", "tustin"}, default="zoh"
+            "zoh" is the matrix logarithm, exact for inputs held between samples;
+            "tustin" is the bilinear approximation, which warps frequencies.
+
+        Raises
+        ------
+        ValueError
+            If a pole has no continuous equivalent (at 0 for "zoh", at -1 for "tustin").
+
+        Warns
+        -----
+        RuntimeWarning
+            If a pole on the negative real axis becomes a pair ("zoh").
+
+        Examples
+        --------
+        >>> StateSpace(1, 0.5, 1, sampling_time=0.5).to_continuous().B
+        array([[1.]])
+        """
+        _check_method(method)
+        if self.sampling_time is None:
+            return self
+        if method == "zoh":
+            A, B, C = d2c_zoh(self.A, self.B, self.C, self.sampling_time)
+            return StateSpace(A, B, C, self.D)
+        return StateSpace(
+            *d2c_tustin(self.A, self.B, self.C, self.D, self.sampling_time)
+        )
+
+    def to_control(self) -> Any:
+        """The model as a ``control.StateSpace`` (needs python-control)."""
+        import control
+
+        dt = 0 if self.is_continuous else self.sampling_time
+        return control.ss(self.A, self.B, self.C, self.D, dt)
+
+    @classmethod
+    def from_control(cls, model: Any) -> StateSpace:
+        """Copy a python-control state-space model.
+
+        Raises
+        ------
+        ValueError
+            If `model` is not in state space, or its sampling time is not known.
+        """
+        if not all(hasattr(model, name) for name in ("A", "B", "C", "D", "dt")):
+            raise ValueError(
+                "`model` must be a control.StateSpace (convert with control.ss). Got "
+                f"{type(model).__name__}."
+            )
+        dt = model.dt
+        if dt is True or dt is None:
+            raise ValueError(
+                f"`model.dt` must be 0 or a sampling time in seconds. Got {dt}."
+            )
+        return cls(model.A, model.B, model.C, model.D, dt if dt > 0 else None)
+
+
+def _same_time(one: float | None, other: float | None) -> bool:
+    """Whether two sampling times agree; None is continuous time."""
+    if one is None or other is None:
+        return one is other
+    return abs(one - other) <= 1e-6 * other
+
+
+def _check_method(method: str) -> None:
+    if method not in ("zoh", "tustin"):
+        raise ValueError(f"`method` must be 'zoh' or 'tustin'. Got {method!r}.")

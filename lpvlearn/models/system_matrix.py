@@ -1,0 +1,75 @@
+"""The system matrix S = [[A, B], [C, D]]: its blocks, and orders of poles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+Blocks = tuple[Array, Array, Array, Array]
+
+
+def sorted_poles(A: Array) -> NDArray[np.complex128]:
+    """Eigenvalues of (..., n, n) matrices, by modulus, real part, imaginary part."""
+    poles = np.linalg.eigvals(A).astype(complex)
+    order = np.lexsort((poles.imag, poles.real, np.abs(poles)), axis=-1)
+    return np.take_along_axis(poles, order, axis=-1)
+
+
+def blocks(S: Array, order: int) -> Blocks:
+    """A, B, C, D of ``S = [[A, B], [C, D]]``, stacked over its leading axes.
+
+    Examples
+    --------
+    >>> A, B, C, D = blocks(np.arange(4.0).reshape(2, 2), 1)
+    >>> float(B[0, 0])
+    1.0
+    """
+    n = order
+    return S[..., :n, :n], S[..., :n, n:], S[..., n:, :n], S[..., n:, n:]
+
+
+def stack_system(
+    source: str,
+    blocks: Sequence[Any],
+    shape: tuple[int, int, int],
+    lead: tuple[int, ...],
+) -> NDArray[Any]:
+    """``[[A, B], [C, D]]`` from (A, B, C) or (A, B, C, D), after `lead` axes.
+
+    Parameters
+    ----------
+    source : str
+        Name of the function that returned the blocks, for the message.
+    blocks : sequence of array-like
+    shape : tuple of int
+        order, n_inputs, n_outputs.
+    lead : tuple of int
+        Leading axes that all blocks have.
+
+    Raises
+    ------
+    ValueError
+        If a block has another shape.
+    """
+    n, m, p = shape
+    given = [np.asarray(block) for block in blocks if block is not None]
+    S = np.zeros((*lead, n + p, n + m), np.result_type(float, *given))
+    corners = ((0, 0, n, n), (0, n, n, m), (n, 0, p, n), (n, n, p, m))
+    for i, (row, column, height, width) in enumerate(corners):
+        if i >= len(blocks) or blocks[i] is None:
+            continue
+        array, expected = np.asarray(blocks[i]), (*lead, height, width)
+        if array.shape != expected:
+            if array.size != np.prod(expected):
+                raise ValueError(
+                    f"`{source}` must return `{'ABCD'[i]}` of shape {expected}. Got "
+                    f"{array.shape}."
+                )
+            array = array.reshape(expected)
+        S[..., row : row + height, column : column + width] = array
+    return S

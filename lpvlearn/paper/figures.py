@@ -1,0 +1,261 @@
+"""The paper's Figures 2 to 10, drawn from our own run of its experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..inspection.bode import BodeDisplay
+from ..inspection.drawing import axes_grid, figure_legend, tidy
+from ..inspection.parameters import ParameterDisplay
+from ..inspection.simulation import SimulationDisplay
+from ..lpv.polynomial import PolynomialLPV
+from .experiment import PaperExperiment
+from .tables import local_experiments, nearest_model, simulate_sweep
+
+Array = NDArray[np.float64]
+
+__all__ = ["save_figures"]
+
+RATE = "rad/s"
+
+DOTS_PER_INCH = 130
+
+TITLE_SIZE = 10.0
+
+# The arm's dynamics, 0.7 to 120 rad/s, and up to 1e4 rad/s as in the paper.
+BODE_RANGE = (1e-1, 1e4)
+
+# Diagonal and neighbours of A: enough to see how a balanced basis wanders.
+BALANCED_ENTRIES = (
+    (1, 1), (1, 2), (2, 2), (2, 3), (3, 3), (3, 4), (4, 4), (4, 5),
+    (5, 5), (5, 6), (6, 6), (1, 6),
+)  # fmt: skip
+
+
+def save_figures(experiment: PaperExperiment, directory: Path) -> list[Path]:
+    """Draw Figures 2 to 10 and save them as PNG files.
+
+    Parameters
+    ----------
+    experiment : PaperExperiment
+        From `run_paper_experiment`.
+    directory : Path
+        Made if it does not exist.
+
+    Returns
+    -------
+    list of Path
+        ``figure02.png``, ..., ``figure10.png``.
+
+    Notes
+    -----
+    The figures are closed when they are saved: none is shown.
+    """
+    from matplotlib import pyplot as plt
+
+    directory.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for number, draw in FIGURES.items():
+        figure, title = draw(experiment)
+        entitle(figure, f"Figure {number}. {title}")
+        # Saving would lay the figure out twice: do it once, and keep it.
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+        path = directory / f"figure{number:02d}.png"
+        figure.savefig(path, dpi=DOTS_PER_INCH)
+        plt.close(figure)
+        paths.append(path)
+    return paths
+
+
+def entitle(figure: Any, title: str) -> None:
+    """A title above a figure: over its legend where that stands above the axes."""
+    if not figure.legends:
+        figure.suptitle(title, fontsize=TITLE_SIZE, x=0.01, ha="left")
+        return
+    # Both would claim the same place if the title were the figure's.
+    legend = figure.legends[0]
+    legend.set_alignment("left")
+    legend.set_title(title, prop={"size": TITLE_SIZE})
+
+
+def draw_data(experiment: PaperExperiment) -> tuple[Any, str]:
+    """Fig. 2: inputs and outputs of one local experiment."""
+    data = experiment.data
+    labels = data.X["experiment"].to_numpy()
+    middle = np.unique(labels)[len(np.unique(labels)) // 2]
+    X, y = data.X[labels == middle], data.y[labels == middle]
+    figure, axes = axes_grid(None, 4, 1, height=6.2, sharex=True)
+    for ax, (name, signal) in zip(
+        axes[:, 0], [*X[["u1", "u2"]].items(), *y.items()], strict=True
+    ):
+        is_input = name in X
+        ax.plot(
+            X["time"],
+            signal,
+            color="#000000" if is_input else "#0072B2",
+            linewidth=0.8,
+            drawstyle="steps-post" if is_input else "default",
+        )
+        ax.set_ylabel(f"{name} ({RATE})")
+        ax.set_xlim(0.0, X["time"].iloc[-1])
+        tidy(ax)
+    axes[-1, 0].set_xlabel("Time (s)")
+    angle = nearest_angle(data.theta2, float(X["kappa"].mean()))
+    return figure, (
+        f"Noisy data of one local experiment at θ₂ = {angle}: velocity references "
+        "(above), outputs"
+    )
+
+
+def draw_local_responses(experiment: PaperExperiment) -> tuple[Any, str]:
+    """Fig. 3: time responses of the local model at 5 pi / 8."""
+    data = experiment.data
+    wanted = np.cos(5 * np.pi / 8)
+    kappa, X, y = min(local_experiments(data), key=lambda e: abs(e[0] - wanted))
+    model = nearest_model(experiment.pipeline, kappa)
+    simulated = model.simulate(
+        X[["u1", "u2"]].to_numpy(), sampling_time=data.sampling_time
+    )
+    display = SimulationDisplay.from_predictions(
+        X["time"],
+        y.rename(columns=str),
+        {"local model": simulated},
+        units=RATE,
+        zoom=(0.0, min(1.0, float(X["time"].iloc[-1]))),
+    )
+    angle = nearest_angle(data.theta2, kappa)
+    return display.figure_, f"Local model at θ₂ = {angle} on new noise-free data"
+
+
+def draw_bode(experiment: PaperExperiment) -> tuple[Any, str]:
+    """Fig. 4: magnitudes at pi / 8 of the analytic, rigid and estimated models."""
+    data = experiment.data
+    theta2 = float(data.theta2[0])
+    models = {
+        "analytic": data.analytic_models[0],
+        "estimated": nearest_model(experiment.pipeline, np.cos(theta2)),
+        "rigid arm": data.arm.rigid(theta2),
+    }
+    display = BodeDisplay.from_models(models, omega=np.geomspace(*BODE_RANGE, 600))
+    nyquist = np.pi / data.sampling_time
+    for ax in display.axes_.flat:
+        ax.axvline(nyquist, color="0.6", linewidth=0.8, linestyle=":")
+    display.axes_[0, 0].annotate(
+        "Nyquist",
+        (nyquist, 0.02),
+        xycoords=("data", "axes fraction"),
+        xytext=(-3, 0),
+        textcoords="offset points",
+        ha="right",
+        fontsize=8,
+        color="0.4",
+    )
+    angle = nearest_angle(data.theta2, np.cos(theta2))
+    return display.figure_, f"Bode magnitudes of the local models at θ₂ = {angle}"
+
+
+def draw_parameters(experiment: PaperExperiment) -> tuple[Any, str]:
+    """Fig. 5: the restructured and the analytic parameters over cos(theta2)."""
+    names = experiment.pipeline.parameters_.columns.tolist()
+    sets = {
+        name: experiment.parameters[name].theta for name in ("restructured", "analytic")
+    }
+    display = ParameterDisplay(
+        experiment.pipeline.operating_points_,
+        sets,
+        names=names,
+        interpolators={"restructured": experiment.lpv["restructured"].interpolator},
+        scheduling_label="κ = cos θ₂",
+    ).plot()
+    return display.figure_, (
+        f"Parameters of the restructured and the analytic models, degree "
+        f"{experiment.degree}"
+    )
+
+
+def draw_balanced(experiment: PaperExperiment) -> tuple[Any, str]:
+    """Fig. 6: entries of A of the balanced local models over cos(theta2)."""
+    found = experiment.parameters["balanced"]
+    A = found.structure.matrices(found.theta)[0]
+    order = A.shape[1]
+    entries = [(i, j) for i, j in BALANCED_ENTRIES if max(i, j) <= order]
+    display = ParameterDisplay.from_parameters(
+        experiment.pipeline.operating_points_,
+        {"balanced": np.array([A[:, i - 1, j - 1] for i, j in entries]).T},
+        names=[f"A[{i}, {j}]" for i, j in entries],
+        interpolator=PolynomialLPV(experiment.degree),
+        scheduling_label="κ = cos θ₂",
+    )
+    return display.figure_, (
+        f"Entries of A of the balanced local models, degree {experiment.degree}"
+    )
+
+
+def draw_sweep_angle(experiment: PaperExperiment) -> tuple[Any, str]:
+    """Fig. 7: theta2 during the validation of the LPV models."""
+    data = experiment.data
+    figure, axes = axes_grid(None, 1, 1, height=3.2)
+    ax = axes[0, 0]
+    ax.plot(
+        data.X_sweep["time"],
+        np.arccos(data.X_sweep["kappa"]),
+        color="#000000",
+        linewidth=1.4,
+        label="θ₂ during the sweep",
+    )
+    for theta2 in data.theta2:
+        ax.axhline(theta2, color="#0072B2", linewidth=0.8, linestyle="--", zorder=1)
+    (local,) = ax.plot([], [], color="#0072B2", linewidth=0.8, linestyle="--")
+    local.set_label("operating points of the local experiments")
+    ax.set_yticks(
+        data.theta2, [nearest_angle(data.theta2, np.cos(t)) for t in data.theta2]
+    )
+    ax.set_xlim(0.0, data.X_sweep["time"].iloc[-1])
+    ax.set_ylabel("θ₂ (rad)")
+    ax.set_xlabel("Time (s)")
+    tidy(ax)
+    figure_legend(figure, ax, ax.get_legend_handles_labels()[0], own=True)
+    return figure, "θ₂ during the validation of the LPV models"
+
+
+def sweep_drawer(name: str) -> Callable[[PaperExperiment], tuple[Any, str]]:
+    """The function that draws one LPV model on the sweep: Fig. 8, 9 or 10."""
+
+    def draw(experiment: PaperExperiment) -> tuple[Any, str]:
+        data = experiment.data
+        model = experiment.lpv[name]
+        display = SimulationDisplay.from_predictions(
+            data.X_sweep["time"],
+            data.y_sweep,
+            {f"LPV, {name}": simulate_sweep(model, data)},
+            units=RATE,
+        )
+        return display.figure_, f"LPV model from the {name} local models on the sweep"
+
+    return draw
+
+
+def nearest_angle(theta2: Array, kappa: float) -> str:
+    """The operating point nearest to a scheduling value, as a multiple of pi."""
+    n = len(theta2) + 1
+    i = int(np.argmin(np.abs(np.cos(theta2) - kappa))) + 1
+    return f"π/{n}" if i == 1 else f"{i}π/{n}"
+
+
+FIGURES: dict[int, Callable[[PaperExperiment], tuple[Any, str]]] = {
+    2: draw_data,
+    3: draw_local_responses,
+    4: draw_bode,
+    5: draw_parameters,
+    6: draw_balanced,
+    7: draw_sweep_angle,
+    8: sweep_drawer("restructured"),
+    9: sweep_drawer("analytic"),
+    10: sweep_drawer("balanced"),
+}

@@ -1,0 +1,401 @@
+"""The whole method: local experiments to a validated LPV model."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
+from sklearn.utils.validation import check_is_fitted
+
+from ..data.columns import ROLES, as_list
+from ..data.experiments import Experiment, read_experiments, read_outputs
+from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
+from ..data.preparation import split_at_gaps
+from ..exceptions import ExtrapolationWarning
+from ..lpv.model import LPVStateSpace
+from ..lpv.polynomial import PolynomialLPV
+from ..metrics.simulation import in_table_order, simulate_experiments
+from ..restructuring.estimator import GrayBoxRestructurer
+from ..subspace.estimator import SubspaceLTI
+from ..validation import positive_time
+from .local_models import identify_points
+from .reports import (
+    operating_point_report,
+    parameter_report,
+    parameter_tables,
+    summarise,
+)
+from .runner import Laps, PointRunner, check_steps, checked_memory
+from .structured_models import restructure_points
+
+Array = NDArray[np.float64]
+
+__all__ = ["LocalLPVPipeline"]
+
+_DEFAULTS = {
+    "local": SubspaceLTI,
+    "restructurer": GrayBoxRestructurer,
+    "interpolator": PolynomialLPV,
+}
+
+
+class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """Local LPV identification: experiments at operating points to one LPV model.
+
+    Identifies a black-box model at every operating point, brings each into the
+    gray-box structure, so that all share one state basis, and interpolates the
+    parameters over the scheduling variables. A row of the table is a time instant.
+
+    Parameters
+    ----------
+    local : estimator, default=None
+        Step 3, a black-box model per operating point; None is ``SubspaceLTI()``. Its
+        column roles are set by the pipeline. ``order="auto"`` becomes the order of the
+        restructurer's structure where it has one.
+    restructurer : GrayBoxRestructurer, "passthrough" or None, default=None
+        Step 4; None is ``GrayBoxRestructurer()``, the observable canonical form.
+        "passthrough" interpolates the entries of the balanced local models: the
+        baseline without structure.
+    interpolator : regressor, default=None
+        Step 5, from scheduling values (n_points, n_scheduling) to parameters
+        (n_points, n_params); None is ``PolynomialLPV()``, a parabola (a line through
+        two points). Any scikit-learn regressor with several outputs serves. One
+        operating point makes a constant, whatever the interpolator.
+    inputs, scheduling, experiment, time, operating_point : column name, position or \
+list, default=None
+        Roles of the columns of X. Inputs None: every column without another role.
+        Experiment None: the table is one experiment. Scheduling None: the model is
+        time-invariant. Operating point None: experiments are grouped by their mean
+        scheduling value.
+    scheduling_tol : float, default=None
+        Distance below which experiments belong to one operating point; None chooses it
+        from the data.
+    sampling_time : float, default=None
+        Seconds between samples. None reads it from the time column, else takes that of
+        `local`.
+    combine : {"pool", "average"}, default="pool"
+        Several experiments at one operating point enter one fit, or are identified
+        one by one and their balanced models averaged (the paper's Monte Carlo).
+    discretization : {"zoh", "tustin"}, default="zoh"
+        From discrete to continuous time; "zoh" is exact for inputs that are held.
+    on_error : {"raise", "skip"}, default="raise"
+        What a failure at one operating point does: raise an error that names it, or
+        leave the point out with a warning.
+    memory : str, path or joblib.Memory, default=None
+        Where local and gray-box models are kept, as in scikit-learn's ``Pipeline``: a
+        search over the interpolator then identifies and restructures nothing twice,
+        nor do splits that share operating points. Results from it warn no more.
+    n_jobs : int, default=None
+        Operating points worked on at the same time.
+    verbose : int, default=0
+        1 shows a progress bar.
+
+    Attributes
+    ----------
+    operating_points_ : ndarray of shape (n_points, n_scheduling)
+    local_models_ : list of StateSpace
+        Black-box models, continuous time, balanced.
+    structured_models_ : list of StateSpace
+        Gray-box models (the balanced ones after "passthrough").
+    restructurers_ : list
+        The fitted restructurers, empty after "passthrough".
+    parameters_ : DataFrame of shape (n_points, n_params)
+        Gray-box parameters, one row per operating point.
+    parameters_std_ : DataFrame of shape (n_points, n_params)
+        Their standard deviations, to first order: from the covariance of the pooled
+        black box, or from the spread of the realizations that ``combine="average"``
+        identifies. NaN where that is not known: a local model that does not minimise
+        the simulation error (``refine=False``, a stability that had to be enforced),
+        collinear inputs, or "passthrough".
+    interpolator_ : fitted regressor
+    lpv_ : LPVStateSpace
+    report_ : DataFrame
+        One row per operating point: experiments, samples, order, BFT of the local and
+        of the gray-box model on the estimation data (percent, mean over the outputs),
+        restructuring error, its structural floor and what remains apart from that, all
+        relative to the black box's norm, the active frequency (rad/s) of what
+        remains, stationarity; the distance from the gray-box
+        model to the interpolated one (H-infinity norm, relative), and the FIT (percent,
+        Eq. (36)) of its parameters; the parameters ("param_"), and their standard
+        deviations ("std_") where known.
+    parameter_report_ : DataFrame
+        One row per parameter: lowest and highest value over the points, median
+        standard deviation, RMSE and FIT (percent) of the interpolation.
+    step_times_ : dict of str to float
+        Seconds that each step took.
+    scheduling_range_ : ndarray of shape (2, n_scheduling)
+        Beyond which `predict` warns: the operating points, widened by how far the
+        scheduling variables moved within an experiment.
+    sampling_time_ : float
+    output_names_, scheduling_names_ : list
+    n_outputs_, n_features_in_ : int
+    feature_names_in_ : ndarray of str
+
+    See Also
+    --------
+    SubspaceLTI, GrayBoxRestructurer, PolynomialLPV : The three steps.
+
+    Examples
+    --------
+    A spring that stiffens with the scheduling variable, excited at three values of it:
+
+    >>> import numpy as np
+    >>> from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, LocalLPVPipeline
+    >>> from lpvlearn import from_trajectories
+    >>> spring = GrayBoxStructure.from_template(
+    ...     A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0]])
+    >>> u = np.sign(np.random.default_rng(0).standard_normal(400))
+    >>> X, y = from_trajectories(
+    ...     [(u, kappa, spring.model({"k": 4 + kappa**2, "c": 1}).simulate(
+    ...         u, sampling_time=0.1)) for kappa in (0.0, 1.0, 2.0)], sampling_time=0.1)
+    >>> pipeline = LocalLPVPipeline(
+    ...     restructurer=GrayBoxRestructurer(spring),
+    ...     scheduling="kappa", experiment="experiment", time="time").fit(X, y)
+    >>> pipeline.parameters_.round(4)
+                       c    k
+    operating_point
+    0.0              1.0  4.0
+    1.0              1.0  5.0
+    2.0              1.0  8.0
+    >>> bool(pipeline.score(X, y) > 0.999)
+    True
+    """
+
+    def __init__(
+        self,
+        local: Any = None,
+        restructurer: Any = None,
+        interpolator: Any = None,
+        *,
+        inputs: Any = None,
+        scheduling: Any = None,
+        experiment: Any = None,
+        time: Any = None,
+        operating_point: Any = None,
+        scheduling_tol: float | None = None,
+        sampling_time: float | None = None,
+        combine: str = "pool",
+        discretization: str = "zoh",
+        on_error: str = "raise",
+        memory: Any = None,
+        n_jobs: int | None = None,
+        verbose: int = 0,
+    ) -> None:
+        self.local = local
+        self.restructurer = restructurer
+        self.interpolator = interpolator
+        self.inputs = inputs
+        self.scheduling = scheduling
+        self.experiment = experiment
+        self.time = time
+        self.operating_point = operating_point
+        self.scheduling_tol = scheduling_tol
+        self.sampling_time = sampling_time
+        self.combine = combine
+        self.discretization = discretization
+        self.on_error = on_error
+        self.memory = memory
+        self.n_jobs = n_jobs
+        self.verbose = verbose
+
+    def set_params(self, **params: Any) -> LocalLPVPipeline:
+        """Set parameters, also ``step__name`` of a step left None (its default)."""
+        for step, default in _DEFAULTS.items():
+            nested = any(name.startswith(step + "__") for name in params)
+            if nested and params.get(step, getattr(self, step)) is None:
+                params[step] = default()
+        return super().set_params(**params)
+
+    # -- fitting -------------------------------------------------------------------
+
+    def fit(self, X: Any, y: Any) -> LocalLPVPipeline:
+        """Identify the LPV model from local experiments.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+            Inputs, scheduling variables and columns with other roles.
+        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            If a role names no column, an experiment is not local, or a step fails at
+            an operating point (which the message names).
+        """
+        self._check_options()
+        runner, laps = self._runner(), Laps()
+        experiments = self._read(X, y, reset=True)
+        self.output_names_ = read_outputs(y)[1]
+        self.n_outputs_ = len(self.output_names_)
+        self._single_output = np.asarray(y).ndim == 1
+        check_outputs(experiments, self.output_names_)
+        self.sampling_time_ = self._sampling_time(experiments)
+
+        # Steps 1 and 2: local experiments, in groups by operating point
+        points = local_experiments(experiments, self.scheduling_tol)
+        laps.mark("reading of the table")
+
+        # Step 3: a black-box model at every operating point
+        restructurer = self._restructurer()
+        local, points = identify_points(
+            SubspaceLTI() if self.local is None else self.local,
+            points,
+            runner,
+            structure=getattr(restructurer, "structure", None),
+            sampling_time=self.sampling_time_,
+            combine=self.combine,
+            discretization=self.discretization,
+        )
+        laps.mark("local models")
+
+        # Step 4: all of them in one structure
+        structured = restructure_points(restructurer, local, points.kappa, runner)
+        local = [local[k] for k in structured.kept]
+        points = points.keep(structured.kept)
+        self.local_models_ = [model.lti for model in local]
+        self.structured_models_ = structured.models
+        self.restructurers_ = structured.restructurers
+        laps.mark("restructuring")
+
+        # Step 5: the parameters as functions of the scheduling variables
+        theta, kappa = structured.theta, points.kappa
+        self.interpolator_ = self._interpolator(len(points)).fit(kappa, theta)
+        self.lpv_ = LPVStateSpace(structured.structure, self.interpolator_, points.span)
+        self.operating_points_ = kappa
+        self.scheduling_range_ = points.identified_range
+        self.scheduling_names_ = as_list(self.scheduling)
+        self.parameters_, self.parameters_std_ = parameter_tables(structured, kappa)
+        found = (points, local, structured, self.parameters_std_, self.lpv_)
+        self.report_ = operating_point_report(*found, self.sampling_time_)
+        self.parameter_report_ = parameter_report(
+            self.parameters_, self.parameters_std_, self.lpv_.parameters(kappa)
+        )
+        laps.mark("interpolation and report")
+        self.step_times_ = laps.seconds
+        return self
+
+    # -- use -----------------------------------------------------------------------
+
+    def predict(self, X: Any) -> Array:
+        """Simulate the LPV model along every experiment of a table, from rest.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Where a scheduling variable leaves `scheduling_range_`.
+        """
+        check_is_fitted(self, "lpv_")
+        return self._simulate(self._read(X, None, reset=False), estimate=False)
+
+    def predict_with_initial_state(self, X: Any, y: Any) -> Array:
+        """Simulate from initial states estimated on the measured outputs.
+
+        For tables that start in the middle of an experiment: `y` serves for the initial
+        state of every experiment only (least squares over the whole experiment).
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+        """
+        check_is_fitted(self, "lpv_")
+        return self._simulate(self._read(X, y, reset=False), estimate=True)
+
+    def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
+        """Rows of every experiment of a table, in the order of time."""
+        check_is_fitted(self, "lpv_")
+        return [e.rows for e in self._read(X, None, reset=False)]
+
+    def summary(self) -> str:
+        """What was identified and how well, as text: ``print(pipeline.summary())``."""
+        check_is_fitted(self, "lpv_")
+        return summarise(self)
+
+    def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
+        if getattr(self.interpolator_, "extrapolation", None) != "clip":
+            warn_extrapolation(
+                experiments, self.scheduling_range_, self.scheduling_names_
+            )
+        with warnings.catch_warnings():  # said above, of all experiments at once
+            warnings.simplefilter("ignore", ExtrapolationWarning)
+            simulated = simulate_experiments(
+                self.lpv_, experiments, self.sampling_time_, estimate=estimate
+            )
+        out = in_table_order(experiments, simulated)
+        return out[:, 0] if self._single_output else out
+
+    # -- helpers -------------------------------------------------------------------
+
+    def _read(self, X: Any, y: Any, *, reset: bool) -> list[Experiment]:
+        roles: dict[str, Any] = {name: getattr(self, name) for name in ROLES}
+        options: dict[str, Any] = {"reset": reset}
+        if reset:
+            gaps = getattr(self.local, "missing", None) == "split"
+            options |= {"sampling_time": self.sampling_time, "allow_missing": gaps}
+        experiments = read_experiments(self, X, y, **roles, **options)
+        return (
+            split_at_gaps(experiments) if options.get("allow_missing") else experiments
+        )
+
+    def _sampling_time(self, experiments: list[Experiment]) -> float:
+        steps = [e.sampling_time for e in experiments if e.sampling_time is not None]
+        if steps:
+            return float(np.median(steps))
+        if self.sampling_time is not None:
+            return positive_time("sampling_time", self.sampling_time)
+        return float(getattr(self.local, "sampling_time", 1.0))
+
+    def _runner(self) -> PointRunner:
+        steps = {"local": self.local, "restructurer": self.restructurer}
+        memory = checked_memory(self.memory, steps)
+        return PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
+
+    def _restructurer(self) -> Any:
+        """The restructurer to clone, or None for "passthrough"."""
+        if isinstance(self.restructurer, str):
+            return None
+        if self.restructurer is None:
+            return GrayBoxRestructurer()
+        return self.restructurer
+
+    def _interpolator(self, n_points: int) -> Any:
+        if n_points == 1:
+            return PolynomialLPV(degree=0)
+        if self.interpolator is None:
+            return PolynomialLPV(degree=min(2, n_points - 1))
+        return clone(self.interpolator)
+
+    def _check_options(self) -> None:
+        for name, value, allowed in (
+            ("combine", self.combine, ("pool", "average")),
+            ("discretization", self.discretization, ("zoh", "tustin")),
+            ("on_error", self.on_error, ("raise", "skip")),
+        ):
+            if value not in allowed:
+                raise ValueError(f"`{name}` must be one of {allowed}. Got {value!r}.")
+        check_steps({name: getattr(self, name) for name in _DEFAULTS})
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.regressor_tags.poor_score = True
+        return tags

@@ -1,0 +1,272 @@
+"""Step 3: the experiments of every operating point to a continuous-time model."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from sklearn.base import clone
+
+from ..data.experiments import Experiment
+from ..data.operating_points import OperatingPoints
+from ..models.statespace import StateSpace
+from ..structures.structure import GrayBoxStructure
+from ..subspace.statistics import ModelPair, deviated_models
+from ..systems.balancing import align_signs
+from .runner import PointRunner
+
+Array = NDArray[np.float64]
+
+# Mean of an output in standard deviations, from which it looks like an offset.
+_OFFSET = 5.0
+
+_ROLES = ("inputs", "scheduling", "experiment", "time", "operating_point")
+
+
+@dataclass(frozen=True)
+class LocalModel:
+    """The black-box model of one operating point.
+
+    Attributes
+    ----------
+    lti : StateSpace
+        Continuous time, balanced.
+    order : int
+        As identified, in discrete time.
+    horizon : int or None
+        Horizon of the subspace step, where the estimator tells it.
+    realizations : list of StateSpace
+        Models that were averaged; none after a pooled fit.
+    deviated : list of (StateSpace, StateSpace)
+        Continuous-time models to either side of a pooled fit, as `deviated_models`
+        has them.
+    """
+
+    lti: StateSpace
+    order: int
+    horizon: int | None
+    realizations: list[StateSpace] = field(default_factory=list)
+    deviated: list[ModelPair] = field(default_factory=list)
+
+
+def identify_points(
+    local: Any,
+    points: OperatingPoints,
+    runner: PointRunner,
+    *,
+    structure: GrayBoxStructure | None,
+    **options: Any,
+) -> tuple[list[LocalModel], OperatingPoints]:
+    """Identify the local models of all operating points.
+
+    Parameters
+    ----------
+    local : estimator
+        As in `identify_point`.
+    points : OperatingPoints
+    runner : PointRunner
+    structure : GrayBoxStructure or None
+        Its order replaces ``order="auto"`` of the local estimator. Without one, "auto"
+        becomes the highest order that a point takes.
+    **options
+        As in `identify_point`.
+
+    Returns
+    -------
+    models : list of LocalModel
+    points : OperatingPoints
+        Those that did not fail.
+    """
+    chooses = _has_auto_order(local)
+    if chooses and isinstance(structure, GrayBoxStructure):
+        local = clone(local).set_params(order=structure.order)
+    # Where a record stood in the table does not matter: splits share their results.
+    groups = [[_bare(e) for e in group] for group in points.experiments]
+
+    def identify(estimator: Any) -> list[LocalModel | None]:
+        arguments = [(estimator, group) for group in groups]
+        return runner.run(
+            "local models", identify_point, arguments, points.kappa, **options
+        )
+
+    found = identify(local)
+    orders = {model.order for model in found if model is not None}
+    if chooses and structure is None and len(orders) > 1:
+        found = identify(clone(local).set_params(order=max(orders)))
+    kept = [k for k, model in enumerate(found) if model is not None]
+    return [model for model in found if model is not None], points.keep(kept)
+
+
+def identify_point(
+    local: Any,
+    experiments: Sequence[Experiment],
+    *,
+    sampling_time: float,
+    combine: str,
+    discretization: str,
+) -> LocalModel:
+    """Identify the local model of one operating point.
+
+    Parameters
+    ----------
+    local : estimator
+        Like `SubspaceLTI`: fitted, it has `lti_`, a discrete-time StateSpace. It is
+        cloned.
+    experiments : sequence of Experiment
+        The realisations of this operating point.
+    combine : {"pool", "average"}
+        One fit of all experiments, or one model each, balanced, signs aligned, and the
+        matrices averaged (the paper's Monte Carlo).
+    discretization : {"zoh", "tustin"}
+
+    Raises
+    ------
+    ValueError
+        If no output varies, or the identified model is unstable, so that it cannot be
+        balanced.
+    """
+    advice = _look_at_outputs(experiments)
+    labels = list(dict.fromkeys(e.label for e in experiments))
+    if combine == "pool" or len(labels) == 1:
+        fitted = fit_local(local, experiments, sampling_time)
+        lti = _continuous(fitted.lti_, discretization, advice)
+        deviated = deviated_models(
+            fitted,
+            [(e.inputs, e.outputs) for e in experiments if e.outputs is not None],
+            lambda model: model.to_continuous(discretization),
+        )
+        return LocalModel(lti, fitted.lti_.order, _horizon(fitted), deviated=deviated)
+    # The first realisation chooses order and horizon, the others follow it.
+    # A realisation with gaps is several experiments of one label.
+    realisations = [[e for e in experiments if e.label == label] for label in labels]
+    fitted = fit_local(local, realisations[0], sampling_time)
+    chosen = clone(local)
+    for name in ("order", "horizon"):
+        if name in chosen.get_params() and hasattr(fitted, name + "_"):
+            chosen.set_params(**{name: getattr(fitted, name + "_")})
+    models, failures = [], []
+    for realisation in realisations:
+        model = fit_local(chosen, realisation, sampling_time).lti_
+        try:
+            models.append(_continuous(model, discretization, advice))
+        except ValueError as error:
+            failures.append((realisation[0].label, error))
+    if not models:
+        raise failures[0][1]
+    if failures:
+        warnings.warn(
+            f"{len(failures)} of {len(labels)} realisations were left out of the "
+            f"average; the first, {failures[0][0]!r}: {failures[0][1]}",
+            UserWarning,
+            stacklevel=2,
+        )
+    models = [model for model in models if model.order == models[0].order]
+    return LocalModel(
+        average_models(models), fitted.lti_.order, _horizon(fitted), models
+    )
+
+
+def fit_local(
+    local: Any, experiments: Sequence[Experiment], sampling_time: float
+) -> Any:
+    """A clone of the local estimator, fitted on the experiments as one table."""
+    u = np.vstack([e.inputs for e in experiments])
+    y = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    label = np.repeat(np.arange(len(experiments)), [len(e.rows) for e in experiments])
+    names = _column_names(experiments[0].input_names, u.shape[1])
+    table = pd.DataFrame(np.column_stack([u, label]), columns=names)
+    roles = dict.fromkeys(_ROLES)
+    own: dict[str, Any] = {
+        **roles,
+        "inputs": names[:-1],
+        "experiment": names[-1],
+        "sampling_time": sampling_time,
+    }
+    estimator = clone(local)
+    known = estimator.get_params(deep=False)
+    estimator.set_params(**{name: own[name] for name in own if name in known})
+    fitted = estimator.fit(table, y)
+    if not isinstance(getattr(fitted, "lti_", None), StateSpace):
+        raise ValueError(
+            "`local` must be an estimator that identifies a StateSpace model, its "
+            f"attribute `lti_`, as SubspaceLTI does. Got {type(local).__name__}."
+        )
+    return fitted
+
+
+def _column_names(inputs: Sequence[Hashable], n_inputs: int) -> list[str]:
+    """Names of the inputs as the user knows them, and of a column of labels."""
+    names = [str(name) for name in inputs or range(n_inputs)]
+    label = "experiment"
+    while label in names:
+        label += "_"
+    return [*names, label]
+
+
+def average_models(models: Sequence[StateSpace]) -> StateSpace:
+    """Average balanced models of one order, state signs aligned to the first."""
+    reference = models[0]
+    total = [np.zeros_like(M) for M in (reference.A, reference.B, reference.C)]
+    D = np.zeros_like(reference.D)
+    for model in models:
+        s = align_signs(model.B, model.C, reference.B, reference.C)
+        total[0] += s[:, None] * model.A * s
+        total[1] += s[:, None] * model.B
+        total[2] += model.C * s
+        D += model.D
+    n = len(models)
+    return StateSpace(total[0] / n, total[1] / n, total[2] / n, D / n)
+
+
+def _has_auto_order(local: Any) -> bool:
+    order = local.get_params(deep=False).get("order")
+    return isinstance(order, str) and order == "auto"
+
+
+def _bare(experiment: Experiment) -> Experiment:
+    """An experiment without its place in the table."""
+    return replace(
+        experiment,
+        rows=np.arange(len(experiment.rows)),
+        scheduling=None,
+        operating_point=None,
+    )
+
+
+def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
+    """What to try first if the model turns out unstable."""
+    outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    spread = outputs.std(axis=0)
+    if len(outputs) > len(experiments) and not np.ptp(outputs, axis=0).any():
+        raise ValueError(
+            f"An output must vary. Got {outputs[0].tolist()} throughout: no dynamics "
+            "can be identified from it."
+        )
+    if (np.abs(outputs.mean(axis=0)) > _OFFSET * spread).any():
+        return (
+            "The outputs stand far from zero: subtract their value at rest from y (a "
+            "simulation begins there). Else try "
+        )
+    return "Try "
+
+
+def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpace:
+    lti = model.to_continuous(discretization)
+    if not lti.is_stable:
+        worst = lti.poles()[np.argmax(lti.poles().real)]
+        raise ValueError(
+            f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
+            "local=SubspaceLTI(stability='enforce'), another `order`, a longer "
+            "`horizon` or more data, or leave the point out by on_error='skip'."
+        )
+    return lti.balance()
+
+
+def _horizon(fitted: Any) -> int | None:
+    horizon = getattr(fitted, "horizon_", None)
+    return None if horizon is None else int(horizon)

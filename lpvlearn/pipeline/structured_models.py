@@ -1,0 +1,251 @@
+"""Step 4 over all operating points: the points help one another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import clone
+
+from ..models.statespace import StateSpace
+from ..restructuring.identifiability import response_gain
+from ..restructuring.problem import problem_from_models
+from ..restructuring.starts import GOOD_FIT
+from ..structures.structure import GrayBoxStructure
+from ..subspace.statistics import _STEP, ModelPair
+from ..systems.balancing import align_signs
+from .local_models import LocalModel
+from .runner import PointRunner
+
+Array = NDArray[np.float64]
+
+
+def covariance_of_parameters(
+    structure: GrayBoxStructure,
+    theta: Array,
+    weight: Any,
+    model: StateSpace,
+    deviated: Sequence[ModelPair],
+) -> Array:
+    """Covariance of gray-box parameters from that of the black box.
+
+    The response's deviations are carried to the parameters to first order, as the
+    least-squares fit of the response does.
+
+    Parameters
+    ----------
+    structure : GrayBoxStructure
+    theta : ndarray of shape (n_params,)
+    weight : StateSpace, (low, high) or None
+        As `frequency_weight` of `GrayBoxRestructurer`.
+    model : StateSpace
+        The black box.
+    deviated : sequence of (StateSpace, StateSpace)
+        From `deviated_models`.
+
+    Returns
+    -------
+    ndarray of shape (n_params, n_params)
+    """
+    problem = problem_from_models(structure, [model], weight)
+    omega = problem.omega
+    K = response_gain(problem.system, theta, omega).conj()
+    changes = []
+    for above, below in deviated:
+        dG = above.frequency_response(omega) - below.frequency_response(omega)
+        changes.append(np.einsum("jkpm,kpm->j", K, dG).real / (2.0 * _STEP))
+    T = np.array(changes)
+    return T.T @ T
+
+
+_SWEEPS = 4
+
+_NEIGHBOURS = 2
+
+_BETTER = 0.98  # a neighbour's start must lower the least-squares error by that
+
+
+@dataclass(frozen=True)
+class StructuredModels:
+    """Models of one structure at the operating points.
+
+    Attributes
+    ----------
+    structure : GrayBoxStructure
+    theta : ndarray of shape (n_points, n_params)
+        Parameters.
+    models : list of StateSpace
+    restructurers : list
+        The fitted restructurers; empty without that step.
+    kept : list of int
+        The operating points, of those given, that did not fail.
+    covariances : list of ndarray or None
+        Of the parameters, where they are known.
+    """
+
+    structure: GrayBoxStructure
+    theta: Array
+    models: list[StateSpace]
+    restructurers: list[Any]
+    kept: list[int]
+    covariances: list[Array | None]
+
+
+def restructure_points(
+    restructurer: Any, local: Sequence[LocalModel], kappa: Array, runner: PointRunner
+) -> StructuredModels:
+    """Bring the local models of all operating points into one structure.
+
+    Parameters
+    ----------
+    restructurer : estimator or None
+        Like `GrayBoxRestructurer`; None takes the entries of balanced models as they
+        are.
+    local : sequence of LocalModel
+    kappa : ndarray of shape (n_points, n_scheduling)
+    runner : PointRunner
+    """
+    if restructurer is None:
+        structure, theta = balanced_entries([model.lti for model in local])
+        balanced = [structure.model(row) for row in theta]
+        every = list(range(len(theta)))
+        return StructuredModels(
+            structure, theta, balanced, [], every, [None] * len(theta)
+        )
+    # What a fit is about: the model, and where they are known its realizations.
+    tasks = [
+        (_plain(model.lti), [_plain(other) for other in model.realizations])
+        for model in local
+    ]
+    found = runner.run(
+        "restructuring", restructure_point, tasks, kappa, restructurer=restructurer
+    )
+    kept = [k for k, result in enumerate(found) if result is not None]
+    helped = runner.memory.cache(help_neighbours, ignore=["fitted"])(
+        [found[k] for k in kept], [tasks[k] for k in kept], kappa[kept], restructurer
+    )
+    theta = np.array([fitted.params_ for fitted in helped])
+    structured = [fitted.lti_ for fitted in helped]
+    covariances = [
+        point_covariance(fitted, local[k], runner)
+        for k, fitted in zip(kept, helped, strict=True)
+    ]
+    return StructuredModels(
+        helped[0].structure_, theta, structured, helped, kept, covariances
+    )
+
+
+def point_covariance(
+    fitted: Any, local: LocalModel, runner: PointRunner
+) -> Array | None:
+    """Covariance of the parameters at one point: the restructurer's, else our own."""
+    told = getattr(fitted, "params_covariance_", None)
+    if told is not None or not local.deviated:
+        return None if told is None else np.asarray(told)
+    return runner.memory.cache(covariance_of_parameters)(
+        fitted.structure_,
+        fitted.params_,
+        getattr(fitted, "frequency_weight", None),
+        _plain(local.lti),
+        local.deviated,
+    )
+
+
+def restructure_point(
+    model: StateSpace,
+    realizations: Sequence[StateSpace],
+    *,
+    restructurer: Any,
+    **options: Any,
+) -> Any:
+    """A clone of the restructurer, fitted to one local model."""
+    if len(realizations) > 1:
+        options["realizations"] = realizations
+    return clone(restructurer).fit_model(model, **options)
+
+
+def help_neighbours(
+    fitted: Sequence[Any],
+    tasks: Sequence[tuple[StateSpace, list[StateSpace]]],
+    kappa: Array,
+    restructurer: Any,
+) -> list[Any]:
+    """Try the parameters of neighbouring points as starts, until nothing improves.
+
+    A point in a wrong basin is one that its neighbours' parameters lead out of. Points
+    that fit well need no help.
+
+    Parameters
+    ----------
+    fitted : sequence of estimators
+        The restructurer fitted to every model: they follow from the other arguments.
+    tasks : sequence of tuple
+        Model and realizations of every point.
+    kappa : ndarray of shape (n_points, n_scheduling)
+    restructurer : estimator
+    """
+    fitted = list(fitted)
+    span = np.ptp(kappa, axis=0)
+    scaled = kappa / np.where(span > 0, span, 1.0)
+    distance = np.linalg.norm(scaled[:, None] - scaled[None], axis=2)
+    tried: set[tuple[int, bytes]] = set()
+    for _ in range(_SWEEPS):
+        improved = False
+        for i, task in enumerate(tasks):
+            if fitted[i].fit_error_ <= GOOD_FIT:
+                continue
+            for j in np.argsort(distance[i], kind="stable")[1 : 1 + _NEIGHBOURS]:
+                start = fitted[j].params_
+                key = (i, start.tobytes())
+                if key in tried:
+                    continue
+                tried.add(key)
+                own = fitted[i].fit_error_
+                if fitted[i].start_error(task[0], start) < _BETTER * own:
+                    fitted[i] = restructure_point(
+                        *task, restructurer=restructurer, starts=[start]
+                    )
+                    improved = True
+        if not improved:
+            break
+    return fitted
+
+
+def _plain(model: StateSpace) -> StateSpace:
+    """The model with matrices laid out as a memory returns them, to be found there."""
+    A, B, C, D = (np.array(M, order="C") for M in (model.A, model.B, model.C, model.D))
+    return StateSpace(A, B, C, D, model.sampling_time)
+
+
+def balanced_entries(models: Sequence[StateSpace]) -> tuple[GrayBoxStructure, Array]:
+    """The entries of balanced models as parameters, signs aligned along the points.
+
+    The baseline of the paper: no common state basis is guaranteed.
+
+    Raises
+    ------
+    ValueError
+        If the models differ in order.
+    """
+    orders = sorted({model.order for model in models})
+    if len(orders) > 1:
+        raise ValueError(
+            "`restructurer='passthrough'` interpolates matrices and needs local models "
+            f"of one order. Got orders {orders}. Fix the order: "
+            "local=SubspaceLTI(order=...)."
+        )
+    first = models[0]
+    structure = GrayBoxStructure.full(orders[0], first.n_inputs, first.n_outputs)
+    rows = []
+    previous = first
+    for model in models:
+        s = align_signs(model.B, model.C, previous.B, previous.C)
+        previous = StateSpace(
+            s[:, None] * model.A * s, s[:, None] * model.B, model.C * s, model.D
+        )
+        blocks = (previous.A, previous.B, previous.C, previous.D)
+        rows.append(np.concatenate([block.ravel() for block in blocks]))
+    return structure, np.array(rows)

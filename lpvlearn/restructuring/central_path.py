@@ -1,0 +1,438 @@
+"""The logarithmic barrier of the error's largest singular value, and its derivatives.
+
+With a level t above the largest singular value of the error E at every frequency,
+
+    psi(theta, mu) = min_t  log t - mu sum_k log det(I - E_k^H E_k / t^2)
+
+is smooth: least squares for a large mu, the highest singular value for a small one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .coordinates import ResponseGeometry
+from .error_system import ErrorSystem
+from .least_squares import frequency_grid
+from .limits import Limits
+from .measured import MeasuredErrorSystem
+
+Array = NDArray[np.float64]
+
+Complex = NDArray[np.complex128]
+
+_BARRIER = 1e-2  # weight of the logarithms of the limits, relative to mu
+
+
+def level_of(squares: Array, mu: float) -> float:
+    """Square of the level t, where ``2 mu sum s / (t^2 - s) = 1``.
+
+    Parameters
+    ----------
+    squares : ndarray
+        Squared singular values s, of all frequencies.
+    """
+    top = float(squares.max())
+    gap, low = squares - top, 2.0 * mu * top
+    high = 2.0 * mu * float(squares.sum())
+    x = low
+    for _ in range(60):  # 1 / sum is nearly linear in the distance x
+        ratio = squares / (x - gap)
+        total = float(ratio.sum())
+        slope = float((ratio / (x - gap)).sum())
+        new = x - (1.0 / total - 2.0 * mu) * total**2 / slope
+        new = min(max(new, low), high)
+        if abs(new - x) <= 4e-16 * new:
+            break
+        x = new
+    return top + x
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """psi near one theta, along geodesics of the response.
+
+    Attributes
+    ----------
+    value : float
+    gradient : ndarray of shape (q,)
+    hessian : ndarray of shape (q, q)
+    drift : ndarray of shape (q,)
+        Derivative of the gradient by mu.
+    geometry : ResponseGeometry
+        Of which y are the coordinates.
+    """
+
+    value: float
+    gradient: Array
+    hessian: Array
+    drift: Array
+    geometry: ResponseGeometry
+
+
+class Barrier:
+    """psi for one set of frequencies.
+
+    Parameters
+    ----------
+    system : ErrorSystem
+    limits : Limits
+        Kept by logarithms of their own.
+    omega : ndarray
+        Frequencies, rad/s.
+    size : float
+        Change of the response that a unit step makes.
+
+    Attributes
+    ----------
+    missed : ndarray
+        Frequencies (rad/s) of resonances between the others that rose above the level
+        at the point of the last `value`.
+    """
+
+    def __init__(
+        self, system: ErrorSystem, limits: Limits, omega: Array, size: float
+    ) -> None:
+        self.system, self.limits, self.size = system, limits, size
+        self.missed = np.zeros(0)
+        self.watch(omega)
+
+    def watch(self, omega: Array) -> None:
+        """Take that set of frequencies."""
+        self.omega = omega
+        self._G0 = self.system.target_response(omega)
+        self._W = self.system.weight_response(omega)[0]
+
+    def mu_of_level(self, theta: Array, ratio: float) -> float:
+        """mu for which the level is `ratio` times the largest singular value."""
+        s = self._squares(theta, self.omega, self._G0, self._W)
+        return float(0.5 / (s / (ratio**2 * s.max() - s)).sum())
+
+    def _squares(self, theta: Array, omega: Array, G0: Complex, W: Complex) -> Array:
+        E = W @ (self.system.response(theta, omega) - G0)
+        return np.asarray(np.linalg.svd(E, compute_uv=False) ** 2).ravel()
+
+    def value(self, theta: Array, mu: float) -> float:
+        """psi, infinite where the limits are not kept.
+
+        And where a resonance of the gray-box model, unseen between the frequencies,
+        rises above the level.
+        """
+        self.missed = np.zeros(0)
+        system = self.system
+        if not np.isfinite(theta).all():
+            return np.inf
+        poles = system.poles(theta)
+        if not np.isfinite(poles).all():
+            return np.inf
+        c = self.limits.values(theta, poles)
+        if not c.max(initial=-1.0) < 0:
+            return np.inf
+        s = self._squares(theta, self.omega, self._G0, self._W)
+        if not np.isfinite(s).all():
+            return np.inf
+        level = level_of(s, mu)
+        turns = system.resonances(poles)
+        if turns.size:
+            self.missed = turns[system.values(theta, turns) ** 2 >= level]
+            if self.missed.size:
+                return np.inf
+        return _psi(s, level, mu) - _BARRIER * mu * float(np.log(-c).sum())
+
+    def quadratic(self, theta: Array, mu: float) -> Quadratic:
+        """psi, its gradient and its Hessian.
+
+        With ``M = (t^2 I - E^H E)^-1`` and ``dX = E^H dE + dE^H E`` the terms of a
+        frequency have the derivatives ``2 mu Re tr(M E^H dE)`` and ``mu (2 tr(M dE^H
+        dE) + tr(M dX M dX) + 2 Re tr(M E^H d2E))``. The level is eliminated. Along
+        geodesics only the normal part of the covector ``2 mu E M`` meets ``d2E``.
+        """
+        c, dc, _ = self.limits.rows(theta)
+        pull, weight = dc / -c[:, None], _BARRIER * mu
+        geometry = ResponseGeometry(
+            self.system, theta, self.omega, self.size, self._G0, pull
+        )
+        at, L, S = geometry.at, geometry.L, geometry.S
+        E = self._W @ at.E
+        k, p, m = E.shape
+        q = len(S)
+        _, sigma, Vh = np.linalg.svd(E)
+        s = sigma**2
+        tau = level_of(s.ravel(), mu)
+        padded = np.zeros((k, m))
+        padded[:, : s.shape[1]] = s
+        C = Vh.conj().swapaxes(1, 2) / np.sqrt(tau - padded)[:, None]  # M = C C^H
+        Eh, Ch = E.conj().swapaxes(1, 2), C.conj().swapaxes(1, 2)
+        inner = C @ (Ch @ Eh)  # M E^H
+        P = at.R @ inner @ L  # tr(M E^H dE_j) = tr(P S_j)
+        P2 = (at.R @ (C @ (Ch @ inner)) @ L).sum(0)
+        flat, T = S.reshape(q, -1), geometry.T
+        gradient = 2.0 * mu * (flat @ np.real(P.sum(0)).T.ravel())
+        by_level = -2.0 * mu * (flat @ np.real(P2).T.ravel())
+        level_curvature = mu / tau * float((s / (tau - s) ** 2).sum())
+        # dE C and C^H dX C, whose Gram matrices are the terms of first derivatives
+        dEC = geometry.by_parameter(geometry.products @ (at.R @ C))
+        Z = ((Ch @ Eh) @ dEC.reshape(k, p, m * q)).reshape(k, m, m, q)
+        dX = (Z + Z.conj().swapaxes(1, 2)).reshape(-1, q)
+        first = np.sqrt(2.0) * dEC
+        rows = np.concatenate([first.real, first.imag, dX.real, dX.imag])
+        value = _psi(s.ravel(), tau, mu) - weight * float(np.log(-c).sum())
+        hessian = mu * (rows.T @ rows) + weight * (pull.T @ pull)
+        hessian = hessian - np.outer(by_level, by_level) / level_curvature
+        gradient, by_level = T.T @ (gradient + weight * pull.sum(0)), T.T @ by_level
+        normal = 2.0 * mu * P - geometry.tangential(gradient)
+        hessian = T.T @ hessian @ T + geometry.second_derivatives(normal)
+        # at fixed theta the level falls with mu by 1 / (2 mu tau curvature)
+        drift = gradient / mu + by_level / (2.0 * mu * tau * level_curvature)
+        return Quadratic(value, gradient, hessian, drift, geometry)
+
+
+def _psi(squares: Array, tau: float, mu: float) -> float:
+    return float(0.5 * np.log(tau) - mu * np.log1p(-squares / tau).sum())
+
+
+_SHRINK = 0.3  # of mu, from one stage to the next
+
+_FIRST_LEVEL = 2.0  # level of the first stage, relative to the largest singular value
+
+_NEGLIGIBLE = 1e-14
+
+_TAKEN = 1e-2  # part of the promised decrease that a step must bring
+
+_WORSE = 1.05
+
+_DEPTH = 0.5  # local maxima down to there join the frequencies
+
+_BENT = 1.5  # a step whose geodesic bends more than that is too long
+
+_HALVINGS = 6
+
+
+def search_grid(system: ErrorSystem) -> Array:
+    """Frequencies at which a search watches the error, rad/s."""
+    if isinstance(system, MeasuredErrorSystem):
+        return system.omega
+    poles = np.linalg.eigvals(system.target.A).astype(complex)
+    return frequency_grid(poles, system.dt)
+
+
+@dataclass
+class PathPoint:
+    """Where the central path was left.
+
+    Attributes
+    ----------
+    theta : ndarray of shape (n_params,)
+        Its end; the point of least norm met where the end is much above that.
+    mu : float or None
+        Its last value; None for a point that is not on the path yet.
+    frequencies : ndarray
+        Local maxima met on the way, rad/s.
+    n_iter : int
+        Newton steps.
+    history : list of dict
+        One row per value of mu: objective, mu, steps.
+    """
+
+    theta: Array
+    mu: float | None
+    frequencies: Array
+    n_iter: int
+    history: list[dict[str, float]]
+
+
+def central_path(
+    system: ErrorSystem,
+    theta: Array,
+    limits: Limits,
+    *,
+    mu_end: float,
+    max_iter: int,
+    decrement: float = 1e-1,
+    mu: float | None = None,
+    frequencies: Array | None = None,
+) -> PathPoint:
+    """Follow the path from `theta` to `mu_end`.
+
+    Parameters
+    ----------
+    system : ErrorSystem
+    theta : ndarray of shape (n_params,)
+        Stable; the least-squares fit, or a point met on the path.
+    limits : Limits
+    mu_end : float
+        There the level is about ``mu_end * n_active`` (relative) above the minimum.
+    max_iter : int
+        Newton steps.
+    decrement : float
+        A stage ends when Newton's method promises less, relative to mu. The steps that
+        a point far from the path needs are longest while mu is large.
+    mu : float, default=None
+        First value; by default that of a level of twice the norm.
+    frequencies : ndarray, default=None
+        Local maxima that are known already.
+    """
+    grid = search_grid(system)
+    inside = theta if limits.strict(theta) else limits.inside(theta)
+    if not limits.strict(inside):  # at the margin: nothing to follow
+        return PathPoint(theta, mu, np.zeros(0), 0, [])
+    theta = inside
+    found = system.peaks(theta, _DEPTH)
+    best, best_norm = theta, found.norm
+    seen = np.zeros(0) if frequencies is None else frequencies
+    history: list[dict[str, float]] = []
+    n_iter = 0
+    while n_iter < max_iter:
+        if system.peaks_move:
+            seen = np.union1d(seen, found.frequencies)
+        barrier = Barrier(system, limits, np.union1d(grid, seen), found.norm)
+        if mu is None:
+            mu = barrier.mu_of_level(theta, _FIRST_LEVEL)
+        ahead = max(_SHRINK * mu, min(mu_end, mu))
+        theta, steps = _stage(
+            barrier, theta, mu, ahead, decrement * mu, max_iter - n_iter
+        )
+        n_iter += steps
+        found = system.peaks(theta, _DEPTH)
+        history.append({"objective": found.norm, "mu": mu, "steps": float(steps)})
+        if found.norm < best_norm:
+            best, best_norm = theta, found.norm
+        if mu <= mu_end:
+            break
+        mu = ahead
+    if found.norm > _WORSE * best_norm:
+        theta = best
+    return PathPoint(theta, mu, seen, n_iter, history)
+
+
+def _stage(
+    barrier: Barrier,
+    theta: Array,
+    mu: float,
+    ahead: float,
+    enough: float,
+    max_iter: int,
+) -> tuple[Array, int]:
+    """Newton's method at one mu, and a step towards the next one.
+
+    Returns the end and the number of steps.
+    """
+    radius, n_iter = 1.0, 0
+    while n_iter < max_iter:
+        model = barrier.quadratic(theta, mu)
+        n_iter += 1
+        if not (np.isfinite(model.gradient).all() and np.isfinite(model.hessian).all()):
+            break
+        spectrum, Q = np.linalg.eigh(0.5 * (model.hessian + model.hessian.T))
+        slopes = Q.T @ model.gradient
+        x = trust_region_step(spectrum, slopes, radius)
+        if ahead < mu and _promised(spectrum, slopes, x) < enough:
+            return _predicted(barrier, theta, model, (spectrum, Q), ahead, mu), n_iter
+        theta, radius, promised = _newton(
+            barrier, theta, mu, model, (spectrum, Q), radius
+        )
+        if promised < enough:
+            break
+    return theta, n_iter
+
+
+def _promised(spectrum: Array, slopes: Array, x: Array) -> float:
+    return -float(slopes @ x + 0.5 * x @ (spectrum * x))
+
+
+def _newton(
+    barrier: Barrier,
+    theta: Array,
+    mu: float,
+    model: Quadratic,
+    eigen: tuple[Array, Array],
+    radius: float,
+) -> tuple[Array, float, float]:
+    """One step of the trust region: its end, the next radius, the promised decrease.
+
+    The decrease is zero where no step lowers psi.
+    """
+    spectrum, Q = eigen
+    slopes = Q.T @ model.gradient
+    missed = np.zeros(0)
+    while radius > _NEGLIGIBLE:
+        x = trust_region_step(spectrum, slopes, radius)
+        promised, length = _promised(spectrum, slopes, x), float(np.linalg.norm(x))
+        if promised < _NEGLIGIBLE:
+            break
+        trial = _along(theta, model, Q @ x)
+        if trial is None:
+            radius = 0.5 * min(length, radius)
+            continue
+        ratio = (model.value - barrier.value(trial, mu)) / promised
+        missed = np.union1d(missed, barrier.missed)
+        if ratio > _TAKEN:
+            if missed.size:
+                barrier.watch(np.union1d(barrier.omega, missed))
+            if ratio > 0.7:
+                radius = max(radius, 3.0 * length)
+            elif ratio < 0.25:
+                radius *= 0.5
+            return trial, radius, promised
+        radius = 0.3 * min(length, radius)
+    return theta, radius, 0.0
+
+
+def _predicted(
+    barrier: Barrier,
+    theta: Array,
+    model: Quadratic,
+    eigen: tuple[Array, Array],
+    ahead: float,
+    mu: float,
+) -> Array:
+    """A step along the path: to where it will be at the next mu, or part of the way."""
+    spectrum, Q = eigen
+    slopes = Q.T @ (model.gradient + (ahead - mu) * model.drift)
+    size = np.abs(spectrum)
+    d = -Q @ (slopes / np.maximum(size, 1e-12 * size.max(initial=1e-300)))
+    here = barrier.value(theta, ahead)
+    for _ in range(_HALVINGS):
+        trial = _along(theta, model, d)
+        if trial is not None and barrier.value(trial, ahead) < here:
+            return trial
+        d = 0.5 * d
+    return theta
+
+
+def _along(theta: Array, model: Quadratic, d: Array) -> Array | None:
+    """End of the geodesic that leaves along `d`; None where it bends too much."""
+    a = model.geometry.acceleration(d)
+    if not np.linalg.norm(a) <= _BENT * np.linalg.norm(d):
+        return None
+    return theta + model.geometry.T @ (d + 0.5 * a)
+
+
+def trust_region_step(spectrum: Array, slopes: Array, radius: float) -> Array:
+    """Minimise ``slopes x + sum(spectrum x^2) / 2`` over ``|x| <= radius``."""
+    size = max(float(np.abs(spectrum).max(initial=0.0)), 1e-300)
+    low = float(spectrum.min())
+    if low > 1e-13 * size:
+        x = -slopes / spectrum
+        if np.linalg.norm(x) <= radius:
+            return x
+    shift = max(0.0, -low) + 1e-14 * size
+    x = -slopes / (spectrum + shift)
+    short = radius**2 - float(x @ x)
+    if short > 0:  # the hard case: the rest along the lowest curvature
+        i = int(np.argmin(spectrum))
+        x[i] += np.sqrt(short) if slopes[i] <= 0 else -np.sqrt(short)
+        return x
+    high = shift + float(np.linalg.norm(slopes)) / radius + size
+    for _ in range(60):
+        middle = np.sqrt(shift * high)
+        if np.linalg.norm(slopes / (spectrum + middle)) > radius:
+            shift = middle
+        else:
+            high = middle
+        if high < 1.001 * shift:
+            break
+    return -slopes / (spectrum + high)

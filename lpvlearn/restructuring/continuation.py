@@ -1,0 +1,244 @@
+"""Starts by continuation: from a blurred response to the response itself.
+
+On the frequency axis a lightly damped resonance is a narrow peak, and a fit that
+begins with the peak beside it has a wrong minimum to fall into. On the shifted contour
+``s = rho + j omega`` all modes look damped by ``rho``: the response is smooth, and a
+fit of it begins almost anywhere. The fit is repeated while the shift goes to zero. It
+needs no similarity transformation, so the structure may be any smooth function.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .error_system import Structure
+from .transfer import Target, resolvent
+
+Array = NDArray[np.float64]
+
+Complex = NDArray[np.complex128]
+
+Flags = NDArray[np.bool_]
+
+SHIFTS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015, 0.0)  # relative to the fastest pole
+
+_FLOOR = 1e-2  # errors are relative to the response, where it is not below that
+
+_LONGEST = 1.5  # of a step, in logarithms of the parameters
+
+_SMALL = 1e-3  # relative decrease that ends a stage
+
+_LOST = 1e12
+
+_HOLD = 1e-4  # pull to the start of a stage, times the shift
+
+
+def continued_fits(
+    structure: Structure,
+    target: Target,
+    thetas: Array,
+    signed: Flags,
+    *,
+    shifts: tuple[float, ...] = SHIFTS,
+    n_points: int = 25,
+    max_iter: int = 20,
+) -> tuple[Array, Array]:
+    """Fit the response on contours that approach the frequency axis.
+
+    Parameters
+    ----------
+    structure : Structure
+    target : Target
+        The black box.
+    thetas : ndarray of shape (k, n_params)
+        Starting points; a wrong size by a factor of ten does no harm.
+    signed : ndarray of bool, shape (n_params,)
+        Parameters that keep their signs: their logarithms are searched.
+    shifts : tuple of float
+        Distances from the frequency axis, relative to the fastest pole.
+    n_points : int
+        Frequencies of a contour.
+    max_iter : int
+        Steps on each contour.
+
+    Returns
+    -------
+    thetas : ndarray of shape (k, n_params)
+        By ascending cost; starts that were lost are left out.
+    costs : ndarray of shape (k,)
+        Root mean square of the relative errors on the last contour.
+
+    Examples
+    --------
+    The frequency is ten times too low at the start:
+
+    >>> from lpvlearn import GrayBoxStructure
+    >>> structure = GrayBoxStructure.from_template(
+    ...     A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]])
+    >>> A, B, C, D = structure.matrices([2.0, 0.1, 100.0])
+    >>> start, signed = np.array([[1.0, 0.3, 1.0]]), np.ones(3, bool)
+    >>> found, _ = continued_fits(structure, Target(A, B, C, D), start, signed)
+    >>> found.round(6)
+    array([[  2. ,   0.1, 100. ]])
+    """
+    thetas = thetas[np.isfinite(thetas).all(1)]
+    signed = signed & (thetas != 0).all(0)
+    search = _Search(structure, target, thetas, signed)
+    X = search.coordinates(thetas)
+    cost = np.full(len(X), np.inf)
+    for shift in shifts:
+        search.move(shift, n_points, X)
+        X, cost = _batched_steps(search, X, max_iter)
+    found = search.thetas(X, np.arange(len(X)))
+    good = np.isfinite(cost) & np.isfinite(found).all(1)
+    order = np.argsort(cost[good], kind="stable")
+    return found[good][order], np.sqrt(cost[good][order])
+
+
+class _Search:
+    """Errors on one contour, in coordinates that keep the signs of parameters."""
+
+    def __init__(
+        self, structure: Structure, target: Target, thetas: Array, signed: Flags
+    ) -> None:
+        self.structure, self.target, self.signed = structure, target, signed
+        typical = np.abs(thetas).max(0, initial=0.0)
+        size = np.where(thetas == 0, np.where(typical > 0, typical, 1.0), thetas)
+        self.size = np.where(signed, np.sign(thetas), np.abs(size))
+        self.center, self.hold = thetas, 0.0
+        rates = np.linalg.eigvals(target.A).astype(complex)
+        if target.dt is not None:
+            rates = np.log(np.where(rates == 0, 1e-300, rates)) / target.dt
+        sizes = np.abs(rates)
+        self.rates = rates
+        self.low = float(sizes[sizes > 0].min(initial=sizes.max(initial=1.0)))
+        self.high = float(sizes.max(initial=self.low))
+
+    def coordinates(self, thetas: Array) -> Array:
+        """Logarithms, or multiples of the starting sizes."""
+        safe = np.where(self.signed, np.abs(thetas), 1.0)
+        return np.where(self.signed, np.log(safe), thetas / self.size)
+
+    def thetas(self, X: Array, rows: NDArray[np.intp]) -> Array:
+        """Parameters of some starts."""
+        grown = np.exp(np.where(self.signed, np.minimum(X, 300.0), 0.0))
+        return self.size[rows] * np.where(self.signed, grown, X)
+
+    def move(self, shift: float, n_points: int, X: Array) -> None:
+        """Take another contour, beginning at `X`.
+
+        Parameters that a blurred response hardly shows are held where they are.
+        """
+        self.center, self.hold = X, np.sqrt(_HOLD * shift)
+        omega = np.geomspace(self.low / 3.0, 2.0 * self.high, n_points)
+        if shift == 0:  # the resonances are narrow here
+            turn, decay = np.abs(self.rates.imag), np.abs(self.rates.real)
+            near = (turn[:, None] + decay[:, None] * np.array([-1.0, 0.0, 1.0])).ravel()
+            omega = np.unique(np.concatenate([omega, near[near > 0]]))
+        t = self.target
+        s = shift * self.high + 1j * omega
+        self.s = np.asarray(s if t.dt is None else np.exp(s * t.dt), dtype=complex)
+        self.G0 = t.C @ resolvent(t.A, self.s) @ t.B + t.D
+        size = np.abs(self.G0)
+        top = size.max(0)
+        if shift == 0:
+            size = np.zeros_like(size) + top
+        top = np.where(top > 0, top, max(float(top.max(initial=0.0)), 1e-300))
+        count = np.sqrt(self.G0.size)
+        self.weight = 1.0 / (count * (size + _FLOOR * top))
+
+    def residuals(
+        self, X: Array, rows: NDArray[np.intp], jacobian: bool
+    ) -> tuple[Array, Array]:
+        """Weighted errors of every start, and their derivatives."""
+        theta = self.thetas(X, rows)
+        n, q = self.structure.order, theta.shape[1]
+        S = self.structure.system_matrix(theta)
+        A, B, C, D = S[:, :n, :n], S[:, :n, n:], S[:, n:, :n], S[:, n:, n:]
+        good = np.asarray(np.isfinite(S).all((1, 2)))
+        poles, V = np.linalg.eig(np.where(good[:, None, None], A, 0.0).astype(complex))
+        try:
+            inverse = np.linalg.inv(V)
+        except np.linalg.LinAlgError:  # a defective matrix among them
+            inverse = np.linalg.pinv(V)
+        CV, VB = C @ V, inverse @ B
+        modes = 1.0 / (self.s[:, None] - poles[:, None])  # (k, f, n)
+        CVm = CV[:, None] * modes[:, :, None]
+        E = self.weight * (CVm @ VB[:, None] + D[:, None] - self.G0)
+        E[~good] = np.nan
+        flat = E.reshape(len(X), -1)
+        pull = self.hold * (X - self.center[rows])
+        r = np.concatenate([flat.real, flat.imag, pull], 1)
+        if not jacobian:
+            return r, np.zeros((0, 0, 0))
+        left = CVm @ inverse[:, None]  # C (s I - A)^-1, (k, f, p, n)
+        k, f, p = left.shape[:3]
+        L = np.concatenate([left, np.broadcast_to(np.eye(p), (k, f, p, p))], 3)
+        m = B.shape[2]
+        R = V[:, None] @ (modes[..., None] * VB[:, None])
+        R = np.concatenate([R, np.broadcast_to(np.eye(m), (k, f, m, m))], 2)
+        J = np.empty((k, f, p, m, q), complex)
+        slope = np.where(self.signed, theta, self.size[rows])
+        for i in range(k):
+            dS = self.structure.jacobian(theta[i])
+            products = np.tensordot(L[i], dS, axes=(2, 1))  # (f, p, q, n + m)
+            J[i] = (products @ R[i][:, None]).swapaxes(2, 3) * slope[i]
+        J = (self.weight[..., None] * J).reshape(k, -1, q)
+        held = np.broadcast_to(self.hold * np.eye(q), (k, q, q))
+        return r, np.concatenate([J.real, J.imag, held], 1)
+
+
+def _batched_steps(search: _Search, X: Array, max_iter: int) -> tuple[Array, Array]:
+    """Levenberg's method on every row of `X`; a row stops when it gains little."""
+
+    def costs(X: Array, rows: NDArray[np.intp]) -> Array:
+        with np.errstate(all="ignore"):
+            try:
+                r = search.residuals(X, rows, False)[0]
+            except np.linalg.LinAlgError:
+                return np.full(len(X), np.inf)
+            cost = np.einsum("ij,ij->i", r, r)
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    X = X.copy()
+    cost = costs(X, np.arange(len(X)))
+    damping = np.full(len(X), 1e-3)
+    active = cost < _LOST
+    idle = np.zeros(len(X), int)
+    for _ in range(max_iter):
+        rows = np.flatnonzero(active)
+        if len(rows) == 0:
+            break
+        r, J = search.residuals(X[rows], rows, True)
+        finite = np.isfinite(J).all((1, 2))
+        active[rows[~finite]] = False
+        rows, r, J = rows[finite], r[finite], J[finite]
+        Jt = J.swapaxes(1, 2)
+        H, g = Jt @ J, (Jt @ r[:, :, None])[:, :, 0]
+        eye = np.eye(X.shape[1])
+        level = np.trace(H, axis1=1, axis2=2) / len(eye) + 1e-300
+        pending = np.ones(len(rows), bool)
+        for _ in range(8):
+            todo = np.flatnonzero(pending)
+            if len(todo) == 0:
+                break
+            own = rows[todo]
+            extra = (damping[own] * level[todo])[:, None, None] * eye
+            step = -np.linalg.solve(H[todo] + extra, g[todo][:, :, None])[:, :, 0]
+            longest = np.abs(step).max(1)
+            step *= np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-300))[:, None]
+            new = costs(X[own] + step, own)
+            better = new < cost[own]
+            taken = own[better]
+            slow = new[better] > (1.0 - _SMALL) * cost[taken]
+            idle[taken] = np.where(slow, idle[taken] + 1, 0)
+            X[taken] += step[better]
+            cost[taken] = new[better]
+            damping[own] = np.where(
+                better, np.maximum(damping[own] * 0.2, 1e-10), damping[own] * 5.0
+            )
+            pending[todo[better]] = False
+        active[rows[pending]] = False
+        active[rows] &= (idle[rows] < 2) & (cost[rows] > 1e-20)
+    return X, cost

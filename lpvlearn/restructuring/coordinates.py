@@ -1,0 +1,374 @@
+"""How the frequency response moves, and bends, with the parameters.
+
+The coefficients of a structure are seldom good coordinates: along a straight line in
+them the response soon leaves its tangent. Most of that bend lies within the tangent
+space and belongs to the coordinates alone. A step along a geodesic of the response,
+
+    theta + d + a / 2,   J a = -(the tangential part of G''[d, d]),
+
+is free of it, and reaches much further along a curved valley (the geodesic
+acceleration of Transtrum and Sethna, 2012, for Newton's method).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..systems.balancing import balancing_transformation
+from .error_system import ErrorPoint, ErrorSystem
+from .limits import Limits
+from .similarity import linear_equations, nearest_parameters, scaled_problem
+
+Array = NDArray[np.float64]
+
+Complex = NDArray[np.complex128]
+
+# Directions that the response sees a thousand times less than others are steps of
+# that length all the same: further along them its second derivative takes over.
+_METRIC_CAP = 1e-3
+
+_FIT_CAP = 1e-5
+
+_REACH = 2.0
+
+_DAMPING = 1e-5  # of the acceleration along directions that the response hardly sees
+
+
+def metric_coordinates(R: Array, size: float) -> Array:
+    """`T` with ``|R T y| = size |y|`` on the directions that `R` sees.
+
+    `R` is the triangular factor of the response Jacobian. Directions that it does not
+    see (unidentifiable ones) are capped, in units in which all parameters count alike.
+    """
+    unit = _units(R)
+    _, s, Vt = np.linalg.svd(R / unit)
+    s = np.maximum(s, _FIT_CAP * s.max(initial=0.0))
+    s = np.where(s > 0, s, 1.0)
+    return Vt.T * (size / s) / unit[:, None]
+
+
+def _units(R: Array) -> Array:
+    """Lengths of the columns, not zero."""
+    unit = np.linalg.norm(R, axis=0)
+    return np.where(unit > 0, unit, max(float(unit.max(initial=0.0)), 1e-300))
+
+
+class ResponseGeometry:
+    """Response at one theta, its derivatives, and coordinates of its metric.
+
+    Parameters
+    ----------
+    system : ErrorSystem
+    theta : ndarray of shape (n_params,)
+    omega : ndarray of shape (k,)
+        Frequencies, rad/s.
+    size : float
+        Change of the response (root mean square over frequency) of a unit step.
+    G0 : ndarray of shape (k, n_outputs, n_inputs), default=None
+        Response that `at` holds the error to; by default zero.
+    pull : ndarray of shape (k, n_params), default=None
+        Gradients of logarithms that a unit step shall change by less than about
+        `_REACH`: those of the distances to bounds.
+
+    Attributes
+    ----------
+    T, inverse : ndarray of shape (n_params, n_params)
+        ``theta + T y``, and back.
+    at : ErrorPoint
+        Without the weight.
+    S : ndarray of shape (n_params, n + n_outputs, n + n_inputs)
+        Derivatives of the system matrix.
+    L : ndarray of shape (k, n_outputs, n + n_outputs)
+        That of `at` behind the weight.
+    products : ndarray of shape (k, n_outputs * n_params, n + n_inputs)
+        ``L S_j``: the derivatives of the error are ``L S_j R``.
+    """
+
+    def __init__(
+        self,
+        system: ErrorSystem,
+        theta: Array,
+        omega: Array,
+        size: float,
+        G0: Complex | None = None,
+        pull: Array | None = None,
+    ) -> None:
+        structure, self.n = system.structure, system.n
+        zero = np.zeros((1, system.n_outputs, system.n_inputs), complex)
+        self.at: ErrorPoint = system.point(theta, omega, zero if G0 is None else G0)
+        self.S = structure.jacobian(theta)
+        self._bend = structure.curvature(theta)
+        self.L = system.weight_response(omega)[0] @ self.at.L
+        k, p, _ = self.L.shape
+        q, m = len(self.S), self.at.R.shape[2]
+        self._shape = (k, p, m)
+        self.products = np.tensordot(self.L, self.S, axes=(2, 1)).reshape(k, p * q, -1)
+        J = self.by_parameter(self.products @ self.at.R)
+        J = np.concatenate([J.real, J.imag]) / np.sqrt(k)
+        metric = J / size
+        if pull is not None:
+            metric = np.concatenate([metric, pull / _REACH])
+        unit = _units(metric)
+        metric = metric / unit
+        squares, V = np.linalg.eigh(metric.T @ metric)
+        s = np.sqrt(np.maximum(squares, _METRIC_CAP**2 * squares.max(initial=0.0)))
+        s = np.where(s > 0, s, 1.0)
+        self.T = V / s / unit[:, None]
+        self.inverse = (V * s).T * unit
+        self._J = J @ self.T
+        self._gram = self._J.T @ self._J + _DAMPING * size**2 * np.eye(q)
+
+    def by_parameter(self, X: Complex) -> Complex:
+        """(k, n_outputs * n_params, m) as (k * n_outputs * m, n_params)."""
+        k, p, m = self._shape
+        q = len(self.S)
+        return X.reshape(k, p, q, m).swapaxes(2, 3).reshape(-1, q)
+
+    def _solve(self, g: Array) -> Array:
+        return np.asarray(np.linalg.solve(self._gram, g))
+
+    def acceleration(self, d: Array) -> Array:
+        """Second derivative, in y, of the geodesic that leaves in the direction `d`."""
+        v, n, at = self.T @ d, self.n, self.at
+        S = np.tensordot(v, self.S, axes=1)
+        second = 2.0 * (self.L @ S[:, :n]) @ at.Phi @ (S[:n] @ at.R)
+        if self._bend is not None:
+            bend = np.tensordot(v, np.tensordot(v, self._bend, axes=1), axes=1)
+            second = second + self.L @ bend @ at.R
+        flat = second.ravel() / np.sqrt(len(second))
+        return -self._solve(self._J.T @ np.concatenate([flat.real, flat.imag]))
+
+    def tangential(self, gradient: Array) -> Complex:
+        """The covector of the response with that gradient in y and no normal part.
+
+        As ``P = R V^H L``, shape (k, n + n_inputs, n + n_outputs), for the covector V.
+        """
+        flat = self._J @ self._solve(gradient) / np.sqrt(self._shape[0])
+        half = len(flat) // 2
+        V = (flat[:half] + 1j * flat[half:]).reshape(self._shape)
+        return self.at.R @ V.conj().swapaxes(1, 2) @ self.L
+
+    def second_derivatives(self, P: Complex) -> Array:
+        """``Re sum_k tr(V_k^H d2E_ij)`` in y, for a covector as ``P = R V^H L``.
+
+        ``d2E_ij = L S_i Phi S_j R``, its mirror image, and what bends the structure.
+        """
+        q, n = len(self.S), self.n
+        mixed = np.real(np.tensordot(P, self.at.Phi, axes=(0, 0)))  # (b, a, c, d)
+        mixed = mixed.transpose(1, 2, 3, 0).reshape(P.shape[2] * n, n * P.shape[1])
+        H = self.S[:, :, :n].reshape(q, -1) @ mixed @ self.S[:, :n].reshape(q, -1).T
+        H = H + H.T
+        if self._bend is not None:
+            H = H + np.tensordot(self._bend, np.real(P.sum(0)).T, axes=2)
+        return self.T.T @ H @ self.T
+
+
+_EXACT = 1e-7  # relative residual of a realisation in a canonical form
+
+_NUDGE = 1e-2
+
+_MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
+
+_SAME_NORM = 1e-7  # relative difference that rounding may make
+
+
+class LocalChart:
+    """The models near one, as an affine structure; zero is that model.
+
+    Parameters
+    ----------
+    S : ndarray of shape (order + n_outputs, order + n_inputs)
+        System matrix of a stable, minimal model.
+    order : int
+    dt : float or None
+    feedthrough : bool
+        Whether D is free.
+
+    Raises
+    ------
+    ValueError
+        If the model is not minimal: no neighbourhood of it is smooth.
+    """
+
+    is_affine = True
+
+    def __init__(self, S: Array, order: int, dt: float | None, feedthrough: bool):
+        n = self.order = order
+        A, B, C, D = S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
+        hankel, left, right = balancing_transformation(A, B, C, discrete=dt is not None)
+        if len(left) < n or hankel[-1] <= _MINIMAL * hankel[0]:
+            raise ValueError("the model is not minimal, or nearly so.")
+        A, B, C = left @ A @ right, left @ B, C @ right
+        self.offset = np.block([[A, B], [C, D]])
+        # in units of time and gain in which all entries are about one
+        rate, size = _rate(A, dt), np.sqrt(np.linalg.norm(B) * np.linalg.norm(C))
+        unit = np.ones_like(self.offset)
+        unit[:n, :n], unit[:n, n:], unit[n:, :n] = rate, size, size
+        changes = unit * _without_basis_changes(self.offset / unit, n)
+        if feedthrough:
+            direct = np.zeros((D.size, *S.shape))
+            direct[:, n:, n:] = np.eye(D.size).reshape(-1, *D.shape)
+            changes = np.concatenate([changes, direct])
+        self.basis = changes
+        self.n_params = len(changes)
+        self.lower = np.full(self.n_params, -np.inf)
+        self.upper = np.full(self.n_params, np.inf)
+
+    def system_matrix(self, theta: Array) -> Array:
+        """``[[A, B], [C, D]]``."""
+        return np.asarray(self.offset + np.tensordot(theta, self.basis, axes=1))
+
+    def jacobian(self, theta: Array) -> Array:
+        """Its derivatives, the same everywhere."""
+        return self.basis
+
+    def curvature(self, theta: Array) -> Array | None:
+        """None: the chart is affine."""
+        return None
+
+
+def _rate(A: Array, dt: float | None) -> float:
+    poles = np.abs(np.linalg.eigvals(A))
+    poles = poles[poles > 0]
+    if dt is not None or poles.size == 0:
+        return 1.0
+    return float(np.exp(np.log(poles).mean()))
+
+
+def _without_basis_changes(S: Array, n: int) -> Array:
+    """Orthonormal changes of (A, B, C) that are orthogonal to ``(XA - AX, XB, -CX)``.
+
+    Shape (n (n_inputs + n_outputs), n + n_outputs, n + n_inputs).
+    """
+    A, B, C = S[:n, :n], S[:n, n:], S[n:, :n]
+    orbit = np.zeros((n, n, *S.shape))
+    for i in range(n):
+        for j in range(n):
+            change = orbit[i, j]
+            change[i, :n] += A[j]
+            change[:n, j] -= A[:, i]
+            change[i, n:] = B[j]
+            change[n:, j] = -C[:, i]
+    entries = np.ones(S.shape, bool)
+    entries[n:, n:] = False
+    orbit = orbit.reshape(n * n, *S.shape)[:, entries]
+    Q = np.linalg.qr(orbit.T, mode="complete")[0][:, n * n :]
+    changes = np.zeros((Q.shape[1], *S.shape))
+    changes[:, entries] = Q.T
+    return changes
+
+
+class CanonicalForm:
+    """An affine structure in which every model of its order has its own parameters.
+
+    Parameters
+    ----------
+    structure : GrayBoxStructure
+    dt : float or None
+    """
+
+    def __init__(self, structure: Any, dt: float | None) -> None:
+        self.structure, self.dt = structure, dt
+        n, shape = structure.order, structure.offset.shape
+        n_outputs, n_inputs = shape[0] - n, shape[1] - n
+        self.feedthrough = structure.n_params > n * (n_inputs + n_outputs)
+
+    @classmethod
+    def of(cls, system: ErrorSystem, theta: Array) -> CanonicalForm | None:
+        """The form, where the structure is one: told by models near that of `theta`."""
+        structure: Any = system.structure
+        if not getattr(structure, "is_affine", False) or structure.order == 0:
+            return None
+        n, p, m = structure.order, system.n_outputs, system.n_inputs
+        free_D = int((structure.basis[:, n:, n:] != 0).any(0).sum())
+        size = n * (m + p) + free_D
+        bounded = np.isfinite([structure.lower, structure.upper]).any()
+        if bounded or structure.n_params != size or free_D not in (0, m * p):
+            return None
+        form = cls(structure, system.dt)
+        S = structure.system_matrix(theta)
+        inside = np.ones(S.shape, bool)
+        inside[n:, n:] = False
+        nudge = _NUDGE * np.cos(np.arange(S.size).reshape(S.shape) ** 2)
+        near = S * np.where(inside, 1.0 + nudge, 1.0)
+        return None if form.parameters(near) is None else form
+
+    def parameters(self, S: Array) -> Array | None:
+        """Those of the model with that system matrix; None where it has none."""
+        n, structure = self.structure.order, self.structure
+        A, B, C, D = S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
+        problem = scaled_problem(
+            A, B, C, D, structure.offset, structure.basis, _rate(A, self.dt)
+        )
+        M, b = linear_equations(problem)
+        if len(b) < n * n:
+            return None
+        T = np.linalg.lstsq(M, b, rcond=None)[0].reshape(n, n)
+        try:
+            inverse = np.linalg.inv(T)
+        except np.linalg.LinAlgError:
+            return None
+        new = np.block(
+            [[T @ problem.A @ inverse, T @ problem.B], [problem.C @ inverse, problem.D]]
+        )
+        d = new - problem.offset
+        theta = nearest_parameters(problem, d.reshape(1, -1))[0]
+        rest = d - np.tensordot(theta, problem.basis, axes=1)
+        exact = np.linalg.norm(rest) <= _EXACT * np.linalg.norm(d)
+        return theta if exact else None
+
+
+@dataclass(frozen=True)
+class View:
+    """The problem near one point, in coordinates that suit it.
+
+    Attributes
+    ----------
+    system : ErrorSystem
+    theta : ndarray of shape (n_params,)
+        The point.
+    limits : Limits
+    back : callable
+        Coordinates to parameters of the structure, or None where these do not exist.
+    """
+
+    system: ErrorSystem
+    theta: Array
+    limits: Limits
+    back: Callable[[Array], Array | None]
+
+
+def view_at(
+    system: ErrorSystem, theta: Array, limits: Limits, form: CanonicalForm | None
+) -> View:
+    """The structure's own parameters, or a chart around the model of a canonical form.
+
+    Parameters
+    ----------
+    form : CanonicalForm or None
+    """
+    plain = View(system, theta, limits, lambda x: x)
+    if form is None:
+        return plain
+    S = form.structure.system_matrix(theta)
+    try:
+        chart = LocalChart(S, form.structure.order, form.dt, form.feedthrough)
+    except (ValueError, np.linalg.LinAlgError):
+        return plain
+    if chart.n_params != len(theta):  # the basis changes are not independent
+        return plain
+    inner = system.restructured(chart)
+
+    def back(z: Array) -> Array | None:
+        found = form.parameters(chart.system_matrix(z))
+        if found is None:
+            return None
+        there, here = system.peaks(found).norm, inner.peaks(z).norm
+        return found if abs(there - here) <= _SAME_NORM * here else None
+
+    return View(inner, np.zeros(chart.n_params), Limits(inner, limits.margin), back)

@@ -1,0 +1,381 @@
+"""The error system of model matching, Eq. (8), and the derivatives of its peaks.
+
+With ``S(theta) = [[A, B], [C, D]]`` and ``Phi = (s I - A)^-1`` the error is
+``E = C Phi B + D - G0(s)`` and its derivative, Eq. (24)-(25) in one product,
+``dE_j = L S_j R`` with ``L = [C Phi, I]``, ``R = [Phi B; I]``, ``S_j = dS/dtheta_j``.
+The largest singular value ``sigma = u^H E v`` is differentiated twice with respect to
+the parameters and the frequency together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..systems.hinf_norm import PeakSet, linf_norm
+from .transfer import Target, laplace_variable, model_derivatives, resolvent, series
+
+Array = NDArray[np.float64]
+
+
+def remembering(f: Callable[[NDArray], Any], points: int = 4) -> Callable[..., Any]:
+    """The function `f` of one array, with its values at the last points remembered.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> calls = []
+    >>> square = remembering(lambda x: calls.append(x) or x**2)
+    >>> square(np.array([2.0])), square(np.array([2.0])), len(calls)
+    (array([4.]), array([4.]), 1)
+    """
+    known: dict[bytes, Any] = {}
+
+    def remembered(x: NDArray) -> Any:
+        key = x.tobytes()
+        if key not in known:
+            value = f(x)
+            while len(known) >= points:
+                known.pop(next(iter(known)), None)
+            known[key] = value
+        return known[key]
+
+    return remembered
+
+
+Complex = NDArray[np.complex128]
+
+
+_CONSTANT = 1e-7  # relative change of an error that no parameter changes
+
+
+class Structure(Protocol):
+    """What this room needs of a gray-box structure."""
+
+    order: int
+    n_params: int
+
+    @property
+    def lower(self) -> Array: ...
+    @property
+    def upper(self) -> Array: ...
+    def system_matrix(self, theta: Array) -> Array: ...
+    def jacobian(self, theta: Array) -> Array: ...
+    def curvature(self, theta: Array) -> Array | None: ...
+
+
+@dataclass(frozen=True)
+class ErrorPoint:
+    """Quantities at one theta and several frequencies (leading axis k).
+
+    ``E = G(theta) - G0``, ``dE_j = L S_j R``, and ``Phi = (s I - A)^-1``.
+    """
+
+    L: Complex  # (k, n_outputs, n + n_outputs)
+    R: Complex  # (k, n + n_inputs, n_inputs)
+    E: Complex  # (k, n_outputs, n_inputs)
+    Phi: Complex  # (k, n, n)
+
+
+class _Remembered:
+    """A structure that is not affine, with what it gave at the last parameters."""
+
+    def __init__(self, structure: Structure) -> None:
+        self.order, self.n_params = structure.order, structure.n_params
+        self.lower, self.upper = structure.lower, structure.upper
+        self.system_matrix = remembering(structure.system_matrix)
+        self.jacobian = remembering(structure.jacobian)
+        self.curvature = remembering(structure.curvature)
+
+
+class ErrorSystem:
+    """``W (G(theta) - G0)`` for a structure, a black-box model and a weight.
+
+    The weight is a stable model with one output, for all outputs alike, or a square
+    one; None is no weight.
+    """
+
+    peaks_move = True  # the peaks are local maxima over a continuum of frequencies
+
+    def __init__(
+        self, structure: Structure, target: Target, weight: Target | None = None
+    ) -> None:
+        affine = getattr(structure, "is_affine", False)
+        self.structure = structure if affine else _Remembered(structure)
+        self.target, self.dt = target, target.dt
+        self.n = structure.order
+        # steps and trial steps watch the same frequencies
+        self.target_response = remembering(self._target_response)
+        self.n_outputs, self.n_inputs = target.D.shape
+        self.fastest = float(np.abs(np.linalg.eigvals(target.A)).max(initial=0.0))
+        self.weight = weight
+        if weight is not None and weight.D.shape == (1, 1) and self.n_outputs > 1:
+            self.weight = weight.repeated(self.n_outputs)
+
+    def split(self, S: Array) -> tuple[Array, Array, Array, Array]:
+        """Blocks ``A, B, C, D`` of a system matrix."""
+        n = self.n
+        return S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
+
+    def poles(self, theta: Array) -> Complex:
+        """Poles of the gray-box model; infinite where its matrices are not finite."""
+        A = self.split(self.structure.system_matrix(theta))[0]
+        if not np.isfinite(A).all():
+            return np.full(self.n, np.inf + 0j)
+        return np.linalg.eigvals(A).astype(complex)
+
+    def resonances(self, poles: Complex) -> Array:
+        """Frequencies (rad/s) at which the error may have a narrow peak."""
+        turns = np.imag(poles)
+        if self.dt is not None:
+            turns = np.angle(poles) / self.dt
+        return turns[turns > 0]
+
+    def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
+        """H-infinity norm of the error and its local maxima over frequency.
+
+        The gray-box model must be stable: the level-set method measures the
+        L-infinity norm, which stays finite (and meaningless) beyond the boundary.
+        """
+        A, B, C, D = self.split(self.structure.system_matrix(theta))
+        t = self.target
+        n, n0 = self.n, len(t.A)
+        Ae = np.zeros((n + n0, n + n0))
+        Ae[:n, :n], Ae[n:, n:] = A, t.A
+        Be, Ce, De = np.vstack([B, t.B]), np.hstack([C, -t.C]), D - t.D
+        if self.weight is not None:
+            Ae, Be, Ce, De = series(Ae, Be, Ce, De, self.weight)
+        return linf_norm(Ae, Be, Ce, De, dt=self.dt, within=within)
+
+    def restructured(self, structure: Structure) -> ErrorSystem:
+        """The error of another structure."""
+        return ErrorSystem(structure, self.target, self.weight)
+
+    def reweighted(self, weight: Target) -> ErrorSystem:
+        """The same error behind one more weight (a scalar one)."""
+        if self.weight is not None:
+            old, new = self.weight, weight.repeated(self.n_outputs)
+            total = series(old.A, old.B, old.C, old.D, new)
+            weight = Target(*total, weight.dt)
+        return ErrorSystem(self.structure, self.target, weight)
+
+    def weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        """``W`` and its first two derivatives along the frequency, (k, p, p)."""
+        if self.weight is None:
+            eye = np.broadcast_to(
+                np.eye(self.n_outputs), (len(omega),) + (self.n_outputs,) * 2
+            )
+            zero = np.zeros_like(eye)
+            return eye.astype(complex), zero.astype(complex), zero.astype(complex)
+        return model_derivatives(self.weight, omega)
+
+    def _target_response(self, omega: Array) -> Complex:
+        """``G0`` at the frequencies, shape (k, n_outputs, n_inputs)."""
+        t = self.target
+        s = laplace_variable(omega, self.dt)[0]
+        return t.C @ resolvent(t.A, s) @ t.B + t.D
+
+    def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        return model_derivatives(self.target, omega)
+
+    def response(self, theta: Array, omega: Array) -> Complex:
+        """Response of the gray-box model, shape (k, n_outputs, n_inputs)."""
+        A, B, C, D = self.split(self.structure.system_matrix(theta))
+        s = laplace_variable(omega, self.dt)[0]
+        return C @ resolvent(A, s) @ B + D
+
+    def response_jacobian(self, theta: Array, omega: Array) -> tuple[Complex, Complex]:
+        """Response and its derivatives, shapes (k, p, m) and (k, p, m, n_params)."""
+        at = self.point(
+            theta, omega, np.zeros((1, self.n_outputs, self.n_inputs), complex)
+        )
+        S = self.structure.jacobian(theta)
+        k, p, _ = at.L.shape
+        # contract the short axes first: (k, p, a) (j, a, b) -> (k, p, j, b)
+        left = np.tensordot(at.L, S, axes=(2, 1)).reshape(k, p * len(S), -1)
+        J = (left @ at.R).reshape(k, p, len(S), -1)
+        return at.E, J.swapaxes(2, 3)
+
+    def point(self, theta: Array, omega: Array, G0: Complex) -> ErrorPoint:
+        """The error without its weight, and what its derivatives are made of."""
+        A, B, C, D = self.split(self.structure.system_matrix(theta))
+        Phi = resolvent(A, laplace_variable(omega, self.dt)[0])
+        k, p, m = len(omega), self.n_outputs, self.n_inputs
+        L = np.empty((k, p, self.n + p), complex)
+        L[:, :, : self.n], L[:, :, self.n :] = C @ Phi, np.eye(p)
+        R = np.empty((k, self.n + m, m), complex)
+        R[:, : self.n], R[:, self.n :] = Phi @ B, np.eye(m)
+        return ErrorPoint(L, R, C @ R[:, : self.n] + D - G0, Phi)
+
+    def values(self, theta: Array, omega: Array) -> Array:
+        """Largest singular values at the frequencies, shape (k,)."""
+        E = self.response(theta, omega) - self.target_response(omega)
+        W = self.weight_response(omega)[0]
+        return np.asarray(np.linalg.norm(W @ E, 2, axis=(1, 2)))
+
+    def gradients(self, theta: Array, omega: Array) -> tuple[Array, Array]:
+        """Largest singular values and their gradients, Eq. (20) for sigma itself.
+
+        Returns
+        -------
+        sigma : ndarray of shape (k,)
+        gradients : ndarray of shape (k, n_params)
+        """
+        at = self.point(theta, omega, self.target_response(omega))
+        W = self.weight_response(omega)[0]
+        U, sigma, Vh = np.linalg.svd(W @ at.E)
+        left = np.einsum("kp,kpq,kqa->ka", U[:, :, 0].conj(), W, at.L)
+        right = np.einsum("kbm,km->kb", at.R, Vh[:, 0].conj())
+        outer = np.real(left[:, :, None] * right[:, None, :])
+        outer = outer.reshape(len(omega), left.shape[1] * right.shape[1])
+        S = self.structure.jacobian(theta).reshape(self.structure.n_params, -1)
+        return sigma[:, 0], outer @ S.T
+
+    def constant_at(self, theta: Array, omega: Array) -> NDArray[np.bool_]:
+        """Whether the error at these frequencies is one that no parameter changes.
+
+        Told from two other points: a gradient that vanishes may be that of a minimum.
+        """
+        structure = self.structure
+        size = np.abs(theta)
+        size = np.maximum(size, 1e-3 * size.max(initial=0.0))
+        size = np.where(size > 0, size, 1.0)
+        G0 = self.target_response(omega)
+        here = self.point(theta, omega, G0).E
+        top = np.abs(here).max((1, 2))
+        same = np.ones(len(omega), bool)
+        for turn in (1.0, 2.0):
+            step = 0.1 * size * np.cos(turn + np.arange(len(theta)) ** 2)
+            other = np.clip(theta + step, structure.lower, structure.upper)
+            if not np.isfinite(self.poles(other)).all():
+                continue
+            change = np.abs(self.point(other, omega, G0).E - here).max((1, 2))
+            same &= change <= _CONSTANT * top + 1e-12 * np.abs(G0).max((1, 2))
+        return same
+
+    def hessians(self, theta: Array, omega: Array, moving: NDArray[np.bool_]) -> Array:
+        """Second derivatives of the singular values at the given frequencies.
+
+        Where `moving`, the frequency is a local maximum that follows the parameters,
+        ``H = sigma_tt - sigma_tw sigma_tw^T / sigma_ww``.
+
+        Returns
+        -------
+        ndarray of shape (k, n_params, n_params)
+        """
+        q = self.structure.n_params
+        joint = self.joint_hessians(theta, omega)
+        out = joint[:, :q, :q].copy()
+        for k in range(len(omega)):
+            row, ww = joint[k, :q, q], joint[k, q, q]
+            if moving[k] and ww < 0:
+                out[k] -= np.outer(row, row) / ww
+        return out
+
+    def joint_hessians(self, theta: Array, omega: Array) -> Array:
+        """Hessians of sigma in theta and omega, (k, n_params + 1, n_params + 1)."""
+        q, n = self.structure.n_params, self.n
+        S = self.structure.jacobian(theta)
+        curvature = self.structure.curvature(theta)
+        p, m = self.n_outputs, self.n_inputs
+        _, s1, s2 = laplace_variable(omega, self.dt)
+        G0, G0_1, G0_2 = self._target_derivatives(omega)
+        at = self.point(theta, omega, G0)
+        A, B, C, _ = self.split(self.structure.system_matrix(theta))
+        W, W1, W2 = self.weight_response(omega)
+        U, sigma, Vh = np.linalg.svd(W @ at.E)
+        out = np.empty((len(omega), q + 1, q + 1))
+        for k in range(len(omega)):
+            u, v = U[k, :, 0], Vh[k, 0].conj()
+            Phi, L, R = at.Phi[k], at.L[k], at.R[k]
+            uW, uW1 = u.conj() @ W[k], u.conj() @ W1[k]
+            left, right = uW @ L, R @ v
+            dE = np.empty((q + 1, p, m), complex)
+            dE[:q] = W[k] @ L @ S @ R
+            first, second = _frequency_derivatives(Phi, B, C, s1[k], s2[k])
+            first, second = first - G0_1[k], second - G0_2[k]
+            dE[q] = W1[k] @ at.E[k] + W[k] @ first
+            # u^H (d2E) v: pairs of parameters, parameter and frequency, frequency
+            mixed = (left @ S)[:, :n] @ Phi @ (S[:, :n] @ right).T
+            d2 = np.zeros((q + 1, q + 1), complex)
+            d2[:q, :q] = mixed + mixed.T
+            if curvature is not None:
+                d2[:q, :q] += np.einsum("a,ijab,b->ij", left, curvature, right)
+            dleft = uW1 @ L
+            dleft[:n] -= s1[k] * (left[:n] @ Phi)
+            dright = -s1[k] * (Phi @ right[:n])
+            cross = (dleft @ S) @ right + (left @ S[:, :, :n]) @ dright
+            d2[:q, q] = d2[q, :q] = cross
+            bend = u.conj() @ W2[k] @ at.E[k] + 2.0 * (uW1 @ first) + uW @ second
+            d2[q, q] = bend @ v
+            out[k] = np.real(d2) + _coupling(dE, U[k], sigma[k], Vh[k])
+        return out
+
+
+def vanishing_weight(system: ErrorSystem, omega: float) -> Target | None:
+    """First-order weight that vanishes at zero or infinite frequency.
+
+    ``s / (s + c)`` with `c` the fastest pole of the black box, or ``c / (s + c)`` with
+    the slowest; None for a frequency in between.
+    """
+    poles = np.linalg.eigvals(system.target.A).astype(complex)
+    dt = system.dt
+    if dt is not None:
+        poles = np.log(np.where(poles == 0, 1e-300, poles)) / dt
+    size = np.abs(poles)
+    size = size[size > 0]
+    if size.size == 0 or (0 < omega < np.inf):
+        return None
+    one = np.ones((1, 1))
+    if omega == 0:
+        c = float(size.max())
+        if dt is None:
+            return Target(-c * one, c * one, -one, one)
+        a = np.exp(-c * dt)
+        return Target(a * one, (a - 1.0) * one, one, one, dt)
+    c = float(size.min())
+    return Target(-c * one, c * one, one, 0 * one)
+
+
+def _frequency_derivatives(
+    Phi: Complex, B: Array, C: Array, s1: complex, s2: complex
+) -> tuple[Complex, Complex]:
+    """First and second derivative of ``C (s I - A)^-1 B`` along the frequency."""
+    X = Phi @ (Phi @ B)
+    return -s1 * (C @ X), 2.0 * s1**2 * (C @ (Phi @ X)) - s2 * (C @ X)
+
+
+def _coupling(dE: Complex, U: Complex, sigma: Array, Vh: Complex) -> Array:
+    """Second-order term of the largest singular value through the other ones.
+
+    sigma is an eigenvalue of ``[[0, E], [E^H, 0]]``, whose other eigenvalues are
+    ``+-sigma_a`` and zeros: ``2 Re sum_a conj(c_a) c_a^T / (sigma - lambda_a)``.
+    """
+    p, m = dE.shape[1:]
+    r = len(sigma)
+    Ev = dE @ Vh[0].conj()  # (q, p)
+    uE = U[:, 0].conj() @ dE  # (q, m)
+    a = Ev @ U.conj()  # u_a^H dE v
+    b = (uE @ Vh.conj().T).conj()  # v_a^H dE^H u
+    total = np.zeros((len(dE), len(dE)))
+    floor = 1e-10 * sigma[0]
+    for i in range(max(p, m)):
+        if i < r:
+            terms = [
+                ((a[:, i] + b[:, i]) / 2.0, sigma[i]),
+                ((a[:, i] - b[:, i]) / 2.0, -sigma[i]),
+            ]
+        elif p > m:
+            terms = [(a[:, i] / np.sqrt(2.0), 0.0)]
+        else:
+            terms = [(b[:, i] / np.sqrt(2.0), 0.0)]
+        if i == 0:
+            terms = terms[1:]
+        for c, value in terms:
+            gap = max(sigma[0] - value, floor)
+            total += 2.0 * np.real(np.outer(c.conj(), c)) / gap
+    return total

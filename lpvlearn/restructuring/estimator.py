@@ -1,0 +1,497 @@
+"""Step 4 of the method: a black-box model in the user's gray-box form.
+
+The parameters minimise the H-infinity norm of the difference of the two transfer
+functions, Eq. (6): no similarity transformation is involved, and the orders may
+differ.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils.validation import check_is_fitted
+
+from ..exceptions import RankWarning
+from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
+from ..models.statespace import StateSpace
+from ..structures.structure import GrayBoxStructure
+from .identifiability import Identifiability, perturbation_table, spread_covariance
+from .least_squares import LeastSquaresResult, channel_balance, fit_frequency_response
+from .measured import stack_response
+from .minimise_h2 import minimise_h2
+from .minimise_hinf import SOLVERS, minimise_hinf, promising
+from .problem import (
+    FrequencyWeight,
+    RestructuringProblem,
+    problem_from_models,
+    problem_from_response,
+)
+from .similarity import minimise_bilinear
+from .starts import relative_error, search
+
+Array = NDArray[np.float64]
+
+_NORMS = ("hinf", "h2", "similarity")
+
+_POOR_FIT = 2e-2  # relative least-squares error that is warned about
+
+_AGREE = 1e-3  # relative difference of the errors of fits in one basin
+
+_PROVEN = 1e-8  # an error that much above its lower bound is optimal
+
+_ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
+
+
+def check_options(restructurer: Any) -> None:
+    """A ValueError for options of a GrayBoxRestructurer that are not valid."""
+    for name, allowed in (("norm", _NORMS), ("solver", tuple(SOLVERS))):
+        value = getattr(restructurer, name)
+        if value not in allowed:
+            raise ValueError(f"`{name}` must be one of {allowed}. Got {value!r}.")
+    init = restructurer.init
+    if isinstance(init, str) and init != "similarity":
+        raise ValueError(
+            f"`init` must be 'similarity' or a vector of parameters. Got {init!r}."
+        )
+    for name, least in (("n_starts", 1), ("max_iter", 0)):
+        value = getattr(restructurer, name)
+        if not isinstance(value, Integral) or value < least:
+            raise ValueError(
+                f"`{name}` must be an integer of at least {least}. Got {value!r}."
+            )
+    tol = restructurer.tol
+    if not isinstance(tol, Real) or not 0.0 <= float(tol) < 1.0:
+        raise ValueError(
+            f"`tol` must be a relative decrease, at least 0 and below 1. Got {tol!r}."
+        )
+
+
+def minimise(
+    problem: RestructuringProblem,
+    fits: list[LeastSquaresResult],
+    *,
+    norm: str,
+    solver: str,
+    max_iter: int,
+    tol: float,
+) -> tuple[Array, MinimaxResult, float]:
+    """Minimise the norm of the error from least-squares fits.
+
+    Returns
+    -------
+    theta : ndarray of shape (n_params,)
+    result : MinimaxResult
+    floor : float
+        Highest peak that no parameter changes.
+    """
+    options: dict[str, Any] = {
+        "max_iter": max_iter,
+        "tol": tol,
+        "negligible": _ROUNDING * problem.reference,
+    }
+    system, margin = problem.system, problem.margin
+    if norm == "h2":
+        runs = [minimise_h2(system, fit, margin, **options) for fit in promising(fits)]
+        return *min(runs, key=lambda run: run[1].peaks.top), 0.0
+    if norm == "similarity":
+        found = minimise_bilinear(problem.structure, problem.box, fits[0].x, max_iter)
+        return *found, 0.0
+    theta, result, floor = minimise_hinf(
+        system, fits, margin, SOLVERS[solver], **options
+    )
+    if result.peaks.top <= problem.lower_bound * (1.0 + _PROVEN):
+        # no model is nearer; where the error is equally high everywhere, its peaks
+        # could not tell
+        result = replace(result, stationarity=0.0, converged=True)
+    return theta, result, floor
+
+
+def warn_about(
+    restructurer: Any, problem: RestructuringProblem, result: MinimaxResult
+) -> None:
+    """Warnings about a fitted GrayBoxRestructurer."""
+    if not result.converged:
+        spent = restructurer.n_iter_ >= restructurer.max_iter
+        warnings.warn(
+            f"the search {'ended at' if spent else 'stalled before'} "
+            f"`max_iter`={restructurer.max_iter} steps, with `stationarity_` "
+            f"{restructurer.stationarity_:.1g} (0 at an optimum): a lower norm may be "
+            "near. The best point is kept. "
+            + ("Raise `max_iter`" if spent else "Try another `random_state`")
+            + ", or take a structure of fewer parameters.",
+            ConvergenceWarning,
+            stacklevel=4,
+        )
+    error = restructurer.fit_error_
+    floor = restructurer.structural_floor_ / max(problem.reference, 1e-300)
+    if error - floor > _POOR_FIT:
+        costs = restructurer.starts_["relative_error"].to_numpy()
+        agreeing = int((costs <= costs.min() * (1.0 + _AGREE)).sum())
+        warnings.warn(
+            f"the structure comes no nearer than {100 * error:.2g} % (root mean square "
+            f"over frequency) to the black box; {agreeing} of {len(costs)} fits from "
+            "different starts end there. "
+            + (
+                "It probably cannot represent the model any better."
+                if agreeing > 1
+                else "Either it cannot represent the model, or the search ended in a "
+                "wrong basin."
+            )
+            + " Give `init`, or raise `n_starts`, to search elsewhere.",
+            ConvergenceWarning,
+            stacklevel=4,
+        )
+    found = restructurer.identifiability_
+    if found.rank < problem.structure.n_params:
+        warnings.warn(str(found), RankWarning, stacklevel=4)
+
+
+__all__ = ["GrayBoxRestructurer"]
+
+
+class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
+    r"""Find the gray-box parameters whose model is closest to a black box.
+
+    Minimises :math:`\|G(\vartheta) - \mathfrak{G}\|_\infty`, Eq. (6), over the
+    parameters of a structure, without an initial guess. A sample of the estimator is a
+    frequency; :meth:`fit_model` takes a state-space model instead and works with the
+    exact norm.
+
+    Parameters
+    ----------
+    structure : GrayBoxStructure, default=None
+        None is the observable canonical form of the model's order (`fit_model` only).
+    norm : {"hinf", "h2", "similarity"}, default="hinf"
+        What is minimised: the largest singular value of the error over frequency,
+        Eq. (6); its mean square over frequency and entries; or, for comparison, the
+        bilinear equations of a similarity transformation, Eq. (7), for affine
+        structures of the black box's order.
+    solver : {"sqp", "bundle"}, default="sqp"
+        What ends the search: minimax sequential quadratic programming with exact
+        second derivatives, or the paper's proximity control with cutting planes,
+        Eq. (18)-(21).
+    init : "similarity" or array-like of shape (n_params,), default="similarity"
+        Where the search begins: from nothing, by similarity transformations of the
+        black box, or from a physical guess.
+    n_starts : int, default=16
+        Random starts at each of two time scales.
+    frequency_weight : StateSpace, (low, high) or None, default=None
+        Weight W of the error, ``W (G - G0)``: a stable model with one output for all
+        outputs alike, or a square one; or a band in rad/s, None leaving a side open.
+    max_iter : int, default=1000
+        Newton steps on the central path and iterations of the solver, in all.
+    tol : float, default=1e-10
+        Relative decrease of the norm below which the solver stops.
+    random_state : int, RandomState instance or None, default=0
+        Randomness of the starts.
+
+    Attributes
+    ----------
+    structure_ : GrayBoxStructure
+    params_ : ndarray of shape (n_params,)
+        The parameters, in the order of ``structure_.parameter_names``.
+    lti_ : StateSpace
+        The gray-box model at `params_`.
+    error_ : float
+        H-infinity norm of the weighted error (its maximum over the frequencies, after
+        `fit`), whatever norm was minimised.
+    relative_error_ : float
+        `error_` divided by the norm of the weighted black box.
+    objective_ : float
+        The norm that was minimised.
+    lower_bound_ : float
+        No parameters have a smaller H-infinity error: the structural floor, or the
+        Hankel singular value that a model of the structure's order leaves.
+    active_frequencies_ : ndarray
+        Frequencies, rad/s, of the peaks that support the optimum.
+    structural_floor_ : float
+        Highest peak of the error that no parameter changes (a gain fixed by the
+        structure); 0 where there is none. It is set aside, and the remaining peaks are
+        minimised.
+    remaining_error_ : float
+        Highest peak of the error apart from the floor; equal to `error_` where there is
+        no floor, or a lower one.
+    stationarity_, second_order_ : float
+        Shortest vector in the convex hull of the active gradients (0: stationary, or
+        proven optimal by `lower_bound_`), and smallest eigenvalue of the reduced
+        Hessian (positive: a strict local minimum), relative to the error, in the metric
+        of the response.
+    identifiability_ : Identifiability
+        Rank and condition of the derivative of the response to the parameters.
+    dropped_feedthrough_ : ndarray of shape (n_outputs, n_inputs)
+        What the black box has in D where the structure has no parameter: left out of
+        the comparison, as in Eq. (4).
+    fit_error_ : float
+        Relative root-mean-square error over frequency of the best least-squares fit.
+    params_covariance_ : ndarray of shape (n_params, n_params)
+        Covariance of the parameters from the spread of the `realizations` given to
+        `fit_model`; absent without them.
+    start_params_ : ndarray of shape (n_params,)
+        Least-squares fit that the search started from.
+    starts_ : DataFrame
+        Relative error of the least-squares fits that the search could start from.
+    n_iter_ : int
+    history_ : DataFrame
+        Objective, and mu and Newton steps for each stage of the central path;
+        predicted decrease, step bound and number of active peaks by iteration of the
+        solver.
+
+    Notes
+    -----
+    Candidates come from similarity transformations that solve the equations without
+    parameters exactly (Eq. (34)); the best ones in frequency response start
+    least-squares fits. From there a smooth path of minimisers leads to the least
+    maximum over frequency (:mod:`~lpvlearn.restructuring.central_path`); the solver
+    ends it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lpvlearn import GrayBoxRestructurer, GrayBoxStructure
+    >>> structure = GrayBoxStructure.from_template(
+    ...     A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]])
+    >>> black_box = structure.model({"k": 4.0, "c": 0.5, "b": 2.0}).balance()
+    >>> restructurer = GrayBoxRestructurer(structure).fit_model(black_box)
+    >>> dict(zip(structure.parameter_names, restructurer.params_.round(6).tolist()))
+    {'b': 2.0, 'c': 0.5, 'k': 4.0}
+    """
+
+    def __init__(
+        self,
+        structure: GrayBoxStructure | None = None,
+        *,
+        norm: str = "hinf",
+        solver: str = "sqp",
+        init: str | ArrayLike = "similarity",
+        n_starts: int = 16,
+        frequency_weight: FrequencyWeight = None,
+        max_iter: int = 1000,
+        tol: float = 1e-10,
+        random_state: Any = 0,
+    ) -> None:
+        self.structure = structure
+        self.norm = norm
+        self.solver = solver
+        self.init = init
+        self.n_starts = n_starts
+        self.frequency_weight = frequency_weight
+        self.max_iter = max_iter
+        self.tol = tol
+        self.random_state = random_state
+
+    # -- fitting -------------------------------------------------------------------
+
+    def fit_model(
+        self,
+        model: StateSpace | Sequence[StateSpace],
+        *,
+        starts: Sequence[ArrayLike] = (),
+        realizations: Sequence[StateSpace] = (),
+    ) -> GrayBoxRestructurer:
+        """Restructure a black-box state-space model with the exact H-infinity norm.
+
+        Parameters
+        ----------
+        model : StateSpace or sequence of StateSpace
+            Stable; its time domain (continuous, or discrete with its sampling time) is
+            that of the gray-box model. Several models of one operating point are
+            matched together: the norm is that of their errors stacked.
+        starts : sequence of array-like of shape (n_params,), default=()
+            Further candidates, e.g. the parameters of neighbouring operating points.
+        realizations : sequence of StateSpace, default=()
+            Models from single realizations of the noise, of which `model` is the
+            average; their spread gives `params_covariance_`.
+
+        Raises
+        ------
+        ValueError
+            If a model is unstable, or the structure has other inputs or outputs.
+        """
+        problem = self._problem(model)
+        self._solve(problem, [problem.structure.check_params(s) for s in starts])
+        if len(realizations):
+            responses = [m.frequency_response(problem.omega) for m in realizations]
+            self.params_covariance_ = spread_covariance(
+                problem.system, self.params_, problem.omega, responses
+            )
+        return self
+
+    def fit(
+        self,
+        omega: ArrayLike,
+        frf: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+    ) -> GrayBoxRestructurer:
+        """Restructure a measured frequency response.
+
+        Parameters
+        ----------
+        omega : array-like of shape (n_freq,) or (n_freq, 1)
+            Angular frequencies, rad/s, positive or zero, each once.
+        frf : array-like of shape (n_freq, 2 * n_outputs * n_inputs)
+            Real parts of the entries of the response, row by row, then the imaginary
+            parts; a complex array of shape (n_freq, n_outputs, n_inputs) is accepted.
+        sample_weight : array-like of shape (n_freq,), default=None
+            Weight of the error at every frequency, e.g. the inverse of the standard
+            deviation of the measurement.
+
+        Raises
+        ------
+        ValueError
+            If `structure` is None (a response does not tell the order), or shapes do
+            not fit.
+        """
+        check_options(self)
+        if self.norm != "hinf":
+            raise ValueError(
+                "`norm` must be 'hinf' to fit a frequency response. Got "
+                f"{self.norm!r}; identify a model first and use fit_model()."
+            )
+        problem = problem_from_response(
+            self.structure, omega, frf, self.frequency_weight, sample_weight
+        )
+        self.n_features_in_ = 1
+        self._solve(problem, [])
+        return self
+
+    def start_error(self, model: StateSpace, params: ArrayLike) -> float:
+        """Error of the least-squares fit from given parameters, as `fit_error_`.
+
+        Parameters
+        ----------
+        model : StateSpace
+        params : array-like of shape (n_params,)
+
+        Returns
+        -------
+        float
+            Root-mean-square error over frequency, relative to the black box; infinite
+            where the parameters give an unstable model.
+        """
+        problem = self._problem(model)
+        theta = problem.structure.check_params(params)
+        fit = fit_frequency_response(
+            problem.system,
+            theta,
+            problem.omega,
+            problem.response,
+            admissible=problem.stable,
+        )
+        return np.inf if fit is None else relative_error(fit, problem)
+
+    def perturbation_check(
+        self, model: StateSpace, n_restarts: int = 10, size: float = 0.05
+    ) -> pd.DataFrame:
+        """The paper's empirical check of identifiability, Section 3.3.2: restarts.
+
+        Parameters
+        ----------
+        model : StateSpace
+            The model that was restructured.
+        n_restarts : int, default=10
+        size : float, default=0.05
+            Relative standard deviation of the perturbations.
+
+        Returns
+        -------
+        DataFrame of shape (n_restarts, n_params + 1)
+            Relative deviation of every parameter from `params_`, and `error_`.
+        """
+        check_is_fitted(self, "params_")
+        return perturbation_table(self, model, n_restarts, size)
+
+    def _problem(
+        self, model: StateSpace | Sequence[StateSpace]
+    ) -> RestructuringProblem:
+        check_options(self)
+        models = list(model) if isinstance(model, Sequence) and model else [model]
+        return problem_from_models(self.structure, models, self.frequency_weight)
+
+    def _solve(self, problem: RestructuringProblem, given: list[Array]) -> None:
+        """Candidates, least-squares fits, and the minimisation from the best."""
+        self.__dict__.pop("params_covariance_", None)  # of an earlier fit
+        self.structure_ = problem.structure
+        problem, fits = search(self, problem, given)
+        relative = [relative_error(fit, problem) for fit in fits]
+        self.starts_ = pd.DataFrame({"relative_error": relative})
+        self.fit_error_, self.start_params_ = relative[0], fits[0].x
+        self.params_, result, floor = minimise(
+            problem,
+            fits,
+            norm=self.norm,
+            solver=self.solver,
+            max_iter=self.max_iter,
+            tol=self.tol,
+        )
+        self._describe(problem, result, floor)
+        warn_about(self, problem, result)
+
+    def _describe(
+        self, problem: RestructuringProblem, result: MinimaxResult, floor: float
+    ) -> None:
+        """Attributes that describe the result."""
+        system, structure = problem.system, problem.structure
+        self.lti_ = structure.model(self.params_, system.dt)
+        peaks = system.peaks(self.params_)
+        self.error_ = peaks.norm
+        size = problem.reference
+        self.relative_error_ = self.error_ / size if size > 0 else np.nan
+        self.dropped_feedthrough_ = problem.dropped_feedthrough
+        self.structural_floor_ = floor
+        self.lower_bound_ = max(floor, problem.lower_bound)
+        self.stationarity_ = result.stationarity
+        self.second_order_ = result.second_order
+        self.n_iter_ = result.n_iter
+        self.history_ = pd.DataFrame(result.history)
+        self.objective_ = result.peaks.top if self.norm != "hinf" else self.error_
+        if self.norm == "hinf":
+            found = result.peaks
+            active = found.values >= found.top * (1.0 - ACTIVE_PEAK)
+            self.active_frequencies_ = np.sort(found.frequencies[active])
+            self.remaining_error_ = found.top
+        else:
+            self.active_frequencies_ = np.sort(peaks.frequencies)
+            self.remaining_error_ = self.error_
+        J = system.response_jacobian(self.params_, problem.omega)[1]
+        balance = channel_balance(problem.response)
+        if balance is not None:  # a faint channel tells parameters, too
+            J = J * balance[..., None]
+        self.identifiability_ = Identifiability.from_jacobian(
+            J, structure.parameter_names
+        )
+
+    # -- use -----------------------------------------------------------------------
+
+    def predict(self, omega: ArrayLike) -> Array:
+        """Frequency response of the gray-box model.
+
+        Parameters
+        ----------
+        omega : array-like of shape (n_freq,) or (n_freq, 1)
+            Angular frequencies, rad/s.
+
+        Returns
+        -------
+        ndarray of shape (n_freq, 2 * n_outputs * n_inputs)
+            Real parts of the entries, row by row, then the imaginary parts.
+        """
+        check_is_fitted(self, "lti_")
+        grid = np.asarray(omega, dtype=float).reshape(-1)
+        return stack_response(self.lti_.frequency_response(grid))
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.one_d_array = True
+        tags.input_tags.two_d_array = False
+        tags.target_tags.multi_output = True
+        tags.target_tags.single_output = False
+        return tags

@@ -1,0 +1,233 @@
+"""The error of a structure against a measured frequency response."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..systems.hinf_norm import PeakSet
+from ..systems.sampling import d2c_tustin
+from ..validation import real_array
+from .error_system import ErrorSystem, Structure
+from .transfer import Target, model_derivatives
+
+Array = NDArray[np.float64]
+
+Complex = NDArray[np.complex128]
+
+
+def stack_response(G: Complex) -> Array:
+    """(n_freq, n_outputs, n_inputs) to (n_freq, 2 n_outputs n_inputs).
+
+    Examples
+    --------
+    >>> stack_response(np.array([[[1 + 2j, 3 + 4j]]]))
+    array([[1., 3., 2., 4.]])
+    """
+    flat = G.reshape(len(G), -1)
+    return np.hstack([flat.real, flat.imag])
+
+
+def read_frequency_data(
+    omega: ArrayLike, frf: ArrayLike, n_outputs: int, n_inputs: int
+) -> tuple[Array, Complex]:
+    """Frequencies and complex response, or a ValueError that teaches.
+
+    Parameters
+    ----------
+    omega : array-like of shape (n_freq,) or (n_freq, 1)
+        Angular frequencies, rad/s.
+    frf : array-like of shape (n_freq, 2 * n_outputs * n_inputs), or complex of shape
+        (n_freq, n_outputs, n_inputs)
+        Real parts of the entries row by row, then imaginary parts; or the complex
+        response.
+    n_outputs, n_inputs : int
+
+    Returns
+    -------
+    omega : ndarray of shape (n_freq,)
+    G : ndarray of shape (n_freq, n_outputs, n_inputs)
+
+    Raises
+    ------
+    ValueError
+        If a shape does not fit, a value is not finite, or a frequency is negative or
+        given twice.
+
+    Examples
+    --------
+    >>> omega, G = read_frequency_data([1.0, 2.0], [[0.5, -0.5], [0.2, -0.4]], 1, 1)
+    >>> G[:, 0, 0]
+    array([0.5-0.5j, 0.2-0.4j])
+    """
+    grid = real_array("omega", omega)
+    if grid.ndim == 2 and grid.shape[1] == 1:
+        grid = grid[:, 0]
+    if grid.ndim != 1 or len(grid) == 0:
+        raise ValueError(
+            "`omega` must have shape (n_freq,) or (n_freq, 1) with n_freq >= 1. "
+            f"Got {grid.shape}."
+        )
+    if not np.isfinite(grid).all() or (grid < 0).any() or not (grid > 0).any():
+        raise ValueError("`omega` must be finite, not negative, and not only zero.")
+    if len(np.unique(grid)) != len(grid):
+        raise ValueError("`omega` must hold every frequency once.")
+    table = np.asarray(frf)
+    entries = n_outputs * n_inputs
+    if np.iscomplexobj(table):
+        if table.size != len(grid) * entries or table.shape[:1] != grid.shape:
+            raise ValueError(
+                f"complex `frf` must have shape ({len(grid)}, {n_outputs}, "
+                f"{n_inputs}). Got {table.shape}."
+            )
+        G = table.reshape(len(grid), n_outputs, n_inputs)
+    else:
+        table = real_array("frf", frf)
+        if table.shape != (len(grid), 2 * entries):
+            raise ValueError(
+                f"`frf` must have shape ({len(grid)}, {2 * entries}): real parts of "
+                f"the {n_outputs} x {n_inputs} entries row by row, then imaginary. "
+                f"Got {table.shape}."
+            )
+        G = (table[:, :entries] + 1j * table[:, entries:]).reshape(
+            len(grid), n_outputs, n_inputs
+        )
+    if not np.isfinite(G).all():
+        k = int(np.argwhere(~np.isfinite(G))[0, 0])
+        raise ValueError(f"`frf` must be finite. Got a NaN or infinity in row {k}.")
+    return grid, G.astype(complex)
+
+
+def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
+    """Model of the given order near a response, or None where the data are too few.
+
+    Parameters
+    ----------
+    omega : ndarray of shape (k,)
+        Distinct angular frequencies, rad/s, not negative and not only zero.
+    G : ndarray of shape (k, n_outputs, n_inputs)
+    order : int
+
+    Returns
+    -------
+    Target or None
+        A continuous-time model: exact where `G` is the response of a model of that
+        order. Not necessarily stable.
+
+    References
+    ----------
+    .. [1] T. McKelvey, H. Akcay, L. Ljung, "Subspace-based multivariable system
+       identification from frequency response data", IEEE Transactions on Automatic
+       Control 41, 1996.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> omega = np.linspace(0.5, 10.0, 12)
+    >>> model = realize_response(omega, (1 / (1j * omega + 2))[:, None, None], order=1)
+    >>> float(model.A[0, 0].round(9))
+    -2.0
+    """
+    k, p, m = G.shape
+    rows = order + 1 + order // 2
+    if order < 1 or 2 * k * m < rows * m + order or rows * p <= order:
+        return None
+    positive = omega[omega > 0]
+    centre = float(np.exp(0.5 * np.log(positive.min() * positive.max())))
+    z = (centre + 1j * omega) / (centre - 1j * omega)
+    powers = z ** np.arange(rows)[:, None]
+    outputs = np.einsum("ik,kpm->ipkm", powers, G).reshape(rows * p, k * m)
+    inputs = np.einsum("ik,ab->iakb", powers, np.eye(m)).reshape(rows * m, k * m)
+    stacked = np.vstack([inputs, outputs])
+    data = np.hstack([stacked.real, stacked.imag]).T
+    R = np.asarray(np.linalg.qr(data, mode="r"))
+    remainder = R[rows * m :, rows * m :].T
+    U = np.linalg.svd(remainder)[0]
+    observability = U[:, :order]
+    C = observability[:p]
+    A = np.linalg.lstsq(observability[:-p], observability[p:], rcond=None)[0]
+    # B and D enter the response linearly
+    try:
+        X = np.linalg.inv(z[:, None, None] * np.eye(order) - A)
+        left = np.concatenate([C @ X, np.broadcast_to(np.eye(p), (k, p, p))], axis=2)
+        flat = left.reshape(k * p, order + p)
+        rhs = G.reshape(k * p, m)
+        regressors = np.vstack([flat.real, flat.imag])
+        responses = np.vstack([rhs.real, rhs.imag])
+        BD = np.linalg.lstsq(regressors, responses, rcond=None)[0]
+        return Target(*d2c_tustin(A, BD[:order], C, BD[order:], 2.0 / centre))
+    except ValueError:  # a pole on a data point or at infinity
+        return None
+
+
+_BESIDE = 1e-3  # relative difference of measured neighbours that are equally high
+
+
+class MeasuredErrorSystem(ErrorSystem):
+    """The error of a structure against a measured frequency response.
+
+    The maximum runs over the measured frequencies only: a lower bound of the
+    H-infinity norm.
+    """
+
+    peaks_move = False
+
+    def __init__(
+        self,
+        structure: Structure,
+        omega: Array,
+        G: Complex,
+        weight: Complex | None = None,
+    ) -> None:
+        n_outputs, n_inputs = G.shape[1:]
+        empty = np.zeros((0, 0))
+        D = np.zeros((n_outputs, n_inputs))
+        target = Target(empty, np.zeros((0, n_inputs)), np.zeros((n_outputs, 0)), D)
+        super().__init__(structure, target)
+        order = np.argsort(omega)
+        self.omega, self.G = omega[order], G[order]
+        self.fastest = float(self.omega[-1])
+        unit = np.broadcast_to(np.eye(n_outputs), (len(omega), n_outputs, n_outputs))
+        self.W = (unit if weight is None else weight[order]).astype(complex)
+
+    def restructured(self, structure: Structure) -> ErrorSystem:
+        """The error of another structure."""
+        return MeasuredErrorSystem(structure, self.omega, self.G, self.W)
+
+    def reweighted(self, weight: Target) -> ErrorSystem:
+        """The same error behind one more weight (a scalar one)."""
+        factor = model_derivatives(weight, self.omega)[0][:, :1, :1]
+        return MeasuredErrorSystem(self.structure, self.omega, self.G, factor * self.W)
+
+    def resonances(self, poles: Complex) -> Array:
+        """None: no frequency lies between the measured ones."""
+        return np.zeros(0)
+
+    def weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        """The weight at some of the measured frequencies."""
+        W = self.W[np.searchsorted(self.omega, omega)]
+        return W, np.zeros_like(W), np.zeros_like(W)
+
+    def _target_response(self, omega: Array) -> Complex:
+        """The measured response at some of the measured frequencies."""
+        return self.G[np.searchsorted(self.omega, omega)]
+
+    def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        G0 = self.target_response(omega)
+        return G0, np.zeros_like(G0), np.zeros_like(G0)
+
+    def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
+        """Local maxima of the error over the measured frequencies.
+
+        And their neighbours that are as high: at an optimum two often are equal.
+        """
+        E = self.W @ (self.response(theta, self.omega) - self.G)
+        sigma = np.linalg.norm(E, 2, axis=(1, 2))
+        top = float(sigma.max())
+        rising = np.r_[True, sigma[1:] >= sigma[:-1]]
+        falling = np.r_[sigma[:-1] >= sigma[1:], True]
+        level = top if within is None else (1.0 - within) * top
+        beside = sigma >= (1.0 - _BESIDE) * top
+        index = np.flatnonzero((rising & falling | beside) & (sigma >= level))
+        index = index[np.argsort(-sigma[index], kind="stable")]
+        return PeakSet(top, self.omega[index], sigma[index])

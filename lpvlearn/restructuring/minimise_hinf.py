@@ -1,0 +1,480 @@
+"""Minimisation of the H-infinity norm of the error over the parameters, Eq. (14)-(16).
+
+From the least-squares fit along the central path, and to the end by one of the minimax
+solvers; what a constant peak leaves free is chosen by the remaining error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..minimax.bundle import proximal_bundle
+from ..minimax.problem import Flags, MinimaxProblem, MinimaxResult, Peaks
+from ..minimax.sqp import minimax_sqp
+from .central_path import PathPoint, central_path, search_grid
+from .coordinates import CanonicalForm, ResponseGeometry, view_at
+from .error_system import ErrorSystem, vanishing_weight
+from .least_squares import LeastSquaresResult, fit_frequency_response
+from .limits import Limits, within_bounds
+
+Array = NDArray[np.float64]
+
+_DEPTH = 0.6  # peaks down to that fraction below the objective enter the local model
+
+_FLAT = 1e-7  # a peak with a smaller relative gradient does not depend on theta
+
+_CAP_TOLERANCE = 1e-7
+
+_MAX_CAPS = 12
+
+_BENT = 1.0  # part of a step that its bend may be at most
+
+_HARD_STEPS = (0.99, 0.9999)
+
+
+@dataclass
+class HinfObjective:
+    """Peaks of the error in the coordinates y, with constant peaks set aside.
+
+    Attributes
+    ----------
+    system : ErrorSystem
+    theta0 : ndarray of shape (n_params,)
+    T : ndarray of shape (n_params, n_params)
+    limits : Limits
+        Of stability, speed, and the parameters' bounds.
+    grid : ndarray
+        Frequencies (rad/s) at which the search watches the error.
+    cap : float
+        With `capped`: its norm stays below that.
+    capped : ErrorSystem or None
+        The error whose norm is bounded while that of `system` is minimised.
+    floor, floor_frequency : float
+        Highest peak met so far whose value does not depend on the parameters.
+    """
+
+    system: ErrorSystem
+    theta0: Array
+    T: Array
+    limits: Limits
+    grid: Array
+    cap: float = np.inf
+    capped: ErrorSystem | None = None
+    floor: float = 0.0
+    floor_frequency: float = 0.0
+    _top: float = 0.0
+    _cap_frequencies: Array = field(default_factory=lambda: np.zeros(0))
+
+    def theta(self, y: Array) -> Array:
+        """Parameters at the coordinates `y`."""
+        return self.theta0 + self.T @ y
+
+    def admissible(self, theta: Array) -> bool:
+        """Whether the gray-box model keeps (most of) the margin, and the cap."""
+        if not np.isfinite(theta).all() or not self.limits.admissible(theta):
+            return False
+        if self.capped is None:
+            return True
+        found = self.capped.peaks(theta, 1e-3)
+        high = found.frequencies[found.values > self.cap * (1.0 + _CAP_TOLERANCE)]
+        if high.size:  # bounded there from now on, by a smooth constraint
+            known = np.concatenate([self._cap_frequencies, high])
+            self._cap_frequencies = np.unique(known)[-_MAX_CAPS:]
+        return high.size == 0
+
+    def peaks(self, y: Array) -> Peaks | None:
+        """Peaks that depend on the parameters; None where `y` is not admissible."""
+        theta = self.theta(y)
+        if not self.admissible(theta):
+            return None
+        within = _DEPTH
+        if self.floor > 0 and self._top > 0:
+            within = max(_DEPTH, 1.0 - (1.0 - _DEPTH) * self._top / self.floor)
+        for depth in (within, *(h for h in _HARD_STEPS if h > within), 1.0):
+            found = self.system.peaks(theta, min(depth, 1.0 - 1e-9))
+            _, gradients = self.system.gradients(theta, found.frequencies)
+            gradients = gradients @ self.T
+            steep = np.linalg.norm(gradients, axis=1) > _FLAT * found.values
+            if not steep.all():
+                flat = found.frequencies[~steep]
+                steep[~steep] = ~self.system.constant_at(theta, flat)
+            if found.norm == 0.0 or steep.any():
+                break
+        if not steep.all():
+            high = int(np.argmax(np.where(steep, -np.inf, found.values)))
+            if found.values[high] > self.floor:
+                self.floor = float(found.values[high])
+                self.floor_frequency = float(found.frequencies[high])
+        if not steep.any():  # nothing is left that the parameters could lower
+            none = np.zeros(1)
+            return Peaks(none, none, np.zeros((1, len(y))), np.zeros(1, bool))
+        peaks = Peaks(
+            found.values[steep],
+            found.frequencies[steep],
+            gradients[steep],
+            np.full(int(steep.sum()), self.system.peaks_move),
+        )
+        self._top = peaks.top
+        return peaks
+
+    def samples(self, y: Array, omega: Array) -> Peaks:
+        """Singular values at fixed frequencies, and their gradients."""
+        values, gradients = self.system.gradients(self.theta(y), omega)
+        return Peaks(values, omega, gradients @ self.T, np.zeros(len(omega), bool))
+
+    def values(self, y: Array, omega: Array) -> Array:
+        """Singular values at fixed frequencies, infinite where there is no model."""
+        theta = self.theta(y)
+        if not np.isfinite(self.system.poles(theta)).all():
+            return np.full(len(omega), np.inf)
+        return self.system.values(theta, omega)
+
+    def hessians(self, y: Array, omega: Array, moving: Flags) -> Array:
+        """Second derivatives of the peaks in the coordinates y."""
+        H = self.system.hessians(self.theta(y), omega, moving)
+        return self.T.T @ H @ self.T
+
+    def constraints(self, y: Array) -> tuple[Array, Array]:
+        """The limits, relative to their sizes, and the cap, with gradients."""
+        theta = self.theta(y)
+        c, dc, size = self.limits.rows(theta)
+        c, dc = c / size, dc @ self.T / size[:, None]
+        if self.capped is None or self._cap_frequencies.size == 0:
+            return c, dc
+        values, slopes = self.capped.gradients(theta, self._cap_frequencies)
+        return (
+            np.concatenate([c, values / self.cap - 1.0]),
+            np.vstack([dc, slopes @ self.T / self.cap]),
+        )
+
+    def curve(self, y: Array) -> Geodesics:
+        """Geodesics of the response through `y`."""
+        return Geodesics(self, self.theta(y))
+
+    def problem(self) -> MinimaxProblem:
+        """The callbacks of the minimax solvers."""
+        return MinimaxProblem(
+            self.peaks,
+            self.samples,
+            self.values,
+            self.hessians,
+            self.constraints,
+            self.grid,
+            self.curve,
+        )
+
+
+class Geodesics:
+    """Geodesics of the response through one theta, in the coordinates of a problem."""
+
+    def __init__(self, objective: HinfObjective, theta: Array) -> None:
+        self._geometry = ResponseGeometry(objective.system, theta, objective.grid, 1.0)
+        self._system, self._theta, self._T = objective.system, theta, objective.T
+        self._inverse = np.linalg.inv(objective.T)
+        self._local = self._geometry.inverse @ objective.T
+
+    def step(self, d: Array) -> Array:
+        """End of the geodesic that leaves along `d`, within the parameters' bounds."""
+        local = self._local @ d
+        a = self._geometry.acceleration(local)
+        most = _BENT * float(np.linalg.norm(local))
+        a *= min(1.0, most / max(float(np.linalg.norm(a)), 1e-300))
+        end = self._theta + self._T @ d + 0.5 * self._geometry.T @ a
+        return self._inverse @ (within_bounds(self._system, end) - self._theta)
+
+    def curvature(self, gradient: Array) -> Array:
+        """What the bend of the geodesics adds to a Hessian of that gradient."""
+        local = np.asarray(np.linalg.solve(self._local.T, gradient))
+        normal = -self._geometry.tangential(local)
+        return self._local.T @ self._geometry.second_derivatives(normal) @ self._local
+
+
+_STATIONARY = 1e-8
+
+_NEARLY = 1e-3  # stationarity up to which no more is said
+
+# mu at the end of a round on the central path, and iterations of the solver from there;
+# the next round if these do not converge
+_ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
+
+_BUNDLE_PACE = 10  # as many iterations of a first-order method
+
+_PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
+
+_PROGRESS = 1e-9  # a round that converged and brings less is the last one
+
+_AHEAD = 0.98  # the path is left for a point that much below it
+
+# mu to which the path is followed from several fits, how many are kept there, and the
+# most steps of each: its norm soon tells more of a basin than the least-squares error
+_EXPLORED = ((1e-2, 2, 40), (1e-3, 1, 60))
+
+_FITS = 6
+
+_APART = 1e-4  # relative difference of the costs of different basins
+
+_ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
+
+_RADIUS = 0.1  # first trust-region radius of the solver
+
+_REMAINDER_TOLERANCE = 1e-3  # the choice among optimal points is soon good enough
+
+_REMAINDER_STEPS = 20
+
+Solver = Callable[..., MinimaxResult]
+
+SOLVERS: dict[str, Solver] = {"sqp": minimax_sqp, "bundle": proximal_bundle}
+
+
+def minimise_hinf(
+    system: ErrorSystem,
+    fits: list[LeastSquaresResult],
+    margin: float,
+    solver: Solver,
+    *,
+    max_iter: int,
+    tol: float,
+    negligible: float,
+) -> tuple[Array, MinimaxResult, float]:
+    """Minimise the H-infinity norm of the error from least-squares fits.
+
+    Parameters
+    ----------
+    system : ErrorSystem
+    fits : list of LeastSquaresResult
+        Stable starts, by ascending cost; the first one gives the metric of the steps.
+    margin : float
+        Stability margin, 1/s.
+    solver : callable
+        One of `SOLVERS`.
+    max_iter : int
+        Newton steps on the central path and iterations of the solver, in all.
+    negligible : float
+        Errors at or below it are rounding noise.
+
+    Returns
+    -------
+    theta : ndarray of shape (n_params,)
+    result : MinimaxResult
+        Of the peaks that depend on the parameters.
+    floor : float
+        Highest constant peak (0 where there is none).
+
+    Notes
+    -----
+    Where the floor is above all other peaks, the start is already optimal, and so is
+    every theta that keeps the others below it. Then a weight that vanishes at the
+    floor's frequency sets it aside, and the norm of what remains is minimised among
+    these optimal points.
+    """
+    theta0 = fits[0].x
+    start = system.peaks(theta0)
+    if start.norm <= negligible:  # exact already
+        flat = np.zeros((len(start.values), len(theta0)))
+        still = np.zeros(len(start.values), bool)
+        peaks = Peaks(start.values, start.frequencies, flat, still)
+        return theta0, MinimaxResult(theta0, peaks, 0.0, np.inf, True, 0), 0.0
+    origin = np.zeros(len(theta0))
+    limits, grid = Limits(system, margin), search_grid(system)
+    T = ResponseGeometry(system, theta0, grid, start.norm).T
+    objective = HinfObjective(system, theta0, T, limits, grid)
+    first = objective.peaks(origin)
+    options: dict[str, Any] = {"tol": tol, "negligible": negligible}
+    if first is None or objective.floor < first.top:
+        theta, result, floor = _from_least_squares(
+            system, fits, limits, solver, max_iter, options
+        )
+        return theta, result, floor if floor > negligible else 0.0
+    weight = vanishing_weight(system, objective.floor_frequency)
+    if weight is None:
+        certified = MinimaxResult(theta0, first, 0.0, 0.0, True, 0)
+        return theta0, certified, objective.floor
+    options["max_iter"] = max_iter
+    theta, result = _minimise_remainder(
+        system, system.reweighted(weight), objective.floor, theta0, limits, options
+    )
+    # a constant peak is active: its zero gradient certifies the optimum, though
+    # not a strict one
+    certified = replace(result, stationarity=0.0, second_order=0.0, converged=True)
+    return theta, certified, objective.floor
+
+
+def _from_least_squares(
+    system: ErrorSystem,
+    fits: list[LeastSquaresResult],
+    limits: Limits,
+    solver: Solver,
+    max_iter: int,
+    options: dict[str, Any],
+) -> tuple[Array, MinimaxResult, float]:
+    """Rounds of the central path and a solver; parameters, result and floor."""
+    form = CanonicalForm.of(system, fits[0].x)
+    path, used = _best_path(system, fits, limits, form, max_iter)
+    history, floor = list(path.history), 0.0
+    pace = 1 if solver is minimax_sqp else _BUNDLE_PACE
+    best: tuple[Array, MinimaxResult] | None = None
+    for mu_end, solver_iter in _ROUNDS:
+        path = _followed(
+            system,
+            path,
+            limits,
+            form,
+            mu_end=mu_end,
+            max_iter=int(_PATH_SHARE * (max_iter - used)),
+        )
+        used, history = used + path.n_iter, history + path.history
+        size = max(system.peaks(path.theta).norm, 1e-300)
+        theta, result, high = _ended(
+            system,
+            path.theta,
+            limits,
+            form,
+            solver,
+            max_iter=min(pace * solver_iter, max_iter - used),
+            **options,
+        )
+        used, history = used + result.n_iter, history + result.history
+        floor = max(floor, high)
+        top = np.inf if best is None else best[1].peaks.top
+        if best is None or result.peaks.top < top:
+            best = theta, result
+        settled = result.stationarity <= _STATIONARY and result.converged
+        settled |= best[1].peaks.top <= options["negligible"]
+        idle = result.converged and best[1].peaks.top >= (1.0 - _PROGRESS) * top
+        if settled or idle or used >= max_iter:
+            break
+        ahead = best[1].peaks.top < _AHEAD * size and limits.strict(best[0])
+        inner = best[0] if ahead else path.theta
+        path = replace(path, theta=inner, mu=mu_end)
+    assert best is not None
+    exact = best[1].peaks.top <= options["negligible"]
+    converged = exact or idle or best[1].stationarity <= _NEARLY
+    result = replace(best[1], n_iter=used, history=history, converged=converged)
+    return best[0], result, floor
+
+
+def promising(fits: list[LeastSquaresResult]) -> list[LeastSquaresResult]:
+    """Fits in different basins (by ascending cost), not much worse than the best one.
+
+    Where the structure is far from the black box, the best fit in least squares need
+    not lie in the basin of the least norm.
+    """
+    chosen = [fits[0]]
+    for fit in fits[1:]:
+        apart = fit.cost > chosen[-1].cost * (1.0 + _APART)
+        if apart and fit.cost <= _ALIKE**2 * fits[0].cost and len(chosen) < _FITS:
+            chosen.append(fit)
+    return chosen
+
+
+def _best_path(
+    system: ErrorSystem,
+    fits: list[LeastSquaresResult],
+    limits: Limits,
+    form: CanonicalForm | None,
+    max_iter: int,
+) -> tuple[PathPoint, int]:
+    """The best point at a moderate mu, from several fits, and the steps of all."""
+    paths = [PathPoint(fit.x, None, np.zeros(0), 0, []) for fit in promising(fits)]
+    used = 0
+    for mu_end, kept, steps in _EXPLORED:
+        if len(paths) == 1:
+            break
+        paths = [
+            _followed(
+                system,
+                path,
+                limits,
+                form,
+                mu_end=mu_end,
+                max_iter=min(steps, max_iter // 10),
+            )
+            for path in paths
+        ]
+        used += sum(path.n_iter for path in paths)
+        norms = [system.peaks(path.theta).norm for path in paths]
+        paths = [paths[i] for i in np.argsort(norms, kind="stable")[:kept]]
+    return paths[0], used
+
+
+def _followed(
+    system: ErrorSystem,
+    path: PathPoint,
+    limits: Limits,
+    form: CanonicalForm | None,
+    **options: Any,
+) -> PathPoint:
+    """The central path from where it was left, in suitable coordinates."""
+    view = view_at(system, path.theta, limits, form)
+    end = central_path(
+        view.system,
+        view.theta,
+        view.limits,
+        mu=path.mu,
+        frequencies=path.frequencies,
+        **options,
+    )
+    theta = view.back(end.theta)
+    if theta is None:  # the form has no parameters for that model
+        return _followed(system, path, limits, None, **options)
+    return replace(end, theta=theta)
+
+
+def _ended(
+    system: ErrorSystem,
+    theta: Array,
+    limits: Limits,
+    form: CanonicalForm | None,
+    solver: Solver,
+    **options: Any,
+) -> tuple[Array, MinimaxResult, float]:
+    """End of a solver that starts at `theta`, its result, and the highest floor met."""
+    view = view_at(system, theta, limits, form)
+    grid = search_grid(system)
+    size = max(view.system.peaks(view.theta).norm, 1e-300)
+    T = ResponseGeometry(view.system, view.theta, grid, size).T
+    objective = HinfObjective(view.system, view.theta, T, view.limits, grid)
+    result = solver(
+        objective.problem(), np.zeros(len(view.theta)), radius=_RADIUS, **options
+    )
+    end = view.back(within_bounds(view.system, objective.theta(result.y)))
+    if end is None:
+        return _ended(system, theta, limits, None, solver, **options)
+    return end, result, objective.floor
+
+
+def _minimise_remainder(
+    system: ErrorSystem,
+    remainder: ErrorSystem,
+    floor: float,
+    theta0: Array,
+    limits: Limits,
+    options: dict[str, Any],
+) -> tuple[Array, MinimaxResult]:
+    """Minimise the weighted remainder while the error stays on its floor."""
+    grid = search_grid(system)
+    eye = np.eye(len(theta0))
+    bound = HinfObjective(remainder, theta0, eye, limits, grid, floor, system)
+    fit = fit_frequency_response(
+        remainder,
+        theta0,
+        grid,
+        remainder.target_response(grid),
+        admissible=bound.admissible,
+    )
+    assert fit is not None  # theta0 is admissible
+    size = max(remainder.peaks(fit.x).norm, 1e-300)
+    T = ResponseGeometry(remainder, fit.x, grid, size).T
+    objective = HinfObjective(remainder, fit.x, T, limits, grid, floor, system)
+    # the optimum is certified by the floor; what follows chooses among optimal points
+    options = options | {
+        "tol": max(options["tol"], _REMAINDER_TOLERANCE),
+        "max_iter": min(options["max_iter"], _REMAINDER_STEPS),
+    }
+    result = minimax_sqp(objective.problem(), np.zeros(len(theta0)), **options)
+    return within_bounds(system, objective.theta(result.y)), result

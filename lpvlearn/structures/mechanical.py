@@ -1,0 +1,211 @@
+"""Forms that structures are written in: canonical, modal and mechanical ones.
+
+The functions return what :class:`GrayBoxStructure` is built from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..models.system_matrix import Blocks, blocks
+from ..validation import matrix
+from .templates import Affine, affine_arrays, parse_cells
+
+Array = NDArray[np.float64]
+
+_OUTPUTS = ("position", "velocity", "acceleration")
+
+_SINGULAR = 1e-13  # reciprocal condition number of a singular mass matrix
+
+
+@dataclass(frozen=True, eq=False)
+class ImplicitSystem:
+    """System matrices ``S = offset + W X`` with ``M(theta) X = N(theta)``, M, N affine.
+
+    The form that physics is written in: the equations of motion before they are
+    solved for the accelerations ``X [x; u]``.
+
+    Attributes
+    ----------
+    M : ndarray of shape (1 + n_params, n_dof, n_dof)
+        Constant part, then the part of every parameter.
+    N : ndarray of shape (1 + n_params, n_dof, order + n_inputs)
+    W : ndarray of shape (order + n_outputs, n_dof)
+    offset : ndarray of shape (order + n_outputs, order + n_inputs)
+    order : int
+    """
+
+    M: Array
+    N: Array
+    W: Array
+    offset: Array
+    order: int
+
+    def _solved(self, theta: Array) -> tuple[Array, Array]:
+        """``M^-1`` and ``X``; NaN where M is singular, for a search to step back."""
+        M = self.M[0] + np.tensordot(theta, self.M[1:], 1)
+        N = self.N[0] + np.tensordot(theta, self.N[1:], 1)
+        try:
+            inverse = np.linalg.inv(M)
+        except np.linalg.LinAlgError:
+            inverse = np.full_like(M, np.nan)
+        return inverse, inverse @ N
+
+    def __call__(self, theta: Array) -> Blocks:
+        """Matrices A, B, C, D."""
+        return blocks(self.offset + self.W @ self._solved(theta)[1], self.order)
+
+    def jacobian(self, theta: Array) -> Blocks:
+        """Their derivatives: ``M X_i = N_i - M_i X``."""
+        inverse, X = self._solved(theta)
+        S = self.W @ inverse @ (self.N[1:] - self.M[1:] @ X)
+        return blocks(S, self.order)
+
+    def curvature(self, theta: Array) -> Array:
+        """Second derivatives of S: ``M X_ij = -M_i X_j - M_j X_i``."""
+        inverse, X = self._solved(theta)
+        first = inverse @ (self.N[1:] - self.M[1:] @ X)
+        product = self.M[1:][:, None] @ first[None]
+        return -self.W @ inverse @ (product + product.swapaxes(0, 1))
+
+    def fix(self, values: Array, free: NDArray[np.bool_]) -> ImplicitSystem:
+        """The equations with the parameters that are not free at given values."""
+        keep, known = np.r_[True, free], values * ~free
+        M, N = (
+            np.concatenate([X[:1] + np.tensordot(known, X[1:], 1), X[1:]])[keep]
+            for X in (self.M, self.N)
+        )
+        return ImplicitSystem(M, N, self.W, self.offset, self.order)
+
+    def affine(self) -> tuple[Array, Array]:
+        """Offset and basis of S where M holds no parameter."""
+        X = np.linalg.solve(self.M[0], self.N)
+        S = self.W @ X + 0.0  # no negative zeros
+        return self.offset + S[0], S[1:]
+
+    def natural_sizes(self, rate: float, gains: Array) -> Array:
+        """Sizes of the parameters, up to a factor, that make all terms alike.
+
+        Parameters
+        ----------
+        rate : float
+            1 / s, at which the states move.
+        gains : ndarray of shape (n_outputs,)
+            Sizes of the outputs for inputs of size one.
+
+        Returns
+        -------
+        ndarray of shape (n_params,)
+            Positive.
+        """
+        n, dof = self.order, len(self.M[0])
+        # x_i' = a x_j: log s_j - log s_i = log rate - log |a|; the same for X
+        columns = np.hstack([self.offset[:, :n], self.W])
+        rows, values = [], []
+        for i, j in np.argwhere(columns[:n]):
+            row = np.zeros(n + dof)
+            row[j] += 1.0
+            row[i] -= 1.0
+            rows.append(row)
+            values.append(np.log(rate) - np.log(abs(columns[i, j])))
+        s = np.ones(n + dof)
+        if rows:
+            s = np.exp(np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0])
+        outputs = (np.abs(columns[n:]) * s).max(1, initial=0.0)
+        seen = (outputs > 0) & (gains > 0)
+        if seen.any():
+            s = s * np.median(gains[seen] / outputs[seen])
+        inputs = np.ones(self.N.shape[2] - n)
+        terms = np.concatenate(
+            [np.abs(self.M) * s[n:], np.abs(self.N) * np.concatenate([s[:n], inputs])],
+            axis=2,
+        ).max((1, 2))
+        level = terms[0] if terms[0] > 0 else 1.0  # that of what holds no parameter
+        return np.asarray(level / np.where(terms[1:] > 0, terms[1:], level))
+
+    def regular_point(self) -> Array:
+        """Parameters that bring M near the identity, so that S exists there."""
+        q, n = len(self.M) - 1, len(self.M[0])
+        target = (np.eye(n) - self.M[0]).ravel()
+        theta = np.linalg.lstsq(self.M[1:].reshape(q, -1).T, target, rcond=None)[0]
+        rng = np.random.default_rng(0)
+        for candidate in (theta, np.ones(q), *rng.uniform(0.5, 2.0, (8, q))):
+            M = self.M[0] + np.tensordot(candidate, self.M[1:], 1)
+            if 1.0 / np.linalg.cond(M) > _SINGULAR:
+                return candidate
+        raise ValueError(
+            "`M` must be regular for some parameters. Got a template that is singular "
+            "for all; a coordinate without mass is no state."
+        )
+
+
+def mechanical_system(
+    M: Any,
+    D: Any,
+    K: Any,
+    F: Any,
+    outputs: str,
+    sensors: ArrayLike | None,
+    parameter_names: Sequence[str] | None,
+) -> tuple[ImplicitSystem, list[str]]:
+    """Equations of motion, see `GrayBoxStructure.mechanical`; and parameter names."""
+    if outputs not in _OUTPUTS:
+        raise ValueError(f"`outputs` must be one of {_OUTPUTS}. Got {outputs!r}.")
+    cells = {
+        name: parse_cells(name, block)
+        for name, block in (("M", M), ("D", D), ("K", K), ("F", F))
+    }
+    n, m = len(cells["M"]), len(cells["F"][0]) if cells["F"] else 0
+    if n == 0 or m == 0:
+        raise ValueError(
+            "`M` and `F` must describe at least one coordinate and one input. Got "
+            f"{n} and {m}."
+        )
+    for name, block in cells.items():
+        expected = (n, m if name == "F" else n)
+        shape = (len(block), len(block[0]) if block else 0)
+        if shape != expected:
+            raise ValueError(
+                f"`{name}` must have shape {expected} to fit `M` and `F`. Got {shape}."
+            )
+    H = np.eye(n) if sensors is None else matrix("sensors", sensors)
+    if H.shape[1] != n or len(H) == 0:
+        raise ValueError(
+            f"`sensors` must have {n} columns, one for each coordinate. Got shape "
+            f"{H.shape}."
+        )
+    rows: list[list[Affine]] = [
+        list(mass)
+        + [_negative(entry) for entry in (*stiffness, *damping)]
+        + list(force)
+        for mass, stiffness, damping, force in zip(
+            cells["M"], cells["K"], cells["D"], cells["F"], strict=True
+        )
+    ]
+    offset, basis, names = affine_arrays(rows, parameter_names)
+    stacked = np.concatenate([offset[None], basis])
+    mass, force = stacked[:, :, :n], stacked[:, :, n:]
+    if not mass[1:].any() and not 1.0 / np.linalg.cond(mass[0]) > _SINGULAR:
+        raise ValueError(
+            "`M` must be regular: a coordinate without mass is no state. Got "
+            f"{mass[0].tolist()}."
+        )
+    p = len(H)
+    W, fixed = np.zeros((2 * n + p, n)), np.zeros((2 * n + p, 2 * n + m))
+    W[n : 2 * n] = np.eye(n)
+    fixed[:n, n : 2 * n] = np.eye(n)
+    if outputs == "acceleration":
+        W[2 * n :] = H
+    else:
+        first = 0 if outputs == "position" else n
+        fixed[2 * n :, first : first + n] = H
+    return ImplicitSystem(mass, force, W, fixed, 2 * n), names
+
+
+def _negative(entry: Affine) -> Affine:
+    return {name: -value for name, value in entry.items()}

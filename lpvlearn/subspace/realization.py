@@ -1,0 +1,280 @@
+"""State matrices from the compressed data: weighted subspaces and shift invariance.
+
+With ``[U_f; W_p; Y_f] = L Q`` (``W_p`` the past inputs and, but for PI-MOESP, the past
+outputs), the block ``L32`` is the part of the future outputs that the past explains and
+the future inputs do not. Its column space is that of the extended observability
+matrix; the methods differ in how they weight it (Van Overschee and De Moor, 1995).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from .simulation_fit import Freedom, scaled_lstsq
+
+Array = NDArray[np.float64]
+
+METHODS = ("po-moesp", "pi-moesp", "n4sid", "cva")
+
+# Squaring (eigenvectors of L32 L32.T) is exact enough above this ratio of the last
+# wanted to the first singular value; below it the SVD is used.
+_MIN_RATIO = 1e-4
+
+
+class ObservabilitySubspace(NamedTuple):
+    """Column space of the extended observability matrix.
+
+    Attributes
+    ----------
+    basis : ndarray of shape (horizon * n_outputs, k)
+        Leading directions, most important first, weighting undone.
+    singular_values : ndarray of shape (horizon * n_outputs,)
+        All singular values, descending.
+    """
+
+    basis: Array
+    singular_values: Array
+
+
+def _left_singular(matrix: Array, max_order: int) -> tuple[Array, Array]:
+    """Leading left singular vectors and all singular values of a wide matrix."""
+    gram = matrix @ matrix.T
+    size = len(gram)
+    wanted = min(max_order, size)
+    values = np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
+    if wanted == 0:
+        return np.zeros((size, 0)), values
+    if values[wanted - 1] > _MIN_RATIO * values[0]:
+        vectors = linalg.eigh(
+            gram, subset_by_index=[size - wanted, size - 1], check_finite=False
+        )[1]
+        return vectors[:, ::-1], values
+    vectors, values, _ = linalg.svd(matrix, full_matrices=False, check_finite=False)
+    return vectors[:, :wanted], values
+
+
+def observability_subspace(
+    factor: Array,
+    n_inputs: int,
+    n_outputs: int,
+    horizon: int,
+    max_order: int,
+    method: str = "po-moesp",
+) -> ObservabilitySubspace:
+    """Extended observability matrix from the triangular factor of the data.
+
+    Parameters
+    ----------
+    factor : ndarray of shape (r, r)
+        Lower triangular, of ``[U_f; U_p; Y_p; Y_f]``, without ``Y_p`` for PI-MOESP.
+    n_inputs, n_outputs, horizon : int
+        Dimensions of the blocks.
+    max_order : int
+        Number of directions to return.
+    method : {"po-moesp", "pi-moesp", "n4sid", "cva"}, default="po-moesp"
+        "pi-moesp": instruments are past inputs only, consistent under coloured
+        measurement noise (Verhaegen, 1993). "po-moesp": past inputs and outputs
+        (Verhaegen, 1994). "n4sid", "cva": the same past, weighted by the oblique
+        projection or to canonical correlations (Van Overschee and De Moor, 1995).
+
+    Returns
+    -------
+    ObservabilitySubspace
+    """
+    n_future, n_last = horizon * n_inputs, horizon * n_outputs
+    past = slice(n_future, factor.shape[0] - n_last)
+    explained = factor[-n_last:, past]
+    if method == "n4sid":
+        # The oblique projection L32 L22^-1 [L21 L22] Q; a pseudo-inverse, because
+        # L22 is singular without noise.
+        weight = linalg.lstsq(
+            factor[past, past].T,
+            explained.T,
+            lapack_driver="gelsy",
+            cond=1e-10,
+            check_finite=False,
+        )[0].T
+        explained = np.hstack([weight @ factor[past, :n_future], explained])
+    elif method == "cva":
+        residual = factor[-n_last:, past.stop :]
+        values, vectors = linalg.eigh(
+            explained @ explained.T + residual @ residual.T, check_finite=False
+        )
+        # Without noise the weight has no inverse on the unexcited directions.
+        floor = 1e-12 * values[-1] or 1.0
+        root = np.sqrt(np.maximum(values, floor))
+        left, singular = _left_singular((vectors / root).T @ explained, max_order)
+        return ObservabilitySubspace((vectors * root) @ left, singular)
+    return ObservabilitySubspace(*_left_singular(explained, max_order))
+
+
+def shift_invariant_pair(
+    basis: Array, n_outputs: int, order: int
+) -> tuple[Array, Array]:
+    """``(A, C)`` from the shift invariance of the extended observability matrix.
+
+    ``C`` is the first block row and ``A`` solves ``O[:-1] A = O[1:]`` in the least
+    squares sense.
+
+    Parameters
+    ----------
+    basis : ndarray of shape (horizon * n_outputs, >= order)
+        Basis of the subspace.
+    n_outputs : int
+        Height of a block row.
+    order : int
+        Number of states, at most ``(horizon - 1) * n_outputs``.
+
+    Returns
+    -------
+    A : ndarray of shape (order, order)
+    C : ndarray of shape (n_outputs, order)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> basis = 2.0 * 0.5 ** np.arange(4.0)[:, None]
+    >>> A, C = shift_invariant_pair(basis, n_outputs=1, order=1)
+    >>> round(A.item(), 12), C.item()
+    (0.5, 2.0)
+    """
+    leading = basis[:, :order]
+    if order == 0:
+        return np.zeros((0, 0)), np.zeros((n_outputs, 0))
+    A = linalg.lstsq(
+        leading[:-n_outputs],
+        leading[n_outputs:],
+        lapack_driver="gelsy",
+        check_finite=False,
+    )[0]
+    return np.ascontiguousarray(A), leading[:n_outputs].copy()
+
+
+def reflect_unstable(A: Array, limit: float = 1.0) -> Array:
+    """Reflect the poles outside a circle around the origin into it.
+
+    Every pole ``z`` with ``|z| > limit`` becomes ``limit**2 / conj(z)``; the others
+    stay.
+
+    Parameters
+    ----------
+    A : ndarray of shape (order, order)
+    limit : float, default=1.0
+        Radius of the circle.
+
+    Returns
+    -------
+    ndarray of shape (order, order)
+        ``A`` itself when nothing had to be reflected.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> reflect_unstable(np.diag([2.0, 0.5]))
+    array([[0.5, 0. ],
+           [0. , 0.5]])
+    """
+    if A.size == 0 or np.abs(linalg.eigvals(A)).max() <= limit:
+        return A
+    # By the real Schur form, because the eigenvectors may be nearly dependent; as
+    # 1 / conj(z) = z / |z|**2, a diagonal block is divided by its squared modulus.
+    triangular, rotation = linalg.schur(A, output="real")
+    start = 0
+    while start < len(A):
+        pair = start + 1 < len(A) and triangular[start + 1, start] != 0.0
+        block = slice(start, start + 1 + pair)
+        modulus = np.abs(linalg.eigvals(triangular[block, block])).max()
+        if modulus > limit:
+            triangular[block, block] *= (limit / modulus) ** 2
+        start = block.stop
+    return rotation @ triangular @ rotation.T
+
+
+def dominant_pair(
+    A: Array, B: Array, C: Array, order: int, length: int
+) -> tuple[Array, Array]:
+    """``(A, C)`` of the part of a model that dominates its first Markov parameters.
+
+    The model is reduced through the singular values of its Hankel matrix (Ho and
+    Kalman, 1966), which needs no stability. States that the inputs do not reach,
+    such as those of a noise model, drop out.
+
+    Parameters
+    ----------
+    A, B, C : ndarray
+        State-space matrices.
+    order : int
+        Number of states to keep.
+    length : int
+        Block rows and columns of the Hankel matrix.
+
+    Returns
+    -------
+    A : ndarray of shape (order, order)
+    C : ndarray of shape (n_outputs, order)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> A, B, C = np.diag([0.9, 0.2]), np.array([[1.0], [0.0]]), np.ones((1, 2))
+    >>> dominant_pair(A, B, C, 1, 8)[0].round(6)
+    array([[0.9]])
+    """
+    seen, reached = [C], [B]
+    for _ in range(length - 1):
+        seen.append(seen[-1] @ A)
+        reached.append(A @ reached[-1])
+    left, s, _ = linalg.svd(
+        np.vstack(seen) @ np.hstack(reached), full_matrices=False, check_finite=False
+    )
+    return shift_invariant_pair(left * np.sqrt(s), len(C), order)
+
+
+def factor_input_matrices(
+    factor: Array, A: Array, C: Array, free: Freedom, horizon: int
+) -> tuple[Array, Array]:
+    """B and D from the triangular factor alone (MOESP).
+
+    With ``Q`` orthogonal to the extended observability matrix ``O`` and ``T`` the
+    Toeplitz matrix of the Markov parameters, ``Q.T L31 = Q.T T L11`` but for the
+    noise, which is linear in B and D (Verhaegen and Verdult, 2007, Section 9.2.4).
+    Consistent, but less accurate than the simulation least squares of
+    `simulation_fit`, which needs the samples.
+
+    Parameters
+    ----------
+    factor : ndarray of shape (r, r)
+        Lower triangular, of ``[U_f; ...; Y_f]``.
+    A : ndarray of shape (order, order)
+    C : ndarray of shape (n_outputs, order)
+    free : Freedom
+    horizon : int
+
+    Returns
+    -------
+    B : ndarray of shape (order, n_inputs)
+    D : ndarray of shape (n_outputs, n_inputs)
+    """
+    (ny, n), m = C.shape, free.direct.shape[1]
+    powers = [C]
+    for _ in range(horizon - 1):
+        powers.append(powers[-1] @ A)
+    observability = np.vstack(powers)
+    Q = linalg.qr(observability, check_finite=False)[0][:, n:]
+    L11 = factor[: horizon * m, : horizon * m].reshape(horizon, m, horizon * m)
+    L31 = Q.T @ factor[-horizon * ny :, : horizon * m]
+    effect = np.zeros((horizon, Q.shape[1], ny + n))
+    for t in range(horizon):
+        effect[t, :, :ny] = Q[t * ny : (t + 1) * ny].T
+        rest = horizon - t - 1
+        effect[t, :, ny:] = Q[(t + 1) * ny :].T @ observability[: rest * ny]
+    M = np.einsum("tar,tjc->acrj", effect, L11).reshape(L31.size, -1)
+    allowed = np.vstack([free.direct, np.ones((n, m), dtype=bool)]).ravel()
+    solution = np.zeros(len(allowed))
+    solution[allowed] = scaled_lstsq(M[:, allowed], L31.ravel())[0]
+    DB = solution.reshape(ny + n, m)
+    return DB[ny:], DB[:ny]

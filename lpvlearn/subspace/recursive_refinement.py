@@ -1,0 +1,373 @@
+"""Recursive Gauss-Newton steps on the simulation error of a stream.
+
+Every stretch of data is linearised at the model of that moment, in fixed local
+coordinates around a pilot model, and stacked to a triangular factor of bounded size: a
+Gauss-Newton method that sees each sample once, as efficient as the batch one in
+the limit (Ljung and Soderstrom, 1983), because the pilot is already close. A stretch
+has an initial state of its own, which costs next to nothing.
+
+The factor holds the simulation error as a function of all parameters near the models
+it was linearised at. B and D for given matrices A and C, such as the subspace estimate
+of the whole stream, follow from it as well (`input_matrices`): the simulation least
+squares without the samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from .signals import Record, signal_factor, state_coefficients
+from .simulation_fit import (
+    Freedom,
+    Point,
+    Realization,
+    jacobian_regression,
+    linear_regression,
+    n_own,
+    project_out,
+    scaled_lstsq,
+    stack_regressions,
+)
+
+Array = NDArray[np.float64]
+
+# Directions of the scaled parameters that the pilot data do not determine.
+_RCOND = 1e-9
+
+# Samples from which the initial state of a stretch is estimated first.
+_HEAD = 4_096
+
+# A linearisation holds for changes of a pole of this share of its distance from the
+# unit circle, taken as no smaller than a stretch of data can tell.
+_RANGE = 0.1
+
+_CLOSEST = 1e-4
+
+_SLOWEST = 1e-100
+
+# Newton steps towards the pilot's blocks, and the coupling that counts as none.
+_MAX_ALIGN = 30
+
+_COUPLING = 1e-14
+
+
+class Recursion(NamedTuple):
+    """Accumulated linearised simulation errors around a pilot model.
+
+    Attributes
+    ----------
+    pilot : Realization
+        In section form.
+    directions : ndarray of shape (n_parameters, k)
+        Local coordinates: parameters (B, D, A, C) are those of the pilot plus
+        ``directions @ position``.
+    coordinates : ndarray of shape (k, n_parameters)
+        The other way: position of a change of the parameters, but for what leaves the
+        response as it is.
+    restraint : ndarray of shape (k,)
+        Weight of the distance from the pilot, along every coordinate.
+    information : ndarray of shape (k + 1, k + 1)
+        Triangular factor of ``[J, J position - error]``, summed up.
+    position : ndarray of shape (k,)
+    """
+
+    pilot: Realization
+    directions: Array
+    coordinates: Array
+    restraint: Array
+    information: Array
+    position: Array
+
+
+def start_recursion(
+    pilot: Realization,
+    regressions: Sequence[Array],
+    free: Freedom,
+    variance: float = 0.0,
+) -> Recursion:
+    """Local coordinates and first information, from the data of the pilot model.
+
+    Parameters
+    ----------
+    pilot : Realization
+    regressions : sequence of ndarray
+        One per experiment, from `jacobian_regression` at the pilot model.
+    free : Freedom
+    variance : float, default=0.0
+        Of the simulation error. What is known of the parameters no better than the
+        linearisation is valid, such as the poles of a superfluous mode, stays with
+        the pilot until the data tell more.
+
+    Returns
+    -------
+    Recursion
+    """
+    own = n_own(len(pilot.A), free)
+    stacked = stack_regressions(regressions, own)
+    jacobian = stacked[:, :-1]
+    scale = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
+    scale[scale == 0.0] = 1.0
+    _, s, right = linalg.svd(jacobian / scale, full_matrices=False, check_finite=False)
+    right = right[s > _RCOND * s.max(initial=0.0)]
+    directions = right.T / scale[:, None]
+    k = directions.shape[1]
+    rows = np.column_stack([jacobian @ directions, stacked[:, -1]])
+    information = _triangle(rows, k + 1)
+    restraint = np.sqrt(variance) / _ranges(pilot, directions)
+    position = _solve(information, restraint)
+    return Recursion(pilot, directions, right * scale, restraint, information, position)
+
+
+def _ranges(pilot: Realization, directions: Array) -> Array:
+    """How far every coordinate may move before a pole leaves its neighbourhood."""
+    assert pilot.blocks is not None
+    stop = len(directions) - pilot.C.size
+    start = stop - sum(block.size for block in pilot.blocks)
+    speed = np.full(directions.shape[1], _SLOWEST)
+    for block in pilot.blocks:
+        change = directions[start : start + block.size]
+        margin = 1.0 - np.abs(np.linalg.eigvals(block)).max()
+        size = np.sqrt(np.einsum("ij,ij->j", change, change))
+        speed = np.maximum(speed, size / (_RANGE * max(abs(margin), _CLOSEST)))
+        start += block.size
+    return 1.0 / speed
+
+
+def _triangle(rows: Array, size: int) -> Array:
+    """Upper triangular factor of shape (size, size)."""
+    out = np.zeros((size, size))
+    upper = np.linalg.qr(rows, mode="r")
+    out[: len(upper)] = upper
+    return out
+
+
+def _solve(information: Array, restraint: Array) -> Array:
+    rows = np.vstack([information[:-1, :-1], np.diag(restraint)])
+    target = np.concatenate([information[:-1, -1], np.zeros(len(restraint))])
+    return scaled_lstsq(rows, target)[0]
+
+
+def current_model(recursion: Recursion, free: Freedom) -> Realization:
+    """Model at the present position.
+
+    Returns
+    -------
+    Realization
+        Its loss is the sum of squared errors of the linearised problem.
+    """
+    step = recursion.directions @ recursion.position
+    return _moved(recursion, step, recursion.position, free)
+
+
+def _moved(
+    recursion: Recursion, step: Array, position: Array, free: Freedom
+) -> Realization:
+    """The pilot model after a step of its parameters."""
+    pilot, blocks = recursion.pilot, []
+    assert pilot.blocks is not None
+    n_b, n_d = pilot.B.size, int(free.direct.sum())
+    D = pilot.D.copy()
+    D[free.direct] += step[n_b : n_b + n_d]
+    start = n_b + n_d
+    for block in pilot.blocks:
+        blocks.append(block + step[start : start + block.size].reshape(block.shape))
+        start += block.size
+    residual = recursion.information[:, -1].copy()
+    residual[:-1] -= recursion.information[:-1, :-1] @ position
+    return pilot._replace(
+        A=linalg.block_diag(*blocks) if blocks else pilot.A,
+        B=pilot.B + step[:n_b].reshape(pilot.B.shape),
+        C=pilot.C + step[start:].reshape(pilot.C.shape),
+        D=D,
+        loss=float(residual @ residual),
+        blocks=tuple(blocks),
+    )
+
+
+def input_matrices(
+    recursion: Recursion, A: Array, C: Array, free: Freedom
+) -> Realization | None:
+    """Model with given A and C: B and D that minimise the linearised error.
+
+    Parameters
+    ----------
+    recursion : Recursion
+    A : ndarray of shape (order, order)
+    C : ndarray of shape (n_outputs, order)
+        In any state basis; near the model of the recursion.
+    free : Freedom
+
+    Returns
+    -------
+    Realization or None
+        In the basis of the pilot model. None where ``(A, C)`` has no form with the
+        pilot's blocks.
+    """
+    pilot = recursion.pilot
+    pair = aligned_pair(A, C, pilot)
+    if pair is None:
+        return None
+    blocks, C = pair
+    n_bd = pilot.B.size + int(free.direct.sum())
+    step = _step_to(pilot._replace(blocks=blocks, C=C), pilot, free)
+    R, target = recursion.information[:-1, :-1], recursion.information[:-1, -1]
+    rest = target - R @ (recursion.coordinates @ step)
+    step[:n_bd] = scaled_lstsq(R @ recursion.coordinates[:, :n_bd], rest)[0]
+    return _moved(recursion, step, recursion.coordinates @ step, free)
+
+
+def _step_to(model: Realization, pilot: Realization, free: Freedom) -> Array:
+    """Change of the parameters (B, D, A, C) from the pilot to another model."""
+    assert model.blocks is not None and pilot.blocks is not None
+    changes = [new - old for new, old in zip(model.blocks, pilot.blocks, strict=True)]
+    return np.concatenate(
+        [
+            (model.B - pilot.B).ravel(),
+            (model.D - pilot.D)[free.direct],
+            *(change.ravel() for change in changes),
+            (model.C - pilot.C).ravel(),
+        ]
+    )
+
+
+def aligned_pair(
+    A: Array, C: Array, pilot: Realization
+) -> tuple[tuple[Array, ...], Array] | None:
+    """``(A, C)`` in the state basis of another model, with blocks as that has them.
+
+    The extended observability matrices give the basis; Newton steps on the invariant
+    subspaces remove what then couples the blocks.
+
+    Parameters
+    ----------
+    A : ndarray of shape (order, order)
+    C : ndarray of shape (n_outputs, order)
+    pilot : Realization
+        In section form.
+
+    Returns
+    -------
+    blocks : tuple of ndarray
+    C : ndarray of shape (n_outputs, order)
+        None instead of both where there is no such form near the pilot's.
+    """
+    assert pilot.blocks is not None
+    n, owner = (
+        len(A),
+        np.repeat(np.arange(len(pilot.blocks)), [len(block) for block in pilot.blocks]),
+    )
+    if n == 0:
+        return (), C
+    stacks = []
+    for matrix, rows in ((A, [C]), (pilot.A, [pilot.C])):
+        for _ in range(2 * n - 1):
+            rows.append(rows[-1] @ matrix)
+        stacks.append(np.vstack(rows))
+    T, coupled = linalg.lstsq(*stacks)[0], owner[:, None] != owner
+    try:
+        A, C = linalg.solve(T, A @ T), C @ T
+        for _ in range(_MAX_ALIGN):
+            if np.abs(A[coupled]).max(initial=0.0) <= _COUPLING * np.abs(A).max():
+                cuts = [np.flatnonzero(owner == k) for k in range(len(pilot.blocks))]
+                return tuple(A[np.ix_(cut, cut)] for cut in cuts), C
+            S = np.eye(n)
+            for i, j in np.argwhere(np.triu(np.ones((owner[-1] + 1,) * 2), 1)):
+                for p, q in ((owner == i, owner == j), (owner == j, owner == i)):
+                    S[np.ix_(p, q)] = linalg.solve_sylvester(
+                        A[np.ix_(p, p)], -A[np.ix_(q, q)], -A[np.ix_(p, q)]
+                    )
+            A, C = linalg.solve(S, A @ S), C @ S
+            if not np.abs(A).max() < 1e6:
+                return None
+    except (linalg.LinAlgError, ValueError):
+        return None
+    return None
+
+
+def extend_recursion(
+    recursion: Recursion,
+    record: Record,
+    free: Freedom,
+    point: Realization | None = None,
+) -> tuple[Recursion, Array]:
+    """Add a stretch of data, linearised at the present model.
+
+    Parameters
+    ----------
+    recursion : Recursion
+    record : Record
+        Scaled as the pilot's data.
+    free : Freedom
+    point : Realization, default=None
+        Another model to linearise at, from `input_matrices`.
+
+    Returns
+    -------
+    recursion : Recursion
+        Unchanged where the responses overflow.
+    initial_state : ndarray of shape (order,)
+        Of the stretch.
+    """
+    model, position = current_model(recursion, free), recursion.position
+    if point is not None:
+        model, position = (
+            point,
+            recursion.coordinates @ _step_to(point, recursion.pilot, free),
+        )
+    assert model.blocks is not None
+    own = n_own(len(model.A), free)
+    # A linearisation point for the initial state; the stretch corrects it.
+    head = Record(record.u[:, :_HEAD], record.y[:, :_HEAD])
+    loss, x0 = stretch_error(model, head, free)
+    if not np.isfinite(loss):
+        return recursion, x0
+    driven = np.column_stack([x0, model.B])
+    state_map = state_coefficients(model.blocks, driven)
+    R = signal_factor(model.blocks, record, state_map)
+    if R is None:
+        return recursion, x0
+    around = Point(model.C, model.D, driven)
+    M = project_out(jacobian_regression(R, model.blocks, around, free), own)
+    J = M[:, :-1] @ recursion.directions
+    rows = np.column_stack([J, M[:, -1] + J @ position])
+    information = _triangle(
+        np.vstack([recursion.information, rows]), len(recursion.information)
+    )
+    position = _solve(information, recursion.restraint)
+    return recursion._replace(information=information, position=position), x0
+
+
+def stretch_error(
+    model: Realization, record: Record, free: Freedom
+) -> tuple[float, Array]:
+    """Simulation error of a stretch with the best initial state.
+
+    Parameters
+    ----------
+    model : Realization
+        In section form.
+    record : Record
+    free : Freedom
+
+    Returns
+    -------
+    loss : float
+        Sum of squares; infinite where the responses overflow.
+    initial_state : ndarray of shape (order,)
+    """
+    assert model.blocks is not None
+    n, own = len(model.A), n_own(len(model.A), free)
+    R = signal_factor(model.blocks, record)
+    if R is None:
+        return np.inf, np.zeros(n)
+    M = linear_regression(R, model.blocks, model.C, free)
+    known = np.concatenate([model.B.ravel(), model.D[free.direct]])
+    error = M[:, -1] - M[:, own:-1] @ known
+    x0 = scaled_lstsq(M[:, :own], error)[0]
+    error = error - M[:, :own] @ x0
+    return float(error @ error), x0 if own else np.zeros(n)

@@ -1,0 +1,394 @@
+"""A discrete state matrix as a bank of first- and second-order sections.
+
+With ``A = T diag(A_1, A_2, ...) inv(T)``, blocks of size one or two, every response of
+the model is a fixed combination of a few filtered signals that do not depend on B, C
+or the initial state. They are what the least-squares problems of `simulationfit` and
+`refinement` are made of. Poles that lie close together share a block, so that a
+double pole, or a pair of real poles about to become complex, is not singular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, signal
+
+from .hankel import cholesky_factor, stack_factors
+
+Array = NDArray[np.float64]
+
+# Beyond this condition number of T the sections would lose half of the digits.
+_MAX_CONDITION = 1e8
+
+# Cosine above which two eigenvectors do not define their plane accurately.
+_PARALLEL = 1.0 - 1e-8
+
+
+class Sections(NamedTuple):
+    """Block-diagonal form of a state matrix.
+
+    Attributes
+    ----------
+    blocks : tuple of ndarray of shape (1, 1) or (2, 2)
+        Diagonal blocks.
+    transform : ndarray of shape (order, order)
+        ``A @ transform = transform @ block_diag(*blocks)``.
+    """
+
+    blocks: tuple[Array, ...]
+    transform: Array
+
+
+def _pair_real(poles: Array) -> list[list[int]]:
+    """Group real poles, given in ascending order, two by two with their neighbours.
+
+    Of an odd number the one is left alone whose removal keeps the pairs closest.
+    """
+    n = len(poles)
+    if n % 2 == 0:
+        return [[i, i + 1] for i in range(0, n, 2)]
+    gaps = np.diff(poles)
+    cost = [gaps[0:i:2].sum() + gaps[i + 1 :: 2].sum() for i in range(0, n, 2)]
+    alone = 2 * int(np.argmin(cost))
+    rest = [i for i in range(n) if i != alone]
+    return [[alone]] + [rest[i : i + 2] for i in range(0, n - 1, 2)]
+
+
+def _invariant_basis(A: Array, poles: Array, vectors: Array) -> Array:
+    """Orthonormal basis of the invariant subspace of one or two real poles."""
+    if len(poles) == 2 and abs(vectors[:, 0] @ vectors[:, 1]) > _PARALLEL:
+        # A (nearly) defective pair: the null space of (A - p1 I)(A - p2 I).
+        eye = np.eye(len(A))
+        product = (A - poles[0] * eye) @ (A - poles[1] * eye)
+        return linalg.svd(product, check_finite=False)[2][-2:].T
+    return linalg.qr(vectors, mode="economic", check_finite=False)[0]
+
+
+def block_sections(A: Array) -> Sections | None:
+    """Split a state matrix into sections of one or two states.
+
+    Parameters
+    ----------
+    A : ndarray of shape (order, order)
+
+    Returns
+    -------
+    Sections or None
+        None where the transformation is too ill conditioned (a pole of multiplicity
+        three or more, or a repeated complex pair).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> A = np.array([[0.9, 1.0, 0.0], [0.0, 0.9, 0.0], [0.3, 0.0, 0.2]])
+    >>> sections = block_sections(A)
+    >>> [block.shape[0] for block in sections.blocks]
+    [1, 2]
+    >>> T = sections.transform
+    >>> from scipy.linalg import block_diag
+    >>> np.allclose(A @ T, T @ block_diag(*sections.blocks))
+    True
+    """
+    poles, vectors = linalg.eig(A)
+    real = np.flatnonzero(poles.imag == 0.0)
+    real = real[np.argsort(poles[real].real)]
+    bases = [
+        _invariant_basis(A, poles[real[group]].real, vectors[:, real[group]].real)
+        for group in _pair_real(poles[real].real)
+    ]
+    for i in np.flatnonzero(poles.imag > 0.0):
+        pair = np.column_stack([vectors[:, i].real, vectors[:, i].imag])
+        bases.append(linalg.qr(pair, mode="economic", check_finite=False)[0])
+    transform = np.hstack(bases) if bases else np.zeros((0, 0))
+    if A.size and not np.linalg.cond(transform) <= _MAX_CONDITION:
+        return None
+    blocks = tuple(basis.T @ A @ basis for basis in bases)
+    return Sections(blocks, transform)
+
+
+def block_coefficients(block: Array) -> tuple[float, Array]:
+    """Centre ``s`` and remainder ``N = A - s I`` of a block, ``s`` half its trace.
+
+    The resolvent is ``inv(z I - A) = ((z - s) I + N) / det(z I - A)``, so that any
+    response of the block combines the two signals of a `SectionBank`.
+
+    Parameters
+    ----------
+    block : ndarray of shape (k, k)
+        ``k`` is one or two.
+
+    Returns
+    -------
+    s : float
+    N : ndarray of shape (k, k)
+    """
+    centre = float(np.trace(block)) / len(block)
+    return centre, block - centre * np.eye(len(block))
+
+
+class SectionBank:
+    """Filters of all blocks, with the memory that a record in pieces needs.
+
+    For a block of two states the signals are ``d = (z - s) g`` and
+    ``g = v / det(z I - A)``; the state driven by ``b v`` from rest is ``d b + g N b``.
+    For one state only ``d`` exists, which is the state driven by ``v``.
+
+    Parameters
+    ----------
+    blocks : tuple of ndarray of shape (k, k)
+        ``k`` is one or two.
+    widths : sequence of int
+        Number of signals that drive each block.
+    """
+
+    def __init__(self, blocks: tuple[Array, ...], widths: Sequence[int]) -> None:
+        self._blocks = blocks
+        self._memory = [
+            np.zeros((width, len(block)))
+            for block, width in zip(blocks, widths, strict=True)
+        ]
+        self._last = [np.zeros(width) for width in widths]
+
+    def run(self, late: Sequence[Array], out: Array) -> None:
+        """Filter the next piece.
+
+        Parameters
+        ----------
+        late : sequence of ndarray of shape (n_signals, n_samples)
+            What drives each block, one sample late.
+        out : ndarray of shape (sum of k * n_signals, n_samples)
+            Receives, block after block, ``d`` and (two states) ``g``.
+        """
+        row = 0
+        for i, v in enumerate(late):
+            width = len(v)
+            first = out[row : row + width]
+            if len(self._blocks[i]) == 1:
+                first[:] = self._filter(i, v)
+                row += width
+                continue
+            ahead, centre = self._filter(i, v), 0.5 * np.trace(self._blocks[i])
+            g = out[row + width : row + 2 * width]
+            self._delay(i, ahead, g)
+            np.multiply(g, -centre, out=first)
+            first += ahead
+            row += 2 * width
+
+    def run_last(self, late: Sequence[Array], out: Array) -> None:
+        """As `run`, but only ``g`` of blocks of two states (``d`` of one state)."""
+        row = 0
+        for i, v in enumerate(late):
+            part = out[row : row + len(v)]
+            if len(self._blocks[i]) == 1:
+                part[:] = self._filter(i, v)
+            else:
+                self._delay(i, self._filter(i, v), part)
+            row += len(v)
+
+    def _filter(self, i: int, v: Array) -> Array:
+        """``d`` of one state; ``g`` of two, one sample early."""
+        block = self._blocks[i]
+        denominator = [1.0, -block[0, 0]]
+        if len(block) == 2:
+            det = block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0]
+            denominator = [1.0, -block[0, 0] - block[1, 1], det]
+        out, self._memory[i] = signal.lfilter(
+            [1.0], denominator, v, axis=1, zi=self._memory[i]
+        )
+        return out
+
+    def _delay(self, i: int, ahead: Array, out: Array) -> None:
+        out[:, 0] = self._last[i]
+        out[:, 1:] = ahead[:, :-1]
+        self._last[i] = ahead[:, -1].copy()
+
+
+def section_signals(blocks: tuple[Array, ...], u: Array) -> Array:
+    """Signals that span the free and the forced responses of all sections.
+
+    Parameters
+    ----------
+    blocks : tuple of ndarray
+        Blocks of `Sections`.
+    u : ndarray of shape (n_inputs, n_samples)
+
+    Returns
+    -------
+    ndarray of shape (order * (1 + n_inputs), n_samples)
+        Section after section: for each of its signals (see `SectionBank`), the
+        answer to an impulse that sets the state at time 0, then the answers to each
+        input.
+    """
+    m, n_samples = u.shape
+    source = np.zeros((1 + m, n_samples))
+    source[0, 0] = 1.0
+    source[1:, 1:] = u[:, :-1]
+    order = sum(len(block) for block in blocks)
+    out = np.empty((order * (1 + m), n_samples))
+    SectionBank(blocks, [1 + m] * len(blocks)).run([source] * len(blocks), out)
+    return out
+
+
+def output_coefficients(blocks: tuple[Array, ...], C: Array) -> Array:
+    """Outputs of every section, in terms of its signals.
+
+    ``c x = sum_i coefficient[i, j] b[j] signal[i]`` for a state driven through ``b``:
+    rows ``c`` for ``d`` and ``c N`` for ``g``.
+
+    Parameters
+    ----------
+    blocks : tuple of ndarray
+        Blocks of `Sections`.
+    C : ndarray of shape (n_outputs, order)
+        In the coordinates of the blocks.
+
+    Returns
+    -------
+    ndarray of shape (n_outputs, order, order)
+        Block diagonal, one matrix per output.
+    """
+    ny, n = C.shape
+    out = np.zeros((ny, n, n))
+    start = 0
+    for block in blocks:
+        part = slice(start, start + len(block))
+        out[:, start, part] = C[:, part]
+        if len(block) == 2:
+            out[:, start + 1, part] = C[:, part] @ block_coefficients(block)[1]
+        start = part.stop
+    return out
+
+
+def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
+    """States in terms of the section signals.
+
+    Parameters
+    ----------
+    blocks : tuple of ndarray
+        Blocks of `Sections`.
+    driven : ndarray of shape (order, 1 + n_inputs)
+        Initial state and input matrix.
+
+    Returns
+    -------
+    ndarray of shape (order, order * (1 + n_inputs))
+    """
+    n, width = driven.shape
+    out = np.zeros((n, n, width))
+    start = 0
+    for block in blocks:
+        part = slice(start, start + len(block))
+        out[part, start] = driven[part]
+        if len(block) == 2:
+            out[part, start + 1] = block_coefficients(block)[1] @ driven[part]
+        start = part.stop
+    return out.reshape(n, n * width)
+
+
+# Samples worked on at a time: their signals stay in the cache.
+_PIECE = 8192
+
+# Squares of responses beyond this would overflow.
+_LARGEST = 1e200
+
+
+class Record(NamedTuple):
+    """Samples of one experiment, one row per channel.
+
+    Attributes
+    ----------
+    u : ndarray of shape (n_inputs, n_samples)
+    y : ndarray of shape (n_outputs, n_samples)
+    """
+
+    u: Array
+    y: Array
+
+
+def signal_pieces(
+    blocks: tuple[Array, ...], record: Record, state_map: Array | None = None
+) -> Iterator[Array]:
+    """Signals of consecutive stretches of a record.
+
+    Parameters
+    ----------
+    blocks : tuple of ndarray
+        Diagonal blocks of A.
+    record : Record
+    state_map : ndarray of shape (order, order * (1 + n_inputs)), default=None
+        Coefficients of the states in the section signals. Given, the second responses
+        follow: what every block answers to its own states, by `run_last`, since
+        ``d = N g + [x0, B] g_u`` for states driven by signals with answers ``g_u``.
+
+    Yields
+    ------
+    ndarray of shape (n_signals, n_samples_i)
+        Rows: section signals, inputs, outputs, and second responses block by block.
+        The memory is used again for the next piece.
+    """
+    (m, n_samples), ny = record.u.shape, len(record.y)
+    order = sum(len(block) for block in blocks)
+    base = order * (1 + m)
+    second = 0 if state_map is None else order
+    memory = np.empty((base + m + ny + second, min(n_samples, _PIECE)))
+    first_bank = SectionBank(blocks, [1 + m] * len(blocks))
+    second_bank = SectionBank(blocks, [len(block) for block in blocks])
+    source = np.zeros((1 + m, memory.shape[1]))
+    source[0, 0] = 1.0
+    late = np.empty((order, memory.shape[1]))
+    last_state = np.zeros(order)
+    for start in range(0, n_samples, _PIECE):
+        stop = min(start + _PIECE, n_samples)
+        n = stop - start
+        X = memory[:, :n]
+        if start:
+            source[0, 0] = 0.0
+            source[1:, 0] = record.u[:, start - 1]
+        source[1:, 1:n] = record.u[:, start : stop - 1]
+        first_bank.run([source[:, :n]] * len(blocks), X[:base])
+        X[base : base + m] = record.u[:, start:stop]
+        X[base + m : base + m + ny] = record.y[:, start:stop]
+        if state_map is not None:
+            late[:, 0] = last_state
+            late[:, 1:n] = state_map @ X[:base, :-1]
+            last_state = state_map @ X[:base, -1]
+            stops = np.cumsum([len(block) for block in blocks])
+            parts = [
+                late[stop - len(block) : stop, :n]
+                for block, stop in zip(blocks, stops, strict=True)
+            ]
+            second_bank.run_last(parts, X[base + m + ny :])
+        yield X
+
+
+def signal_factor(
+    blocks: tuple[Array, ...], record: Record, state_map: Array | None = None
+) -> Array | None:
+    """Upper triangular factor of the signals of a record.
+
+    Parameters
+    ----------
+    blocks, record, state_map
+        As in `signal_pieces`.
+
+    Returns
+    -------
+    ndarray of shape (n_signals, n_signals) or None
+        None where the responses overflow.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        gram: Array | float = 0.0
+        for X in signal_pieces(blocks, record, state_map):
+            gram = gram + X @ X.T
+        gram = np.asarray(gram)
+        if not np.abs(np.diagonal(gram)).max(initial=0.0) < _LARGEST:
+            return None
+        lower = cholesky_factor(gram)
+    if lower is None:
+        lower = np.zeros((len(gram), 0))
+        for X in signal_pieces(blocks, record, state_map):
+            lower = stack_factors([lower, X])
+    return lower.T

@@ -1,0 +1,1 @@
+"""Pure functions on the arrays of a linear system: responses, norms, simulation."""

@@ -1,0 +1,518 @@
+"""LocalLPVPipeline: from local experiments to an LPV model."""
+
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+from joblib import Memory
+from sklearn.base import clone
+from sklearn.ensemble import RandomForestRegressor
+from sklearn.linear_model import LinearRegression
+
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    PolynomialLPV,
+    SubspaceLTI,
+    bft_score,
+    fit_report,
+)
+from lpvlearn.exceptions import ExtrapolationWarning
+
+from ..conftest import (
+    KAPPA,
+    ROLES,
+    spring_pipeline,
+    spring_structure,
+    spring_sweep,
+    spring_tables,
+    spring_truth,
+)
+
+
+@pytest.fixture(scope="module")
+def fitted(spring):
+    X, y, _, _ = spring
+    return spring_pipeline().fit(X, y)
+
+
+def test_noise_free_experiments_give_the_true_model(fitted, spring):
+    _, _, X_sweep, y_sweep = spring
+    np.testing.assert_allclose(fitted.operating_points_[:, 0], KAPPA)
+    np.testing.assert_allclose(fitted.parameters_, spring_truth(KAPPA), rtol=1e-6)
+    np.testing.assert_allclose(fitted.predict(X_sweep), y_sweep, atol=1e-6)
+
+
+def test_parameters_and_report_are_tables_by_operating_point(fitted):
+    assert list(fitted.parameters_.columns) == ["b", "c", "k"]
+    assert list(fitted.parameters_.index) == list(KAPPA)
+    report = fitted.report_
+    assert list(report.index) == list(KAPPA)
+    assert (report["n_samples"] == 600).all()
+    assert (report["local_BFT"] > 99.999).all()
+    assert (report["structured_BFT"] > 99.999).all()
+    assert (report["relative_error"] < 1e-6).all()
+    assert (report["interpolation_error"] < 1e-6).all()
+
+
+def test_prediction_is_the_simulation_of_the_lpv_model(fitted, spring):
+    _, _, X, _ = spring
+    direct = fitted.lpv_.simulate(X[["force"]], X["kappa"], 0.02)
+    np.testing.assert_array_equal(fitted.predict(X), direct)
+
+
+def test_order_of_experiments_does_not_matter(fitted, spring):
+    X, y, X_sweep, _ = spring
+    order = np.concatenate([X.index[X["run"] == f"p{k}r0"] for k in (2, 0, 3, 1)])
+    other = spring_pipeline().fit(X.loc[order], y.loc[order])
+    np.testing.assert_allclose(other.parameters_, fitted.parameters_, rtol=1e-9)
+
+
+def test_rows_of_experiments_may_be_interleaved(fitted, spring):
+    X, _, _, _ = spring
+    mixed = X.sort_values("time", kind="stable")
+    expected = pd.DataFrame(fitted.predict(X), index=X.index).loc[mixed.index]
+    np.testing.assert_array_equal(fitted.predict(mixed), expected)
+
+
+@pytest.mark.parametrize("combine", ["pool", "average"])
+def test_realizations_are_pooled_or_averaged(combine):
+    X, y = spring_tables(noise=0.03, n_repeats=4)
+    pipeline = spring_pipeline(combine=combine).fit(X, y)
+    X_sweep, y_sweep = spring_sweep()
+    assert bft_score(y_sweep, pipeline.predict(X_sweep)) > 98
+    assert (pipeline.report_["n_experiments"] == 4).all()
+    np.testing.assert_allclose(pipeline.parameters_, spring_truth(KAPPA), rtol=0.05)
+
+
+def test_baseline_without_structure_is_worse(fitted, spring):
+    X, y, X_sweep, y_sweep = spring
+    baseline = spring_pipeline(restructurer="passthrough").fit(X, y)
+    assert baseline.restructurers_ == []
+    assert baseline.parameters_.shape == (4, 4 + 2 + 2 + 1)
+    for balanced, true in zip(
+        baseline.structured_models_, fitted.structured_models_, strict=True
+    ):
+        assert (balanced - true).hinf_norm() < 1e-6 * true.hinf_norm()
+    score = bft_score(y_sweep, baseline.predict(X_sweep))
+    assert score < bft_score(y_sweep, fitted.predict(X_sweep)) - 1
+
+
+def test_default_restructurer_is_the_canonical_form(spring):
+    X, y, X_sweep, y_sweep = spring
+    pipeline = LocalLPVPipeline(SubspaceLTI(feedthrough=False), **ROLES).fit(X, y)
+    assert pipeline.parameters_.shape == (4, 4)  # two poles, two entries of B
+    assert bft_score(y_sweep, pipeline.predict(X_sweep)) > 99.9
+
+
+def test_any_regressor_interpolates(spring):
+    X, y, X_sweep, y_sweep = spring
+    linear = spring_pipeline(interpolator=LinearRegression()).fit(X, y)
+    same = spring_pipeline(interpolator=PolynomialLPV(1)).fit(X, y)
+    np.testing.assert_allclose(
+        linear.predict(X_sweep), same.predict(X_sweep), atol=1e-9
+    )
+    forest = RandomForestRegressor(5, random_state=0)
+    steps = spring_pipeline(interpolator=forest).fit(X, y)
+    assert bft_score(y_sweep, steps.predict(X_sweep)) > 50
+
+
+def test_sub_estimators_are_cloned(spring):
+    X, y, _, _ = spring
+    pipeline = spring_pipeline(local=SubspaceLTI(), interpolator=PolynomialLPV(1))
+    pipeline.fit(X, y)
+    assert not hasattr(pipeline.local, "lti_")
+    assert not hasattr(pipeline.restructurer, "params_")
+    assert not hasattr(pipeline.interpolator, "coef_")
+    assert pipeline.local.inputs is None
+
+
+def test_processes_do_not_change_the_result(fitted, spring):
+    X, y, _, _ = spring
+    parallel = spring_pipeline(n_jobs=2).fit(X, y)
+    np.testing.assert_array_equal(parallel.parameters_, fitted.parameters_)
+
+
+def test_pickled_model_predicts_the_same(fitted, spring):
+    _, _, X_sweep, _ = spring
+    again = pickle.loads(pickle.dumps(fitted))
+    np.testing.assert_array_equal(again.predict(X_sweep), fitted.predict(X_sweep))
+
+
+def test_initial_state_is_estimated_in_the_middle_of_an_experiment(fitted, spring):
+    _, _, X, y = spring
+    part = slice(500, 900)
+    from_rest = fitted.predict(X.iloc[part])
+    estimated = fitted.predict_with_initial_state(X.iloc[part], y.iloc[part])
+    assert bft_score(y.iloc[part], from_rest) < 95
+    np.testing.assert_allclose(estimated, y.iloc[part], atol=1e-6)
+
+
+def test_one_operating_point_is_a_time_invariant_model(spring):
+    X, y, _, _ = spring
+    one = X["run"] == "p1r0"
+    roles = {"inputs": "force", "experiment": "run", "time": "time"}
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(feedthrough=False), GrayBoxRestructurer(spring_structure()), **roles
+    ).fit(X[one], y[one])
+    np.testing.assert_allclose(pipeline.parameters_, spring_truth([0.5]), rtol=1e-6)
+    np.testing.assert_allclose(pipeline.predict(X[one]), y[one], atol=1e-6)
+
+
+def test_arrays_take_positions_as_roles(fitted, spring):
+    X, y, _, _ = spring
+    numbers = X.assign(run=X["run"].astype("category").cat.codes).to_numpy(float)
+    pipeline = LocalLPVPipeline(
+        restructurer=GrayBoxRestructurer(spring_structure()),
+        scheduling=1,
+        experiment=2,
+        time=3,
+    ).fit(numbers, y.to_numpy()[:, 0])
+    np.testing.assert_allclose(pipeline.parameters_, fitted.parameters_, rtol=1e-9)
+    assert pipeline.predict(numbers).shape == (len(X),)
+
+
+def test_sampling_time_without_a_time_column(fitted, spring):
+    X, y, X_sweep, _ = spring
+    roles = {"scheduling": "kappa", "experiment": "run"}
+    pipeline = LocalLPVPipeline(
+        restructurer=GrayBoxRestructurer(spring_structure()),
+        sampling_time=0.02,
+        **roles,
+    ).fit(X.drop(columns="time"), y)
+    np.testing.assert_allclose(pipeline.parameters_, fitted.parameters_, rtol=1e-9)
+    finer = X_sweep.assign(time=X_sweep["time"] / 2)
+    assert not np.allclose(fitted.predict(finer), fitted.predict(X_sweep), atol=1e-2)
+
+
+@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
+def test_tustin_warps_what_zero_order_hold_does_not(fitted, spring):
+    X, y, _, _ = spring
+    tustin = spring_pipeline(discretization="tustin").fit(X, y)
+    error = np.abs(tustin.parameters_ / fitted.parameters_ - 1).max().max()
+    assert 1e-4 < error < 0.1
+
+
+def test_progress_goes_to_stderr_only(spring, capsys):
+    X, y, _, _ = spring
+    spring_pipeline(verbose=1).fit(X, y)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "local models" in captured.err and "restructuring" in captured.err
+
+
+@pytest.mark.filterwarnings("ignore:The (identified )?model")
+@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
+def test_failure_names_its_point_and_can_be_skipped(spring):
+    X, y = spring[:2]
+    y = y.copy()
+    t = X.loc[X["run"] == "p2r0", "time"]
+    y.loc[X["run"] == "p2r0", "position"] = np.exp(0.5 * t) * np.cos(20 * t)
+    local = SubspaceLTI(order=2, feedthrough=False)
+    with pytest.raises(ValueError, match=r"operating point 2 \(scheduling 1\).*stable"):
+        spring_pipeline(local=local).fit(X, y)
+    with pytest.warns(UserWarning, match="left out operating point 2"):
+        kept = spring_pipeline(local=local, on_error="skip").fit(X, y)
+    np.testing.assert_allclose(kept.operating_points_[:, 0], [0.0, 0.5, 1.5])
+    np.testing.assert_allclose(
+        kept.parameters_, spring_truth([0.0, 0.5, 1.5]), rtol=1e-5
+    )
+
+
+ERRORS = [
+    ({"combine": "sum"}, "`combine` must be one of"),
+    ({"discretization": "euler"}, "`discretization` must be one of"),
+    ({"on_error": "ignore"}, "`on_error` must be one of"),
+    ({"restructurer": "none"}, "`restructurer` must be an estimator"),
+    ({"scheduling": "theta"}, "theta"),
+    ({"sampling_time": 0.5}, "sampling"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), ERRORS)
+def test_errors_teach(options, words, spring):
+    X, y, _, _ = spring
+    with pytest.raises(ValueError, match=words):
+        LocalLPVPipeline(**{**ROLES, **options}).fit(X, y)
+
+
+def test_a_sweep_is_refused_as_a_local_experiment(spring):
+    X, y, X_sweep, y_sweep = spring
+    with pytest.raises(ValueError, match="'sweep' must be local"):
+        spring_pipeline().fit(pd.concat([X, X_sweep]), pd.concat([y, y_sweep]))
+
+
+def test_shuffled_rows_are_refused(spring):
+    X, y, _, _ = spring
+    shuffled = np.random.default_rng(0).permutation(len(X))
+    with pytest.raises(ValueError, match="time"):
+        spring_pipeline().fit(X.iloc[shuffled], y.iloc[shuffled])
+
+
+def test_nested_parameters_reach_the_steps():
+    pipeline = spring_pipeline(local=SubspaceLTI(), interpolator=PolynomialLPV())
+    pipeline.set_params(
+        local__horizon=12, restructurer__n_starts=3, interpolator__degree=1
+    )
+    copy = clone(pipeline)
+    assert copy.local.horizon == 12
+    assert copy.restructurer.n_starts == 3
+    assert copy.interpolator.degree == 1
+
+
+def test_parameters_of_a_default_step_can_be_set():
+    pipeline = LocalLPVPipeline(**ROLES)
+    pipeline.set_params(local__horizon=12, interpolator__degree=1)
+    assert pipeline.local.get_params() == SubspaceLTI(horizon=12).get_params()
+    assert pipeline.interpolator.degree == 1
+    assert pipeline.restructurer is None
+    with pytest.raises(ValueError, match="Invalid parameter 'horizn'"):
+        pipeline.set_params(local__horizn=3)
+
+
+# --------------------------------------------------------- where the model is not valid
+
+
+def test_leaving_the_identified_range_warns_once_for_all_experiments(fitted, spring):
+    X = spring[2]
+    beyond = pd.concat(
+        [
+            X.assign(run=run, kappa=X["kappa"] + shift)
+            for run, shift in (("a", 1), ("b", 2))
+        ]
+    )
+    with pytest.warns(ExtrapolationWarning) as caught:
+        fitted.predict(beyond)
+    (warning,) = caught
+    text = str(warning.message)
+    outside = int((beyond["kappa"] > 1.5 + 1e-5).sum())
+    assert "'kappa' must be within the identified range, 0 to 1.5." in text
+    assert f"Got {outside} of 3000 samples outside, the farthest at 3.5" in text
+    assert warning.filename == __file__
+
+
+def test_holding_the_border_is_no_extrapolation(spring):
+    X, y, X_sweep, _ = spring
+    pipeline = spring_pipeline(interpolator=PolynomialLPV(extrapolation="clip"))
+    pipeline.fit(X, y)
+    beyond = X_sweep.assign(kappa=9.0)
+    border = X_sweep.assign(kappa=1.5)
+    np.testing.assert_allclose(pipeline.predict(beyond), pipeline.predict(border))
+
+
+def test_the_interpolators_own_warning_is_not_added(spring):
+    X, y, X_sweep, _ = spring
+    pipeline = spring_pipeline(interpolator=PolynomialLPV(extrapolation="warn"))
+    pipeline.fit(X, y)
+    with pytest.warns(ExtrapolationWarning) as caught:
+        pipeline.predict(X_sweep.assign(kappa=2.0))
+    assert len(caught) == 1
+
+
+def test_motion_seen_in_local_experiments_is_within_the_range():
+    X, y = spring_tables()
+    rng = np.random.default_rng(0)
+    noisy = X.assign(kappa=X["kappa"] + 0.01 * rng.normal(size=len(X)))
+    pipeline = spring_pipeline().fit(noisy, y)
+    pipeline.predict(noisy)  # does not warn
+    low, high = pipeline.scheduling_range_[:, 0]
+    assert -0.15 < low < -0.02 and 1.52 < high < 1.65
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.5])
+def test_one_operating_point_with_noise_is_a_time_invariant_model(kappa):
+    X, y = spring_tables(kappas=(0.5,), n_repeats=2)
+    rng = np.random.default_rng(1)
+    noisy = X.assign(kappa=kappa + 1e-3 * rng.normal(size=len(X)))
+    with pytest.warns(UserWarning, match="one operating point .*time-invariant"):
+        pipeline = spring_pipeline(interpolator=PolynomialLPV(3)).fit(noisy, y)
+    assert pipeline.interpolator_.degree == 0
+    np.testing.assert_allclose(pipeline.parameters_, spring_truth([0.5]), rtol=1e-6)
+    np.testing.assert_allclose(pipeline.predict(noisy), y, atol=1e-6)
+    assert "time-invariant" in pipeline.summary()
+    with pytest.warns(ExtrapolationWarning):
+        pipeline.predict(noisy.assign(kappa=1.0))
+
+
+def test_one_sweep_is_no_operating_point(spring):
+    with pytest.raises(ValueError, match="'sweep' must be local"):
+        spring_pipeline().fit(*spring[2:])
+
+
+def test_two_points_carry_a_line_by_default(spring):
+    X, y, _, _ = spring
+    two = X["kappa"].isin([0.0, 0.5])
+    pipeline = spring_pipeline().fit(X[two], y[two])
+    assert pipeline.interpolator_.degree == 1
+
+
+# -------------------------------------------------------------------- tables and arrays
+
+
+def test_read_only_and_memory_mapped_arrays(fitted, spring, tmp_path):
+    X, y, _, _ = spring
+    numbers = X.assign(run=X["run"].astype("category").cat.codes).to_numpy(float)
+    roles = {"scheduling": 1, "experiment": 2, "time": 3}
+    np.save(tmp_path / "X.npy", numbers)
+    mapped = np.load(tmp_path / "X.npy", mmap_mode="r")
+    frozen = y.to_numpy().copy()
+    frozen.setflags(write=False)
+    pipeline = LocalLPVPipeline(
+        restructurer=GrayBoxRestructurer(spring_structure()), **roles
+    ).fit(mapped, frozen)
+    np.testing.assert_array_equal(pipeline.parameters_, fitted.parameters_)
+    np.testing.assert_array_equal(pipeline.predict(mapped), fitted.predict(X))
+
+
+def test_polars_tables(fitted, spring):
+    polars = pytest.importorskip("polars")
+    X, y, X_sweep, y_sweep = (
+        polars.DataFrame({name: table[name].tolist() for name in table})
+        for table in spring
+    )
+    pipeline = spring_pipeline().fit(X, y)
+    # scikit-learn 1.6 does not see the names of the newest polars' columns
+    names = getattr(pipeline, "feature_names_in_", X.columns)
+    assert list(names) == list(X.columns)
+    assert pipeline.output_names_ == ["position"]
+    np.testing.assert_array_equal(pipeline.parameters_, fitted.parameters_)
+    np.testing.assert_array_equal(pipeline.predict(X_sweep), fitted.predict(spring[2]))
+    assert fit_report(pipeline, X_sweep, y_sweep)["experiment"].tolist() == ["sweep"]
+
+
+def test_names_of_columns_are_kept_and_checked(fitted, spring):
+    X = spring[0]
+    assert list(fitted.feature_names_in_) == ["force", "kappa", "run", "time"]
+    assert fitted.n_features_in_ == 4
+    assert fitted.output_names_ == ["position"]
+    assert fitted.scheduling_names_ == ["kappa"]
+    with pytest.raises(ValueError, match="feature names should match"):
+        fitted.predict(X.rename(columns={"force": "u"}))
+
+
+def test_html_shows_the_steps_before_and_after_fitting(fitted):
+    nested = spring_pipeline(local=SubspaceLTI(), interpolator=PolynomialLPV())
+    for pipeline, state in ((nested, "Not fitted"), (fitted, "Fitted")):
+        html = pipeline._repr_html_()
+        assert "GrayBoxRestructurer" in html and "GrayBoxStructure" in html
+        assert state in html
+    assert "PolynomialLPV" in nested._repr_html_()
+
+
+# ------------------------------------------------------------------------------ memory
+
+
+def test_memory_is_a_folder_a_path_or_a_joblib_memory(fitted, spring, tmp_path):
+    X, y, _, _ = spring
+    for memory in (
+        str(tmp_path / "a"),
+        tmp_path / "b",
+        Memory(tmp_path / "c", verbose=0),
+    ):
+        for _ in range(2):
+            pipeline = spring_pipeline(memory=memory).fit(X, y)
+            pd.testing.assert_frame_equal(pipeline.parameters_, fitted.parameters_)
+            pd.testing.assert_frame_equal(pipeline.report_, fitted.report_)
+
+
+def test_memory_teaches_what_it_cannot_keep(spring, tmp_path):
+    X, y, _, _ = spring
+    with pytest.raises(
+        ValueError, match="`memory` must be None, a folder, or a joblib"
+    ):
+        spring_pipeline(memory=3).fit(X, y)
+    truth = spring_structure()
+    structure = GrayBoxStructure.from_function(
+        lambda theta: truth.matrices(theta), [30.0, 1.2, 50.0]
+    )
+    pipeline = spring_pipeline(restructurer=GrayBoxRestructurer(structure))
+    with pytest.raises(ValueError, match="pickled. Got a `restructurer`.*lambda"):
+        pipeline.set_params(memory=tmp_path).fit(X, y)
+
+
+@pytest.mark.parametrize("combine", ["pool", "average"])
+def test_gaps_are_split_where_the_local_estimator_splits(spring, combine):
+    X, y = spring_tables(n_repeats=2)
+    y = y.mask((X["time"] > 5.0) & (X["time"] < 5.5), axis=0)
+    with pytest.raises(ValueError, match="Input y contains NaN"):
+        spring_pipeline().fit(X, y)
+    local = SubspaceLTI(order=2, horizon=10, missing="split")
+    pipeline = spring_pipeline(local=local, combine=combine).fit(X, y)
+    np.testing.assert_allclose(pipeline.parameters_, spring_truth(KAPPA), rtol=1e-6)
+    assert (pipeline.report_["n_experiments"] == 2).all()
+
+
+@pytest.mark.parametrize("n_jobs", [None, 2])
+@pytest.mark.parametrize("on_error", ["raise", "skip"])
+def test_a_failure_that_all_points_share_names_none(spring, on_error, n_jobs):
+    X, y, _, _ = spring
+    pipeline = spring_pipeline(
+        local=SubspaceLTI(order=400), on_error=on_error, n_jobs=n_jobs
+    )
+    with pytest.raises(ValueError, match="^`order` must be at most .*400"):
+        pipeline.fit(X, y)
+
+
+def test_different_failures_everywhere_tell_the_first(spring):
+    X, y, _, _ = spring
+    unequal = (X["kappa"] < 0.2) | (X["time"] < 4 + X["kappa"])
+    pipeline = spring_pipeline(local=SubspaceLTI(order=400), on_error="skip")
+    with pytest.raises(
+        ValueError, match="every .* failed. First operating point 0 .*400"
+    ):
+        pipeline.fit(X[unequal], y[unequal])
+
+
+def test_deviations_of_averaged_parameters_cover_their_errors():
+    """Errors are of the size of the deviations."""
+    X, y = spring_tables(noise=0.05, n_samples=300, n_repeats=12)
+    local = SubspaceLTI(order=2, horizon=10, feedthrough=False)
+    pipeline = spring_pipeline(local=local, combine="average").fit(X, y)
+    errors = (pipeline.parameters_ - spring_truth(KAPPA)) / pipeline.parameters_std_
+    assert errors.shape == (4, 3)
+    assert 0.4 < np.sqrt((errors**2).mean(axis=None)) < 2.0
+    assert (errors.abs() < 4).all(axis=None)
+    np.testing.assert_array_equal(
+        pipeline.report_["std_k"], pipeline.parameters_std_["k"]
+    )
+    assert " std" in pipeline.summary()
+
+
+def test_two_scheduling_variables():
+    """k = 40 + 10 load + 5 heat, on a grid of four points and at one within."""
+    tables, outputs = [], []
+    rng = np.random.default_rng(0)
+    for run, (load, heat) in enumerate([(0, 0), (0, 1), (1, 0), (1, 1), (0.5, 0.5)]):
+        u = rng.choice([-1.0, 1.0], size=60).repeat(5)
+        theta = {"b": 30.0, "c": 1.2, "k": 40.0 + 10 * load + 5 * heat}
+        y = spring_structure().model(theta).simulate(u, sampling_time=0.02)
+        time = 0.02 * np.arange(300)
+        roles = {"load": load, "heat": heat, "run": run, "time": time}
+        tables.append(pd.DataFrame({"force": u, **roles}))
+        outputs.append(y)
+    X, y = pd.concat(tables, ignore_index=True), np.vstack(outputs)[:, 0]
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(order=2, horizon=10),
+        GrayBoxRestructurer(spring_structure()),
+        PolynomialLPV(1),
+        **{**ROLES, "scheduling": ["load", "heat"]},
+    ).fit(X, y)
+    assert pipeline.parameters_.index[1] == (0.0, 1.0)
+    assert pipeline.report_.index.equals(pipeline.parameters_.index)
+    np.testing.assert_allclose(pipeline.predict(X), y, atol=1e-6)
+    assert "load from 0 to 1, heat from 0 to 1" in pipeline.summary()
+    with pytest.warns(ExtrapolationWarning, match="'heat' .* the farthest at 3"):
+        pipeline.predict(X.assign(heat=3.0))
+
+
+@pytest.mark.filterwarnings("ignore:All experiments are at one operating point")
+def test_motion_about_a_single_point_is_no_sweep():
+    """An oscillation about zero, as of the arm's elbow, has no scale."""
+    X, y = spring_tables(kappas=(0.5,))
+    t = X["time"].to_numpy()
+    wobble = 0.004 * (np.sin(1.3 * t) + np.sin(7.1 * t))
+    spring_pipeline().fit(X.assign(kappa=wobble), y)
+    with pytest.raises(ValueError, match="'p0r0' must be local"):
+        spring_pipeline().fit(X.assign(kappa=np.linspace(-1, 1, len(X))), y)

@@ -1,0 +1,167 @@
+"""The error system of model matching: peaks and their derivatives."""
+
+import numpy as np
+import pytest
+
+from lpvlearn import GrayBoxStructure, StateSpace
+from lpvlearn.restructuring.error_system import ErrorSystem
+from lpvlearn.restructuring.measured import MeasuredErrorSystem
+from lpvlearn.restructuring.transfer import Target, resolvent
+
+
+def stable_model(rng, order, n_inputs, n_outputs, sampling_time=None):
+    A = rng.normal(size=(order, order))
+    A -= (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(order)
+    B = rng.normal(size=(order, n_inputs))
+    C = rng.normal(size=(n_outputs, order))
+    D = rng.normal(size=(n_outputs, n_inputs))
+    model = StateSpace(A, B, C, D)
+    return model if sampling_time is None else model.to_discrete(sampling_time)
+
+
+def error_system(rng, shape, dt=None, structure=None):
+    n_outputs, n_inputs = shape
+    black_box = stable_model(rng, 4, n_inputs, n_outputs, dt)
+    structure = structure or GrayBoxStructure.full(3, n_inputs, n_outputs)
+    gray_box = stable_model(rng, 3, n_inputs, n_outputs, dt)
+    theta = np.concatenate(
+        [M.ravel() for M in (gray_box.A, gray_box.B, gray_box.C, gray_box.D)]
+    )
+    target = Target(black_box.A, black_box.B, black_box.C, black_box.D, dt)
+    return ErrorSystem(structure, target), theta, gray_box, black_box
+
+
+SHAPES = [(1, 1), (2, 2), (3, 1), (1, 3), (2, 3)]
+
+
+@pytest.mark.parametrize("dt", [None, 0.1])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_norm_is_that_of_the_difference_of_the_models(shape, dt):
+    system, theta, gray_box, black_box = error_system(
+        np.random.default_rng(1), shape, dt
+    )
+    assert np.isclose(
+        system.peaks(theta).norm, (gray_box - black_box).hinf_norm(), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("dt", [None, 0.1])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_gradients_equal_central_differences(shape, dt):
+    system, theta, _, _ = error_system(np.random.default_rng(2), shape, dt)
+    omega = np.array([0.0, 0.3, 2.0])
+    _, gradients = system.gradients(theta, omega)
+    h = 1e-6
+    numeric = np.array(
+        [
+            (
+                system.gradients(theta + h * e, omega)[0]
+                - system.gradients(theta - h * e, omega)[0]
+            )
+            / (2 * h)
+            for e in np.eye(len(theta))
+        ]
+    ).T
+    np.testing.assert_allclose(gradients, numeric, atol=1e-7 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize("dt", [None, 0.1])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_joint_hessians_equal_differences_of_gradients(shape, dt):
+    system, theta, _, _ = error_system(np.random.default_rng(3), shape, dt)
+    omega = np.array([0.4, 1.7])
+    H = system.joint_hessians(theta, omega)
+    h, q = 1e-5, len(theta)
+    tt = np.array(
+        [
+            (
+                system.gradients(theta + h * e, omega)[1]
+                - system.gradients(theta - h * e, omega)[1]
+            )
+            / (2 * h)
+            for e in np.eye(q)
+        ]
+    ).transpose(1, 0, 2)
+    tw = (
+        system.gradients(theta, omega + h)[1] - system.gradients(theta, omega - h)[1]
+    ) / (2 * h)
+    k = 1e-3
+    values = [system.gradients(theta, omega + s * k)[0] for s in (-1, 0, 1)]
+    ww = (values[0] - 2 * values[1] + values[2]) / k**2
+    scale = np.abs(H).max()
+    np.testing.assert_allclose(H[:, :q, :q], tt, atol=1e-6 * scale)
+    np.testing.assert_allclose(H[:, :q, q], tw, atol=1e-6 * scale)
+    np.testing.assert_allclose(H[:, q, q], ww, atol=1e-4 * np.abs(ww).max())
+
+
+def test_hessian_of_a_moving_peak_follows_the_maximum():
+    rng = np.random.default_rng(5)
+    system, theta, _, _ = error_system(rng, (2, 2))
+    peaks = system.peaks(theta, within=0.9)
+    inner = (peaks.frequencies > 0) & np.isfinite(peaks.frequencies)
+    assert inner.any()
+    omega = peaks.frequencies[inner][:1]
+    direction = rng.normal(size=len(theta))
+    direction /= np.linalg.norm(direction)
+    H = system.hessians(theta, omega, np.array([True]))[0]
+
+    def height(t):
+        found = system.peaks(theta + t * direction, within=0.95)
+        near = np.argmin(np.abs(found.frequencies - omega[0]))
+        return found.values[near]
+
+    h = 1e-3
+    numeric = (height(h) - 2 * height(0.0) + height(-h)) / h**2
+    assert np.isclose(direction @ H @ direction, numeric, rtol=1e-3)
+
+
+def test_curvature_of_a_function_structure_enters_the_hessian():
+    def squared(p):
+        return [[0, 1], [-(p[0] ** 2), -p[0] * p[1]]], [[0], [p[0] ** 2]], [[1, 0]]
+
+    structure = GrayBoxStructure.from_function(squared, [2.0, 0.4])
+    rng = np.random.default_rng(0)
+    box = stable_model(rng, 3, 1, 1)
+    system = ErrorSystem(structure, Target(box.A, box.B, box.C, 0 * box.D))
+    theta, omega, h = np.array([2.2, 0.5]), np.array([1.3]), 1e-5
+    H = system.joint_hessians(theta, omega)[0, :2, :2]
+    numeric = np.array(
+        [
+            system.gradients(theta + h * e, omega)[1][0]
+            - system.gradients(theta - h * e, omega)[1][0]
+            for e in np.eye(2)
+        ]
+    ) / (2 * h)
+    np.testing.assert_allclose(H, numeric, atol=1e-5 * np.abs(numeric).max())
+
+
+def test_response_jacobian_is_the_derivative_of_the_response():
+    system, theta, gray_box, _ = error_system(np.random.default_rng(8), (2, 3))
+    omega = np.array([0.0, 0.5, 4.0])
+    G, J = system.response_jacobian(theta, omega)
+    np.testing.assert_allclose(G, gray_box.frequency_response(omega), rtol=1e-10)
+    h = 1e-6
+    for j in (0, 8, len(theta) - 1):
+        e = h * np.eye(len(theta))[j]
+        numeric = system.response(theta + e, omega) - system.response(theta - e, omega)
+        np.testing.assert_allclose(
+            J[..., j], numeric / (2 * h), atol=1e-7 * np.abs(J).max()
+        )
+
+
+def test_resolvent_vanishes_at_infinity():
+    assert not resolvent(np.eye(2), np.array([np.inf + 0j])).any()
+
+
+def test_measured_error_is_the_maximum_over_the_grid():
+    rng = np.random.default_rng(4)
+    system, theta, gray_box, black_box = error_system(rng, (2, 2))
+    omega = np.geomspace(0.05, 20, 40)
+    G0 = black_box.frequency_response(omega)
+    shuffled = rng.permutation(len(omega))
+    measured = MeasuredErrorSystem(system.structure, omega[shuffled], G0[shuffled])
+    sigma = np.linalg.norm(gray_box.frequency_response(omega) - G0, 2, axis=(1, 2))
+    peaks = measured.peaks(theta, within=0.5)
+    assert np.isclose(peaks.norm, sigma.max(), rtol=1e-12)
+    assert np.isclose(peaks.frequencies[0], omega[np.argmax(sigma)])
+    assert peaks.norm <= system.peaks(theta).norm * (1 + 1e-12)

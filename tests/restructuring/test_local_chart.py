@@ -1,0 +1,155 @@
+"""Charts of the set of models, and canonical forms in their coordinates."""
+
+import numpy as np
+import pytest
+
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn.restructuring.coordinates import CanonicalForm, LocalChart, view_at
+from lpvlearn.restructuring.error_system import ErrorSystem
+from lpvlearn.restructuring.limits import Limits
+from lpvlearn.restructuring.transfer import Target
+
+
+def stable_model(rng, order, n_inputs, n_outputs, dt=None, rate=1.0):
+    A = rng.normal(size=(order, order))
+    A -= (np.linalg.eigvals(A).real.max() + 0.5) * np.eye(order)
+    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
+    model = StateSpace(rate * A, rate * B, C)
+    return model if dt is None else model.to_discrete(dt)
+
+
+def target_of(model):
+    return Target(model.A, model.B, model.C, model.D, model.sampling_time)
+
+
+def matrix_of(model):
+    return np.block([[model.A, model.B], [model.C, model.D]])
+
+
+def model_of(S, n, dt):
+    return StateSpace(S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:], dt)
+
+
+CASES = [
+    {"n_inputs": 1, "n_outputs": 1},
+    {"n_inputs": 2, "n_outputs": 1},
+    {"n_inputs": 2, "n_outputs": 3},
+    {"n_inputs": 1, "n_outputs": 2, "dt": 0.1},
+    {"n_inputs": 1, "n_outputs": 2, "rate": 1e5},
+    {"n_inputs": 1, "n_outputs": 2, "rate": 1e-4},
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize("feedthrough", [False, True])
+def test_a_chart_has_as_many_coordinates_as_models_have(case, feedthrough):
+    """n (m + p) + m p, none of which leaves the transfer function unchanged."""
+    model = stable_model(np.random.default_rng(0), 4, **case)
+    m, p = case["n_inputs"], case["n_outputs"]
+    chart = LocalChart(matrix_of(model), 4, model.sampling_time, feedthrough)
+    assert chart.n_params == 4 * (m + p) + feedthrough * m * p
+    top = case.get("rate", 1.0) * 10
+    omega = np.geomspace(top / 1e4, top, 60)
+    if model.sampling_time:
+        omega = np.linspace(0.1, 30, 60)
+    origin = model_of(chart.system_matrix(np.zeros(chart.n_params)), 4, case.get("dt"))
+    G = model.frequency_response(omega)
+    assert np.allclose(origin.frequency_response(omega), G, rtol=1e-9)
+    system = ErrorSystem(chart, target_of(model))
+    J = system.response_jacobian(np.zeros(chart.n_params), omega)[1]
+    J = J.reshape(-1, chart.n_params)
+    s = np.linalg.svd(np.vstack([J.real, J.imag]), compute_uv=False)
+    assert s[-1] > 1e-6 * s[0]
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_the_parameters_of_a_canonical_form_are_found_again(case):
+    rng = np.random.default_rng(1)
+    model = stable_model(rng, 5, **case)
+    structure = GrayBoxStructure.observable_canonical(
+        5, case["n_inputs"], case["n_outputs"]
+    )
+    dt = case.get("dt")
+    form = CanonicalForm(structure, dt)
+    theta = form.parameters(matrix_of(model))
+    size = np.abs(np.linalg.eigvals(model.A)).max() if dt is None else 10.0
+    omega = np.geomspace(0.1 * size, 3 * size, 9)
+    found = structure.model(theta, sampling_time=dt).frequency_response(omega)
+    assert np.allclose(found, model.frequency_response(omega), rtol=1e-6)
+
+
+def system_with(structure, order=3, seed=2):
+    box = stable_model(
+        np.random.default_rng(seed), order, structure.n_inputs, structure.n_outputs
+    )
+    return ErrorSystem(structure, target_of(box))
+
+
+def test_canonical_forms_are_told_from_other_structures():
+    observable = GrayBoxStructure.observable_canonical(2, 1, 1)
+    controllable = GrayBoxStructure.from_template(
+        [[0, 1], ["-a0", "-a1"]], [[0], [1]], [["b0", "b1"]]
+    )
+    spring = GrayBoxStructure.from_template(
+        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
+    )
+    full = GrayBoxStructure.full(2, 1, 1, feedthrough=False)
+    # as many parameters as a canonical form, but not every model has its gain
+    chain = GrayBoxStructure.from_template(
+        [["a", "b"], ["c", "-a"]], [[1], [0]], [["d", 0]]
+    )
+    values = {
+        "a0": 2.0, "a1": 0.5, "b0": 1.0, "b1": 0.3, "k": 2.0, "c": -0.5, "b": 1.0
+    }  # fmt: skip
+
+    def form_of(structure):
+        system = system_with(structure)
+        theta = np.array([values.get(n, 0.7) for n in structure.parameter_names])
+        return CanonicalForm.of(system, theta)
+
+    assert form_of(controllable) is not None
+    assert form_of(spring) is None
+    assert form_of(full) is None
+    assert form_of(chain) is None
+    assert form_of(observable) is not None
+    assert (
+        form_of(observable.with_bounds({observable.parameter_names[0]: (0, 9)})) is None
+    )
+    assert form_of(observable.fix({observable.parameter_names[0]: -1.0})) is None
+
+
+def test_a_view_and_its_point_are_the_same_model():
+    structure = GrayBoxStructure.observable_canonical(4, 2, 2)
+    rng = np.random.default_rng(3)
+    model = stable_model(rng, 4, 2, 2)
+    system = ErrorSystem(structure, target_of(stable_model(rng, 6, 2, 2)))
+    theta = CanonicalForm(structure, None).parameters(matrix_of(model))
+    form = CanonicalForm.of(system, theta)
+    view = view_at(system, theta, Limits(system, 1e-3), form)
+    assert view.system is not system
+    assert np.allclose(view.back(view.theta), theta, rtol=1e-6)
+    moved = view.theta + 1e-3 * rng.normal(size=len(view.theta))
+    norm = view.system.peaks(moved).norm
+    assert np.isclose(system.peaks(view.back(moved)).norm, norm, rtol=1e-8)
+
+
+def test_all_canonical_forms_of_one_order_end_at_the_same_norm():
+    """Reduction of a model of order 6 to 4: the forms hold the same models."""
+    box = stable_model(np.random.default_rng(7), 6, 1, 1)
+    A = [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [f"-a{i}" for i in range(4)]]
+    controllable = GrayBoxStructure.from_template(
+        A, [[0], [0], [0], [1]], [[f"b{i}" for i in range(4)]]
+    )
+    observable = GrayBoxStructure.observable_canonical(4)
+    errors = [
+        GrayBoxRestructurer(s).fit_model(box).error_ for s in (controllable, observable)
+    ]
+    assert np.isclose(*errors, rtol=1e-6)
+    bound = box.hankel_singular_values()[4]
+    assert min(errors) >= bound * (1 - 1e-9)
+
+
+def test_a_model_that_is_not_minimal_has_no_chart():
+    model = StateSpace(np.diag([-1.0, -2.0]), [[1.0], [0.0]], [[1.0, 1.0]])
+    with pytest.raises(ValueError, match="not minimal"):
+        LocalChart(matrix_of(model), 2, None, False)

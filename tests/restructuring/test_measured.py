@@ -1,0 +1,140 @@
+"""Tables of frequency responses, and models realised from them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from lpvlearn import StateSpace
+from lpvlearn.restructuring.measured import (
+    read_frequency_data,
+    realize_response,
+    stack_response,
+)
+
+
+def response(n_freq=5, n_outputs=2, n_inputs=3, seed=0):
+    rng = np.random.default_rng(seed)
+    shape = (n_freq, n_outputs, n_inputs)
+    return rng.normal(size=shape) + 1j * rng.normal(size=shape)
+
+
+def test_tables_and_responses_are_the_same_thing():
+    omega, G = np.array([3.0, 0.0, 1.0, 2.0, 9.0]), response()
+    table = stack_response(G)
+    assert_array_equal(table[:, 4], G[:, 1, 1].real)
+    assert_array_equal(table[:, 6 + 4], G[:, 1, 1].imag)
+    for grid in (omega, omega[:, None], omega.tolist()):
+        for frf in (table, table.tolist(), G, G.reshape(5, 6)):
+            read_omega, read_G = read_frequency_data(grid, frf, 2, 3)
+            assert_array_equal(read_omega, omega)
+            assert_array_equal(read_G, G)
+
+
+def test_one_channel_may_be_a_complex_vector():
+    G = response(4, 1, 1)
+    assert_array_equal(read_frequency_data(np.arange(4.0), G[:, 0, 0], 1, 1)[1], G)
+
+
+OMEGA, TABLE = np.arange(1.0, 6.0), stack_response(response())
+BROKEN = TABLE.copy()
+BROKEN[3, 1] = np.nan
+
+
+@pytest.mark.parametrize(
+    "omega, frf, message",
+    [
+        ([], np.zeros((0, 12)), r"`omega` must have shape \(n_freq,\)"),
+        (np.ones((5, 2)), TABLE, r"`omega` must have shape.*\(5, 2\)"),
+        (3.0, TABLE, "`omega` must have shape"),
+        ("dc", TABLE, "`omega` must hold real"),
+        (OMEGA * 1j, TABLE, "`omega` must hold real"),
+        (-OMEGA, TABLE, "`omega` must be finite, not negative"),
+        ([0.0], TABLE[:1], "`omega` must be finite, not negative, and not only zero"),
+        ([1, 2, 3, 4, np.inf], TABLE, "`omega` must be finite"),
+        ([1, 2, 3, 4, 4], TABLE, "`omega` must hold every frequency once"),
+        (OMEGA, TABLE[:4], r"`frf` must have shape \(5, 12\).*\(4, 12\)"),
+        (OMEGA, TABLE[:, :6], r"`frf` must have shape \(5, 12\).*\(5, 6\)"),
+        (OMEGA, response(4), r"complex `frf` must have shape \(5, 2, 3\)"),
+        (OMEGA[:1], np.complex128(1), "complex `frf` must have shape"),
+        (OMEGA, response().transpose(1, 0, 2), "complex `frf` must have shape"),
+        (OMEGA, "table", "`frf` must hold real"),
+        (OMEGA, BROKEN, "`frf` must be finite.*row 3"),
+    ],
+)
+def test_wrong_data_are_explained(omega, frf, message):
+    with pytest.raises(ValueError, match=message):
+        read_frequency_data(omega, frf, 2, 3)
+
+
+# -- realisation -----------------------------------------------------------------
+
+
+def realized(omega, G, order):
+    target = realize_response(omega, G, order)
+    assert target is not None and target.dt is None
+    return StateSpace(target.A, target.B, target.C, target.D)
+
+
+def random_model(seed, order, n_inputs, n_outputs):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(order, order))
+    A = A - (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(order)
+    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
+    return StateSpace(A, B, C, rng.normal(size=(n_outputs, n_inputs)))
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    seed=st.integers(0, 10**6),
+    order=st.integers(1, 5),
+    n_inputs=st.integers(1, 3),
+    n_outputs=st.integers(1, 3),
+    scale=st.floats(-4, 4).map(lambda e: 10.0**e),
+)
+def test_a_response_without_noise_gives_its_model(
+    seed, order, n_inputs, n_outputs, scale
+):
+    model = random_model(seed, order, n_inputs, n_outputs)
+    model = StateSpace(scale * model.A, scale * model.B, model.C, model.D)
+    omega = scale * np.logspace(-1, 1.3, 25)
+    G = model.frequency_response(omega)
+    found = realized(omega, G, order)
+    # between the data points too; poles only where they show in the response
+    between = scale * np.concatenate([[0.0], np.logspace(-1, 1.3, 60)])
+    error = np.abs(
+        found.frequency_response(between) - model.frequency_response(between)
+    )
+    assert error.max() <= 1e-4 * np.abs(G).max()
+    assert np.abs(found.frequency_response(omega) - G).max() <= 1e-6 * np.abs(G).max()
+
+
+def test_poles_are_recovered():
+    model = StateSpace(
+        [[0, 1, 0], [-9, -0.2, 0], [0, 0, -2]], [[0], [1], [1]], [[1, 0, 1]]
+    )
+    omega = np.linspace(0.0, 8.0, 30)
+    found = realized(omega, model.frequency_response(omega), 3)
+    assert_allclose(found.poles(), model.poles(), atol=1e-9)
+    assert_allclose(found.D, 0, atol=1e-9)
+
+
+def test_unstable_models_are_realised_too():
+    model = StateSpace(np.diag([1.0, -2.0]), [[1], [1]], [[1, 1]])
+    omega = np.linspace(0.1, 8.0, 20)
+    found = realized(omega, model.frequency_response(omega), 2)
+    assert_allclose(found.poles(), [1, -2], atol=1e-9)
+
+
+def test_few_points_give_no_model():
+    model = random_model(0, 4, 1, 1)
+    for count, enough in ((2, False), (5, False), (6, True)):
+        omega = np.linspace(0.5, 5, count)
+        found = realize_response(omega, model.frequency_response(omega), 4)
+        assert (found is not None) == enough
+
+
+def test_order_zero_gives_no_model():
+    omega = np.linspace(0.5, 5, 8)
+    assert realize_response(omega, np.ones((8, 1, 1), complex), 0) is None

@@ -1,0 +1,305 @@
+"""SubspaceLTI: a scikit-learn estimator that simulates, chooses and teaches."""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.linalg import block_diag
+from sklearn.base import clone
+from sklearn.model_selection import GridSearchCV, GroupKFold
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn.exceptions import RankWarning
+from lpvlearn.systems.simulation import lti_response
+
+
+@pytest.mark.filterwarnings("ignore:The model explains:UserWarning")
+@pytest.mark.filterwarnings("ignore:The data leave:lpvlearn.exceptions.RankWarning")
+@pytest.mark.filterwarnings("ignore:The identified model is unstable:UserWarning")
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.SkipTestWarning")
+@parametrize_with_checks([SubspaceLTI(), SubspaceLTI(method="pi-moesp", refine=False)])
+def test_scikit_learn_contract(estimator, check):
+    check(estimator)
+
+
+def bft(y, fitted):
+    error = np.linalg.norm(y - fitted, axis=0)
+    return 100.0 * (1.0 - error / np.linalg.norm(y - y.mean(axis=0), axis=0))
+
+
+def noisy(y, snr_db, rng):
+    return y + y.std(axis=0) * 10 ** (-snr_db / 20) * rng.standard_normal(y.shape)
+
+
+def arm_like(rng, n_samples=3000):
+    """The difficulty of the arm at 1 ms: a slow pole beside fast modes."""
+    poles = [-0.7, -45.0, -3.8 + 52.6j, -46.0 + 121.0j]
+    blocks = [
+        np.array([[p.real, p.imag], [-p.imag, p.real]])
+        if np.imag(p)
+        else np.array([[np.real(p)]])
+        for p in poles
+    ]
+    A = block_diag(*blocks)
+    B = np.array(
+        [[0.3, 0.2], [20.0, 12.0], [2.0, -3.0], [1.0, 2.0], [9.0, 6.0], [-8.0, 9.0]]
+    )
+    C = np.array([[1.0, 0.6, 1.0, 0.5, 0.7, 0.4], [-0.8, 1.0, 0.7, -1.0, 0.5, -0.6]])
+    system = StateSpace(A, B, C).to_discrete(1e-3)
+    n_switch = n_samples // 5 + 1
+    u = 0.1 * np.repeat(rng.choice([-1.0, 1.0], (n_switch, 2)), 5, axis=0)[:n_samples]
+    return system, u, system.simulate(u)
+
+
+def resonant(rng):
+    """Order 6, two inputs, two outputs, damping 0.01 to 0.02, feedthrough."""
+    omega, zeta = rng.uniform(0.1, 2.5, 3), rng.uniform(0.01, 0.02, 3)
+    blocks = []
+    for w, z in zip(omega, zeta, strict=True):
+        c, s = np.cos(w), np.sin(w)
+        blocks.append(np.exp(-z * w) * np.array([[c, s], [-s, c]]))
+    shapes = (6, 2), (2, 6), (2, 2)
+    return StateSpace(
+        block_diag(*blocks), *(rng.standard_normal(s) for s in shapes), 1.0
+    )
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def table():
+    """Three runs of a second-order system, rows interleaved at random."""
+    rng = np.random.default_rng(3)
+    A, B = np.array([[0.8, 0.3], [-0.3, 0.8]]), np.array([[1.0], [0.5]])
+    C, D = np.array([[1.0, 0.0], [0.0, 2.0]]), np.zeros((2, 1))
+    parts = []
+    for run, n in zip("abc", (150, 200, 120), strict=True):
+        u = rng.standard_normal((n, 1))
+        y = lti_response(A, B, C, D, u, rng.standard_normal(2))
+        parts.append(
+            pd.DataFrame(
+                {"u": u[:, 0], "run": run, "t": 0.01 * np.arange(n), "kappa": 0.5}
+            ).assign(y1=y[:, 0], y2=y[:, 1])
+        )
+    order = np.argsort(np.concatenate([rng.random(len(p)).cumsum() for p in parts]))
+    data = pd.concat(parts, ignore_index=True).iloc[order]
+    return data[["u", "run", "t", "kappa"]], data[["y1", "y2"]]
+
+
+ROLES = {"inputs": "u", "experiment": "run", "time": "t", "scheduling": "kappa"}
+
+
+@pytest.mark.parametrize("method", ["po-moesp", "pi-moesp"])
+def test_interleaved_experiments_are_identified_exactly(table, method):
+    X, y = table
+    model = SubspaceLTI(2, method=method, **ROLES).fit(X, y)
+    np.testing.assert_allclose(model.lti_.poles(), [0.8 - 0.3j, 0.8 + 0.3j], atol=1e-8)
+    assert model.lti_.sampling_time == pytest.approx(0.01)
+    assert model.initial_states_.shape == (3, 2)
+    fitted = model.predict_with_initial_state(X, y)
+    np.testing.assert_allclose(fitted, y, atol=1e-7)
+    assert abs(model.predict(X) - y.to_numpy()).max() > 0.1  # from rest
+
+
+def test_split_experiments_lists_the_rows_of_every_run(table):
+    X, y = table
+    model = SubspaceLTI(2, horizon=5, **ROLES).fit(X, y)
+    rows = model.split_experiments(X)
+    np.testing.assert_array_equal(np.sort(np.concatenate(rows)), np.arange(len(X)))
+    for part in rows:
+        assert X.iloc[part]["run"].nunique() == 1
+        assert X.iloc[part]["t"].is_monotonic_increasing
+
+
+def test_prediction_does_not_depend_on_the_order_of_experiments(table):
+    X, y = table
+    model = SubspaceLTI(2, horizon=5, **ROLES).fit(X, y)
+    whole = pd.DataFrame(model.predict(X), index=X.index)
+    by_run = X.sort_values("run", kind="stable", ascending=False)
+    other = SubspaceLTI(2, horizon=5, **ROLES).fit(by_run, y.loc[by_run.index])
+    np.testing.assert_allclose(
+        other.predict(by_run), whole.loc[by_run.index], atol=1e-6
+    )
+    kept = X[X["run"] != "b"]
+    np.testing.assert_allclose(model.predict(kept), whole.loc[kept.index], atol=1e-12)
+
+
+def test_grid_search_over_orders_with_experiments_as_groups(table):
+    X, y = table
+    search = GridSearchCV(
+        SubspaceLTI(horizon=5, **ROLES), {"order": [1, 2]}, cv=GroupKFold(3)
+    )
+    search.fit(X, y, groups=X["run"])
+    assert search.best_params_ == {"order": 2}
+
+
+def test_single_output_predicts_one_dimension(rng):
+    u = rng.standard_normal((200, 1))
+    y = lti_response(*(np.array([[v]]) for v in (0.8, 1.0, 1.0, 0.0)), u)
+    assert SubspaceLTI(1).fit(u, y[:, 0]).predict(u).shape == (200,)
+    assert SubspaceLTI(1).fit(u, y).predict(u).shape == (200, 1)
+
+
+@pytest.mark.parametrize("horizon", [15, 30])
+def test_resonant_system_in_noise_reaches_the_accuracy_of_maximum_likelihood(horizon):
+    scores = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        system = resonant(rng)
+        u, v = rng.standard_normal((2, 3000, 2))
+        model = SubspaceLTI(6, horizon=horizon).fit(
+            u, noisy(system.simulate(u), 30, rng)
+        )
+        scores.append(bft(system.simulate(v), model.predict(v)).mean())
+    assert np.median(scores) > 99.7
+
+
+@pytest.mark.filterwarnings("ignore:horizon=.* ends in a poor model:UserWarning")
+@pytest.mark.parametrize("method", ["po-moesp", "pi-moesp"])
+@pytest.mark.parametrize("refine", [True, False])
+def test_automatic_horizon_is_as_good_as_the_best_of_a_full_scan(method, refine):
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        system, u, y = arm_like(rng)
+        _, v, z = arm_like(np.random.default_rng(1000 + seed))
+        y = noisy(y, 30, rng)
+        options = {"method": method, "refine": refine}
+        auto = bft(z, SubspaceLTI(6, **options).fit(u, y).predict(v)).mean()
+        scan = [
+            bft(z, SubspaceLTI(6, horizon=h, **options).fit(u, y).predict(v)).mean()
+            for h in (40, 60, 80, 100, 120)
+        ]
+        assert auto > max(scan) - 0.3
+
+
+def test_automatic_order_on_the_slow_and_fast_system():
+    orders = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        system, u, y = arm_like(rng)
+        model = SubspaceLTI().fit(u, noisy(y, 30, rng))
+        orders.append(model.order_)
+        assert bft(y, model.predict(u)).min() > 99.0
+    assert np.median(orders) == 6
+
+
+def test_selection_table_shows_what_was_tried(rng):
+    u = rng.standard_normal((400, 1))
+    y = noisy(lti_response(*(np.array([[v]]) for v in (0.9, 1, 1, 0)), u), 20, rng)
+    table = SubspaceLTI().fit(u, y).selection_
+    assert list(table) == ["order", "horizon", "criterion", "validation_bft", "chosen"]
+    row = table[table["chosen"]].iloc[0]
+    assert row["order"] == 1 and row["validation_bft"] > 85
+    # An order that is too low has a larger error.
+    assert table[table["order"] == 0]["criterion"].min() > row["criterion"]
+
+
+def test_pure_gain_and_pure_delay(rng):
+    u = rng.standard_normal((300, 2))
+    gain = np.array([[2.0, -1.0]])
+    model = SubspaceLTI().fit(u, u @ gain.T)
+    assert model.order_ == 0
+    np.testing.assert_allclose(model.lti_.D, gain, atol=1e-10)
+    delayed = np.vstack([np.zeros((3, 1)), u[:-3, :1]])
+    model = SubspaceLTI().fit(u[:, :1], delayed)
+    assert model.order_ == 3
+    np.testing.assert_allclose(model.predict(u[:, :1]), delayed, atol=1e-6)
+
+
+def test_integrator_is_identified(rng):
+    u = rng.standard_normal((500, 1))
+    y = np.vstack([[0.0], np.cumsum(u, axis=0)[:-1]])
+    with warnings.catch_warnings():
+        # Rounding decides on which side of the unit circle the pole lies.
+        warnings.simplefilter("ignore", UserWarning)
+        model = SubspaceLTI(1).fit(u, y)
+    np.testing.assert_allclose(model.lti_.poles(), [1.0], atol=1e-7)
+    np.testing.assert_allclose(model.predict(u), y, atol=1e-4)
+
+
+def test_outputs_of_zero_give_a_model_of_zero(rng):
+    u = rng.standard_normal((100, 2))
+    for order in (0, 2, "auto"):
+        model = SubspaceLTI(order).fit(u, np.zeros((100, 2)))
+        assert not model.predict(u).any()
+
+
+def test_collinear_inputs_warn_and_share_the_effect(rng):
+    u = rng.standard_normal((300, 1))
+    y = lti_response(*(np.array([[v]]) for v in (0.8, 1.0, 1.0, 0.0)), u)
+    with pytest.warns(RankWarning, match="collinear"):
+        model = SubspaceLTI(1).fit(np.hstack([u, u]), y)
+    np.testing.assert_allclose(model.lti_.B[:, 0], model.lti_.B[:, 1])
+    np.testing.assert_allclose(model.predict(np.hstack([u, u])), y, atol=1e-8)
+
+
+@pytest.mark.parametrize("shape", [(10, 3), (15, 4), (21, 2), (6, 2), (4, 8), (2, 1)])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_tiny_tables_are_fitted(rng, shape):
+    for n_outputs in (1, 5):
+        X, y = rng.standard_normal(shape), rng.standard_normal((shape[0], n_outputs))
+        model = SubspaceLTI().fit(X, y)
+        assert model.predict(X).shape == y.shape
+
+
+def test_unstable_system_warns_or_is_made_stable(rng):
+    u = rng.standard_normal((300, 1))
+    y = lti_response(*(np.array([[v]]) for v in (1.02, 1.0, 1.0, 0.0)), u)
+    with pytest.warns(UserWarning, match="unstable"):
+        model = SubspaceLTI(1).fit(u, y)
+    np.testing.assert_allclose(model.lti_.poles(), [1.02], atol=1e-8)
+    model = SubspaceLTI(1, stability="enforce").fit(u, y)
+    assert model.lti_.is_stable
+
+
+def test_unrelated_outputs_warn(rng):
+    u, y = rng.standard_normal((2, 500, 1))
+    with pytest.warns(UserWarning, match="next to nothing"):
+        SubspaceLTI(2).fit(u, y)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"order": -1}, "`order` must be 'auto' or an integer of at least 0. Got -1"),
+        ({"order": 2.0}, "`order` must be"),
+        ({"order": True}, "`order` must be"),
+        ({"horizon": 0}, "`horizon` must be 'auto' or an integer of at least 1"),
+        ({"method": "arx"}, "`method` must be one of po-moesp"),
+        ({"stability": "maybe"}, "`stability` must be 'warn' or 'enforce'"),
+        ({"sampling_time": 0.0}, "`sampling_time` must be a positive"),
+        ({"horizon": 20}, "`horizon` must be at most 5 for 40 samples"),
+        (
+            {"order": 8, "horizon": 4},
+            "`order` must be at most 3 for 40 samples and horizon 4. Got 8.",
+        ),
+        ({"order": 30}, "`order` must be at most 4 for 40 samples"),
+    ],
+)
+def test_options_are_refused_with_the_remedy(rng, options, message):
+    X, y = rng.standard_normal((40, 2)), rng.standard_normal(40)
+    with pytest.raises(ValueError, match=message):
+        SubspaceLTI(**options).fit(X, y)
+
+
+def test_constant_input_is_refused(rng):
+    X = np.column_stack([rng.standard_normal(50), np.full(50, 2.0)])
+    with pytest.raises(ValueError, match="Every input must vary. Got input 1"):
+        SubspaceLTI().fit(X, X[:, 0])
+
+
+def test_one_sample_is_refused():
+    with pytest.raises(ValueError, match="n_samples = 1"):
+        SubspaceLTI().fit([[1.0]], [1.0])
+
+
+def test_clone_and_refit_give_the_same_model(table):
+    X, y = table
+    model = SubspaceLTI(2, horizon=6, **ROLES)
+    first = model.fit(X, y).predict(X)
+    np.testing.assert_array_equal(clone(model).fit(X, y).predict(X), first)

@@ -1,0 +1,166 @@
+"""Standard deviations of gray-box parameters after pooled fits."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    StateSpace,
+    SubspaceLTI,
+    from_trajectories,
+)
+from lpvlearn.pipeline.structured_models import covariance_of_parameters
+from lpvlearn.subspace.statistics import deviated_models
+
+from ..conftest import spring_pipeline, spring_tables
+
+LAG = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+STEP = 0.1
+
+
+def lag_record(seed, n_samples=300, noise=0.05):
+    rng = np.random.default_rng(seed)
+    u = rng.choice([-1.0, 1.0], (n_samples // 3, 1)).repeat(3, axis=0)
+    y = LAG.model({"a": 0.8, "b": 1.5}).simulate(u, sampling_time=STEP)
+    return u, y + noise * rng.standard_normal(y.shape)
+
+
+def simulated(theta, u, x0):
+    model = LAG.model(theta)
+    return model.simulate(u, sampling_time=STEP, initial_state=[x0])[:, 0]
+
+
+def test_covariance_is_that_of_nonlinear_least_squares_in_the_parameters():
+    """Black box and gray box have as many parameters here: the formula is known."""
+    u, y = lag_record(0)
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(order=1, horizon=8, feedthrough=False, sampling_time=STEP),
+        GrayBoxRestructurer(LAG),
+    ).fit(u, y)
+    theta = pipeline.parameters_.to_numpy()[0]
+    h = 1e-6
+    J = np.column_stack(
+        [
+            (simulated(theta + h * e, u, 0.0) - simulated(theta - h * e, u, 0.0))
+            / (2 * h)
+            for e in np.eye(2)
+        ]
+        + [simulated(theta, u, 1.0) - simulated(theta, u, 0.0)]
+    )
+    error = y[:, 0] - simulated(theta, u, 0.0)
+    error = error - J[:, 2:] @ np.linalg.lstsq(J[:, 2:], error, rcond=None)[0]
+    variance = error @ error / (len(y) - 3)
+    expected = np.sqrt(variance * np.diag(np.linalg.inv(J.T @ J))[:2])
+    # The noise may have been taken for a faintly coloured one.
+    np.testing.assert_allclose(pipeline.parameters_std_.iloc[0], expected, rtol=0.15)
+
+
+def test_more_experiments_tell_more():
+    def deviations(n_repeats):
+        X, y = spring_tables(0.05, n_samples=300, n_repeats=n_repeats)
+        return spring_pipeline().fit(X, y).parameters_std_
+
+    ratio = deviations(1) / deviations(4)
+    assert ratio.median().between(1.5, 2.7).all()  # the root of 4
+
+
+def test_deviations_are_the_spread_over_new_noise():
+    found, told = [], []
+    for seed in range(30):
+        pipeline = LocalLPVPipeline(
+            SubspaceLTI(order=1, horizon=8, feedthrough=False, sampling_time=STEP),
+            GrayBoxRestructurer(LAG, n_starts=2),
+        ).fit(*lag_record(seed))
+        found.append(pipeline.parameters_.iloc[0])
+        told.append(pipeline.parameters_std_.iloc[0])
+    ratio = pd.DataFrame(told).mean() / pd.DataFrame(found).std()
+    assert ratio.between(0.65, 1.5).all()
+
+
+def test_deviations_follow_the_units():
+    X, y = spring_tables(0.05, n_samples=300)
+    one = spring_pipeline().fit(X, y)
+    other = spring_pipeline().fit(X, 1000.0 * y)
+    np.testing.assert_allclose(
+        other.parameters_std_["b"], 1000.0 * one.parameters_std_["b"], rtol=1e-3
+    )
+    np.testing.assert_allclose(
+        other.parameters_std_["k"], one.parameters_std_["k"], rtol=1e-3
+    )
+
+
+@pytest.mark.parametrize("method", ["zoh", "tustin"])
+def test_pairs_stand_on_both_sides_of_the_estimate(method):
+    u, y = lag_record(1)
+    fitted = SubspaceLTI(1, horizon=8, sampling_time=STEP).fit(u, y)
+    pairs = deviated_models(fitted, [(u, y)], lambda m: m.to_continuous(method))
+    assert len(pairs) == 3  # pole, gain and feedthrough
+    omega = np.geomspace(0.01, 20, 20)
+    here = fitted.lti_.to_continuous(method).frequency_response(omega)
+    for above, below in pairs:
+        step = above.frequency_response(omega) - here
+        middle = above.frequency_response(omega) + below.frequency_response(omega)
+        assert np.abs(middle - 2 * here).max() < 0.02 * np.abs(step).max()
+
+
+@pytest.mark.filterwarnings("ignore:The model explains next to nothing")
+@pytest.mark.parametrize("options", [{"refine": False}, {"order": 0}])
+def test_nothing_is_claimed_where_the_covariance_is_not_known(options):
+    u, y = lag_record(2)
+    fitted = SubspaceLTI(**{"order": 1, "horizon": 8, **options}).fit(u, y)
+    assert deviated_models(fitted, [(u, y)], lambda model: model) == []
+
+
+def test_collinear_inputs_leave_the_deviations_open():
+    rng = np.random.default_rng(0)
+    u = rng.choice([-1.0, 1.0], (200, 1))
+    y = StateSpace([[0.8]], [[1.0]], [[1.0]], sampling_time=1.0).simulate(u)
+    y = y + 0.01 * rng.standard_normal(y.shape)
+    both = np.hstack([u, 2 * u])
+    with pytest.warns(UserWarning, match="collinear"):
+        fitted = SubspaceLTI(1, horizon=5).fit(both, y)
+    assert deviated_models(fitted, [(both, y)], lambda model: model) == []
+
+
+def test_a_frequency_weight_enters_the_covariance():
+    u, y = lag_record(3)
+    fitted = SubspaceLTI(1, horizon=8, feedthrough=False, sampling_time=STEP).fit(u, y)
+    pairs = deviated_models(fitted, [(u, y)], StateSpace.to_continuous)
+    box = fitted.lti_.to_continuous()
+    theta = GrayBoxRestructurer(LAG).fit_model(box).params_
+    plain, weighted = (
+        covariance_of_parameters(LAG, theta, weight, box, pairs)
+        for weight in (None, (None, 2.0))
+    )
+    # A structure that meets the black box exactly leaves a weight nothing to choose.
+    np.testing.assert_allclose(weighted, plain, rtol=0.05)
+
+
+def test_average_tells_its_own_spread_and_a_single_experiment_that_of_its_fit():
+    X, y = spring_tables(0.05, n_samples=300, n_repeats=3)
+    average = spring_pipeline(combine="average").fit(X, y)
+    first = X["run"].str.endswith("r0")
+    single = spring_pipeline(combine="average").fit(X[first], y[first])
+    pooled = spring_pipeline(combine="pool").fit(X[first], y[first])
+    assert average.restructurers_[0].params_covariance_.shape == (3, 3)
+    pd.testing.assert_frame_equal(single.parameters_std_, pooled.parameters_std_)
+
+
+def test_memory_tells_the_same_deviations(tmp_path):
+    u, y = lag_record(4)
+    X, Y = from_trajectories([(u, 0.3, y)], sampling_time=STEP)
+    options = {"experiment": "experiment", "time": "time", "inputs": "u1"}
+    fits = [
+        LocalLPVPipeline(
+            SubspaceLTI(1, horizon=8),
+            GrayBoxRestructurer(LAG),
+            memory=memory,
+            **options,
+        ).fit(X, Y)
+        for memory in (None, tmp_path, tmp_path)
+    ]
+    for other in fits[1:]:
+        pd.testing.assert_frame_equal(fits[0].parameters_std_, other.parameters_std_)

@@ -1,0 +1,294 @@
+"""Gaps, trends, known zeros, stability, poor horizons, and what must hold."""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn.data.preparation import remove_trends
+from lpvlearn.exceptions import RankWarning
+from lpvlearn.systems.simulation import lti_response
+
+A = 0.9 * np.array([[np.cos(0.6), np.sin(0.6)], [-np.sin(0.6), np.cos(0.6)]])
+SYSTEM = (
+    A,
+    np.array([[1.0, 0.3], [0.4, -1.0]]),
+    np.array([[1.0, 0.5], [0.2, -1.0]]),
+    np.array([[0.3, 0.0], [0.0, 0.7]]),
+)
+POLES = np.sort_complex(np.linalg.eigvals(A))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def record(rng, n_samples=400, x0=None):
+    u = rng.standard_normal((n_samples, 2))
+    return u, lti_response(*SYSTEM, u, x0)
+
+
+def poles_of(model):
+    return np.sort_complex(model.lti_.poles())
+
+
+def test_gaps_split_an_experiment_where_asked_for(rng):
+    u, y = record(rng)
+    X, Y = u.copy(), y.copy()
+    X[100, 0], Y[200:215, 1], X[300, 1] = np.nan, np.nan, np.nan
+    with pytest.raises(ValueError, match="contains NaN"):
+        SubspaceLTI(2, horizon=5).fit(X, Y)
+    model = SubspaceLTI(2, horizon=5, missing="split").fit(X, Y)
+    np.testing.assert_allclose(poles_of(model), POLES, atol=1e-9)
+    assert model.initial_states_.shape == (4, 2)
+    fitted = model.predict_with_initial_state(X, Y)
+    complete = np.isfinite(X).all(axis=1) & np.isfinite(Y).all(axis=1)
+    np.testing.assert_allclose(fitted[complete], y[complete], atol=1e-8)
+    assert np.isnan(fitted[~complete]).all()
+    # A simulation from rest needs every input.
+    with pytest.raises(ValueError, match="contains NaN"):
+        model.predict(X)
+    np.testing.assert_allclose(model.predict(u), y, atol=1e-8)
+
+
+def test_infinity_is_refused_even_where_gaps_split(rng):
+    u, y = record(rng)
+    u[3, 0] = np.inf
+    with pytest.raises(ValueError, match="infinity"):
+        SubspaceLTI(missing="split").fit(u, y)
+    with pytest.raises(ValueError, match="consecutive complete samples"):
+        SubspaceLTI(missing="split").fit(np.full((20, 1), np.nan), np.zeros(20))
+
+
+@pytest.mark.parametrize("detrend, drift", [("constant", 0.0), ("linear", 0.05)])
+def test_offsets_and_drifts_are_removed_experiment_by_experiment(rng, detrend, drift):
+    parts, t = [], np.arange(3000.0)[:, None]
+    for run, level in enumerate((5.0, -20.0)):
+        u, y = record(rng, 3000)
+        y = y + level + drift * t
+        parts.append(pd.DataFrame(u, columns=["u1", "u2"]).assign(run=run, y1=y[:, 0]))
+    data = pd.concat(parts)
+    X, y = data[["u1", "u2", "run"]], data["y1"]
+    options = {"experiment": "run", "horizon": 8}
+    model = SubspaceLTI(2, detrend=detrend, **options).fit(X, y)
+    np.testing.assert_allclose(poles_of(model), POLES, atol=5e-3)
+    assert model.output_offset_ == pytest.approx(y.mean())
+    assert model.predict(X).mean() == pytest.approx(y.mean(), abs=1.0)
+
+
+def test_detrending_subtracts_the_least_squares_line(rng):
+    pairs = [record(rng, n) for n in (50, 80)]
+    cleaned, u0, _ = remove_trends(pairs, "linear")
+    for (u, _), (v, _) in zip(pairs, cleaned, strict=True):
+        t = np.arange(len(u))
+        line = np.polyfit(t, u, 1)
+        np.testing.assert_allclose(v, u - np.outer(t, line[0]) - line[1], atol=1e-12)
+    np.testing.assert_allclose(u0, np.vstack([u for u, _ in pairs]).mean(axis=0))
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_known_zeros_of_D_stay_zero(rng, refine):
+    u, y = record(rng, 2000)
+    y = y + 0.05 * rng.standard_normal(y.shape)
+    known = np.array([[True, False], [False, True]])
+    model = SubspaceLTI(2, horizon=8, feedthrough=known, refine=refine).fit(u, y)
+    assert not model.lti_.D[~known].any()
+    np.testing.assert_allclose(model.lti_.D[known], [0.3, 0.7], atol=0.02)
+    with pytest.raises(ValueError, match=r"\(n_outputs, n_inputs\) = \(2, 2\)"):
+        SubspaceLTI(2, feedthrough=[True, False]).fit(u, y)
+
+
+def test_enforced_stability_is_guaranteed_and_its_price_reported(rng):
+    u = rng.standard_normal((300, 1))
+    unstable = tuple(np.array([[v]]) for v in (1.02, 1.0, 1.0, 0.0))
+    y = lti_response(*unstable, u)
+    model = SubspaceLTI(1, horizon=5, stability="enforce").fit(u, y)
+    assert model.lti_.is_stable
+    with pytest.warns(UserWarning, match="unstable"):
+        free = SubspaceLTI(1, horizon=5).fit(u, y)
+    assert model.stability_loss_ == pytest.approx(model.residual_ - free.residual_)
+    assert model.stability_loss_ > 0.01
+    u, y = record(rng)
+    assert SubspaceLTI(2, horizon=5, stability="enforce").fit(u, y).stability_loss_ == 0
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_enforced_stability_keeps_the_order_of_an_unstable_system(rng, refine):
+    u = rng.standard_normal((500, 1))
+    unstable = tuple(np.array([[v]]) for v in (1.05, 1.0, 1.0, 0.0))
+    y = lti_response(*unstable, u)
+    model = SubspaceLTI(stability="enforce", refine=refine)
+    with pytest.warns(UserWarning, match="seems to be unstable"):
+        model.fit(u, y)
+    assert model.order_ == 1
+    assert model.lti_.is_stable
+    assert model.stability_loss_ == pytest.approx(model.residual_, abs=1e-6)
+    chosen = model.selection_[model.selection_["chosen"]]
+    assert len(chosen) == 1
+    assert chosen["order"].item() == 1
+
+
+def test_experiments_that_start_at_rest_have_zero_initial_states(rng):
+    """B and D minimise the simulation error from rest: it is orthogonal to them."""
+    u, y = record(rng, 300)
+    y = y + 0.3 * rng.standard_normal(y.shape)
+    model = SubspaceLTI(2, horizon=6, refine=False, initial_state="rest").fit(u, y)
+    assert not model.initial_states_.any()
+    error, lti = y - model.predict(u), model.lti_
+    weight = 1.0 / np.mean(y**2, axis=0)
+    for shape, name in ((lti.B.shape, "B"), (lti.D.shape, "D")):
+        for entry in np.ndindex(shape):
+            part = {"B": np.zeros_like(lti.B), "D": np.zeros_like(lti.D)}
+            part[name][entry] = 1.0
+            effect = lti_response(lti.A, part["B"], lti.C, part["D"], u)
+            cosine = (weight * effect * error).sum()
+            cosine /= np.sqrt((weight * effect**2).sum() * (weight * error**2).sum())
+            assert abs(cosine) < 1e-9
+    refined = SubspaceLTI(2, horizon=6, initial_state="rest").fit(u, y)
+    assert refined.residual_ <= model.residual_
+    assert not refined.initial_states_.any()
+    assert np.isfinite(refined.poles_std_).all()
+
+
+def test_knowing_that_short_experiments_start_at_rest_helps(rng):
+    errors = {"rest": [], "estimate": []}
+    truth, omega = StateSpace(*SYSTEM, 1.0), np.linspace(0.05, 3.0, 20)
+    for _ in range(15):
+        runs = [record(rng, 4) for _ in range(60)]
+        X = np.vstack(
+            [np.column_stack([u, np.full(4, k)]) for k, (u, _) in enumerate(runs)]
+        )
+        y = np.vstack([y for _, y in runs])
+        y = y + 0.5 * rng.standard_normal(y.shape)
+        for start, found in errors.items():
+            model = SubspaceLTI(2, horizon=2, experiment=2, initial_state=start)
+            gap = model.fit(X, y).lti_.frequency_response(omega)
+            found.append(np.linalg.norm(gap - truth.frequency_response(omega)))
+    assert np.mean(errors["rest"]) < 0.9 * np.mean(errors["estimate"])
+
+
+def test_what_follows_a_gap_does_not_start_at_rest():
+    model = SubspaceLTI(missing="split", initial_state="rest")
+    with pytest.raises(ValueError, match="`initial_state` must be 'estimate' with"):
+        model.fit(np.zeros((9, 1)), np.zeros(9))
+    with pytest.raises(ValueError, match="must be 'estimate' or 'rest'. Got 'zero'"):
+        SubspaceLTI(initial_state="zero").fit(np.zeros((9, 1)), np.zeros(9))
+
+
+def test_constant_inputs_are_called_by_their_names(rng):
+    u, y = record(rng, 50)
+    X = pd.DataFrame({"t": 0.1 * np.arange(50), "pump": u[:, 0], "valve": 2.0})
+    with pytest.raises(ValueError, match="Got input 'valve' constant at 2:"):
+        SubspaceLTI(time="t").fit(X, y)
+    with pytest.raises(ValueError, match="Got input 'valve' constant at 2:"):
+        SubspaceLTI(inputs=["valve", "pump"]).fit(X, y)
+    with pytest.raises(ValueError, match="Got input 2 constant at 2:"):
+        SubspaceLTI(time=0).fit(X.to_numpy(), y)
+
+
+def test_a_given_horizon_that_ends_in_a_poor_minimum_warns():
+    """A pole a hundred times slower than the horizon, past inputs as instruments."""
+    poles = np.exp(1e-3 * np.array([-0.7, -45.0]))
+    fast = np.exp(1e-3 * np.array([-3.8 + 52.6j, -46.0 + 121.0j]))
+    blocks = np.diag(poles)
+    big = np.zeros((6, 6))
+    big[:2, :2] = blocks
+    for k, p in enumerate(fast):
+        i = 2 + 2 * k
+        big[i : i + 2, i : i + 2] = [[p.real, p.imag], [-p.imag, p.real]]
+    B = np.array([[0.3, 0.2], [20, 12], [2, -3], [1, 2], [9, 6], [-8, 9.0]]) * 1e-3
+    C = np.array([[1, 0.6, 1, 0.5, 0.7, 0.4], [-0.8, 1, 0.7, -1, 0.5, -0.6]])
+    rng = np.random.default_rng(0)
+    u = 0.1 * np.repeat(rng.choice([-1.0, 1.0], (300, 2)), 10, axis=0)
+    y = lti_response(big, B, C, np.zeros((2, 2)), u)
+    y = y + 0.03 * y.std(axis=0) * rng.standard_normal(y.shape)
+    options = {"method": "pi-moesp", "feedthrough": False}
+    with pytest.warns(UserWarning, match="ends in a poor model"):
+        SubspaceLTI(6, horizon=12, **options).fit(u, y)
+    SubspaceLTI(6, **options).fit(u, y)  # the automatic one is silent
+
+
+def test_selection_is_readable_as_text(rng):
+    u, y = record(rng, 300)
+    model = SubspaceLTI().fit(u, y + 0.1 * rng.standard_normal(y.shape))
+    lines = model.selection_text().splitlines()
+    assert len(lines) == len(model.selection_) + 1
+    marked = [line for line in lines if line.endswith("<- chosen")]
+    assert len(marked) == 1
+    assert marked[0].split()[:2] == [str(model.order_), str(model.horizon_)]
+
+
+def test_outputs_on_very_different_scales_are_treated_alike(rng):
+    u, y = record(rng, 1000)
+    y = y + 0.1 * rng.standard_normal(y.shape)
+    su, sy = np.array([1e9, 1e-9]), np.array([1e-9, 1e9])
+    first, other = SubspaceLTI(2).fit(u, y), SubspaceLTI(2).fit(u * su, y * sy)
+    np.testing.assert_allclose(
+        other.predict(u * su) / sy, first.predict(u), rtol=1e-4, atol=1e-4
+    )
+
+
+def test_integer_object_and_nullable_columns_are_numbers(rng):
+    u = rng.integers(-3, 4, (200, 2))
+    y = lti_response(*SYSTEM, u.astype(float))
+    expected = SubspaceLTI(2, horizon=5).fit(u.astype(float), y).predict(u)
+    for X in (u, u.astype(object), pd.DataFrame(u, columns=["a", "b"]).astype("Int64")):
+        model = SubspaceLTI(2, horizon=5).fit(X, y)
+        np.testing.assert_allclose(model.predict(X), expected, atol=1e-9)
+
+
+def test_more_channels_than_samples_teaches_or_fits(rng):
+    X, y = rng.standard_normal((6, 8)), rng.standard_normal((6, 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        assert SubspaceLTI().fit(X, y).predict(X).shape == (6, 3)
+    with pytest.raises(ValueError, match="`horizon` must be at most 1 for 6 samples"):
+        SubspaceLTI(2, horizon=4).fit(X, y)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.filterwarnings("ignore:The identified model is unstable:UserWarning")
+def test_chains_of_integrators_are_identified(rng, order):
+    u = rng.standard_normal((400, 1))
+    y = u
+    for _ in range(order):
+        y = np.vstack([[0.0], np.cumsum(y, axis=0)[:-1]])
+    model = SubspaceLTI(order, horizon=6).fit(u, y)
+    np.testing.assert_allclose(model.lti_.poles(), 1.0, atol=1e-3)
+    error = model.predict(u) - y
+    assert np.linalg.norm(error) < 1e-3 * np.linalg.norm(y)
+
+
+@pytest.mark.parametrize("delay", [1, 5])
+def test_pure_delay_is_identified(rng, delay):
+    u = rng.standard_normal((400, 1))
+    y = np.vstack([np.zeros((delay, 1)), u[:-delay]])
+    model = SubspaceLTI(method="po-moesp").fit(u, y)
+    assert model.order_ == delay
+    np.testing.assert_allclose(model.predict(u), y, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["po-moesp", "pi-moesp", "n4sid", "cva"])
+def test_time_shifted_starts_and_lengths_do_not_matter(rng, method):
+    """Pieces of one long record, each from where the state happened to be."""
+    u, y = record(rng, 900)
+    cuts = [(0, 150), (160, 500), (505, 900)]
+    X = np.vstack(
+        [np.column_stack([u[a:b], np.full(b - a, k)]) for k, (a, b) in enumerate(cuts)]
+    )
+    Y = np.vstack([y[a:b] for a, b in cuts])
+    model = SubspaceLTI(2, horizon=6, method=method, experiment=2).fit(X, Y)
+    np.testing.assert_allclose(poles_of(model), POLES, atol=1e-8)
+    np.testing.assert_allclose(model.predict_with_initial_state(X, Y), Y, atol=1e-7)
+
+
+def test_repeated_inputs_warn_once_and_fit(rng):
+    u, y = record(rng)
+    with pytest.warns(RankWarning, match="collinear"):
+        model = SubspaceLTI(2, horizon=5).fit(np.hstack([u, u[:, :1]]), y)
+    np.testing.assert_allclose(model.predict(np.hstack([u, u[:, :1]])), y, atol=1e-8)
+    std = model.frequency_response_std([0.5])
+    assert std.shape == (1, 2, 3)

@@ -1,0 +1,294 @@
+"""Predictor and uncertainty of SubspaceLTI."""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+from lpvlearn import SubspaceLTI
+from lpvlearn.models.innovation import NoiseModel
+from lpvlearn.subspace.simulation_fit import Freedom, Realization
+from lpvlearn.subspace.uncertainty import (
+    autoregression,
+    frequency_response_jacobian,
+    pole_jacobian,
+    reduce_noise_model,
+    spectrum,
+)
+from lpvlearn.systems.simulation import lti_response, state_trajectory
+
+OMEGA = np.array([0.1, 0.5, 1.0, 2.0])
+
+
+def second_order():
+    A = 0.9 * np.array([[np.cos(0.6), np.sin(0.6)], [-np.sin(0.6), np.cos(0.6)]])
+    C = np.array([[1.0, 0.5], [0.2, -1.0]])
+    return A, np.array([[1.0], [0.4]]), C, np.array([[0.3], [0.0]])
+
+
+def coloured(rng, n_samples, pole, n_outputs=2):
+    return lfilter([1.0], [1.0, -pole], rng.standard_normal((n_samples, n_outputs)), 0)
+
+
+def experiment(seed, n_samples, pole=0.0, level=0.3):
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((n_samples, 1))
+    y = lti_response(*second_order(), u)
+    e = coloured(rng, n_samples, pole)
+    return u, y + level * y.std(axis=0) * e / e.std(axis=0)
+
+
+def truth(omega):
+    A, B, C, D = second_order()
+    return np.array(
+        [C @ np.linalg.solve(np.exp(1j * w) * np.eye(2) - A, B) + D for w in omega]
+    )
+
+
+def test_autoregression_recovers_a_vector_process():
+    rng = np.random.default_rng(0)
+    Phi = np.array([[0.8, 0.3], [-0.2, 0.5]])
+    e = rng.standard_normal((40_000, 2)) @ np.array([[1.0, 0.4], [0.0, 0.6]])
+    v = np.zeros_like(e)
+    for t in range(1, len(e)):
+        v[t] = Phi @ v[t - 1] + e[t]
+    model = autoregression([v[:15_000], v[15_000:]])
+    np.testing.assert_allclose(model.A, Phi, atol=0.02)
+    np.testing.assert_allclose(model.covariance, np.cov(e.T), rtol=0.05, atol=0.02)
+    assert abs(np.linalg.eigvals(model.A - model.K @ model.C)).max() < 1e-9
+
+
+def test_white_and_vanishing_errors_have_no_noise_states():
+    white = np.random.default_rng(0).standard_normal((3000, 2))
+    assert len(autoregression([white]).A) == 0
+    assert len(autoregression([np.zeros((50, 2))]).A) == 0
+
+
+def test_reduced_noise_model_has_a_stable_predictor_and_the_riccati_gain():
+    e = np.random.default_rng(1).standard_normal((20_000, 1))
+    long = autoregression([lfilter([1.0, 0.7], [1.0, -0.9], e, axis=0)], order=12)
+    short = reduce_noise_model(long, 1)
+    np.testing.assert_allclose(short.A, [[0.9]], atol=0.02)
+    assert abs(np.linalg.eigvals(short.A - short.K @ short.C)).max() < 1.0
+    omega = 2.0 * np.pi * np.arange(256) / 256
+    np.testing.assert_allclose(spectrum(short, omega), spectrum(long, omega), rtol=0.2)
+    # An innovation form is its own Kalman filter: the Riccati solution is zero.
+    Q, S = short.K @ short.covariance @ short.K.T, short.K @ short.covariance
+    P = solve_discrete_are(short.A.T, short.C.T, Q, short.covariance, s=S)
+    np.testing.assert_allclose(P, 0.0, atol=1e-8)
+    white = reduce_noise_model(long, 0)
+    np.testing.assert_allclose(
+        white.covariance, spectrum(long, omega).real.mean(), rtol=0.1
+    )
+
+
+def test_spectrum_integrates_to_the_variance():
+    one = np.ones((1, 1))
+    model = NoiseModel(0.8 * one, 0.8 * one, one, 2.0 * one)
+    omega = 2.0 * np.pi * np.arange(512) / 512
+    variance = spectrum(model, omega).mean().real
+    assert variance == pytest.approx(2.0 / (1.0 - 0.64), rel=1e-9)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_prediction_error_under_coloured_noise_is_that_of_the_true_predictor(steps):
+    u, y = experiment(0, 20_000, pole=0.9)
+    model = SubspaceLTI(2, horizon=12).fit(u, y)
+    predictor = model.predictor_
+    assert predictor.n_noise_states == 2
+    np.testing.assert_allclose(np.linalg.eigvals(predictor.noise.A), 0.9, atol=0.02)
+    v, z = experiment(1, 20_000, pole=0.9)
+    ahead = z - model.predict_ahead(v, z, steps=steps)
+    simulated = z - model.predict_with_initial_state(v, z)
+    expected = np.sqrt(1.0 - 0.81**steps)
+    np.testing.assert_allclose(ahead.std(0) / simulated.std(0), expected, rtol=0.03)
+    if steps == 1:
+        np.testing.assert_allclose(
+            np.diag(predictor.covariance), ahead.var(0), rtol=0.05
+        )
+
+
+def test_far_prediction_and_white_noise_are_the_simulation():
+    u, y = experiment(0, 3000, pole=0.9)
+    model = SubspaceLTI(2, horizon=12).fit(u, y)
+    simulated = model.predict_with_initial_state(u, y)
+    np.testing.assert_allclose(model.predict_ahead(u, y, 400), simulated, atol=1e-9)
+    u, y = experiment(0, 3000)
+    model = SubspaceLTI(2, horizon=12).fit(u, y)
+    assert not model.predictor_.K.any()
+    np.testing.assert_array_equal(
+        model.predict_ahead(u, y), model.predict_with_initial_state(u, y)
+    )
+
+
+def test_prediction_uses_no_later_output():
+    u, y = experiment(0, 500, pole=0.9)
+    model = SubspaceLTI(2, horizon=12).fit(u, y)
+    changed = y.copy()
+    changed[300:] += 5.0
+    pair = [model.predict_ahead(u, z, 2, initial_state="rest") for z in (y, changed)]
+    np.testing.assert_array_equal(pair[0][:302], pair[1][:302])
+    assert abs(pair[0][302] - pair[1][302]).max() > 0.1
+
+
+def test_noise_model_in_the_units_of_the_outputs():
+    u, y = experiment(0, 4000, pole=0.8)
+    scale = np.array([1e-6, 1e6])
+    first = SubspaceLTI(2, horizon=10).fit(u, y).predictor_
+    other = SubspaceLTI(2, horizon=10).fit(u, y * scale).predictor_
+    np.testing.assert_allclose(
+        other.covariance, first.covariance * np.outer(scale, scale), rtol=1e-5
+    )
+
+
+def test_noise_states_make_the_unrefined_po_moesp_consistent():
+    errors = {}
+    for extra in (0, 2):
+        gaps = []
+        for seed in range(3):
+            u, y = experiment(seed, 30_000, pole=0.9, level=0.5)
+            model = SubspaceLTI(2, horizon=12, refine=False, n_noise_states=extra)
+            response = model.fit(u, y).lti_.frequency_response(OMEGA)
+            gaps.append(np.linalg.norm(response - truth(OMEGA)))
+        errors[extra] = np.median(gaps)
+    assert errors[2] < 0.3 * errors[0]
+
+
+def finite_difference(function, blocks, B, C, D, step=1e-6):
+    """Derivatives in the order of the parameters: B, D, A, C."""
+    columns = []
+    for matrices in (B, D, *blocks, C):
+        for index in np.ndindex(matrices.shape):
+            before = matrices[index]
+            values = []
+            for sign in (1.0, -1.0):
+                matrices[index] = before + sign * step
+                values.append(function())
+            matrices[index] = before
+            columns.append((values[0] - values[1]) / (2.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+def test_jacobians_equal_finite_differences():
+    rng = np.random.default_rng(0)
+    blocks = (np.array([[0.5]]), np.array([[0.7, 0.4], [-0.3, 0.6]]))
+    B, C, D = (rng.standard_normal(s) for s in ((3, 2), (2, 3), (2, 2)))
+
+    def assemble():
+        A = np.zeros((3, 3))
+        A[:1, :1], A[1:, 1:] = blocks
+        return A
+
+    def response():
+        return np.array(
+            [
+                C @ np.linalg.solve(np.exp(1j * w) * np.eye(3) - assemble(), B) + D
+                for w in OMEGA
+            ]
+        )
+
+    model = Realization(assemble(), B, C, D, np.zeros((1, 3)), 0.0, 0, blocks)
+    J = frequency_response_jacobian(model, Freedom(np.ones((2, 2), bool)), OMEGA)
+    expected = finite_difference(response, blocks, B, C, D)
+    np.testing.assert_allclose(J, expected, atol=1e-7)
+    poles, J = pole_jacobian(model, expected.shape[-1])
+
+    def all_poles():
+        return np.concatenate([np.linalg.eigvals(block) for block in blocks])
+
+    np.testing.assert_allclose(poles, all_poles())
+    np.testing.assert_allclose(
+        J, finite_difference(all_poles, blocks, B, C, D), atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.9])
+def test_bands_of_95_percent_cover_the_truth(pole):
+    """Within what 60 runs can tell, entry by entry; 300 runs are a benchmark."""
+    runs = 60
+    hits, pole_hits = [], []
+    for seed in range(runs):
+        u, y = experiment(seed, 600, pole=pole)
+        model = SubspaceLTI(2, horizon=10).fit(u, y)
+        error = model.lti_.frequency_response(OMEGA) - truth(OMEGA)
+        std = model.frequency_response_std(OMEGA)
+        hits.append(
+            [abs(error.real) < 1.96 * std.real, abs(error.imag) < 1.96 * std.imag]
+        )
+        true_pole = 0.9 * np.exp(0.6j * np.sign(model.lti_.poles().imag))
+        gap = model.lti_.poles() - true_pole
+        pole_hits.append(abs(gap.real) < 1.96 * model.poles_std_.real)
+    worst = binom.ppf(1e-4, runs, 0.95) / runs
+    assert np.mean(hits, axis=0).min() >= worst
+    assert np.mean(pole_hits) >= binom.ppf(1e-4, runs, 0.95) / runs
+    # Not by being too wide: the average over entries is near 95 %.
+    assert 0.90 < np.mean(hits) < 0.99
+
+
+def test_covariance_holds_the_variances_and_follows_the_units():
+    u, y = experiment(0, 800)
+    model = SubspaceLTI(2, horizon=10).fit(u, y)
+    covariance = model.frequency_response_covariance(OMEGA)
+    assert covariance.shape == (4, 4, 4)
+    std = model.frequency_response_std(OMEGA).reshape(4, 2)
+    np.testing.assert_allclose(
+        np.sqrt(np.einsum("fii->fi", covariance)),
+        np.hstack([std.real, std.imag]),
+        atol=1e-12,
+    )
+    su, sy = 1e3, np.array([1e-9, 1e9])
+    other = SubspaceLTI(2, horizon=10, sampling_time=0.1).fit(su * u, sy * y)
+    np.testing.assert_allclose(
+        other.frequency_response_std(OMEGA / 0.1) / sy[:, None] * su,
+        model.frequency_response_std(OMEGA),
+        rtol=1e-4,
+    )
+
+
+def test_more_data_shrink_the_standard_deviation_as_one_over_root_n():
+    stds = []
+    for n_samples in (2_000, 80_000):  # the longer one is averaged over a part
+        model = SubspaceLTI(2, horizon=10).fit(*experiment(0, n_samples))
+        stds.append(np.abs(model.frequency_response_std(OMEGA)).mean())
+    assert stds[0] / stds[1] == pytest.approx(np.sqrt(40.0), rel=0.1)
+
+
+def test_covariance_of_an_unrefined_model_is_refused():
+    model = SubspaceLTI(2, horizon=10, refine=False).fit(*experiment(0, 400))
+    with pytest.raises(ValueError, match="needs refine=True"):
+        model.frequency_response_std(OMEGA)
+    assert not hasattr(model, "poles_std_")
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"steps": 0}, "`steps` must be an integer of at least 1. Got 0"),
+        ({"initial_state": "zero"}, "`initial_state` must be 'estimate' or 'rest'"),
+    ],
+)
+def test_wrong_prediction_arguments_are_refused(arguments, message):
+    u, y = experiment(0, 300, pole=0.9)
+    model = SubspaceLTI(2, horizon=10).fit(u, y)
+    with pytest.raises(ValueError, match=message):
+        model.predict_ahead(u, y, **arguments)
+
+
+def test_process_noise_is_predicted_as_well_as_by_the_kalman_filter():
+    A, B, C, _ = second_order()
+    rng = np.random.default_rng(1)
+
+    def simulate(n_samples):
+        u = rng.standard_normal((n_samples, 1))
+        w = 0.5 * rng.standard_normal((n_samples, 2))
+        x = state_trajectory(A, u @ B.T + w)
+        return u, x @ C.T + 0.5 * rng.standard_normal((n_samples, 2))
+
+    model = SubspaceLTI(2, horizon=15, n_noise_states=2).fit(*simulate(10_000))
+    u, y = simulate(10_000)
+    P = solve_discrete_are(A.T, C.T, 0.25 * np.eye(2), 0.25 * np.eye(2))
+    best = np.sqrt(np.diag(C @ P @ C.T + 0.25 * np.eye(2)))
+    error = (y - model.predict_ahead(u, y)).std(axis=0)
+    np.testing.assert_allclose(error, best, rtol=0.03)
+    assert (error < 0.7 * (y - model.predict(u)).std(axis=0)).all()

@@ -1,0 +1,188 @@
+"""Frequency responses against independent formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+
+from lpvlearn.systems.response import FrequencyEngine, balanced, frequency_response
+from lpvlearn.systems.singular_values import sigma_max, square_derivatives, square_jet
+
+Matrices = tuple[NDArray, NDArray, NDArray, NDArray]
+
+
+def random_system(
+    n: int = 7, n_inputs: int = 2, n_outputs: int = 3, seed: int = 0
+) -> Matrices:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n))
+    A -= (np.linalg.eigvals(A).real.max() + 0.2) * np.eye(n)
+    return (
+        A,
+        rng.standard_normal((n, n_inputs)),
+        rng.standard_normal((n_outputs, n)),
+        rng.standard_normal((n_outputs, n_inputs)),
+    )
+
+
+def jordan_chain(n: int = 6) -> Matrices:
+    """1 / (s + 1)**n: the eigenvectors are all one."""
+    A = -np.eye(n) + np.eye(n, k=-1)
+    return A, np.eye(n)[:, :1], np.eye(n)[-1:], np.zeros((1, 1))
+
+
+def solved_at(system: Matrices, x: complex) -> NDArray:
+    A, B, C, D = system
+    return C @ np.linalg.solve(x * np.eye(len(A)) - A, B.astype(complex)) + D
+
+
+def test_continuous_response_is_the_resolvent_formula() -> None:
+    system = random_system()
+    omega = np.array([0.0, 0.3, 2.0, 50.0])
+    expected = [solved_at(system, 1j * w) for w in omega]
+    assert_allclose(frequency_response(*system, omega), expected, rtol=1e-11)
+
+
+def test_discrete_response_is_evaluated_on_the_unit_circle() -> None:
+    A, B, C, D = random_system()
+    system = (0.1 * A, B, C, D)
+    omega = np.array([0.0, 3.0, np.pi / 0.02])
+    expected = [solved_at(system, np.exp(1j * w * 0.02)) for w in omega]
+    assert_allclose(frequency_response(*system, omega, dt=0.02), expected, rtol=1e-11)
+
+
+def test_infinite_frequency_gives_the_feedthrough() -> None:
+    system = random_system()
+    assert_array_equal(frequency_response(*system, [np.inf])[0], system[3])
+
+
+def test_infinite_frequency_is_refused_in_discrete_time() -> None:
+    with pytest.raises(ValueError, match=r"`omega` must be finite.*pi/dt"):
+        frequency_response(*random_system(), [np.inf], dt=0.1)
+
+
+def test_order_zero_is_the_feedthrough_everywhere() -> None:
+    D = np.array([[1.0, 2.0]])
+    G = frequency_response(
+        np.empty((0, 0)), np.empty((0, 2)), np.empty((1, 0)), D, [0.0, 1.0, np.inf]
+    )
+    assert_array_equal(G, np.tile(D, (3, 1, 1)))
+
+
+def test_response_at_a_pole_on_the_axis_is_infinite() -> None:
+    one = np.ones((1, 1))
+    G = frequency_response(0.0 * one, one, one, one, [0.0, 1.0])
+    assert np.isinf(G[0, 0, 0])
+    assert G[1, 0, 0] == 1.0 - 1.0j
+
+
+def test_roll_off_keeps_its_digits_far_above_the_poles() -> None:
+    """Modal terms cancel to 1e-18 of their size here."""
+    n, omega = 6, 1e3
+    poles = np.arange(1.0, n + 1.0)
+    A = -np.diag(poles) + np.eye(n, k=-1)
+    G = frequency_response(A, np.eye(n)[:, :1], np.eye(n)[-1:], np.zeros((1, 1)), omega)
+    assert_allclose(G[0, 0, 0], 1.0 / np.prod(1j * omega + poles), rtol=1e-12)
+
+
+def test_response_is_accurate_where_eigenvectors_are_useless() -> None:
+    system = jordan_chain()
+    engine = FrequencyEngine(*system)
+    assert not engine.is_modal
+    omega = np.array([0.0, 0.5, 3.0])
+    expected = 1.0 / (1j * omega + 1.0) ** 6
+    assert_allclose(engine.response(omega)[0, 0], expected, rtol=1e-12)
+    assert_allclose(frequency_response(*system, omega)[:, 0, 0], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("system", [random_system(), jordan_chain()])
+def test_derivatives_are_those_of_the_resolvent(
+    system: Matrices, discrete: bool
+) -> None:
+    A, B, C, D = system
+    A = 0.1 * A if discrete else A
+    engine = FrequencyEngine(A, B, C, D, discrete=discrete)
+    for w in (0.0, 0.4, 3.0):
+        x = np.exp(1j * w) if discrete else 1j * w
+        R = np.linalg.inv(x * np.eye(len(A)) - A)
+        x1, x2 = (1j * x, -x) if discrete else (1j, 0.0)
+        slope = -C @ R @ R @ B * x1
+        bend = 2.0 * C @ R @ R @ R @ B * x1**2 - C @ R @ R @ B * x2
+        G, G1, G2 = (M[:, :, 0] for M in engine.derivatives(np.array([w])))
+        assert_allclose(G, C @ R @ B + D, atol=1e-11 * abs(G).max())
+        assert_allclose(G1, slope, atol=1e-11 * abs(slope).max())
+        assert_allclose(G2, bend, atol=1e-11 * abs(bend).max())
+        solved = engine.solved(np.array([w]))
+        assert_allclose(solved[:, :, 0], G, atol=1e-11 * abs(G).max())
+        jets = [engine.jet(w)] + ([engine.modal_jet(w)] if engine.is_modal else [])
+        for jet in jets:
+            for found, expected in zip(jet, (G, slope, bend), strict=True):
+                assert_allclose(found, expected, atol=1e-11 * abs(expected).max())
+
+
+def test_fast_sampling_loses_no_digits() -> None:
+    """One step of 1e-9 s of a lag of 1 s: all of A is in its last digits."""
+    step = 2.0**-30
+    A, B = np.array([[1.0 - step]]), np.array([[step]])
+    one, zero = np.ones((1, 1)), np.zeros((1, 1))
+    G = frequency_response(A, B, one, zero, [0.0, 1.0], dt=step)[:, 0, 0]
+    assert_allclose(G[0], 1.0, rtol=1e-14)
+    assert_allclose(G[1], 1.0 / (1.0 + 1.0j), rtol=2.0 * step)
+
+
+def test_solves_are_refined_at_a_nearly_undamped_mode() -> None:
+    """The exact gain at resonance, in coordinates that mix slow and fast."""
+    w, z, fast = 2.0**-6, 2.0**-24, 64.0
+    A = np.zeros((3, 3))
+    A[:2, :2] = [[0.0, w], [-w, -2.0 * z * w]]
+    A[2, 2] = -fast
+    B, C = np.array([[0.0], [w], [0.0]]), np.array([[2.0 * z, 0.0, 0.0]])
+    mix = np.eye(3) + np.array([[0, 0, 1], [0, 0, 0], [0, 0, 0]])
+    back = 2.0 * np.eye(3) - mix
+    engine = FrequencyEngine(mix @ A @ back, mix @ B, C @ back, np.zeros((1, 1)))
+    G = engine.solved(np.array([w]))[0, 0, 0]
+    assert_allclose(G, -1j, rtol=1e-8)
+    assert_allclose(engine.jet(w)[0], [[-1j]], rtol=1e-8)
+
+
+def test_balancing_leaves_the_response_alone() -> None:
+    A, B, C, D = random_system()
+    s = 2.0 ** np.arange(-12, 16, 4)
+    scaled = A * s / s[:, None], B / s[:, None], C * s
+    Ab, Bb, Cb = balanced(*scaled)
+    assert np.abs(Ab).max() < 1e2 * np.abs(A).max()
+    for w in (0.0, 1.0):
+        assert_allclose(
+            solved_at((Ab, Bb, Cb, D), 1j * w), solved_at((A, B, C, D), 1j * w)
+        )
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 3), (2, 2), (3, 2), (2, 4), (4, 3)])
+def test_derivatives_of_the_singular_value_match_differences(
+    shape: tuple[int, int],
+) -> None:
+    system = random_system(6, shape[1], shape[0], seed=3)
+    engine = FrequencyEngine(*system)
+    w, h = np.array([0.2, 0.7, 1.9, 5.0]), 1e-3
+    value, slope, bend = square_derivatives(*engine.derivatives(w))
+    steps = np.arange(-3, 4) * h
+    f = np.array([sigma_max(engine.response(w + step)) ** 2 for step in steps])
+    first = np.array([-1, 9, -45, 0, 45, -9, 1]) / (60.0 * h)
+    second = np.array([2, -27, 270, -490, 270, -27, 2]) / (180.0 * h * h)
+    for k, at in enumerate(w):
+        jet = square_jet(*engine.jet(at))
+        assert_allclose(jet, [value[k], slope[k], bend[k]], rtol=1e-9, atol=1e-12)
+    assert_allclose(value, f[3], rtol=1e-13)
+    assert_allclose(slope, first @ f, rtol=1e-6, atol=1e-8 * f.max())
+    assert_allclose(bend, second @ f, rtol=1e-6, atol=1e-6 * f.max())
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 1), (2, 2), (2, 5), (4, 4)])
+def test_largest_singular_value_equals_the_svd(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(0)
+    G = rng.standard_normal((*shape, 9)) + 1j * rng.standard_normal((*shape, 9))
+    expected = np.linalg.svd(G.transpose(2, 0, 1), compute_uv=False)[:, 0]
+    assert_allclose(sigma_max(G), expected, rtol=1e-13)
