@@ -73,6 +73,23 @@ def whole_number(name: str, value: Any, low: int, high: int | None = None) -> in
     return int(value)
 
 
+def one_of(name: str, value: Any, allowed: Sequence[Any]) -> None:
+    """Refuse a `value` that is none of the `allowed` options, naming them.
+
+    Examples
+    --------
+    >>> one_of("norm", "h3", ("hinf", "h2"))
+    Traceback (most recent call last):
+        ...
+    ValueError: `norm` must be 'hinf' or 'h2'. Got 'h3'.
+    """
+    if any(value is v or (isinstance(value, str) and value == v) for v in allowed):
+        return
+    listed = [repr(option) for option in allowed]
+    last = f"{', '.join(listed[:-1])} or " if len(listed) > 1 else ""
+    raise ValueError(f"`{name}` must be {last}{listed[-1]}. Got {value!r}.")
+
+
 def input_samples(u: ArrayLike, n_inputs: int) -> Array:
     """`u` as a finite array of shape (n_samples, n_inputs), or a ValueError."""
     u = real_array("u", u)

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.linalg import block_diag
 
 from lpvlearn import (
     GrayBoxRestructurer,
@@ -10,10 +11,48 @@ from lpvlearn import (
     LocalLPVPipeline,
     LPVStateSpace,
     PolynomialLPV,
+    StateSpace,
 )
 
 ROLES = {"scheduling": "kappa", "experiment": "run", "time": "time"}
 KAPPA = (0.0, 0.5, 1.0, 1.5)
+
+
+def modes(*poles):
+    """Real block-diagonal matrix with the given poles, one of each complex pair."""
+    return block_diag(
+        *(
+            [[p.real, p.imag], [-p.imag, p.real]] if np.imag(p) else [[np.real(p)]]
+            for p in poles
+        )
+    )
+
+
+def stable_model(
+    seed,
+    order=4,
+    n_inputs=2,
+    n_outputs=2,
+    *,
+    sampling_time=None,
+    feedthrough=False,
+    decay=0.3,
+):
+    """A random stable model; `seed` may be a Generator that goes on.
+
+    The slowest mode of a continuous model decays at the rate `decay`; with a
+    `sampling_time` the spectral radius is 0.9.
+    """
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(order, order))
+    poles = np.linalg.eigvals(A)
+    if sampling_time is None:
+        A = A - (poles.real.max(initial=0.0) + decay) * np.eye(order)
+    else:
+        A = 0.9 * A / np.abs(poles).max(initial=1e-3)
+    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
+    D = rng.normal(size=(n_outputs, n_inputs)) if feedthrough else None
+    return StateSpace(A, B, C, D, sampling_time)
 
 
 def spring_structure():

@@ -278,6 +278,8 @@ def compare_models(
         if name not in allowed:
             raise ValueError(f"a role must be one of {allowed}. Got {name!r}.")
     known = _roles_of(models.values()) | roles
+    if known.get("time") is not None and "sampling_time" not in roles:
+        known["sampling_time"] = None  # every experiment tells its own
     parts = []
     for name, model in models.items():
         if isinstance(model, (LPVStateSpace, StateSpace)):

@@ -118,7 +118,7 @@ class TableSimulator(BaseEstimator):
     def __init__(
         self,
         model: Any,
-        sampling_time: float = 1.0,
+        sampling_time: float | None = None,
         inputs: Any = None,
         scheduling: Any = None,
         experiment: Any = None,
@@ -153,10 +153,10 @@ class TableSimulator(BaseEstimator):
                 "that the LPV model follows. Got None."
             )
         roles = {name: getattr(self, name) for name in ROLES}
-        return read_experiments(self, X, y, **roles)
+        return read_experiments(self, X, y, **roles, sampling_time=self.sampling_time)
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
         simulated = simulate_experiments(
-            self.model, experiments, self.sampling_time, estimate=estimate
+            self.model, experiments, self.sampling_time or 1.0, estimate=estimate
         )
         return in_table_order(experiments, simulated)

@@ -363,7 +363,7 @@ list, default=None
             return float(np.median(steps))
         if self.sampling_time is not None:
             return positive_time("sampling_time", self.sampling_time)
-        return float(getattr(self.local, "sampling_time", 1.0))
+        return float(getattr(self.local, "sampling_time", None) or 1.0)
 
     def _runner(self) -> PointRunner:
         steps = {"local": self.local, "restructurer": self.restructurer}

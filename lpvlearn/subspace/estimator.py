@@ -57,9 +57,9 @@ class SubspaceLTI(
         Past and future horizon in samples. "auto" tries a geometric grid and takes
         one whose model simulates the data as well as any. Of more than 12,000
         samples "auto" looks at that many, spread over the experiments.
-    sampling_time : float, default=1.0
-        Seconds between samples. With a `time` column the default stands for the
-        column's own step; any other value must agree with it.
+    sampling_time : float, default=None
+        Seconds between samples, which must agree with the `time` column. None: the
+        step of that column; without one, 1 s.
     feedthrough : bool or array-like of bool, default=True
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
         shape (n_outputs, n_inputs) single entries of D.
@@ -170,7 +170,7 @@ class SubspaceLTI(
         *,
         method: str = "po-moesp",
         horizon: int | str = "auto",
-        sampling_time: float = 1.0,
+        sampling_time: float | None = None,
         feedthrough: Any = True,
         refine: bool = True,
         stability: str = "warn",
@@ -282,7 +282,8 @@ class SubspaceLTI(
 
     def _set_step(self, experiments: Sequence[Experiment]) -> None:
         step = next((e.sampling_time for e in experiments if e.sampling_time), None)
-        self._step = float(self.sampling_time) if step is None else step
+        given = 1.0 if self.sampling_time is None else float(self.sampling_time)
+        self._step = given if step is None else step
 
     def predict(self, X: Any) -> Array:
         """Simulate the outputs of every experiment from rest.
@@ -347,7 +348,6 @@ class SubspaceLTI(
     def _read(
         self, X: Any, y: Any, *, reset: bool, split: bool = True
     ) -> tuple[list[Experiment], int]:
-        declared = self.sampling_time if self.sampling_time != 1.0 else None
         # A simulation needs every input; gaps are for what has outputs beside them.
         gaps = self.missing == "split" and y is not None
         experiments = read_experiments(
@@ -359,7 +359,7 @@ class SubspaceLTI(
             experiment=self.experiment,
             time=self.time,
             operating_point=self.operating_point,
-            sampling_time=declared,
+            sampling_time=self.sampling_time,
             reset=reset,
             allow_missing=gaps,
         )

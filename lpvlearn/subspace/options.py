@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..data.preparation import DETRENDS, Pairs
 from ..exceptions import RankWarning
+from ..validation import positive_time
 from .identification import Identified, max_horizon, max_order
 from .realization import METHODS
 from .selection import Candidate, Selection
@@ -114,11 +115,8 @@ def check_options(estimator: Any) -> Choices:
             if len(values) > 3:
                 listed = "one of " + ", ".join(str(v) for v in values)
             raise ValueError(f"`{name}` must be {listed}. Got {value!r}.")
-    if not estimator.sampling_time > 0.0:
-        raise ValueError(
-            "`sampling_time` must be a positive number of seconds. Got "
-            f"{estimator.sampling_time}."
-        )
+    if estimator.sampling_time is not None:
+        positive_time("sampling_time", estimator.sampling_time)
     if estimator.initial_state == "rest" and estimator.missing == "split":
         raise ValueError(
             "`initial_state` must be 'estimate' with missing='split': what follows a "

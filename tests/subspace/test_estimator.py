@@ -303,3 +303,19 @@ def test_clone_and_refit_give_the_same_model(table):
     model = SubspaceLTI(2, horizon=6, **ROLES)
     first = model.fit(X, y).predict(X)
     np.testing.assert_array_equal(clone(model).fit(X, y).predict(X), first)
+
+
+@pytest.mark.parametrize("given", [1.0, 1, 0.2])
+def test_a_sampling_time_beside_a_time_column_must_agree_with_it(given):
+    u = np.random.default_rng(0).standard_normal(100)
+    X = pd.DataFrame({"u": u, "time": 0.1 * np.arange(100)})
+    with pytest.raises(ValueError, match="`sampling_time` must be the step of the"):
+        SubspaceLTI(1, time="time", sampling_time=given).fit(X, np.roll(u, 1))
+    for agreed in (0.1, None):
+        model = SubspaceLTI(1, time="time", sampling_time=agreed)
+        assert model.fit(X, np.roll(u, 1)).lti_.sampling_time == pytest.approx(0.1)
+
+
+def test_without_any_sampling_time_a_sample_lasts_a_second():
+    u = np.random.default_rng(0).standard_normal((100, 1))
+    assert SubspaceLTI(1).fit(u, np.roll(u, 1)).lti_.sampling_time == 1.0
