@@ -7,11 +7,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import pandas as pd
+import joblib
 
-from .paper.experiment import PaperExperiment, Stopwatch, run_paper_experiment
-from .paper.figures import save_figures
-from .paper.text import tables_text
+from .paper import run_paper_experiment, save_figures, tables_text
+
+_MAX_JOBS = 7  # one for each operating point of the paper
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -65,15 +65,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.degree,
         method=options.method,
         random_state=options.seed,
-        n_jobs=options.jobs or min(7, _cores()),
+        n_jobs=options.jobs or min(_MAX_JOBS, joblib.cpu_count()),
         verbose=1,
     )
-    watch = Stopwatch()
-    with watch.step("figures"):
-        figures = _without_windows(experiment, options.output)
-    tables = experiment.tables | {
-        "timing": with_step(experiment.tables["timing"], watch.seconds)
-    }
+    with experiment.watch.step("figures"):
+        import matplotlib
+
+        matplotlib.use("agg")  # there may be no screen
+        figures = save_figures(experiment, options.output)
+    tables = experiment.tables | {"timing": experiment.watch.table()}
     for name, table in tables.items():
         table.to_csv(options.output / f"{name}.csv", index=False)
     print(tables_text(experiment, tables))
@@ -89,32 +89,6 @@ def _positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1. Got {value}.")
     return value
-
-
-def _cores() -> int:
-    import joblib
-
-    return int(joblib.cpu_count())
-
-
-def _without_windows(experiment: PaperExperiment, directory: Path) -> list[Path]:
-    """The figures, drawn where there may be no screen."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    return save_figures(experiment, directory)
-
-
-def with_step(timing: pd.DataFrame, seconds: dict[str, float]) -> pd.DataFrame:
-    """The table of step times with further steps before the total."""
-    steps = timing[timing["step"] != "total"]
-    more = pd.DataFrame(list(seconds.items()), columns=["step", "seconds"])
-    rows = pd.concat([steps, more], ignore_index=True)
-    total = pd.DataFrame([("total", rows["seconds"].sum())], columns=rows.columns)
-    return pd.concat([rows, total], ignore_index=True)
-
-
-# -- the printed report ----------------------------------------------------------------
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ instead of one hundred. The full size is one command, ``python -m lpvlearn``.
 # Everything in one call. The result holds the data, the fitted pipeline, the LPV models
 # and the tables.
 
-from lpvlearn.paper.experiment import run_paper_experiment
+from lpvlearn.paper import run_paper_experiment
 
 experiment = run_paper_experiment(n_realizations=2, degree=2, random_state=0)
 
@@ -21,7 +21,7 @@ experiment = run_paper_experiment(n_realizations=2, degree=2, random_state=0)
 # calibrated so that the *analytic* rows come out near the paper's. Compare the
 # differences between the models, not single figures.
 
-from lpvlearn.paper.text import tables_text
+from lpvlearn.paper import tables_text
 
 print(tables_text(experiment))
 
@@ -30,7 +30,7 @@ print(tables_text(experiment))
 # nearly stretched, beside the linearised equations and an arm with rigid links (Fig.
 # 4).
 
-from lpvlearn.paper.figures import draw_balanced, draw_bode, draw_parameters
+from lpvlearn.paper import draw_balanced, draw_bode, draw_parameters
 
 figure, title = draw_bode(experiment)
 

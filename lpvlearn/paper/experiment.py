@@ -6,10 +6,7 @@ realizations, local models, restructuring, interpolation, and validation on a sw
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,13 +14,16 @@ import pandas as pd
 from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
-from ..datasets.generator import make_flexible_arm
-from ..lpv.model import LPVStateSpace
-from ..lpv.polynomial import PolynomialLPV
-from ..pipeline.estimator import LocalLPVPipeline
+from .. import (
+    GrayBoxRestructurer,
+    LocalLPVPipeline,
+    LPVStateSpace,
+    PolynomialLPV,
+    SubspaceLTI,
+)
+from ..datasets import make_flexible_arm
+from ..pipeline.runner import Stopwatch
 from ..pipeline.structured_models import balanced_entries
-from ..restructuring.estimator import GrayBoxRestructurer
-from ..subspace.estimator import SubspaceLTI
 from .tables import (
     ParameterSet,
     interpolation_table,
@@ -33,26 +33,6 @@ from .tables import (
 )
 
 Array = NDArray[np.float64]
-
-
-@dataclass
-class Stopwatch:
-    """Wall-clock time of each step, in the order of the steps."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        """Add the time that the block takes to the step."""
-        start = time.perf_counter()
-        yield
-        elapsed = time.perf_counter() - start
-        self.seconds[name] = self.seconds.get(name, 0.0) + elapsed
-
-    def table(self) -> pd.DataFrame:
-        """Columns step and seconds, with the total."""
-        rows = [*self.seconds.items(), ("total", sum(self.seconds.values()))]
-        return pd.DataFrame(rows, columns=["step", "seconds"])
 
 
 @dataclass(frozen=True)
@@ -79,6 +59,8 @@ class PaperExperiment:
         Noise realizations at each operating point.
     method, other_method : str
         Subspace methods of `pipeline` and `comparison`.
+    watch : Stopwatch
+        Seconds of the steps; times of further steps (figures) are added to it.
     """
 
     data: Bunch
@@ -91,6 +73,7 @@ class PaperExperiment:
     n_realizations: int
     method: str
     other_method: str
+    watch: Stopwatch
 
 
 def run_paper_experiment(
@@ -140,8 +123,7 @@ def run_paper_experiment(
         PolynomialLPV(degree),
         **roles,
     ).fit(data.X, data.y)
-    for name, seconds in pipeline.step_times_.items():
-        watch.seconds[name] = seconds
+    watch.seconds |= pipeline.step_times_
     other = "pi-moesp" if method == "po-moesp" else "po-moesp"
     with watch.step(f"local models by {other}, for comparison"):
         comparison = LocalLPVPipeline(
@@ -155,11 +137,14 @@ def run_paper_experiment(
             "restructured": ParameterSet(
                 data.structure, pipeline.parameters_.to_numpy()
             ),
-            "analytic": ParameterSet(data.structure, true_parameters(data, kappa)),
+            "analytic": ParameterSet(
+                data.structure,
+                np.array([data.arm.parameters(np.arccos(k)) for k in kappa[:, 0]]),
+            ),
             "balanced": ParameterSet(*balanced_entries(pipeline.local_models_)),
         }
         lpv = {
-            name: interpolated(found, kappa, degree)
+            name: _interpolated(found, kappa, degree)
             for name, found in parameters.items()
         }
         tables = {
@@ -181,15 +166,11 @@ def run_paper_experiment(
         n_realizations,
         method,
         other,
+        watch,
     )
 
 
-def true_parameters(data: Bunch, kappa: Array) -> Array:
-    """Parameters of the linearised arm at the operating points."""
-    return np.array([data.arm.parameters(np.arccos(k)) for k in kappa[:, 0]])
-
-
-def interpolated(found: ParameterSet, kappa: Array, degree: int) -> LPVStateSpace:
+def _interpolated(found: ParameterSet, kappa: Array, degree: int) -> LPVStateSpace:
     """The LPV model through parameters at the operating points, Eq. (35)."""
     interpolator = PolynomialLPV(degree).fit(kappa, found.theta)
     return LPVStateSpace(

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..inspection.bode import BodeDisplay
+from .. import PolynomialLPV
+from ..inspection import BodeDisplay, ParameterDisplay, SimulationDisplay
 from ..inspection.drawing import axes_grid, figure_legend, tidy
-from ..inspection.parameters import ParameterDisplay
-from ..inspection.simulation import SimulationDisplay
-from ..lpv.polynomial import PolynomialLPV
 from .experiment import PaperExperiment
 from .tables import local_experiments, nearest_model, simulate_sweep
 

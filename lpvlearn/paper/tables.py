@@ -10,12 +10,16 @@ import pandas as pd
 from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
-from ..lpv.model import LPVStateSpace
-from ..lpv.polynomial import PolynomialLPV
-from ..metrics.scores import bft_score, parameter_fit, vaf_score
-from ..models.statespace import StateSpace
-from ..pipeline.estimator import LocalLPVPipeline
-from ..structures.structure import GrayBoxStructure
+from .. import (
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    LPVStateSpace,
+    PolynomialLPV,
+    StateSpace,
+    bft_score,
+    parameter_fit,
+    vaf_score,
+)
 
 Array = NDArray[np.float64]
 

@@ -28,7 +28,7 @@ from .reports import (
     parameter_tables,
     summarise,
 )
-from .runner import Laps, PointRunner, check_steps, checked_memory
+from .runner import PointRunner, Stopwatch, check_steps, checked_memory
 from .structured_models import restructure_points
 
 Array = NDArray[np.float64]
@@ -231,55 +231,59 @@ list, default=None
             an operating point (which the message names).
         """
         self._check_options()
-        runner, laps = self._runner(), Laps()
-        experiments = self._read(X, y, reset=True)
-        self.output_names_ = read_outputs(y)[1]
-        self.n_outputs_ = len(self.output_names_)
-        self._single_output = np.asarray(y).ndim == 1
-        check_outputs(experiments, self.output_names_)
-        self.sampling_time_ = self._sampling_time(experiments)
-
-        # Steps 1 and 2: local experiments, in groups by operating point
-        points = local_experiments(experiments, self.scheduling_tol)
-        laps.mark("reading of the table")
-
-        # Step 3: a black-box model at every operating point
+        runner, watch = self._runner(), Stopwatch()
         restructurer = self._restructurer()
-        local, points = identify_points(
-            SubspaceLTI() if self.local is None else self.local,
-            points,
-            runner,
-            structure=getattr(restructurer, "structure", None),
-            sampling_time=self.sampling_time_,
-            combine=self.combine,
-            discretization=self.discretization,
-        )
-        laps.mark("local models")
 
-        # Step 4: all of them in one structure
-        structured = restructure_points(restructurer, local, points.kappa, runner)
-        local = [local[k] for k in structured.kept]
-        points = points.keep(structured.kept)
-        self.local_models_ = [model.lti for model in local]
-        self.structured_models_ = structured.models
-        self.restructurers_ = structured.restructurers
-        laps.mark("restructuring")
+        with watch.step("reading of the table"):  # steps 1 and 2, and their groups
+            experiments = self._read(X, y, reset=True)
+            self.output_names_ = read_outputs(y)[1]
+            self.n_outputs_ = len(self.output_names_)
+            self._single_output = np.asarray(y).ndim == 1
+            check_outputs(experiments, self.output_names_)
+            self.sampling_time_ = self._sampling_time(experiments)
+            points = local_experiments(experiments, self.scheduling_tol)
 
-        # Step 5: the parameters as functions of the scheduling variables
-        theta, kappa = structured.theta, points.kappa
-        self.interpolator_ = self._interpolator(len(points)).fit(kappa, theta)
-        self.lpv_ = LPVStateSpace(structured.structure, self.interpolator_, points.span)
-        self.operating_points_ = kappa
-        self.scheduling_range_ = points.identified_range
-        self.scheduling_names_ = as_list(self.scheduling)
-        self.parameters_, self.parameters_std_ = parameter_tables(structured, kappa)
-        found = (points, local, structured, self.parameters_std_, self.lpv_)
-        self.report_ = operating_point_report(*found, self.sampling_time_)
-        self.parameter_report_ = parameter_report(
-            self.parameters_, self.parameters_std_, self.lpv_.parameters(kappa)
-        )
-        laps.mark("interpolation and report")
-        self.step_times_ = laps.seconds
+        with watch.step("local models"):  # step 3: a black box at every point
+            local, points = identify_points(
+                SubspaceLTI() if self.local is None else self.local,
+                points,
+                runner,
+                structure=getattr(restructurer, "structure", None),
+                sampling_time=self.sampling_time_,
+                combine=self.combine,
+                discretization=self.discretization,
+            )
+
+        with watch.step("restructuring"):  # step 4: all of them in one structure
+            structured = restructure_points(restructurer, local, points.kappa, runner)
+            local = [local[k] for k in structured.kept]
+            points = points.keep(structured.kept)
+            self.local_models_ = [model.lti for model in local]
+            self.structured_models_ = structured.models
+            self.restructurers_ = structured.restructurers
+
+        with watch.step("interpolation and report"):  # step 5: parameters over kappa
+            theta, kappa = structured.theta, points.kappa
+            self.interpolator_ = self._interpolator(len(points)).fit(kappa, theta)
+            self.lpv_ = LPVStateSpace(
+                structured.structure, self.interpolator_, points.span
+            )
+            self.operating_points_ = kappa
+            self.scheduling_range_ = points.identified_range
+            self.scheduling_names_ = as_list(self.scheduling)
+            self.parameters_, self.parameters_std_ = parameter_tables(structured, kappa)
+            self.report_ = operating_point_report(
+                points,
+                local,
+                structured,
+                self.parameters_std_,
+                self.lpv_,
+                self.sampling_time_,
+            )
+            self.parameter_report_ = parameter_report(
+                self.parameters_, self.parameters_std_, self.lpv_.parameters(kappa)
+            )
+        self.step_times_ = watch.seconds
         return self
 
     # -- use -----------------------------------------------------------------------

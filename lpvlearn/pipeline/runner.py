@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import pickle
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import cache
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from joblib import Memory, Parallel, delayed, hash
 from numpy.typing import NDArray
 from sklearn.utils.validation import check_memory
@@ -186,18 +188,23 @@ def checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
     return memory
 
 
-class Laps:
-    """Seconds between successive marks."""
+@dataclass
+class Stopwatch:
+    """Wall-clock seconds of each step, in the order of the steps."""
 
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = perf_counter()
+    seconds: dict[str, float] = field(default_factory=dict)
 
-    def mark(self, name: str) -> None:
-        """End a lap."""
-        now = perf_counter()
-        self.seconds[name] = now - self._last
-        self._last = now
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Add the time that the block takes to the step."""
+        start = perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + perf_counter() - start
+
+    def table(self) -> pd.DataFrame:
+        """Columns step and seconds, with the total."""
+        rows = [*self.seconds.items(), ("total", sum(self.seconds.values()))]
+        return pd.DataFrame(rows, columns=["step", "seconds"])
 
 
 def _as_text(memory: Any) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lpvlearn.__main__ import main, with_step
+from lpvlearn.__main__ import main
 from lpvlearn.paper.tables import TABLE_1, TABLE_2
 from lpvlearn.paper.text import aligned_text
 
@@ -112,13 +112,6 @@ def test_total_time_is_the_sum_of_the_steps(results: Path) -> None:
     seconds = read(results, "timing").set_index("step")["seconds"]
     assert seconds["total"] == pytest.approx(seconds.drop("total").sum())
     assert {"local models", "restructuring", "figures"} <= set(seconds.index)
-
-
-def test_further_steps_stand_before_the_total() -> None:
-    timing = pd.DataFrame([("a", 1.0), ("total", 1.0)], columns=["step", "seconds"])
-    longer = with_step(timing, {"b": 2.0})
-    assert longer["step"].tolist() == ["a", "b", "total"]
-    assert longer["seconds"].tolist() == [1.0, 2.0, 3.0]
 
 
 def test_printed_columns_are_aligned() -> None:
