@@ -13,18 +13,18 @@ from ..data.columns import ROLES, Table, is_table
 from ..data.experiments import read_outputs
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
+from ..validation import one_of
 from .scorers import (
     InitialState,
-    _check_options,
-    _drop_start,
-    _owner_of_experiments,
-    _simulate,
-    _split,
-    _unwrap,
-    simulator_in,
+    check_options,
+    drop_start,
+    owner_of_experiments,
+    simulate,
+    split,
+    unwrap,
 )
 from .scores import bft_score, r2_ratio, vaf_score
-from .simulation import TableSimulator
+from .table_simulation import TableSimulator
 
 
 def fit_report(
@@ -73,44 +73,40 @@ def fit_report(
        experiment operating_point output     BFT     VAF   RMSE     R2
     0           0            None     y1  53.709  85.714  0.577  0.786
     """
-    _check_options(initial_state, burn_in)
-    simulator, X = _unwrap(estimator, X)
+    check_options(initial_state, burn_in)
+    simulator, X = unwrap(estimator, X)
     Y, names = read_outputs(y)
-    Y_pred = _simulate(simulator, X, y, initial_state)
+    Y_pred = simulate(simulator, X, y, initial_state)
     groups = [np.arange(len(Y))]
     labels: list[tuple[Hashable, Hashable]] = [(0, None)]
-    if burn_in or _owner_of_experiments(simulator) is not None:
-        groups = _split(simulator, X)
-        labels = _labels(simulator, X, groups)
-    table = []
+    if burn_in or owner_of_experiments(simulator) is not None:
+        groups = split(simulator, X)
+        roles = owner_of_experiments(simulator).get_params(deep=False)
+        labels = _labels(roles, X, groups)
+    parts = []
     for rows, (experiment, operating_point) in zip(
-        _drop_start(groups, burn_in), labels, strict=True
+        drop_start(groups, burn_in), labels, strict=True
     ):
         true, pred = Y[rows], Y_pred[rows]
-        bft = bft_score(true, pred, multioutput="raw_values")
-        vaf = vaf_score(true, pred, multioutput="raw_values")
-        rmse = np.sqrt(np.mean((true - pred) ** 2, axis=0))
-        r2 = r2_ratio(true, pred)
-        for k, name in enumerate(names):
-            table.append(
-                {
-                    "experiment": experiment,
-                    "operating_point": operating_point,
-                    "output": name,
-                    "BFT": float(bft[k]),
-                    "VAF": float(vaf[k]),
-                    "RMSE": float(rmse[k]),
-                    "R2": float(r2[k]),
-                }
-            )
-    return pd.DataFrame(table)
+        columns = {
+            "output": names,
+            "BFT": bft_score(true, pred, multioutput="raw_values"),
+            "VAF": vaf_score(true, pred, multioutput="raw_values"),
+            "RMSE": np.sqrt(np.mean((true - pred) ** 2, axis=0)),
+            "R2": r2_ratio(true, pred),
+        }
+        parts += [
+            {"experiment": experiment, "operating_point": operating_point}
+            | {column: values[k] for column, values in columns.items()}
+            for k in range(len(names))
+        ]
+    return pd.DataFrame(parts)
 
 
 def _labels(
-    estimator: Any, X: Any, groups: Sequence[NDArray[np.intp]]
+    roles: Mapping[str, Any], X: Any, groups: Sequence[NDArray[np.intp]]
 ) -> list[tuple[Hashable, Hashable]]:
-    """Return the experiment's and operating point's label for each group of rows."""
-    roles = _owner_of_experiments(estimator).get_params(deep=False)
+    """The experiment's and operating point's label for each group of rows."""
     table = Table(X if is_table(X) else np.asarray(X, dtype=object))
     label = table.one(roles.get("experiment"), "experiment")
     point = table.one(roles.get("operating_point"), "operating_point")
@@ -127,6 +123,8 @@ def _labels(
         points = [mean if len(mean) > 1 else mean[0] for mean in means]
     return list(zip(names, points, strict=True))
 
+
+_DIGITS = "{:.4g}"  # of numbers without a format of their own
 
 # Heading and format of the columns of the reports, for people.
 _READABLE = {
@@ -156,9 +154,6 @@ _READABLE = {
     "highest": ("highest", "{:.4g}"),
     "std": ("std", "{:.2g}"),
 }
-
-# Share of the black box's norm below which a floor is none.
-_NO_FLOOR = 1e-8
 
 
 def readable_report(report: pd.DataFrame) -> pd.DataFrame:
@@ -192,31 +187,26 @@ def readable_report(report: pd.DataFrame) -> pd.DataFrame:
     """
     headings, columns = [], []
     for name, column in report.items():
-        heading, style = _READABLE.get(str(name), (str(name), "{:.4g}"))
+        heading, style = _READABLE.get(str(name), (str(name), _DIGITS))
         heading = heading.removeprefix("param_").replace("std_", "std ", 1)
         headings.append(heading)
-        columns.append([_as_shown(value, style) for value in column])
-    index = pd.Index([_as_shown(value, "{:.4g}") for value in report.index])
+        columns.append([as_shown(value, style) for value in column])
+    index = pd.Index([as_shown(value) for value in report.index])
     index.name = _READABLE.get(str(report.index.name), (report.index.name,))[0]
     return pd.DataFrame(
         dict(enumerate(columns)), index=index if len(index) else None
     ).set_axis(headings, axis=1)
 
 
-def _as_shown(value: Any, style: str) -> str:
-    if isinstance(value, (bool, str)) or value is None:
-        return "" if value is None else str(value)
+def as_shown(value: Any, style: str = _DIGITS) -> str:
+    """A cell of a report as text; nothing for a value that is not known."""
     if isinstance(value, tuple):
-        return ", ".join(_as_shown(part, "{:.4g}") for part in value)
-    if isinstance(value, (int, np.integer)):
-        return str(value)
+        return ", ".join(as_shown(part) for part in value)
     if isinstance(value, (float, np.floating)):
-        return (
-            ""
-            if np.isnan(value)
-            else ("{:.4g}" if style == "{}" else style).format(value)
-        )
-    return str(value)
+        if np.isnan(value):
+            return ""
+        return (_DIGITS if style == "{}" else style).format(value)
+    return "" if value is None else str(value)
 
 
 def compare_models(
@@ -273,10 +263,8 @@ def compare_models(
             "`models` must be a dict from names to models, not empty. Got "
             f"{type(models).__name__}."
         )
-    allowed = (*ROLES, "sampling_time")
     for name in roles:
-        if name not in allowed:
-            raise ValueError(f"a role must be one of {allowed}. Got {name!r}.")
+        one_of("roles", name, (*ROLES, "sampling_time"))
     known = _roles_of(models.values()) | roles
     if known.get("time") is not None and "sampling_time" not in roles:
         known["sampling_time"] = None  # every experiment tells its own
@@ -301,8 +289,8 @@ def compare_models(
 def _roles_of(models: Any) -> dict[str, Any]:
     """Roles and sampling time of the first estimator that has them."""
     for model in models:
-        owner = simulator_in(model)
-        if hasattr(owner, "split_experiments"):
+        owner = owner_of_experiments(model)
+        if owner is not None:
             roles = {name: getattr(owner, name, None) for name in ROLES}
             step = getattr(owner, "sampling_time_", owner.sampling_time)
             return {**roles, "sampling_time": step}

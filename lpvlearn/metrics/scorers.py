@@ -1,7 +1,4 @@
-"""Scorers and reports of fit for estimators that simulate.
-
-The measures `bft_score`, `vaf_score` and `parameter_fit` are pure functions.
-"""
+"""Scorers of estimators that simulate, and how such an estimator is simulated."""
 
 from __future__ import annotations
 
@@ -10,13 +7,15 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from sklearn.pipeline import Pipeline
+from numpy.typing import NDArray
 
 from ..data.experiments import read_outputs
-from .scores import bft_score, vaf_score
+from ..validation import one_of, whole_number
+from .scores import Multioutput, bft_score, vaf_score
 
 InitialState = Literal["rest", "estimate"]
+
+Average = Literal["pool", "experiment"]
 
 
 @dataclass(frozen=True)
@@ -39,18 +38,18 @@ class TrajectoryScorer:
     initial_state: InitialState = "rest"
     burn_in: int = 0
     multioutput: str | tuple[float, ...] = "uniform_average"
-    average: Literal["pool", "experiment"] = "pool"
+    average: Average = "pool"
 
     def __call__(self, estimator: Any, X: Any, y: Any) -> float | dict[str, float]:
         """Score an estimator's simulation of `X` against `y`."""
         score = bft_score if self.metric == "BFT" else vaf_score
-        simulator, X = _unwrap(estimator, X)
+        simulator, X = unwrap(estimator, X)
         Y, names = read_outputs(y)
-        Y_pred = _simulate(simulator, X, y, self.initial_state)
+        Y_pred = simulate(simulator, X, y, self.initial_state)
         pool = self.average == "pool"
         groups = [np.arange(len(Y))]
         if self.burn_in or not pool:
-            groups = _drop_start(_split(simulator, X), self.burn_in)
+            groups = drop_start(split(simulator, X), self.burn_in)
         if pool:
             groups = [np.concatenate(groups)]
         scores = [
@@ -70,10 +69,8 @@ def make_bft_scorer(
     *,
     initial_state: InitialState = "rest",
     burn_in: int = 0,
-    multioutput: Literal["uniform_average", "raw_values"] | ArrayLike = (
-        "uniform_average"
-    ),
-    average: Literal["pool", "experiment"] = "pool",
+    multioutput: Multioutput = "uniform_average",
+    average: Average = "pool",
 ) -> TrajectoryScorer:
     """Make a scorer of the best fit ratio.
 
@@ -117,10 +114,8 @@ def make_vaf_scorer(
     *,
     initial_state: InitialState = "rest",
     burn_in: int = 0,
-    multioutput: Literal["uniform_average", "raw_values"] | ArrayLike = (
-        "uniform_average"
-    ),
-    average: Literal["pool", "experiment"] = "pool",
+    multioutput: Multioutput = "uniform_average",
+    average: Average = "pool",
 ) -> TrajectoryScorer:
     """Make a scorer of the variance accounted for.
 
@@ -155,48 +150,38 @@ def _make_scorer(
     initial_state: InitialState,
     burn_in: int,
     multioutput: Any,
-    average: Literal["pool", "experiment"],
+    average: Average,
 ) -> TrajectoryScorer:
-    _check_options(initial_state, burn_in)
-    if average not in ("pool", "experiment"):
-        raise ValueError(f"`average` must be 'pool' or 'experiment'. Got {average!r}.")
-    if isinstance(multioutput, str):
-        if multioutput not in ("uniform_average", "raw_values"):
-            raise ValueError(
-                "`multioutput` of a scorer must be 'uniform_average', 'raw_values' or "
-                f"one weight per output. Got {multioutput!r}."
-            )
-    else:
+    check_options(initial_state, burn_in)
+    one_of("average", average, ("pool", "experiment"))
+    if not isinstance(multioutput, str):
         multioutput = tuple(np.asarray(multioutput, dtype=np.float64).tolist())
+    elif multioutput not in ("uniform_average", "raw_values"):
+        raise ValueError(
+            "`multioutput` of a scorer must be 'uniform_average', 'raw_values' or "
+            f"one weight per output. Got {multioutput!r}."
+        )
     return TrajectoryScorer(metric, initial_state, burn_in, multioutput, average)
 
 
-def _check_options(initial_state: str, burn_in: int) -> None:
-    if initial_state not in ("rest", "estimate"):
-        raise ValueError(
-            f"`initial_state` must be 'rest' or 'estimate'. Got {initial_state!r}."
-        )
-    if not isinstance(burn_in, (int, np.integer)) or burn_in < 0:
-        raise ValueError(
-            f"`burn_in` must be a number of samples, an integer >= 0. Got {burn_in!r}."
-        )
+def check_options(initial_state: str, burn_in: int) -> None:
+    """Refuse options that scorers and reports do not know."""
+    one_of("initial_state", initial_state, ("rest", "estimate"))
+    whole_number("burn_in", burn_in, 0)
 
 
-def simulator_in(estimator: Any) -> Any:
-    """Return the estimator within a search, a pipeline or a transformed target."""
-    while True:
-        if hasattr(estimator, "best_estimator_"):
-            estimator = estimator.best_estimator_
-        elif isinstance(estimator, Pipeline):
-            estimator = estimator[-1]
-        elif hasattr(estimator, "regressor_"):
-            estimator = estimator.regressor_
-        else:
-            return estimator
+bft_scorer = make_bft_scorer()
+
+vaf_scorer = make_vaf_scorer()
 
 
-def _unwrap(estimator: Any, X: Any) -> tuple[Any, Any]:
-    """Return the simulating estimator within a search or pipeline, and its input."""
+# -- from an estimator and a table to simulated experiments ----------------------------
+
+
+def unwrap(estimator: Any, X: Any) -> tuple[Any, Any]:
+    """The simulating estimator within a search or pipeline, and its input."""
+    from sklearn.pipeline import Pipeline  # slow to import
+
     while True:
         if hasattr(estimator, "best_estimator_"):
             estimator = estimator.best_estimator_
@@ -207,9 +192,26 @@ def _unwrap(estimator: Any, X: Any) -> tuple[Any, Any]:
             return estimator, X
 
 
-def _simulate(
+def owner_of_experiments(estimator: Any) -> Any:
+    """Who knows the experiments: the estimator, or what it wraps; else None."""
+    from sklearn.pipeline import Pipeline
+
+    while not hasattr(estimator, "split_experiments"):
+        if hasattr(estimator, "best_estimator_"):
+            estimator = estimator.best_estimator_
+        elif isinstance(estimator, Pipeline):
+            estimator = estimator[-1]
+        elif hasattr(estimator, "regressor_"):
+            estimator = estimator.regressor_
+        else:
+            return None
+    return estimator
+
+
+def simulate(
     estimator: Any, X: Any, y: Any, initial_state: InitialState
 ) -> NDArray[np.float64]:
+    """Simulated outputs of a table, one column for each output."""
     if initial_state == "rest":
         return read_outputs(estimator.predict(X))[0]
     if not hasattr(estimator, "predict_with_initial_state"):
@@ -221,17 +223,9 @@ def _simulate(
     return read_outputs(estimator.predict_with_initial_state(X, y))[0]
 
 
-def _owner_of_experiments(estimator: Any) -> Any:
-    """Return who knows the experiments: the estimator, or what it wraps."""
-    for owner in (estimator, getattr(estimator, "regressor_", None)):
-        if hasattr(owner, "split_experiments"):
-            return owner
-    return None
-
-
-def _split(estimator: Any, X: Any) -> list[NDArray[np.intp]]:
-    """Return the rows of each experiment."""
-    owner = _owner_of_experiments(estimator)
+def split(estimator: Any, X: Any) -> list[NDArray[np.intp]]:
+    """Rows of each experiment."""
+    owner = owner_of_experiments(estimator)
     if owner is None:
         raise TypeError(
             "`burn_in` and `average='experiment'` need an estimator with the method "
@@ -241,9 +235,10 @@ def _split(estimator: Any, X: Any) -> list[NDArray[np.intp]]:
     return list(owner.split_experiments(X))
 
 
-def _drop_start(
+def drop_start(
     groups: Sequence[NDArray[np.intp]], burn_in: int
 ) -> list[NDArray[np.intp]]:
+    """Rows of the experiments without their first `burn_in` samples."""
     shortest = min(len(rows) for rows in groups)
     if burn_in >= shortest:
         raise ValueError(
@@ -251,8 +246,3 @@ def _drop_start(
             f"{shortest} in the shortest. Got {burn_in}."
         )
     return [rows[burn_in:] for rows in groups]
-
-
-bft_scorer = make_bft_scorer()
-
-vaf_scorer = make_vaf_scorer()

@@ -53,8 +53,7 @@ def bft_score(
     55.27...
     """
     true, pred = _read_pair(y_true, y_pred)
-    ratio = _fit_ratio(_norm(true - pred), _norm(_centred(true)))
-    return _aggregate(100 * np.maximum(ratio, 0), multioutput)
+    return _percent(_norm(true - pred), _norm(_centred(true)), multioutput)
 
 
 def vaf_score(
@@ -97,8 +96,8 @@ def vaf_score(
     80.0
     """
     true, pred = _read_pair(y_true, y_pred)
-    ratio = _fit_ratio(_norm(_centred(true - pred)) ** 2, _norm(_centred(true)) ** 2)
-    return _aggregate(100 * np.maximum(ratio, 0), multioutput)
+    error, spread = _norm(_centred(true - pred)), _norm(_centred(true))
+    return _percent(error**2, spread**2, multioutput)
 
 
 def parameter_fit(params_true: ArrayLike, params_pred: ArrayLike) -> float:
@@ -211,8 +210,11 @@ def _fit_ratio(
     return np.where(varies, ratio, error == 0)
 
 
-def _aggregate(scores: NDArray[np.float64], multioutput: Multioutput) -> Any:
-    """Average the outputs' scores as asked."""
+def _percent(
+    error: NDArray[np.float64], spread: NDArray[np.float64], multioutput: Multioutput
+) -> Any:
+    """Fit of the outputs in percent, at least 0, averaged as asked."""
+    scores = 100 * np.maximum(_fit_ratio(error, spread), 0)
     if isinstance(multioutput, str):
         if multioutput == "raw_values":
             return scores

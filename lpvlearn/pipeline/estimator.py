@@ -17,10 +17,10 @@ from ..data.preparation import split_at_gaps
 from ..exceptions import ExtrapolationWarning
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
-from ..metrics.simulation import in_table_order, simulate_experiments
+from ..metrics.table_simulation import in_table_order, simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..subspace.estimator import SubspaceLTI
-from ..validation import positive_time
+from ..validation import one_of, positive_time
 from .local_models import identify_points
 from .reports import (
     operating_point_report,
@@ -28,7 +28,7 @@ from .reports import (
     parameter_tables,
     summarise,
 )
-from .runner import PointRunner, Stopwatch, check_steps, checked_memory
+from .runner import PointRunner, Stopwatch, checked_memory
 from .structured_models import restructure_points
 
 Array = NDArray[np.float64]
@@ -39,6 +39,13 @@ _DEFAULTS = {
     "local": SubspaceLTI,
     "restructurer": GrayBoxRestructurer,
     "interpolator": PolynomialLPV,
+}
+
+# Methods that the steps need, an example, and what else is allowed.
+_STEPS = {
+    "local": (("fit",), "SubspaceLTI()", None),
+    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", "passthrough"),
+    "interpolator": (("fit", "predict"), "PolynomialLPV()", None),
 }
 
 
@@ -333,7 +340,17 @@ list, default=None
     def summary(self) -> str:
         """What was identified and how well, as text: ``print(pipeline.summary())``."""
         check_is_fitted(self, "lpv_")
-        return summarise(self)
+        return summarise(
+            self.report_,
+            self.parameter_report_,
+            self.lpv_,
+            self.parameters_,
+            self.parameters_std_,
+            sampling_time=self.sampling_time_,
+            scheduling=self.scheduling_names_,
+            local=_name_of_step(self.local, "local"),
+            restructurer=_name_of_step(self.restructurer, "restructurer"),
+        )
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
         if getattr(self.interpolator_, "extrapolation", None) != "clip":
@@ -352,14 +369,12 @@ list, default=None
 
     def _read(self, X: Any, y: Any, *, reset: bool) -> list[Experiment]:
         roles: dict[str, Any] = {name: getattr(self, name) for name in ROLES}
-        options: dict[str, Any] = {"reset": reset}
+        gaps = reset and getattr(self.local, "missing", None) == "split"
+        options: dict[str, Any] = {"reset": reset, "allow_missing": gaps}
         if reset:
-            gaps = getattr(self.local, "missing", None) == "split"
-            options |= {"sampling_time": self.sampling_time, "allow_missing": gaps}
+            options["sampling_time"] = self.sampling_time
         experiments = read_experiments(self, X, y, **roles, **options)
-        return (
-            split_at_gaps(experiments) if options.get("allow_missing") else experiments
-        )
+        return split_at_gaps(experiments) if gaps else experiments
 
     def _sampling_time(self, experiments: list[Experiment]) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]
@@ -390,16 +405,34 @@ list, default=None
         return clone(self.interpolator)
 
     def _check_options(self) -> None:
-        for name, value, allowed in (
-            ("combine", self.combine, ("pool", "average")),
-            ("discretization", self.discretization, ("zoh", "tustin")),
-            ("on_error", self.on_error, ("raise", "skip")),
-        ):
-            if value not in allowed:
-                raise ValueError(f"`{name}` must be one of {allowed}. Got {value!r}.")
-        check_steps({name: getattr(self, name) for name in _DEFAULTS})
+        one_of("combine", self.combine, ("pool", "average"))
+        one_of("discretization", self.discretization, ("zoh", "tustin"))
+        one_of("on_error", self.on_error, ("raise", "skip"))
+        for name in _STEPS:
+            _check_step(name, getattr(self, name))
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
         tags.regressor_tags.poor_score = True
         return tags
+
+
+def _name_of_step(step: Any, name: str) -> str:
+    return (_DEFAULTS[name] if step is None else type(step)).__name__
+
+
+def _check_step(name: str, step: Any) -> None:
+    """Refuse what cannot be a step of the method, and say what can."""
+    methods, example, other = _STEPS[name]
+    if step is None or (other and isinstance(step, str) and step == other):
+        return
+    got = f"{step!r}" if isinstance(step, str) else type(step).__name__
+    if isinstance(step, type):
+        got = f"the class {step.__name__}, not an instance"
+    elif all(hasattr(step, method) for method in (*methods, "get_params")):
+        return
+    choice = f"an estimator, {other!r} or None" if other else "an estimator or None"
+    raise ValueError(
+        f"`{name}` must be {choice}. Got {got}. Give an instance with the "
+        f"method(s) {', '.join(methods)}, such as {example}."
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -12,8 +11,10 @@ import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import clone
 
+from ..data.columns import ROLES
 from ..data.experiments import Experiment
 from ..data.operating_points import OperatingPoints
+from ..exceptions import warn
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..subspace.statistics import ModelPair, deviated_models
@@ -22,10 +23,9 @@ from .runner import PointRunner
 
 Array = NDArray[np.float64]
 
-# Mean of an output in standard deviations, from which it looks like an offset.
+# Mean of an output in standard deviations, from which it looks like an offset (a record
+# that rises steadily from rest has a mean of 1.7).
 _OFFSET = 5.0
-
-_ROLES = ("inputs", "scheduling", "experiment", "time", "operating_point")
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def identify_point(
     advice = _look_at_outputs(experiments)
     labels = list(dict.fromkeys(e.label for e in experiments))
     if combine == "pool" or len(labels) == 1:
-        fitted = fit_local(local, experiments, sampling_time)
+        fitted = _fit_local(local, experiments, sampling_time)
         lti = _continuous(fitted.lti_, discretization, advice)
         deviated = deviated_models(
             fitted,
@@ -144,14 +144,14 @@ def identify_point(
     # The first realisation chooses order and horizon, the others follow it.
     # A realisation with gaps is several experiments of one label.
     realisations = [[e for e in experiments if e.label == label] for label in labels]
-    fitted = fit_local(local, realisations[0], sampling_time)
+    fitted = _fit_local(local, realisations[0], sampling_time)
     chosen = clone(local)
     for name in ("order", "horizon"):
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
     models, failures = [], []
     for realisation in realisations:
-        model = fit_local(chosen, realisation, sampling_time).lti_
+        model = _fit_local(chosen, realisation, sampling_time).lti_
         try:
             models.append(_continuous(model, discretization, advice))
         except ValueError as error:
@@ -159,19 +159,15 @@ def identify_point(
     if not models:
         raise failures[0][1]
     if failures:
-        warnings.warn(
+        warn(
             f"{len(failures)} of {len(labels)} realisations were left out of the "
-            f"average; the first, {failures[0][0]!r}: {failures[0][1]}",
-            UserWarning,
-            stacklevel=2,
+            f"average; the first, {failures[0][0]!r}: {failures[0][1]}"
         )
     models = [model for model in models if model.order == models[0].order]
-    return LocalModel(
-        average_models(models), fitted.lti_.order, _horizon(fitted), models
-    )
+    return LocalModel(_average(models), fitted.lti_.order, _horizon(fitted), models)
 
 
-def fit_local(
+def _fit_local(
     local: Any, experiments: Sequence[Experiment], sampling_time: float
 ) -> Any:
     """A clone of the local estimator, fitted on the experiments as one table."""
@@ -180,9 +176,8 @@ def fit_local(
     label = np.repeat(np.arange(len(experiments)), [len(e.rows) for e in experiments])
     names = _column_names(experiments[0].input_names, u.shape[1])
     table = pd.DataFrame(np.column_stack([u, label]), columns=names)
-    roles = dict.fromkeys(_ROLES)
     own: dict[str, Any] = {
-        **roles,
+        **dict.fromkeys(ROLES),
         "inputs": names[:-1],
         "experiment": names[-1],
         "sampling_time": sampling_time,
@@ -208,19 +203,18 @@ def _column_names(inputs: Sequence[Hashable], n_inputs: int) -> list[str]:
     return [*names, label]
 
 
-def average_models(models: Sequence[StateSpace]) -> StateSpace:
+def _average(models: Sequence[StateSpace]) -> StateSpace:
     """Average balanced models of one order, state signs aligned to the first."""
-    reference = models[0]
-    total = [np.zeros_like(M) for M in (reference.A, reference.B, reference.C)]
-    D = np.zeros_like(reference.D)
-    for model in models:
-        s = align_signs(model.B, model.C, reference.B, reference.C)
-        total[0] += s[:, None] * model.A * s
-        total[1] += s[:, None] * model.B
-        total[2] += model.C * s
-        D += model.D
-    n = len(models)
-    return StateSpace(total[0] / n, total[1] / n, total[2] / n, D / n)
+    aligned = [with_signs_of(models[0], model) for model in models]
+    return StateSpace(*(np.mean([getattr(m, M) for m in aligned], 0) for M in "ABCD"))
+
+
+def with_signs_of(reference: StateSpace, model: StateSpace) -> StateSpace:
+    """A balanced model with the signs of its states turned to those of another."""
+    s = align_signs(model.B, model.C, reference.B, reference.C)
+    return StateSpace(
+        s[:, None] * model.A * s, s[:, None] * model.B, model.C * s, model.D
+    )
 
 
 def _has_auto_order(local: Any) -> bool:

@@ -1,9 +1,13 @@
-"""One step of the method at every operating point: processes, progress, failures."""
+"""One step of the method at every operating point: processes, progress, failures.
+
+A `PointRunner` applies a function to the points, several at a time; `Remembered` keeps
+its results in a joblib.Memory; a `Stopwatch` tells what each step took.
+"""
 
 from __future__ import annotations
 
+import inspect
 import pickle
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,17 +23,11 @@ from sklearn.utils.validation import check_memory
 from threadpoolctl import ThreadpoolController
 from tqdm import tqdm
 
+from ..exceptions import warn
+
 Array = NDArray[np.float64]
 
-
 _SKIP = " (Mend the experiments there, or leave the point out by on_error='skip'.)"
-
-# Methods that the steps of the pipeline need, an example, and what else is allowed.
-_STEPS = {
-    "local": (("fit",), "SubspaceLTI()", None),
-    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", "passthrough"),
-    "interpolator": (("fit", "predict"), "PolynomialLPV()", None),
-}
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ class PointRunner:
             point, unless another one fails in the same words: the cause is an option
             then.
         """
-        kept = self.memory.cache(function)
+        kept = self.remembered(function)
         stop = self.on_error == "raise"
         tasks = (
             delayed(_attempt)(kept, args, shared, k if stop else None)
@@ -117,40 +115,69 @@ class PointRunner:
                 f"{first.text}"
             ) from first.error
         for k, failure in failures.items():
-            warnings.warn(
-                f"left out {_place(k, kappa)}: {failure.text}",
-                UserWarning,
-                stacklevel=5,
-            )
+            warn(f"left out {_place(k, kappa)}: {failure.text}")
         return [None if isinstance(r, _Failure) else r for r in found]
 
+    def remembered(
+        self, function: Callable[..., Any], *, ignore: Sequence[str] = ()
+    ) -> Callable[..., Any]:
+        """A function of the module's top whose results the memory keeps.
 
-def check_steps(steps: dict[str, Any]) -> None:
-    """Refuse what cannot be a step of the method, and say what can.
+        Parameters
+        ----------
+        function : callable
+        ignore : sequence of str
+            Arguments that follow from the others and do not tell results apart.
+        """
+        if hasattr(self.memory, "store_backend"):
+            return Remembered(function, self.memory.store_backend, tuple(ignore))
+        # An object with the interface of joblib.Memory: its own affair.
+        return self.memory.cache(function, ignore=list(ignore))
 
-    Parameters
+
+@dataclass(frozen=True)
+class Remembered:
+    """A function whose results a store keeps by the values of its arguments.
+
+    What ``joblib.Memory.cache`` does, without its record of the arguments as text:
+    joblib warns the user where writing that took long, as under load it may.
+
+    Attributes
     ----------
-    steps : dict of str to estimator or None
-        By the names of the arguments: local, restructurer, interpolator.
-
-    Raises
-    ------
-    ValueError
+    function : callable
+        At the top of a module.
+    store : joblib store backend or None
+        Of a joblib.Memory; None keeps nothing.
+    ignore : tuple of str
+        As in `PointRunner.remembered`.
     """
-    for name, step in steps.items():
-        methods, example, other = _STEPS[name]
-        if step is None or (other and isinstance(step, str) and step == other):
-            continue
-        got = f"{step!r}" if isinstance(step, str) else type(step).__name__
-        if isinstance(step, type):
-            got = f"the class {step.__name__}, not an instance"
-        elif all(hasattr(step, method) for method in (*methods, "get_params")):
-            continue
-        choice = f"an estimator, {other!r} or None" if other else "an estimator or None"
-        raise ValueError(
-            f"`{name}` must be {choice}. Got {got}. Give an instance with the "
-            f"method(s) {', '.join(methods)}, such as {example}."
-        )
+
+    function: Callable[..., Any]
+    store: Any
+    ignore: tuple[str, ...] = ()
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """The result for these arguments: the one kept, else a new one."""
+        if self.store is None:
+            return self.function(*args, **kwargs)
+        item = self._item(args, kwargs)
+        if self.store.contains_item(item):
+            try:
+                return self.store.load_item(item, verbose=0)
+            except Exception:  # cleared meanwhile, or damaged: it is made again
+                pass
+        result = self.function(*args, **kwargs)
+        self.store.dump_item(item, result, verbose=0)
+        return result
+
+    def _item(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[str]:
+        """Place in the store: folders of the function, and of source and arguments."""
+        named = inspect.signature(self.function).bind(*args, **kwargs).arguments
+        told = {name: v for name, v in named.items() if name not in self.ignore}
+        folder = f"{self.function.__module__}.{self.function.__qualname__}"
+        # Results of another version of the function are not taken for its own.
+        source = inspect.getsource(self.function)
+        return [folder, hash((source, told), coerce_mmap=True)]
 
 
 def checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
@@ -167,8 +194,9 @@ def checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
     ValueError
         If `memory` is none of these, or a step cannot be pickled.
     """
+    path = str(memory) if hasattr(memory, "__fspath__") else memory
     try:
-        memory = check_memory(None if memory is None else _as_text(memory))
+        memory = check_memory(path)  # which takes a path as text only
     except ValueError as error:
         raise ValueError(
             "`memory` must be None, a folder, or a joblib.Memory. Got "
@@ -207,11 +235,6 @@ class Stopwatch:
         return pd.DataFrame(rows, columns=["step", "seconds"])
 
 
-def _as_text(memory: Any) -> Any:
-    """A path as text, the only form that scikit-learn takes."""
-    return str(memory) if hasattr(memory, "__fspath__") else memory
-
-
 @dataclass(frozen=True)
 class _Failure:
     """Why a point failed."""
@@ -221,12 +244,6 @@ class _Failure:
     @property
     def text(self) -> str:
         return str(self.error)
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    """Found once in every process: the search takes longer than a small step."""
-    return ThreadpoolController()
 
 
 class _Stopped(Exception):
@@ -247,6 +264,12 @@ def _attempt(
         if stop_as is not None:
             raise _Stopped(stop_as, error) from error
         return _Failure(error)  # told by the runner, who knows the other points
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """Found once in every process: the search takes longer than a small step."""
+    return ThreadpoolController()
 
 
 def _place(number: int, kappa: Array) -> str:

@@ -1,4 +1,7 @@
-"""Step 4 over all operating points: the points help one another."""
+"""Step 4 at every operating point: all local models in one structure.
+
+The points help one another: the parameters of a neighbour lead out of a wrong basin.
+"""
 
 from __future__ import annotations
 
@@ -16,56 +19,17 @@ from ..restructuring.problem import problem_from_models
 from ..restructuring.starts import GOOD_FIT
 from ..structures.structure import GrayBoxStructure
 from ..subspace.statistics import _STEP, ModelPair
-from ..systems.balancing import align_signs
-from .local_models import LocalModel
+from .local_models import LocalModel, with_signs_of
 from .runner import PointRunner
 
 Array = NDArray[np.float64]
 
 
-def covariance_of_parameters(
-    structure: GrayBoxStructure,
-    theta: Array,
-    weight: Any,
-    model: StateSpace,
-    deviated: Sequence[ModelPair],
-) -> Array:
-    """Covariance of gray-box parameters from that of the black box.
+_SWEEPS = 4  # passes over the points: help travels that far from a good one
 
-    The response's deviations are carried to the parameters to first order, as the
-    least-squares fit of the response does.
+_NEIGHBOURS = 2  # points that help one: those to either side along one variable
 
-    Parameters
-    ----------
-    structure : GrayBoxStructure
-    theta : ndarray of shape (n_params,)
-    weight : StateSpace, (low, high) or None
-        As `frequency_weight` of `GrayBoxRestructurer`.
-    model : StateSpace
-        The black box.
-    deviated : sequence of (StateSpace, StateSpace)
-        From `deviated_models`.
-
-    Returns
-    -------
-    ndarray of shape (n_params, n_params)
-    """
-    problem = problem_from_models(structure, [model], weight)
-    omega = problem.omega
-    K = response_gain(problem.system, theta, omega).conj()
-    changes = []
-    for above, below in deviated:
-        dG = above.frequency_response(omega) - below.frequency_response(omega)
-        changes.append(np.einsum("jkpm,kpm->j", K, dG).real / (2.0 * _STEP))
-    T = np.array(changes)
-    return T.T @ T
-
-
-_SWEEPS = 4
-
-_NEIGHBOURS = 2
-
-_BETTER = 0.98  # a neighbour's start must lower the least-squares error by that
+_BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
 
 
 @dataclass(frozen=True)
@@ -121,40 +85,34 @@ def restructure_points(
         for model in local
     ]
     found = runner.run(
-        "restructuring", restructure_point, tasks, kappa, restructurer=restructurer
+        "restructuring", _restructure_point, tasks, kappa, restructurer=restructurer
     )
     kept = [k for k, result in enumerate(found) if result is not None]
-    helped = runner.memory.cache(help_neighbours, ignore=["fitted"])(
+    helped = runner.remembered(_help_neighbours, ignore=["fitted"])(
         [found[k] for k in kept], [tasks[k] for k in kept], kappa[kept], restructurer
     )
-    theta = np.array([fitted.params_ for fitted in helped])
-    structured = [fitted.lti_ for fitted in helped]
-    covariances = [
-        point_covariance(fitted, local[k], runner)
-        for k, fitted in zip(kept, helped, strict=True)
-    ]
+    covariance = runner.remembered(covariance_of_parameters)
+    covariances: list[Array | None] = []
+    for k, fitted in zip(kept, helped, strict=True):
+        known = getattr(fitted, "params_covariance_", None)  # where it tells its own
+        if known is None and local[k].deviated:
+            weight = getattr(fitted, "frequency_weight", None)
+            black_box, deviated = tasks[k][0], local[k].deviated
+            known = covariance(
+                fitted.structure_, fitted.params_, weight, black_box, deviated
+            )
+        covariances.append(None if known is None else np.asarray(known))
     return StructuredModels(
-        helped[0].structure_, theta, structured, helped, kept, covariances
+        helped[0].structure_,
+        np.array([fitted.params_ for fitted in helped]),
+        [fitted.lti_ for fitted in helped],
+        helped,
+        kept,
+        covariances,
     )
 
 
-def point_covariance(
-    fitted: Any, local: LocalModel, runner: PointRunner
-) -> Array | None:
-    """Covariance of the parameters at one point: the restructurer's, else our own."""
-    told = getattr(fitted, "params_covariance_", None)
-    if told is not None or not local.deviated:
-        return None if told is None else np.asarray(told)
-    return runner.memory.cache(covariance_of_parameters)(
-        fitted.structure_,
-        fitted.params_,
-        getattr(fitted, "frequency_weight", None),
-        _plain(local.lti),
-        local.deviated,
-    )
-
-
-def restructure_point(
+def _restructure_point(
     model: StateSpace,
     realizations: Sequence[StateSpace],
     *,
@@ -167,7 +125,7 @@ def restructure_point(
     return clone(restructurer).fit_model(model, **options)
 
 
-def help_neighbours(
+def _help_neighbours(
     fitted: Sequence[Any],
     tasks: Sequence[tuple[StateSpace, list[StateSpace]]],
     kappa: Array,
@@ -205,13 +163,51 @@ def help_neighbours(
                 tried.add(key)
                 own = fitted[i].fit_error_
                 if fitted[i].start_error(task[0], start) < _BETTER * own:
-                    fitted[i] = restructure_point(
+                    fitted[i] = _restructure_point(
                         *task, restructurer=restructurer, starts=[start]
                     )
                     improved = True
         if not improved:
             break
     return fitted
+
+
+def covariance_of_parameters(
+    structure: GrayBoxStructure,
+    theta: Array,
+    weight: Any,
+    model: StateSpace,
+    deviated: Sequence[ModelPair],
+) -> Array:
+    """Covariance of gray-box parameters from that of the black box.
+
+    The response's deviations are carried to the parameters to first order, as the
+    least-squares fit of the response does.
+
+    Parameters
+    ----------
+    structure : GrayBoxStructure
+    theta : ndarray of shape (n_params,)
+    weight : StateSpace, (low, high) or None
+        As `frequency_weight` of `GrayBoxRestructurer`.
+    model : StateSpace
+        The black box.
+    deviated : sequence of (StateSpace, StateSpace)
+        From `deviated_models`.
+
+    Returns
+    -------
+    ndarray of shape (n_params, n_params)
+    """
+    problem = problem_from_models(structure, [model], weight)
+    omega = problem.omega
+    K = response_gain(problem.system, theta, omega).conj()
+    changes = []
+    for above, below in deviated:
+        dG = above.frequency_response(omega) - below.frequency_response(omega)
+        changes.append(np.einsum("jkpm,kpm->j", K, dG).real / (2.0 * _STEP))
+    T = np.array(changes)
+    return T.T @ T
 
 
 def _plain(model: StateSpace) -> StateSpace:
@@ -242,10 +238,6 @@ def balanced_entries(models: Sequence[StateSpace]) -> tuple[GrayBoxStructure, Ar
     rows = []
     previous = first
     for model in models:
-        s = align_signs(model.B, model.C, previous.B, previous.C)
-        previous = StateSpace(
-            s[:, None] * model.A * s, s[:, None] * model.B, model.C * s, model.D
-        )
-        blocks = (previous.A, previous.B, previous.C, previous.D)
-        rows.append(np.concatenate([block.ravel() for block in blocks]))
+        previous = with_signs_of(previous, model)
+        rows.append(np.concatenate([getattr(previous, M).ravel() for M in "ABCD"]))
     return structure, np.array(rows)

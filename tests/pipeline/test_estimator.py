@@ -222,9 +222,9 @@ def test_failure_names_its_point_and_can_be_skipped(spring):
 
 
 ERRORS = [
-    ({"combine": "sum"}, "`combine` must be one of"),
-    ({"discretization": "euler"}, "`discretization` must be one of"),
-    ({"on_error": "ignore"}, "`on_error` must be one of"),
+    ({"combine": "sum"}, "`combine` must be 'pool' or 'average'"),
+    ({"discretization": "euler"}, "`discretization` must be 'zoh' or"),
+    ({"on_error": "ignore"}, "`on_error` must be 'raise' or"),
     ({"restructurer": "none"}, "`restructurer` must be an estimator"),
     ({"scheduling": "theta"}, "theta"),
     ({"sampling_time": 0.5}, "sampling"),

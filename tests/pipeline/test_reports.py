@@ -243,7 +243,7 @@ def test_a_discrete_model_is_compared_as_it_is(spring):
         ({}, {}, "`models` must be a dict"),
         ([StateSpace([[-1.0]], [[1.0]], [[1.0]])], {}, "`models` must be a dict"),
         ({"a": 3}, {}, r"`models\['a'\]` must be a fitted estimator"),
-        ({"a": spring_lpv()}, {"run": "run"}, "a role must be one of .* Got 'run'"),
+        ({"a": spring_lpv()}, {"run": "run"}, "`roles` must be 'inputs', .* Got 'run'"),
         (
             {"a": spring_lpv()},
             {"inputs": "force"},

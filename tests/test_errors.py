@@ -28,7 +28,7 @@ from lpvlearn import (
 )
 from lpvlearn.datasets import make_flexible_arm
 
-from ..conftest import (
+from .conftest import (
     ROLES,
     spring_pipeline,
     spring_structure,
@@ -354,11 +354,11 @@ STEPS = {
     ),
     "an unknown way to combine": (
         lambda: fit(combine="mean"),
-        ["`combine` must be one of ('pool', 'average')", "Got 'mean'"],
+        ["`combine` must be 'pool' or 'average'", "Got 'mean'"],
     ),
     "an unknown discretization": (
         lambda: fit(discretization="tusin"),
-        ["`discretization` must be one of ('zoh', 'tustin')", "Got 'tusin'"],
+        ["`discretization` must be 'zoh' or 'tustin'", "Got 'tusin'"],
     ),
     "a number for the memory": (lambda: fit(memory=3), ["`memory` must be", "Got int"]),
     "a misspelt parameter of a step": (

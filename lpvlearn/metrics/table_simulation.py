@@ -74,25 +74,28 @@ def simulate_experiments(
     -------
     list of ndarray of shape (n_samples, n_outputs)
     """
-    simulated = []
-    for e in experiments:
-        dt = e.sampling_time or sampling_time
-        x0 = None
-        if isinstance(model, LPVStateSpace):
-            kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
-            if estimate:
-                forced = model.simulate(e.inputs, kappa, dt)
-                free = model.free_responses(kappa, dt)
-                x0 = estimate_initial_state(free, _outputs(e, model.n_outputs) - forced)
-            simulated.append(model.simulate(e.inputs, kappa, dt, x0))
-        else:
-            sampled = model.to_discrete(dt) if model.is_continuous else model
-            if estimate:
-                error = _outputs(e, model.n_outputs) - sampled.simulate(e.inputs)
-                free = free_responses(sampled.A, sampled.C, len(e.rows))
-                x0 = estimate_initial_state(free, error)
-            simulated.append(sampled.simulate(e.inputs, initial_state=x0))
-    return simulated
+    return [
+        _simulate(model, e, e.sampling_time or sampling_time, estimate)
+        for e in experiments
+    ]
+
+
+def _simulate(
+    model: StateSpace | LPVStateSpace, e: Experiment, dt: float, estimate: bool
+) -> Array:
+    x0 = None
+    if isinstance(model, LPVStateSpace):
+        kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
+        if estimate:
+            error = _outputs(e, model.n_outputs) - model.simulate(e.inputs, kappa, dt)
+            x0 = estimate_initial_state(model.free_responses(kappa, dt), error)
+        return model.simulate(e.inputs, kappa, dt, x0)
+    sampled = model.to_discrete(dt) if model.is_continuous else model
+    if estimate:
+        error = _outputs(e, model.n_outputs) - sampled.simulate(e.inputs)
+        free = free_responses(sampled.A, sampled.C, len(e.rows))
+        x0 = estimate_initial_state(free, error)
+    return sampled.simulate(e.inputs, initial_state=x0)
 
 
 def in_table_order(experiments: Sequence[Experiment], parts: Sequence[Array]) -> Array:
