@@ -5,14 +5,12 @@ import pickle
 import numpy as np
 import pandas as pd
 import pytest
-from joblib import Memory
 from sklearn.base import clone
 from sklearn.ensemble import RandomForestRegressor
 from sklearn.linear_model import LinearRegression
 
 from lpvlearn import (
     GrayBoxRestructurer,
-    GrayBoxStructure,
     LocalLPVPipeline,
     PolynomialLPV,
     SubspaceLTI,
@@ -401,37 +399,6 @@ def test_html_shows_the_steps_before_and_after_fitting(fitted):
     assert "PolynomialLPV" in nested._repr_html_()
 
 
-# ------------------------------------------------------------------------------ memory
-
-
-def test_memory_is_a_folder_a_path_or_a_joblib_memory(fitted, spring, tmp_path):
-    X, y, _, _ = spring
-    for memory in (
-        str(tmp_path / "a"),
-        tmp_path / "b",
-        Memory(tmp_path / "c", verbose=0),
-    ):
-        for _ in range(2):
-            pipeline = spring_pipeline(memory=memory).fit(X, y)
-            pd.testing.assert_frame_equal(pipeline.parameters_, fitted.parameters_)
-            pd.testing.assert_frame_equal(pipeline.report_, fitted.report_)
-
-
-def test_memory_teaches_what_it_cannot_keep(spring, tmp_path):
-    X, y, _, _ = spring
-    with pytest.raises(
-        ValueError, match="`memory` must be None, a folder, or a joblib"
-    ):
-        spring_pipeline(memory=3).fit(X, y)
-    truth = spring_structure()
-    structure = GrayBoxStructure.from_function(
-        lambda theta: truth.matrices(theta), [30.0, 1.2, 50.0]
-    )
-    pipeline = spring_pipeline(restructurer=GrayBoxRestructurer(structure))
-    with pytest.raises(ValueError, match="pickled. Got a `restructurer`.*lambda"):
-        pipeline.set_params(memory=tmp_path).fit(X, y)
-
-
 @pytest.mark.parametrize("combine", ["pool", "average"])
 def test_gaps_are_split_where_the_local_estimator_splits(spring, combine):
     X, y = spring_tables(n_repeats=2)
@@ -442,27 +409,6 @@ def test_gaps_are_split_where_the_local_estimator_splits(spring, combine):
     pipeline = spring_pipeline(local=local, combine=combine).fit(X, y)
     np.testing.assert_allclose(pipeline.parameters_, spring_truth(KAPPA), rtol=1e-6)
     assert (pipeline.report_["n_experiments"] == 2).all()
-
-
-@pytest.mark.parametrize("n_jobs", [None, 2])
-@pytest.mark.parametrize("on_error", ["raise", "skip"])
-def test_a_failure_that_all_points_share_names_none(spring, on_error, n_jobs):
-    X, y, _, _ = spring
-    pipeline = spring_pipeline(
-        local=SubspaceLTI(order=400), on_error=on_error, n_jobs=n_jobs
-    )
-    with pytest.raises(ValueError, match="^`order` must be at most .*400"):
-        pipeline.fit(X, y)
-
-
-def test_different_failures_everywhere_tell_the_first(spring):
-    X, y, _, _ = spring
-    unequal = (X["kappa"] < 0.2) | (X["time"] < 4 + X["kappa"])
-    pipeline = spring_pipeline(local=SubspaceLTI(order=400), on_error="skip")
-    with pytest.raises(
-        ValueError, match="every .* failed. First operating point 0 .*400"
-    ):
-        pipeline.fit(X[unequal], y[unequal])
 
 
 def test_deviations_of_averaged_parameters_cover_their_errors():
