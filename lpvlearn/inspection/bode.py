@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..models.statespace import StateSpace
+from .. import StateSpace
 from .drawing import axes_grid, figure_legend, line_style, named, names_of, tidy
+from .fitted import check_model, models_of, unwrapped, with_others
 from .frequency import check_frequencies, frequency_axis, response_up_to_nyquist
-from .models import models_of, unwrapped, with_others
 
 Array = NDArray[np.float64]
 
 Complex = NDArray[np.complex128]
 
-_RANGE = 140.0  # dB below the highest gain that are shown
+# dB below the highest gain that are shown: seven decades; zeros reach further down.
+_RANGE = 140.0
 
 
 class BodeDisplay:
@@ -156,13 +157,12 @@ class BodeDisplay:
             If models differ in inputs or outputs, or shapes do not fit.
         """
         models = named("models", models, "StateSpace models")
+        hint = (
+            "; a fitted estimator holds one in `lti_`, an LPVStateSpace gives one by "
+            "`at(kappa)`"
+        )
         for name, model in models.items():
-            if not isinstance(model, StateSpace):
-                raise ValueError(
-                    f"`models[{name!r}]` must be a StateSpace. Got "
-                    f"{type(model).__name__}; a fitted estimator holds one in `lti_`, "
-                    "an LPVStateSpace gives one by `at(kappa)`."
-                )
+            check_model(f"models[{name!r}]", model, hint=hint)
         if std and omega is None:
             raise ValueError(
                 "`omega` must be given with `std`, which belongs to frequencies. Got "
@@ -176,14 +176,8 @@ class BodeDisplay:
         responses = {
             name: response_up_to_nyquist(model, grid) for name, model in models.items()
         }
-        display = cls(
-            grid,
-            responses,
-            std=std,
-            output_names=output_names,
-            input_names=input_names,
-        )
-        return display.plot(ax, phase=phase)
+        names = {"output_names": output_names, "input_names": input_names}
+        return cls(grid, responses, std=std, **names).plot(ax, phase=phase)
 
     @classmethod
     def from_estimator(
@@ -273,10 +267,10 @@ class BodeDisplay:
         )
         self.axes_ = axes[::kinds]
         self.phase_axes_ = axes[1::2] if phase else None
-        self.lines_ = self._draw(self.axes_, magnitude, n_std)
+        self.lines_ = self._draw(self.axes_, _magnitudes, n_std)
         self.phase_lines_: dict[str, Any] = {}
         if self.phase_axes_ is not None:
-            self.phase_lines_ = self._draw(self.phase_axes_, aligned_phases, n_std)
+            self.phase_lines_ = self._draw(self.phase_axes_, _aligned_phases, n_std)
         self._dress(axes)
         handles = [lines[0, 0] for lines in self.lines_.values()]
         self.figure_.align_ylabels(axes[:, 0])
@@ -323,11 +317,12 @@ class BodeDisplay:
                 row = self.phase_axes_[i]
                 row[0].set_ylabel("Phase (deg)")
                 span = np.ptp([(a.dataLim.y0, a.dataLim.y1) for a in row])
+                # Fractions of a turn as ticks, five of them at most.
                 step = next((s for s in (45, 90, 180, 360) if span <= 5 * s), 720)
                 row[0].yaxis.set_major_locator(MultipleLocator(step))
 
 
-def magnitude(
+def _magnitudes(
     entries: Mapping[str, Complex], spread: Mapping[str, Array]
 ) -> dict[str, tuple[Array, Array, Array]]:
     """Magnitudes in dB with their bands, by name; NaN where a gain is zero."""
@@ -335,17 +330,14 @@ def magnitude(
     for name, G in entries.items():
         size, width = np.abs(G), spread.get(name, 0.0)
         # A band that reaches down to zero ends far below the picture.
-        low = np.maximum(size - width, 1e-3 * size)
-        found[name] = (decibels(size), decibels(low), decibels(size + width))
+        low = np.maximum(size - width, 1e-3 * size)  # 60 dB below the curve
+        gains = (np.where(gain > 0, gain, np.nan) for gain in (size, low, size + width))
+        middle, low, high = (20.0 * np.log10(gain) for gain in gains)
+        found[name] = (middle, low, high)
     return found
 
 
-def decibels(size: Array) -> Array:
-    """``20 log10`` of gains; NaN for zero."""
-    return 20.0 * np.log10(np.where(size > 0, size, np.nan))
-
-
-def aligned_phases(
+def _aligned_phases(
     entries: Mapping[str, Complex], spread: Mapping[str, Array]
 ) -> dict[str, tuple[Array, Array, Array]]:
     """Unwrapped phases in degrees with their bands, by name.

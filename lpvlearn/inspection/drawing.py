@@ -110,6 +110,12 @@ def axes_grid(
     return axes.flat[0].figure, axes.reshape(n_rows, n_columns)
 
 
+def single_axes(ax: Any, height: float) -> tuple[Any, Any]:
+    """A figure and an array of one Axes to draw in; `ax` and `height` as above."""
+    figure, axes = axes_grid(ax, 1, 1, height=height)
+    return figure, axes.ravel()
+
+
 def tidy(ax: Any) -> None:
     """A light grid below the data, no box, small tick labels."""
     ax.grid(True, which="major", color="0.9", linewidth=0.7)

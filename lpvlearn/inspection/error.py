@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..models.statespace import StateSpace
-from .drawing import ACCENT, INK, MUTED, axes_grid, legend_above, tidy
+from .. import StateSpace
+from .drawing import ACCENT, INK, MUTED, legend_above, single_axes, tidy
+from .fitted import check_model
 from .frequency import (
     check_frequencies,
     frequency_axis,
@@ -18,6 +19,8 @@ from .frequency import (
 )
 
 Array = NDArray[np.float64]
+
+_DEPTH = 1e-6  # six decades: the accuracy of the norm that is drawn
 
 
 class ErrorDisplay:
@@ -138,11 +141,8 @@ class ErrorDisplay:
         ValueError
             If the models do not fit together.
         """
-        for name, model in (("gray_box", gray_box), ("black_box", black_box)):
-            if not isinstance(model, StateSpace):
-                raise ValueError(
-                    f"`{name}` must be a StateSpace. Got {type(model).__name__}."
-                )
+        check_model("gray_box", gray_box)
+        check_model("black_box", black_box)
         difference = gray_box - black_box
         active = _vector(active_frequencies)
         marked = np.minimum(active, nyquist_frequency(difference))
@@ -212,11 +212,7 @@ class ErrorDisplay:
                 f"{type(restructurer).__name__} without `lti_`; call fit_model() "
                 "first. A fitted pipeline holds its own in `restructurers_`."
             )
-        gray_box = restructurer.lti_
-        if not isinstance(model, StateSpace):
-            raise ValueError(
-                f"`model` must be a StateSpace. Got {type(model).__name__}."
-            )
+        check_model("model", model)
         dropped = restructurer.dropped_feedthrough_
         if dropped.shape != model.D.shape:
             raise ValueError(
@@ -234,12 +230,11 @@ class ErrorDisplay:
                     f"{start!r}."
                 )
             start = getattr(restructurer, "start_params_", None)
-        if start is None or isinstance(start, StateSpace):
-            before = start
-        else:
+        before = start
+        if before is not None and not isinstance(before, StateSpace):
             before = restructurer.structure_.model(start, model.sampling_time)
         return cls.from_models(
-            gray_box,
+            restructurer.lti_,
             compared,
             start=before,
             active_frequencies=restructurer.active_frequencies_,
@@ -260,8 +255,7 @@ class ErrorDisplay:
         -------
         ErrorDisplay
         """
-        self.figure_, axes = axes_grid(ax, 1, 1, height=3.6)
-        self.axes_ = axes.ravel()
+        self.figure_, self.axes_ = single_axes(ax, height=3.6)
         self.ax_ = one = self.axes_[0]
         self.lines_: dict[str, Any] = {}
         (self.lines_["error"],) = one.loglog(
@@ -327,12 +321,12 @@ class ErrorDisplay:
             self.active_points_.append(point)
 
     def _limit(self, ax: Any) -> None:
-        """No more than six decades: below them there is nothing to see."""
+        """Not below `_DEPTH` of the highest: nothing is to be seen there."""
         curves = [c for c in (self.error, self.start) if c is not None]
         top = max(c.max() for c in curves)
         low = min(c[c > 0].min(initial=np.inf) for c in curves)
-        if np.isfinite(low) and low < 1e-6 * top:
-            ax.set_ylim(1e-6 * top, 2.0 * top)
+        if np.isfinite(low) and low < _DEPTH * top:
+            ax.set_ylim(_DEPTH * top, 2.0 * top)  # with room for the dots above
 
 
 def _sigma(model: StateSpace, omega: Array) -> Array:

@@ -10,7 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
 from .drawing import axes_grid, figure_legend, named, names_of, point_style, tidy
-from .models import check_one_scheduling, scheduling_name, unwrapped, with_others
+from .fitted import (
+    check_one_scheduling,
+    fitted_pipeline,
+    scheduling_name,
+    with_others,
+)
 
 Array = NDArray[np.float64]
 
@@ -185,12 +190,7 @@ class ParameterDisplay:
             If the pipeline is not fitted or has several scheduling variables, or
             `others` has other shapes.
         """
-        pipeline = unwrapped(pipeline)
-        if not hasattr(pipeline, "parameters_"):
-            raise ValueError(
-                "`pipeline` must be a fitted LocalLPVPipeline. Got "
-                f"{type(pipeline).__name__} without `parameters_`; call fit() first."
-            )
+        pipeline = fitted_pipeline(pipeline, "parameters_")
         check_one_scheduling(pipeline.operating_points_.shape[1], "ParameterDisplay")
         if name is None:
             name = "restructured" if pipeline.restructurers_ else "balanced"

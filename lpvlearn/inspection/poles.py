@@ -7,15 +7,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..lpv.model import LPVStateSpace
-from .drawing import LABEL_SIZE, MUTED, TEXT_SIZE, axes_grid, tidy
-from .models import check_one_scheduling, scheduling_name, unwrapped
+from .. import LPVStateSpace
+from .drawing import LABEL_SIZE, MUTED, TEXT_SIZE, single_axes, tidy
+from .fitted import (
+    check_model,
+    check_one_scheduling,
+    fitted_pipeline,
+    scheduling_name,
+)
 
 Array = NDArray[np.float64]
 
 Complex = NDArray[np.complex128]
 
-_DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)
+_DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)  # damping ratios that get a ray
+
+_N_POINTS = 101  # frozen models over the range: their poles make a line
 
 
 class PoleDisplay:
@@ -108,11 +115,8 @@ class PoleDisplay:
         ValueError
             If the model has several scheduling variables.
         """
-        if not isinstance(model, LPVStateSpace):
-            raise ValueError(
-                f"`model` must be an LPVStateSpace. Got {type(model).__name__}; a "
-                "fitted LocalLPVPipeline holds one in `lpv_`."
-            )
+        hint = "; a fitted LocalLPVPipeline holds one in `lpv_`"
+        check_model("model", model, LPVStateSpace, hint)
         grid = _grid(model, kappa)
         display = cls(grid, model.frozen_poles(grid), scheduling_label=scheduling_label)
         return display.plot(ax, damping=damping)
@@ -149,12 +153,7 @@ class PoleDisplay:
         ValueError
             If the pipeline is not fitted or has several scheduling variables.
         """
-        pipeline = unwrapped(pipeline)
-        if not hasattr(pipeline, "lpv_"):
-            raise ValueError(
-                "`pipeline` must be a fitted LocalLPVPipeline. Got "
-                f"{type(pipeline).__name__} without `lpv_`; call fit() first."
-            )
+        pipeline = fitted_pipeline(pipeline, "lpv_")
         grid = _grid(pipeline.lpv_, kappa)
         points, models = pipeline.operating_points_[:, 0], pipeline.local_models_
         display = cls(
@@ -182,8 +181,7 @@ class PoleDisplay:
         """
         from matplotlib.lines import Line2D
 
-        self.figure_, axes = axes_grid(ax, 1, 1, height=4.4)
-        self.axes_ = axes.ravel()
+        self.figure_, self.axes_ = single_axes(ax, height=4.4)
         self.ax_ = one = self.axes_[0]
         colours = _colours(np.concatenate([self.kappa, self.local_kappa]))
         s = self.poles.ravel()
@@ -273,7 +271,7 @@ def _grid(model: LPVStateSpace, kappa: ArrayLike | None) -> Array:
     if kappa is not None:
         return np.asarray(kappa, dtype=float).reshape(-1)
     low, high = model.scheduling_range[:, 0]
-    return np.linspace(low, high, 101)
+    return np.linspace(low, high, _N_POINTS)
 
 
 def _pair(prefix: str, kappa: ArrayLike, poles: ArrayLike) -> tuple[Array, Complex]:

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .. import bft_score
 from ..data.columns import Table, is_table
 from ..data.experiments import read_outputs
 from ..data.timestamps import time_in_seconds
-from ..metrics.scores import bft_score
+from ..validation import one_of
 from .drawing import (
     ACCENT,
     axes_grid,
@@ -21,7 +22,7 @@ from .drawing import (
     tidy,
     with_unit,
 )
-from .models import unwrapped
+from .fitted import unwrapped
 
 Array = NDArray[np.float64]
 
@@ -197,10 +198,7 @@ class SimulationDisplay:
         ValueError
             If there is no such experiment, or an option is unknown.
         """
-        if initial_state not in ("rest", "estimate"):
-            raise ValueError(
-                f"`initial_state` must be 'rest' or 'estimate'. Got {initial_state!r}."
-            )
+        one_of("initial_state", initial_state, ("rest", "estimate"))
         estimator = unwrapped(estimator)
         if not hasattr(estimator, "split_experiments"):
             raise ValueError(
@@ -318,9 +316,8 @@ def _time_of(estimator: Any, table: Table) -> tuple[Array, str]:
     if column is not None:
         seconds = time_in_seconds(column[1].values, column[1].name)
         return np.asarray(seconds, dtype=float), "Time (s)"
+    number = np.arange(table.n_rows, dtype=np.float64)
     step = getattr(estimator, "sampling_time_", None)
     if step is None and hasattr(estimator, "lti_"):
         step = estimator.lti_.sampling_time
-    if step is None:
-        return np.arange(table.n_rows, dtype=float), "Sample"
-    return float(step) * np.arange(table.n_rows, dtype=np.float64), "Time (s)"
+    return (number, "Sample") if step is None else (float(step) * number, "Time (s)")

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .drawing import ACCENT, INK, MUTED, TEXT_SIZE, axes_grid, tidy
-from .models import unwrapped
+from .drawing import ACCENT, INK, MUTED, TEXT_SIZE, single_axes, tidy
+from .fitted import unwrapped
 
-_N_SHOWN = 30
+_N_SHOWN = 30  # values that are told apart in a figure of 8 inches
 
 
 class SingularValueDisplay:
@@ -125,8 +125,7 @@ class SingularValueDisplay:
         """
         from matplotlib.ticker import MaxNLocator
 
-        self.figure_, axes = axes_grid(ax, 1, 1, height=3.4)
-        self.axes_ = axes.ravel()
+        self.figure_, self.axes_ = single_axes(ax, height=3.4)
         self.ax_ = one = self.axes_[0]
         order = 0 if self.order is None else self.order
         values = self.singular_values[: max(n_shown, 2 * order)]

@@ -1,4 +1,4 @@
-"""The models that a fitted estimator holds."""
+"""What fitted estimators hold that can be drawn, and errors where they hold none."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..models.statespace import StateSpace
+from .. import StateSpace
 
 
 def unwrapped(estimator: Any) -> Any:
@@ -52,6 +52,27 @@ def models_of(
     if estimator.restructurers_:
         found["gray-box"] = estimator.structured_models_[nearest]
     return found | {"interpolated": estimator.lpv_.at(place)}
+
+
+def fitted_pipeline(pipeline: Any, attribute: str) -> Any:
+    """The pipeline (of a search), or a ValueError if it is not fitted."""
+    pipeline = unwrapped(pipeline)
+    if not hasattr(pipeline, attribute):
+        raise ValueError(
+            "`pipeline` must be a fitted LocalLPVPipeline. Got "
+            f"{type(pipeline).__name__} without `{attribute}`; call fit() first."
+        )
+    return pipeline
+
+
+def check_model(name: str, model: Any, kind: type = StateSpace, hint: str = "") -> None:
+    """A ValueError unless the argument is a model of that kind."""
+    if not isinstance(model, kind):
+        article = "an" if kind.__name__[0] in "AEILO" else "a"
+        raise ValueError(
+            f"`{name}` must be {article} {kind.__name__}. Got {type(model).__name__}"
+            f"{hint}."
+        )
 
 
 def with_others(own: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
