@@ -1,10 +1,9 @@
 """The built-in flexible arm: simulator and experiments; stored data sets."""
 
 from .excitation import prbs
-from .flexible_arm import FlexibleArm
+from .flexible_arm import ArmResponse, FlexibleArm
 from .generator import make_flexible_arm
 from .reference import load_flexible_arm, load_varying_spring
-from .response import ArmResponse
 
 __all__ = [
     "ArmResponse",

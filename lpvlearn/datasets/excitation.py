@@ -4,19 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.random import Generator, RandomState
+from numpy.typing import NDArray
 from sklearn.utils import check_random_state
 
-from .dynamics import FloatArray
-
-__all__ = ["measurement_noise", "prbs"]
-
-
-def spawn_generators(
-    random_state: int | RandomState | None, n_generators: int
-) -> list[Generator]:
-    """Independent generators, so that one draw never shifts another one."""
-    seeds = check_random_state(random_state).randint(2**31 - 1, size=n_generators)
-    return [np.random.default_rng(seed) for seed in seeds]
+Array = NDArray[np.float64]
 
 
 def prbs(
@@ -27,7 +18,7 @@ def prbs(
     clock: int = 1,
     balance: int | None = None,
     random_state: int | RandomState | Generator | None = None,
-) -> FloatArray:
+) -> Array:
     """Pseudo-random binary sequences, independent between channels.
 
     Parameters
@@ -66,15 +57,10 @@ def prbs(
     >>> prbs(8, clock=2, balance=2, random_state=0).ravel().tolist()
     [1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, -1.0]
     """
-    for name, value in (
-        ("n_samples", n_samples),
-        ("n_channels", n_channels),
-        ("clock", clock),
-    ):
-        if value != int(value) or value < 1:
-            raise ValueError(f"`{name}` must be an integer of at least 1. Got {value}.")
-    if not (np.isfinite(amplitude) and amplitude > 0):
-        raise ValueError(f"`amplitude` must be finite and positive. Got {amplitude}.")
+    check_count("n_samples", n_samples)
+    check_count("n_channels", n_channels)
+    check_count("clock", clock)
+    check_size("amplitude", amplitude)
     if balance is not None and (balance < 2 or balance % 2):
         raise ValueError(
             "`balance` must be None or an even number of bits, at least 2. "
@@ -96,8 +82,8 @@ def prbs(
 
 
 def measurement_noise(
-    y: FloatArray, snr_db: float, n_realizations: int, rng: Generator
-) -> FloatArray:
+    y: Array, snr_db: float, n_realizations: int, rng: Generator
+) -> Array:
     """White Gaussian noise at a signal-to-noise ratio for each channel.
 
     Parameters
@@ -119,3 +105,24 @@ def measurement_noise(
     scale = y.std(axis=-2, keepdims=True) * 10.0 ** (-snr_db / 20.0)
     shape = (*y.shape[:-2], n_realizations, *y.shape[-2:])
     return scale[..., np.newaxis, :, :] * rng.standard_normal(shape)
+
+
+def spawn_generators(
+    random_state: int | RandomState | None, n_generators: int
+) -> list[Generator]:
+    """Independent generators, so that one draw never shifts another one."""
+    seeds = check_random_state(random_state).randint(2**31 - 1, size=n_generators)
+    return [np.random.default_rng(seed) for seed in seeds]
+
+
+def check_count(name: str, value: float) -> None:
+    """Refuse what is no whole number of at least 1."""
+    if value != int(value) or value < 1:
+        raise ValueError(f"`{name}` must be an integer of at least 1. Got {value}.")
+
+
+def check_size(name: str, value: float, may_be_zero: bool = False) -> None:
+    """Refuse what is not finite and positive (or zero, where that may be)."""
+    if not (np.isfinite(value) and (value > 0 or (may_be_zero and value == 0))):
+        rule = "non-negative" if may_be_zero else "positive"
+        raise ValueError(f"`{name}` must be finite and {rule}. Got {value}.")

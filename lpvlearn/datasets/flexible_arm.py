@@ -1,4 +1,4 @@
-"""The two-link flexible arm: physical parameters, equations, linearisation."""
+"""The two-link flexible arm: parameters, equations, linear models, response."""
 
 from __future__ import annotations
 
@@ -7,21 +7,24 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ..models.statespace import StateSpace
-from ..structures.structure import GrayBoxStructure
-from .dynamics import (
-    FloatArray,
+from .. import GrayBoxStructure, StateSpace
+from .excitation import check_size
+from .mechanics import (
     arm_tables,
+    check_coordinates,
     coordinate_change,
     inertial_terms,
     integrate,
+    rigid_joint_rates,
 )
-from .kinematics import check_coordinates, rigid_joint_rates
-from .response import ArmResponse, pair_experiments
 
-__all__ = ["FlexibleArm"]
+Array = NDArray[np.float64]
+
+# Largest step of the integration times fastest pole: Runge-Kutta 4 is stable up to
+# 2.78, and beyond 2 it is also useless.
+_LONGEST_STEP = 2.0
 
 
 @dataclass(frozen=True)
@@ -89,16 +92,9 @@ class FlexibleArm:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if name == "gains":
-                continue
-            rule = "non-negative" if name.endswith("mass") else "positive"
-            if (
-                not np.isfinite(value)
-                or value < 0
-                or (rule == "positive" and not value)
-            ):
-                raise ValueError(f"`{name}` must be finite and {rule}. Got {value}.")
+            if field.name != "gains":
+                may_be_zero = field.name.endswith("mass")
+                check_size(field.name, getattr(self, field.name), may_be_zero)
         gains = np.asarray(self.gains, dtype=float)
         if gains.shape != (2,) or not np.all(np.isfinite(gains) & (gains >= 0)):
             raise ValueError(
@@ -108,21 +104,21 @@ class FlexibleArm:
         object.__setattr__(self, "gains", (float(gains[0]), float(gains[1])))
 
     @cached_property
-    def _tables(self) -> FloatArray:
+    def _tables(self) -> Array:
         inertia = (self.J1, self.J2, self.elbow_mass, self.tip_mass)
         return arm_tables(self.l1, self.l2, self.rho1, self.rho2, *inertia)
 
     @cached_property
-    def _stiffness(self) -> FloatArray:
+    def _stiffness(self) -> Array:
         """Elastic stiffness K over q."""
         return np.diag([0.0, 0.0, 4 * self.EI1 * self.l1, 4 * self.EI2 * self.l2])
 
     @cached_property
-    def _damping(self) -> FloatArray:
+    def _damping(self) -> Array:
         """``G Lambda G'`` over q: the passive part of the velocity loops."""
         return np.diag([*self.gains, 0.0, 0.0])
 
-    def mass_matrix(self, q: ArrayLike) -> FloatArray:
+    def mass_matrix(self, q: ArrayLike) -> Array:
         """Mass matrix M(q) of Eq. (26).
 
         Parameters
@@ -147,7 +143,7 @@ class FlexibleArm:
         M = T.T @ np.moveaxis(mass, -1, 0) @ T
         return (0.5 * (M + M.swapaxes(1, 2))).reshape(*q.shape, 4)
 
-    def forces(self, q: ArrayLike, qdot: ArrayLike) -> FloatArray:
+    def forces(self, q: ArrayLike, qdot: ArrayLike) -> Array:
         """Coriolis, centrifugal and elastic forces F(q, q') of Eq. (26).
 
         Parameters
@@ -172,9 +168,7 @@ class FlexibleArm:
         F = force.reshape(4, -1).T @ coordinate_change(self.l1)
         return F.reshape(q.shape) - q @ self._stiffness
 
-    def _inertial_terms(
-        self, q: FloatArray, qdot: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _inertial_terms(self, q: Array, qdot: Array) -> tuple[Array, Array]:
         T = coordinate_change(self.l1)
         r, rdot = (T @ x.reshape(-1, 4).T for x in (q, qdot))
         return inertial_terms(r.reshape(2, 2, -1), rdot.reshape(2, 2, -1), self._tables)
@@ -248,7 +242,7 @@ class FlexibleArm:
         B += [[f"-{name}" for name in row] for row in p[:, 2:]]
         return GrayBoxStructure.from_template(A, B, self._output_matrix().tolist())
 
-    def parameters(self, theta2: float) -> FloatArray:
+    def parameters(self, theta2: float) -> Array:
         """True values of the parameters of `structure` at the elbow angle `theta2`.
 
         Parameters
@@ -269,12 +263,12 @@ class FlexibleArm:
         """
         return self.linearize(theta2).A[2:, :4].T.ravel()
 
-    def _rest_mass(self, theta2: float) -> FloatArray:
+    def _rest_mass(self, theta2: float) -> Array:
         if np.ndim(theta2) != 0 or not np.isfinite(theta2):
             raise ValueError(f"`theta2` must be one finite angle in rad. Got {theta2}.")
         return self.mass_matrix([0.0, theta2, 0.0, 0.0])
 
-    def _output_matrix(self) -> FloatArray:
+    def _output_matrix(self) -> Array:
         C1 = [[1.0, 0.0, self.l1, 0.0], [0.0, 1.0, self.l1, self.l2]]
         return np.hstack([np.zeros((2, 2)), C1])
 
@@ -321,7 +315,7 @@ class FlexibleArm:
         >>> arm.simulate(np.zeros((10, 2)), [1.0, 2.0], 1e-3).theta2[:, -1]
         array([1., 2.])
         """
-        reference, angles = pair_experiments(velocity_reference, theta2)
+        reference, angles = _pair_experiments(velocity_reference, theta2)
         single = np.ndim(velocity_reference) == 2 and np.ndim(theta2) == 0
         n = len(angles)
         n_substeps = self._substeps(angles, sampling_time, integration_step)
@@ -345,27 +339,24 @@ class FlexibleArm:
         return ArmResponse(y[0], q[0], qdot[0]) if single else ArmResponse(y, q, qdot)
 
     def _substeps(
-        self, angles: FloatArray, sampling_time: float, integration_step: float
+        self, angles: Array, sampling_time: float, integration_step: float
     ) -> int:
-        for name, value in (
-            ("sampling_time", sampling_time),
-            ("integration_step", integration_step),
-        ):
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"`{name}` must be finite and positive. Got {value}.")
+        check_size("sampling_time", sampling_time)
+        check_size("integration_step", integration_step)
+        # A quotient that is a hair above a whole number is that number.
         n_substeps = max(1, int(np.ceil(sampling_time / integration_step - 1e-9)))
         fastest = max(
             np.abs(self.linearize(a).poles()).max() for a in np.unique(angles)
         )
-        # Runge-Kutta 4 is stable up to 2.78 / |pole|; beyond 2 it is also useless.
-        if fastest * sampling_time / n_substeps > 2.0:
+        if fastest * sampling_time / n_substeps > _LONGEST_STEP:
+            longest = _LONGEST_STEP / fastest
             raise ValueError(
-                f"`integration_step` must be at most {2.0 / fastest:.3g} s for the "
+                f"`integration_step` must be at most {longest:.3g} s for the "
                 f"fastest pole ({fastest:.4g} rad/s). Got {integration_step}."
             )
         return n_substeps
 
-    def rigid_rates(self, q: ArrayLike, qdot: ArrayLike) -> FloatArray:
+    def rigid_rates(self, q: ArrayLike, qdot: ArrayLike) -> Array:
         """Joint rates of the rigid arm whose end-effector moves like this one's.
 
         Exact inverse kinematics of Eq. (28); to first order in v and v' this is
@@ -398,3 +389,72 @@ class FlexibleArm:
             self.l1,
             self.l2,
         )
+
+
+@dataclass(frozen=True)
+class ArmResponse:
+    """Response of the arm at the sampling instants, before each input acts.
+
+    The leading axis ``n_experiments`` is absent for a single experiment.
+
+    Attributes
+    ----------
+    y : ndarray of shape (n_experiments, n_samples, 2)
+        Joint rates of the rigid arm with the same end-effector position, rad/s.
+    q, qdot : ndarray of shape (n_experiments, n_samples, 4)
+        Coordinates ``(theta1, theta2, v1, v2)`` (rad, rad, 1/m, 1/m) and their rates.
+
+    Examples
+    --------
+    >>> from lpvlearn.datasets import FlexibleArm
+    >>> response = FlexibleArm().simulate(np.zeros((5, 2)), np.pi / 3, 1e-3)
+    >>> response.kappa.round(6)
+    array([0.5, 0.5, 0.5, 0.5, 0.5])
+    """
+
+    y: Array
+    q: Array
+    qdot: Array
+
+    @property
+    def theta2(self) -> Array:
+        """Elbow angle in rad, shape (n_experiments, n_samples)."""
+        return self.q[..., 1]
+
+    @property
+    def kappa(self) -> Array:
+        """Scheduling variable cos(theta2), shape (n_experiments, n_samples)."""
+        return np.cos(self.theta2)
+
+
+def _pair_experiments(
+    velocity_reference: ArrayLike, theta2: ArrayLike
+) -> tuple[Array, Array]:
+    """References (n_experiments, n_samples, 2) and initial angles (n_experiments,).
+
+    One reference serves several angles and one angle several references.
+    """
+    reference = np.asarray(velocity_reference, dtype=float)
+    if reference.ndim not in (2, 3) or reference.shape[-1] != 2:
+        raise ValueError(
+            "`velocity_reference` must have shape (n_samples, 2) or "
+            f"(n_experiments, n_samples, 2). Got {reference.shape}."
+        )
+    if not np.isfinite(reference).all():
+        raise ValueError("`velocity_reference` must be finite. Got NaN or infinity.")
+    angles = np.asarray(theta2, dtype=float)
+    if angles.ndim > 1 or not np.isfinite(angles).all():
+        raise ValueError(
+            "`theta2` must be one finite angle in rad or one for each experiment. "
+            f"Got {angles}."
+        )
+    if reference.ndim == 3 and angles.ndim and len(angles) != len(reference):
+        raise ValueError(
+            "`theta2` must hold one angle for each experiment of "
+            f"`velocity_reference` ({len(reference)}). Got {len(angles)}."
+        )
+    n = len(reference) if reference.ndim == 3 else angles.size
+    return (
+        np.broadcast_to(reference, (n, *reference.shape[-2:])),
+        np.broadcast_to(angles, (n,)),
+    )

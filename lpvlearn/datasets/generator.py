@@ -7,15 +7,22 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.random import Generator, RandomState
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import Bunch
 
-from .dynamics import FloatArray
-from .excitation import measurement_noise, prbs, spawn_generators
+from .excitation import (
+    check_count,
+    check_size,
+    measurement_noise,
+    prbs,
+    spawn_generators,
+)
 from .flexible_arm import FlexibleArm
-from .response import ArmResponse
 
-__all__ = ["make_flexible_arm"]
+Array = NDArray[np.float64]
+
+# The paper's sweep goes from the first of its operating points to the last in 3 s.
+_SWEEP_START, _SWEEP_RATE = np.pi / 8, (6 * np.pi / 8) / 3
 
 INPUTS, OUTPUTS = ["u1", "u2"], ["y1", "y2"]
 
@@ -157,12 +164,8 @@ def make_flexible_arm(
     >>> list(data.X.columns)
     ['u1', 'u2', 'kappa', 'experiment', 'time']
     """
-    for name, value in (
-        ("n_operating_points", n_operating_points),
-        ("n_realizations", n_realizations),
-    ):
-        if value != int(value) or value < 1:
-            raise ValueError(f"`{name}` must be an integer of at least 1. Got {value}.")
+    check_count("n_operating_points", n_operating_points)
+    check_count("n_realizations", n_realizations)
     if np.isnan(snr_db):
         raise ValueError("`snr_db` must be a number of decibels or infinity. Got nan.")
     arm = FlexibleArm() if arm is None else arm
@@ -184,42 +187,35 @@ def make_flexible_arm(
             return None
         return 2 * max(1, round(balance_time / sampling_time / samples / 2))
 
-    def local_reference(rng: Generator) -> FloatArray:
-        windows = (None, balance(clocks[1]))
+    def reference(
+        n: int,
+        size: float,
+        clocks: tuple[int, int],
+        windows: tuple[int | None, int | None],
+        rng: Generator,
+    ) -> Array:
+        """Binary sequences for both joints."""
         return np.hstack(
             [
-                prbs(
-                    n_samples,
-                    amplitude=amplitude,
-                    clock=samples,
-                    balance=window,
-                    random_state=rng,
-                )
-                for samples, window in zip(clocks, windows, strict=True)
+                prbs(n, amplitude=size, clock=bit, balance=window, random_state=rng)
+                for bit, window in zip(clocks, windows, strict=True)
             ]
         )
 
     # All experiments are integrated together, shorter ones padded with rest.
     references = np.zeros((2 * n_points + 1, max(n_samples, n_sweep), 2))
+    local = (n_samples, amplitude, clocks, (None, balance(clocks[1])))
     for i in range(n_points):
-        references[i, :n_samples] = local_reference(input_rng)
-        references[n_points + i, :n_samples] = local_reference(local_rng)
-    references[-1, :n_sweep] = np.hstack(
-        [
-            prbs(
-                n_sweep,
-                amplitude=sweep_amplitude,
-                clock=samples,
-                balance=balance(samples),
-                random_state=sweep_rng,
-            )
-            for samples in sweep_clocks
-        ]
+        references[i, :n_samples] = reference(*local, input_rng)
+        references[n_points + i, :n_samples] = reference(*local, local_rng)
+    windows = (balance(sweep_clocks[0]), balance(sweep_clocks[1]))
+    references[-1, :n_sweep] = reference(
+        n_sweep, sweep_amplitude, sweep_clocks, windows, sweep_rng
     )
-    references[-1, :n_sweep, 1] += (6 * np.pi / 8) / 3
+    references[-1, :n_sweep, 1] += _SWEEP_RATE
     response = arm.simulate(
         references,
-        np.concatenate([theta2, theta2, [np.pi / 8]]),
+        np.concatenate([theta2, theta2, [_SWEEP_START]]),
         sampling_time,
         integration_step=integration_step,
     )
@@ -227,14 +223,10 @@ def make_flexible_arm(
     def tables(
         rows: slice, length: int, n_repeats: int = 1, snr: float = np.inf
     ) -> tuple[pd.DataFrame, pd.DataFrame]:
-        part = ArmResponse(
-            *(a[rows, :length] for a in (response.y, response.q, response.qdot))
-        )
-        noise = measurement_noise(part.y, snr, n_repeats, noise_rng)
-        y = part.y[:, np.newaxis] + noise
-        X = _input_table(
-            references[rows, :length], part.kappa, n_repeats, sampling_time
-        )
+        y = response.y[rows, :length]
+        y = y[:, np.newaxis] + measurement_noise(y, snr, n_repeats, noise_rng)
+        kappa = response.kappa[rows, :length]
+        X = _input_table(references[rows, :length], kappa, n_repeats, sampling_time)
         return X, pd.DataFrame(y.reshape(-1, 2), columns=OUTPUTS)
 
     X, y = tables(slice(0, n_points), n_samples, int(n_realizations), snr_db)
@@ -260,7 +252,7 @@ def make_flexible_arm(
 
 
 def describe_arm(
-    arm: FlexibleArm, theta2: FloatArray, sampling_time: float
+    arm: FlexibleArm, theta2: Array, sampling_time: float
 ) -> dict[str, Any]:
     """Entries of the Bunch that hold the truth about the arm."""
     return {
@@ -274,7 +266,7 @@ def describe_arm(
 
 
 def _input_table(
-    references: FloatArray, kappa: FloatArray, n_repeats: int, sampling_time: float
+    references: Array, kappa: Array, n_repeats: int, sampling_time: float
 ) -> pd.DataFrame:
     """One row a sample, the experiments below each other, each `n_repeats` times."""
     n_experiments, n_samples = kappa.shape
@@ -291,10 +283,7 @@ def _input_table(
 
 def _count(name: str, duration: float, sampling_time: float) -> int:
     """Number of samples in a duration."""
-    if not (np.isfinite(sampling_time) and sampling_time > 0):
-        raise ValueError(
-            f"`sampling_time` must be finite and positive. Got {sampling_time}."
-        )
+    check_size("sampling_time", sampling_time)
     if not (np.isfinite(duration) and duration >= sampling_time):
         raise ValueError(
             f"`{name}` must be finite and at least `sampling_time` "

@@ -8,22 +8,15 @@ import numpy as np
 import pandas as pd
 from sklearn.utils import Bunch
 
-from ..structures.structure import GrayBoxStructure
+from .. import GrayBoxStructure
 from .flexible_arm import FlexibleArm
 from .generator import INPUTS, OUTPUTS, describe_arm, make_flexible_arm
 
-__all__ = [
-    "REFERENCE_SEED",
-    "load_flexible_arm",
-    "load_varying_spring",
-    "write_reference",
-]
-
 REFERENCE_SEED = 0
 
-SAMPLING_TIME = 1e-3
+_SAMPLING_TIME = 1e-3  # s
 
-N_OPERATING_POINTS = 7
+_N_OPERATING_POINTS = 7  # as the paper
 
 TABLES = {
     "flexible_arm_estimation.csv.gz": ("X", "y"),
@@ -81,10 +74,10 @@ def load_flexible_arm() -> Bunch:
         table = pd.read_csv(folder / name)
         parts[inputs] = table[[*INPUTS, "kappa", "experiment", "time"]]
         parts[outputs] = table[OUTPUTS]
-    theta2 = np.pi * np.arange(1, N_OPERATING_POINTS + 1) / (N_OPERATING_POINTS + 1)
+    theta2 = np.pi * np.arange(1, _N_OPERATING_POINTS + 1) / (_N_OPERATING_POINTS + 1)
     return Bunch(
         **parts,
-        **describe_arm(FlexibleArm(), theta2, SAMPLING_TIME),
+        **describe_arm(FlexibleArm(), theta2, _SAMPLING_TIME),
         DESCR=(folder / "README.md").read_text(encoding="utf-8"),
     )
 
@@ -146,8 +139,8 @@ def load_varying_spring() -> Bunch:
 def write_reference(folder: Path) -> None:
     """Write the reference files into `folder`, always the same bytes."""
     data = make_flexible_arm(
-        n_operating_points=N_OPERATING_POINTS,
-        sampling_time=SAMPLING_TIME,
+        n_operating_points=_N_OPERATING_POINTS,
+        sampling_time=_SAMPLING_TIME,
         random_state=REFERENCE_SEED,
     )
     for name, (inputs, outputs) in TABLES.items():

@@ -151,10 +151,10 @@ def test_power_of_the_velocity_loops_is_the_change_of_energy():
 
 
 def test_energy_is_conserved_without_control():
-    from lpvlearn.datasets import dynamics
+    from lpvlearn.datasets import mechanics
 
     arm = FlexibleArm(gains=(0.0, 0.0))
-    T = dynamics.coordinate_change(arm.l1)
+    T = mechanics.coordinate_change(arm.l1)
     inverse = np.linalg.inv(T)
     q0, qdot0 = np.array([0.3, 1.0, 0.05, -0.1]), np.array([2.0, -3.0, 1.0, 2.0])
     elastic = (
@@ -162,11 +162,11 @@ def test_energy_is_conserved_without_control():
         @ np.diag([0, 0, 4 * arm.EI1 * arm.l1, 4 * arm.EI2 * arm.l2])
         @ inverse
     )
-    states = dynamics.integrate(
+    states = mechanics.integrate(
         np.concatenate([T @ q0, T @ qdot0])[:, np.newaxis],
         np.zeros((1000, 4, 1)),
         np.hstack([elastic, np.zeros((4, 4))]),
-        dynamics.arm_tables(
+        mechanics.arm_tables(
             arm.l1,
             arm.l2,
             arm.rho1,

@@ -1,4 +1,4 @@
-"""Equations of motion of the two-link flexible arm, as pure functions on arrays.
+"""Mechanics of the two-link flexible arm, as pure functions on arrays.
 
 In the complex plane, with the absolute angles ``a1 = theta1`` and
 ``a2 = theta1 + theta2 + 2 l1 v1``, a point of link k at abscissa x lies at
@@ -11,31 +11,37 @@ second derivatives of the coordinates. A link enters these sums only through the
 moments ``int x^k dm`` of its mass, and every sum is linear in the monomials
 ``{1, w^2, w v', v'^2} x {1, v, v^2, v^3, v^4}`` of its bending v, its bending rate
 v' and its turning rate w = a'. One constant matrix per link therefore holds all of
-its mechanics (`link_table`), and no quadrature remains at run time.
+its mechanics (`_link_table`), and no quadrature remains at run time.
 
 The coordinates are ``r = (a1, v1, a2, v2) = T q`` with ``q = (theta1, theta2, v1,
 v2)`` and the constant T of `coordinate_change`, so ``M_q = T' M_r T`` and
 ``F_q = T' F_r``. Arrays of coordinates are shaped (2 links, 2 kinds, n): kind 0 the
 angle, kind 1 the bending, n the number of experiments.
+
+At the end stands the kinematics: what the end-effector of the bent arm does, and the
+rigid arm that does the same.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+Array = NDArray[np.float64]
+
+ComplexArray = NDArray[np.complexfloating]
 
 # Half the integral of the squared slope: 1/2 int_0^x (2 xi v)^2 dxi = 2/3 x^3 v^2.
-SHORTENING = 2.0 / 3.0
+_SHORTENING = 2.0 / 3.0
 
-# Monomial (i, j) is RATES[i] * v^j and stands in column N_POWERS * i + j.
-N_POWERS = 5
+# Monomial (i, j) is the rate i, {1, w^2, w v', v'^2}, times v^j; it stands in column
+# _N_POWERS * i + j.
+_N_POWERS = 5
 
-ONE, TURNING2, CORIOLIS, BENDING2 = 0, 1, 2, 3
+_ONE, _TURNING2, _CORIOLIS, _BENDING2 = 0, 1, 2, 3
 
 
-def link_moments(length: float, density: float, end_mass: float) -> FloatArray:
+def _link_moments(length: float, density: float, end_mass: float) -> Array:
     """Moments ``int x^k dm``, k = 0..6, of a uniform link with a mass at its end.
 
     Parameters
@@ -54,16 +60,16 @@ def link_moments(length: float, density: float, end_mass: float) -> FloatArray:
 
     Examples
     --------
-    >>> link_moments(1.0, 2.0, 0.5)[:3].round(4)
+    >>> _link_moments(1.0, 2.0, 0.5)[:3].round(4)
     array([2.5   , 1.5   , 1.1667])
     """
     k = np.arange(7)
     return density * length ** (k + 1) / (k + 1) + end_mass * length**k
 
 
-def link_table(
-    moments: FloatArray, lever: FloatArray, hub_inertia: float, conjugate: bool
-) -> FloatArray:
+def _link_table(
+    moments: Array, lever: Array, hub_inertia: float, conjugate: bool
+) -> Array:
     """Matrix from the monomials of one link to its share of M, F and the coupling.
 
     Parameters
@@ -86,29 +92,29 @@ def link_table(
         of ``dz/da``, ``dz/dv`` and the acceleration of the lever, all three in the
         frame of the link.
     """
-    s, m = SHORTENING, moments
-    table = np.zeros((12, 4, N_POWERS))
+    s, m = _SHORTENING, moments
+    table = np.zeros((12, 4, _N_POWERS))
     # |z|^2, Im(conj(z) dz/dv) and |dz/dv|^2, integrated
-    table[0, ONE, [0, 2, 4]] = m[2] + hub_inertia, (1 - 2 * s) * m[4], s**2 * m[6]
-    table[1, ONE, [0, 2]] = table[2, ONE, [0, 2]] = m[3], s * m[5]
-    table[3, ONE, [0, 2]] = m[4], 4 * s**2 * m[6]
+    table[0, _ONE, [0, 2, 4]] = m[2] + hub_inertia, (1 - 2 * s) * m[4], s**2 * m[6]
+    table[1, _ONE, [0, 2]] = table[2, _ONE, [0, 2]] = m[3], s * m[5]
+    table[3, _ONE, [0, 2]] = m[4], 4 * s**2 * m[6]
     # Half of d|z|^2/dv makes both the Coriolis torque and the centrifugal bending.
     half_slope = (1 - 2 * s) * m[4], 2 * s**2 * m[6]
-    table[4, CORIOLIS, [1, 3]] = -2 * half_slope[0], -2 * half_slope[1]
-    table[4, BENDING2, 1] = -2 * s * m[5]
-    table[5, TURNING2, [1, 3]] = half_slope
-    table[5, BENDING2, 1] = -4 * s**2 * m[6]
+    table[4, _CORIOLIS, [1, 3]] = -2 * half_slope[0], -2 * half_slope[1]
+    table[4, _BENDING2, 1] = -2 * s * m[5]
+    table[5, _TURNING2, [1, 3]] = half_slope
+    table[5, _BENDING2, 1] = -4 * s**2 * m[6]
 
     z = np.array([lever[1], 1j * lever[2], -s * lever[3]])
-    vectors = np.zeros((3, 4, N_POWERS), dtype=complex)
-    vectors[0, ONE, :3] = 1j * z
-    vectors[1, ONE, :2] = z[1], 2 * z[2]
-    vectors[2, TURNING2, :3] = -z
-    vectors[2, CORIOLIS, :2] = 2j * z[1], 4j * z[2]
-    vectors[2, BENDING2, 0] = 2 * z[2]
+    vectors = np.zeros((3, 4, _N_POWERS), dtype=complex)
+    vectors[0, _ONE, :3] = 1j * z
+    vectors[1, _ONE, :2] = z[1], 2 * z[2]
+    vectors[2, _TURNING2, :3] = -z
+    vectors[2, _CORIOLIS, :2] = 2j * z[1], 4j * z[2]
+    vectors[2, _BENDING2, 0] = 2 * z[2]
     table[6:9] = vectors.real
     table[9:12] = -vectors.imag if conjugate else vectors.imag
-    return table.reshape(12, 4 * N_POWERS)
+    return table.reshape(12, 4 * _N_POWERS)
 
 
 def arm_tables(
@@ -120,24 +126,24 @@ def arm_tables(
     J2: float,
     elbow_mass: float,
     tip_mass: float,
-) -> FloatArray:
+) -> Array:
     """Tables of both links, shape (2, 12, 20): all that M and F need.
 
     Link 1 carries the whole of link 2 as a point mass at its end, as far as the
     motion of that point goes; the rest is the coupling of the chord of link 1 with
     the first moment of link 2.
     """
-    second = link_moments(l2, rho2, tip_mass)
-    first = link_moments(l1, rho1, elbow_mass + second[0])
+    second = _link_moments(l2, rho2, tip_mass)
+    first = _link_moments(l1, rho1, elbow_mass + second[0])
     return np.stack(
         [
-            link_table(first, l1 ** np.arange(4.0), J1, conjugate=True),
-            link_table(second, second[:4], J2, conjugate=False),
+            _link_table(first, l1 ** np.arange(4.0), J1, conjugate=True),
+            _link_table(second, second[:4], J2, conjugate=False),
         ]
     )
 
 
-def coordinate_change(l1: float) -> FloatArray:
+def coordinate_change(l1: float) -> Array:
     """Matrix T of ``(a1, v1, a2, v2) = T (theta1, theta2, v1, v2)``.
 
     Examples
@@ -158,9 +164,7 @@ def coordinate_change(l1: float) -> FloatArray:
     )
 
 
-def inertial_terms(
-    position: FloatArray, rate: FloatArray, tables: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def inertial_terms(position: Array, rate: Array, tables: Array) -> tuple[Array, Array]:
     """Mass matrix and Coriolis and centrifugal forces in the coordinates r.
 
     Parameters
@@ -176,16 +180,16 @@ def inertial_terms(
     force : ndarray of shape (2, 2, n)
     """
     n = position.shape[-1]
-    powers = np.empty((2, N_POWERS, n))
+    powers = np.empty((2, _N_POWERS, n))
     powers[:, 0] = 1.0
     powers[:, 1] = v = position[:, 1]
     powers[:, 2] = v * v
     powers[:, 3:] = powers[:, 1:3] * powers[:, 2:3]
     rates = np.empty((2, 4, 1, n))
-    rates[:, ONE] = 1.0
-    rates[:, TURNING2::2, 0] = rate * rate
-    rates[:, CORIOLIS, 0] = rate[:, 0] * rate[:, 1]
-    monomials = (rates * powers[:, np.newaxis]).reshape(2, 4 * N_POWERS, n)
+    rates[:, _ONE] = 1.0
+    rates[:, _TURNING2::2, 0] = rate * rate
+    rates[:, _CORIOLIS, 0] = rate[:, 0] * rate[:, 1]
+    monomials = (rates * powers[:, np.newaxis]).reshape(2, 4 * _N_POWERS, n)
     values = tables @ monomials
 
     # The coupling is Re(conj(J_1) J_2), Re(conj(J_1) a_2) and Re(conj(a_1) J_2).
@@ -206,13 +210,13 @@ def inertial_terms(
 
 
 def integrate(
-    state: FloatArray,
-    inputs: FloatArray,
-    linear_force: FloatArray,
-    tables: FloatArray,
+    state: Array,
+    inputs: Array,
+    linear_force: Array,
+    tables: Array,
     step: float,
     n_substeps: int,
-) -> FloatArray:
+) -> Array:
     """Integrate several experiments together by Runge-Kutta 4 with a fixed step.
 
     Parameters
@@ -239,7 +243,7 @@ def integrate(
     states = np.empty((len(inputs), 8, n))
     slopes = np.empty((4, 8, n))
 
-    def derivative(x: FloatArray, held: FloatArray, out: FloatArray) -> None:
+    def derivative(x: Array, held: Array, out: Array) -> None:
         r = x.reshape(2, 2, 2, n)
         mass, force = inertial_terms(r[0], r[1], tables)
         total = linear_force @ x
@@ -258,3 +262,80 @@ def integrate(
             slopes[1:3] *= 2.0
             state = state + (step / 6) * slopes.sum(axis=0)
     return states
+
+
+def check_coordinates(name: str, value: ArrayLike) -> Array:
+    """`value` as a finite array of shape (..., 4)."""
+    array = np.asarray(value, dtype=float)
+    if array.ndim == 0 or array.shape[-1] != 4:
+        raise ValueError(
+            f"`{name}` must have shape (..., 4): theta1, theta2, v1, v2. "
+            f"Got {array.shape}."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(f"`{name}` must be finite. Got NaN or infinity.")
+    return array
+
+
+def _chord(length: float, v: Array) -> tuple[ComplexArray, ComplexArray]:
+    """Vector from base to end of a bent link in its frame, and its v-derivative."""
+    end = np.asarray(length + 1j * length**2 * v - _SHORTENING * length**3 * v**2)
+    slope = np.asarray(1j * length**2 - 2 * _SHORTENING * length**3 * v)
+    return end, slope
+
+
+def rigid_joint_rates(q: Array, qdot: Array, l1: float, l2: float) -> Array:
+    """Joint rates of the rigid arm with the same end-effector position and velocity.
+
+    Parameters
+    ----------
+    q, qdot : ndarray of shape (..., 4)
+        ``(theta1, theta2, v1, v2)`` and its time derivative.
+    l1, l2 : float
+        Lengths of the links in m.
+
+    Returns
+    -------
+    y : ndarray of shape (..., 2)
+        In rad/s.
+
+    Raises
+    ------
+    ValueError
+        If the end-effector is out of the rigid arm's reach, or the arm is stretched
+        or folded.
+
+    Examples
+    --------
+    >>> rigid_joint_rates(np.array([0.0, 1, 0, 0]), np.array([0.3, 0.2, 0, 0]), 1, 1)
+    array([0.3, 0.2])
+    """
+    _, theta2, v1, v2 = np.moveaxis(q, -1, 0)
+    rate1, rate2, w1, w2 = np.moveaxis(qdot, -1, 0)
+    chord1, slope1 = _chord(l1, v1)
+    chord2, slope2 = _chord(l2, v2)
+    # Everything is seen in the frame of joint 1, whose angle therefore drops out.
+    turn = np.exp(1j * (theta2 + 2 * l1 * v1))
+    forearm = turn * chord2
+    z = chord1 + forearm
+    zdot = (
+        1j * rate1 * chord1
+        + slope1 * w1
+        + 1j * (rate1 + rate2 + 2 * l1 * w1) * forearm
+        + turn * slope2 * w2
+    )
+    reach2 = np.abs(z) ** 2
+    cosine = (reach2 - l1**2 - l2**2) / (2 * l1 * l2)
+    if not (np.abs(cosine) < 1).all():
+        raise ValueError(
+            "`theta2` must stay away from multiples of pi, where the arm is stretched "
+            "or folded and the rigid arm's rates do not exist. Got cos(theta2) up to "
+            f"{np.abs(cosine).max():.6g} in magnitude; start further away or lower "
+            "the velocity reference."
+        )
+    # The elbow bends to the side on which the forearm leaves the upper arm.
+    side = np.sign((chord1.conj() * forearm).imag)
+    product = z.conj() * zdot
+    y2 = -product.real / (l1 * l2 * side * np.sqrt(1 - cosine**2))
+    y1 = (product.imag - y2 * l2 * (l2 + l1 * cosine)) / reach2
+    return np.stack([y1, y2], axis=-1)
