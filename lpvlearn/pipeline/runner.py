@@ -21,7 +21,6 @@ from joblib import Memory, Parallel, delayed, hash
 from numpy.typing import NDArray
 from sklearn.utils.validation import check_memory
 from threadpoolctl import ThreadpoolController
-from tqdm import tqdm
 
 from ..exceptions import warn
 
@@ -92,11 +91,12 @@ class PointRunner:
             for k, args in enumerate(arguments)
         )
         results = Parallel(n_jobs=self.n_jobs, return_as="generator")(tasks)
-        total = len(arguments)
+        if self.verbose:
+            from tqdm import tqdm  # slow to import
+
+            results = tqdm(results, desc=what, total=len(arguments))
         try:
-            found = list(
-                tqdm(results, desc=what, total=total, disable=not self.verbose)
-            )
+            found = list(results)
         except _Stopped as stopped:
             k, error = stopped.args
             # The point, or an option? A neighbour (the last for the first) tells.
@@ -106,7 +106,7 @@ class PointRunner:
             skip = "" if "on_error" in str(error) else _SKIP
             raise ValueError(f"{_place(k, kappa)}: {error}{skip}") from error
         failures = {k: r for k, r in enumerate(found) if isinstance(r, _Failure)}
-        if len(failures) == total:
+        if len(failures) == len(found):
             first = found[0]
             if all(failure.text == first.text for failure in failures.values()):
                 raise ValueError(first.text) from first.error

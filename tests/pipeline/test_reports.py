@@ -1,33 +1,20 @@
-"""Reports: tables that say what was fitted, and how well."""
+"""Reports of a pipeline: what was fitted at every point, how well, and in words."""
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from lpvlearn import (
     GrayBoxRestructurer,
     GrayBoxStructure,
     LocalLPVPipeline,
-    LPVStateSpace,
-    PolynomialLPV,
-    StateSpace,
     SubspaceLTI,
-    bft_score,
-    compare_models,
-    fit_report,
     from_trajectories,
     parameter_fit,
-    readable_report,
 )
 
 from ..conftest import (
-    KAPPA,
-    ROLES,
-    spring_lpv,
     spring_pipeline,
-    spring_structure,
     spring_tables,
-    spring_truth,
 )
 
 
@@ -54,9 +41,6 @@ def uncertain(fitted, monkeypatch):
 
     monkeypatch.setattr(GrayBoxRestructurer, "fit_model", fit_model)
     return spring_pipeline().fit(*spring_tables(n_samples=200))
-
-
-# ------------------------------------------------------------------------- the pipeline
 
 
 def test_the_report_of_a_pipeline_covers_all_three_steps(fitted):
@@ -171,144 +155,3 @@ def test_the_summary_tells_what_was_found(fitted, balanced):
         assert words in text
     assert max(map(len, text.splitlines())) <= 120
     assert "no common state basis" in balanced.summary()
-
-
-# --------------------------------------------------------------------------- comparison
-
-
-@pytest.fixture(scope="module")
-def comparison(fitted, balanced, spring):
-    X, y = spring[2:]
-    models = {
-        "restructured": fitted,
-        "balanced": balanced,
-        "analytic": spring_lpv(),
-        "frozen": spring_lpv().at(0.75),
-    }
-    return models, compare_models(models, X, y)
-
-
-def test_estimators_and_models_are_compared_on_one_table(comparison, spring):
-    X, y = spring[2:]
-    models, report = comparison
-    assert list(report["model"]) == list(models)
-    assert list(report.columns[1:]) == list(fit_report(models["balanced"], X, y))
-    bft = report.set_index("model")["BFT"]
-    assert bft["analytic"] > 100 - 1e-6
-    assert bft["restructured"] > bft["balanced"] > bft["frozen"]
-    expected = bft_score(y, models["restructured"].predict(X))
-    assert bft["restructured"] == pytest.approx(expected)
-    frozen = models["frozen"].simulate(X[["force"]], sampling_time=0.02)
-    assert bft["frozen"] == pytest.approx(bft_score(y, frozen))
-
-
-def test_models_without_an_estimator_take_roles(spring):
-    X, y = spring[2:]
-    report = compare_models({"analytic": spring_lpv()}, X, y, **ROLES)
-    assert report["BFT"].item() > 100 - 1e-6
-    assert report[["experiment", "output"]].to_numpy().tolist() == [
-        ["sweep", "position"]
-    ]
-    bare = compare_models(
-        {"analytic": spring_lpv()},
-        X.drop(columns="time"),
-        y,
-        scheduling="kappa",
-        experiment="run",
-        sampling_time=0.02,
-    )
-    assert bare["BFT"].item() > 100 - 1e-6
-
-
-def test_the_start_of_a_record_in_the_middle_is_estimated(spring):
-    X, y = (table.iloc[400:900] for table in spring[2:])
-    models = {"lpv": spring_lpv(), "lti": spring_lpv().at(0.75)}
-    rest = compare_models(models, X, y, **ROLES)["BFT"]
-    estimated = compare_models(models, X, y, initial_state="estimate", **ROLES)["BFT"]
-    assert rest[0] < 95 and estimated[0] > 100 - 1e-6
-    assert estimated[1] >= rest[1]
-
-
-def test_a_discrete_model_is_compared_as_it_is(spring):
-    X, y = spring[:2]
-    first = (X["run"] == "p0r0").to_numpy()
-    sampled = spring_lpv().at(0.0).to_discrete(0.02)
-    report = compare_models({"sampled": sampled}, X[first], y[first], **ROLES)
-    assert report["BFT"].item() > 100 - 1e-6
-
-
-@pytest.mark.parametrize(
-    ("models", "roles", "words"),
-    [
-        ({}, {}, "`models` must be a dict"),
-        ([StateSpace([[-1.0]], [[1.0]], [[1.0]])], {}, "`models` must be a dict"),
-        ({"a": 3}, {}, r"`models\['a'\]` must be a fitted estimator"),
-        ({"a": spring_lpv()}, {"run": "run"}, "`roles` must be 'inputs', .* Got 'run'"),
-        (
-            {"a": spring_lpv()},
-            {"inputs": "force"},
-            "model 'a': `scheduling` must name the 1 column",
-        ),
-        (
-            {"a": StateSpace(-np.eye(2), np.eye(2), np.eye(2))},
-            {"inputs": "force"},
-            "model 'a': .*2",
-        ),
-    ],
-)
-def test_bad_comparisons_name_the_cause(models, roles, words, spring):
-    with pytest.raises(ValueError, match=words):
-        compare_models(models, *spring[2:], **roles)
-
-
-# --------------------------------------------------------------------------- for people
-
-
-def test_readable_reports_keep_every_row_and_column(fitted, comparison):
-    for report in (fitted.report_, fitted.parameter_report_, comparison[1]):
-        text = readable_report(report)
-        assert text.shape == report.shape
-        assert all(isinstance(cell, str) for cell in text.to_numpy().ravel())
-        assert not any("_" in heading for heading in text.columns)
-    assert readable_report(fitted.report_).index.tolist() == ["0", "0.5", "1", "1.5"]
-    assert readable_report(pd.DataFrame({"BFT": [99.999, np.nan]}))["BFT"].tolist() == [
-        "100.00",
-        "",
-    ]
-
-
-def test_reports_over_several_scheduling_variables_are_readable():
-    report = pd.DataFrame(
-        {"local_BFT": [99.0]},
-        index=pd.Index([(0.5, 1.25)], name="operating_point", tupleize_cols=False),
-    )
-    assert readable_report(report).index.tolist() == ["0.5, 1.25"]
-
-
-def test_reports_are_written_to_latex(fitted):
-    pytest.importorskip("jinja2")
-    latex = readable_report(fitted.report_).to_latex()
-    assert "local BFT" in latex and "95." in latex
-    assert "active at rad/s" in latex
-    assert fitted.report_.style.format(precision=2).to_html()
-    labelled = readable_report(pd.DataFrame({"experiment": ["run_1"], "BFT": [98.0]}))
-    assert r"run\_1 & 98.00" in labelled.to_latex(escape=True)
-
-
-def test_reports_are_written_to_markdown(fitted):
-    pytest.importorskip("tabulate")
-    lines = readable_report(fitted.report_).to_markdown().splitlines()
-    assert len(lines) == 2 + len(KAPPA)
-    text = readable_report(pd.DataFrame({"BFT": [98.0]}))
-    assert "98.00" in text.to_markdown(disable_numparse=True)
-
-
-def test_the_analytic_model_may_be_any_lpv_model(spring):
-    """Built from parameters at points, as a user does who knows the physics."""
-    kappa = np.array(KAPPA)[:, None]
-    lpv = LPVStateSpace(
-        spring_structure(),
-        PolynomialLPV(2).fit(kappa, spring_truth(KAPPA)),
-        [[0.0], [1.5]],
-    )
-    assert compare_models({"lpv": lpv}, *spring[2:], **ROLES)["BFT"].item() > 99.999

@@ -1,0 +1,86 @@
+"""A spring at four scheduling values, and pictures that are closed again."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    StateSpace,
+    SubspaceLTI,
+)
+
+STEP = 0.05
+KAPPA = np.array([-1.0, 0.0, 1.0, 2.0])
+SPRING = GrayBoxStructure.from_template(
+    A=[[0, 1], ["-k", "-c"]], B=[[0], ["k"]], C=[[1, 0]]
+)
+
+
+ONE = StateSpace([[-1.0]], [[1.0]], [[1.0]])
+
+
+@pytest.fixture(autouse=True)
+def plt():
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as pyplot
+
+    yield pyplot
+    pyplot.close("all")
+
+
+def spring(kappa):
+    return SPRING.model({"k": 9.0 + 2.0 * kappa + kappa**2, "c": 0.8})
+
+
+@pytest.fixture(scope="session")
+def tables():
+    rng = np.random.default_rng(0)
+    parts = []
+    for label, kappa in zip("abcd", KAPPA, strict=True):
+        u = np.repeat(rng.choice([-1.0, 1.0], (60, 1)), 5, axis=0)
+        y = spring(kappa).simulate(u, sampling_time=STEP)
+        parts.append(
+            pd.DataFrame(
+                {
+                    "u": u[:, 0],
+                    "kappa": kappa,
+                    "run": label,
+                    "time": STEP * np.arange(300),
+                    "angle": y[:, 0],
+                }
+            )
+        )
+    table = pd.concat(parts, ignore_index=True)
+    return table.drop(columns="angle"), table[["angle"]]
+
+
+@pytest.fixture(scope="session")
+def pipeline(tables):
+    return LocalLPVPipeline(
+        local=SubspaceLTI(order=2, horizon=8),
+        restructurer=GrayBoxRestructurer(SPRING),
+        scheduling="kappa",
+        experiment="run",
+        time="time",
+    ).fit(*tables)
+
+
+def random_model(seed, order=4, n_outputs=2, n_inputs=3, sampling_time=None):
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((order, order))
+    if sampling_time is None:
+        A -= (np.abs(np.linalg.eigvals(A).real).max() + 0.1) * np.eye(order)
+    else:
+        A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    return StateSpace(
+        A,
+        rng.standard_normal((order, n_inputs)),
+        rng.standard_normal((n_outputs, order)),
+        rng.standard_normal((n_outputs, n_inputs)),
+        sampling_time,
+    )

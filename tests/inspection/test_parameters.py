@@ -1,0 +1,106 @@
+"""Parameters over the scheduling variable."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_allclose
+
+from lpvlearn import (
+    PolynomialLPV,
+)
+from lpvlearn.inspection import (
+    ParameterDisplay,
+)
+
+from .conftest import KAPPA
+
+
+def test_parameters_of_a_pipeline_are_points_and_their_interpolation_a_curve(pipeline):
+    truth = pd.DataFrame({"k": 9.0 + 2 * KAPPA + KAPPA**2, "c": 0.8})
+    display = ParameterDisplay.from_estimator(pipeline, others={"truth": truth})
+    names = list(pipeline.parameters_.columns)
+    assert [ax.get_title() for ax in display.axes_] == names
+    assert list(display.lines_) == ["restructured", "truth"]
+    for k, name in enumerate(names):
+        points = display.lines_["restructured"][k]
+        assert_allclose(points.get_xdata(), pipeline.operating_points_[:, 0])
+        assert_allclose(points.get_ydata(), pipeline.parameters_[name])
+        assert_allclose(display.lines_["truth"][k].get_ydata(), truth[name])
+        curve = display.curves_["restructured"][k]
+        fine = curve.get_xdata()
+        assert fine[0] == KAPPA.min() and fine[-1] == KAPPA.max()
+        assert_allclose(
+            curve.get_ydata(), pipeline.lpv_.parameters(fine)[:, k], rtol=1e-9
+        )
+
+
+def test_names_select_parameters(pipeline):
+    display = ParameterDisplay.from_estimator(pipeline, names=["k"])
+    assert display.names == ["k"] and len(display.axes_) == 1
+    assert_allclose(
+        display.lines_["restructured"][0].get_ydata(), pipeline.parameters_["k"]
+    )
+
+
+def test_sixteen_parameters_make_a_grid_of_four_by_four():
+    rng = np.random.default_rng(0)
+    theta = rng.standard_normal((5, 16))
+    display = ParameterDisplay.from_parameters(
+        np.linspace(0, 1, 5)[:, None], {"a": theta, "b": theta + 1}
+    )
+    assert len(display.axes_) == 16
+    spec = display.axes_[0].get_subplotspec().get_gridspec()
+    assert spec.get_geometry() == (4, 4)
+    assert display.names[0] == "p1" and not display.curves_
+
+
+def test_an_interpolator_is_fitted_to_each_set_and_left_alone():
+    kappa = np.linspace(-1, 1, 5)
+    sets = {"line": 2 * kappa[:, None], "bend": kappa[:, None] ** 2}
+    polynomial = PolynomialLPV(degree=2)
+    display = ParameterDisplay.from_parameters(
+        kappa, sets, interpolator=polynomial, names=["gain"]
+    )
+    assert not hasattr(polynomial, "coef_")
+    fine = display.curves_["bend"][0].get_xdata()
+    assert_allclose(display.curves_["bend"][0].get_ydata(), fine**2, atol=1e-12)
+    assert_allclose(display.curves_["line"][0].get_ydata(), 2 * fine, atol=1e-12)
+
+
+def test_a_constant_parameter_is_drawn_flat():
+    theta = 5 + 1e-12 * np.arange(4.0)[:, None]
+    low, high = (
+        ParameterDisplay.from_parameters(KAPPA, {"a": theta}).axes_[0].get_ylim()
+    )
+    assert high - low > 0.5
+
+
+@pytest.mark.parametrize(
+    ("kappa", "parameters", "names", "message"),
+    [
+        (
+            np.ones((4, 2)),
+            {"a": np.ones((4, 1))},
+            None,
+            "needs one scheduling variable",
+        ),
+        (KAPPA, {"a": np.ones((3, 1))}, None, r"`parameters\['a'\]` must .*\(4, 1\)"),
+        (KAPPA, np.ones((4, 1)), None, "`parameters` must be a dict"),
+        (KAPPA, {"a": np.ones((4, 2))}, ["p"], "`names` must hold 2 names"),
+        (
+            KAPPA,
+            {"a": pd.DataFrame({"k": KAPPA})},
+            ["m"],
+            "`names` must be among the parameters k. Got 'm'",
+        ),
+        (
+            KAPPA,
+            {"a": pd.DataFrame({"k": KAPPA}), "b": pd.DataFrame({"m": KAPPA})},
+            None,
+            r"`parameters\['b'\]` must have the columns .* none named 'k'",
+        ),
+    ],
+)
+def test_parameter_errors_teach(kappa, parameters, names, message):
+    with pytest.raises(ValueError, match=message):
+        ParameterDisplay.from_parameters(kappa, parameters, names=names)

@@ -1,0 +1,62 @@
+"""Poles of the frozen models."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from lpvlearn import (
+    LPVStateSpace,
+    PolynomialLPV,
+)
+from lpvlearn.inspection import (
+    PoleDisplay,
+)
+
+from .conftest import SPRING, spring
+
+
+def lpv_of(n_scheduling):
+    corners = np.array([[0.0] * n_scheduling, [1.0] * n_scheduling])
+    points = np.vstack([corners, np.eye(n_scheduling)])
+    theta = np.column_stack([np.full(len(points), 0.5), 4 + points.sum(1)])
+    return LPVStateSpace(SPRING, PolynomialLPV(degree=1).fit(points, theta), corners)
+
+
+def test_pole_points_are_the_frozen_poles_coloured_by_scheduling():
+    lpv = lpv_of(1)
+    kappa = np.linspace(0, 1, 7)
+    display = PoleDisplay.from_model(lpv, kappa=kappa, damping=True)
+    poles = np.array([lpv.at(k).poles() for k in kappa]).ravel()
+    drawn = display.points_.get_offsets() @ [1, 1j]
+    assert_allclose(np.sort_complex(drawn), np.sort_complex(poles))
+    assert_array_equal(display.points_.get_array(), np.repeat(kappa, 2))
+    assert display.local_points_ is None
+    right = display.ax_.get_xlim()[1]
+    assert right > 0  # the border of stability is seen
+
+
+def test_damping_lines_go_through_poles_of_that_damping():
+    display = PoleDisplay([0.0], [[-3 + 4j, -3 - 4j]]).plot(damping=True)
+    lines = [line for line in display.ax_.lines if line.get_linestyle() == ":"]
+    ratios = [
+        -line.get_xdata()[0] / np.hypot(line.get_xdata()[0], line.get_ydata()[0])
+        for line in lines
+    ]
+    labels = [text.get_text() for text in display.ax_.texts]
+    assert_allclose(ratios, [float(label.split()[-1]) for label in labels])
+
+
+def test_poles_of_a_pipeline_show_the_local_models_as_rings(pipeline):
+    display = PoleDisplay.from_estimator(pipeline)
+    drawn = display.local_points_.get_offsets() @ [1, 1j]
+    local = np.concatenate([model.poles() for model in pipeline.local_models_])
+    assert_allclose(drawn, local)
+
+
+def test_pole_errors_teach():
+    with pytest.raises(ValueError, match="needs one scheduling variable.* Got 2"):
+        PoleDisplay.from_model(lpv_of(2))
+    with pytest.raises(ValueError, match="`model` must be an LPVStateSpace"):
+        PoleDisplay.from_model(spring(0.0))
+    with pytest.raises(ValueError, match=r"`poles` must have shape \(1, order\)"):
+        PoleDisplay([0.0], [-1.0, -2.0])

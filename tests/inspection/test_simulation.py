@@ -1,0 +1,114 @@
+"""Simulated outputs beside the measured ones."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from lpvlearn import (
+    PolynomialLPV,
+    SubspaceLTI,
+    bft_score,
+)
+from lpvlearn.inspection import (
+    SimulationDisplay,
+)
+
+from .conftest import STEP
+
+
+def legend_texts(ax):
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def test_simulation_draws_the_signals_and_tells_their_bft():
+    rng = np.random.default_rng(0)
+    time, y = np.arange(50) * 0.1, rng.standard_normal((50, 2))
+    predictions = {"good": y + 0.1, "poor": 0.3 * y}
+    display = SimulationDisplay.from_predictions(time, y, predictions, units=["V", "A"])
+    assert len(display.axes_) == 2
+    assert [ax.get_ylabel() for ax in display.axes_] == ["y1 (V)", "y2 (A)"]
+    for i, ax in enumerate(display.axes_):
+        assert_array_equal(display.lines_["measured"][i].get_ydata(), y[:, i])
+        for name, y_pred in predictions.items():
+            line = display.lines_[name][i]
+            assert_array_equal(line.get_xdata(), time)
+            assert_array_equal(line.get_ydata(), y_pred[:, i])
+        fits = [bft_score(y[:, i], y_pred[:, i]) for y_pred in predictions.values()]
+        assert legend_texts(ax) == [
+            "measured",
+            f"good: BFT {fits[0]:.1f} %",
+            f"poor: BFT {fits[1]:.1f} %",
+        ]
+
+
+def test_zoom_shows_a_part_and_keeps_the_fit_of_the_whole():
+    time = np.arange(100) * 0.1
+    y = np.sin(time)
+    display = SimulationDisplay.from_predictions(time, y, 0.9 * y, zoom=(2.0, 3.0))
+    line = display.lines_["simulated"][0]
+    assert_allclose(line.get_xdata(), np.arange(20, 31) * 0.1)
+    assert legend_texts(display.axes_[0])[1].endswith(f"{bft_score(y, 0.9 * y):.1f} %")
+    title = display.axes_[0].get_legend().get_title().get_text()
+    assert "whole record, 0 to 9.9 s" in title
+
+
+def test_simulation_of_an_experiment_is_the_prediction_there(pipeline, tables):
+    X, y = tables
+    display = SimulationDisplay.from_estimator(pipeline, X, y, experiment="c")
+    rows = (X["run"] == "c").to_numpy()
+    line = display.lines_["simulated"][0]
+    assert_allclose(line.get_ydata(), pipeline.predict(X)[rows][:, 0])
+    assert_allclose(line.get_xdata(), X["time"][rows])
+    assert display.axes_[0].get_ylabel() == "angle"
+    assert display.axes_[-1].get_xlabel() == "Time (s)"
+
+
+def test_simulation_from_an_estimated_state_fits_a_record_cut_in_the_middle(
+    pipeline, tables
+):
+    X, y = (table.iloc[30:300] for table in tables)
+    rest = SimulationDisplay.from_estimator(pipeline, X, y)
+    estimate = SimulationDisplay.from_estimator(
+        pipeline, X, y, initial_state="estimate"
+    )
+    assert rest.bft_["simulated"][0] < 90 < 99 < estimate.bft_["simulated"][0]
+    assert estimate.time[0] == pytest.approx(30 * STEP)
+
+
+def test_simulation_takes_arrays_and_searches(tables):
+    X, y = tables[0][["u"]].to_numpy()[:300], tables[1].to_numpy()[:300, 0]
+    fitted = SubspaceLTI(order=2, horizon=8, sampling_time=STEP).fit(X, y)
+    search = SimpleNamespace(best_estimator_=fitted)
+    display = SimulationDisplay.from_estimator(search, X, y, name="model")
+    assert_allclose(display.lines_["model"][0].get_ydata(), fitted.predict(X))
+    assert_allclose(display.time, STEP * np.arange(300))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"experiment": "z"}, "`experiment` must be the label .*'a', 'b'.* Got 'z'"),
+        ({"initial_state": "zero"}, "`initial_state` must be 'rest' or 'estimate'"),
+        ({"zoom": (99, 100)}, "`zoom` must be .*within 0 to 14.95. Got"),
+        ({"units": ["m", "s"]}, "`units` must hold 1 names"),
+        ({"name": "measured"}, "must not name a simulation 'measured'"),
+    ],
+)
+def test_simulation_errors_teach(pipeline, tables, options, message):
+    with pytest.raises(ValueError, match=message):
+        SimulationDisplay.from_estimator(pipeline, *tables, **options)
+
+
+def test_simulation_errors_teach_about_shapes_and_estimators(tables):
+    with pytest.raises(ValueError, match=r"`time` must have shape \(3,\)"):
+        SimulationDisplay.from_predictions([0, 1], [1, 2, 3], [1, 2, 3])
+    with pytest.raises(ValueError, match=r"'simulated' must have the shape"):
+        SimulationDisplay.from_predictions([0, 1], [1.0, 2], [1.0, 2, 3])
+    with pytest.raises(ValueError, match=r"split_experiments.*from_predictions"):
+        SimulationDisplay.from_estimator(PolynomialLPV(), *tables)
+    alone = SubspaceLTI(order=2, horizon=8, inputs="u")
+    X, y = (table.iloc[:300] for table in tables)
+    with pytest.raises(ValueError, match="`experiment` must be None"):
+        SimulationDisplay.from_estimator(alone.fit(X, y), X, y, experiment="a")
