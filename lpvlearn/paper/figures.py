@@ -17,19 +17,17 @@ from .tables import local_experiments, nearest_model, simulate_sweep
 
 Array = NDArray[np.float64]
 
-__all__ = ["save_figures"]
+_RATE = "rad/s"  # unit of inputs and outputs
 
-RATE = "rad/s"
+_DOTS_PER_INCH = 130  # 1040 pixels wide
 
-DOTS_PER_INCH = 130
-
-TITLE_SIZE = 10.0
+_TITLE_SIZE = 10.0  # points
 
 # The arm's dynamics, 0.7 to 120 rad/s, and up to 1e4 rad/s as in the paper.
-BODE_RANGE = (1e-1, 1e4)
+_BODE_RANGE = (1e-1, 1e4)
 
 # Diagonal and neighbours of A: enough to see how a balanced basis wanders.
-BALANCED_ENTRIES = (
+_BALANCED_ENTRIES = (
     (1, 1), (1, 2), (2, 2), (2, 3), (3, 3), (3, 4), (4, 4), (4, 5),
     (5, 5), (5, 6), (6, 6), (1, 6),
 )  # fmt: skip
@@ -58,28 +56,28 @@ def save_figures(experiment: PaperExperiment, directory: Path) -> list[Path]:
 
     directory.mkdir(parents=True, exist_ok=True)
     paths = []
-    for number, draw in FIGURES.items():
+    for number, draw in _FIGURES.items():
         figure, title = draw(experiment)
-        entitle(figure, f"Figure {number}. {title}")
+        _entitle(figure, f"Figure {number}. {title}")
         # Saving would lay the figure out twice: do it once, and keep it.
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
         path = directory / f"figure{number:02d}.png"
-        figure.savefig(path, dpi=DOTS_PER_INCH)
+        figure.savefig(path, dpi=_DOTS_PER_INCH)
         plt.close(figure)
         paths.append(path)
     return paths
 
 
-def entitle(figure: Any, title: str) -> None:
+def _entitle(figure: Any, title: str) -> None:
     """A title above a figure: over its legend where that stands above the axes."""
     if not figure.legends:
-        figure.suptitle(title, fontsize=TITLE_SIZE, x=0.01, ha="left")
+        figure.suptitle(title, fontsize=_TITLE_SIZE, x=0.01, ha="left")
         return
     # Both would claim the same place if the title were the figure's.
     legend = figure.legends[0]
     legend.set_alignment("left")
-    legend.set_title(title, prop={"size": TITLE_SIZE})
+    legend.set_title(title, prop={"size": _TITLE_SIZE})
 
 
 def draw_data(experiment: PaperExperiment) -> tuple[Any, str]:
@@ -100,11 +98,11 @@ def draw_data(experiment: PaperExperiment) -> tuple[Any, str]:
             linewidth=0.8,
             drawstyle="steps-post" if is_input else "default",
         )
-        ax.set_ylabel(f"{name} ({RATE})")
+        ax.set_ylabel(f"{name} ({_RATE})")
         ax.set_xlim(0.0, X["time"].iloc[-1])
         tidy(ax)
     axes[-1, 0].set_xlabel("Time (s)")
-    angle = nearest_angle(data.theta2, float(X["kappa"].mean()))
+    angle = _nearest_angle(data.theta2, float(X["kappa"].mean()))
     return figure, (
         f"Noisy data of one local experiment at θ₂ = {angle}: velocity references "
         "(above), outputs"
@@ -124,10 +122,10 @@ def draw_local_responses(experiment: PaperExperiment) -> tuple[Any, str]:
         X["time"],
         y.rename(columns=str),
         {"local model": simulated},
-        units=RATE,
+        units=_RATE,
         zoom=(0.0, min(1.0, float(X["time"].iloc[-1]))),
     )
-    angle = nearest_angle(data.theta2, kappa)
+    angle = _nearest_angle(data.theta2, kappa)
     return display.figure_, f"Local model at θ₂ = {angle} on new noise-free data"
 
 
@@ -140,7 +138,7 @@ def draw_bode(experiment: PaperExperiment) -> tuple[Any, str]:
         "estimated": nearest_model(experiment.pipeline, np.cos(theta2)),
         "rigid arm": data.arm.rigid(theta2),
     }
-    display = BodeDisplay.from_models(models, omega=np.geomspace(*BODE_RANGE, 600))
+    display = BodeDisplay.from_models(models, omega=np.geomspace(*_BODE_RANGE, 600))
     nyquist = np.pi / data.sampling_time
     for ax in display.axes_.flat:
         ax.axvline(nyquist, color="0.6", linewidth=0.8, linestyle=":")
@@ -154,7 +152,7 @@ def draw_bode(experiment: PaperExperiment) -> tuple[Any, str]:
         fontsize=8,
         color="0.4",
     )
-    angle = nearest_angle(data.theta2, np.cos(theta2))
+    angle = _nearest_angle(data.theta2, np.cos(theta2))
     return display.figure_, f"Bode magnitudes of the local models at θ₂ = {angle}"
 
 
@@ -182,7 +180,7 @@ def draw_balanced(experiment: PaperExperiment) -> tuple[Any, str]:
     found = experiment.parameters["balanced"]
     A = found.structure.matrices(found.theta)[0]
     order = A.shape[1]
-    entries = [(i, j) for i, j in BALANCED_ENTRIES if max(i, j) <= order]
+    entries = [(i, j) for i, j in _BALANCED_ENTRIES if max(i, j) <= order]
     display = ParameterDisplay.from_parameters(
         experiment.pipeline.operating_points_,
         {"balanced": np.array([A[:, i - 1, j - 1] for i, j in entries]).T},
@@ -212,7 +210,7 @@ def draw_sweep_angle(experiment: PaperExperiment) -> tuple[Any, str]:
     (local,) = ax.plot([], [], color="#0072B2", linewidth=0.8, linestyle="--")
     local.set_label("operating points of the local experiments")
     ax.set_yticks(
-        data.theta2, [nearest_angle(data.theta2, np.cos(t)) for t in data.theta2]
+        data.theta2, [_nearest_angle(data.theta2, np.cos(t)) for t in data.theta2]
     )
     ax.set_xlim(0.0, data.X_sweep["time"].iloc[-1])
     ax.set_ylabel("θ₂ (rad)")
@@ -222,7 +220,7 @@ def draw_sweep_angle(experiment: PaperExperiment) -> tuple[Any, str]:
     return figure, "θ₂ during the validation of the LPV models"
 
 
-def sweep_drawer(name: str) -> Callable[[PaperExperiment], tuple[Any, str]]:
+def _sweep_drawer(name: str) -> Callable[[PaperExperiment], tuple[Any, str]]:
     """The function that draws one LPV model on the sweep: Fig. 8, 9 or 10."""
 
     def draw(experiment: PaperExperiment) -> tuple[Any, str]:
@@ -232,28 +230,28 @@ def sweep_drawer(name: str) -> Callable[[PaperExperiment], tuple[Any, str]]:
             data.X_sweep["time"],
             data.y_sweep,
             {f"LPV, {name}": simulate_sweep(model, data)},
-            units=RATE,
+            units=_RATE,
         )
         return display.figure_, f"LPV model from the {name} local models on the sweep"
 
     return draw
 
 
-def nearest_angle(theta2: Array, kappa: float) -> str:
+def _nearest_angle(theta2: Array, kappa: float) -> str:
     """The operating point nearest to a scheduling value, as a multiple of pi."""
     n = len(theta2) + 1
     i = int(np.argmin(np.abs(np.cos(theta2) - kappa))) + 1
     return f"π/{n}" if i == 1 else f"{i}π/{n}"
 
 
-FIGURES: dict[int, Callable[[PaperExperiment], tuple[Any, str]]] = {
+_FIGURES: dict[int, Callable[[PaperExperiment], tuple[Any, str]]] = {
     2: draw_data,
     3: draw_local_responses,
     4: draw_bode,
     5: draw_parameters,
     6: draw_balanced,
     7: draw_sweep_angle,
-    8: sweep_drawer("restructured"),
-    9: sweep_drawer("analytic"),
-    10: sweep_drawer("balanced"),
+    8: _sweep_drawer("restructured"),
+    9: _sweep_drawer("analytic"),
+    10: _sweep_drawer("balanced"),
 }

@@ -1,4 +1,4 @@
-"""The figures that the paper published, Tables 1 to 4."""
+"""Tables 1 to 4: this library's figures beside those that the paper published."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import Bunch
 
 from .. import (
@@ -76,8 +76,19 @@ def local_experiments(
 
 def nearest_model(pipeline: LocalLPVPipeline, kappa: float) -> StateSpace:
     """The local black-box model whose operating point is nearest."""
-    distance = np.abs(pipeline.operating_points_[:, 0] - kappa)
-    return pipeline.local_models_[int(np.argmin(distance))]
+    return pipeline.local_models_[_nearest(pipeline, kappa)]
+
+
+def _nearest(pipeline: LocalLPVPipeline, kappa: float) -> int:
+    return int(np.argmin(np.abs(pipeline.operating_points_[:, 0] - kappa)))
+
+
+def _fits(y: ArrayLike, simulated: ArrayLike) -> Iterator[tuple[str, str, float]]:
+    """Metric, output and percent of both outputs by both metrics."""
+    for metric, score in (("BFT", bft_score), ("VAF", vaf_score)):
+        values = score(y, simulated, multioutput="raw_values")
+        for output, value in zip(OUTPUTS, values, strict=True):
+            yield metric, output, float(value)
 
 
 def local_table(pipeline: LocalLPVPipeline, data: Bunch) -> pd.DataFrame:
@@ -88,11 +99,9 @@ def local_table(pipeline: LocalLPVPipeline, data: Bunch) -> pd.DataFrame:
         simulated = model.simulate(
             X[["u1", "u2"]].to_numpy(), sampling_time=data.sampling_time
         )
-        for metric, score in (("BFT", bft_score), ("VAF", vaf_score)):
-            values = score(y, simulated, multioutput="raw_values")
-            for output, value in zip(OUTPUTS, values, strict=True):
-                paper = TABLE_1[metric, output][i]
-                rows.append((data.theta2[i], metric, output, float(value), paper))
+        for metric, output, value in _fits(y, simulated):
+            paper = TABLE_1[metric, output][i]
+            rows.append((data.theta2[i], metric, output, value, paper))
     return pd.DataFrame(rows, columns=["theta2", "metric", "output", "ours", "paper"])
 
 
@@ -104,8 +113,7 @@ def restructuring_table(pipeline: LocalLPVPipeline, data: Bunch) -> pd.DataFrame
     """
     rows = []
     for i, theta2 in enumerate(data.theta2):
-        distance = np.abs(pipeline.operating_points_[:, 0] - np.cos(theta2))
-        k = int(np.argmin(distance))
+        k = _nearest(pipeline, np.cos(theta2))
         size = data.analytic_models[i].hinf_norm()
         gain = pipeline.local_models_[k].dc_gain()
         floor = float(np.linalg.norm(np.eye(len(gain)) - gain, 2))
@@ -126,12 +134,9 @@ def interpolation_table(
             fitted = found.structure.matrices(smooth)
             paper = TABLE_3[name, degree]
             for k, matrix in enumerate("ABCD"):
-                true = local[k].ravel()
-                ours = (
-                    parameter_fit(true, fitted[k].ravel())
-                    if true.any()
-                    else NOT_DETERMINED
-                )
+                true, ours = local[k].ravel(), NOT_DETERMINED
+                if true.any():
+                    ours = parameter_fit(true, fitted[k].ravel())
                 rows.append((name, degree, matrix, ours, paper[k]))
     return pd.DataFrame(rows, columns=["model", "degree", "matrix", "ours", "paper"])
 
@@ -140,12 +145,9 @@ def validation_table(lpv: dict[str, LPVStateSpace], data: Bunch) -> pd.DataFrame
     """Table 4: fit of the LPV models on the sweep, simulated from rest."""
     rows = []
     for name, model in lpv.items():
-        simulated = simulate_sweep(model, data)
-        for metric, score in (("BFT", bft_score), ("VAF", vaf_score)):
-            values = score(data.y_sweep, simulated, multioutput="raw_values")
-            for output, value in zip(OUTPUTS, values, strict=True):
-                paper = TABLE_4[name, output][metric == "VAF"]
-                rows.append((name, output, metric, float(value), paper))
+        for metric, output, value in _fits(data.y_sweep, simulate_sweep(model, data)):
+            paper = TABLE_4[name, output][metric == "VAF"]
+            rows.append((name, output, metric, value, paper))
     return pd.DataFrame(rows, columns=["model", "output", "metric", "ours", "paper"])
 
 

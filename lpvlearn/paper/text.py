@@ -6,7 +6,7 @@ import pandas as pd
 
 from .experiment import PaperExperiment
 
-__all__ = ["tables_text"]
+Pairs = dict[str, tuple[list[str], list[str]]]  # title -> ours, the paper's
 
 
 def tables_text(
@@ -33,37 +33,31 @@ def tables_text(
         "Left of each pair: this library.\n"
         "Right: the paper, whose arm has other (unpublished) parameters.",
         f"Table 1. Local models by {experiment.method.upper()} on new noise-free data, "
-        f"in percent\n({local})\n\n" + local_text(tables["table1"], n_points),
+        f"in percent\n({local})\n\n" + _local_text(tables["table1"], n_points),
         f"Table 1, the same by {experiment.other_method.upper()}\n\n"
-        + local_text(tables["table1_other"], n_points),
+        + _local_text(tables["table1_other"], n_points),
         "Table 2. H-infinity error of the restructuring, relative to the analytic "
         "model\n(the structure fixes the gain at standstill; the floor is the part of "
         "the error\nthat is due to it, which no parameter can lower)\n\n"
-        + restructuring_text(tables["table2"], n_points),
+        + _restructuring_text(tables["table2"], n_points),
         "Table 3. FIT of the interpolated matrices, in percent "
-        "(d: degree of the polynomial)\n\n" + interpolation_text(tables["table3"]),
+        "(d: degree of the polynomial)\n\n" + _interpolation_text(tables["table3"]),
         "Table 4. LPV models along the sweep of theta2, simulated from rest, in percent"
         f"\n(degree {experiment.degree}; the paper's is 2)\n\n"
-        + validation_text(tables["table4"]),
-        "Computation time in seconds\n\n" + timing_text(tables["timing"]),
+        + _validation_text(tables["table4"]),
+        "Computation time in seconds\n\n" + _timing_text(tables["timing"]),
     ]
     return "\n" + "\n\n\n".join(parts)
 
 
-def local_text(table: pd.DataFrame, n_points: int) -> str:
+def _local_text(table: pd.DataFrame, n_points: int) -> str:
     """Table 1: a row for each angle, each figure beside the paper's."""
-    pairs = {
-        f"{metric} {output}": (
-            # A VAF of 100.00 would hide that the fit is not perfect.
-            _cells(rows["ours"], "{:.4f}" if metric == "VAF" else "{:.2f}"),
-            _cells(rows["paper"], "{:.2f}"),
-        )
-        for (metric, output), rows in table.groupby(["metric", "output"], sort=False)
-    }
-    return paired_text("theta2", _angles(n_points), pairs)
+    # A VAF of 100.00 would hide that the fit is not perfect.
+    pairs = _pairs(table, ["metric", "output"], {"VAF": "{:.4f}"}, "{:.2f}")
+    return _paired_text("theta2", _angles(n_points), pairs)
 
 
-def restructuring_text(table: pd.DataFrame, n_points: int) -> str:
+def _restructuring_text(table: pd.DataFrame, n_points: int) -> str:
     """Table 2: a row for each angle."""
     columns = {"theta2": _angles(n_points)} | {
         title: _cells(table[name], "{:.2e}")
@@ -76,38 +70,43 @@ def restructuring_text(table: pd.DataFrame, n_points: int) -> str:
     return aligned_text([[name, *cells] for name, cells in columns.items()])
 
 
-def interpolation_text(table: pd.DataFrame) -> str:
+def _interpolation_text(table: pd.DataFrame) -> str:
     """Table 3: a row for each model and degree."""
     labels = table[["model", "degree"]].drop_duplicates().itertuples(index=False)
-    pairs = {
-        str(matrix): (_cells(rows["ours"], "{:.1f}"), _cells(rows["paper"], "{:.1f}"))
-        for matrix, rows in table.groupby("matrix", sort=False)
-    }
-    return paired_text("model", [f"{m}, d = {d}" for m, d in labels], pairs)
+    pairs = _pairs(table, ["matrix"], {}, "{:.1f}")
+    return _paired_text("model", [f"{m}, d = {d}" for m, d in labels], pairs)
 
 
-def validation_text(table: pd.DataFrame) -> str:
+def _validation_text(table: pd.DataFrame) -> str:
     """Table 4: a row for each model."""
-    pairs = {
-        f"{metric} {output}": (
-            _cells(rows["ours"], "{:.1f}"),
-            _cells(rows["paper"], "{:.1f}"),
-        )
-        for (metric, output), rows in table.groupby(["metric", "output"], sort=False)
-    }
-    return paired_text("model", table["model"].unique().tolist(), pairs)
+    pairs = _pairs(table, ["metric", "output"], {}, "{:.1f}")
+    return _paired_text("model", table["model"].unique().tolist(), pairs)
 
 
-def timing_text(table: pd.DataFrame) -> str:
+def _timing_text(table: pd.DataFrame) -> str:
     """A row for each step."""
     return aligned_text(
         [["step", *table["step"]], ["seconds", *_cells(table["seconds"], "{:.1f}")]]
     )
 
 
-def paired_text(
-    heading: str, labels: list[str], pairs: dict[str, tuple[list[str], list[str]]]
-) -> str:
+def _pairs(
+    table: pd.DataFrame, keys: list[str], ours: dict[str, str], form: str
+) -> Pairs:
+    """Cells of ours and of the paper, by the values of the keys.
+
+    Numbers have the form `form`, ours that of `ours` where it has the first key.
+    """
+    return {
+        " ".join(key): (
+            _cells(rows["ours"], ours.get(key[0], form)),
+            _cells(rows["paper"], form),
+        )
+        for key, rows in table.groupby(keys, sort=False)
+    }
+
+
+def _paired_text(heading: str, labels: list[str], pairs: Pairs) -> str:
     """Lines with ours and the paper's side by side under a common title."""
     columns = [["", heading, *labels]]
     for title, (ours, paper) in pairs.items():
