@@ -22,18 +22,11 @@ from ..restructuring.estimator import GrayBoxRestructurer
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time
 from .local_models import identify_points
-from .reports import (
-    operating_point_report,
-    parameter_report,
-    parameter_tables,
-    summarise,
-)
+from .reports import Tables, summarise, tables
 from .runner import PointRunner, Stopwatch, checked_memory
 from .structured_models import restructure_points
 
 Array = NDArray[np.float64]
-
-__all__ = ["LocalLPVPipeline"]
 
 _DEFAULTS = {
     "local": SubspaceLTI,
@@ -271,25 +264,16 @@ list, default=None
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
             theta, kappa = structured.theta, points.kappa
-            self.interpolator_ = self._interpolator(len(points)).fit(kappa, theta)
+            self.interpolator_ = self._interpolator(len(kappa)).fit(kappa, theta)
             self.lpv_ = LPVStateSpace(
                 structured.structure, self.interpolator_, points.span
             )
             self.operating_points_ = kappa
             self.scheduling_range_ = points.identified_range
             self.scheduling_names_ = as_list(self.scheduling)
-            self.parameters_, self.parameters_std_ = parameter_tables(structured, kappa)
-            self.report_ = operating_point_report(
-                points,
-                local,
-                structured,
-                self.parameters_std_,
-                self.lpv_,
-                self.sampling_time_,
-            )
-            self.parameter_report_ = parameter_report(
-                self.parameters_, self.parameters_std_, self.lpv_.parameters(kappa)
-            )
+            found = tables(points, local, structured, self.lpv_, self.sampling_time_)
+            self.parameters_, self.parameters_std_ = found.parameters, found.deviations
+            self.report_, self.parameter_report_ = found.points, found.by_parameter
         self.step_times_ = watch.seconds
         return self
 
@@ -341,11 +325,13 @@ list, default=None
         """What was identified and how well, as text: ``print(pipeline.summary())``."""
         check_is_fitted(self, "lpv_")
         return summarise(
-            self.report_,
-            self.parameter_report_,
+            Tables(
+                self.parameters_,
+                self.parameters_std_,
+                self.report_,
+                self.parameter_report_,
+            ),
             self.lpv_,
-            self.parameters_,
-            self.parameters_std_,
             sampling_time=self.sampling_time_,
             scheduling=self.scheduling_names_,
             local=_name_of_step(self.local, "local"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -14,6 +14,7 @@ from ..lpv.model import LPVStateSpace
 from ..metrics.reports import as_shown, readable_report
 from ..metrics.scores import parameter_fit
 from ..metrics.table_simulation import fit_of
+from ..restructuring.estimator import GrayBoxRestructurer
 from .local_models import LocalModel
 from .structured_models import StructuredModels
 
@@ -24,34 +25,55 @@ Array = NDArray[np.float64]
 _NO_FLOOR = 1e-8
 
 
-def operating_point_report(
+class Tables(NamedTuple):
+    """What a pipeline found.
+
+    Attributes
+    ----------
+    parameters, deviations : DataFrame of shape (n_points, n_params)
+        Gray-box parameters, and their standard deviations: NaN where not known.
+    points : DataFrame
+        One row per operating point: how good each step was; columns as in
+        `LocalLPVPipeline.report_`.
+    by_parameter : DataFrame
+        One row per parameter: how it varies over the points, and how it is met;
+        columns as in `LocalLPVPipeline.parameter_report_`.
+    """
+
+    parameters: pd.DataFrame
+    deviations: pd.DataFrame
+    points: pd.DataFrame
+    by_parameter: pd.DataFrame
+
+
+def tables(
     points: OperatingPoints,
     local: Sequence[LocalModel],
     structured: StructuredModels,
-    deviations: pd.DataFrame,
     lpv: LPVStateSpace,
     sampling_time: float,
-) -> pd.DataFrame:
-    """One row per operating point: how good each step was.
+) -> Tables:
+    """Tabulate the results of steps 3 to 5 at the operating points.
 
     Parameters
     ----------
     points : OperatingPoints
     local : sequence of LocalModel
     structured : StructuredModels
-    deviations : DataFrame of shape (n_points, n_params)
-        Standard deviations of the parameters.
     lpv : LPVStateSpace
     sampling_time : float
-
-    Returns
-    -------
-    DataFrame
-        Columns as in `LocalLPVPipeline.report_`.
+        Seconds.
     """
-    interpolated = lpv.parameters(points.kappa)
-    names = deviations.columns
-    known = bool(deviations.notna().any(axis=None))
+    labels = [row[0] if len(row) == 1 else tuple(row) for row in points.kappa.tolist()]
+    index = pd.Index(labels, name="operating_point", tupleize_cols=False)
+    names = pd.Index(structured.structure.parameter_names)
+    theta, interpolated = structured.theta, lpv.parameters(points.kappa)
+    spread = np.full(theta.shape, np.nan)
+    for k, covariance in enumerate(structured.covariances):
+        if covariance is not None:
+            spread[k] = np.sqrt(np.diag(covariance))
+    deviations = pd.DataFrame(spread, index, list(names))
+
     rows = []
     for k, (group, model) in enumerate(zip(points.experiments, local, strict=True)):
         gray_box = structured.models[k]
@@ -64,93 +86,52 @@ def operating_point_report(
         }
         if structured.restructurers:
             row["structured_BFT"] = fit_of(gray_box, group, sampling_time)
-            fitted = structured.restructurers[k]
-            size = np.inf  # of the black box
-            if fitted.relative_error_ > 0:
-                size = fitted.error_ / fitted.relative_error_
-            row |= {
-                "relative_error": fitted.relative_error_,
-                "relative_floor": fitted.structural_floor_ / size,
-                "remaining_error": fitted.remaining_error_ / size,
-                "active_frequency": np.max(fitted.active_frequencies_, initial=0.0),
-                "stationarity": fitted.stationarity_,
-            }
+            row |= _restructuring(structured.restructurers[k])
         distance = (gray_box - lpv.at(points.kappa[k])).hinf_norm()
         size = gray_box.hinf_norm()
         row["interpolation_error"] = distance / size if size > 0 else np.nan
-        row["interpolation_FIT"] = parameter_fit(structured.theta[k], interpolated[k])
+        row["interpolation_FIT"] = parameter_fit(theta[k], interpolated[k])
         if structured.restructurers:
-            row |= dict(zip("param_" + names, structured.theta[k], strict=True))
-            if known:
-                row |= dict(zip("std_" + names, deviations.iloc[k], strict=True))
+            row |= dict(zip("param_" + names, theta[k], strict=True))
+            if not np.isnan(spread).all():
+                row |= dict(zip("std_" + names, spread[k], strict=True))
         rows.append(row)
-    return pd.DataFrame(rows, index=_point_index(points.kappa))
 
-
-def parameter_tables(
-    structured: StructuredModels, kappa: Array
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Parameters and their standard deviations, one row per operating point.
-
-    A deviation that is not known is NaN.
-
-    Parameters
-    ----------
-    structured : StructuredModels
-    kappa : ndarray of shape (n_points, n_scheduling)
-    """
-    index, names = _point_index(kappa), list(structured.structure.parameter_names)
-    parameters = pd.DataFrame(structured.theta, index, names)
-    deviations = pd.DataFrame(np.nan, index, names)
-    for k, covariance in enumerate(structured.covariances):
-        if covariance is not None:
-            deviations.iloc[k] = np.sqrt(np.diag(covariance))
-    return parameters, deviations
-
-
-def parameter_report(
-    parameters: pd.DataFrame, deviations: pd.DataFrame, interpolated: Array
-) -> pd.DataFrame:
-    """One row per parameter: how it varies over the points, and how it is met.
-
-    Parameters
-    ----------
-    parameters, deviations : DataFrame of shape (n_points, n_params)
-    interpolated : ndarray of shape (n_points, n_params)
-
-    Returns
-    -------
-    DataFrame
-        Columns as in `LocalLPVPipeline.parameter_report_`.
-    """
-    theta = parameters.to_numpy()
-    return pd.DataFrame(
-        {
-            "lowest": theta.min(axis=0),
-            "highest": theta.max(axis=0),
-            "std": deviations.median(),
-            "interpolation_RMSE": np.sqrt(np.mean((theta - interpolated) ** 2, axis=0)),
-            "interpolation_FIT": [
-                parameter_fit(own, met)
-                for own, met in zip(theta.T, interpolated.T, strict=True)
-            ],
-        },
-        index=pd.Index(parameters.columns, name="parameter"),
+    by_parameter = {
+        "lowest": theta.min(axis=0),
+        "highest": theta.max(axis=0),
+        "std": deviations.median().to_numpy(),
+        "interpolation_RMSE": np.sqrt(np.mean((theta - interpolated) ** 2, axis=0)),
+        "interpolation_FIT": [
+            parameter_fit(own, met)
+            for own, met in zip(theta.T, interpolated.T, strict=True)
+        ],
+    }
+    return Tables(
+        pd.DataFrame(theta, index, list(names)),
+        deviations,
+        pd.DataFrame(rows, index=index),
+        pd.DataFrame(by_parameter, index=names.rename("parameter")),
     )
 
 
-def _point_index(kappa: Array) -> pd.Index:
-    """Scheduling values as the index of a table."""
-    labels = [row[0] if len(row) == 1 else tuple(row) for row in kappa.tolist()]
-    return pd.Index(labels, name="operating_point", tupleize_cols=False)
+def _restructuring(fitted: GrayBoxRestructurer) -> dict[str, float]:
+    """Errors of step 4 at one point, relative to the black box's norm."""
+    size = np.inf
+    if fitted.relative_error_ > 0:
+        size = fitted.error_ / fitted.relative_error_
+    return {
+        "relative_error": fitted.relative_error_,
+        "relative_floor": fitted.structural_floor_ / size,
+        "remaining_error": fitted.remaining_error_ / size,
+        "active_frequency": np.max(fitted.active_frequencies_, initial=0.0),
+        "stationarity": fitted.stationarity_,
+    }
 
 
 def summarise(
-    report: pd.DataFrame,
-    parameter_report: pd.DataFrame,
+    found: Tables,
     lpv: LPVStateSpace,
-    parameters: pd.DataFrame,
-    deviations: pd.DataFrame,
     *,
     sampling_time: float,
     scheduling: Sequence[Hashable],
@@ -161,11 +142,8 @@ def summarise(
 
     Parameters
     ----------
-    report, parameter_report : DataFrame
-        From `operating_point_report` and `parameter_report`.
+    found : Tables
     lpv : LPVStateSpace
-    parameters, deviations : DataFrame of shape (n_points, n_params)
-        From `parameter_tables`.
     sampling_time : float
         Seconds.
     scheduling : sequence of hashable
@@ -173,6 +151,7 @@ def summarise(
     local, restructurer : str
         Names of the estimators of steps 3 and 4.
     """
+    report = found.points
     kappa = np.array([np.atleast_1d(label) for label in report.index], dtype=float)
     places = "no scheduling variable"
     if scheduling:
@@ -185,7 +164,7 @@ def summarise(
         places = f"{len(kappa)} operating point(s), {', '.join(spans)}"
     lines = [
         f"LPV model of order {lpv.order}: {lpv.n_inputs} input(s), {lpv.n_outputs} "
-        f"output(s), {parameters.shape[1]} parameters",
+        f"output(s), {found.parameters.shape[1]} parameters",
         f"{report['n_experiments'].sum()} experiment(s), {report['n_samples'].sum()} "
         f"samples at {sampling_time:.4g} s, {places}",
         "",
@@ -216,7 +195,7 @@ def summarise(
         hidden += (
             ["relative_error"] if has_floor else ["relative_floor", "remaining_error"]
         )
-        unknown = int(deviations.isna().all(axis=1).sum())
+        unknown = int(found.deviations.isna().all(axis=1).sum())
         if unknown:
             lines.append(
                 f"    standard deviations of the parameters are not known at {unknown} "
@@ -230,7 +209,7 @@ def summarise(
     distance = 100 * report["interpolation_error"]
     lines += [
         f"Interpolation: {lpv.interpolator}, parameter fit (FIT) "
-        f"{parameter_fit(parameters, lpv.parameters(kappa)):.2f} %",
+        f"{parameter_fit(found.parameters, lpv.parameters(kappa)):.2f} %",
         f"    H-infinity error {_span(distance)} % of the model's norm, the largest at "
         f"{_label_of_largest(distance)}",
     ]
@@ -239,7 +218,7 @@ def summarise(
     shown = [name for name in report.columns if not name.startswith(tuple(hidden))]
     lines += ["", readable_report(report[shown]).to_string()]
     if restructured:
-        table = parameter_report.dropna(axis=1, how="all")
+        table = found.by_parameter.dropna(axis=1, how="all")
         lines += ["", readable_report(table).to_string()]
     return "\n".join(lines)
 

@@ -1,7 +1,7 @@
 """One step of the method at every operating point: processes, progress, failures.
 
-A `PointRunner` applies a function to the points, several at a time; `Remembered` keeps
-its results in a joblib.Memory; a `Stopwatch` tells what each step took.
+A `PointRunner` applies a function to the points, several at a time; a joblib.Memory
+keeps its results; a `Stopwatch` tells what each step took.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class PointRunner:
             point, unless another one fails in the same words: the cause is an option
             then.
         """
-        kept = self.remembered(function)
+        kept = self._remembered(function)
         stop = self.on_error == "raise"
         tasks = (
             delayed(_attempt)(kept, args, shared, k if stop else None)
@@ -118,25 +118,32 @@ class PointRunner:
             warn(f"left out {_place(k, kappa)}: {failure.text}")
         return [None if isinstance(r, _Failure) else r for r in found]
 
-    def remembered(
-        self, function: Callable[..., Any], *, ignore: Sequence[str] = ()
-    ) -> Callable[..., Any]:
-        """A function of the module's top whose results the memory keeps.
+    def call(
+        self, function: Callable[..., Any], *args: Any, ignore: Sequence[str] = ()
+    ) -> Any:
+        """Call a function, or take its result from the memory.
 
         Parameters
         ----------
         function : callable
+            At the top of a module.
+        *args
         ignore : sequence of str
             Arguments that follow from the others and do not tell results apart.
         """
+        return self._remembered(function, ignore)(*args)
+
+    def _remembered(
+        self, function: Callable[..., Any], ignore: Sequence[str] = ()
+    ) -> Callable[..., Any]:
         if hasattr(self.memory, "store_backend"):
-            return Remembered(function, self.memory.store_backend, tuple(ignore))
+            return _Remembered(function, self.memory.store_backend, tuple(ignore))
         # An object with the interface of joblib.Memory: its own affair.
         return self.memory.cache(function, ignore=list(ignore))
 
 
 @dataclass(frozen=True)
-class Remembered:
+class _Remembered:
     """A function whose results a store keeps by the values of its arguments.
 
     What ``joblib.Memory.cache`` does, without its record of the arguments as text:
@@ -149,7 +156,7 @@ class Remembered:
     store : joblib store backend or None
         Of a joblib.Memory; None keeps nothing.
     ignore : tuple of str
-        As in `PointRunner.remembered`.
+        As in `PointRunner.call`.
     """
 
     function: Callable[..., Any]

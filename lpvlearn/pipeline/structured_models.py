@@ -88,18 +88,25 @@ def restructure_points(
         "restructuring", _restructure_point, tasks, kappa, restructurer=restructurer
     )
     kept = [k for k, result in enumerate(found) if result is not None]
-    helped = runner.remembered(_help_neighbours, ignore=["fitted"])(
-        [found[k] for k in kept], [tasks[k] for k in kept], kappa[kept], restructurer
+    helped = runner.call(
+        _help_neighbours,
+        [found[k] for k in kept],
+        [tasks[k] for k in kept],
+        kappa[kept],
+        restructurer,
+        ignore=["fitted"],
     )
-    covariance = runner.remembered(covariance_of_parameters)
     covariances: list[Array | None] = []
     for k, fitted in zip(kept, helped, strict=True):
         known = getattr(fitted, "params_covariance_", None)  # where it tells its own
         if known is None and local[k].deviated:
-            weight = getattr(fitted, "frequency_weight", None)
-            black_box, deviated = tasks[k][0], local[k].deviated
-            known = covariance(
-                fitted.structure_, fitted.params_, weight, black_box, deviated
+            known = runner.call(
+                covariance_of_parameters,
+                fitted.structure_,
+                fitted.params_,
+                getattr(fitted, "frequency_weight", None),
+                tasks[k][0],
+                local[k].deviated,
             )
         covariances.append(None if known is None else np.asarray(known))
     return StructuredModels(

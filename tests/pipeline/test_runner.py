@@ -1,6 +1,7 @@
 """Steps at every operating point: what is kept, what is timed, what fails."""
 
 import itertools
+from functools import partial
 from types import SimpleNamespace
 
 import joblib
@@ -38,21 +39,21 @@ def runner(memory, **options):
 
 def test_results_are_kept_by_the_values_of_the_arguments(tmp_path, calls):
     for _ in range(2):
-        kept = runner(Memory(tmp_path, verbose=0)).remembered(square, ignore=["note"])
-        assert kept(3) == 9
-        assert kept(x=3, note="of no influence") == 9
-        np.testing.assert_array_equal(kept(np.arange(3)), [0, 1, 4])
+        call = partial(runner(Memory(tmp_path, verbose=0)).call, square)
+        assert call(3) == 9
+        assert call(3, "of no influence", ignore=["note"]) == 9
+        np.testing.assert_array_equal(call(np.arange(3)), [0, 1, 4])
     assert len(calls) == 2
 
 
 def test_nothing_is_kept_without_a_folder(calls):
-    kept = runner(Memory(None)).remembered(square)
+    kept = partial(runner(Memory(None)).call, square)
     assert [kept(2), kept(2)] == [4, 4] and len(calls) == 2
 
 
 def test_a_damaged_or_cleared_result_is_made_again(tmp_path, calls):
     memory = Memory(tmp_path, verbose=0)
-    kept = runner(memory).remembered(square)
+    kept = partial(runner(memory).call, square)
     kept(3)
     (file,) = tmp_path.rglob("output.pkl")
     file.write_bytes(b"cut")
@@ -63,7 +64,7 @@ def test_a_damaged_or_cleared_result_is_made_again(tmp_path, calls):
 
 def test_the_size_of_the_memory_can_be_reduced(tmp_path):
     memory = Memory(tmp_path, verbose=0)
-    kept = runner(memory).remembered(square)
+    kept = partial(runner(memory).call, square)
     for x in range(3):
         kept(x)
     memory.reduce_size(items_limit=1)
@@ -76,7 +77,7 @@ def test_an_object_with_the_interface_of_a_memory_serves(calls):
     def cache(function, ignore=None):
         return lambda x: results.setdefault(x, function(x))
 
-    assert runner(SimpleNamespace(cache=cache)).remembered(square)(4) == 16
+    assert runner(SimpleNamespace(cache=cache)).call(square, 4) == 16
     assert results == {4: 16}
 
 
