@@ -28,12 +28,13 @@ from ..conftest import (
     spring_tables,
     spring_truth,
 )
+from .conftest import N_SAMPLES
 
 
 @pytest.fixture(scope="module")
-def fitted(spring):
+def fitted(spring, memory):
     X, y, _, _ = spring
-    return spring_pipeline().fit(X, y)
+    return spring_pipeline(memory=memory).fit(X, y)
 
 
 def test_noise_free_experiments_give_the_true_model(fitted, spring):
@@ -48,7 +49,7 @@ def test_parameters_and_report_are_tables_by_operating_point(fitted):
     assert list(fitted.parameters_.index) == list(KAPPA)
     report = fitted.report_
     assert list(report.index) == list(KAPPA)
-    assert (report["n_samples"] == 600).all()
+    assert (report["n_samples"] == N_SAMPLES).all()
     assert (report["local_BFT"] > 99.999).all()
     assert (report["structured_BFT"] > 99.999).all()
     assert (report["relative_error"] < 1e-6).all()
@@ -77,7 +78,7 @@ def test_rows_of_experiments_may_be_interleaved(fitted, spring):
 
 @pytest.mark.parametrize("combine", ["pool", "average"])
 def test_realizations_are_pooled_or_averaged(combine):
-    X, y = spring_tables(noise=0.03, n_repeats=4)
+    X, y = spring_tables(noise=0.03, n_samples=300, n_repeats=4)
     pipeline = spring_pipeline(combine=combine).fit(X, y)
     X_sweep, y_sweep = spring_sweep()
     assert bft_score(y_sweep, pipeline.predict(X_sweep)) > 98
@@ -85,9 +86,9 @@ def test_realizations_are_pooled_or_averaged(combine):
     np.testing.assert_allclose(pipeline.parameters_, spring_truth(KAPPA), rtol=0.05)
 
 
-def test_baseline_without_structure_is_worse(fitted, spring):
+def test_baseline_without_structure_is_worse(fitted, spring, memory):
     X, y, X_sweep, y_sweep = spring
-    baseline = spring_pipeline(restructurer="passthrough").fit(X, y)
+    baseline = spring_pipeline(restructurer="passthrough", memory=memory).fit(X, y)
     assert baseline.restructurers_ == []
     assert baseline.parameters_.shape == (4, 4 + 2 + 2 + 1)
     for balanced, true in zip(
@@ -105,15 +106,15 @@ def test_default_restructurer_is_the_canonical_form(spring):
     assert bft_score(y_sweep, pipeline.predict(X_sweep)) > 99.9
 
 
-def test_any_regressor_interpolates(spring):
+def test_any_regressor_interpolates(spring, memory):
     X, y, X_sweep, y_sweep = spring
-    linear = spring_pipeline(interpolator=LinearRegression()).fit(X, y)
-    same = spring_pipeline(interpolator=PolynomialLPV(1)).fit(X, y)
+    linear = spring_pipeline(interpolator=LinearRegression(), memory=memory).fit(X, y)
+    same = spring_pipeline(interpolator=PolynomialLPV(1), memory=memory).fit(X, y)
     np.testing.assert_allclose(
         linear.predict(X_sweep), same.predict(X_sweep), atol=1e-9
     )
     forest = RandomForestRegressor(5, random_state=0)
-    steps = spring_pipeline(interpolator=forest).fit(X, y)
+    steps = spring_pipeline(interpolator=forest, memory=memory).fit(X, y)
     assert bft_score(y_sweep, steps.predict(X_sweep)) > 50
 
 
@@ -291,18 +292,20 @@ def test_leaving_the_identified_range_warns_once_for_all_experiments(fitted, spr
     assert warning.filename == __file__
 
 
-def test_holding_the_border_is_no_extrapolation(spring):
+def test_holding_the_border_is_no_extrapolation(spring, memory):
     X, y, X_sweep, _ = spring
-    pipeline = spring_pipeline(interpolator=PolynomialLPV(extrapolation="clip"))
+    clipped = PolynomialLPV(extrapolation="clip")
+    pipeline = spring_pipeline(interpolator=clipped, memory=memory)
     pipeline.fit(X, y)
     beyond = X_sweep.assign(kappa=9.0)
     border = X_sweep.assign(kappa=1.5)
     np.testing.assert_allclose(pipeline.predict(beyond), pipeline.predict(border))
 
 
-def test_the_interpolators_own_warning_is_not_added(spring):
+def test_the_interpolators_own_warning_is_not_added(spring, memory):
     X, y, X_sweep, _ = spring
-    pipeline = spring_pipeline(interpolator=PolynomialLPV(extrapolation="warn"))
+    warning = PolynomialLPV(extrapolation="warn")
+    pipeline = spring_pipeline(interpolator=warning, memory=memory)
     pipeline.fit(X, y)
     with pytest.warns(ExtrapolationWarning) as caught:
         pipeline.predict(X_sweep.assign(kappa=2.0))
@@ -339,10 +342,10 @@ def test_one_sweep_is_no_operating_point(spring):
         spring_pipeline().fit(*spring[2:])
 
 
-def test_two_points_carry_a_line_by_default(spring):
+def test_two_points_carry_a_line_by_default(spring, memory):
     X, y, _, _ = spring
     two = X["kappa"].isin([0.0, 0.5])
-    pipeline = spring_pipeline().fit(X[two], y[two])
+    pipeline = spring_pipeline(memory=memory).fit(X[two], y[two])
     assert pipeline.interpolator_.degree == 1
 
 

@@ -25,8 +25,8 @@ def fitted():
 
 
 @pytest.fixture(scope="module")
-def balanced(spring):
-    return spring_pipeline(restructurer="passthrough").fit(*spring[:2])
+def balanced(spring, memory):
+    return spring_pipeline(restructurer="passthrough", memory=memory).fit(*spring[:2])
 
 
 @pytest.fixture
