@@ -128,6 +128,7 @@ def test_sub_estimators_are_cloned(spring):
     assert pipeline.local.inputs is None
 
 
+@pytest.mark.slow  # it starts processes
 def test_processes_do_not_change_the_result(fitted, spring):
     X, y, _, _ = spring
     parallel = spring_pipeline(n_jobs=2).fit(X, y)

@@ -138,7 +138,8 @@ def test_a_stopwatch_adds_up_the_times_of_the_steps():
 
 
 @pytest.mark.parametrize(
-    ("on_error", "n_jobs"), [("raise", None), ("skip", None), ("raise", 2)]
+    ("on_error", "n_jobs"),
+    [("raise", None), ("skip", None), pytest.param("raise", 2, marks=pytest.mark.slow)],
 )
 def test_a_failure_that_all_points_share_names_none(spring, on_error, n_jobs):
     pipeline = spring_pipeline(

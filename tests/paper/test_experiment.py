@@ -13,7 +13,9 @@ from lpvlearn.__main__ import main
 from lpvlearn.datasets import make_flexible_arm
 from lpvlearn.paper import experiment
 from lpvlearn.paper.tables import TABLE_1, TABLE_2
-from lpvlearn.paper.text import aligned_text
+
+# One run of the command takes more than ten seconds.
+pytestmark = pytest.mark.slow
 
 COLUMNS = {
     "table1": ["theta2", "metric", "output", "ours", "paper"],
@@ -121,16 +123,3 @@ def test_total_time_is_the_sum_of_the_steps(results: Path) -> None:
     seconds = read(results, "timing").set_index("step")["seconds"]
     assert seconds["total"] == pytest.approx(seconds.drop("total").sum())
     assert {"local models", "restructuring", "figures"} <= set(seconds.index)
-
-
-def test_printed_columns_are_aligned() -> None:
-    assert aligned_text([["a", "longer"], ["b", "1.5"]]) == "a         b\nlonger  1.5"
-
-
-@pytest.mark.parametrize("option", ["--realizations", "--degree", "--jobs"])
-def test_counts_below_one_are_refused(
-    option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        main([option, "0"])
-    assert "must be at least 1. Got 0." in capsys.readouterr().err
