@@ -9,9 +9,9 @@ import numpy as np
 
 WIDTH = 8.0  # inches: 800 pixels at matplotlib's 100 dots per inch
 
-LABEL_SIZE = 9.0
+LABEL_SIZE, TEXT_SIZE = 9.0, 8.5  # points: read at the width of a column
 
-TEXT_SIZE = 8.5
+_N_MARKERS = 20  # on a line
 
 INK, MUTED, ACCENT = "#000000", "#767676", "#D55E00"
 
@@ -37,10 +37,10 @@ _POINTS: tuple[dict[str, Any], ...] = (
 
 
 def line_style(k: int, n_points: int = 0) -> dict[str, Any]:
-    """Keywords of the k-th line; markers, where it has them, stand about 20 times."""
+    """Keywords of the k-th line; markers, where it has them, stand at distances."""
     style = dict(_STYLES[k % len(_STYLES)])
     if "marker" in style:
-        step = max(1, n_points // 20)
+        step = max(1, n_points // _N_MARKERS)
         # Lines with markers do not put them at the same places.
         style |= {
             "markersize": 4.0,

@@ -20,7 +20,7 @@ from .frequency import (
 
 Array = NDArray[np.float64]
 
-_DEPTH = 1e-6  # six decades: the accuracy of the norm that is drawn
+_DEPTH = 1e-6  # six decades below the highest point, there is nothing to see
 
 
 class ErrorDisplay:
@@ -321,7 +321,7 @@ class ErrorDisplay:
             self.active_points_.append(point)
 
     def _limit(self, ax: Any) -> None:
-        """Not below `_DEPTH` of the highest: nothing is to be seen there."""
+        """The axis ends at `_DEPTH` of the highest point."""
         curves = [c for c in (self.error, self.start) if c is not None]
         top = max(c.max() for c in curves)
         low = min(c[c > 0].min(initial=np.inf) for c in curves)

@@ -20,9 +20,7 @@ from .structured_models import StructuredModels
 
 Array = NDArray[np.float64]
 
-# Share of the black box's norm below which a floor is none: rounding of a feedthrough
-# that the structure cannot change.
-_NO_FLOOR = 1e-8
+_NO_FLOOR = 1e-8  # share of the black box's norm below which a floor is rounding
 
 
 class Tables(NamedTuple):
