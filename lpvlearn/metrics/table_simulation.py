@@ -57,8 +57,8 @@ def simulate_experiments(
     sampling_time: float,
     *,
     estimate: bool,
-) -> list[Array]:
-    """Simulate a model along experiments.
+) -> Array:
+    """Simulate a model along the experiments of a table.
 
     Parameters
     ----------
@@ -72,12 +72,14 @@ def simulate_experiments(
 
     Returns
     -------
-    list of ndarray of shape (n_samples, n_outputs)
+    ndarray of shape (n_samples, n_outputs)
+        Rows of all experiments where they stand in the table.
     """
-    return [
-        _simulate(model, e, e.sampling_time or sampling_time, estimate)
-        for e in experiments
-    ]
+    table = np.empty((sum(len(e.rows) for e in experiments), model.n_outputs))
+    for e in experiments:
+        dt = e.sampling_time or sampling_time
+        table[e.rows] = _simulate(model, e, dt, estimate)
+    return table
 
 
 def _simulate(
@@ -96,14 +98,6 @@ def _simulate(
         free = free_responses(sampled.A, sampled.C, len(e.rows))
         x0 = estimate_initial_state(free, error)
     return sampled.simulate(e.inputs, initial_state=x0)
-
-
-def in_table_order(experiments: Sequence[Experiment], parts: Sequence[Array]) -> Array:
-    """The rows of all experiments where they stood in the table."""
-    table = np.empty((sum(len(part) for part in parts), parts[0].shape[1]))
-    for e, part in zip(experiments, parts, strict=True):
-        table[e.rows] = part
-    return table
 
 
 def _outputs(experiment: Experiment, n_outputs: int) -> Array:
@@ -159,7 +153,5 @@ class TableSimulator(BaseEstimator):
         return read_experiments(self, X, y, **roles, sampling_time=self.sampling_time)
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
-        simulated = simulate_experiments(
-            self.model, experiments, self.sampling_time or 1.0, estimate=estimate
-        )
-        return in_table_order(experiments, simulated)
+        step = self.sampling_time or 1.0  # where the table does not tell it
+        return simulate_experiments(self.model, experiments, step, estimate=estimate)

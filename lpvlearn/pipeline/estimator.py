@@ -17,7 +17,7 @@ from ..data.preparation import split_at_gaps
 from ..exceptions import ExtrapolationWarning
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
-from ..metrics.table_simulation import in_table_order, simulate_experiments
+from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time
@@ -345,10 +345,9 @@ list, default=None
             )
         with warnings.catch_warnings():  # said above, of all experiments at once
             warnings.simplefilter("ignore", ExtrapolationWarning)
-            simulated = simulate_experiments(
+            out = simulate_experiments(
                 self.lpv_, experiments, self.sampling_time_, estimate=estimate
             )
-        out = in_table_order(experiments, simulated)
         return out[:, 0] if self._single_output else out
 
     # -- helpers -------------------------------------------------------------------

@@ -213,8 +213,10 @@ def test_failure_names_its_point_and_can_be_skipped(spring):
     local = SubspaceLTI(order=2, feedthrough=False)
     with pytest.raises(ValueError, match=r"operating point 2 \(scheduling 1\).*stable"):
         spring_pipeline(local=local).fit(X, y)
-    with pytest.warns(UserWarning, match="left out operating point 2"):
+    with pytest.warns(UserWarning, match="left out operating point 2") as caught:
         kept = spring_pipeline(local=local, on_error="skip").fit(X, y)
+    (told,) = (w for w in caught if "left out" in str(w.message))
+    assert told.filename == __file__
     np.testing.assert_allclose(kept.operating_points_[:, 0], [0.0, 0.5, 1.5])
     np.testing.assert_allclose(
         kept.parameters_, spring_truth([0.0, 0.5, 1.5]), rtol=1e-5
