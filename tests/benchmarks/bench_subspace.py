@@ -18,7 +18,7 @@ from unittest import mock
 import numpy as np
 from scipy.linalg import block_diag, expm
 
-from lpvlearn.subspace.hankel import data_factor, hankel_matrix
+from lpvlearn.subspace.hankel import _hankel_matrix, data_factor
 from lpvlearn.subspace.identification import identify, scale_records
 from lpvlearn.subspace.selection import select
 from lpvlearn.systems.simulation import lti_response
@@ -193,7 +193,7 @@ def compression(n: int, horizon: int) -> None:
     data_factor([z], 2, horizon)
     fast = time.process_time() - start
     start = time.process_time()
-    np.linalg.qr(hankel_matrix(z, 2 * horizon).T, mode="r")
+    np.linalg.qr(_hankel_matrix(z, 2 * horizon).T, mode="r")
     plain = time.process_time() - start
     print(
         f"  N = {n}, horizon {horizon}: {1e3 * fast:.1f} ms, numpy QR of the "

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from lpvlearn.subspace.hankel import (
+    _hankel_gram,
+    _hankel_matrix,
+    _past_future_rows,
+    _pooled_gram,
+    _qr_factor,
     cholesky_factor,
     correlation_sequence,
     data_factor,
-    gram_factor,
-    hankel_gram,
-    hankel_matrix,
-    past_future_rows,
-    qr_factor,
     stack_factors,
     triangularize,
 )
@@ -34,22 +34,22 @@ def test_correlation_sequence_is_the_sum_of_lagged_products(rng, n_samples):
 @pytest.mark.parametrize("shape, n_rows", [((60, 3), 8), ((9, 2), 9), ((5, 1), 1)])
 def test_gram_by_recursion_equals_the_product_of_the_hankel_matrix(rng, shape, n_rows):
     z = rng.standard_normal(shape)
-    H = hankel_matrix(z, n_rows)
+    H = _hankel_matrix(z, n_rows)
     assert H.shape == (n_rows * shape[1], shape[0] - n_rows + 1)
-    np.testing.assert_allclose(hankel_gram(z, n_rows), H @ H.T, atol=1e-12)
+    np.testing.assert_allclose(_hankel_gram(z, n_rows), H @ H.T, atol=1e-12)
 
 
 def test_hankel_columns_stack_consecutive_samples(rng):
     z = rng.standard_normal((10, 2))
-    np.testing.assert_array_equal(hankel_matrix(z, 3)[:, 4], z[4:7].ravel())
+    np.testing.assert_array_equal(_hankel_matrix(z, 3)[:, 4], z[4:7].ravel())
 
 
 def test_rows_are_ordered_future_inputs_past_inputs_past_outputs_future_outputs():
     z = np.array([[10 * t, 10 * t + 1] for t in range(4)])
-    column = hankel_matrix(z, 4)[:, 0]
-    rows = past_future_rows(1, 1, 2)
+    column = _hankel_matrix(z, 4)[:, 0]
+    rows = _past_future_rows(1, 1, 2)
     np.testing.assert_array_equal(column[rows], [20, 30, 0, 10, 1, 11, 21, 31])
-    rows = past_future_rows(1, 1, 2, past_outputs=False)
+    rows = _past_future_rows(1, 1, 2, past_outputs=False)
     np.testing.assert_array_equal(column[rows], [20, 30, 0, 10, 21, 31])
 
 
@@ -64,31 +64,32 @@ def test_cholesky_engine_equals_qr_engine(rng, past_outputs):
 
 def test_pooled_experiments_equal_stacked_factors(rng):
     records = [rng.standard_normal((n, 3)) for n in (300, 120, 80)]
-    rows = past_future_rows(2, 1, 5)
-    pooled = gram_factor(records, 10, rows)
-    stacked = stack_factors([gram_factor([z], 10, rows) for z in records])
+    pooled = data_factor(records, 2, 5)
+    stacked = stack_factors([data_factor([z], 2, 5) for z in records])
     np.testing.assert_allclose(pooled, stacked, atol=1e-10)
 
 
 def test_blocked_qr_equals_one_qr_of_the_whole_matrix(rng):
     z = rng.standard_normal((3000, 2))
-    rows = past_future_rows(1, 1, 3)
-    whole = stack_factors([hankel_matrix(z, 6)[rows]])
-    np.testing.assert_allclose(qr_factor([z], 6, rows), whole, atol=1e-10)
+    rows = _past_future_rows(1, 1, 3)
+    whole = stack_factors([_hankel_matrix(z, 6)[rows]])
+    np.testing.assert_allclose(_qr_factor([z], 6, rows), whole, atol=1e-10)
 
 
 def test_no_column_crosses_the_border_between_experiments(rng):
     first, second = rng.standard_normal((50, 2)), rng.standard_normal((40, 2))
     rows = np.arange(8)
-    H = np.hstack([hankel_matrix(first, 4), hankel_matrix(second, 4)])
-    L = gram_factor([first, second], 4, rows)
+    H = np.hstack([_hankel_matrix(first, 4), _hankel_matrix(second, 4)])
+    gram = _pooled_gram([first, second], 4, rows)
+    np.testing.assert_allclose(gram, H @ H.T, atol=1e-10)
+    L = _qr_factor([first, second], 4, rows)
     np.testing.assert_allclose(L @ L.T, H @ H.T, atol=1e-10)
 
 
 def test_experiments_shorter_than_the_window_give_no_column(rng):
     z = rng.standard_normal((60, 2))
     rows = np.arange(12)
-    for compress in (gram_factor, qr_factor):
+    for compress in (_pooled_gram, _qr_factor):
         np.testing.assert_array_equal(
             compress([z, z[:5]], 6, rows), compress([z], 6, rows)
         )
@@ -98,10 +99,10 @@ def test_experiments_shorter_than_the_window_give_no_column(rng):
 def test_singular_data_fall_back_to_qr_and_keep_their_accuracy(rng):
     z = rng.standard_normal((200, 1))
     z = np.hstack([z, 2.0 * z])
-    rows = past_future_rows(1, 1, 3)
-    H = hankel_matrix(z, 6)[rows]
+    rows = _past_future_rows(1, 1, 3)
+    H = _hankel_matrix(z, 6)[rows]
     assert cholesky_factor(H @ H.T) is None
-    L = gram_factor([z], 6, rows)
+    L = data_factor([z], 1, 3)
     np.testing.assert_allclose(L @ L.T, H @ H.T, atol=1e-11 * np.abs(H @ H.T).max())
 
 
