@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from .simulation_fit import Freedom, scaled_lstsq
+from ..systems.least_squares import scaled_lstsq
+from .simulation_fit import Freedom
 
 Array = NDArray[np.float64]
 

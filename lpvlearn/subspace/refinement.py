@@ -19,16 +19,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from .signals import Record, block_sections, signal_factor, state_coefficients
+from ..systems.least_squares import scaled_lstsq
+from .signals import (
+    Record,
+    block_sections,
+    output_energy,
+    signal_factor,
+    state_coefficients,
+)
 from .simulation_fit import (
     Freedom,
     Point,
     Realization,
     block_fit,
+    column_scale,
     freedom,
     jacobian_regression,
     n_own,
-    scaled_lstsq,
     stack_regressions,
 )
 
@@ -96,7 +103,7 @@ def refine_simulation(
     if free is None:
         free = freedom(*model.D.shape)
     model = in_sections(model)
-    energy = sum(float((record.y**2).sum()) for record in records)
+    energy = output_energy(records)
     n_values = sum(record.y.size for record in records)
     for iteration in range(max_iter):
         if model.loss <= _ROUNDING * energy or model.blocks is None:
@@ -193,8 +200,7 @@ def _accepted(
 def _trial_steps(step: Array, jacobian: Array, residual: Array) -> Iterator[Array]:
     """The whole step, then damped ones."""
     yield step
-    scale = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
-    scale[scale == 0.0] = 1.0
+    scale = column_scale(jacobian)
     left, s, right = linalg.svd(
         jacobian / scale, full_matrices=False, check_finite=False
     )

@@ -1,10 +1,16 @@
-"""A discrete state matrix as a bank of first- and second-order sections.
+"""Records, and the signals that all responses of a model to them are made of.
 
 With ``A = T diag(A_1, A_2, ...) inv(T)``, blocks of size one or two, every response of
 the model is a fixed combination of a few filtered signals that do not depend on B, C
-or the initial state. They are what the least-squares problems of `simulationfit` and
+or the initial state. They are what the least-squares problems of `simulation_fit` and
 `refinement` are made of. Poles that lie close together share a block, so that a
 double pole, or a pair of real poles about to become complex, is not singular.
+
+A block of two states has the resolvent
+``inv(z I - A) = ((z - s) I + N) / det(z I - A)`` with ``s`` half its trace and
+``N = A - s I``. Driven by ``b v`` from rest its state is
+therefore ``d b + g N b``, with the two signals ``d = (z - s) g`` and
+``g = v / det(z I - A)``. For one state only ``d`` exists, the state driven by ``v``.
 """
 
 from __future__ import annotations
@@ -26,6 +32,30 @@ _MAX_CONDITION = 1e8
 # Cosine above which two eigenvectors do not define their plane accurately.
 _PARALLEL = 1.0 - 1e-8
 
+# Samples worked on at a time: their signals stay in the cache.
+_PIECE = 8192
+
+# Squares of responses beyond this would overflow.
+_LARGEST = 1e200
+
+
+class Record(NamedTuple):
+    """Samples of one experiment, one row per channel.
+
+    Attributes
+    ----------
+    u : ndarray of shape (n_inputs, n_samples)
+    y : ndarray of shape (n_outputs, n_samples)
+    """
+
+    u: Array
+    y: Array
+
+
+def output_energy(records: Sequence[Record]) -> float:
+    """Sum of squares of all outputs."""
+    return sum(float((record.y**2).sum()) for record in records)
+
 
 class Sections(NamedTuple):
     """Block-diagonal form of a state matrix.
@@ -40,31 +70,6 @@ class Sections(NamedTuple):
 
     blocks: tuple[Array, ...]
     transform: Array
-
-
-def _pair_real(poles: Array) -> list[list[int]]:
-    """Group real poles, given in ascending order, two by two with their neighbours.
-
-    Of an odd number the one is left alone whose removal keeps the pairs closest.
-    """
-    n = len(poles)
-    if n % 2 == 0:
-        return [[i, i + 1] for i in range(0, n, 2)]
-    gaps = np.diff(poles)
-    cost = [gaps[0:i:2].sum() + gaps[i + 1 :: 2].sum() for i in range(0, n, 2)]
-    alone = 2 * int(np.argmin(cost))
-    rest = [i for i in range(n) if i != alone]
-    return [[alone]] + [rest[i : i + 2] for i in range(0, n - 1, 2)]
-
-
-def _invariant_basis(A: Array, poles: Array, vectors: Array) -> Array:
-    """Orthonormal basis of the invariant subspace of one or two real poles."""
-    if len(poles) == 2 and abs(vectors[:, 0] @ vectors[:, 1]) > _PARALLEL:
-        # A (nearly) defective pair: the null space of (A - p1 I)(A - p2 I).
-        eye = np.eye(len(A))
-        product = (A - poles[0] * eye) @ (A - poles[1] * eye)
-        return linalg.svd(product, check_finite=False)[2][-2:].T
-    return linalg.qr(vectors, mode="economic", check_finite=False)[0]
 
 
 def block_sections(A: Array) -> Sections | None:
@@ -109,203 +114,29 @@ def block_sections(A: Array) -> Sections | None:
     return Sections(blocks, transform)
 
 
-def block_coefficients(block: Array) -> tuple[float, Array]:
-    """Centre ``s`` and remainder ``N = A - s I`` of a block, ``s`` half its trace.
+def _pair_real(poles: Array) -> list[list[int]]:
+    """Group real poles, given in ascending order, two by two with their neighbours.
 
-    The resolvent is ``inv(z I - A) = ((z - s) I + N) / det(z I - A)``, so that any
-    response of the block combines the two signals of a `SectionBank`.
-
-    Parameters
-    ----------
-    block : ndarray of shape (k, k)
-        ``k`` is one or two.
-
-    Returns
-    -------
-    s : float
-    N : ndarray of shape (k, k)
+    Of an odd number the one is left alone whose removal keeps the pairs closest.
     """
-    centre = float(np.trace(block)) / len(block)
-    return centre, block - centre * np.eye(len(block))
+    n = len(poles)
+    if n % 2 == 0:
+        return [[i, i + 1] for i in range(0, n, 2)]
+    gaps = np.diff(poles)
+    cost = [gaps[0:i:2].sum() + gaps[i + 1 :: 2].sum() for i in range(0, n, 2)]
+    alone = 2 * int(np.argmin(cost))
+    rest = [i for i in range(n) if i != alone]
+    return [[alone]] + [rest[i : i + 2] for i in range(0, n - 1, 2)]
 
 
-class SectionBank:
-    """Filters of all blocks, with the memory that a record in pieces needs.
-
-    For a block of two states the signals are ``d = (z - s) g`` and
-    ``g = v / det(z I - A)``; the state driven by ``b v`` from rest is ``d b + g N b``.
-    For one state only ``d`` exists, which is the state driven by ``v``.
-
-    Parameters
-    ----------
-    blocks : tuple of ndarray of shape (k, k)
-        ``k`` is one or two.
-    widths : sequence of int
-        Number of signals that drive each block.
-    """
-
-    def __init__(self, blocks: tuple[Array, ...], widths: Sequence[int]) -> None:
-        self._blocks = blocks
-        self._memory = [
-            np.zeros((width, len(block)))
-            for block, width in zip(blocks, widths, strict=True)
-        ]
-        self._last = [np.zeros(width) for width in widths]
-
-    def run(self, late: Sequence[Array], out: Array) -> None:
-        """Filter the next piece.
-
-        Parameters
-        ----------
-        late : sequence of ndarray of shape (n_signals, n_samples)
-            What drives each block, one sample late.
-        out : ndarray of shape (sum of k * n_signals, n_samples)
-            Receives, block after block, ``d`` and (two states) ``g``.
-        """
-        row = 0
-        for i, v in enumerate(late):
-            width = len(v)
-            first = out[row : row + width]
-            if len(self._blocks[i]) == 1:
-                first[:] = self._filter(i, v)
-                row += width
-                continue
-            ahead, centre = self._filter(i, v), 0.5 * np.trace(self._blocks[i])
-            g = out[row + width : row + 2 * width]
-            self._delay(i, ahead, g)
-            np.multiply(g, -centre, out=first)
-            first += ahead
-            row += 2 * width
-
-    def run_last(self, late: Sequence[Array], out: Array) -> None:
-        """As `run`, but only ``g`` of blocks of two states (``d`` of one state)."""
-        row = 0
-        for i, v in enumerate(late):
-            part = out[row : row + len(v)]
-            if len(self._blocks[i]) == 1:
-                part[:] = self._filter(i, v)
-            else:
-                self._delay(i, self._filter(i, v), part)
-            row += len(v)
-
-    def _filter(self, i: int, v: Array) -> Array:
-        """``d`` of one state; ``g`` of two, one sample early."""
-        block = self._blocks[i]
-        denominator = [1.0, -block[0, 0]]
-        if len(block) == 2:
-            det = block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0]
-            denominator = [1.0, -block[0, 0] - block[1, 1], det]
-        out, self._memory[i] = signal.lfilter(
-            [1.0], denominator, v, axis=1, zi=self._memory[i]
-        )
-        return out
-
-    def _delay(self, i: int, ahead: Array, out: Array) -> None:
-        out[:, 0] = self._last[i]
-        out[:, 1:] = ahead[:, :-1]
-        self._last[i] = ahead[:, -1].copy()
-
-
-def section_signals(blocks: tuple[Array, ...], u: Array) -> Array:
-    """Signals that span the free and the forced responses of all sections.
-
-    Parameters
-    ----------
-    blocks : tuple of ndarray
-        Blocks of `Sections`.
-    u : ndarray of shape (n_inputs, n_samples)
-
-    Returns
-    -------
-    ndarray of shape (order * (1 + n_inputs), n_samples)
-        Section after section: for each of its signals (see `SectionBank`), the
-        answer to an impulse that sets the state at time 0, then the answers to each
-        input.
-    """
-    m, n_samples = u.shape
-    source = np.zeros((1 + m, n_samples))
-    source[0, 0] = 1.0
-    source[1:, 1:] = u[:, :-1]
-    order = sum(len(block) for block in blocks)
-    out = np.empty((order * (1 + m), n_samples))
-    SectionBank(blocks, [1 + m] * len(blocks)).run([source] * len(blocks), out)
-    return out
-
-
-def output_coefficients(blocks: tuple[Array, ...], C: Array) -> Array:
-    """Outputs of every section, in terms of its signals.
-
-    ``c x = sum_i coefficient[i, j] b[j] signal[i]`` for a state driven through ``b``:
-    rows ``c`` for ``d`` and ``c N`` for ``g``.
-
-    Parameters
-    ----------
-    blocks : tuple of ndarray
-        Blocks of `Sections`.
-    C : ndarray of shape (n_outputs, order)
-        In the coordinates of the blocks.
-
-    Returns
-    -------
-    ndarray of shape (n_outputs, order, order)
-        Block diagonal, one matrix per output.
-    """
-    ny, n = C.shape
-    out = np.zeros((ny, n, n))
-    start = 0
-    for block in blocks:
-        part = slice(start, start + len(block))
-        out[:, start, part] = C[:, part]
-        if len(block) == 2:
-            out[:, start + 1, part] = C[:, part] @ block_coefficients(block)[1]
-        start = part.stop
-    return out
-
-
-def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
-    """States in terms of the section signals.
-
-    Parameters
-    ----------
-    blocks : tuple of ndarray
-        Blocks of `Sections`.
-    driven : ndarray of shape (order, 1 + n_inputs)
-        Initial state and input matrix.
-
-    Returns
-    -------
-    ndarray of shape (order, order * (1 + n_inputs))
-    """
-    n, width = driven.shape
-    out = np.zeros((n, n, width))
-    start = 0
-    for block in blocks:
-        part = slice(start, start + len(block))
-        out[part, start] = driven[part]
-        if len(block) == 2:
-            out[part, start + 1] = block_coefficients(block)[1] @ driven[part]
-        start = part.stop
-    return out.reshape(n, n * width)
-
-
-# Samples worked on at a time: their signals stay in the cache.
-_PIECE = 8192
-
-# Squares of responses beyond this would overflow.
-_LARGEST = 1e200
-
-
-class Record(NamedTuple):
-    """Samples of one experiment, one row per channel.
-
-    Attributes
-    ----------
-    u : ndarray of shape (n_inputs, n_samples)
-    y : ndarray of shape (n_outputs, n_samples)
-    """
-
-    u: Array
-    y: Array
+def _invariant_basis(A: Array, poles: Array, vectors: Array) -> Array:
+    """Orthonormal basis of the invariant subspace of one or two real poles."""
+    if len(poles) == 2 and abs(vectors[:, 0] @ vectors[:, 1]) > _PARALLEL:
+        # A (nearly) defective pair: the null space of (A - p1 I)(A - p2 I).
+        eye = np.eye(len(A))
+        product = (A - poles[0] * eye) @ (A - poles[1] * eye)
+        return linalg.svd(product, check_finite=False)[2][-2:].T
+    return linalg.qr(vectors, mode="economic", check_finite=False)[0]
 
 
 def signal_pieces(
@@ -319,23 +150,25 @@ def signal_pieces(
         Diagonal blocks of A.
     record : Record
     state_map : ndarray of shape (order, order * (1 + n_inputs)), default=None
-        Coefficients of the states in the section signals. Given, the second responses
-        follow: what every block answers to its own states, by `run_last`, since
-        ``d = N g + [x0, B] g_u`` for states driven by signals with answers ``g_u``.
+        `state_coefficients`. Given, second responses follow: what every block answers
+        to its own states, the last signal of it only, since ``d = N g + [x0, B] g_u``
+        for states driven by signals with answers ``g_u``.
 
     Yields
     ------
     ndarray of shape (n_signals, n_samples_i)
         Rows: section signals, inputs, outputs, and second responses block by block.
-        The memory is used again for the next piece.
+        Section signals: for each block and each of its signals, the answer to an
+        impulse that sets the state at time 0, then those to each input. The memory is
+        used again for the next piece.
     """
     (m, n_samples), ny = record.u.shape, len(record.y)
     order = sum(len(block) for block in blocks)
     base = order * (1 + m)
     second = 0 if state_map is None else order
     memory = np.empty((base + m + ny + second, min(n_samples, _PIECE)))
-    first_bank = SectionBank(blocks, [1 + m] * len(blocks))
-    second_bank = SectionBank(blocks, [len(block) for block in blocks])
+    first_bank = _SectionBank(blocks, [1 + m] * len(blocks))
+    second_bank = _SectionBank(blocks, [len(block) for block in blocks])
     source = np.zeros((1 + m, memory.shape[1]))
     source[0, 0] = 1.0
     late = np.empty((order, memory.shape[1]))
@@ -348,19 +181,15 @@ def signal_pieces(
             source[0, 0] = 0.0
             source[1:, 0] = record.u[:, start - 1]
         source[1:, 1:n] = record.u[:, start : stop - 1]
-        first_bank.run([source[:, :n]] * len(blocks), X[:base])
+        first_bank.run([source[:, :n]] * len(blocks), X[:base], last_only=False)
         X[base : base + m] = record.u[:, start:stop]
         X[base + m : base + m + ny] = record.y[:, start:stop]
         if state_map is not None:
             late[:, 0] = last_state
             late[:, 1:n] = state_map @ X[:base, :-1]
             last_state = state_map @ X[:base, -1]
-            stops = np.cumsum([len(block) for block in blocks])
-            parts = [
-                late[stop - len(block) : stop, :n]
-                for block, stop in zip(blocks, stops, strict=True)
-            ]
-            second_bank.run_last(parts, X[base + m + ny :])
+            parts = [late[part, :n] for part in block_slices(blocks)]
+            second_bank.run(parts, X[base + m + ny :], last_only=True)
         yield X
 
 
@@ -392,3 +221,129 @@ def signal_factor(
         for X in signal_pieces(blocks, record, state_map):
             lower = stack_factors([lower, X])
     return lower.T
+
+
+class _SectionBank:
+    """Filters of all blocks, with the memory that a record in pieces needs.
+
+    Parameters
+    ----------
+    blocks : tuple of ndarray of shape (k, k)
+        ``k`` is one or two.
+    widths : sequence of int
+        Number of signals that drive each block.
+    """
+
+    def __init__(self, blocks: tuple[Array, ...], widths: Sequence[int]) -> None:
+        self._blocks = blocks
+        self._memory = [
+            np.zeros((width, len(block)))
+            for block, width in zip(blocks, widths, strict=True)
+        ]
+        self._last = [np.zeros(width) for width in widths]
+
+    def run(self, late: Sequence[Array], out: Array, *, last_only: bool) -> None:
+        """Filter the next piece.
+
+        Parameters
+        ----------
+        late : sequence of ndarray of shape (n_signals, n_samples)
+            What drives each block, one sample late.
+        out : ndarray of shape (n_rows, n_samples)
+            Receives, block after block, ``d`` and, of blocks of two states, ``g``.
+        last_only : bool
+            Only the last of them: ``d`` of one state, ``g`` of two.
+        """
+        row = 0
+        for i, v in enumerate(late):
+            width, ahead = len(v), self._filter(i, v)
+            first = out[row : row + width]
+            row += width
+            if len(self._blocks[i]) == 1:
+                first[:] = ahead
+            elif last_only:
+                self._delay(i, ahead, first)
+            else:
+                g = out[row : row + width]
+                self._delay(i, ahead, g)
+                np.multiply(g, -0.5 * np.trace(self._blocks[i]), out=first)
+                first += ahead
+                row += width
+
+    def _filter(self, i: int, v: Array) -> Array:
+        """``d`` of one state; ``g`` of two, one sample early."""
+        block = self._blocks[i]
+        denominator = [1.0, -block[0, 0]]
+        if len(block) == 2:
+            det = block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0]
+            denominator = [1.0, -block[0, 0] - block[1, 1], det]
+        out, self._memory[i] = signal.lfilter(
+            [1.0], denominator, v, axis=1, zi=self._memory[i]
+        )
+        return out
+
+    def _delay(self, i: int, ahead: Array, out: Array) -> None:
+        out[:, 0] = self._last[i]
+        out[:, 1:] = ahead[:, :-1]
+        self._last[i] = ahead[:, -1].copy()
+
+
+def output_coefficients(blocks: tuple[Array, ...], C: Array) -> Array:
+    """Outputs of every section, in terms of its signals.
+
+    ``c x = sum_i coefficient[i, j] b[j] signal[i]`` for a state driven through ``b``:
+    rows ``c`` for ``d`` and ``c N`` for ``g``.
+
+    Parameters
+    ----------
+    blocks : tuple of ndarray
+        Blocks of `Sections`.
+    C : ndarray of shape (n_outputs, order)
+        In the coordinates of the blocks.
+
+    Returns
+    -------
+    ndarray of shape (n_outputs, order, order)
+        Block diagonal, one matrix per output.
+    """
+    ny, n = C.shape
+    out = np.zeros((ny, n, n))
+    for block, part in zip(blocks, block_slices(blocks), strict=True):
+        out[:, part.start, part] = C[:, part]
+        if len(block) == 2:
+            out[:, part.start + 1, part] = C[:, part] @ block_remainder(block)
+    return out
+
+
+def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
+    """States in terms of the section signals.
+
+    Parameters
+    ----------
+    blocks : tuple of ndarray
+        Blocks of `Sections`.
+    driven : ndarray of shape (order, 1 + n_inputs)
+        Initial state and input matrix.
+
+    Returns
+    -------
+    ndarray of shape (order, order * (1 + n_inputs))
+    """
+    n, width = driven.shape
+    out = np.zeros((n, n, width))
+    for block, part in zip(blocks, block_slices(blocks), strict=True):
+        out[part, part.start] = driven[part]
+        if len(block) == 2:
+            out[part, part.start + 1] = block_remainder(block) @ driven[part]
+    return out.reshape(n, n * width)
+
+
+def block_slices(blocks: Sequence[Array]) -> list[slice]:
+    """States of every block."""
+    stops = np.cumsum([len(block) for block in blocks]).tolist()
+    return [slice(stop - len(b), stop) for b, stop in zip(blocks, stops, strict=True)]
+
+
+def block_remainder(block: Array) -> Array:
+    """``N = A - s I`` of a block, with ``s`` its trace divided by its size."""
+    return block - float(np.trace(block)) / len(block) * np.eye(len(block))

@@ -1,4 +1,14 @@
-"""Least squares in compressed form: simulated outputs by their parameters."""
+"""B, D and initial states by least squares on the simulation error.
+
+With A and C given, the simulated outputs ``y = C (z I - A)^-1 (x0 + B u) + D u`` are
+linear in the rest of the model. The regressors of all samples are combinations of a
+few section signals (see `signals`), so that the triangular factor of these signals,
+computed once, stands for the samples: the regressions here have as many rows as there
+are signals, for each output. The derivative of the simulation error with respect to
+all parameters, which `refinement` takes its steps by, is a regression on the same
+signals and on second responses. The unknowns of an experiment (its initial state) are
+projected out before experiments are pooled.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +24,9 @@ from ..systems.simulation import lti_response
 from .hankel import triangularize
 from .signals import (
     Record,
-    block_coefficients,
+    block_remainder,
     block_sections,
+    block_slices,
     output_coefficients,
     signal_factor,
     state_coefficients,
@@ -39,143 +50,145 @@ class Freedom(NamedTuple):
     initial_states: bool = True
 
 
-class Point(NamedTuple):
-    """A model in section form, around which the simulation error is linearised.
+def freedom(
+    n_outputs: int,
+    n_inputs: int,
+    feedthrough: bool | NDArray[np.bool_] = True,
+    initial_states: bool = True,
+) -> Freedom:
+    """Initial states free or zero, and D as `feedthrough` says: all, none or a mask."""
+    direct = np.broadcast_to(np.asarray(feedthrough, dtype=bool), (n_outputs, n_inputs))
+    return Freedom(np.array(direct), initial_states)
+
+
+class Realization(NamedTuple):
+    """A discrete-time model with the initial states of its experiments.
 
     Attributes
     ----------
-    C : ndarray of shape (n_outputs, order)
-    D : ndarray of shape (n_outputs, n_inputs)
-    driven : ndarray of shape (order, 1 + n_inputs)
-        Initial state and B.
+    A, B, C, D : ndarray
+        State-space matrices.
+    initial_states : ndarray of shape (n_experiments, order)
+    loss : float
+        Sum of squared simulation errors over all experiments; infinite where the
+        simulation overflows.
+    rank_deficit : int
+        Number of directions of B and D that the data leave undetermined.
+    blocks : tuple of ndarray or None
+        Diagonal blocks of A where it is in section form.
     """
 
+    A: Array
+    B: Array
     C: Array
     D: Array
-    driven: Array
+    initial_states: Array
+    loss: float
+    rank_deficit: int = 0
+    blocks: tuple[Array, ...] | None = None
 
 
-def n_own(order: int, free: Freedom) -> int:
-    """Number of unknowns that belong to one experiment."""
-    return order if free.initial_states else 0
-
-
-def linear_regression(
-    R: Array, blocks: tuple[Array, ...], C: Array, free: Freedom
-) -> Array:
-    """Regression of the outputs on initial state, B and D, with A and C given.
+def simulation_fit(
+    A: Array, C: Array, records: Sequence[Record], free: Freedom | None = None
+) -> Realization:
+    """B, D and initial states that minimise the simulation error.
 
     Parameters
     ----------
-    R : ndarray of shape (k, n_signals)
-        From `signal_factor`.
-    blocks : tuple of ndarray
-        Blocks of A.
+    A : ndarray of shape (order, order)
     C : ndarray of shape (n_outputs, order)
-    free : Freedom
+    records : sequence of Record
+        Experiments, each with its own initial state.
+    free : Freedom, default=None
+        None frees all initial states and all of D.
 
     Returns
     -------
-    ndarray of shape (n_outputs * k, n_unknowns + 1)
-        Columns: initial state (if free), B (state-major), free entries of D, output.
+    Realization
+        In the coordinates of `block_sections` where these exist, else in those given.
+
+    References
+    ----------
+    M. Verhaegen and V. Verdult, *Filtering and System Identification*, Cambridge
+    University Press, 2007, Section 9.2.4.
     """
-    (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
+    if free is None:
+        free = freedom(len(C), len(records[0].u))
+    sections = block_sections(A)
+    if sections is not None:
+        return block_fit(sections.blocks, C @ sections.transform, records, free)
+    with np.errstate(over="ignore", invalid="ignore"):
+        factors = [_general_regression(A, C, r, free) for r in records]
+    if not all(np.isfinite(factor).all() for factor in factors):
+        return _overflowing(A, C, records)
+    return _realization(A, C, factors, free, None)
+
+
+def block_fit(
+    blocks: tuple[Array, ...], C: Array, records: Sequence[Record], free: Freedom
+) -> Realization:
+    """As `simulation_fit`, for a state matrix in section form."""
+    A = linalg.block_diag(*blocks) if blocks else np.zeros((0, 0))
+    factors = []
+    for record in records:
+        R = signal_factor(blocks, record)
+        if R is None:
+            return _overflowing(A, C, records)
+        factors.append(linear_regression(R, blocks, C, free))
+    return _realization(A, C, factors, free, blocks)
+
+
+def _general_regression(A: Array, C: Array, record: Record, free: Freedom) -> Array:
+    """As `linear_regression` for any A, by the adjoint state recursion.
+
+    ``c (z I - A)^-1 B u_j`` is linear in B through the state of the model
+    ``(A.T, c)`` driven by ``u_j``. Slower, but free of any transformation.
+    """
+    (m, n_samples), (ny, n) = record.u.shape, C.shape
     own = n_own(n, free)
     where = np.argwhere(free.direct)
-    out = np.zeros((ny, k, own + n * m + len(where) + 1))
-    base = _driven_columns(out, R, blocks, C, m, own)
-    for column, (i, j) in enumerate(where, start=own + n * m):
-        out[i, :, column] = R[:, base + j]
-    out[:, :, -1] = R[:, base + m : base + m + ny].T
-    return out.reshape(ny * k, -1)
-
-
-def jacobian_regression(
-    R: Array, blocks: tuple[Array, ...], point: Point, free: Freedom
-) -> Array:
-    """Regression of the simulation error on changes of all parameters.
-
-    Parameters
-    ----------
-    R : ndarray of shape (k, n_signals)
-        From `signal_factor`, with second responses.
-    blocks : tuple of ndarray
-        Blocks of A.
-    point : Point
-    free : Freedom
-
-    Returns
-    -------
-    ndarray of shape (n_outputs * k, n_parameters + 1)
-        Columns: initial state (if free), B, free entries of D, A (blocks, row-major),
-        C, simulation error.
-    """
-    C, D, driven = point
-    (ny, n), m, k = C.shape, D.shape[1], len(R)
-    own, second = n_own(n, free), sum(len(block) ** 2 for block in blocks)
-    where = np.argwhere(free.direct)
-    at_a = own + n * m + len(where)
-    out = np.zeros((ny, k, at_a + second + ny * n + 1))
-    base = _driven_columns(out, R, blocks, C, m, own)
-    for column, (i, j) in enumerate(where, start=own + n * m):
-        out[i, :, column] = R[:, base + j]
-    start, column, row = 0, at_a, base + m + ny
-    for block in blocks:
-        size = len(block)
-        part = slice(start, start + size)
-        # Entry (p, q) of the block drives state p with state q.
-        answer = R[:, row : row + size]
-        if size == 1:
-            effect = C[:, None, part, None] * answer[None, :, None, :]
-        else:
-            N = block_coefficients(block)[1]
-            g_u = R[:, (start + 1) * (1 + m) : (start + 2) * (1 + m)]
-            first = answer @ N.T + g_u @ driven[part].T
-            effect = C[:, None, part, None] * first[None, :, None, :]
-            effect += (C[:, part] @ N)[:, None, :, None] * answer[None, :, None, :]
-        out[:, :, column : column + size * size] = effect.reshape(ny, k, -1)
-        start, column, row = part.stop, column + size * size, row + size
-    states = R[:, :base] @ state_coefficients(blocks, driven).T
+    eye, none = np.eye(n), np.zeros((n, 1))
+    parts = []
     for i in range(ny):
-        out[i, :, column + i * n : column + (i + 1) * n] = states
-    fitted = states @ C.T + R[:, base : base + m] @ D.T
-    out[:, :, -1] = (R[:, base + m : base + m + ny] - fitted).T
-    return out.reshape(ny * k, -1)
+        M = np.zeros((own + n * m + len(where) + 1, n_samples))
+        if own:
+            at_rest = np.zeros((n_samples, 1))
+            M[:n] = lti_response(A.T, none, eye, none, at_rest, C[i]).T
+        for j in range(m):
+            M[own + j : own + n * m : m] = lti_response(
+                A.T, C[i][:, None], eye, none, record.u[j][:, None]
+            ).T
+        for row, (output, j) in enumerate(where, start=own + n * m):
+            if output == i:
+                M[row] = record.u[j]
+        M[-1] = record.y[i]
+        parts.append(triangularize(M))
+    return np.vstack(parts)
 
 
-def _driven_columns(
-    out: Array, R: Array, blocks: tuple[Array, ...], C: Array, m: int, own: int
-) -> int:
-    """Fill in the effects of initial state and B; the number of section signals."""
-    (ny, n), k = C.shape, len(R)
-    base = n * (1 + m)
-    signals = R[:, :base].reshape(k, n, 1 + m).transpose(0, 2, 1)
-    effect = signals[None] @ output_coefficients(blocks, C)[:, None]
-    out[:, :, :own] = effect[:, :, 0, :own]
-    by_state = effect[:, :, 1:].transpose(0, 1, 3, 2)
-    out[:, :, own : own + n * m] = by_state.reshape(ny, k, n * m)
-    return base
+def _realization(
+    A: Array,
+    C: Array,
+    factors: Sequence[Array],
+    free: Freedom,
+    blocks: tuple[Array, ...] | None,
+) -> Realization:
+    n, m = len(A), free.direct.shape[1]
+    own = n_own(n, free)
+    common, states, loss, deficit = solve_regressions(factors, own)
+    D = np.zeros(free.direct.shape)
+    D[free.direct] = common[n * m :]
+    if not own:
+        states = np.zeros((len(factors), n))
+    return Realization(
+        A, common[: n * m].reshape(n, m), C, D, states, loss, deficit, blocks
+    )
 
 
-def project_out(M: Array, n: int, rcond: float = RCOND) -> Array:
-    """The columns after the first `n`, without what the first `n` explain."""
-    if n == 0:
-        return M
-    scale = np.sqrt(np.einsum("ij,ij->j", M[:, :n], M[:, :n]))
-    scale[scale == 0.0] = 1.0
-    left, s, _ = linalg.svd(M[:, :n] / scale, full_matrices=False, check_finite=False)
-    left = left[:, s > rcond * s[0]]
-    return M[:, n:] - left @ (left.T @ M[:, n:])
-
-
-def stack_regressions(regressions: Sequence[Array], n: int) -> Array:
-    """One regression on the common unknowns, the first `n` of each projected out."""
-    reduced = [project_out(M, n) for M in regressions]
-    if len(reduced) == 1:
-        return reduced[0]
-    return np.triu(linalg.qr(np.vstack(reduced), mode="r", check_finite=False)[0])[
-        : reduced[0].shape[1]
-    ]
+def _overflowing(A: Array, C: Array, records: Sequence[Record]) -> Realization:
+    m, (ny, n) = len(records[0].u), C.shape
+    zero = np.zeros((n, m)), np.zeros((ny, m)), np.zeros((len(records), n))
+    return Realization(A, zero[0], C, zero[1], zero[2], np.inf)
 
 
 def solve_regressions(
@@ -214,142 +227,140 @@ def solve_regressions(
     return common, own, loss, len(common) - rank
 
 
-class Realization(NamedTuple):
-    """A discrete-time model with the initial states of its experiments.
+def stack_regressions(regressions: Sequence[Array], n: int) -> Array:
+    """One regression on the common unknowns, the first `n` of each projected out."""
+    reduced = [project_out(M, n) for M in regressions]
+    if len(reduced) == 1:
+        return reduced[0]
+    return triangularize(np.vstack(reduced).T)
+
+
+def project_out(M: Array, n: int) -> Array:
+    """The columns after the first `n`, without what the first `n` explain."""
+    if n == 0:
+        return M
+    explained = linalg.orth(M[:, :n] / column_scale(M[:, :n]), RCOND)
+    return M[:, n:] - explained @ (explained.T @ M[:, n:])
+
+
+def column_scale(M: Array) -> Array:
+    """Norm of every column; 1 for a column of zeros."""
+    scale = np.sqrt(np.einsum("ij,ij->j", M, M))
+    scale[scale == 0.0] = 1.0
+    return scale
+
+
+class Point(NamedTuple):
+    """A model in section form, around which the simulation error is linearised.
 
     Attributes
     ----------
-    A, B, C, D : ndarray
-        State-space matrices.
-    initial_states : ndarray of shape (n_experiments, order)
-    loss : float
-        Sum of squared simulation errors over all experiments; infinite where the
-        simulation overflows.
-    rank_deficit : int
-        Number of directions of B and D that the data leave undetermined.
-    blocks : tuple of ndarray or None
-        Diagonal blocks of A where it is in section form.
+    C : ndarray of shape (n_outputs, order)
+    D : ndarray of shape (n_outputs, n_inputs)
+    driven : ndarray of shape (order, 1 + n_inputs)
+        Initial state and B.
     """
 
-    A: Array
-    B: Array
     C: Array
     D: Array
-    initial_states: Array
-    loss: float
-    rank_deficit: int = 0
-    blocks: tuple[Array, ...] | None = None
+    driven: Array
 
 
-def freedom(
-    n_outputs: int,
-    n_inputs: int,
-    feedthrough: bool | NDArray[np.bool_] = True,
-    initial_states: bool = True,
-) -> Freedom:
-    """Initial states free or zero, and D as `feedthrough` says: all, none or a mask."""
-    direct = np.broadcast_to(np.asarray(feedthrough, dtype=bool), (n_outputs, n_inputs))
-    return Freedom(np.array(direct), initial_states)
-
-
-def general_regression(A: Array, C: Array, record: Record, free: Freedom) -> Array:
-    """As `linear_regression` for any A, by the adjoint state recursion.
-
-    ``c (z I - A)^-1 B u_j`` is linear in B through the state of the model
-    ``(A.T, c)`` driven by ``u_j``. Slower, but free of any transformation.
-    """
-    (m, n_samples), (ny, n) = record.u.shape, C.shape
-    own = n_own(n, free)
-    where = np.argwhere(free.direct)
-    eye, none = np.eye(n), np.zeros((n, 1))
-    parts = []
-    for i in range(ny):
-        M = np.zeros((own + n * m + len(where) + 1, n_samples))
-        if own:
-            at_rest = np.zeros((n_samples, 1))
-            M[:n] = lti_response(A.T, none, eye, none, at_rest, C[i]).T
-        for j in range(m):
-            M[own + j : own + n * m : m] = lti_response(
-                A.T, C[i][:, None], eye, none, record.u[j][:, None]
-            ).T
-        for row, (output, j) in enumerate(where, start=own + n * m):
-            if output == i:
-                M[row] = record.u[j]
-        M[-1] = record.y[i]
-        parts.append(triangularize(M))
-    return np.vstack(parts)
-
-
-def simulation_fit(
-    A: Array, C: Array, records: Sequence[Record], free: Freedom | None = None
-) -> Realization:
-    """B, D and initial states that minimise the simulation error.
+def linear_regression(
+    R: Array, blocks: tuple[Array, ...], C: Array, free: Freedom
+) -> Array:
+    """Regression of the outputs on initial state, B and D, with A and C given.
 
     Parameters
     ----------
-    A : ndarray of shape (order, order)
+    R : ndarray of shape (k, n_signals)
+        From `signal_factor`.
+    blocks : tuple of ndarray
+        Blocks of A.
     C : ndarray of shape (n_outputs, order)
-    records : sequence of Record
-        Experiments, each with its own initial state.
-    free : Freedom, default=None
-        None frees all initial states and all of D.
+    free : Freedom
 
     Returns
     -------
-    Realization
-        In the coordinates of `block_sections` where these exist, else in those given.
-
-    References
-    ----------
-    M. Verhaegen and V. Verdult, *Filtering and System Identification*, Cambridge
-    University Press, 2007, Section 9.2.4.
+    ndarray of shape (n_outputs * k, n_unknowns + 1)
+        Columns: initial state (if free), B (state-major), free entries of D, output.
     """
-    if free is None:
-        free = freedom(len(C), len(records[0].u))
-    sections = block_sections(A)
-    if sections is not None:
-        return block_fit(sections.blocks, C @ sections.transform, records, free)
-    with np.errstate(over="ignore", invalid="ignore"):
-        factors = [general_regression(A, C, r, free) for r in records]
-    if not all(np.isfinite(factor).all() for factor in factors):
-        return _overflowing(A, C, records)
-    return _realization(A, C, factors, free, None)
+    (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
+    out = np.zeros((ny, k, _n_linear(n, free) + 1))
+    _fill_linear(out, R, blocks, C, free)
+    base = n * (1 + m)
+    out[:, :, -1] = R[:, base + m : base + m + ny].T
+    return out.reshape(ny * k, -1)
 
 
-def block_fit(
-    blocks: tuple[Array, ...], C: Array, records: Sequence[Record], free: Freedom
-) -> Realization:
-    """As `simulation_fit`, for a state matrix in section form."""
-    A = linalg.block_diag(*blocks) if blocks else np.zeros((0, 0))
-    factors = []
-    for record in records:
-        R = signal_factor(blocks, record)
-        if R is None:
-            return _overflowing(A, C, records)
-        factors.append(linear_regression(R, blocks, C, free))
-    return _realization(A, C, factors, free, blocks)
+def jacobian_regression(
+    R: Array, blocks: tuple[Array, ...], point: Point, free: Freedom
+) -> Array:
+    """Regression of the simulation error on changes of all parameters.
+
+    Parameters
+    ----------
+    R : ndarray of shape (k, n_signals)
+        From `signal_factor`, with second responses.
+    blocks : tuple of ndarray
+        Blocks of A.
+    point : Point
+    free : Freedom
+
+    Returns
+    -------
+    ndarray of shape (n_outputs * k, n_parameters + 1)
+        Columns: initial state (if free), B, free entries of D, A (blocks, row-major),
+        C, simulation error.
+    """
+    C, D, driven = point
+    (ny, n), m, k = C.shape, D.shape[1], len(R)
+    column, base = _n_linear(n, free), n * (1 + m)
+    size_a = sum(block.size for block in blocks)
+    out = np.zeros((ny, k, column + size_a + ny * n + 1))
+    _fill_linear(out, R, blocks, C, free)
+    second = R[:, base + m + ny :]
+    for block, part in zip(blocks, block_slices(blocks), strict=True):
+        # Entry (p, q) of the block drives state p with state q.
+        answer = second[:, part]
+        if len(block) == 1:
+            effect = C[:, None, part, None] * answer[None, :, None, :]
+        else:
+            N = block_remainder(block)
+            g_u = R[:, (part.start + 1) * (1 + m) : part.stop * (1 + m)]
+            first = answer @ N.T + g_u @ driven[part].T
+            effect = C[:, None, part, None] * first[None, :, None, :]
+            effect += (C[:, part] @ N)[:, None, :, None] * answer[None, :, None, :]
+        out[:, :, column : column + block.size] = effect.reshape(ny, k, -1)
+        column += block.size
+    states = R[:, :base] @ state_coefficients(blocks, driven).T
+    for i in range(ny):
+        out[i, :, column + i * n : column + (i + 1) * n] = states
+    fitted = states @ C.T + R[:, base : base + m] @ D.T
+    out[:, :, -1] = (R[:, base + m : base + m + ny] - fitted).T
+    return out.reshape(ny * k, -1)
 
 
-def _overflowing(A: Array, C: Array, records: Sequence[Record]) -> Realization:
-    m, (ny, n) = len(records[0].u), C.shape
-    zero = np.zeros((n, m)), np.zeros((ny, m)), np.zeros((len(records), n))
-    return Realization(A, zero[0], C, zero[1], zero[2], np.inf)
+def _n_linear(order: int, free: Freedom) -> int:
+    """Number of unknowns that an output is linear in: initial state, B and D."""
+    return n_own(order, free) + order * free.direct.shape[1] + int(free.direct.sum())
 
 
-def _realization(
-    A: Array,
-    C: Array,
-    factors: Sequence[Array],
-    free: Freedom,
-    blocks: tuple[Array, ...] | None,
-) -> Realization:
-    n, m = len(A), free.direct.shape[1]
-    own = n_own(n, free)
-    common, states, loss, deficit = solve_regressions(factors, own)
-    D = np.zeros(free.direct.shape)
-    D[free.direct] = common[n * m :]
-    if not own:
-        states = np.zeros((len(factors), n))
-    return Realization(
-        A, common[: n * m].reshape(n, m), C, D, states, loss, deficit, blocks
-    )
+def _fill_linear(
+    out: Array, R: Array, blocks: tuple[Array, ...], C: Array, free: Freedom
+) -> None:
+    """Fill in the effects of initial state (if free), B and the free entries of D."""
+    (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
+    own, base = n_own(n, free), n * (1 + m)
+    signals = R[:, :base].reshape(k, n, 1 + m).transpose(0, 2, 1)
+    effect = signals[None] @ output_coefficients(blocks, C)[:, None]
+    out[:, :, :own] = effect[:, :, 0, :own]
+    by_state = effect[:, :, 1:].transpose(0, 1, 3, 2)
+    out[:, :, own : own + n * m] = by_state.reshape(ny, k, n * m)
+    for column, (i, j) in enumerate(np.argwhere(free.direct), start=own + n * m):
+        out[i, :, column] = R[:, base + j]
+
+
+def n_own(order: int, free: Freedom) -> int:
+    """Number of unknowns that belong to one experiment."""
+    return order if free.initial_states else 0

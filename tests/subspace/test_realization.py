@@ -20,13 +20,13 @@ from lpvlearn.subspace.selection import (
 from lpvlearn.subspace.signals import (
     Record,
     block_sections,
-    section_signals,
     signal_factor,
+    signal_pieces,
 )
 from lpvlearn.subspace.simulation_fit import (
     Realization,
+    _general_regression,
     freedom,
-    general_regression,
     linear_regression,
     simulation_fit,
     solve_regressions,
@@ -238,7 +238,8 @@ def test_sections_span_free_and_forced_responses(rng, A):
     u = rng.standard_normal((60, 1))
     y = lti_response(A, B, C, D, u, rng.standard_normal(n))
     sections = block_sections(A)
-    signals = section_signals(sections.blocks, u.T).T
+    (piece,) = signal_pieces(sections.blocks, Record(u.T, y.T))
+    signals = piece[: 2 * n].T
     fitted = signals @ np.linalg.lstsq(signals, y, rcond=None)[0]
     np.testing.assert_allclose(fitted, y, atol=1e-9 * np.abs(y).max())
 
@@ -257,7 +258,7 @@ def test_both_regressions_give_the_same_B_D_and_initial_state(rng):
     free, blocks = freedom(2, 2), sections.blocks
     R = signal_factor(blocks, record)
     fast = solve_regressions([linear_regression(R, blocks, C @ T, free)], 6)
-    slow = solve_regressions([general_regression(A, C, record, free)], 6)
+    slow = solve_regressions([_general_regression(A, C, record, free)], 6)
     np.testing.assert_allclose(T @ fast[1][0], slow[1][0], atol=1e-9)
     np.testing.assert_allclose(
         T @ fast[0][:12].reshape(6, 2), slow[0][:12].reshape(6, 2), atol=1e-9
