@@ -21,13 +21,14 @@ from .realization import (
     shift_invariant_pair,
 )
 from .refinement import refine_simulation
-from .signals import Record
+from .signals import Record, output_energy
 from .simulation_fit import Freedom, Realization, freedom, simulation_fit
 
 Array = NDArray[np.float64]
 
-# A reflected (stable) start is preferred unless it fits this much worse, and by more
-# than growing states explain of the last samples' noise.
+# A reflected (stable) start is preferred unless its loss is larger by this factor, one
+# per cent, and by more than growing states explain of the last samples' noise: this
+# many times what the parameters of a model absorb of it.
 STABLE_LOSS = 1.01
 
 _BY_CHANCE = 10.0
@@ -50,6 +51,28 @@ class ScaledRecords(NamedTuple):
     records: list[Record]
     input_scale: Array
     output_scale: Array
+
+
+class Settings(NamedTuple):
+    """How models are made of scaled records.
+
+    Attributes
+    ----------
+    free : Freedom
+    method, refine, enforce_stability, n_noise_states
+        As in `identify`.
+    """
+
+    free: Freedom
+    method: str = "po-moesp"
+    refine: bool = True
+    enforce_stability: bool = False
+    n_noise_states: int = 0
+
+    def max_order(self, horizon: int) -> int:
+        """Highest order that a horizon can show of these channels."""
+        n_outputs, n_inputs = self.free.direct.shape
+        return max_order(horizon, n_inputs, n_outputs, self.method)
 
 
 class Identified(NamedTuple):
@@ -165,16 +188,16 @@ def max_order(horizon: int, n_inputs: int, n_outputs: int, method: str) -> int:
     return min(order, horizon * n_inputs) if method == "pi-moesp" else order
 
 
-def samples_of(records: Sequence[Record]) -> list[Array]:
-    """Samples ``[u, y]`` of records, one row per time instant."""
-    return [np.ascontiguousarray(np.vstack(record).T) for record in records]
-
-
 def correlations_of(records: Sequence[Record], horizon: int) -> list[Array]:
     """Correlation sequences that serve all horizons up to the one given."""
     return [
-        correlation_sequence(z, min(2 * horizon, len(z))) for z in samples_of(records)
+        correlation_sequence(z, min(2 * horizon, len(z))) for z in _samples_of(records)
     ]
+
+
+def _samples_of(records: Sequence[Record]) -> list[Array]:
+    """Samples ``[u, y]`` of records, one row per time instant."""
+    return [np.ascontiguousarray(np.vstack(record).T) for record in records]
 
 
 def subspace_of(
@@ -204,7 +227,7 @@ def subspace_of(
     """
     m, ny = len(records[0].u), len(records[0].y)
     factor = data_factor(
-        samples_of(records),
+        _samples_of(records),
         m,
         horizon,
         past_outputs=method != "pi-moesp",
@@ -218,12 +241,9 @@ def realize(
     subspace: ObservabilitySubspace,
     records: Sequence[Record],
     order: int,
-    free: Freedom | None = None,
-    *,
-    enforce_stability: bool = False,
-    n_noise_states: int = 0,
+    settings: Settings,
 ) -> Realization:
-    """Model of one order from an observability subspace.
+    """Model of one order from an observability subspace, not yet refined.
 
     Poles outside the unit circle are reflected into it where that costs next to
     nothing in simulation error, or always with ``enforce_stability``. With
@@ -235,19 +255,17 @@ def realize(
     subspace : ObservabilitySubspace
     records : sequence of Record
     order : int
-    free : Freedom, default=None
-        As in `simulation_fit`.
-    enforce_stability : bool, default=False
-    n_noise_states : int, default=0
+    settings : Settings
 
     Returns
     -------
     Realization
     """
-    A, C = _state_pair(subspace, records, order, free, n_noise_states)
-    stable_A = reflect_unstable(A, 1.0 - STABLE_MARGIN if enforce_stability else 1.0)
+    enforce, free = settings.enforce_stability, settings.free
+    A, C = _state_pair(subspace, records, order, settings)
+    stable_A = reflect_unstable(A, 1.0 - STABLE_MARGIN if enforce else 1.0)
     stable = simulation_fit(stable_A, C, records, free)
-    if stable_A is A or enforce_stability:
+    if stable_A is A or enforce:
         return stable
     as_found = simulation_fit(A, C, records, free)
     n_values = sum(record.y.size for record in records)
@@ -260,20 +278,35 @@ def _state_pair(
     subspace: ObservabilitySubspace,
     records: Sequence[Record],
     order: int,
-    free: Freedom | None,
-    n_noise_states: int,
+    settings: Settings,
 ) -> tuple[Array, Array]:
+    """A and C, with noise states of those that the inputs reach most."""
     ny = len(records[0].y)
     horizon = len(subspace.singular_values) // ny
     most = min(subspace.basis.shape[1], (horizon - 1) * ny)
-    extended = min(order + n_noise_states, most)
+    extended = min(order + settings.n_noise_states, most)
     if order == 0 or extended <= order:
         return shift_invariant_pair(subspace.basis, ny, order)
     A, C = shift_invariant_pair(subspace.basis, ny, extended)
-    whole = simulation_fit(reflect_unstable(A), C, records, free)
+    whole = simulation_fit(reflect_unstable(A), C, records, settings.free)
     if not np.isfinite(whole.loss):
         return shift_invariant_pair(subspace.basis, ny, order)
     return dominant_pair(whole.A, whole.B, whole.C, order, horizon)
+
+
+def estimate(
+    subspace: ObservabilitySubspace,
+    records: Sequence[Record],
+    order: int,
+    settings: Settings,
+) -> tuple[Realization, int]:
+    """As `realize`, then refined where the settings say so; and the steps taken."""
+    start = realize(subspace, records, order, settings)
+    return (
+        refine_simulation(start, records, settings.free)
+        if settings.refine
+        else (start, 0)
+    )
 
 
 def identify(
@@ -331,68 +364,36 @@ def identify(
     0.8
     """
     scaled = scale_records(experiments) if scaled is None else scaled
+    records, su, sy = scaled
     subspace = subspace_of(
-        scaled.records, horizon, order + n_noise_states, method=method, engine=engine
+        records, horizon, order + n_noise_states, method=method, engine=engine
     )
-    sizes = len(scaled.output_scale), len(scaled.input_scale)
-    free = freedom(*sizes, feedthrough, initial_states)
-
-    def best(enforce: bool) -> tuple[Realization, int]:
-        start = realize(
-            subspace,
-            scaled.records,
-            order,
-            free,
-            enforce_stability=enforce,
-            n_noise_states=n_noise_states,
-        )
-        return refine_simulation(start, scaled.records, free) if refine else (start, 0)
-
-    model, n_iter = best(False)
-    best_loss = model.loss
+    free = freedom(len(sy), len(su), feedthrough, initial_states)
+    settings = Settings(free, method, refine, False, n_noise_states)
+    model, n_iter = estimate(subspace, records, order, settings)
+    energy = output_energy(records) or 1.0
+    stability_loss, free_loss = 0.0, model.loss
     if enforce_stability and not _radius(model.A) < 1.0 - STABLE_MARGIN:
-        model, n_iter = best(True)
-    found = unscale(model, scaled, subspace.singular_values, n_iter)
-    energy = sum(float((record.y**2).sum()) for record in scaled.records)
-    if not 0.0 < best_loss < model.loss:
-        return found
-    lost = found.residual - float(np.sqrt(best_loss / energy))
-    return found._replace(stability_loss=lost)
-
-
-def _radius(A: Array) -> float:
-    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
-
-
-def unscale(
-    model: Realization, scaled: ScaledRecords, singular_values: Array, n_iter: int
-) -> Identified:
-    """Bring a model of scaled records back to the units of the data.
-
-    Parameters
-    ----------
-    model : Realization
-    scaled : ScaledRecords
-    singular_values : ndarray
-    n_iter : int
-
-    Returns
-    -------
-    Identified
-    """
-    _, su, sy = scaled
-    energy = sum(float((record.y**2).sum()) for record in scaled.records)
+        stable = settings._replace(enforce_stability=True)
+        model, n_iter = estimate(subspace, records, order, stable)
+        if 0.0 < free_loss < model.loss:
+            stability_loss = np.sqrt(model.loss / energy) - np.sqrt(free_loss / energy)
     return Identified(
         model.A,
         model.B / su,
         sy[:, None] * model.C,
         sy[:, None] * model.D / su,
         model.initial_states,
-        singular_values,
-        float(np.sqrt(model.loss / energy)) if energy > 0.0 else 0.0,
+        subspace.singular_values,
+        float(np.sqrt(model.loss / energy)),
         model.rank_deficit,
         n_iter,
         model,
         su,
         sy,
+        float(stability_loss),
     )
+
+
+def _radius(A: Array) -> float:
+    return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))

@@ -4,13 +4,17 @@ Every candidate is identified on the first part of each experiment. For a given 
 all horizons have the same number of parameters, so that the one with the smallest
 simulation error is simply the best; orders are compared by the simulation error on
 the part held out, and the smallest that is not significantly worse than the best is
-taken.
+taken. The steps, one function each: hold out a part (`_hold_out`), list the horizons
+and orders worth trying (`_horizons`, `_highest_order`), try each order at the horizon
+that suits it (`_try_orders`), and choose among what was tried (`_choose`).
+
+A horizon that was given is not questioned but by `better_horizon`, after the fit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,229 +24,69 @@ from .hankel import correlation_sequence
 from .identification import (
     Identified,
     ScaledRecords,
+    Settings,
     correlations_of,
+    estimate,
     max_horizon,
-    max_order,
     realize,
     subspace_of,
 )
+from .realization import ObservabilitySubspace
 from .refinement import refine_simulation
-from .signals import Record
+from .signals import Record, output_energy
 from .simulation_fit import Freedom, Realization, freedom
 
 Array = NDArray[np.float64]
 
-_ESTIMATION_SHARE = 0.7
-
-_N_BLOCKS = 20
-
-
-def split_record(record: Record) -> tuple[Record, int]:
-    """First part of a record, for estimation, and its length."""
-    n = record.u.shape[1]
-    cut = n if n < 8 else int(np.ceil(_ESTIMATION_SHARE * n))
-    return Record(record.u[:, :cut].copy(), record.y[:, :cut].copy()), cut
-
-
-def thin_records(records: Sequence[Record], n_samples: int) -> list[Record]:
-    """Evenly spread experiments of about `n_samples` in total, at least one.
-
-    Experiments beyond that length are cut to it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
-    >>> [run.u.shape[1] for run in thin_records(runs, 120)]
-    [50, 60]
-    """
-    lengths = [record.u.shape[1] for record in records]
-    keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
-    spread = [i * len(records) // keep for i in range(keep)]
-    return [
-        Record(
-            np.ascontiguousarray(records[i].u[:, :n_samples]),
-            np.ascontiguousarray(records[i].y[:, :n_samples]),
-        )
-        for i in spread
-    ]
-
-
-def held_out_errors(
-    model: Realization, records: Sequence[Record], cuts: Sequence[int]
-) -> tuple[Array, float]:
-    """Simulation errors after the cuts.
-
-    Parameters
-    ----------
-    model : Realization
-        Identified on the parts before the cuts, with their initial states.
-    records : sequence of Record
-        Whole records.
-    cuts : sequence of int
-        Where the held-out part of each begins.
-
-    Returns
-    -------
-    blocks : ndarray of shape (n_blocks,)
-        Sums of squared errors over consecutive blocks of time.
-    bft : float
-        Best fit over the held-out parts, percent, the mean over outputs.
-    """
-    blocks, errors, outputs = [], [], []
-    for record, cut, x0 in zip(records, cuts, model.initial_states, strict=True):
-        if cut == record.u.shape[1]:
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):
-            fitted = lti_response(model.A, model.B, model.C, model.D, record.u.T, x0)
-        error = record.y.T[cut:] - fitted[cut:]
-        errors.append(error)
-        outputs.append(record.y.T[cut:])
-        n_blocks = min(_N_BLOCKS, len(error))
-        blocks += [float((b**2).sum()) for b in np.array_split(error, n_blocks)]
-    if not errors:
-        return np.zeros(0), np.nan
-    error, output = np.vstack(errors), np.vstack(outputs)
-    spread = np.sqrt(((output - output.mean(axis=0)) ** 2).sum(axis=0))
-    spread[spread == 0.0] = 1.0
-    miss = np.sqrt((error**2).sum(axis=0)) / spread
-    bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
-    return np.array(blocks), bft if np.isfinite(bft) else 0.0
-
-
-# What a model at its minimum under white noise does not show: correlation of the
-# simulation error with past inputs (in standard deviations), or with its predecessor.
-_SUSPICIOUS = 6.0
-
-_SMOOTH = 0.3
-
-_N_LAGS = 40
-
-_MAX_SUSPECTED = 4_096
-
-_MAX_ROWS = 1000
-
-# An error below this share of the present one is that of a clearly better model.
-_CLEARLY_BETTER = 0.9
-
-# Relative errors below this are rounding.
-_ROUNDING = 1e-6
-
-
-def error_structure(
-    model: tuple[Array, Array, Array, Array], record: Record, x0: Array
-) -> tuple[float, float]:
-    """How much the simulation error depends on past inputs and on its own past.
-
-    Parameters
-    ----------
-    model : (A, B, C, D)
-    record : Record
-    x0 : ndarray of shape (order,)
-
-    Returns
-    -------
-    by_inputs : float
-        Largest correlation with past inputs, in standard deviations of an error that
-        does not depend on them (Bartlett's formula for two autocorrelated signals).
-    by_itself : float
-        Largest correlation of an output's error with that one sample before.
-    """
-    n = min(record.u.shape[1], _MAX_SUSPECTED)
-    u, m = record.u[:, :n].T, len(record.u)
-    error = record.y[:, :n].T - lti_response(*model, u, x0)
-    lags = correlation_sequence(np.hstack([u, error]), min(_N_LAGS, n))
-    own = np.einsum("dii->di", lags)
-    of_u, of_v = own[:, :m], own[:, m:]
-    white = np.outer(of_u[0], of_v[0])
-    variance = np.maximum(2.0 * of_u.T @ of_v - white, 0.2 * white) / n
-    variance[variance == 0.0] = np.inf
-    by_inputs = (np.abs(lags[:, :m, m:]) / np.sqrt(variance)).max()
-    size = np.where(of_v[0] > 0.0, of_v[0], np.inf)
-    return float(by_inputs), float((of_v[min(1, len(own) - 1)] / size).max())
-
-
-def better_horizon(
-    found: Identified,
-    scaled: ScaledRecords,
-    horizon: int,
-    free: Freedom,
-    *,
-    method: str,
-    refine: bool,
-    enforce_stability: bool,
-) -> tuple[int, float] | None:
-    """Another horizon whose model fits clearly better, where there is one.
-
-    Others are tried only if the simulation error has structure: coloured noise, a model
-    of too low an order, or a poor minimum, which can be told apart by trying.
-
-    Parameters
-    ----------
-    found : Identified
-        Model of the given horizon.
-    scaled : ScaledRecords
-    horizon : int
-    free : Freedom
-    method, refine, enforce_stability
-        As in `identify`.
-
-    Returns
-    -------
-    horizon : int
-    residual : float
-        Its relative simulation error.
-    """
-    records, model = scaled.records, found.scaled_model
-    if not _ROUNDING < found.residual < np.inf:
-        return None
-    states = model.initial_states
-    structure = [
-        error_structure(model[:4], record, x0)
-        for record, x0 in zip(records[:4], states, strict=False)
-    ]
-    if all(u < _SUSPICIOUS and v < _SMOOTH for u, v in structure):
-        return None
-    m, ny, order = len(records[0].u), len(records[0].y), len(model.A)
-    height = 2 * m + (1 if method == "pi-moesp" else 2) * ny
-    lengths = [record.u.shape[1] for record in records]
-    highest = min(max_horizon(lengths, m, ny), max(2, _MAX_ROWS // height))
-    energy = sum(float((record.y**2).sum()) for record in records)
-    for other in (2 * horizon, 4 * horizon, horizon // 2):
-        if not 2 <= other <= highest or max_order(other, m, ny, method) < order:
-            continue
-        space = subspace_of(records, other, order, method=method)
-        trial = realize(
-            space, records, order, free, enforce_stability=enforce_stability
-        )
-        if refine:
-            trial, _ = refine_simulation(trial, records, free)
-        residual = float(np.sqrt(trial.loss / energy))
-        if residual < _CLEARLY_BETTER * found.residual:
-            return other, residual
-    return None
-
-
-_HORIZON_RATIO = 1.5
-
-_MAX_ORDER = 20
-
-# A choice needs fewer samples than an estimate.
+# Samples that a choice is made from: it needs fewer than an estimate.
 _MAX_SAMPLES = 12_000
 
-# Orders tried beyond the last one that reduced the simulation error noticeably.
+# Share of each experiment to identify on, and the length below which none is held out:
+# what is left would be two samples.
+_ESTIMATION_SHARE = 0.7
+
+_TOO_SHORT = 8
+
+# Blocks of time of each held-out part: many enough for the spread of their errors to be
+# known, and long enough for these to be nearly independent.
+_N_BLOCKS = 20
+
+# Horizons tried differ by this factor: the error changes little within it.
+_HORIZON_RATIO = 1.5
+
+# Height of the Hankel matrix up to which horizons are tried: the cost of compression
+# grows with its third power.
+_MAX_ROWS = 1000
+
+# Highest order tried, and the values that the data must have for each parameter.
+_MAX_ORDER = 20
+
+_VALUES_PER_PARAMETER = 10
+
+# Orders tried beyond the last one that made the loss this much smaller, one per cent.
 _PATIENCE = 3
 
 _NOTICEABLE = 0.99
 
-_NEGLIGIBLE_GAIN = 3e-3
-
-# An F statistic that does not come about by chance.
-_CERTAIN = 20.0
+# A loss below this share of the outputs' energy (a relative error of 1e-9) is rounding.
+_EXACT = 1e-18
 
 # A start this close to the best one ends in the same minimum when it is refined; the
 # shorter horizon is then the cheaper one. Unrefined, a horizon must be as good.
 _LOSS_SLACK = {True: 1.05, False: 1.005}
+
+# Held-out errors that are higher by less than this share, or by less than this many
+# standard errors (two: 95 %), are as good: one superfluous state costs more than the
+# first in a record of a few thousand samples.
+_NEGLIGIBLE_GAIN = 3e-3
+
+_STANDARD_ERRORS = 2.0
+
+# What rules an order out by the data it was estimated on: this many times the loss of a
+# higher one (twice the error), and an F statistic that does not come about by chance.
+_TWICE_THE_ERROR = 4.0
+
+_CERTAIN = 20.0
 
 
 class Candidate(NamedTuple):
@@ -281,105 +125,48 @@ class Selection(NamedTuple):
     candidates: list[Candidate]
 
 
-def horizon_grid(lowest: int, highest: int) -> list[int]:
-    """Horizons to try, in a geometric progression that ends at the highest.
+class _Split(NamedTuple):
+    """Records of which the later parts are held out.
 
-    Examples
-    --------
-    >>> horizon_grid(4, 30)
-    [4, 6, 9, 13, 20, 30]
-    """
-    grid = [highest]
-    while grid[-1] / _HORIZON_RATIO >= lowest + 0.5:
-        grid.append(round(grid[-1] / _HORIZON_RATIO))
-    if grid[-1] > lowest:
-        grid.append(lowest)
-    return sorted(set(grid))
-
-
-def smallest_good_order(orders: Sequence[int], blocks: Sequence[Array]) -> int:
-    """Smallest order whose held-out error is not significantly above the best.
-
-    Parameters
+    Attributes
     ----------
-    orders : sequence of int
-        Ascending.
-    blocks : sequence of ndarray of shape (n_blocks,)
-        Block sums of squared held-out errors of each order.
-
-    Returns
-    -------
-    int
-
-    Notes
-    -----
-    Significantly worse means by more than two standard errors of the sum of the
-    blockwise differences, and by more than 0.3 % of the best error, which is less than
-    one superfluous state costs in a record of a few thousand samples.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> errors = [np.full(10, 5.0), np.full(10, 1.001), np.full(10, 1.0)]
-    >>> smallest_good_order([1, 2, 3], errors)
-    2
+    records : list of Record
+        Whole.
+    parts : list of Record
+        What models are estimated on.
+    cuts : list of int
+        Where the held-out part of each record begins; its length where none is.
     """
-    totals = [block.sum() if len(block) else np.inf for block in blocks]
-    totals = [total if np.isfinite(total) else np.inf for total in totals]
-    best = int(np.argmin(totals))
-    for order, block, total in zip(orders, blocks, totals, strict=True):
-        if not np.isfinite(total):
-            continue
-        gap = block - blocks[best]
-        error = 2.0 * gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
-        if total - totals[best] <= max(error, _NEGLIGIBLE_GAIN * totals[best]):
-            return order
-    return orders[best]
+
+    records: list[Record]
+    parts: list[Record]
+    cuts: list[int]
+
+    @property
+    def energy(self) -> float:
+        """Of the outputs to estimate on."""
+        return output_energy(self.parts)
 
 
-def lowest_order(
-    orders: Sequence[int], losses: Sequence[float], n_values: int, per_state: int
-) -> int:
-    """Lowest order that the data it was estimated on do not rule out.
+class _Tried(NamedTuple):
+    """One order, at the horizon that suits it best.
 
-    Held-out parts may be silent, as after an impulse or a step.
-
-    Parameters
+    Attributes
     ----------
-    orders : sequence of int
-        Ascending.
-    losses : sequence of float
-        Sums of squared simulation errors on the estimation part.
-    n_values : int
-        Samples times outputs.
-    per_state : int
-        Parameters that a state adds.
-
-    Returns
-    -------
-    int
-        Every lower order has at least twice the error (root mean square) of a higher
-        one, and many times more than its missing parameters would explain.
-
-    Examples
-    --------
-    >>> lowest_order([0, 1, 2], [1.0, 1e-3, 0.9e-3], n_values=500, per_state=2)
-    1
+    order, horizon : int
+    model : Realization
+        That would be returned, of the parts to estimate on.
+    held_out : ndarray of shape (n_blocks,)
+        Block sums of its squared errors on the parts held out.
+    candidates : list of Candidate
+        The horizons compared.
     """
-    lowest = orders[0]
-    for i, low in enumerate(orders):
-        for high, loss in zip(orders[i + 1 :], losses[i + 1 :], strict=True):
-            degrees = n_values - high * per_state
-            excess = _CERTAIN * (high - low) * per_state * loss / max(degrees, 1)
-            if losses[i] > max(4.0 * loss, loss + excess):
-                lowest = max(lowest, orders[i + 1])
-    return lowest
 
-
-def _best_horizon(losses: dict[int, float], refine: bool) -> int:
-    """Smallest horizon whose loss is near the best."""
-    limit = min(losses.values()) * _LOSS_SLACK[refine]
-    return min(h for h, loss in losses.items() if loss <= limit)
+    order: int
+    horizon: int
+    model: Realization
+    held_out: Array
+    candidates: list[Candidate]
 
 
 def select(
@@ -410,123 +197,427 @@ def select(
     Selection
     """
     m, ny = len(records[0].u), len(records[0].y)
-    if order is None and enforce_stability:
-        # The order is that of the system, whatever a stable model can show of it.
-        shared_options: dict[str, Any] = {
-            "method": method,
-            "feedthrough": feedthrough,
-            "refine": refine,
-            "n_noise_states": n_noise_states,
-            "initial_states": initial_states,
-        }
-        as_found = select(records, None, horizon, **shared_options)
-        order = as_found.order
-        stable = select(
-            records, order, horizon, enforce_stability=True, **shared_options
-        )
-        others = [row for row in as_found.candidates if row.order != order]
-        candidates = sorted(others + stable.candidates)
-        return stable._replace(candidates=candidates)
-    records = thin_records(records, _MAX_SAMPLES)
-    splits = [split_record(record) for record in records]
-    parts, cuts = [part for part, _ in splits], [cut for _, cut in splits]
-    if order and max_order(max_horizon(cuts, m, ny), m, ny, method) < order:
-        # Too few samples to hold any out.
-        parts, cuts = list(records), [record.u.shape[1] for record in records]
-    energy = sum(float((part.y**2).sum()) for part in parts) or 1.0
-    horizons = _horizons(cuts, m, ny, order, horizon, method)
-    highest = _highest_order(parts, m, ny, horizons, method) if order is None else order
-    shared = correlations_of(parts, max(horizons))
-    spaces = {
-        h: subspace_of(
-            parts,
-            h,
-            min(highest + n_noise_states, max_order(h, m, ny, method)),
-            method=method,
-            correlations=shared,
-        )
-        for h in horizons
-    }
     free = freedom(ny, m, feedthrough, initial_states)
-    options: dict[str, Any] = {
-        "free": free,
-        "enforce_stability": enforce_stability,
-        "n_noise_states": n_noise_states,
-    }
-    candidates, tried, held_out, reached, chosen = [], [], [], [], {}
-    best_loss, stale = np.inf, 0
-    for n in [order] if order is not None else range(highest + 1):
-        models = {
-            h: realize(space, parts, n, **options)
-            for h, space in spaces.items()
-            if n <= max_order(h, m, ny, method)
-        }
-        losses = {h: model.loss for h, model in models.items()}
-        chosen[n] = _best_horizon(losses, refine)
-        for h, model in models.items():
-            bft = np.nan
-            if h == chosen[n] or order is not None:
-                if refine:
-                    start = model
-                    model = refine_simulation(start, parts, free)[0]
-                blocks, bft = held_out_errors(model, records, cuts)
-                if h == chosen[n]:
-                    tried.append(n)
-                    held_out.append(blocks)
-                    refined_loss = model.loss
-                    reached.append(refined_loss)
-            criterion = float(np.sqrt(losses[h] / energy))
-            candidates.append(Candidate(n, h, criterion, bft))
-        stale = 0 if refined_loss < _NOTICEABLE * best_loss else stale + 1
-        best_loss = min(best_loss, refined_loss)
-        if stale > _PATIENCE or best_loss <= 1e-18 * energy:
-            break
-    if order is None:
-        n_values = sum(part.y.size for part in parts)
-        lowest = lowest_order(tried, reached, n_values, m + ny + len(parts))
-        allowed = [k for k, n in enumerate(tried) if n >= lowest]
-        best = smallest_good_order(
-            [tried[k] for k in allowed], [held_out[k] for k in allowed]
+    settings = Settings(free, method, refine, enforce_stability, n_noise_states)
+    records = _thin_records(records, _MAX_SAMPLES)
+    if order is not None or not enforce_stability:
+        return _search(records, order, horizon, settings)
+    # The order is that of the system, whatever a stable model can show of it.
+    as_found = settings._replace(enforce_stability=False)
+    chosen = _search(records, None, horizon, as_found)
+    stable = _search(records, chosen.order, horizon, settings)
+    others = [row for row in chosen.candidates if row.order != chosen.order]
+    return stable._replace(candidates=sorted(others + stable.candidates))
+
+
+def _search(
+    records: list[Record], order: int | None, horizon: int | None, settings: Settings
+) -> Selection:
+    """The choice for settings that suit all orders alike."""
+    split = _hold_out(records, order, settings)
+    parts = split.parts
+    horizons = _horizons(parts, order or 0, settings) if horizon is None else [horizon]
+    highest = _highest_order(parts, horizons, settings) if order is None else order
+    orders = range(0 if order is None else order, highest + 1)
+    width = highest + settings.n_noise_states
+    widths = {h: min(width, settings.max_order(h)) for h in horizons}
+    spaces = _subspaces(parts, widths, settings.method)
+    # Of a given order, the table tells what every horizon would return.
+    tried = _try_orders(orders, spaces, split, settings, validate_all=order is not None)
+    best = _choose(tried, split)
+    chosen = best.horizon
+    if not settings.refine and horizon is None:
+        # Nothing corrects the horizon afterwards: compare on the whole records.
+        width = best.order + settings.n_noise_states
+        widths = {h: width for h in horizons if best.order <= settings.max_order(h)}
+        spaces = _subspaces(records, widths, settings.method)
+        starts = _starts(best.order, spaces, records, settings)
+        chosen = _best_horizon(starts, settings.refine)
+    candidates = [row for one in tried for row in one.candidates]
+    return Selection(best.order, chosen, candidates)
+
+
+def _thin_records(records: Sequence[Record], n_samples: int) -> list[Record]:
+    """Evenly spread experiments of about `n_samples` in total, at least one.
+
+    Experiments beyond that length are cut to it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
+    >>> [run.u.shape[1] for run in _thin_records(runs, 120)]
+    [50, 60]
+    """
+    lengths = [record.u.shape[1] for record in records]
+    keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
+    spread = [i * len(records) // keep for i in range(keep)]
+    return [
+        Record(
+            np.ascontiguousarray(records[i].u[:, :n_samples]),
+            np.ascontiguousarray(records[i].y[:, :n_samples]),
         )
-    else:
-        best = order
-    if refine or horizon is not None:
-        return Selection(best, chosen[best], candidates)
-    # Nothing corrects the horizon afterwards: compare on the whole records.
-    losses, shared = {}, correlations_of(records, max(horizons))
-    for h in horizons:
-        if best <= max_order(h, m, ny, method):
-            space = subspace_of(
-                records, h, best + n_noise_states, method=method, correlations=shared
-            )
-            losses[h] = realize(space, records, best, **options).loss
-    return Selection(best, _best_horizon(losses, refine), candidates)
+        for i in spread
+    ]
 
 
-def _horizons(
-    lengths: Sequence[int],
-    m: int,
-    ny: int,
-    order: int | None,
-    horizon: int | None,
-    method: str,
-) -> list[int]:
+def _hold_out(records: list[Record], order: int | None, settings: Settings) -> _Split:
+    """Part the records, unless too few samples are left to estimate a given order."""
+    lengths = [record.u.shape[1] for record in records]
+    cuts = [
+        n if n < _TOO_SHORT else int(np.ceil(_ESTIMATION_SHARE * n)) for n in lengths
+    ]
+    n_outputs, n_inputs = settings.free.direct.shape
+    if order and settings.max_order(max_horizon(cuts, n_inputs, n_outputs)) < order:
+        return _Split(records, records, lengths)
+    parts = [
+        Record(record.u[:, :cut].copy(), record.y[:, :cut].copy())
+        for record, cut in zip(records, cuts, strict=True)
+    ]
+    return _Split(records, parts, cuts)
+
+
+def _horizons(parts: Sequence[Record], order: int, settings: Settings) -> list[int]:
     """Horizons to try: those that show the order and that the data can fill."""
-    if horizon is not None:
-        return [horizon]
-    height = 2 * m + (1 if method == "pi-moesp" else 2) * ny
-    highest = min(max_horizon(lengths, m, ny), max(2, _MAX_ROWS // height))
+    highest = _highest_horizon(parts, settings)
     lowest = 2 if highest > 1 else 1
-    while lowest < highest and max_order(lowest, m, ny, method) < (order or 0):
+    while lowest < highest and settings.max_order(lowest) < order:
         lowest += 1
-    return horizon_grid(lowest, highest)
+    return _horizon_grid(lowest, highest)
+
+
+def _highest_horizon(records: Sequence[Record], settings: Settings) -> int:
+    """Highest horizon to try: one that the data fill and that costs little."""
+    ny, m = settings.free.direct.shape
+    height = 2 * m + (1 if settings.method == "pi-moesp" else 2) * ny
+    lengths = [record.u.shape[1] for record in records]
+    return min(max_horizon(lengths, m, ny), max(2, _MAX_ROWS // height))
+
+
+def _horizon_grid(lowest: int, highest: int) -> list[int]:
+    """Horizons to try, in a geometric progression that ends at the highest.
+
+    Examples
+    --------
+    >>> _horizon_grid(4, 30)
+    [4, 6, 9, 13, 20, 30]
+    """
+    grid = [highest]
+    while grid[-1] / _HORIZON_RATIO >= lowest + 0.5:
+        grid.append(round(grid[-1] / _HORIZON_RATIO))
+    if grid[-1] > lowest:
+        grid.append(lowest)
+    return sorted(set(grid))
 
 
 def _highest_order(
-    parts: Sequence[Record], m: int, ny: int, horizons: Sequence[int], method: str
+    parts: Sequence[Record], horizons: Sequence[int], settings: Settings
 ) -> int:
-    """Highest order to try: one that leaves ten values per parameter."""
+    """Highest order to try: one that leaves enough values for each parameter."""
+    ny, m = settings.free.direct.shape
     n_values = sum(part.y.size for part in parts)
-    affordable = (n_values / 10 - m * ny) / (m + ny + len(parts))
-    by_horizon = max(max_order(h, m, ny, method) for h in horizons)
+    affordable = n_values / _VALUES_PER_PARAMETER - m * ny
+    affordable /= m + ny + len(parts)
+    by_horizon = max(settings.max_order(h) for h in horizons)
     return int(np.clip(affordable, 0, min(_MAX_ORDER, by_horizon)))
+
+
+def _subspaces(
+    records: Sequence[Record], widths: Mapping[int, int], method: str
+) -> dict[int, ObservabilitySubspace]:
+    """Observability subspace of every horizon, of as many directions as given."""
+    shared = correlations_of(records, max(widths))
+    return {
+        horizon: subspace_of(
+            records, horizon, width, method=method, correlations=shared
+        )
+        for horizon, width in widths.items()
+    }
+
+
+def _try_orders(
+    orders: Sequence[int],
+    spaces: Mapping[int, ObservabilitySubspace],
+    split: _Split,
+    settings: Settings,
+    *,
+    validate_all: bool,
+) -> list[_Tried]:
+    """Every order in turn, until further states gain nothing.
+
+    Of the horizons of an order the best is validated, or each with `validate_all`.
+    """
+    tried: list[_Tried] = []
+    best_loss, stale = np.inf, 0
+    for order in orders:
+        starts = _starts(order, spaces, split.parts, settings)
+        found = _validated(order, starts, split, settings, validate_all=validate_all)
+        tried.append(found)
+        stale = 0 if found.model.loss < _NOTICEABLE * best_loss else stale + 1
+        best_loss = min(best_loss, found.model.loss)
+        if stale > _PATIENCE or best_loss <= _EXACT * split.energy:
+            break
+    return tried
+
+
+def _validated(
+    order: int,
+    starts: Mapping[int, Realization],
+    split: _Split,
+    settings: Settings,
+    *,
+    validate_all: bool,
+) -> _Tried:
+    """One order at the horizon whose start is best, and what the others came to."""
+    chosen = _best_horizon(starts, settings.refine)
+    models, errors = {}, {}
+    for horizon in starts if validate_all else [chosen]:
+        model = starts[horizon]
+        if settings.refine:
+            model, _ = refine_simulation(model, split.parts, settings.free)
+        models[horizon] = model
+        errors[horizon] = _held_out_error(model, split.records, split.cuts)
+    candidates = [
+        Candidate(
+            order,
+            horizon,
+            float(np.sqrt(start.loss / (split.energy or 1.0))),
+            errors[horizon].bft if horizon in errors else np.nan,
+        )
+        for horizon, start in starts.items()
+    ]
+    return _Tried(order, chosen, models[chosen], errors[chosen].blocks, candidates)
+
+
+def _starts(
+    order: int,
+    spaces: Mapping[int, ObservabilitySubspace],
+    records: Sequence[Record],
+    settings: Settings,
+) -> dict[int, Realization]:
+    """Model of an order, before refinement, from every horizon that can show it."""
+    return {
+        horizon: realize(space, records, order, settings)
+        for horizon, space in spaces.items()
+        if order <= settings.max_order(horizon)
+    }
+
+
+def _best_horizon(starts: Mapping[int, Realization], refine: bool) -> int:
+    """Smallest horizon whose loss is near the best."""
+    limit = min(model.loss for model in starts.values()) * _LOSS_SLACK[refine]
+    return min(h for h, model in starts.items() if model.loss <= limit)
+
+
+class _HeldOutError(NamedTuple):
+    """Simulation error on the parts held out.
+
+    Attributes
+    ----------
+    blocks : ndarray of shape (n_blocks,)
+        Sums of squares over consecutive blocks of time.
+    bft : float
+        Best fit, percent, the mean over outputs; NaN where nothing is held out.
+    """
+
+    blocks: Array
+    bft: float
+
+
+def _held_out_error(
+    model: Realization, records: Sequence[Record], cuts: Sequence[int]
+) -> _HeldOutError:
+    """Error after the cuts of whole records, simulated from the model's states."""
+    blocks, errors, outputs = [], [], []
+    for record, cut, x0 in zip(records, cuts, model.initial_states, strict=True):
+        if cut == record.u.shape[1]:
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            fitted = lti_response(model.A, model.B, model.C, model.D, record.u.T, x0)
+        error = record.y.T[cut:] - fitted[cut:]
+        errors.append(error)
+        outputs.append(record.y.T[cut:])
+        n_blocks = min(_N_BLOCKS, len(error))
+        blocks += [float((b**2).sum()) for b in np.array_split(error, n_blocks)]
+    if not errors:
+        return _HeldOutError(np.zeros(0), np.nan)
+    error, output = np.vstack(errors), np.vstack(outputs)
+    spread = np.sqrt(((output - output.mean(axis=0)) ** 2).sum(axis=0))
+    spread[spread == 0.0] = 1.0
+    miss = np.sqrt((error**2).sum(axis=0)) / spread
+    bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
+    return _HeldOutError(np.array(blocks), bft if np.isfinite(bft) else 0.0)
+
+
+def _choose(tried: Sequence[_Tried], split: _Split) -> _Tried:
+    """The smallest order that neither part of the data speaks against."""
+    parts = split.parts
+    n_values = sum(part.y.size for part in parts)
+    per_state = len(parts[0].u) + len(parts[0].y) + len(parts)
+    losses = {one.order: one.model.loss for one in tried}
+    lowest = _lowest_order(losses, n_values, per_state)
+    held_out = {one.order: one.held_out for one in tried if one.order >= lowest}
+    order = _smallest_good_order(held_out)
+    return next(one for one in tried if one.order == order)
+
+
+def _smallest_good_order(held_out: Mapping[int, Array]) -> int:
+    """Smallest order whose held-out error is not significantly above the best.
+
+    Significantly: by more than two standard errors of the sum of the blockwise
+    differences, and by more than 0.3 % of the best error. `held_out` are the block sums
+    of squared errors by order, ascending.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> errors = {1: np.full(10, 5.0), 2: np.full(10, 1.001), 3: np.full(10, 1.0)}
+    >>> _smallest_good_order(errors)
+    2
+    """
+    totals = {n: b.sum() if len(b) else np.inf for n, b in held_out.items()}
+    totals = {n: total if np.isfinite(total) else np.inf for n, total in totals.items()}
+    best = min(totals, key=totals.__getitem__)
+    for order, block in held_out.items():
+        if not np.isfinite(totals[order]):
+            continue
+        gap = block - held_out[best]
+        error = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
+        allowed = max(_STANDARD_ERRORS * error, _NEGLIGIBLE_GAIN * totals[best])
+        if totals[order] - totals[best] <= allowed:
+            return order
+    return best
+
+
+def _lowest_order(losses: Mapping[int, float], n_values: int, per_state: int) -> int:
+    """Lowest order that the data it was estimated on do not rule out.
+
+    Held-out parts may be silent, as after an impulse or a step. Ruled out is an order
+    that has twice the error (root mean square) of a higher one, and many times more
+    than its missing parameters would explain.
+
+    Parameters
+    ----------
+    losses : mapping of int to float
+        Sums of squared simulation errors on the estimation part by order, ascending.
+    n_values : int
+        Samples times outputs.
+    per_state : int
+        Parameters that a state adds.
+
+    Examples
+    --------
+    >>> _lowest_order({0: 1.0, 1: 1e-3, 2: 0.9e-3}, n_values=500, per_state=2)
+    1
+    """
+    orders = list(losses)
+    lowest = orders[0]
+    for i, low in enumerate(orders):
+        for high in orders[i + 1 :]:
+            loss = losses[high]
+            degrees = max(n_values - high * per_state, 1)
+            excess = _CERTAIN * (high - low) * per_state * loss / degrees
+            if losses[low] > max(_TWICE_THE_ERROR * loss, loss + excess):
+                lowest = max(lowest, orders[i + 1])
+    return lowest
+
+
+# What a model at its minimum under white noise does not show: correlation of the
+# simulation error with past inputs, in standard deviations (the largest of a hundred
+# chance values is near three), or with its predecessor.
+_SUSPICIOUS = 6.0
+
+_SMOOTH = 0.3
+
+# Where that is looked for: past inputs up to this many samples ago, in this many
+# samples of so many experiments.
+_N_LAGS = 40
+
+_MAX_SUSPECTED = 4_096
+
+_SUSPECTED_RECORDS = 4
+
+# Least variance of a correlation, relative to that of white signals: an estimated sum
+# of products over the lags may come out as low as zero.
+_LEAST_VARIANCE = 0.2
+
+# An error below this share of the present one is that of a clearly better model.
+_CLEARLY_BETTER = 0.9
+
+# Relative errors below this are rounding.
+_ROUNDING = 1e-6
+
+
+def better_horizon(
+    found: Identified,
+    scaled: ScaledRecords,
+    horizon: int,
+    free: Freedom,
+    *,
+    method: str,
+    refine: bool,
+    enforce_stability: bool,
+) -> tuple[int, float] | None:
+    """Another horizon whose model fits clearly better, where there is one.
+
+    Others are tried only if the simulation error has structure: coloured noise, a model
+    of too low an order, or a poor minimum, which can be told apart by trying.
+
+    Parameters
+    ----------
+    found : Identified
+        Model of the given horizon.
+    scaled : ScaledRecords
+    horizon : int
+    free : Freedom
+    method, refine, enforce_stability
+        As in `identify`.
+
+    Returns
+    -------
+    horizon : int
+    residual : float
+        Its relative simulation error.
+    """
+    records, model = scaled.records, found.scaled_model
+    if not _ROUNDING < found.residual < np.inf:
+        return None
+    some = zip(records[:_SUSPECTED_RECORDS], model.initial_states, strict=False)
+    structure = [_error_structure(model, record, x0) for record, x0 in some]
+    if all(u < _SUSPICIOUS and v < _SMOOTH for u, v in structure):
+        return None
+    order, energy = len(model.A), output_energy(records)
+    settings = Settings(free, method, refine, enforce_stability)
+    highest = _highest_horizon(records, settings)
+    for other in (2 * horizon, 4 * horizon, horizon // 2):
+        if not 2 <= other <= highest or settings.max_order(other) < order:
+            continue
+        space = subspace_of(records, other, order, method=method)
+        trial, _ = estimate(space, records, order, settings)
+        residual = float(np.sqrt(trial.loss / energy))
+        if residual < _CLEARLY_BETTER * found.residual:
+            return other, residual
+    return None
+
+
+def _error_structure(
+    model: Realization, record: Record, x0: Array
+) -> tuple[float, float]:
+    """How much the simulation error depends on past inputs and on its own past.
+
+    The largest correlation with past inputs, in standard deviations of an error that
+    does not depend on them (Bartlett's formula for two autocorrelated signals), and
+    the largest of an output's error with that one sample before.
+    """
+    n = min(record.u.shape[1], _MAX_SUSPECTED)
+    u, m = record.u[:, :n].T, len(record.u)
+    error = record.y[:, :n].T - lti_response(*model[:4], u, x0)
+    lags = correlation_sequence(np.hstack([u, error]), min(_N_LAGS, n))
+    own = np.einsum("dii->di", lags)
+    of_u, of_v = own[:, :m], own[:, m:]
+    white = np.outer(of_u[0], of_v[0])
+    variance = np.maximum(2.0 * of_u.T @ of_v - white, 0.2 * white) / n
+    variance[variance == 0.0] = np.inf
+    by_inputs = (np.abs(lags[:, :m, m:]) / np.sqrt(variance)).max()
+    size = np.where(of_v[0] > 0.0, of_v[0], np.inf)
+    return float(by_inputs), float((of_v[min(1, len(own) - 1)] / size).max())

@@ -12,10 +12,10 @@ from lpvlearn.subspace.realization import (
 )
 from lpvlearn.subspace.refinement import refine_simulation
 from lpvlearn.subspace.selection import (
-    held_out_errors,
-    horizon_grid,
+    _held_out_error,
+    _horizon_grid,
+    _smallest_good_order,
     select,
-    smallest_good_order,
 )
 from lpvlearn.subspace.signals import (
     Record,
@@ -322,7 +322,7 @@ def test_limits_count_columns_rows_and_instruments():
 
 def test_horizon_grid_is_increasing_and_holds_both_ends():
     for low, high in ((1, 1), (2, 2), (2, 3), (4, 125)):
-        grid = horizon_grid(low, high)
+        grid = _horizon_grid(low, high)
         assert grid[0] == low and grid[-1] == high
         assert (np.diff(grid) > 0).all()
 
@@ -330,8 +330,8 @@ def test_horizon_grid_is_increasing_and_holds_both_ends():
 def test_order_rule_ignores_insignificant_gains(rng):
     noise = 1.0 + 0.1 * rng.standard_normal(20)
     blocks = [3.0 * noise, noise + 1e-6, noise - 1e-3 * rng.standard_normal(20)]
-    assert smallest_good_order([1, 2, 3], blocks) == 2
-    assert smallest_good_order([0, 1], [np.array([np.nan]), np.ones(1)]) == 1
+    assert _smallest_good_order(dict(zip([1, 2, 3], blocks, strict=True))) == 2
+    assert _smallest_good_order({0: np.array([np.nan]), 1: np.ones(1)}) == 1
 
 
 def test_held_out_error_is_measured_after_the_cut(rng):
@@ -340,7 +340,7 @@ def test_held_out_error_is_measured_after_the_cut(rng):
     y = y.copy()
     y[:70] += 1.0
     model = Realization(*system, np.zeros((1, 6)), 0.0)
-    blocks, bft = held_out_errors(model, [Record(u.T, y.T)], [70])
+    blocks, bft = _held_out_error(model, [Record(u.T, y.T)], [70])
     assert blocks.sum() < 1e-18
     assert bft == pytest.approx(100.0)
 
