@@ -21,6 +21,13 @@ Array = NDArray[np.float64]
 
 METHODS = ("po-moesp", "pi-moesp", "n4sid", "cva")
 
+# Singular values of the block of past data below this share of the largest are those of
+# unexcited directions in data without noise; so are eigenvalues of the future outputs'
+# covariance, their squares but for rounding, below the second.
+_UNEXCITED = 1e-10
+
+_UNEXCITED_POWER = 1e-12
+
 # Squaring (eigenvectors of L32 L32.T) is exact enough above this ratio of the last
 # wanted to the first singular value; below it the SVD is used.
 _MIN_RATIO = 1e-4
@@ -39,23 +46,6 @@ class ObservabilitySubspace(NamedTuple):
 
     basis: Array
     singular_values: Array
-
-
-def _left_singular(matrix: Array, max_order: int) -> tuple[Array, Array]:
-    """Leading left singular vectors and all singular values of a wide matrix."""
-    gram = matrix @ matrix.T
-    size = len(gram)
-    wanted = min(max_order, size)
-    values = np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
-    if wanted == 0:
-        return np.zeros((size, 0)), values
-    if values[wanted - 1] > _MIN_RATIO * values[0]:
-        vectors = linalg.eigh(
-            gram, subset_by_index=[size - wanted, size - 1], check_finite=False
-        )[1]
-        return vectors[:, ::-1], values
-    vectors, values, _ = linalg.svd(matrix, full_matrices=False, check_finite=False)
-    return vectors[:, :wanted], values
 
 
 def observability_subspace(
@@ -96,7 +86,7 @@ def observability_subspace(
             factor[past, past].T,
             explained.T,
             lapack_driver="gelsy",
-            cond=1e-10,
+            cond=_UNEXCITED,
             check_finite=False,
         )[0].T
         explained = np.hstack([weight @ factor[past, :n_future], explained])
@@ -106,11 +96,28 @@ def observability_subspace(
             explained @ explained.T + residual @ residual.T, check_finite=False
         )
         # Without noise the weight has no inverse on the unexcited directions.
-        floor = 1e-12 * values[-1] or 1.0
+        floor = _UNEXCITED_POWER * values[-1] or 1.0
         root = np.sqrt(np.maximum(values, floor))
         left, singular = _left_singular((vectors / root).T @ explained, max_order)
         return ObservabilitySubspace((vectors * root) @ left, singular)
     return ObservabilitySubspace(*_left_singular(explained, max_order))
+
+
+def _left_singular(matrix: Array, max_order: int) -> tuple[Array, Array]:
+    """Leading left singular vectors and all singular values of a wide matrix."""
+    gram = matrix @ matrix.T
+    size = len(gram)
+    wanted = min(max_order, size)
+    values = np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
+    if wanted == 0:
+        return np.zeros((size, 0)), values
+    if values[wanted - 1] > _MIN_RATIO * values[0]:
+        vectors = linalg.eigh(
+            gram, subset_by_index=[size - wanted, size - 1], check_finite=False
+        )[1]
+        return vectors[:, ::-1], values
+    vectors, values, _ = linalg.svd(matrix, full_matrices=False, check_finite=False)
+    return vectors[:, :wanted], values
 
 
 def shift_invariant_pair(

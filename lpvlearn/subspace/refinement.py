@@ -47,12 +47,22 @@ _RCOND = 1e-9
 # An excess of this share of the noise that one parameter absorbs is not worth a step.
 _NEGLIGIBLE = 1e-2
 
+# What is left after a step is the square of how far its gain was from the predicted
+# one, divided by the latter, were there one direction; the misses of several may
+# cancel. It is taken to be this many times that, and no less than this share (5 %
+# squared) of the prediction.
+_MISS_WEIGHT = 4.0
+
+_LEAST_LEFT = 2.5e-3
+
 # Below this share of the outputs' energy the error is rounding.
 _ROUNDING = 1e-22
 
 # Steps keep all poles inside this circle, once they are.
 _STABLE_RADIUS = 1.0 - 1e-8
 
+# Damping of the steps tried in turn, relative to the largest squared singular value:
+# from the hardly determined directions to ever more of them, at last down the gradient.
 _DAMPINGS = (1e-4, 1e-2, 1e-1, 1.0)
 
 
@@ -126,7 +136,8 @@ def refine_simulation(
             return model, iteration
         miss = predicted - (model.loss - improved.loss)
         model = improved
-        if 4.0 * miss**2 / predicted + 2.5e-3 * predicted <= negligible:
+        left = _MISS_WEIGHT * miss**2 / predicted + _LEAST_LEFT * predicted
+        if left <= negligible:
             return model, iteration + 1
     return model, max_iter
 
@@ -186,10 +197,10 @@ def _accepted(
     residual: Array,
 ) -> Realization | None:
     """The first of ever shorter steps that reduces the error."""
-    radius = max(_STABLE_RADIUS, spectral_radius(model.blocks or ()))
+    radius = max(_STABLE_RADIUS, _spectral_radius(model.blocks or ()))
     for trial_step in _trial_steps(step, jacobian, residual):
-        blocks, C = moved(model, trial_step)
-        if spectral_radius(blocks) > radius:
+        blocks, C = _moved(model, trial_step)
+        if _spectral_radius(blocks) > radius:
             continue
         trial = block_fit(blocks, C, records, free)
         if trial.loss < model.loss:
@@ -212,7 +223,7 @@ def _trial_steps(step: Array, jacobian: Array, residual: Array) -> Iterator[Arra
         yield (right.T @ (gain * projected)) / scale
 
 
-def moved(model: Realization, step: Array) -> tuple[tuple[Array, ...], Array]:
+def _moved(model: Realization, step: Array) -> tuple[tuple[Array, ...], Array]:
     """Blocks and C after a step; the other parameters follow by least squares."""
     size_c = model.C.size
     size_a = sum(block.size for block in model.blocks or ())
@@ -224,7 +235,7 @@ def moved(model: Realization, step: Array) -> tuple[tuple[Array, ...], Array]:
     return tuple(blocks), model.C + step[start:].reshape(model.C.shape)
 
 
-def spectral_radius(blocks: Sequence[Array]) -> float:
+def _spectral_radius(blocks: Sequence[Array]) -> float:
     """Largest modulus of the poles of blocks of one or two states."""
     radius = 0.0
     for block in blocks:
