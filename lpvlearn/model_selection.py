@@ -9,7 +9,7 @@ Examples
 Two experiments at each of four operating points of a spring that stiffens:
 
 >>> import numpy as np
->>> from sklearn.model_selection import GridSearchCV, cross_validate
+>>> from sklearn.model_selection import GridSearchCV, cross_val_score
 >>> from lpvlearn import ExperimentSplit, GrayBoxRestructurer, GrayBoxStructure
 >>> from lpvlearn import LocalLPVPipeline, SubspaceLTI, bft_scorer, from_trajectories
 >>> from lpvlearn import make_bft_scorer
@@ -19,21 +19,20 @@ Two experiments at each of four operating points of a spring that stiffens:
 >>> trajectories = []
 >>> for kappa in np.repeat([0.0, 1.0, 2.0, 3.0], 2):
 ...     model = spring.model({"k": 4 + kappa**2, "c": 1})
-...     u = np.sign(rng.standard_normal(200))
+...     u = np.sign(rng.standard_normal(100))
 ...     y = model.simulate(u, sampling_time=0.1)
 ...     trajectories.append((u, kappa, y + 0.002 * rng.standard_normal(y.shape)))
 >>> X, y = from_trajectories(trajectories, sampling_time=0.1)
 >>> roles = {"scheduling": "kappa", "experiment": "experiment"}
 >>> pipeline = LocalLPVPipeline(
 ...     SubspaceLTI(order=2, horizon=10, feedthrough=False),
-...     GrayBoxRestructurer(spring), time="time", **roles)
+...     GrayBoxRestructurer(spring, norm="similarity"), time="time", **roles)
 
 How well a new experiment is simulated:
 
 >>> cv = ExperimentSplit(2, **roles)
->>> scores = cross_validate(
-...     pipeline, X, y, cv=cv, scoring={"BFT": bft_scorer, "R2": "r2"})
->>> bool((scores["test_BFT"] > 90).all())
+>>> scores = cross_val_score(pipeline, X, y, cv=cv, scoring=bft_scorer)
+>>> bool((scores > 90).all())
 True
 
 The degree, from models that lack one operating point each, scored over the whole range.
@@ -42,7 +41,7 @@ With ``memory=`` of the pipeline, nothing is identified twice:
 >>> cv = ExperimentSplit("all", hold_out="operating_point", interior=True,
 ...                      test_on="all", **roles)
 >>> search = GridSearchCV(
-...     pipeline, {"interpolator__degree": [0, 1, 2]}, cv=cv,
+...     pipeline, {"interpolator__degree": [1, 2]}, cv=cv,
 ...     scoring=make_bft_scorer(average="experiment"))
 >>> search.fit(X, y).best_params_
 {'interpolator__degree': 2}
@@ -50,6 +49,7 @@ With ``memory=`` of the pipeline, nothing is identified twice:
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator
 from typing import Any
 
@@ -62,14 +62,81 @@ from sklearn.utils.validation import check_consistent_length
 from .data.columns import Column, Table, is_table
 from .data.experiments import Experiment, group_rows, operating_point_of
 from .data.operating_points import group_operating_points
-from .validation import whole_number
+from .validation import one_of, whole_number
 
 __all__ = ["BlockedTimeSeriesSplit", "ExperimentSplit"]
 
 Indices = NDArray[np.intp]
 
+# Rows of the experiments to train on, and of those to test on.
+Parts = tuple[list[Indices], list[Indices]]
 
-class ExperimentSplit(BaseCrossValidator):
+
+class _SplitOfExperiments(BaseCrossValidator):
+    """Splits of which training and test set are put together from experiments.
+
+    Subclasses say what their experiments are (`_read`), how many folds these make
+    (`_count`), and which rows of which experiments every fold takes (`_parts`).
+    """
+
+    n_splits: int | str
+    experiment: Any
+
+    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
+        """Number of folds.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+            Needed only with ``n_splits="all"``.
+        y : object
+            Ignored.
+        groups : array-like of shape (n_samples,), optional
+            As in `split`.
+
+        Returns
+        -------
+        int
+        """
+        return self._count(X, groups)
+
+    def split(
+        self, X: Any, y: Any = None, groups: Any = None
+    ) -> Iterator[tuple[Indices, Indices]]:
+        """Yield the rows of every training and test set.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : object
+            Ignored.
+        groups : array-like of shape (n_samples,), optional
+            Labels of the experiments, without the `experiment` column.
+
+        Yields
+        ------
+        train, test : ndarray of int
+
+        Raises
+        ------
+        ValueError
+            When there are fewer experiments (points) than folds, an experiment is too
+            short for the folds and the gap, or a column is missing.
+        """
+        for train, test in self._parts(self._read(X, groups)):
+            yield np.concatenate(train), np.concatenate(test)
+
+    def _read(self, X: Any, groups: Any) -> list[Experiment]:
+        return _read_rows(X, groups, self.experiment)
+
+    @abstractmethod
+    def _count(self, X: Any, groups: Any) -> int: ...
+
+    @abstractmethod
+    def _parts(self, experiments: list[Experiment]) -> Iterator[Parts]: ...
+
+
+class ExperimentSplit(_SplitOfExperiments):
     """Folds of whole experiments, or of whole operating points.
 
     Unlike scikit-learn's ``GroupKFold`` it knows the columns itself (no `groups`), and
@@ -148,81 +215,45 @@ class ExperimentSplit(BaseCrossValidator):
         self.shuffle = shuffle
         self.random_state = random_state
 
-    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
-        """Number of folds.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-            Needed with ``n_splits="all"``.
-        y : object
-            Ignored.
-        groups : array-like of shape (n_samples,), optional
-            Labels of the experiments, without the `experiment` column.
-
-        Returns
-        -------
-        int
-        """
+    def _count(self, X: Any, groups: Any) -> int:
         if self.n_splits != "all":
             return whole_number("n_splits", self.n_splits, 2)
         if X is None:
             raise ValueError("`X` must be given to count the folds of n_splits='all'.")
-        return len(self._folds(self._read(X, groups)[1]))
+        return len(self._folds(self._points(self._read(X, groups))))
 
-    def split(
-        self, X: Any, y: Any = None, groups: Any = None
-    ) -> Iterator[tuple[Indices, Indices]]:
-        """Yield the rows of every training and test set.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        y : object
-            Ignored.
-        groups : array-like of shape (n_samples,), optional
-            Labels of the experiments, without the `experiment` column.
-
-        Yields
-        ------
-        train, test : ndarray of int
-
-        Raises
-        ------
-        ValueError
-            When there are fewer experiments (points) than folds, or a column is
-            missing.
-        """
-        experiments, point = self._read(X, groups)
+    def _parts(self, experiments: list[Experiment]) -> Iterator[Parts]:
+        point = self._points(experiments)
         for held_out in self._folds(point):
             kept = np.array([k for k in range(len(point)) if k not in held_out])
             order = kept[np.lexsort((point[kept], _turns(point[kept])))]
-            train = [experiments[k].rows for k in order]
             tested = held_out if self.test_on == "held_out" else range(len(point))
-            test = [experiments[k].rows for k in sorted(tested)]
-            yield np.concatenate(train), np.concatenate(test)
+            yield (
+                [experiments[k].rows for k in order],
+                [experiments[k].rows for k in sorted(tested)],
+            )
 
-    def _read(self, X: Any, groups: Any) -> tuple[list[Experiment], Indices]:
-        """Experiments, and the operating point of each."""
-        for name, allowed in (
-            ("hold_out", ("experiment", "operating_point")),
-            ("test_on", ("held_out", "all")),
-        ):
-            value = getattr(self, name)
-            if value not in allowed:
-                raise ValueError(
-                    f"`{name}` must be {allowed[0]!r} or {allowed[1]!r}. Got {value!r}."
-                )
-        by_point = self.scheduling is not None or self.operating_point is not None
-        if self.hold_out == "operating_point" and not by_point:
+    def _read(self, X: Any, groups: Any) -> list[Experiment]:
+        one_of("hold_out", self.hold_out, ("experiment", "operating_point"))
+        one_of("test_on", self.test_on, ("held_out", "all"))
+        if self.hold_out == "operating_point" and not self._knows_points:
             raise ValueError(
                 "`scheduling` or `operating_point` must name a column to hold out "
                 "operating points. Got None for both."
             )
-        experiments = read_rows(X, groups, self)
-        if not by_point:
-            return experiments, np.zeros(len(experiments), dtype=np.intp)
-        return experiments, group_operating_points(experiments)[0]
+        return _read_rows(
+            X, groups, self.experiment, self.scheduling, self.operating_point
+        )
+
+    @property
+    def _knows_points(self) -> bool:
+        return self.scheduling is not None or self.operating_point is not None
+
+    def _points(self, experiments: list[Experiment]) -> Indices:
+        """The operating point of every experiment."""
+        if not self._knows_points:
+            return np.zeros(len(experiments), dtype=np.intp)
+        return group_operating_points(experiments)[0]
 
     def _folds(self, point: Indices) -> list[set[int]]:
         """Numbers of the experiments that every fold holds out."""
@@ -234,11 +265,9 @@ class ExperimentSplit(BaseCrossValidator):
         n_units = len(units)
         if self.shuffle:
             order = check_random_state(self.random_state).permutation(n_units)
-            if self.hold_out == "experiment":
-                order = order[
-                    np.argsort(point[[units[k][0] for k in order]], kind="stable")
-                ]
             units = [units[k] for k in order]
+            if self.hold_out == "experiment":
+                units.sort(key=lambda unit: point[unit[0]])
         n_splits = n_units
         if self.n_splits != "all":
             n_splits = whole_number("n_splits", self.n_splits, 2)
@@ -256,7 +285,7 @@ class ExperimentSplit(BaseCrossValidator):
         ]
 
 
-class BlockedTimeSeriesSplit(BaseCrossValidator):
+class BlockedTimeSeriesSplit(_SplitOfExperiments):
     """Folds in time, the same in every experiment: the past trains, the next tests.
 
     Every experiment is cut into ``n_splits + 1`` blocks of successive samples. Fold k
@@ -304,47 +333,14 @@ class BlockedTimeSeriesSplit(BaseCrossValidator):
         self.max_train_size = max_train_size
         self.experiment = experiment
 
-    def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
-        """Number of folds.
-
-        Parameters
-        ----------
-        X, y, groups : object
-            Ignored.
-
-        Returns
-        -------
-        int
-        """
+    def _count(self, X: Any, groups: Any) -> int:
         return whole_number("n_splits", self.n_splits, 1)
 
-    def split(
-        self, X: Any, y: Any = None, groups: Any = None
-    ) -> Iterator[tuple[Indices, Indices]]:
-        """Yield the rows of every training and test set.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        y : object
-            Ignored.
-        groups : array-like of shape (n_samples,), optional
-            Labels of the experiments, without the `experiment` column.
-
-        Yields
-        ------
-        train, test : ndarray of int
-
-        Raises
-        ------
-        ValueError
-            When an experiment is too short for the folds and the gap.
-        """
+    def _parts(self, experiments: list[Experiment]) -> Iterator[Parts]:
         n_splits, gap = self.get_n_splits(), whole_number("gap", self.gap, 0)
         longest = self.max_train_size
         if longest is not None:
             longest = whole_number("max_train_size", longest, 1)
-        experiments = read_rows(X, groups, self)
         for e in experiments:
             block = len(e.rows) // (n_splits + 1)
             if block <= gap:
@@ -360,27 +356,27 @@ class BlockedTimeSeriesSplit(BaseCrossValidator):
                 begin = 0 if longest is None else max(0, edges[fold] - longest)
                 train.append(e.rows[begin : edges[fold]])
                 test.append(e.rows[edges[fold] + gap : edges[fold + 1]])
-            yield np.concatenate(train), np.concatenate(test)
+            yield train, test
 
 
-def read_rows(X: Any, groups: Any, roles: Any) -> list[Experiment]:
-    """Experiments of a table for a splitter: their rows, and their operating points.
+def _read_rows(
+    X: Any,
+    groups: Any,
+    experiment: Any,
+    scheduling: Any = None,
+    operating_point: Any = None,
+) -> list[Experiment]:
+    """Experiments of a table: their rows, and what tells their operating points.
 
-    Parameters
-    ----------
-    X : DataFrame or array-like of shape (n_samples, n_features)
-    groups : array-like of shape (n_samples,) or None
-        Labels of the experiments, where `roles` names no column.
-    roles : object
-        With the attribute `experiment`, and maybe `scheduling`, `operating_point`.
+    `groups` are labels of the experiments where no column has them.
     """
     table = Table(X if is_table(X) or hasattr(X, "dtype") else np.asarray(X, object))
-    by_label = table.one(roles.experiment, "experiment")
+    by_label = table.one(experiment, "experiment")
     if by_label is None and groups is not None:
         check_consistent_length(X, groups)
         by_label = None, Column("groups", groups)
-    by_point = table.one(getattr(roles, "operating_point", None), "operating_point")
-    by_kappa = table.several(getattr(roles, "scheduling", None), "scheduling")
+    by_point = table.one(operating_point, "operating_point")
+    by_kappa = table.several(scheduling, "scheduling")
     kappa = [column.numbers("X") for _, column in by_kappa]
     labels, rows = group_rows(by_label, table.n_rows)
     return [
