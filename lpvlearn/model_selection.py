@@ -41,7 +41,7 @@ With ``memory=`` of the pipeline, nothing is identified twice:
 >>> cv = ExperimentSplit("all", hold_out="operating_point", interior=True,
 ...                      test_on="all", **roles)
 >>> search = GridSearchCV(
-...     pipeline, {"interpolator__degree": [1, 2]}, cv=cv,
+...     pipeline, {"interpolator__degree": [1, 2]}, cv=cv, refit=False,
 ...     scoring=make_bft_scorer(average="experiment"))
 >>> search.fit(X, y).best_params_
 {'interpolator__degree': 2}
