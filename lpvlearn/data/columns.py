@@ -12,9 +12,18 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+# The arguments of the estimators that give columns a role.
+ROLES = ("inputs", "scheduling", "experiment", "time", "operating_point")
+
 Role = str | int | None
 
 Roles = str | int | Sequence[str | int] | None
+
+# Likeness (ratio of difflib, its default) from which a name may have been meant.
+_ALIKE = 0.6
+
+# Names listed in an error message, lest a wide table fills the screen.
+_N_SHOWN = 10
 
 
 @dataclass(frozen=True)
@@ -74,7 +83,7 @@ def as_scalar(value: Any) -> Hashable:
 def _did_you_mean(key: Any, names: Sequence[Any]) -> str:
     """A suggestion for a misspelt name, or nothing."""
     lower = {str(name).lower(): name for name in names if name is not None}
-    close = get_close_matches(str(key).lower(), lower, n=1, cutoff=0.6)
+    close = get_close_matches(str(key).lower(), lower, n=1, cutoff=_ALIKE)
     return f" Did you mean {lower[close[0]]!r}?" if close else ""
 
 
@@ -173,8 +182,8 @@ class Table:
         elif not self.named:
             rule = "be an integer position, as X is an array without column names"
         else:
-            shown = ", ".join(map(repr, self.names[:10]))
-            shown += ", ..." if n_columns > 10 else ""
+            shown = ", ".join(map(repr, self.names[:_N_SHOWN]))
+            shown += ", ..." if n_columns > _N_SHOWN else ""
             named = [repr(level) for level in self.levels if level is not None]
             shown += f"; index levels: {', '.join(named)}" if named else ""
             rule = f"name a column or an index level of X ({shown})"
@@ -223,6 +232,3 @@ class Table:
                 f"`{role}` must list at least one column, each once. Got {keys!r}."
             )
         return found
-
-
-ROLES = ("inputs", "scheduling", "experiment", "time", "operating_point")

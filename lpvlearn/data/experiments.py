@@ -178,7 +178,6 @@ def read_outputs(y: Any) -> tuple[NDArray[np.float64], list[Hashable]]:
 
     Examples
     --------
-    >>> from lpvlearn.data.experiments import read_outputs
     >>> read_outputs([0.5, 1.5])
     (array([[0.5],
            [1.5]]), ['y1'])

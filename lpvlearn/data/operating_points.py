@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ..exceptions import ExtrapolationWarning
+from ..exceptions import ExtrapolationWarning, warn
 from .experiments import Experiment
 
 # A single record tells a sweep from noise and from oscillations about a point by the
@@ -21,6 +20,18 @@ from .experiments import Experiment
 _PARTS = 10
 
 _SWEEP = 0.8
+
+# Rounding of scheduling values, relative to the range they are compared with.
+_ROUNDING = 1e-6
+
+# Experiments of a point are closer than this share of the range of all, if not more.
+_CLOSE = 0.01
+
+# A chain of neighbours longer than this many tolerances is no single point.
+_CHAIN = 3
+
+# Digits of a range that a message shows.
+_DIGITS = 3
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,7 @@ class OperatingPoints:
         """The span, widened by how far the variables moved within an experiment."""
         moved = _motion([run for group in self.experiments for run in group])
         low, high = self.span
-        slack = moved + 1e-6 * np.maximum(high - low, np.abs(high))
+        slack = moved + _ROUNDING * np.maximum(high - low, np.abs(high))
         return np.array([low - slack, high + slack])
 
 
@@ -99,12 +110,10 @@ def local_experiments(
             f"{value:.4g}, moving by {spread:.2g}"
             for value, spread in zip(kappa[0], _motion(experiments), strict=True)
         )
-        warnings.warn(
+        warn(
             f"All experiments are at one operating point (scheduling {place}): the "
             "model is time-invariant. Identify at further points for a model that "
-            "follows the scheduling variable, or leave `scheduling` out.",
-            UserWarning,
-            stacklevel=3,
+            "follows the scheduling variable, or leave `scheduling` out."
         )
     return OperatingPoints(kappa, groups)
 
@@ -172,16 +181,15 @@ def warn_extrapolation(
     if not outside:
         return
     row, j = np.unravel_index(np.argmax(excess), excess.shape)
-    digits = 3 - int(np.floor(np.log10(width[j])))
+    digits = _DIGITS - int(np.floor(np.log10(width[j])))
     shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
-    warnings.warn(
+    warn(
         f"Scheduling variable {names[int(j)]!r} must be within the identified range, "
         f"{shown[0]} to {shown[1]}. Got {outside} of {len(kappa)} samples "
         f"outside, the farthest at {kappa[row, j]:.4g}: the model is extrapolated. "
         "Identify a model there too, or hold the border's with "
         "interpolator=PolynomialLPV(extrapolation='clip').",
         ExtrapolationWarning,
-        stacklevel=4,
     )
 
 
@@ -220,7 +228,6 @@ def group_operating_points(
     >>> import pandas as pd
     >>> from sklearn.base import BaseEstimator
     >>> from lpvlearn.data.experiments import read_experiments
-    >>> from lpvlearn.data.operating_points import group_operating_points
     >>> X = pd.DataFrame({"u": 1.0, "kappa": [0.9, 0.1, 0.9], "run": [7, 8, 9]})
     >>> runs = read_experiments(
     ...     BaseEstimator(), X, scheduling="kappa", experiment="run"
@@ -277,7 +284,6 @@ def check_local(
     --------
     >>> import numpy as np
     >>> from lpvlearn.data.experiments import Experiment
-    >>> from lpvlearn.data.operating_points import check_local
     >>> sweep = Experiment(
     ...     "sweep", np.arange(2), np.ones((2, 1)), scheduling=np.array([[0.0], [1.0]])
     ... )
@@ -332,7 +338,7 @@ def _tolerance(
 ) -> NDArray[np.float64]:
     if tol is None:
         spreads = [np.ptp(signal, axis=0) for signal in signals]
-        return np.maximum(0.01 * np.ptp(means, axis=0), np.median(spreads, axis=0))
+        return np.maximum(_CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0))
     given = np.asarray(tol, dtype=np.float64)
     if given.shape not in ((), (means.shape[1],)) or not (given >= 0).all():
         raise ValueError(
@@ -349,8 +355,8 @@ def _cluster(means: NDArray[np.float64], tol: NDArray[np.float64]) -> NDArray[np
     _, group = connected_components(csr_array(near), directed=False)
     for k in range(group.max() + 1):
         extent = np.ptp(means[group == k], axis=0)
-        if (extent > 3 * tol).any():
-            j = int(np.argmax(extent - 3 * tol))
+        if (extent > _CHAIN * tol).any():
+            j = int(np.argmax(extent - _CHAIN * tol))
             raise ValueError(
                 "`scheduling_tol` must separate the operating points. With "
                 f"{tol[j]:.4g}, {int((group == k).sum())} experiments form one chain "

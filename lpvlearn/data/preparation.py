@@ -1,15 +1,19 @@
-"""Records with gaps and with offsets: what is done to samples before identification."""
+"""What is done to samples before identification: gaps, trends, and poor inputs.
+
+Records are cut where a sample is missing, freed of their mean or straight line, and
+refused where an input never changes; inputs that are combinations of each other are
+replaced by independent ones.
+"""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exceptions import RankWarning
+from ..exceptions import RankWarning, warn
 from .experiments import Experiment
 
 Array = NDArray[np.float64]
@@ -17,6 +21,13 @@ Array = NDArray[np.float64]
 Pairs = list[tuple[Array, Array]]
 
 DETRENDS = (None, "constant", "linear")
+
+# Relative singular value below which inputs count as collinear, and the ratio of the
+# eigenvalues of their Gram matrix below which that is looked into: its rounding hides
+# ratios of singular values below 1e-8, well above the first.
+_COLLINEAR = 1e-10
+
+_SUSPECTED = 1e-12
 
 
 def has_gaps(experiment: Experiment) -> bool:
@@ -132,10 +143,6 @@ def _trend(values: Array, degree: int) -> Array:
     return mean + t[:, None] * slope
 
 
-# Relative singular value below which inputs count as collinear.
-_COLLINEAR = 1e-10
-
-
 def constant_inputs(inputs: Sequence[Array]) -> NDArray[np.intp]:
     """Inputs that have one and the same value in all samples of all experiments.
 
@@ -189,10 +196,9 @@ def independent_inputs(inputs: Sequence[Array]) -> Array | None:
     n_samples, n_inputs = stacked.shape
     scale = np.abs(stacked).max(axis=0)
     gram = stacked / scale
-    # Rounding of the Gram matrix hides ratios below 1e-8: only a suspicion is checked
-    # on the samples themselves.
+    # Only a suspicion is checked on the samples themselves.
     values = np.linalg.eigvalsh(gram.T @ gram)
-    if n_samples < n_inputs or values[0] > 1e-12 * values[-1]:
+    if n_samples < n_inputs or values[0] > _SUSPECTED * values[-1]:
         return None
     _, s, right = np.linalg.svd(np.linalg.qr(gram)[1])
     rank = int(np.sum(s > _COLLINEAR * s[0]))
@@ -253,11 +259,10 @@ def reduce_inputs(pairs: Pairs) -> tuple[Pairs, Array]:
     basis = independent_inputs([u for u, _ in pairs])
     if basis is None:
         return pairs, np.eye(n_inputs)
-    warnings.warn(
+    warn(
         f"The {n_inputs} inputs are collinear (rank {basis.shape[1]}): their separate "
         "effects are not identifiable and the smallest solution was taken. Excite the "
         "inputs independently.",
         RankWarning,
-        stacklevel=5,
     )
     return [(u @ basis, y) for u, y in pairs], basis

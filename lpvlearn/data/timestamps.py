@@ -9,10 +9,18 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-# Relative tolerance on a single time step, and on the mean step against a declared one.
+# Relative tolerance on a single time step (beyond the rounding of its stamps), and on
+# the mean step against a declared one, which may be a rounded number itself.
 _STEP_RTOL = 1e-6
 
 _SAMPLING_TIME_RTOL = 1e-4
+
+# Decimals that stamps are tried for, down to nanoseconds. A stamp counts as a multiple
+# of the unit within the first slop, or its own rounding if that is larger; beyond the
+# second every number is one.
+_MAX_DECIMALS = 9
+
+_SLOP, _LARGEST_SLOP = 1e-6, 0.01
 
 _USE_INSTEAD = (
     "A dynamic model needs the samples of an experiment complete and in the order of "
@@ -20,7 +28,6 @@ _USE_INSTEAD = (
     "or LeaveOneGroupOut, or in time with BlockedTimeSeriesSplit or TimeSeriesSplit; "
     "resample a record that was taken unevenly."
 )
-
 
 _RESTARTS = (
     "Where a table holds several experiments, `experiment` must name the column that "
@@ -147,6 +154,8 @@ def check_uniform_time(
         )
     step = float(t[-1] - t[0]) / (n_samples - 1)
     unit = _decimal_unit(t)
+    # A step is the difference of two rounded stamps: off by one unit of their decimals,
+    # and by twice their precision, as long as these are well below the step itself.
     rounding = (unit if unit < 0.5 * step else 0.0) + min(2 * precision, 0.25 * step)
     tolerance = _STEP_RTOL * step + rounding
     # The second condition only bites on rounded stamps: it tells a scatter around one
@@ -182,12 +191,12 @@ def _float_precision(seconds: NDArray[Any]) -> float:
     return float(np.finfo(np.float32 if is_single else np.float64).eps)
 
 
-def _decimal_unit(seconds: NDArray[np.float64], max_decimals: int = 9) -> float:
+def _decimal_unit(seconds: NDArray[np.float64]) -> float:
     """Return the unit of the last decimal place that the stamps use, 0 if none."""
-    for decimals in range(max_decimals + 1):
+    for decimals in range(_MAX_DECIMALS + 1):
         scaled = seconds * 10.0**decimals
-        slop = max(1e-6, 4 * np.finfo(float).eps * float(np.abs(scaled).max()))
-        if slop > 0.01:
+        slop = max(_SLOP, 4 * np.finfo(float).eps * float(np.abs(scaled).max()))
+        if slop > _LARGEST_SLOP:
             break
         if np.abs(scaled - np.round(scaled)).max() <= slop:
             return 10.0**-decimals
