@@ -19,6 +19,13 @@ from sklearn.utils.validation import check_array, check_consistent_length, valid
 from .columns import Column, Role, Roles, Table, as_scalar, is_table
 from .timestamps import check_uniform_time, time_in_seconds
 
+Array = NDArray[np.float64]
+
+Indices = NDArray[np.intp]
+
+# A column that has a role, and where it stands; None where none has it.
+Found = tuple[int | None, Column] | None
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -44,10 +51,10 @@ class Experiment:
     """
 
     label: Hashable
-    rows: NDArray[np.intp]
-    inputs: NDArray[np.float64]
-    outputs: NDArray[np.float64] | None = None
-    scheduling: NDArray[np.float64] | None = None
+    rows: Indices
+    inputs: Array
+    outputs: Array | None = None
+    scheduling: Array | None = None
     operating_point: Hashable = None
     sampling_time: float | None = None
     input_names: tuple[Hashable, ...] = ()
@@ -157,7 +164,109 @@ def read_experiments(
     ]
 
 
-def read_outputs(y: Any) -> tuple[NDArray[np.float64], list[Hashable]]:
+def _as_matrix(estimator: Any, X: Any, *, numeric: bool) -> NDArray[Any]:
+    """Check an array; with labels among its columns, their type is kept."""
+    # A list is read as objects, lest numpy turns its numbers into text.
+    dtype = np.float64 if numeric else None if hasattr(X, "dtype") else object
+    return check_array(
+        X, dtype=dtype, ensure_all_finite=False, estimator=estimator, input_name="X"
+    )
+
+
+def _numbers(columns: Sequence[Column], n_rows: int, argument: str) -> Array:
+    matrix = np.empty((n_rows, len(columns)))
+    for k, column in enumerate(columns):
+        matrix[:, k] = column.numbers(argument)
+    return matrix
+
+
+def _check_finite(
+    matrix: Array,
+    names: Sequence[Hashable],
+    argument: str,
+    labels: Sequence[Hashable],
+    groups: Sequence[Indices],
+    allow_missing: bool = False,
+) -> None:
+    """Refuse infinity, and NaN where it may not be, naming the first."""
+    finite = np.isfinite(matrix) | (allow_missing & np.isnan(matrix))
+    if finite.all():
+        return
+    column = int(np.argmin(finite.all(axis=0)))
+    row = int(np.argmin(finite[:, column]))
+    where = next(k for k, rows in enumerate(groups) if row in rows)
+    missing = np.isnan(matrix[row, column])
+    what = "NaN" if missing else "infinity or a value too large for dtype('float64')"
+    raise ValueError(
+        f"Input {argument} contains {what}. First in column {names[column]!r} of "
+        f"experiment {labels[where]!r}, at row {row}: fill the gap (interpolate) or "
+        "leave the experiment out; dropping single rows breaks the record."
+    )
+
+
+def _sampling_times(
+    found: Found,
+    labels: Sequence[Hashable],
+    groups: Sequence[Indices],
+    sampling_time: float | None,
+) -> list[float | None]:
+    """Check the time column, and return each experiment's step."""
+    if found is None:
+        return [None] * len(labels)
+    column = found[1]
+    seconds = time_in_seconds(column.values, column.name)
+    steps: list[float | None] = []
+    common = None
+    for label, rows in zip(labels, groups, strict=True):
+        step = check_uniform_time(
+            seconds[rows],
+            column=column.name,
+            experiment=label,
+            sampling_time=sampling_time,
+            other_step=common,
+        )
+        common = step if common is None else common
+        steps.append(step)
+    return steps
+
+
+def group_rows(found: Found, n_rows: int) -> tuple[list[Hashable], list[Indices]]:
+    """Labels of experiments in the order of first appearance, and the rows of each."""
+    if found is None:
+        return [0], [np.arange(n_rows)]
+    column = found[1]
+    codes, uniques = pd.factorize(pd.Series(column.values))
+    if (codes < 0).any():
+        raise ValueError(
+            f"`experiment` column {column.name!r} must label every row. Got a missing "
+            f"value at row {int(np.argmin(codes))}."
+        )
+    order = np.argsort(codes, kind="stable")
+    groups = np.split(order, np.cumsum(np.bincount(codes))[:-1])
+    return [as_scalar(label) for label in uniques], groups
+
+
+def operating_point_of(
+    found: Found,
+    rows: Indices,
+    label: Hashable,
+) -> Hashable:
+    """The one value that the operating-point column has in an experiment."""
+    if found is None:
+        return None
+    column = found[1]
+    values = pd.unique(pd.Series(column.values).iloc[rows])
+    if len(values) > 1 or pd.isna(values[0]):
+        raise ValueError(
+            f"`operating_point` column {column.name!r} must hold one value per "
+            f"experiment. Got {[as_scalar(v) for v in values[:3]]} in experiment "
+            f"{label!r}; give the experiments a column with the role `experiment`, and "
+            "continuous variables the role `scheduling`."
+        )
+    return as_scalar(values[0])
+
+
+def read_outputs(y: Any) -> tuple[Array, list[Hashable]]:
     """Read outputs as a matrix with names.
 
     Parameters
@@ -280,110 +389,6 @@ def _trajectory(
     return u, kappa, y
 
 
-def _as_columns(values: ArrayLike) -> NDArray[np.float64]:
+def _as_columns(values: ArrayLike) -> Array:
     array = np.asarray(values, dtype=np.float64)
     return array if array.ndim == 2 else array.reshape(-1, 1)
-
-
-def _as_matrix(estimator: Any, X: Any, *, numeric: bool) -> NDArray[Any]:
-    """Check an array; with labels among its columns, their type is kept."""
-    # A list is read as objects, lest numpy turns its numbers into text.
-    dtype = np.float64 if numeric else None if hasattr(X, "dtype") else object
-    return check_array(
-        X, dtype=dtype, ensure_all_finite=False, estimator=estimator, input_name="X"
-    )
-
-
-def _numbers(
-    columns: Sequence[Column], n_rows: int, argument: str
-) -> NDArray[np.float64]:
-    matrix = np.empty((n_rows, len(columns)))
-    for k, column in enumerate(columns):
-        matrix[:, k] = column.numbers(argument)
-    return matrix
-
-
-def group_rows(
-    found: tuple[int | None, Column] | None, n_rows: int
-) -> tuple[list[Hashable], list[NDArray[np.intp]]]:
-    """Return labels in the order of first appearance, and the rows of each."""
-    if found is None:
-        return [0], [np.arange(n_rows)]
-    column = found[1]
-    codes, uniques = pd.factorize(pd.Series(column.values))
-    if (codes < 0).any():
-        raise ValueError(
-            f"`experiment` column {column.name!r} must label every row. Got a missing "
-            f"value at row {int(np.argmin(codes))}."
-        )
-    order = np.argsort(codes, kind="stable")
-    groups = np.split(order, np.cumsum(np.bincount(codes))[:-1])
-    return [as_scalar(label) for label in uniques], groups
-
-
-def operating_point_of(
-    found: tuple[int | None, Column] | None,
-    rows: NDArray[np.intp],
-    label: Hashable,
-) -> Hashable:
-    if found is None:
-        return None
-    column = found[1]
-    values = pd.unique(pd.Series(column.values).iloc[rows])
-    if len(values) > 1 or pd.isna(values[0]):
-        raise ValueError(
-            f"`operating_point` column {column.name!r} must hold one value per "
-            f"experiment. Got {[as_scalar(v) for v in values[:3]]} in experiment "
-            f"{label!r}; give the experiments a column with the role `experiment`, and "
-            "continuous variables the role `scheduling`."
-        )
-    return as_scalar(values[0])
-
-
-def _check_finite(
-    matrix: NDArray[np.float64],
-    names: Sequence[Hashable],
-    argument: str,
-    labels: Sequence[Hashable],
-    groups: Sequence[NDArray[np.intp]],
-    allow_missing: bool = False,
-) -> None:
-    finite = np.isfinite(matrix) | (allow_missing & np.isnan(matrix))
-    if finite.all():
-        return
-    column = int(np.argmin(finite.all(axis=0)))
-    row = int(np.argmin(finite[:, column]))
-    where = next(k for k, rows in enumerate(groups) if row in rows)
-    missing = np.isnan(matrix[row, column])
-    what = "NaN" if missing else "infinity or a value too large for dtype('float64')"
-    raise ValueError(
-        f"Input {argument} contains {what}. First in column {names[column]!r} of "
-        f"experiment {labels[where]!r}, at row {row}: fill the gap (interpolate) or "
-        "leave the experiment out; dropping single rows breaks the record."
-    )
-
-
-def _sampling_times(
-    found: tuple[int | None, Column] | None,
-    labels: Sequence[Hashable],
-    groups: Sequence[NDArray[np.intp]],
-    sampling_time: float | None,
-) -> list[float | None]:
-    """Check the time column, and return each experiment's step."""
-    if found is None:
-        return [None] * len(labels)
-    column = found[1]
-    seconds = time_in_seconds(column.values, column.name)
-    steps: list[float | None] = []
-    for label, rows in zip(labels, groups, strict=True):
-        other_step = next((step for step in steps if step is not None), None)
-        steps.append(
-            check_uniform_time(
-                seconds[rows],
-                column=column.name,
-                experiment=label,
-                sampling_time=sampling_time,
-                other_step=other_step,
-            )
-        )
-    return steps

@@ -14,12 +14,18 @@ from scipy.sparse.csgraph import connected_components
 from ..exceptions import ExtrapolationWarning, warn
 from .experiments import Experiment
 
+Array = NDArray[np.float64]
+
 # A single record tells a sweep from noise and from oscillations about a point by the
 # means of its parts: those of a sweep differ by that share of the whole spread. (White
 # noise: below 0.2 of 600 samples; the flexible arm at one point: 0.54 to 0.66.)
 _PARTS = 10
 
 _SWEEP = 0.8
+
+# Largest spread of a scheduling variable within a local experiment, relative to its
+# range over the points: what moves further has seen several of the models.
+_MAX_SPREAD = 0.25
 
 # Rounding of scheduling values, relative to the range they are compared with.
 _ROUNDING = 1e-6
@@ -45,7 +51,7 @@ class OperatingPoints:
     experiments : list of lists of Experiment
     """
 
-    kappa: NDArray[np.float64]
+    kappa: Array
     experiments: list[list[Experiment]]
 
     def __len__(self) -> int:
@@ -59,12 +65,12 @@ class OperatingPoints:
         )
 
     @property
-    def span(self) -> NDArray[np.float64]:
+    def span(self) -> Array:
         """Smallest and largest scheduling values of the points, (2, n_scheduling)."""
         return np.array([self.kappa.min(axis=0), self.kappa.max(axis=0)])
 
     @property
-    def identified_range(self) -> NDArray[np.float64]:
+    def identified_range(self) -> Array:
         """The span, widened by how far the variables moved within an experiment."""
         moved = _motion([run for group in self.experiments for run in group])
         low, high = self.span
@@ -86,7 +92,7 @@ def local_experiments(
     Raises
     ------
     ValueError
-        As `group_operating_points` and `check_local`.
+        Also where an experiment is not local.
 
     Warns
     -----
@@ -104,7 +110,7 @@ def local_experiments(
                 f"in. Got None, with {len(kappa)} values of `operating_point`."
             )
         return OperatingPoints(np.zeros((1, 1)), groups)
-    check_local(experiments, kappa)
+    _check_local(experiments, kappa)
     if len(kappa) == 1:
         place = ", ".join(
             f"{value:.4g}, moving by {spread:.2g}"
@@ -118,84 +124,68 @@ def local_experiments(
     return OperatingPoints(kappa, groups)
 
 
-def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:
-    """Refuse outputs that are constant, or stand among the inputs.
+def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
+    """Refuse experiments within which a scheduling variable moves too far.
 
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-    names : sequence
-        Names of the outputs.
+    Its spread (maximum minus minimum) is compared with its range over the operating
+    points `kappa`. Where that is zero: with its largest magnitude, and only if the
+    variable travels; noise and oscillations about one point have no scale to compare
+    with.
 
-    Raises
-    ------
-    ValueError
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from lpvlearn.data.experiments import Experiment
+    >>> sweep = Experiment(
+    ...     "sweep", np.arange(2), np.ones((2, 1)), scheduling=np.array([[0.0], [1.0]])
+    ... )
+    >>> _check_local([sweep], np.array([[0.0], [1.0]]))
+    Traceback (most recent call last):
+        ...
+    ValueError: Experiment 'sweep' must be local. Its scheduling variable 1 spreads ...
     """
-    outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
-    constant = np.ptp(outputs, axis=0) == 0
-    if len(outputs) > len(experiments) and constant.any():
-        j = int(np.argmax(constant))
-        raise ValueError(
-            f"Every output must vary. Got {names[j]!r} constant at {outputs[0, j]:g}: "
-            "no dynamics can be identified from it. Leave it out of `y`, or check the "
-            "sensor and its column."
-        )
-    own = experiments[0].input_names
-    for name in set(own) & set(names):
-        k, j = own.index(name), list(names).index(name)
-        inputs = np.concatenate([e.inputs[:, k] for e in experiments])
-        if isinstance(name, str) and np.array_equal(inputs, outputs[:, j]):
+    extent = np.ptp(kappa, axis=0)
+    for run in experiments:
+        if run.scheduling is None or run.scheduling.shape[1] == 0:
+            continue
+        spread = np.ptp(run.scheduling, axis=0)
+        scale = np.where(extent > 0, extent, np.abs(run.scheduling).max(axis=0))
+        travels = (extent > 0) | (_travel(run.scheduling) > _SWEEP * spread)
+        excess = np.where(travels, spread - _MAX_SPREAD * scale, 0.0)
+        worst = int(np.argmax(excess))
+        if excess[worst] > 0:
+            compared = "range of the operating points" if extent[worst] else "magnitude"
+            several = (
+                " Where the table holds several experiments, `experiment` must name "
+                "the column that tells them apart."
+                if len(experiments) == 1
+                else ""
+            )
             raise ValueError(
-                f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
-                "drop it from X, or list the inputs in `inputs`."
+                f"Experiment {run.label!r} must be local. Its scheduling variable "
+                f"{worst + 1} spreads over {spread[worst]:.4g}, more than "
+                f"{_MAX_SPREAD:g} times the {compared} ({scale[worst]:.4g}). Keep such "
+                f"a record for validation, or cut it into local experiments.{several}"
             )
 
 
-def warn_extrapolation(
-    experiments: Sequence[Experiment],
-    identified_range: NDArray[np.float64],
-    names: Sequence[object],
-) -> None:
-    """Warn, once, of scheduling values outside the range of identification.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-    identified_range : ndarray of shape (2, n_scheduling)
-    names : sequence
-        Names of the scheduling variables.
-
-    Warns
-    -----
-    ExtrapolationWarning
-        With the variable, its range and the farthest value.
-    """
-    signals = [e.scheduling for e in experiments if e.scheduling is not None]
+def _motion(experiments: Sequence[Experiment]) -> Array:
+    """How far each scheduling variable moves within an experiment, at most."""
+    signals = [run.scheduling for run in experiments if run.scheduling is not None]
     if not signals:
-        return
-    kappa = np.vstack(signals)
-    low, high = identified_range
-    width = np.where(high > low, high - low, 1.0)
-    excess = np.maximum(low - kappa, kappa - high) / width
-    outside = int((excess > 0).any(axis=1).sum())
-    if not outside:
-        return
-    row, j = np.unravel_index(np.argmax(excess), excess.shape)
-    digits = _DIGITS - int(np.floor(np.log10(width[j])))
-    shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
-    warn(
-        f"Scheduling variable {names[int(j)]!r} must be within the identified range, "
-        f"{shown[0]} to {shown[1]}. Got {outside} of {len(kappa)} samples "
-        f"outside, the farthest at {kappa[row, j]:.4g}: the model is extrapolated. "
-        "Identify a model there too, or hold the border's with "
-        "interpolator=PolynomialLPV(extrapolation='clip').",
-        ExtrapolationWarning,
-    )
+        return np.zeros(1)
+    return np.max([np.ptp(signal, axis=0) for signal in signals], axis=0)
+
+
+def _travel(scheduling: Array) -> Array:
+    """How far the mean of a part of the record is from that of another part."""
+    parts = np.array_split(scheduling, min(_PARTS, len(scheduling)))
+    return np.ptp([part.mean(axis=0) for part in parts], axis=0)
 
 
 def group_operating_points(
     experiments: Sequence[Experiment], tol: ArrayLike | None = None
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+) -> tuple[NDArray[np.intp], Array]:
     """Group experiments by operating point.
 
     Experiments with an operating-point label are grouped by it; the others by the mean
@@ -256,86 +246,11 @@ def group_operating_points(
     return np.argsort(order)[group], kappa[order]
 
 
-def check_local(
-    experiments: Sequence[Experiment],
-    kappa: NDArray[np.float64],
-    *,
-    max_spread: float = 0.25,
-) -> None:
-    """Check that the scheduling variable barely moves within each experiment.
-
-    Parameters
-    ----------
-    experiments : list of Experiment
-    kappa : ndarray of shape (n_points, n_scheduling)
-        Operating points, as `group_operating_points` returns them.
-    max_spread : float, default=0.25
-        Largest spread (maximum minus minimum) of a scheduling variable within an
-        experiment, relative to its range over the operating points. Where the range is
-        zero: relative to its largest magnitude, and only if the variable travels; noise
-        and oscillations about one point have no scale to compare with.
-
-    Raises
-    ------
-    ValueError
-        When an experiment is not local.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lpvlearn.data.experiments import Experiment
-    >>> sweep = Experiment(
-    ...     "sweep", np.arange(2), np.ones((2, 1)), scheduling=np.array([[0.0], [1.0]])
-    ... )
-    >>> check_local([sweep], np.array([[0.0], [1.0]]))
-    Traceback (most recent call last):
-        ...
-    ValueError: Experiment 'sweep' must be local. Its scheduling variable 1 spreads ...
-    """
-    extent = np.ptp(kappa, axis=0)
-    for run in experiments:
-        if run.scheduling is None or run.scheduling.shape[1] == 0:
-            continue
-        spread = np.ptp(run.scheduling, axis=0)
-        scale = np.where(extent > 0, extent, np.abs(run.scheduling).max(axis=0))
-        travels = (extent > 0) | (_travel(run.scheduling) > _SWEEP * spread)
-        excess = np.where(travels, spread - max_spread * scale, 0.0)
-        worst = int(np.argmax(excess))
-        if excess[worst] > 0:
-            compared = "range of the operating points" if extent[worst] else "magnitude"
-            several = (
-                " Where the table holds several experiments, `experiment` must name "
-                "the column that tells them apart."
-                if len(experiments) == 1
-                else ""
-            )
-            raise ValueError(
-                f"Experiment {run.label!r} must be local. Its scheduling variable "
-                f"{worst + 1} spreads over {spread[worst]:.4g}, more than "
-                f"{max_spread:g} times the {compared} ({scale[worst]:.4g}). Keep such "
-                f"a record for validation, or cut it into local experiments.{several}"
-            )
-
-
-def _motion(experiments: Sequence[Experiment]) -> NDArray[np.float64]:
-    """How far each scheduling variable moves within an experiment, at most."""
-    signals = [run.scheduling for run in experiments if run.scheduling is not None]
-    if not signals:
-        return np.zeros(1)
-    return np.max([np.ptp(signal, axis=0) for signal in signals], axis=0)
-
-
-def _travel(scheduling: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far the mean of a part of the record is from that of another part."""
-    parts = np.array_split(scheduling, min(_PARTS, len(scheduling)))
-    return np.ptp([part.mean(axis=0) for part in parts], axis=0)
-
-
 def _tolerance(
-    signals: Sequence[NDArray[np.float64]],
-    means: NDArray[np.float64],
+    signals: Sequence[Array],
+    means: Array,
     tol: ArrayLike | None,
-) -> NDArray[np.float64]:
+) -> Array:
     if tol is None:
         spreads = [np.ptp(signal, axis=0) for signal in signals]
         return np.maximum(_CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0))
@@ -348,7 +263,7 @@ def _tolerance(
     return np.broadcast_to(given, means.shape[1:])
 
 
-def _cluster(means: NDArray[np.float64], tol: NDArray[np.float64]) -> NDArray[np.intp]:
+def _cluster(means: Array, tol: Array) -> NDArray[np.intp]:
     """Group means that are within `tol`, whatever their order."""
     distance = np.abs(means[:, None, :] - means[None, :, :])
     near = (distance <= tol).all(axis=2)
@@ -365,3 +280,78 @@ def _cluster(means: NDArray[np.float64], tol: NDArray[np.float64]) -> NDArray[np
                 "points with an `operating_point` column."
             )
     return group.astype(np.intp)
+
+
+def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:
+    """Refuse outputs that are constant, or stand among the inputs.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    names : sequence
+        Names of the outputs.
+
+    Raises
+    ------
+    ValueError
+    """
+    outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    constant = np.ptp(outputs, axis=0) == 0
+    if len(outputs) > len(experiments) and constant.any():
+        j = int(np.argmax(constant))
+        raise ValueError(
+            f"Every output must vary. Got {names[j]!r} constant at {outputs[0, j]:g}: "
+            "no dynamics can be identified from it. Leave it out of `y`, or check the "
+            "sensor and its column."
+        )
+    own = experiments[0].input_names
+    for name in set(own) & set(names):
+        k, j = own.index(name), list(names).index(name)
+        inputs = np.concatenate([e.inputs[:, k] for e in experiments])
+        if isinstance(name, str) and np.array_equal(inputs, outputs[:, j]):
+            raise ValueError(
+                f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
+                "drop it from X, or list the inputs in `inputs`."
+            )
+
+
+def warn_extrapolation(
+    experiments: Sequence[Experiment],
+    identified_range: Array,
+    names: Sequence[object],
+) -> None:
+    """Warn, once, of scheduling values outside the range of identification.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    identified_range : ndarray of shape (2, n_scheduling)
+    names : sequence
+        Names of the scheduling variables.
+
+    Warns
+    -----
+    ExtrapolationWarning
+        With the variable, its range and the farthest value.
+    """
+    signals = [e.scheduling for e in experiments if e.scheduling is not None]
+    if not signals:
+        return
+    kappa = np.vstack(signals)
+    low, high = identified_range
+    width = np.where(high > low, high - low, 1.0)
+    excess = np.maximum(low - kappa, kappa - high) / width
+    outside = int((excess > 0).any(axis=1).sum())
+    if not outside:
+        return
+    row, j = np.unravel_index(np.argmax(excess), excess.shape)
+    digits = _DIGITS - int(np.floor(np.log10(width[j])))
+    shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
+    warn(
+        f"Scheduling variable {names[int(j)]!r} must be within the identified range, "
+        f"{shown[0]} to {shown[1]}. Got {outside} of {len(kappa)} samples "
+        f"outside, the farthest at {kappa[row, j]:.4g}: the model is extrapolated. "
+        "Identify a model there too, or hold the border's with "
+        "interpolator=PolynomialLPV(extrapolation='clip').",
+        ExtrapolationWarning,
+    )

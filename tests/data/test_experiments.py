@@ -18,7 +18,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from lpvlearn import from_trajectories
 from lpvlearn.data.experiments import Experiment, read_experiments, read_outputs
-from lpvlearn.data.operating_points import check_local, group_operating_points
+from lpvlearn.data.operating_points import _check_local, group_operating_points
 from lpvlearn.data.timestamps import check_uniform_time, time_in_seconds
 
 ROLES = {"scheduling": "kappa", "experiment": "run", "time": "t"}
@@ -448,16 +448,16 @@ def test_unclear_groups_raise(values, tol, words):
 def test_local_experiments_pass_and_sweeps_raise():
     runs = _runs([0.0, 1.0, 2.0], spread=0.1)
     _, kappa = group_operating_points(runs)
-    check_local(runs, kappa)
+    _check_local(runs, kappa)
     sweep = _runs([0.0, 1.0, 2.0], spread=1.5)
     with pytest.raises(ValueError, match=r"Experiment 0 must be local.*1\.5.*\(2\)"):
-        check_local(sweep, kappa)
+        _check_local(sweep, kappa)
 
 
 def test_a_single_sweep_is_not_local():
     (run,) = runs = _runs([1.0], spread=1.0)
     with pytest.raises(ValueError, match="must be local"):
-        check_local(runs, run.scheduling.mean(axis=0, keepdims=True))
+        _check_local(runs, run.scheduling.mean(axis=0, keepdims=True))
 
 
 # ------------------------------------------------------------------------ trajectories
