@@ -17,11 +17,6 @@ from lpvlearn.subspace.hankel import (
 )
 
 
-@pytest.fixture
-def rng():
-    return np.random.default_rng(0)
-
-
 @pytest.mark.parametrize("n_samples", [37, 300, 9000])
 def test_correlation_sequence_is_the_sum_of_lagged_products(rng, n_samples):
     z = rng.standard_normal((n_samples, 3))

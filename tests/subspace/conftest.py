@@ -1,0 +1,39 @@
+"""Systems and records that the subspace rooms are tested with."""
+
+import numpy as np
+import pytest
+
+from lpvlearn.systems.simulation import lti_response
+
+POLES = (0.9 * np.exp(0.4j), 0.97 * np.exp(1.3j), 0.7, 0.95)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def example(rng, A, n_inputs=2, n_outputs=2):
+    n = len(A)
+    mix = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    B, C = rng.standard_normal((n, n_inputs)), rng.standard_normal((n_outputs, n))
+    return mix @ A @ mix.T, B, C, rng.standard_normal((n_outputs, n_inputs))
+
+
+def experiment(rng, system, n_samples=300, x0=None, noise=0.0):
+    u = rng.standard_normal((n_samples, system[1].shape[1]))
+    y = lti_response(*system, u, x0)
+    return u, y + noise * y.std(axis=0) * rng.standard_normal(y.shape)
+
+
+def markov(A, B, C, D, n=30):
+    out = [D]
+    power = B
+    for _ in range(n):
+        out.append(C @ power)
+        power = A @ power
+    return np.array(out)
+
+
+def sorted_poles(A):
+    return np.sort_complex(np.linalg.eigvals(A).round(12))

@@ -1,0 +1,114 @@
+"""From records to a model: exact without noise, better with more data."""
+
+import numpy as np
+import pytest
+
+from lpvlearn.subspace.identification import identify, max_horizon, max_order
+from lpvlearn.subspace.realization import METHODS
+from lpvlearn.systems.simulation import lti_response
+
+from ..conftest import modes
+from .conftest import POLES, example, experiment, markov, sorted_poles
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("refine", [True, False])
+def test_noise_free_data_give_back_poles_and_markov_parameters(rng, method, refine):
+    system = example(rng, modes(*POLES))
+    runs = [experiment(rng, system, n, rng.standard_normal(6)) for n in (250, 300)]
+    found = identify(runs, 6, 8, method=method, refine=refine)
+    np.testing.assert_allclose(
+        sorted_poles(found.A), sorted_poles(system[0]), atol=1e-8
+    )
+    expected = markov(*system)
+    np.testing.assert_allclose(
+        markov(*found[:4]), expected, atol=1e-8 * np.abs(expected).max()
+    )
+    assert found.residual < 1e-8
+
+
+def test_initial_state_of_every_experiment_is_recovered(rng):
+    system = example(rng, modes(*POLES))
+    states = rng.standard_normal((3, 6))
+    runs = [experiment(rng, system, 200, x0) for x0 in states]
+    found = identify(runs, 6, 6)
+    for (u, y), x0 in zip(runs, found.initial_states, strict=True):
+        np.testing.assert_allclose(lti_response(*found[:4], u, x0), y, atol=1e-7)
+
+
+def test_result_does_not_depend_on_the_units_of_the_channels(rng):
+    system = example(rng, modes(*POLES))
+    u, y = experiment(rng, system, 600, noise=0.1)
+    found = identify([(u, y)], 6, 10)
+    su, sy = np.array([1e9, 1e-3]), np.array([1e-9, 1e9])
+    other = identify([(u * su, y * sy)], 6, 10)
+    np.testing.assert_allclose(
+        markov(*other[:4]) / sy[:, None] * su, markov(*found[:4]), rtol=1e-6, atol=1e-7
+    )
+
+
+def test_pooled_experiments_are_better_than_one(rng):
+    system = example(rng, modes(*POLES))
+    runs = [experiment(rng, system, 300, noise=0.3) for _ in range(8)]
+    truth = markov(*system)
+    one = np.mean(
+        [np.linalg.norm(markov(*identify([r], 6, 10)[:4]) - truth) for r in runs]
+    )
+    pooled = np.linalg.norm(markov(*identify(runs, 6, 10)[:4]) - truth)
+    assert pooled < 0.6 * one
+
+
+def test_feedthrough_off_fixes_D_at_zero(rng):
+    A, B, C, D = example(rng, modes(*POLES))
+    u, y = experiment(rng, (A, B, C, 0 * D))
+    found = identify([(u, y)], 6, 8, feedthrough=False)
+    assert not found.D.any()
+    np.testing.assert_allclose(markov(*found[:4]), markov(A, B, C, 0 * D), atol=1e-7)
+
+
+@pytest.mark.parametrize("engine", ["cholesky", "qr"])
+def test_order_zero_is_the_least_squares_gain(rng, engine):
+    u = rng.standard_normal((50, 2))
+    y = u @ rng.standard_normal((2, 3)) + 0.1 * rng.standard_normal((50, 3))
+    found = identify([(u, y)], 0, 2, engine=engine)
+    np.testing.assert_allclose(found.D, np.linalg.lstsq(u, y, rcond=None)[0].T)
+    assert found.A.shape == (0, 0)
+
+
+@pytest.mark.parametrize("noise", ["white", "coloured"])
+def test_pi_moesp_error_falls_with_the_number_of_samples(noise):
+    errors = []
+    system = example(np.random.default_rng(1), modes(0.9 * np.exp(0.5j), 0.8))
+    truth = markov(*system)
+    for n in (1000, 16000):
+        runs = []
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            u, y = experiment(rng, system, n)
+            e = rng.standard_normal(y.shape)
+            if noise == "coloured":
+                for t in range(1, n):
+                    e[t] += 0.9 * e[t - 1]
+            y = y + 0.3 * y.std(axis=0) * e / e.std(axis=0)
+            found = identify([(u, y)], 3, 15, method="pi-moesp", refine=False)
+            runs.append(np.linalg.norm(markov(*found[:4]) - truth))
+        errors.append(np.median(runs))
+    assert errors[1] < 0.45 * errors[0]  # 1/sqrt(16) = 0.25
+
+
+def test_truly_unstable_system_is_kept_unless_stability_is_enforced(rng):
+    system = example(rng, modes(1.02, 0.8), 1, 1)
+    u, y = experiment(rng, system, 300)
+    found = identify([(u, y)], 2, 6)
+    np.testing.assert_allclose(sorted_poles(found.A), [0.8, 1.02], atol=1e-8)
+    stable = identify([(u, y)], 2, 6, enforce_stability=True)
+    assert np.abs(np.linalg.eigvals(stable.A)).max() < 1.0
+
+
+def test_limits_count_columns_rows_and_instruments():
+    for lengths in ([100], [30, 40, 50]):
+        h = max_horizon(lengths, 2, 1)
+        columns = [sum(max(0, n - 2 * k + 1) for n in lengths) for k in (h, h + 1)]
+        assert columns[0] >= 6 * h and columns[1] < 6 * (h + 1)
+    assert max_order(5, 1, 3, "po-moesp") == 12
+    assert max_order(5, 1, 3, "pi-moesp") == 5

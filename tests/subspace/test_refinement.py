@@ -1,0 +1,54 @@
+"""Gauss-Newton steps on the simulation error."""
+
+import numpy as np
+
+from lpvlearn.subspace.identification import identify
+from lpvlearn.subspace.refinement import refine_simulation
+from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.simulation_fit import simulation_fit
+from lpvlearn.systems.simulation import lti_response
+
+from ..conftest import modes
+from .conftest import example, experiment
+
+
+def test_refinement_is_efficient_where_the_subspace_step_is_not():
+    """A pole much slower than the horizon, as on the arm."""
+    A = modes(0.998, 0.95 * np.exp(0.05j))
+    gains = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        system = (A, np.eye(3), np.ones((1, 3)), np.zeros((1, 3)))
+        u, y = experiment(rng, system, 2000, noise=0.05)
+        truth = lti_response(*system, u)
+        errors = [
+            np.linalg.norm(
+                lti_response(*identify([(u, y)], 3, 15, refine=r)[:4], u) - truth
+            )
+            for r in (True, False)
+        ]
+        gains.append(errors[0] / errors[1])
+    assert np.median(gains) < 0.9
+
+
+def test_refinement_stops_at_a_stationary_point_of_the_simulation_error(rng):
+    system = example(rng, modes(0.9 * np.exp(0.5j), 0.8), 1, 1)
+    u, y = experiment(rng, system, 200, noise=0.2)
+    records = [Record(u.T.copy(), y.T.copy())]
+    start = simulation_fit(system[0], system[2], records)
+    model, n_iter = refine_simulation(start, records)
+    assert n_iter > 0 and model.loss < start.loss
+
+    def loss(A, C):
+        return simulation_fit(A, C, records).loss
+
+    for _ in range(10):
+        dA, dC = rng.standard_normal(model.A.shape), rng.standard_normal((1, 3))
+        h = 1e-5
+        slope = loss(model.A + h * dA, model.C + h * dC) - loss(
+            model.A - h * dA, model.C - h * dC
+        )
+        start_slope = loss(start.A + h * dA, start.C + h * dC) - loss(
+            start.A - h * dA, start.C - h * dC
+        )
+        assert abs(slope) < max(0.1 * abs(start_slope), 1e-4 * model.loss)
