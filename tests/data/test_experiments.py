@@ -1,4 +1,4 @@
-"""Tables read as experiments: roles, order of time, operating points, errors."""
+"""Tables read as experiments: roles, order of time, errors."""
 
 import re
 
@@ -17,9 +17,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from sklearn.utils.validation import check_is_fitted
 
 from lpvlearn import from_trajectories
-from lpvlearn.data.experiments import Experiment, read_experiments, read_outputs
-from lpvlearn.data.operating_points import _check_local, group_operating_points
-from lpvlearn.data.timestamps import check_uniform_time, time_in_seconds
+from lpvlearn.data.experiments import read_experiments, read_outputs
 
 ROLES = {"scheduling": "kappa", "experiment": "run", "time": "t"}
 
@@ -224,55 +222,6 @@ def test_output_names_come_from_y():
 # -------------------------------------------------------------------------------- time
 
 
-@pytest.mark.parametrize(
-    "stamps",
-    [
-        np.arange(3000) / 1000,
-        np.arange(3000) / 300,
-        np.round(np.arange(3000) / 300, 3),
-        np.round(5.1234 + np.arange(3000) / 440.0, 3),
-        (np.arange(3000) * 1e-3).astype(np.float32),
-        (np.arange(3000) * 1e-3).astype(np.float32).astype(float),
-        1e6 + np.arange(3000) / 1000,
-        np.cumsum(np.full(3000, 1e-3)),
-        np.arange(3000),
-        pd.date_range("2024-05-01", periods=3000, freq="10ms"),
-        pd.date_range("2024-05-01", periods=3000, freq="10ms", tz="Europe/Paris"),
-        pd.to_timedelta(np.arange(3000) * 100, unit="us"),
-    ],
-    ids=[
-        "exact", "thirds", "3 decimals", "3 decimals, offset", "float32",
-        "float32 as double", "large offset", "summed", "integers", "datetime",
-        "time zone", "timedelta",
-    ],
-)  # fmt: skip
-def test_even_time_passes_however_it_is_stored(stamps):
-    seconds = time_in_seconds(stamps, "t")
-    step = check_uniform_time(seconds, column="t", experiment=0)
-    expected = float(seconds[-1] - seconds[0]) / 2999
-    np.testing.assert_allclose(step, expected, rtol=1e-6)
-    # One sample lost is seen in all of them.
-    with pytest.raises(ValueError, match="evenly spaced"):
-        check_uniform_time(np.delete(seconds, 1500), column="t", experiment=0)
-
-
-@pytest.mark.parametrize(
-    "stamps",
-    [
-        [0, 1, 2, 4],
-        [0.0, 0.1, 0.25, 0.3],
-        [0.0, 0.1, 0.1, 0.2],
-        [0.3, 0.2, 0.1],
-        np.concatenate([np.arange(100) / 10, 9.9 + 0.11 * np.arange(1, 100)]),
-        np.round(np.cumsum(np.r_[np.full(500, 1.00), np.full(500, 1.06)]), 1),
-    ],
-    ids=["gap", "jitter", "repeat", "reversed", "two paces", "two rounded paces"],
-)
-def test_uneven_time_raises_and_says_what_to_use(stamps):
-    with pytest.raises(ValueError, match="GroupKFold.*TimeSeriesSplit.*resample"):
-        check_uniform_time(np.asarray(stamps, float), column="t", experiment=0)
-
-
 def test_a_clock_of_single_samples_has_no_step():
     X, y = make_table(n_samples=1)
     assert [run.sampling_time for run in read(X, y, **ROLES)] == [None] * 3
@@ -372,92 +321,6 @@ def test_bad_tables_raise_and_name_the_cause(make, roles, words):
         read(X, y, **{**ROLES, **roles})
     for word in words:
         assert word in str(raised.value)
-
-
-# -------------------------------------------------------------------- operating points
-
-
-def _runs(values, spread=0.0, points=None):
-    wiggle = spread * np.array([-0.5, 0.5, 0.0])[:, None]
-    return [
-        Experiment(
-            label=k,
-            rows=np.arange(3 * k, 3 * k + 3),
-            inputs=np.ones((3, 1)),
-            scheduling=np.atleast_1d(value) + wiggle,
-            operating_point=None if points is None else points[k],
-        )
-        for k, value in enumerate(values)
-    ]
-
-
-def test_realizations_of_a_point_are_grouped_whatever_their_order():
-    rng = np.random.default_rng(1)
-    truth = np.repeat([-0.9, 0.1, 0.8], 10)
-    order = rng.permutation(30)
-    values = truth + rng.uniform(-2e-3, 2e-3, 30)
-    index, kappa = group_operating_points(_runs(values[order], spread=0.01))
-    np.testing.assert_array_equal(index, np.repeat([0, 1, 2], 10)[order])
-    np.testing.assert_allclose(kappa.ravel(), values.reshape(3, 10).mean(axis=1))
-
-
-def test_points_of_two_scheduling_variables_need_both_to_agree():
-    values = [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, 1.0]]
-    index, kappa = group_operating_points(_runs(values))
-    np.testing.assert_array_equal(kappa, [[0, 0], [0, 1], [1, 0]])
-    np.testing.assert_array_equal(index, [0, 1, 2, 1])
-
-
-def test_labels_of_operating_points_come_before_scheduling_values():
-    index, kappa = group_operating_points(
-        _runs([0.5, 0.2, 0.2], points=["hot", "cold", "hot"])
-    )
-    np.testing.assert_array_equal(index, [1, 0, 1])
-    np.testing.assert_allclose(kappa, [[0.2], [0.35]])
-
-
-def test_a_tolerance_is_in_units_of_the_scheduling_variable():
-    values = [0.0, 0.3, 1.0]
-    assert group_operating_points(_runs(values), tol=0.29)[1].shape == (3, 1)
-    assert group_operating_points(_runs(values), tol=0.31)[1].shape == (2, 1)
-    assert group_operating_points(_runs([1.0, 1.0]), tol=0)[1].shape == (1, 1)
-
-
-def test_without_scheduling_there_is_one_point():
-    X, y = make_table()
-    index, kappa = group_operating_points(read(X, y, experiment="run", time="t"))
-    np.testing.assert_array_equal(index, [0, 0, 0])
-    assert kappa.shape == (1, 0)
-
-
-@pytest.mark.parametrize(
-    ("values", "tol", "words"),
-    [
-        (np.linspace(0, 1, 200), None, ["200 experiments", "chain", "scheduling_tol"]),
-        ([0.0, 1.0], -1, ["scheduling_tol", "Got -1"]),
-        ([0.0, 1.0], [0.1, 0.1], ["scheduling_tol", "variable (1)"]),
-    ],
-)
-def test_unclear_groups_raise(values, tol, words):
-    with pytest.raises(ValueError) as raised:
-        group_operating_points(_runs(values), tol=tol)
-    for word in words:
-        assert word in str(raised.value)
-
-
-def test_local_experiments_pass_and_sweeps_raise():
-    runs = _runs([0.0, 1.0, 2.0], spread=0.1)
-    _, kappa = group_operating_points(runs)
-    _check_local(runs, kappa)
-    sweep = _runs([0.0, 1.0, 2.0], spread=1.5)
-    with pytest.raises(ValueError, match=r"Experiment 0 must be local.*1\.5.*\(2\)"):
-        _check_local(sweep, kappa)
-
-
-def test_a_single_sweep_is_not_local():
-    (run,) = runs = _runs([1.0], spread=1.0)
-    with pytest.raises(ValueError, match="must be local"):
-        _check_local(runs, run.scheduling.mean(axis=0, keepdims=True))
 
 
 # ------------------------------------------------------------------------ trajectories

@@ -1,0 +1,92 @@
+"""Operating points: experiments grouped, and refused where they are not local."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lpvlearn.data.experiments import Experiment
+from lpvlearn.data.operating_points import _check_local, group_operating_points
+
+
+def _runs(values, spread=0.0, points=None):
+    wiggle = spread * np.array([-0.5, 0.5, 0.0])[:, None]
+    return [
+        Experiment(
+            label=k,
+            rows=np.arange(3 * k, 3 * k + 3),
+            inputs=np.ones((3, 1)),
+            scheduling=np.atleast_1d(value) + wiggle,
+            operating_point=None if points is None else points[k],
+        )
+        for k, value in enumerate(values)
+    ]
+
+
+def test_realizations_of_a_point_are_grouped_whatever_their_order():
+    rng = np.random.default_rng(1)
+    truth = np.repeat([-0.9, 0.1, 0.8], 10)
+    order = rng.permutation(30)
+    values = truth + rng.uniform(-2e-3, 2e-3, 30)
+    index, kappa = group_operating_points(_runs(values[order], spread=0.01))
+    np.testing.assert_array_equal(index, np.repeat([0, 1, 2], 10)[order])
+    np.testing.assert_allclose(kappa.ravel(), values.reshape(3, 10).mean(axis=1))
+
+
+def test_points_of_two_scheduling_variables_need_both_to_agree():
+    values = [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, 1.0]]
+    index, kappa = group_operating_points(_runs(values))
+    np.testing.assert_array_equal(kappa, [[0, 0], [0, 1], [1, 0]])
+    np.testing.assert_array_equal(index, [0, 1, 2, 1])
+
+
+def test_labels_of_operating_points_come_before_scheduling_values():
+    index, kappa = group_operating_points(
+        _runs([0.5, 0.2, 0.2], points=["hot", "cold", "hot"])
+    )
+    np.testing.assert_array_equal(index, [1, 0, 1])
+    np.testing.assert_allclose(kappa, [[0.2], [0.35]])
+
+
+def test_a_tolerance_is_in_units_of_the_scheduling_variable():
+    values = [0.0, 0.3, 1.0]
+    assert group_operating_points(_runs(values), tol=0.29)[1].shape == (3, 1)
+    assert group_operating_points(_runs(values), tol=0.31)[1].shape == (2, 1)
+    assert group_operating_points(_runs([1.0, 1.0]), tol=0)[1].shape == (1, 1)
+
+
+def test_without_scheduling_there_is_one_point():
+    runs = [replace(run, scheduling=None) for run in _runs([0.1, 0.2, 0.3])]
+    index, kappa = group_operating_points(runs)
+    np.testing.assert_array_equal(index, [0, 0, 0])
+    assert kappa.shape == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("values", "tol", "words"),
+    [
+        (np.linspace(0, 1, 200), None, ["200 experiments", "chain", "scheduling_tol"]),
+        ([0.0, 1.0], -1, ["scheduling_tol", "Got -1"]),
+        ([0.0, 1.0], [0.1, 0.1], ["scheduling_tol", "variable (1)"]),
+    ],
+)
+def test_unclear_groups_raise(values, tol, words):
+    with pytest.raises(ValueError) as raised:
+        group_operating_points(_runs(values), tol=tol)
+    for word in words:
+        assert word in str(raised.value)
+
+
+def test_local_experiments_pass_and_sweeps_raise():
+    runs = _runs([0.0, 1.0, 2.0], spread=0.1)
+    _, kappa = group_operating_points(runs)
+    _check_local(runs, kappa)
+    sweep = _runs([0.0, 1.0, 2.0], spread=1.5)
+    with pytest.raises(ValueError, match=r"Experiment 0 must be local.*1\.5.*\(2\)"):
+        _check_local(sweep, kappa)
+
+
+def test_a_single_sweep_is_not_local():
+    (run,) = runs = _runs([1.0], spread=1.0)
+    with pytest.raises(ValueError, match="must be local"):
+        _check_local(runs, run.scheduling.mean(axis=0, keepdims=True))
