@@ -290,10 +290,6 @@ def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) ->
     experiments : sequence of Experiment
     names : sequence
         Names of the outputs.
-
-    Raises
-    ------
-    ValueError
     """
     outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
     constant = np.ptp(outputs, axis=0) == 0

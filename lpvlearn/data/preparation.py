@@ -214,10 +214,6 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
         Arrays (n_samples, n_inputs) and (n_samples, n_outputs), one per experiment.
     names : sequence, default=None
         Of the inputs; None numbers them.
-
-    Raises
-    ------
-    ValueError
     """
     inputs = [u for u, _ in pairs]
     if max(len(u) for u in inputs) < 2:

@@ -196,10 +196,6 @@ def start_hankel_sum(
     n_inputs, horizon : int
     past_outputs : bool, default=True
 
-    Returns
-    -------
-    HankelSum
-
     Examples
     --------
     >>> import numpy as np
@@ -230,10 +226,6 @@ def extend_hankel_sum(state: HankelSum, samples: Array, *, starts: bool) -> Hank
     samples : ndarray of shape (n_samples, n_channels)
     starts : bool
         Whether they begin a new experiment rather than continue the last one.
-
-    Returns
-    -------
-    HankelSum
     """
     z = samples if starts else np.vstack([state.tail, samples])
     n_rows = 2 * state.horizon

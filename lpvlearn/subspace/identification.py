@@ -132,10 +132,6 @@ def scale_records(experiments: Sequence[tuple[Array, Array]]) -> ScaledRecords:
     ----------
     experiments : sequence of (u, y)
         Shapes (n_samples, n_inputs) and (n_samples, n_outputs).
-
-    Returns
-    -------
-    ScaledRecords
     """
     su = _root_mean_square([u for u, _ in experiments])
     sy = _root_mean_square([y for _, y in experiments])
@@ -154,10 +150,6 @@ def max_horizon(lengths: Sequence[int], n_inputs: int, n_outputs: int) -> int:
     lengths : sequence of int
         Samples of every experiment.
     n_inputs, n_outputs : int
-
-    Returns
-    -------
-    int
 
     Examples
     --------
@@ -220,10 +212,6 @@ def subspace_of(
     engine : {"cholesky", "qr"}
     correlations : sequence of ndarray, default=None
         From `correlations_of`, to be shared by several horizons.
-
-    Returns
-    -------
-    ObservabilitySubspace
     """
     m, ny = len(records[0].u), len(records[0].y)
     factor = data_factor(
@@ -249,17 +237,6 @@ def realize(
     nothing in simulation error, or always with ``enforce_stability``. With
     ``n_noise_states`` the subspace is read at that much a higher order, and only the
     states that the inputs reach are kept.
-
-    Parameters
-    ----------
-    subspace : ObservabilitySubspace
-    records : sequence of Record
-    order : int
-    settings : Settings
-
-    Returns
-    -------
-    Realization
     """
     enforce, free = settings.enforce_stability, settings.free
     A, C = _state_pair(subspace, records, order, settings)
@@ -347,10 +324,6 @@ def identify(
         How the data are compressed.
     scaled : ScaledRecords, default=None
         The experiments scaled, where that has been done.
-
-    Returns
-    -------
-    Identified
 
     Examples
     --------

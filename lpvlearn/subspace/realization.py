@@ -71,10 +71,6 @@ def observability_subspace(
         measurement noise (Verhaegen, 1993). "po-moesp": past inputs and outputs
         (Verhaegen, 1994). "n4sid", "cva": the same past, weighted by the oblique
         projection or to canonical correlations (Van Overschee and De Moor, 1995).
-
-    Returns
-    -------
-    ObservabilitySubspace
     """
     n_future, n_last = horizon * n_inputs, horizon * n_outputs
     past = slice(n_future, factor.shape[0] - n_last)

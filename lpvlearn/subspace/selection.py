@@ -191,10 +191,6 @@ def select(
         None is to be chosen.
     method, feedthrough, refine, enforce_stability, n_noise_states, initial_states
         As in `identify`.
-
-    Returns
-    -------
-    Selection
     """
     m, ny = len(records[0].u), len(records[0].y)
     free = freedom(ny, m, feedthrough, initial_states)
