@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..exceptions import ExtrapolationWarning
-from ..models.statespace import StateSpace
-from ..models.system_matrix import sorted_poles
+from ..models.statespace import StateSpace, sorted_poles
 from ..structures.structure import GrayBoxStructure
-from ..systems.simulation import sample_zoh, state_trajectory, tabulate
+from ..systems.sampling import sample_zoh
+from ..systems.simulation import state_trajectory
+from ..systems.tabulation import tabulate
 from ..validation import input_samples, positive_time, real_array, state_vector
 
 Array = NDArray[np.float64]
