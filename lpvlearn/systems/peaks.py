@@ -175,8 +175,11 @@ class PeakRefiner:
         margin = 3e-3 * (upper - lower)
         lower, upper = max(lower - margin, 0.0), min(upper + margin, self.end)
         for _ in range(_MAX_NEWTON):
-            jet = self.engine.modal_jet(w) if quick else self.engine.jet(w)
-            value, slope, bend = square_jet(*jet)
+            if quick:
+                G, G1, G2 = self.engine.derivatives(np.array([w]))
+                value, slope, bend = square_jet(G[:, :, 0], G1[:, :, 0], G2[:, :, 0])
+            else:
+                value, slope, bend = square_jet(*self.engine.jet(w))
             if value == 0.0:
                 break
             if not quick:
