@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from .response import FrequencyEngine
 from .singular_values import sigma_max, square_derivatives, square_jet
 
-__all__ = ["Peak", "PeakRefiner"]
-
 _TINY = float(np.finfo(float).tiny)
 
 _EPS = float(np.finfo(float).eps)
@@ -34,7 +32,7 @@ _MAX_NEWTON = 40
 # Stands for an infinite frequency, where nothing but the feedthrough is left.
 _FAR = 1e200
 
-_FRACTIONS = (np.arange(10) + 0.5) / 10
+TENTHS = (np.arange(10) + 0.5) / 10
 
 # Maxima refined per round, and how far below the best their samples may be.
 _MAX_CANDIDATES = 6
@@ -217,7 +215,7 @@ class PeakRefiner:
         if len(kept) < len(peaks):  # no sample dips between some of them: look closer
             at = np.array([peak.frequency for peak in peaks])
             at = at[at < np.inf]
-            mesh = at[:-1] + np.diff(at) * _FRACTIONS[:, None]
+            mesh = at[:-1] + np.diff(at) * TENTHS[:, None]
             closer = np.concatenate((w, mesh.ravel(), starts[1:].ravel()))
             kept = self._separated(peaks, *self.sampled(closer))
         return self._certain(kept)

@@ -42,29 +42,10 @@ def frequency_response(
     .. math:: G(j\omega) = C (j\omega I - A)^{-1} B + D, \qquad
               G(e^{j\omega \Delta t}) \text{ in discrete time.}
 
-    Parameters
-    ----------
-    A, B, C, D : ndarrays of floats
-        Shapes (n, n), (n, n_inputs), (n_outputs, n), (n_outputs, n_inputs).
-    omega : array_like of shape (n_frequencies,)
-        Frequencies in rad/s. In continuous time infinity is allowed and gives D.
-        At a pole on the axis every entry of the response is infinite.
-    dt : float or None, default None
-        Sampling time in seconds; None for continuous time.
-
-    Returns
-    -------
-    G : ndarray of shape (n_frequencies, n_outputs, n_inputs), complex
-
-    Raises
-    ------
-    ValueError
-        If a discrete-time response is asked for at infinite frequency.
-
-    Notes
-    -----
-    Modal coordinates of the equilibrated system, checked for cancellation; the
-    frequencies where digits would be lost are solved one by one.
+    The result has shape (n_frequencies, n_outputs, n_inputs). Infinite frequencies
+    give D (a ValueError in discrete time); at a pole on the axis every entry is
+    infinite. Modal coordinates of the equilibrated system, checked for cancellation;
+    the frequencies where digits would be lost are solved one by one.
 
     Examples
     --------
@@ -106,12 +87,7 @@ class FrequencyEngine:
     Frequencies stand on the last axis: results have shape
     (n_outputs, n_inputs, n_frequencies). Infinity is not handled here.
 
-    Parameters
-    ----------
-    A, B, C, D : ndarrays of floats
-        Shapes (n, n), (n, n_inputs), (n_outputs, n), (n_outputs, n_inputs).
-    discrete : bool, default False
-        Whether frequencies are angles on the unit circle (rad per sample).
+    If `discrete`, frequencies are angles on the unit circle (rad per sample).
 
     Attributes
     ----------
@@ -347,16 +323,8 @@ def equilibrated(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Scale the states by powers of two so that rows and columns of A agree.
 
-    The transfer function is unchanged to the last bit, as only exponents move.
-
-    Parameters
-    ----------
-    A, B, C : ndarrays of shape (n, n), (n, n_inputs), (n_outputs, n)
-
-    Returns
-    -------
-    A, B, C : ndarrays
-        The scaled matrices (the same objects where nothing is to be scaled).
+    The transfer function is unchanged to the last bit, as only exponents move. Where
+    nothing is to be scaled the same objects are returned.
 
     Examples
     --------
@@ -393,21 +361,9 @@ def pole_grid(
 ) -> NDArray[np.float64]:
     """Frequencies that show every pole: logarithmic, and more around the poles.
 
-    Parameters
-    ----------
-    rates : ndarray of shape (n,)
-        Poles in rad/s.
-    low, high : float
-        Ends of the logarithmic part, rad/s.
-    n_points : int
-        Size of the logarithmic part.
-    offsets : sequence of float
-        Places around the frequency of each pole, in units of its decay.
-
-    Returns
-    -------
-    ndarray
-        Increasing; may reach beyond `low` and `high` around a pole.
+    `n_points` are spread from `low` to `high`; `offsets` are places around the
+    frequency of each pole (`rates`, in rad/s), in units of its decay. The points are
+    sorted, and may reach beyond the ends around a pole.
 
     Examples
     --------

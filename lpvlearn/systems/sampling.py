@@ -41,22 +41,8 @@ def sample_zoh(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
 
     ``exp([A B; 0 0] dt) = [Ad Bd; 0 I]``: exact for inputs held over `dt`.
 
-    Parameters
-    ----------
-    A : ndarray of shape (..., n, n)
-    B : ndarray of shape (..., n, n_inputs)
-    dt : float
-        Sampling time, seconds.
-
-    Returns
-    -------
-    Ad, Bd : ndarray
-        Shapes as A and B; the output matrix and the feedthrough do not change.
-
-    Raises
-    ------
-    ValueError
-        If the exponential overflows (an unstable pole, far too fast for `dt`).
+    The output matrix and the feedthrough do not change. Raises a ValueError if the
+    exponential overflows (an unstable pole, far too fast for `dt`).
 
     Examples
     --------
@@ -116,18 +102,8 @@ def d2c_zoh(A: Array, B: Array, C: Array, dt: float) -> tuple[Array, Array, Arra
     literature, it becomes a complex pair at the Nyquist frequency: the response at
     the sampling instants stays exact and the order grows by one (with a warning).
 
-    Parameters
-    ----------
-    A, B, C : ndarray
-        Shapes (n, n), (n, n_inputs), (n_outputs, n).
-    dt : float
-        Sampling time, seconds.
-
-    Returns
-    -------
-    A, B, C : ndarray
-        The continuous model in the same state basis (the states of poles on the
-        negative axis come twice); the feedthrough does not change.
+    The model keeps its state basis (the states of poles on the negative axis come
+    twice) and its feedthrough.
 
     Raises
     ------
@@ -240,21 +216,7 @@ def c2d_tustin(
 ) -> tuple[Array, Array, Array, Array]:
     """Bilinear transformation ``s = (2/dt) (z - 1) / (z + 1)``.
 
-    Parameters
-    ----------
-    A, B, C, D : ndarray
-        Shapes (n, n), (n, n_inputs), (n_outputs, n), (n_outputs, n_inputs).
-    dt : float
-        Sampling time, seconds.
-
-    Returns
-    -------
-    A, B, C, D : ndarray
-
-    Raises
-    ------
-    ValueError
-        If a pole is at ``2/dt``, which the transformation sends to infinity.
+    Raises a ValueError if a pole is at ``2/dt``, which it sends to infinity.
 
     Examples
     --------
@@ -277,12 +239,7 @@ def d2c_tustin(
 ) -> tuple[Array, Array, Array, Array]:
     """Inverse of `c2d_tustin`: ``z = (1 + s dt / 2) / (1 - s dt / 2)``.
 
-    Parameters, shapes and results are those of `c2d_tustin`.
-
-    Raises
-    ------
-    ValueError
-        If a pole is at -1, which the transformation sends to infinity.
+    Raises a ValueError if a pole is at -1, which it sends to infinity.
 
     Examples
     --------

@@ -83,17 +83,8 @@ def lti_response(
 
     ``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``.
 
-    Parameters
-    ----------
-    A, B, C, D : ndarray
-        Shapes (n, n), (n, n_inputs), (n_outputs, n), (n_outputs, n_inputs).
-    u : ndarray of shape (n_samples, n_inputs)
-    x0 : ndarray of shape (n,), default=None
-        Initial state; None is rest.
-
-    Returns
-    -------
-    ndarray of shape (n_samples, n_outputs)
+    From inputs of shape (n_samples, n_inputs) and an initial state (None is rest) to
+    outputs of shape (n_samples, n_outputs).
     """
     return state_trajectory(A, u @ B.T, x0) @ C.T + u @ D.T
 
@@ -101,15 +92,7 @@ def lti_response(
 def free_responses(A: Array, C: Array, n_samples: int) -> Array:
     """Outputs ``C A^k`` of a discrete-time model from every unit initial state.
 
-    Parameters
-    ----------
-    A : ndarray of shape (order, order)
-    C : ndarray of shape (n_outputs, order)
-    n_samples : int
-
-    Returns
-    -------
-    ndarray of shape (n_samples, n_outputs, order)
+    The result has shape (n_samples, n_outputs, n).
     """
     # (C A^k)^T = (A^T)^k C^T takes one run per output instead of one per state.
     rest = np.zeros((n_samples, *C.T.shape))
@@ -124,14 +107,14 @@ def estimate_initial_state(responses: Array, error: Array) -> Array:
 
     Parameters
     ----------
-    responses : ndarray of shape (n_samples, n_outputs, order)
+    responses : ndarray of shape (n_samples, n_outputs, n)
         Outputs from every unit initial state.
     error : ndarray of shape (n_samples, n_outputs) or (n_samples, n_outputs, n_runs)
         Outputs minus the simulation from rest; several runs share the responses.
 
     Returns
     -------
-    ndarray of shape (order,) or (order, n_runs)
+    ndarray of shape (n,) or (n, n_runs)
 
     Examples
     --------

@@ -11,28 +11,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["sigma_max", "square_derivatives", "square_jet"]
-
 _TINY = float(np.finfo(float).tiny)
 
-# Relative gap below which two singular values count as one.
+# Relative gap below which two singular values count as one: rounding of their squares.
 _TIE = 1e-14
-
-
-def _tall(G: NDArray) -> NDArray:
-    return G if G.shape[0] >= G.shape[1] else G.conj().swapaxes(0, 1)
 
 
 def sigma_max(G: NDArray) -> NDArray:
     """Largest singular value of every response.
-
-    Parameters
-    ----------
-    G : ndarray of shape (n_outputs, n_inputs, n_frequencies)
-
-    Returns
-    -------
-    sigma : ndarray of shape (n_frequencies,)
 
     Examples
     --------
@@ -58,16 +44,9 @@ def square_derivatives(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Square of the largest singular value and its two derivatives.
 
-    Parameters
-    ----------
-    G, G1, G2 : ndarrays of shape (n_outputs, n_inputs, n_frequencies)
-        The response and its first and second derivative in frequency.
-
-    Returns
-    -------
-    value, slope, curvature : ndarrays of shape (n_frequencies,)
-        Where the largest singular value is not simple and not smooth, the
-        curvature is large and positive: such a point is never a maximum.
+    From the response and its two derivatives in frequency. Where the largest singular
+    value is not simple and not smooth, the curvature is large and positive: such a
+    point is never a maximum.
 
     Examples
     --------
@@ -85,10 +64,14 @@ def square_derivatives(
         slope = 2.0 * (conj * G1).real.sum((0, 1))
         bend = (G1.real**2 + G1.imag**2 + (conj * G2).real).sum((0, 1))
         return value, slope, 2.0 * bend
-    G, G1, G2 = _tall(G), _tall(G1), _tall(G2)
+    G, G1, G2 = (_tall(M) for M in (G, G1, G2))
     if smaller == 2:
         return _derivatives_of_two(G, G1, G2)
     return _derivatives_by_svd(*(M.transpose(2, 0, 1) for M in (G, G1, G2)))
+
+
+def _tall(G: NDArray) -> NDArray:
+    return G if G.shape[0] >= G.shape[1] else G.conj().swapaxes(0, 1)
 
 
 def _derivatives_of_two(
@@ -135,16 +118,10 @@ def _derivatives_by_svd(
 
 
 def square_jet(G: NDArray, G1: NDArray, G2: NDArray) -> tuple[float, float, float]:
-    """`square_derivatives` at one frequency, in scalars where they are faster.
+    """`square_derivatives` at one frequency: matrices without the last axis.
 
-    Parameters
-    ----------
-    G, G1, G2 : ndarrays of shape (n_outputs, n_inputs)
-        The response and its first and second derivative in frequency.
-
-    Returns
-    -------
-    value, slope, curvature : floats
+    In scalars where there are two channels, 7 us instead of 23: a norm takes four to
+    eight of these steps one after the other, in 0.35 ms.
 
     Examples
     --------
