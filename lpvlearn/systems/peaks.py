@@ -13,31 +13,44 @@ from .singular_values import sigma_max, square_derivatives, square_jet
 
 _TINY = float(np.finfo(float).tiny)
 
-_EPS = float(np.finfo(float).eps)
-
-# Two maxima are one unless the singular value dips by this much between them.
+# Two maxima are one unless the singular value dips by this much between them: above
+# the rounding of a modal sum, 1e-13 to 1e-12 of its size.
 _DIP = 1e-11
 
-# Closer than this, in units of the width, a dip between two would be smaller.
+# Closer than this, in units of the width, a dip between two would be smaller: a
+# parabola falls by the square.
 _SAME = 1e-6
+
+# Offset from a peak, in units of its width, up to which its parabola is trusted to a
+# few parts in 1e7.
+_COVERED = 1e-3
 
 # Modal values with a smaller bound on their relative error are not solved anew.
 _TRUSTED = 1e-9
 
-# Rounds of subdivision where samples leave the sign of the slope in doubt.
+# Rounds of subdivision, by four each, where samples leave the sign of the slope in
+# doubt: a thousandth of the distance of two samples.
 _MAX_SPLITS = 5
 
+# Newton's method needs three to six steps; the rest is for bisection of a bracket.
 _MAX_NEWTON = 40
+
+# Convergence is quadratic: a step that gains this part of the value is the last.
+_LAST_GAIN = 1e-9
 
 # Stands for an infinite frequency, where nothing but the feedthrough is left.
 _FAR = 1e200
 
+# Places of the samples in an interval that may hold maxima: ten tell three apart.
 TENTHS = (np.arange(10) + 0.5) / 10
 
-# Maxima refined per round, and how far below the best their samples may be.
+# Maxima refined per round, and how far below the best they may be expected: the
+# parabola through samples is good to a few per cent, and the level set shows the rest.
 _MAX_CANDIDATES = 6
-
 _SAMPLED = 0.02
+
+# How far a search may go from the last sample towards infinity, as a factor.
+_REACH = 1e3
 
 
 class Peak(NamedTuple):
@@ -49,7 +62,7 @@ class Peak(NamedTuple):
 
     def covers(self, frequency: float) -> bool:
         """Whether the gain there is that of the peak, up to a few parts in 1e7."""
-        return abs(frequency - self.frequency) <= 1e-3 * self.width
+        return abs(frequency - self.frequency) <= _COVERED * self.width
 
 
 class _Bracket(NamedTuple):
@@ -133,8 +146,8 @@ class PeakRefiner:
             return _Bracket(at, at, at, at, top, top)
         lower, upper = float(w[k - 1]), float(w[k + 1])
         if math.isinf(upper):
-            return _Bracket(at, at, lower, 1e3 * at, top, top)
-        least = 1e-6 * top + _TINY
+            return _Bracket(at, at, lower, _REACH * at, top, top)
+        least = 1e-6 * top + _TINY  # keeps 1 / s^2 finite beside a zero of G
         back, ahead = at - lower, upper - at
         fall = ((top / max(float(s[k - 1]), least)) ** 2 - 1.0) / back
         rise = ((top / max(float(s[k + 1]), least)) ** 2 - 1.0) / ahead
@@ -144,6 +157,7 @@ class PeakRefiner:
         if not lower < vertex < upper:
             return _Bracket(at, at, lower, upper, top, top)
         dip = 0.5 * slope * slope / bend
+        # A parabola that promises more than the root of two has missed a narrow peak.
         expected = top / math.sqrt(max(1.0 - dip, 0.5))
         return _Bracket(at, vertex, lower, upper, top, expected)
 
@@ -152,7 +166,7 @@ class PeakRefiner:
         if bracket.lower == bracket.upper:
             return Peak(bracket.at, self.value(bracket.at), 0.0)
         peak = self._climb(*bracket[1:4], quick=self.engine.is_modal)
-        if peak.value >= bracket.sampled * (1.0 - 1e-9):
+        if peak.value >= bracket.sampled * (1.0 - _TRUSTED):
             return peak
         # Newton's method has left a peak on another branch, or modes are wrong.
         again = self._climb(bracket.at, *bracket[2:4])
@@ -170,7 +184,7 @@ class PeakRefiner:
         The values are those of factorisations; if `quick`, only the first step
         is by modes. Rounding may have moved the bracket a little off the peak.
         """
-        margin = 3e-3 * (upper - lower)
+        margin = 3e-3 * (upper - lower)  # rounding is far below, another peak above
         lower, upper = max(lower - margin, 0.0), min(upper + margin, self.end)
         for _ in range(_MAX_NEWTON):
             if quick:
@@ -185,9 +199,9 @@ class PeakRefiner:
             bend = 2.0 * slope * slope / value - bend
             step = slope / bend if bend > 0.0 else math.inf
             good = lower <= w + step <= upper
+            # Without a step the slope must be flat over a thousand brackets.
             gain = abs(slope * (step if good else 1e3 * (upper - lower)))
-            # Convergence is quadratic: a step that gains 1e-9 is the last.
-            if gain <= 1e-9 * value and not quick:
+            if gain <= _LAST_GAIN * value and not quick:
                 if good:
                     w, value = w + step, value + 0.5 * gain
                 break
@@ -245,7 +259,7 @@ class PeakRefiner:
         k = at[inner]
         tops = (s[k] >= floor) & (s[k] >= s[k - 1]) & (s[k] >= s[k + 1])
         inner, k = inner[tops], k[tops]
-        upper = np.minimum(w[k + 1], 1e3 * w[k])
+        upper = np.minimum(w[k + 1], _REACH * w[k])
         found = [np.concatenate((jets[:, inner], [w[k - 1], upper]))]
         whole = np.flatnonzero(at[1:] == at[:-1] + 1)
         left, right = jets[:, whole], jets[:, whole + 1]
@@ -267,7 +281,10 @@ class PeakRefiner:
         return np.array((w, *square_derivatives(*self.engine.derivatives(w))))
 
     def _newton(self, starts: NDArray) -> NDArray:
-        """As `_climb`, by modes and from many points: frequency, value and width."""
+        """As `_climb`, by modes and from many points: frequency, value and width.
+
+        Twice the same steps: scalars make `_climb` three times as fast on one point.
+        """
         w, lower, upper = starts
         for _ in range(_MAX_NEWTON):
             value, slope, bend = square_derivatives(*self.engine.derivatives(w))
@@ -279,9 +296,8 @@ class PeakRefiner:
             step = slope / bend
             target = w + step
             good = concave & (target >= lower) & (target <= upper)
-            # Convergence is quadratic: a step that gains 1e-9 is the last.
             gain = np.abs(slope * np.where(good, step, 1e3 * (upper - lower)))
-            if (gain <= 1e-9 * value).all():
+            if (gain <= _LAST_GAIN * value).all():
                 w = np.where(good, target, w)
                 value = np.where(good, value + 0.5 * gain, value)
                 break
@@ -317,7 +333,8 @@ class PeakRefiner:
 
 def _is_known(bracket: _Bracket, peaks: list[Peak]) -> bool:
     return any(
-        peak.covers(bracket.vertex) and bracket.expected <= peak.value * (1.0 + 1e-9)
+        peak.covers(bracket.vertex)
+        and bracket.expected <= peak.value * (1.0 + _TRUSTED)
         for peak in peaks
     )
 
@@ -373,6 +390,7 @@ def _may_turn_twice(left: NDArray, right: NDArray) -> NDArray:
     least = np.minimum(np.abs(left[2]), np.abs(right[2]))
     ahead = sign * (left[2] + h * left[3])
     behind = sign * (right[2] - h * right[3])
+    # A cubic that keeps a tenth of the slope at both ends in its middle does not turn.
     doubtful = (sign * steepness < 0.1 * least) | (ahead < 0) | (behind < 0)
     matters = least * h > _DIP * left[1]
     return (left[2] * right[2] > 0) & doubtful & matters
