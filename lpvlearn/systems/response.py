@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lapack, schur
@@ -357,7 +355,7 @@ def pole_rates(poles: NDArray, dt: float | None) -> NDArray[np.complex128]:
 
 
 def pole_grid(
-    rates: NDArray, low: float, high: float, n_points: int, offsets: Sequence[float]
+    rates: NDArray, low: float, high: float, n_points: int, offsets: ArrayLike
 ) -> NDArray[np.float64]:
     """Frequencies that show every pole: logarithmic, and more around the poles.
 
