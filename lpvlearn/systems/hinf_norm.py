@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from .peaks import TENTHS, Peak, PeakRefiner
+from .peaks import TENTHS, Peak, PeakRefiner, sigma_max
 from .response import FrequencyEngine
-from .singular_values import sigma_max
 
 _EPS = float(np.finfo(float).eps)
 

@@ -1,4 +1,4 @@
-"""Largest singular values and their derivatives."""
+"""Largest singular values, their derivatives and their maxima."""
 
 from __future__ import annotations
 
@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from lpvlearn.systems.peaks import (
+    PeakRefiner,
+    sigma_max,
+    square_derivatives,
+    square_jet,
+)
 from lpvlearn.systems.response import FrequencyEngine
-from lpvlearn.systems.singular_values import sigma_max, square_derivatives, square_jet
 
 from .conftest import random_system
 
@@ -38,3 +43,17 @@ def test_largest_singular_value_equals_the_svd(shape: tuple[int, int]) -> None:
     G = rng.standard_normal((*shape, 9)) + 1j * rng.standard_normal((*shape, 9))
     expected = np.linalg.svd(G.transpose(2, 0, 1), compute_uv=False)[:, 0]
     assert_allclose(sigma_max(G), expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_maxima_between_coarse_samples_are_those_of_a_fine_grid(seed: int) -> None:
+    refiner = PeakRefiner(FrequencyEngine(*random_system(6, seed=seed)))
+    w, s = refiner.sampled(np.append(np.geomspace(1e-2, 1e2, 60), [0.0, np.inf]))
+    floor = 0.5 * s.max()
+    found = [peak for peak in refiner.every(w, s, floor) if 0 < peak.frequency < 1e2]
+    fine = np.geomspace(1e-2, 1e2, 40_000)
+    s = sigma_max(refiner.engine.response(fine))
+    tops = np.flatnonzero((s[1:-1] > s[:-2]) & (s[1:-1] > s[2:])) + 1
+    tops = tops[s[tops] > floor]
+    values = [peak.value for peak in found if peak.value > floor]
+    assert_allclose(values, s[tops], rtol=1e-6)
