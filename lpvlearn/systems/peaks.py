@@ -196,9 +196,9 @@ class PeakRefiner:
         for _ in range(_MAX_NEWTON):
             if quick:
                 G, G1, G2 = self.engine.derivatives(np.array([w]))
-                value, slope, bend = square_jet(G[:, :, 0], G1[:, :, 0], G2[:, :, 0])
+                value, slope, bend = _square_jet(G[:, :, 0], G1[:, :, 0], G2[:, :, 0])
             else:
-                value, slope, bend = square_jet(*self.engine.jet(w))
+                value, slope, bend = _square_jet(*self.engine.jet(w))
             if value == 0.0:
                 break
             if not quick:
@@ -285,7 +285,7 @@ class PeakRefiner:
 
     def _jets(self, w: NDArray) -> NDArray:
         """Frequency, squared singular value, its slope and its curvature."""
-        return np.array((w, *square_derivatives(*self.engine.derivatives(w))))
+        return np.array((w, *_square_derivatives(*self.engine.derivatives(w))))
 
     def _newton(self, starts: NDArray) -> NDArray:
         """As `_climb`, by modes and from many points: frequency, value and width.
@@ -294,7 +294,7 @@ class PeakRefiner:
         """
         w, lower, upper = starts
         for _ in range(_MAX_NEWTON):
-            value, slope, bend = square_derivatives(*self.engine.derivatives(w))
+            value, slope, bend = _square_derivatives(*self.engine.derivatives(w))
             rising = slope > 0.0
             lower, upper = np.where(rising, w, lower), np.where(rising, upper, w)
             bend = 2.0 * slope * slope / (value + _TINY) - bend
@@ -442,7 +442,7 @@ def sigma_max(G: NDArray) -> NDArray:
     return np.linalg.svd(G.transpose(2, 0, 1), compute_uv=False)[:, 0]
 
 
-def square_derivatives(
+def _square_derivatives(
     G: NDArray, G1: NDArray, G2: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Square of the largest singular value and its two derivatives.
@@ -457,7 +457,7 @@ def square_derivatives(
 
     >>> import numpy as np
     >>> g = np.array([[[1 / (1 + 1j)]]])
-    >>> [x[0].real.round(12) for x in square_derivatives(g, -1j * g**2, -2 * g**3)]
+    >>> [x[0].real.round(12) for x in _square_derivatives(g, -1j * g**2, -2 * g**3)]
     [np.float64(0.5), np.float64(-0.5), np.float64(0.5)]
     """
     smaller = min(G.shape[:2])
@@ -520,8 +520,8 @@ def _derivatives_by_svd(
     return s[:, 0] ** 2, 2.0 * s[:, 0] * P[:, 0, 0].real, 2.0 * curvature
 
 
-def square_jet(G: NDArray, G1: NDArray, G2: NDArray) -> tuple[float, float, float]:
-    """`square_derivatives` at one frequency: matrices without the last axis.
+def _square_jet(G: NDArray, G1: NDArray, G2: NDArray) -> tuple[float, float, float]:
+    """`_square_derivatives` at one frequency: matrices without the last axis.
 
     In scalars where there are two channels, 7 us instead of 23: a norm takes four to
     eight of these steps one after the other, in 0.35 ms.
@@ -529,12 +529,12 @@ def square_jet(G: NDArray, G1: NDArray, G2: NDArray) -> tuple[float, float, floa
     Examples
     --------
     >>> import numpy as np
-    >>> square_jet(*(np.diag([k, 1.0]) for k in (3.0, 2.0, 1.0)))
+    >>> _square_jet(*(np.diag([k, 1.0]) for k in (3.0, 2.0, 1.0)))
     (9.0, 12.0, 14.0)
     """
     smaller = min(G.shape)
     if smaller > 2:
-        value, slope, bend = square_derivatives(*(M[:, :, None] for M in (G, G1, G2)))
+        value, slope, bend = _square_derivatives(*(M[:, :, None] for M in (G, G1, G2)))
         return float(value[0]), float(slope[0]), float(bend[0])
     if smaller == 1:
         bend = np.vdot(G1, G1).real + np.vdot(G, G2).real

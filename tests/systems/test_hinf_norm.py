@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.signal import cheby1, cont2discrete, tf2ss
 
-from lpvlearn.systems.hinf_norm import LevelSets, hinf_norm, linf_norm
+from lpvlearn.systems.hinf_norm import _LevelSets, hinf_norm, linf_norm
 from lpvlearn.systems.response import FrequencyEngine, frequency_response
 
 from . import conftest
@@ -388,7 +388,7 @@ def test_no_crossing_of_a_level_is_missed(discrete: bool, fraction: float) -> No
     w = np.append(np.geomspace(1e-3, end, 20_000), end)
     s = np.linalg.svd(engine.response(w).transpose(2, 0, 1), compute_uv=False)[:, 0]
     level = fraction * s.max()
-    found = LevelSets(engine).crossings(level)
+    found = _LevelSets(engine).crossings(level)
     turns = np.flatnonzero((s[1:] > level) != (s[:-1] > level))
     assert len(turns)
     for k in turns:

@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose
 
 from lpvlearn.systems.peaks import (
     PeakRefiner,
+    _square_derivatives,
+    _square_jet,
     sigma_max,
-    square_derivatives,
-    square_jet,
 )
 from lpvlearn.systems.response import FrequencyEngine
 
@@ -24,13 +24,13 @@ def test_derivatives_of_the_singular_value_match_differences(
     system = random_system(6, shape[1], shape[0], seed=3)
     engine = FrequencyEngine(*system)
     w, h = np.array([0.2, 0.7, 1.9, 5.0]), 1e-3
-    value, slope, bend = square_derivatives(*engine.derivatives(w))
+    value, slope, bend = _square_derivatives(*engine.derivatives(w))
     steps = np.arange(-3, 4) * h
     f = np.array([sigma_max(engine.response(w + step)) ** 2 for step in steps])
     first = np.array([-1, 9, -45, 0, 45, -9, 1]) / (60.0 * h)
     second = np.array([2, -27, 270, -490, 270, -27, 2]) / (180.0 * h * h)
     for k, at in enumerate(w):
-        jet = square_jet(*engine.jet(at))
+        jet = _square_jet(*engine.jet(at))
         assert_allclose(jet, [value[k], slope[k], bend[k]], rtol=1e-9, atol=1e-12)
     assert_allclose(value, f[3], rtol=1e-13)
     assert_allclose(slope, first @ f, rtol=1e-6, atol=1e-8 * f.max())
