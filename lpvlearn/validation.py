@@ -1,4 +1,4 @@
-"""Numeric arguments of the models: arrays and times, or an error that names them."""
+"""What every room checks of its arguments, once: a value, or an error that names it."""
 
 from __future__ import annotations
 
@@ -45,9 +45,15 @@ def matrix(name: str, value: ArrayLike) -> Array:
         array = array.reshape(1, -1) if array.size else np.zeros((0, 0))
     if array.ndim != 2:
         raise ValueError(f"`{name}` must have 2 dimensions. Got shape {array.shape}.")
-    if not np.isfinite(array).all():
-        i, j = np.argwhere(~np.isfinite(array))[0]
-        raise ValueError(f"`{name}` must be finite. Got {array[i, j]} at [{i}, {j}].")
+    return _finite(name, array, "[{}, {}]")
+
+
+def _finite(name: str, array: Array, place: str) -> Array:
+    finite = np.isfinite(array)
+    if not finite.all():
+        at = tuple(np.argwhere(~finite)[0])
+        where = place.format(*at)
+        raise ValueError(f"`{name}` must be finite. Got {array[at]} at {where}.")
     return array
 
 
@@ -97,10 +103,7 @@ def input_samples(u: ArrayLike, n_inputs: int) -> Array:
         u = u[:, None]
     if u.ndim != 2 or u.shape[1] != n_inputs:
         raise ValueError(f"`u` must have shape (n_samples, {n_inputs}). Got {u.shape}.")
-    if not np.isfinite(u).all():
-        k, j = np.argwhere(~np.isfinite(u))[0]
-        raise ValueError(f"`u` must be finite. Got {u[k, j]} at sample {k}, input {j}.")
-    return u
+    return _finite("u", u, "sample {}, input {}")
 
 
 def state_vector(x0: ArrayLike, order: int) -> Array:

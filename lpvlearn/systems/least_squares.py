@@ -1,4 +1,4 @@
-"""Least squares: linear with scaled columns."""
+"""Linear least squares with scaled columns."""
 
 from __future__ import annotations
 

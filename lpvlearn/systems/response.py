@@ -6,57 +6,70 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lapack, schur
 
-__all__ = ["FrequencyEngine", "frequency_response"]
-
-# Eigenvectors worse conditioned than this are not used as coordinates.
-_MODAL_CONDITION = 1e7
-
-# Relative accuracy below which a modal value is replaced by a solved one.
-_MODAL_ACCURACY = 1e-9
-
-# Relative accuracy below which a solved value is refined.
-_SOLVED_ACCURACY = 1e-9
-
-_REFINEMENTS = 3
-
-# Frequencies solved at once: bounds the memory of the stacked matrices.
-_STACK_ELEMENTS = 4_000_000
-
 _EPS = float(np.finfo(float).eps)
 
+# Eigenvectors worse conditioned than this are not used as coordinates: the modal form
+# has nine digits left there, which is what its values are trusted to.
+_MODAL_CONDITION = 1e7
 
-def balanced(A: NDArray, B: NDArray, C: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Scale the states by powers of two so that rows and columns of A agree.
+# Relative accuracy below which a modal value is solved for, and a solved one refined:
+# a tenth of the 1e-8 to which norms agree with extended precision (the stress test).
+_ACCURACY = 1e-9
 
-    The transfer function is unchanged to the last bit, as only exponents move.
+# Each refinement gains as many digits as the factorisation has right, seven or more:
+# three reach the extended precision of the residuals.
+_REFINEMENTS = 3
 
-    Parameters
-    ----------
-    A, B, C : ndarrays of shape (n, n), (n, n_inputs), (n_outputs, n)
+# Entries of the matrices factored at once: 64 MB.
+_STACK_ENTRIES = 4_000_000
 
-    Returns
-    -------
-    A, B, C : ndarrays
-        The scaled matrices (the same objects where nothing is to be scaled).
+# A pole of a sampled model at the origin (a delay) stands for a decay to this a sample.
+_DELAY = 1e-12
+
+
+def frequency_response(
+    A: NDArray,
+    B: NDArray,
+    C: NDArray,
+    D: NDArray,
+    omega: ArrayLike,
+    dt: float | None = None,
+) -> NDArray:
+    r"""Frequency response of a linear time-invariant state-space system.
+
+    .. math:: G(j\omega) = C (j\omega I - A)^{-1} B + D, \qquad
+              G(e^{j\omega \Delta t}) \text{ in discrete time.}
+
+    The result has shape (n_frequencies, n_outputs, n_inputs). Infinite frequencies
+    give D (a ValueError in discrete time); at a pole on the axis every entry is
+    infinite. Modal coordinates of the equilibrated system, checked for cancellation;
+    the frequencies where digits would be lost are solved one by one.
 
     Examples
     --------
     >>> import numpy as np
-    >>> A, B, C = balanced(np.array([[-1.0, 4096.0], [0.0625, -2.0]]),
-    ...                    np.ones((2, 1)), np.ones((1, 2)))
-    >>> A
-    array([[-1., 16.],
-           [16., -2.]])
+    >>> G = frequency_response(np.array([[-2.0]]), np.array([[2.0]]),
+    ...                        np.array([[1.0]]), np.array([[3.0]]),
+    ...                        [0.0, 2.0, np.inf])
+    >>> G[:, 0, 0]
+    array([4. +0.j , 3.5-0.5j, 3. +0.j ])
     """
-    scaled, _, _, scale, _ = lapack.dgebal(A, scale=1, permute=0)
-    if (scale == 1.0).all():
-        return A, B, C
-    return scaled, B / scale[:, None], C * scale
-
-
-def _norms(M: NDArray) -> NDArray:
-    """Frobenius norm of each matrix of a stack."""
-    return np.sqrt((M.real**2 + M.imag**2).sum((-2, -1)))
+    omega = np.atleast_1d(np.asarray(omega, float))
+    finite = np.isfinite(omega)
+    if dt is not None and not finite.all():
+        raise ValueError(
+            "`omega` must be finite in discrete time, where the highest frequency "
+            f"is pi/dt = {np.pi / dt:.6g} rad/s. Got {omega[~finite][0]}."
+        )
+    G = np.empty((len(omega), *D.shape), complex)
+    G[~finite] = D
+    if len(A) == 0:
+        G[finite] = D
+    elif finite.any():
+        engine = FrequencyEngine(A, B, C, D, discrete=dt is not None)
+        angles = omega[finite] * (1.0 if dt is None else dt)
+        G[finite] = engine.accurate(angles).transpose(2, 0, 1)
+    return G
 
 
 class FrequencyEngine:
@@ -72,12 +85,7 @@ class FrequencyEngine:
     Frequencies stand on the last axis: results have shape
     (n_outputs, n_inputs, n_frequencies). Infinity is not handled here.
 
-    Parameters
-    ----------
-    A, B, C, D : ndarrays of floats
-        Shapes (n, n), (n, n_inputs), (n_outputs, n), (n_outputs, n_inputs).
-    discrete : bool, default False
-        Whether frequencies are angles on the unit circle (rad per sample).
+    If `discrete`, frequencies are angles on the unit circle (rad per sample).
 
     Attributes
     ----------
@@ -97,12 +105,7 @@ class FrequencyEngine:
     """
 
     def __init__(
-        self,
-        A: NDArray,
-        B: NDArray,
-        C: NDArray,
-        D: NDArray,
-        discrete: bool = False,
+        self, A: NDArray, B: NDArray, C: NDArray, D: NDArray, discrete: bool = False
     ) -> None:
         F = A - np.eye(len(A)) if discrete else A
         if discrete:
@@ -112,7 +115,7 @@ class FrequencyEngine:
             self._shift_error = (exact - (rounded - back)) - (1.0 + back)
         self.discrete = discrete
         self.order = len(A)
-        self.F, self.B, self.C = balanced(F, B, C)
+        self.F, self.B, self.C = equilibrated(F, B, C)
         self.D = D
         self._size = np.sqrt((self.F * self.F).sum())
         real, imag, _, vectors, info = lapack.dgeev(self.F, compute_vl=0)
@@ -196,15 +199,6 @@ class FrequencyEngine:
         z = x + 1.0
         return 1j * z * Gx, -z * (z * Gxx + Gx)
 
-    def modal_jet(self, omega: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Return `derivatives` at one frequency, from the modal form in use."""
-        x = self.points(np.asarray(omega))
-        X = 1.0 / (x - self.poles)
-        X2 = X * X
-        values = (self._residues @ np.array((X, X2, X2 * X)).T).T
-        G, G1, G2 = values.reshape(3, *self.D.shape)
-        return G + self.D, *self._chain(x, -G1, 2.0 * G2)
-
     def jet(self, omega: float) -> tuple[NDArray, NDArray, NDArray]:
         """Return G and its two derivatives at one frequency, as accurate as `solved`.
 
@@ -222,7 +216,7 @@ class FrequencyEngine:
         G = self.C @ right + self.D
         square = np.vdot(left, left).real * np.vdot(right, right).real
         noise = _EPS * square**0.5 * (abs(x) + self._size)
-        if noise > _SOLVED_ACCURACY * np.vdot(G, G).real ** 0.5:
+        if noise > _ACCURACY * np.vdot(G, G).real ** 0.5:
             stacks = np.array([x]), M[None], right[None], left[None]
             right, left, G = (P[0] for P in self._polished(*stacks))
         again = lapack.zgetrs(lu, pivots, right)[0]
@@ -236,7 +230,7 @@ class FrequencyEngine:
         long double has it), so that G is that of the matrices as given.
         """
         G = np.empty((*self.D.shape, len(omega)), complex)
-        step = max(1, _STACK_ELEMENTS // max(1, self.order**2))
+        step = max(1, _STACK_ENTRIES // max(1, self.order**2))
         for start in range(0, len(omega), step):
             part = slice(start, start + step)
             G[:, :, part] = self._solved_stack(self.points(omega[part]))
@@ -252,7 +246,7 @@ class FrequencyEngine:
         G = self.C @ right + self.D
         # First-order effect of the backward error of the factorisation on G.
         noise = _norms(left) * _norms(right) * (np.abs(x) + self._size)
-        poor = _EPS * noise > _SOLVED_ACCURACY * _norms(G)
+        poor = _EPS * noise > _ACCURACY * _norms(G)
         if poor.any():
             stacks = x[poor], M[poor], right[poor], left[poor]
             G[poor] = self._polished(*stacks)[2]
@@ -308,77 +302,72 @@ class FrequencyEngine:
         G = np.full((*self.D.shape, len(omega)), np.inf, complex)
         regular = (self.points(omega) != self.poles[:, None]).all(0)
         omega = omega[regular]
-        G[:, :, regular] = self._accurate(omega)
-        return G
-
-    def _accurate(self, omega: NDArray) -> NDArray:
-        G = self.response(omega)
-        size = np.sqrt((G.real**2 + G.imag**2).sum((0, 1)))
-        lost = self.uncertainty(omega) > _MODAL_ACCURACY * size
+        found = self.response(omega)
+        size = np.sqrt((found.real**2 + found.imag**2).sum((0, 1)))
+        lost = self.uncertainty(omega) > _ACCURACY * size
         if lost.any():
-            G[:, :, lost] = self.solved(omega[lost])
+            found[:, :, lost] = self.solved(omega[lost])
+        G[:, :, regular] = found
         return G
 
 
-def frequency_response(
-    A: NDArray,
-    B: NDArray,
-    C: NDArray,
-    D: NDArray,
-    omega: ArrayLike,
-    dt: float | None = None,
-) -> NDArray:
-    r"""Frequency response of a linear time-invariant state-space system.
+def _norms(M: NDArray) -> NDArray:
+    """Frobenius norm of each matrix of a stack."""
+    return np.sqrt((M.real**2 + M.imag**2).sum((-2, -1)))
 
-    .. math:: G(j\omega) = C (j\omega I - A)^{-1} B + D, \qquad
-              G(e^{j\omega \Delta t}) \text{ in discrete time.}
 
-    Parameters
-    ----------
-    A, B, C, D : ndarrays of floats
-        Shapes (n, n), (n, n_inputs), (n_outputs, n), (n_outputs, n_inputs).
-    omega : array_like of shape (n_frequencies,)
-        Frequencies in rad/s. In continuous time infinity is allowed and gives D.
-        At a pole on the axis every entry of the response is infinite.
-    dt : float or None, default None
-        Sampling time in seconds; None for continuous time.
+def equilibrated(
+    A: NDArray, B: NDArray, C: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Scale the states by powers of two so that rows and columns of A agree.
 
-    Returns
-    -------
-    G : ndarray of shape (n_frequencies, n_outputs, n_inputs), complex
-
-    Raises
-    ------
-    ValueError
-        If a discrete-time response is asked for at infinite frequency.
-
-    Notes
-    -----
-    Modal coordinates of the balanced system, checked for cancellation; the
-    frequencies where digits would be lost are solved one by one.
+    The transfer function is unchanged to the last bit, as only exponents move. Where
+    nothing is to be scaled the same objects are returned.
 
     Examples
     --------
     >>> import numpy as np
-    >>> G = frequency_response(np.array([[-2.0]]), np.array([[2.0]]),
-    ...                        np.array([[1.0]]), np.array([[3.0]]),
-    ...                        [0.0, 2.0, np.inf])
-    >>> G[:, 0, 0]
-    array([4. +0.j , 3.5-0.5j, 3. +0.j ])
+    >>> A, B, C = equilibrated(np.array([[-1.0, 4096.0], [0.0625, -2.0]]),
+    ...                        np.ones((2, 1)), np.ones((1, 2)))
+    >>> A
+    array([[-1., 16.],
+           [16., -2.]])
     """
-    omega = np.atleast_1d(np.asarray(omega, float))
-    finite = np.isfinite(omega)
-    if dt is not None and not finite.all():
-        raise ValueError(
-            "`omega` must be finite in discrete time, where the highest frequency "
-            f"is pi/dt = {np.pi / dt:.6g} rad/s. Got {omega[~finite][0]}."
-        )
-    G = np.empty((len(omega), *D.shape), complex)
-    G[~finite] = D
-    if len(A) == 0:
-        G[finite] = D
-    elif finite.any():
-        engine = FrequencyEngine(A, B, C, D, discrete=dt is not None)
-        angles = omega[finite] * (1.0 if dt is None else dt)
-        G[finite] = engine.accurate(angles).transpose(2, 0, 1)
-    return G
+    scaled, _, _, scale, _ = lapack.dgebal(A, scale=1, permute=0)
+    if (scale == 1.0).all():
+        return A, B, C
+    return scaled, B / scale[:, None], C * scale
+
+
+def pole_rates(poles: NDArray, dt: float | None) -> NDArray[np.complex128]:
+    """Poles in rad/s: those of a sampled model by the logarithm.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> pole_rates(np.exp([-0.5 + 1j, -0.5 - 1j]), 0.5)
+    array([-1.+2.j, -1.-2.j])
+    """
+    poles = np.asarray(poles, dtype=complex)
+    if dt is None:
+        return poles
+    return np.asarray(np.log(np.where(poles == 0, _DELAY, poles)) / dt)
+
+
+def pole_grid(
+    rates: NDArray, low: float, high: float, n_points: int, offsets: ArrayLike
+) -> NDArray[np.float64]:
+    """Frequencies that show every pole: logarithmic, and more around the poles.
+
+    `n_points` are spread from `low` to `high`; `offsets` are places around the
+    frequency of each pole (`rates`, in rad/s), in units of its decay. The points are
+    sorted, and may reach beyond the ends around a pole.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> pole_grid(np.array([-1 + 5j]), 1.0, 100.0, 3, [-1.0, 0.0, 1.0])
+    array([  1.,   4.,   5.,   6.,  10., 100.])
+    """
+    around = np.abs(rates.imag) + np.multiply.outer(offsets, np.abs(rates.real))
+    return np.unique(np.append(np.geomspace(low, high, n_points), around))

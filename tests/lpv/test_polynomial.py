@@ -243,7 +243,7 @@ KAPPA = np.arange(4.0)[:, None]
 @pytest.mark.parametrize(
     ("params", "args", "words"),
     [
-        ({"degree": -1}, (KAPPA, KAPPA), ["`degree`", ">= 0", "-1"]),
+        ({"degree": -1}, (KAPPA, KAPPA), ["`degree`", "at least 0", "-1"]),
         ({"degree": 1.5}, (KAPPA, KAPPA), ["`degree`", "integer", "1.5"]),
         ({"degree": True}, (KAPPA, KAPPA), ["`degree`", "integer", "True"]),
         ({"basis": "hermite"}, (KAPPA, KAPPA), ["`basis`", "'power'", "'hermite'"]),

@@ -264,7 +264,7 @@ def test_covariance_of_an_unrefined_model_is_refused():
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ({"steps": 0}, "`steps` must be an integer of at least 1. Got 0"),
+        ({"steps": 0}, "`steps` must be an integer, at least 1. Got 0"),
         ({"initial_state": "zero"}, "`initial_state` must be 'estimate' or 'rest'"),
     ],
 )

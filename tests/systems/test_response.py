@@ -7,24 +7,17 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from lpvlearn.systems.response import FrequencyEngine, balanced, frequency_response
-from lpvlearn.systems.singular_values import sigma_max, square_derivatives, square_jet
+from lpvlearn.systems.response import (
+    FrequencyEngine,
+    equilibrated,
+    frequency_response,
+    pole_grid,
+    pole_rates,
+)
+
+from .conftest import random_system
 
 Matrices = tuple[NDArray, NDArray, NDArray, NDArray]
-
-
-def random_system(
-    n: int = 7, n_inputs: int = 2, n_outputs: int = 3, seed: int = 0
-) -> Matrices:
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((n, n))
-    A -= (np.linalg.eigvals(A).real.max() + 0.2) * np.eye(n)
-    return (
-        A,
-        rng.standard_normal((n, n_inputs)),
-        rng.standard_normal((n_outputs, n)),
-        rng.standard_normal((n_outputs, n_inputs)),
-    )
 
 
 def jordan_chain(n: int = 6) -> Matrices:
@@ -117,10 +110,8 @@ def test_derivatives_are_those_of_the_resolvent(
         assert_allclose(G2, bend, atol=1e-11 * abs(bend).max())
         solved = engine.solved(np.array([w]))
         assert_allclose(solved[:, :, 0], G, atol=1e-11 * abs(G).max())
-        jets = [engine.jet(w)] + ([engine.modal_jet(w)] if engine.is_modal else [])
-        for jet in jets:
-            for found, expected in zip(jet, (G, slope, bend), strict=True):
-                assert_allclose(found, expected, atol=1e-11 * abs(expected).max())
+        for found, expected in zip(engine.jet(w), (G, slope, bend), strict=True):
+            assert_allclose(found, expected, atol=1e-11 * abs(expected).max())
 
 
 def test_fast_sampling_loses_no_digits() -> None:
@@ -148,11 +139,11 @@ def test_solves_are_refined_at_a_nearly_undamped_mode() -> None:
     assert_allclose(engine.jet(w)[0], [[-1j]], rtol=1e-8)
 
 
-def test_balancing_leaves_the_response_alone() -> None:
+def test_equilibration_leaves_the_response_alone() -> None:
     A, B, C, D = random_system()
     s = 2.0 ** np.arange(-12, 16, 4)
     scaled = A * s / s[:, None], B / s[:, None], C * s
-    Ab, Bb, Cb = balanced(*scaled)
+    Ab, Bb, Cb = equilibrated(*scaled)
     assert np.abs(Ab).max() < 1e2 * np.abs(A).max()
     for w in (0.0, 1.0):
         assert_allclose(
@@ -160,29 +151,14 @@ def test_balancing_leaves_the_response_alone() -> None:
         )
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 3), (2, 2), (3, 2), (2, 4), (4, 3)])
-def test_derivatives_of_the_singular_value_match_differences(
-    shape: tuple[int, int],
-) -> None:
-    system = random_system(6, shape[1], shape[0], seed=3)
-    engine = FrequencyEngine(*system)
-    w, h = np.array([0.2, 0.7, 1.9, 5.0]), 1e-3
-    value, slope, bend = square_derivatives(*engine.derivatives(w))
-    steps = np.arange(-3, 4) * h
-    f = np.array([sigma_max(engine.response(w + step)) ** 2 for step in steps])
-    first = np.array([-1, 9, -45, 0, 45, -9, 1]) / (60.0 * h)
-    second = np.array([2, -27, 270, -490, 270, -27, 2]) / (180.0 * h * h)
-    for k, at in enumerate(w):
-        jet = square_jet(*engine.jet(at))
-        assert_allclose(jet, [value[k], slope[k], bend[k]], rtol=1e-9, atol=1e-12)
-    assert_allclose(value, f[3], rtol=1e-13)
-    assert_allclose(slope, first @ f, rtol=1e-6, atol=1e-8 * f.max())
-    assert_allclose(bend, second @ f, rtol=1e-6, atol=1e-6 * f.max())
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (3, 1), (2, 2), (2, 5), (4, 4)])
-def test_largest_singular_value_equals_the_svd(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(0)
-    G = rng.standard_normal((*shape, 9)) + 1j * rng.standard_normal((*shape, 9))
-    expected = np.linalg.svd(G.transpose(2, 0, 1), compute_uv=False)[:, 0]
-    assert_allclose(sigma_max(G), expected, rtol=1e-13)
+@pytest.mark.parametrize("dt", [None, 0.1])
+def test_grid_of_poles_stands_on_every_resonance(dt: float | None) -> None:
+    rates = np.array([-0.1 + 4j, -0.1 - 4j, -2.0])
+    poles = rates if dt is None else np.exp(rates * dt)
+    found = pole_rates(poles, dt)
+    assert_allclose(found, rates, rtol=1e-12)
+    grid = pole_grid(found, 0.1, 10.0, 5, [0.0, 1.0])
+    assert (np.diff(grid) > 0).all()
+    for w in (0.1, 1.0, 10.0, 4.0, 4.1, 2.0):
+        assert np.abs(grid - w).min() < 1e-9
+    assert pole_rates(np.array([0.0]), 0.1).real < -200.0  # a delay is fast

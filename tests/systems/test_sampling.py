@@ -11,7 +11,13 @@ from scipy.linalg import block_diag, expm
 from scipy.signal import cont2discrete
 
 from lpvlearn import StateSpace
-from lpvlearn.systems.sampling import c2d_tustin, c2d_zoh, d2c_tustin, d2c_zoh
+from lpvlearn.systems.sampling import (
+    _expm,
+    c2d_tustin,
+    d2c_tustin,
+    d2c_zoh,
+    sample_zoh,
+)
 
 
 def jordan(pole, size):
@@ -54,7 +60,7 @@ CONTINUOUS = {
 @pytest.mark.parametrize("similar", [True, False])
 def test_zoh_is_undone_by_the_logarithm(name, similar):
     A, B, C, _ = system(CONTINUOUS[name], similar=similar)
-    A2, B2, C2 = d2c_zoh(*c2d_zoh(A, B, 0.1), C, 0.1)
+    A2, B2, C2 = d2c_zoh(*sample_zoh(A, B, 0.1), C, 0.1)
     # a pole that decays to 5e-5 within a sample has lost these digits
     tol = 1e-8 if name == "time scales" else 1e-10
     assert_allclose(A2, A, atol=tol * np.abs(A).max())
@@ -66,7 +72,7 @@ def test_zoh_is_undone_by_the_logarithm(name, similar):
 def test_zoh_is_that_of_scipy(name):
     A, B, C, D = system(CONTINUOUS[name])
     Ad, Bd, *_ = cont2discrete((A, B, C, D), 0.1, method="zoh")
-    for found, expected in zip(c2d_zoh(A, B, 0.1), (Ad, Bd), strict=True):
+    for found, expected in zip(sample_zoh(A, B, 0.1), (Ad, Bd), strict=True):
         assert_allclose(found, expected, atol=1e-13 * np.abs(expected).max())
 
 
@@ -139,8 +145,8 @@ def test_stability_is_kept(method):
 def test_badly_scaled_inputs_do_not_spoil_the_exponential():
     A, B, *_ = system(CONTINUOUS["distinct"])
     units = np.array([1e9, 1e-9])
-    Ad, Bd = c2d_zoh(A, B * units, 0.1)
-    expected_A, expected_B = c2d_zoh(A, B, 0.1)
+    Ad, Bd = sample_zoh(A, B * units, 0.1)
+    expected_A, expected_B = sample_zoh(A, B, 0.1)
     assert_allclose(Ad, expm(0.1 * A), atol=1e-14)
     assert_allclose(Ad, expected_A, atol=1e-15)
     assert_allclose(Bd / units, expected_B, atol=1e-15)
@@ -203,7 +209,7 @@ def test_faint_poles_that_are_not_zero_are_converted():
     A, B, C, _ = system(np.diag([1e-5, 0.5]))
     Ac, Bc, _ = d2c_zoh(A, B, C, 1.0)
     assert_allclose(np.sort(np.linalg.eigvals(Ac)), np.log([1e-5, 0.5]), rtol=1e-9)
-    assert_allclose(c2d_zoh(Ac, Bc, 1.0)[0], A, atol=1e-14)
+    assert_allclose(sample_zoh(Ac, Bc, 1.0)[0], A, atol=1e-14)
 
 
 @pytest.mark.parametrize("A", [np.diag([-1.0, 0.5]), jordan(-1.0, 2)])
@@ -227,7 +233,7 @@ def test_units_of_the_states_do_not_matter():
     with pytest.warns(RuntimeWarning, match="negative real axis"):
         a, b, c = d2c_zoh(*scaled, 0.1)
     expected = markov(A, B, C)
-    found = markov(*c2d_zoh(a, b, 0.1), c)
+    found = markov(*sample_zoh(a, b, 0.1), c)
     assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
     ill = d2c_tustin(*scaled, D, 0.1)
     well = d2c_tustin(A, B, C, D, 0.1)
@@ -238,3 +244,65 @@ def test_units_of_the_states_do_not_matter():
 def test_continuous_models_pass_to_continuous_unchanged():
     model = StateSpace(-1, 1, 1)
     assert model.to_continuous() is model
+
+
+# -- exponentials ----------------------------------------------------------------
+
+
+def normwise(found, expected):
+    return np.abs(found - expected).max() / max(1.0, np.abs(expected).max())
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-3, 0.2, 0.3, 1.0, 10.0, 60.0])
+def test_exponentials_are_those_of_scipy(size):
+    M = size * np.random.default_rng(0).normal(size=(20, 5, 5))
+    expected = np.array([expm(m) for m in M])
+    for found, other in zip(_expm(M), expected, strict=True):
+        assert normwise(found, other) <= 1e-13 * max(1.0, 10 * size)
+
+
+def test_exponentials_in_one_batch_may_differ_in_size():
+    rng = np.random.default_rng(1)
+    M = rng.normal(size=(9, 4, 4)) * np.logspace(-6, 1, 9)[:, None, None]
+    single = np.array([_expm(m) for m in M])
+    assert_allclose(_expm(M), single, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("fast", [1e3, 1e6, 1e9])
+def test_slow_modes_keep_their_digits_beside_fast_ones(fast):
+    slow = np.array([-1e-3, -0.5, 0.2])
+    # not triangular: of such matrices scipy's exponential keeps 5 to 9 digits less
+    V = np.array([[0, 0, 1.0, 1], [1, 0, 0, 1], [0, 0, 0, 1], [0, 1, 0, 1]])
+    M = V @ np.diag([*slow, -fast]) @ np.linalg.inv(V)
+    expected = V @ np.diag([*np.exp(slow), 0.0]) @ np.linalg.inv(V)
+    assert_allclose(_expm(M), expected, atol=2e-15)
+
+
+def test_semigroup_property():
+    M = np.random.default_rng(2).normal(size=(4, 4))
+    assert_allclose(_expm(M) @ _expm(-M), np.eye(4), atol=1e-12)
+    assert_allclose(_expm(2 * M), _expm(M) @ _expm(M), rtol=1e-11)
+
+
+def test_empty_batches_have_empty_exponentials():
+    assert _expm(np.zeros((0, 3, 3))).shape == (0, 3, 3)
+    assert _expm(np.zeros((2, 0, 0))).shape == (2, 0, 0)
+
+
+def test_zoh_of_a_stack_is_the_integral():
+    rng = np.random.default_rng(3)
+    A, B, dt = rng.normal(size=(7, 3, 3)), rng.normal(size=(7, 3, 2)), 0.3
+    Ad, Bd = sample_zoh(A, B, dt)
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    for k in range(7):
+        assert_allclose(Ad[k], expm(A[k] * dt), atol=1e-13)
+        times = 0.5 * dt * (nodes + 1)
+        held = sum(
+            0.5 * dt * w * expm(A[k] * t) for w, t in zip(weights, times, strict=True)
+        )
+        assert_allclose(Bd[k], held @ B[k], atol=1e-13)
+
+
+def test_overflow_is_told():
+    with pytest.raises(ValueError, match="unstable pole.*1e\\+06 rad/s.*Shorten"):
+        sample_zoh(np.array([[1e6]]), np.ones((1, 1)), 1.0)
