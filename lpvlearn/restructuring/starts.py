@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_random_state
 
-from ..structures.mechanical import ImplicitSystem
+from ..structures.mechanical import ImplicitMap
 from ..systems.balancing import balancing_transformation
 from .continuation import continued_fits
 from .error_system import ErrorSystem
@@ -433,7 +433,7 @@ def candidates(
 
 def natural_candidates(
     problem: RestructuringProblem,
-    equations: ImplicitSystem,
+    equations: ImplicitMap,
     n_starts: int,
     rng: np.random.Generator,
 ) -> Array:

@@ -122,7 +122,7 @@ def test_modal_parameters_are_poles():
         ((1, 0), {}, "`n_inputs` must be an integer"),
         ((1, 1, 1.5), {}, "`n_outputs` must be an integer"),
         ((1, 1, 1, -2), {}, "`n_real` must be an integer"),
-        ((1,), {"normalize": "both"}, "`normalize` must be one of"),
+        ((1,), {"normalize": "both"}, "`normalize` must be 'input' or 'output'"),
     ],
 )
 def test_wrong_modal_forms_are_explained(arguments, options, message):
@@ -242,7 +242,7 @@ def test_a_model_without_mass_is_refused():
         ({"D": []}, r"`D` must have shape \(2, 2\).*Got \(0, 0\)"),
         ({"K": [["k*k", 0], [0, 1]]}, r"`K\[0\]\[0\]` must be a number or an affine"),
         ({"F": [[1]]}, r"`F` must have shape \(2, 1\)"),
-        ({"outputs": "force"}, "`outputs` must be one of"),
+        ({"outputs": "force"}, "`outputs` must be 'position', 'velocity' or"),
         ({"sensors": [[1]]}, "`sensors` must have 2 columns"),
         ({"initial": {"m1": 1.0}}, "`initial` must have a value for each"),
         ({"parameter_names": ["m1"]}, "`parameter_names` must name each"),
