@@ -1,4 +1,8 @@
-"""Local identifiability of a gray-box structure from its frequency response."""
+"""What a frequency response tells of the parameters: which ones, and how exactly.
+
+Both follow from the derivative J of the response to the parameters: its rank, and to
+first order the change of the parameters with the response, ``d theta = Re(K dG)``.
+"""
 
 from __future__ import annotations
 

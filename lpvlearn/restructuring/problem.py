@@ -237,7 +237,8 @@ def problem_from_response(
     W = np.broadcast_to(np.eye(p), (len(grid), p, p)).astype(complex)
     filter_ = _weight_model(weight, p, None)
     if filter_ is not None:
-        W = W @ filter_.frequency_response(grid)
+        own = filter_.frequency_response(grid)
+        W = own if own.shape == W.shape else own * W  # one for all outputs
     if sample_weight is not None:
         scale = np.asarray(sample_weight, dtype=float).reshape(-1)
         if scale.shape != grid.shape or not np.isfinite(scale).all() or scale.min() < 0:

@@ -1,13 +1,11 @@
 """What a restructuring must survive: units, few data, bounds, margins, functions."""
 
-import threading
 import warnings
 
 import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
-from lpvlearn.structures.differentiation import numerical_jacobian
 
 LAG = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
 GAIN = GrayBoxStructure.from_template(
@@ -116,21 +114,6 @@ def test_a_gain_need_not_be_linear_in_its_parameter():
     model = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[9.0]])
     fitted = GrayBoxRestructurer(square, init=[2.5]).fit_model(model)
     assert np.isclose(fitted.params_[0], 3.0, rtol=1e-6)
-
-
-def test_threads_leave_the_warning_filters_alone():
-    before = list(warnings.filters)
-
-    def work():
-        for _ in range(50):
-            numerical_jacobian(lambda t: np.array([t[0] ** 2]), np.array([2.0]))
-
-    threads = [threading.Thread(target=work) for _ in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert warnings.filters == before
 
 
 def test_nothing_stays_of_an_earlier_fit():

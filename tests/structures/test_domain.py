@@ -8,25 +8,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lpvlearn import GrayBoxStructure
 
+from .conftest import pendulum, pendulum_jacobian
+
 
 def template():
     return GrayBoxStructure.from_template(
         [[0, 1], ["-k", "-c - e"]], [[0], ["b"]], [["e", 0]]
     )
-
-
-def pendulum(theta):
-    length, damping, gain = theta
-    A = np.array([[0, 1], [-9.81 / length, -damping * length**2]])
-    return A, np.array([[0], [gain * np.exp(-length)]]), np.array([[1, 0]])
-
-
-def pendulum_jacobian(theta):
-    length, damping, gain = theta
-    decay = np.exp(-length)
-    by_length = [[0, 0], [9.81 / length**2, -2 * damping * length]]
-    A = [by_length, [[0, 0], [0, -(length**2)]], np.zeros((2, 2))]
-    return np.array(A), [0, -gain * decay, 0, 0, 0, decay], np.zeros((3, 1, 2))
 
 
 START = {"length": 1.3, "damping": 0.2, "gain": 4.0}
