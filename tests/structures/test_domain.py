@@ -17,12 +17,18 @@ def template():
     )
 
 
+def flat_jacobian(theta):
+    """Blocks of the right size are put into shape."""
+    A, B, C = pendulum_jacobian(theta)
+    return np.array(A), np.ravel(B), C
+
+
 START = {"length": 1.3, "damping": 0.2, "gain": 4.0}
 STRUCTURES = {
     "template": template(),
     "function": GrayBoxStructure.from_function(pendulum, START),
     "jacobian": GrayBoxStructure.from_function(
-        pendulum, START, lambda theta: pendulum_jacobian(theta)
+        pendulum, START, lambda theta: flat_jacobian(theta)
     ),
     "mechanical": GrayBoxStructure.mechanical(
         [["m", 0], [0, 2]],
