@@ -110,28 +110,12 @@ def stack_response(G: Complex) -> Array:
 def read_frequency_data(
     omega: ArrayLike, frf: ArrayLike, n_outputs: int, n_inputs: int
 ) -> tuple[Array, Complex]:
-    """Frequencies and complex response, or a ValueError that teaches.
-
-    Parameters
-    ----------
-    omega : array-like of shape (n_freq,) or (n_freq, 1)
-        Angular frequencies, rad/s.
-    frf : array-like of shape (n_freq, 2 * n_outputs * n_inputs), or complex of shape
-        (n_freq, n_outputs, n_inputs)
-        Real parts of the entries row by row, then imaginary parts; or the complex
-        response.
-    n_outputs, n_inputs : int
+    """The data of `GrayBoxRestructurer.fit`, or a ValueError that teaches.
 
     Returns
     -------
     omega : ndarray of shape (n_freq,)
     G : ndarray of shape (n_freq, n_outputs, n_inputs)
-
-    Raises
-    ------
-    ValueError
-        If a shape does not fit, a value is not finite, or a frequency is negative or
-        given twice.
 
     Examples
     --------

@@ -263,13 +263,7 @@ def problem_from_response(
 def _weight_model(
     weight: Any, n_outputs: int, sampling_time: float | None
 ) -> StateSpace | None:
-    """The weight as a model in the time domain of the black boxes.
-
-    Parameters
-    ----------
-    weight : StateSpace, pair of float or None
-        A stable model with one input and output, or with as many as the black box has
-        outputs; or a band ``(low, high)`` in rad/s, where None leaves a side open.
+    """The `frequency_weight`, model or band, in the time domain of the black boxes.
 
     Raises
     ------
@@ -301,12 +295,9 @@ def _weight_model(
 
 
 def _band(edges: Any) -> StateSpace:
-    """First-order band-pass ``s / (s + low) * high / (s + high)`` between two edges.
+    """First-order band-pass ``s / (s + low) * high / (s + high)``; rad/s.
 
-    Parameters
-    ----------
-    edges : pair of float or None
-        Rad/s; None, 0 or infinity leaves that side open.
+    None, 0 or infinity leaves that side open.
     """
     try:
         low, high = edges

@@ -86,16 +86,7 @@ def search(
     Where no model of the structure decays as fast as the black box lets expect, its
     stability margin is given up.
 
-    Parameters
-    ----------
-    problem : RestructuringProblem
-    init : str or array-like of shape (n_params,)
-        A first guess; a string for none.
-    n_starts : int
-        Random starts of every kind, in the first round.
-    given : list of ndarray
-        Further candidates.
-    random_state : int, RandomState instance or None
+    The options are those of `GrayBoxRestructurer`; further candidates may be `given`.
 
     Raises
     ------

@@ -104,17 +104,7 @@ def numerical_curvature(
 ) -> Array:
     """Second derivatives, by central differences of the first ones, symmetrised.
 
-    Parameters
-    ----------
-    f : callable
-        Maps (n_params,) to an array of any shape, as for `numerical_jacobian`.
-    theta : ndarray of shape (n_params,)
-    typical : ndarray of shape (n_params,), default=None
-        Usual sizes of the parameters.
-
-    Returns
-    -------
-    ndarray of shape (n_params, n_params, ...)
+    The arguments are those of `numerical_jacobian`; shape (n_params, n_params, ...).
 
     Examples
     --------

@@ -7,9 +7,10 @@ equations of motion.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,28 +27,33 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
-class StructureMap(Protocol):
+class StructureMap(ABC):
     """What a structure asks of its map; theta has shape (n_params,)."""
 
     @property
+    @abstractmethod
     def shape(self) -> tuple[int, ...]:
         """Shape of S, (order + n_outputs, order + n_inputs)."""
 
+    @abstractmethod
     def system_matrix(self, theta: Array) -> Array:
         """S; NaN where the parameters give no model."""
 
+    @abstractmethod
     def jacobian(self, theta: Array) -> Array:
         """``dS / dtheta``, shape (n_params, *shape)."""
 
+    @abstractmethod
     def curvature(self, theta: Array) -> Array | None:
         """Second derivatives, (n_params, n_params, *shape); None where all are zero."""
 
     def fix(self, values: Array, free: Flags) -> StructureMap:
         """The map of the `free` parameters, the others at their `values`."""
+        return FixedMap(self, values, free)
 
 
 @dataclass(frozen=True, eq=False)
-class AffineMap:
+class AffineMap(StructureMap):
     """``S(theta) = offset + sum_j theta_j basis_j``, also for stacked theta."""
 
     offset: Array
@@ -77,7 +83,7 @@ class AffineMap:
 
 
 @dataclass(frozen=True, eq=False)
-class FunctionMap:
+class FunctionMap(StructureMap):
     """A smooth function of the user.
 
     Attributes
@@ -121,12 +127,9 @@ class FunctionMap:
             return numerical_curvature(self.system_matrix, theta, self.typical)
         return symmetric_differences(self.jacobian, theta, self.typical)
 
-    def fix(self, values: Array, free: Flags) -> FixedMap:
-        return FixedMap(self, values, free)
-
 
 @dataclass(frozen=True, eq=False)
-class FixedMap:
+class FixedMap(StructureMap):
     """Another map of which only the `free` parameters are left."""
 
     parent: StructureMap
@@ -152,12 +155,9 @@ class FixedMap:
         H = self.parent.curvature(self._all(theta))
         return None if H is None else H[self.free][:, self.free]
 
-    def fix(self, values: Array, free: Flags) -> FixedMap:
-        return FixedMap(self, values, free)
-
 
 @dataclass(frozen=True, eq=False)
-class RowsMap:
+class RowsMap(StructureMap):
     """Some rows of the S of another map; one may stand several times."""
 
     parent: StructureMap
@@ -176,6 +176,3 @@ class RowsMap:
     def curvature(self, theta: Array) -> Array | None:
         H = self.parent.curvature(theta)
         return None if H is None else H[:, :, self.rows]
-
-    def fix(self, values: Array, free: Flags) -> RowsMap:
-        return RowsMap(self.parent.fix(values, free), self.rows)

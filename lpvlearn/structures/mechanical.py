@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..validation import matrix, one_of
-from .map import AffineMap
+from .map import AffineMap, StructureMap
 from .templates import affine_arrays, parse_cells
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ _SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
-class ImplicitMap:
+class ImplicitMap(StructureMap):
     """``S = offset + W X`` with ``M(theta) X = N(theta)``, M and N affine.
 
     Of equations of motion, ``X [x; u]`` are the accelerations.

@@ -80,7 +80,7 @@ def off_structure(model, rng, size):
 
 @cache
 def far_fit(seed):
-    """A black box off the structure of two masses, and the restructurer fitted to it."""
+    """A black box off the structure of two masses, and a restructurer fitted to it."""
     structure, params = CASES["two_masses"]
     rng = np.random.default_rng(seed)
     black_box = off_structure(structure.model(params), rng, 0.03)
