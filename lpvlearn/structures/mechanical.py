@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..validation import matrix, one_of
 from .map import AffineMap, StructureMap
-from .templates import affine_arrays, parse_cells
+from .templates import affine_arrays, check_shapes, parse_cells
 
 Array = NDArray[np.float64]
 
@@ -167,13 +167,8 @@ def mechanical_map(
             "`M` and `F` must describe at least one coordinate and one input. Got "
             f"{n} and {m}."
         )
-    for name, block in cells.items():
-        expected = (n, m if name == "F" else n)
-        shape = (len(block), len(block[0]) if block else 0)
-        if shape != expected:
-            raise ValueError(
-                f"`{name}` must have shape {expected} to fit `M` and `F`. Got {shape}."
-            )
+    square = dict.fromkeys("MDK", (n, n))
+    check_shapes(cells, square | {"F": (n, m)}, "`M` and `F`")
     H = np.eye(n) if sensors is None else matrix("sensors", sensors)
     if H.shape[1] != n or len(H) == 0:
         raise ValueError(

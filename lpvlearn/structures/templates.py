@@ -67,17 +67,23 @@ def affine_system(
     zero: Affine = {"": 0.0}
     cells.setdefault("D", [[zero] * m for _ in range(p)])
     expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
-    for name, block in cells.items():
-        shape = (len(block), len(block[0])) if block else (0, expected[name][1])
-        if shape != expected[name]:
-            raise ValueError(
-                f"`{name}` must have shape {expected[name]} to fit the other matrices. "
-                f"Got {shape}."
-            )
+    check_shapes(cells, expected, "the other matrices")
     rows = [a + b for a, b in zip(cells["A"], cells["B"], strict=True)]
     rows += [c + d for c, d in zip(cells["C"], cells["D"], strict=True)]
     offset, basis, names = affine_arrays(rows, parameter_names)
     return n, AffineMap(offset, basis), names
+
+
+def check_shapes(
+    cells: dict[str, list[list[Affine]]], expected: dict[str, tuple[int, int]], to: str
+) -> None:
+    """Refuse blocks that do not fit to others; an empty one has no columns."""
+    for name, block in cells.items():
+        shape = (len(block), len(block[0]) if block else 0)
+        if shape != expected[name] and (block or expected[name][0]):
+            raise ValueError(
+                f"`{name}` must have shape {expected[name]} to fit {to}. Got {shape}."
+            )
 
 
 def affine_arrays(
