@@ -396,9 +396,9 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             self.active_frequencies_ = np.sort(peaks.frequencies)
             self.remaining_error_ = self.error_
         J = system.response_jacobian(self.params_, problem.omega)[1]
-        balance = channel_balance(problem.response)
-        if balance is not None:  # a faint channel tells parameters, too
-            J = J * balance[..., None]
+        scaling = channel_balance(problem.response)
+        if scaling is not None:  # a faint channel tells parameters, too
+            J = J * scaling[..., None]
         self.identifiability_ = Identifiability.from_jacobian(
             J, self.structure_.parameter_names
         )

@@ -86,7 +86,7 @@ class RestructuringProblem:
         return keeps_margin(self.system, theta, self.margin)
 
     def fit(
-        self, theta: Array, balance: Array | float = 1.0
+        self, theta: Array, scaling: Array | float = 1.0
     ) -> LeastSquaresResult | None:
         """Least-squares fit of the response from given parameters; None if unstable."""
         return fit_frequency_response(
@@ -95,7 +95,7 @@ class RestructuringProblem:
             self.omega,
             self.response,
             admissible=self.is_stable,
-            balance=balance,
+            balance=scaling,
         )
 
     def relative_error(self, fit: LeastSquaresResult) -> float:

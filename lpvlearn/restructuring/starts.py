@@ -30,7 +30,7 @@ from .transfer import Target, model_derivatives
 
 Array = NDArray[np.float64]
 
-GOOD_FIT = 3e-3  # relative least-squares error that needs no further starts
+GOOD_FIT = 3e-3  # relative least-squares error that no wrong basin comes down to
 
 # A worse fit is searched on for, even where starts agree on it: a structure seldom is
 # that far from what it is meant to describe, and starts may agree on a wrong basin.
@@ -40,13 +40,13 @@ _ROUNDS = 3  # more starts; then a smoother response; then both, thoroughly
 
 _N_FITS = 3  # of a round, from the best candidates: their ranking is seldom far off
 
-_SAME = 1e-4  # relative difference of the costs of fits in one basin
+_SAME = 1e-4  # relative difference of the costs of fits in one basin: they end at 1e-6
 
 # A structure slower than the black box lets expect is searched for with that part of
 # the stability margin: it must be stable still.
 _LEAST_MARGIN = 1e-6
 
-_HOP_FIT = 0.03  # error of a fit whose neighbouring basins are looked at
+_HOP_FIT = 0.03  # error of a fit so far off that better basins may lie beside its own
 
 _HOPS = (0.1, 0.3, 1.0) * 4  # sizes of the hops of logarithms: 10 %, to a factor of 3
 
@@ -56,7 +56,7 @@ _HOP_ROUNDS = 4  # from ever better fits
 
 _HOP_GAIN = 1e-3  # relative decrease of the cost that is worth another round
 
-_FAINT = 0.03  # of modes that only fill the order, relative to the black box
+_FAINT = 0.03  # size of modes that only fill the order: seen, but hardly disturbing
 
 _FAST = 3.0  # decay of these modes, relative to the fastest: they are out of the way
 
@@ -147,8 +147,8 @@ def best_fits(
         return []
     system, omega, G0 = problem.system, problem.omega, problem.response
     W = system.weight_response(omega)[0]
-    balance = channel_balance(problem.weighted_response)
-    scale = 1.0 if balance is None else balance
+    scaling = channel_balance(problem.weighted_response)
+    scale = 1.0 if scaling is None else scaling
     errors = [
         np.linalg.norm(scale * (W @ (system.response(theta, omega) - G0)))
         for theta in usable
@@ -156,8 +156,8 @@ def best_fits(
     thetas = _distinct(np.array(usable)[np.argsort(errors, kind="stable")])
     fits = []
     for theta in thetas[:n_fits]:
-        if balance is not None:  # all channels alike first, then as they are
-            first = problem.fit(theta, balance)
+        if scaling is not None:  # all channels alike first, then as they are
+            first = problem.fit(theta, scaling)
             theta = theta if first is None else first.x
         fit = problem.fit(theta)
         if fit is None:
@@ -299,9 +299,9 @@ def _random_similarities(
     if box.dt is None and sizes.size:
         scales = [_mean_rate(sizes), float(sizes.max())]
     offset, basis = affine.offset, affine.basis
-    balance = channel_balance(model_derivatives(box, frequency_grid(poles, box.dt))[0])
-    if balance is not None:  # rank one: factors of the outputs and of the inputs
-        outputs, inputs = balance[:, 0] / balance[0, 0], balance[0]
+    scaling = channel_balance(model_derivatives(box, frequency_grid(poles, box.dt))[0])
+    if scaling is not None:  # rank one: factors of the outputs and of the inputs
+        outputs, inputs = scaling[:, 0] / scaling[0, 0], scaling[0]
         ones = np.ones(len(box.A))
         left = np.concatenate([ones, outputs])[:, None]
         right = np.concatenate([ones, inputs])
