@@ -180,7 +180,7 @@ def mechanical_map(
     rows = [[*mass, *k, *d, *force] for mass, k, d, force in blocks]
     offset, basis, names = affine_arrays(rows, parameter_names)
     stacked = np.concatenate([offset[None], basis])
-    mass, rest = stacked[:, :, :n], stacked[:, :, n:]
+    mass, rest = (part.copy() for part in np.split(stacked, [n], axis=2))
     rest[:, :, : 2 * n] = 0.0 - rest[:, :, : 2 * n]  # no negative zeros
     if not mass[1:].any() and not 1.0 / np.linalg.cond(mass[0]) > _SINGULAR:
         raise ValueError(

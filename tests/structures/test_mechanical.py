@@ -2,6 +2,7 @@
 
 import pickle
 
+import joblib
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -108,6 +109,12 @@ def test_structures_without_a_guess_have_a_regular_reference():
     theta = guessed.initial * np.linspace(1, 2, 3)[:, None]
     other = pickle.loads(pickle.dumps(guessed))
     assert_array_equal(other.system_matrix(theta), guessed.system_matrix(theta))
+
+
+def test_a_pickle_is_the_same_to_a_memory():
+    structure = MECHANICAL(M2, D2, K2, [[1], [0]])
+    other = pickle.loads(pickle.dumps(structure))
+    assert joblib.hash(other) == joblib.hash(structure)
 
 
 def test_a_model_without_mass_is_refused():
