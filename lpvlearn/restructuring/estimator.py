@@ -7,25 +7,25 @@ differ.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.validation import check_is_fitted
 
-from ..exceptions import RankWarning
+from ..exceptions import RankWarning, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from .identifiability import Identifiability, perturbation_table, spread_covariance
-from .least_squares import LeastSquaresResult, channel_balance, fit_frequency_response
+from ..validation import one_of, whole_number
+from .identifiability import Identifiability, spread_covariance
+from .least_squares import LeastSquaresResult, channel_balance
 from .measured import stack_response
 from .minimise_h2 import minimise_h2
 from .minimise_hinf import SOLVERS, minimise_hinf, promising
@@ -36,126 +36,17 @@ from .problem import (
     problem_from_response,
 )
 from .similarity import minimise_bilinear
-from .starts import relative_error, search
+from .starts import search
 
 Array = NDArray[np.float64]
 
-_NORMS = ("hinf", "h2", "similarity")
-
-_POOR_FIT = 2e-2  # relative least-squares error that is warned about
+_POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows in plots
 
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
 
-_PROVEN = 1e-8  # an error that much above its lower bound is optimal
+_PROVEN = 1e-8  # an error that much above its lower bound, its rounding, is optimal
 
 _ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
-
-
-def check_options(restructurer: Any) -> None:
-    """A ValueError for options of a GrayBoxRestructurer that are not valid."""
-    for name, allowed in (("norm", _NORMS), ("solver", tuple(SOLVERS))):
-        value = getattr(restructurer, name)
-        if value not in allowed:
-            raise ValueError(f"`{name}` must be one of {allowed}. Got {value!r}.")
-    init = restructurer.init
-    if isinstance(init, str) and init != "similarity":
-        raise ValueError(
-            f"`init` must be 'similarity' or a vector of parameters. Got {init!r}."
-        )
-    for name, least in (("n_starts", 1), ("max_iter", 0)):
-        value = getattr(restructurer, name)
-        if not isinstance(value, Integral) or value < least:
-            raise ValueError(
-                f"`{name}` must be an integer of at least {least}. Got {value!r}."
-            )
-    tol = restructurer.tol
-    if not isinstance(tol, Real) or not 0.0 <= float(tol) < 1.0:
-        raise ValueError(
-            f"`tol` must be a relative decrease, at least 0 and below 1. Got {tol!r}."
-        )
-
-
-def minimise(
-    problem: RestructuringProblem,
-    fits: list[LeastSquaresResult],
-    *,
-    norm: str,
-    solver: str,
-    max_iter: int,
-    tol: float,
-) -> tuple[Array, MinimaxResult, float]:
-    """Minimise the norm of the error from least-squares fits.
-
-    Returns
-    -------
-    theta : ndarray of shape (n_params,)
-    result : MinimaxResult
-    floor : float
-        Highest peak that no parameter changes.
-    """
-    options: dict[str, Any] = {
-        "max_iter": max_iter,
-        "tol": tol,
-        "negligible": _ROUNDING * problem.reference,
-    }
-    system, margin = problem.system, problem.margin
-    if norm == "h2":
-        runs = [minimise_h2(system, fit, margin, **options) for fit in promising(fits)]
-        return *min(runs, key=lambda run: run[1].peaks.top), 0.0
-    if norm == "similarity":
-        found = minimise_bilinear(problem.structure, problem.box, fits[0].x, max_iter)
-        return *found, 0.0
-    theta, result, floor = minimise_hinf(
-        system, fits, margin, SOLVERS[solver], **options
-    )
-    if result.peaks.top <= problem.lower_bound * (1.0 + _PROVEN):
-        # no model is nearer; where the error is equally high everywhere, its peaks
-        # could not tell
-        result = replace(result, stationarity=0.0, converged=True)
-    return theta, result, floor
-
-
-def warn_about(
-    restructurer: Any, problem: RestructuringProblem, result: MinimaxResult
-) -> None:
-    """Warnings about a fitted GrayBoxRestructurer."""
-    if not result.converged:
-        spent = restructurer.n_iter_ >= restructurer.max_iter
-        warnings.warn(
-            f"the search {'ended at' if spent else 'stalled before'} "
-            f"`max_iter`={restructurer.max_iter} steps, with `stationarity_` "
-            f"{restructurer.stationarity_:.1g} (0 at an optimum): a lower norm may be "
-            "near. The best point is kept. "
-            + ("Raise `max_iter`" if spent else "Try another `random_state`")
-            + ", or take a structure of fewer parameters.",
-            ConvergenceWarning,
-            stacklevel=4,
-        )
-    error = restructurer.fit_error_
-    floor = restructurer.structural_floor_ / max(problem.reference, 1e-300)
-    if error - floor > _POOR_FIT:
-        costs = restructurer.starts_["relative_error"].to_numpy()
-        agreeing = int((costs <= costs.min() * (1.0 + _AGREE)).sum())
-        warnings.warn(
-            f"the structure comes no nearer than {100 * error:.2g} % (root mean square "
-            f"over frequency) to the black box; {agreeing} of {len(costs)} fits from "
-            "different starts end there. "
-            + (
-                "It probably cannot represent the model any better."
-                if agreeing > 1
-                else "Either it cannot represent the model, or the search ended in a "
-                "wrong basin."
-            )
-            + " Give `init`, or raise `n_starts`, to search elsewhere.",
-            ConvergenceWarning,
-            stacklevel=4,
-        )
-    found = restructurer.identifiability_
-    if found.rank < problem.structure.n_params:
-        warnings.warn(str(found), RankWarning, stacklevel=4)
-
-
-__all__ = ["GrayBoxRestructurer"]
 
 
 class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
@@ -317,7 +208,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             If a model is unstable, or the structure has other inputs or outputs.
         """
         problem = self._problem(model)
-        self._solve(problem, [problem.structure.check_params(s) for s in starts])
+        self._restructure(problem, [problem.structure.check_params(s) for s in starts])
         if len(realizations):
             responses = [m.frequency_response(problem.omega) for m in realizations]
             self.params_covariance_ = spread_covariance(
@@ -350,7 +241,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             If `structure` is None (a response does not tell the order), or shapes do
             not fit.
         """
-        check_options(self)
+        self._check_options()
         if self.norm != "hinf":
             raise ValueError(
                 "`norm` must be 'hinf' to fit a frequency response. Got "
@@ -360,7 +251,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             self.structure, omega, frf, self.frequency_weight, sample_weight
         )
         self.n_features_in_ = 1
-        self._solve(problem, [])
+        self._restructure(problem, [])
         return self
 
     def start_error(self, model: StateSpace, params: ArrayLike) -> float:
@@ -378,15 +269,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             where the parameters give an unstable model.
         """
         problem = self._problem(model)
-        theta = problem.structure.check_params(params)
-        fit = fit_frequency_response(
-            problem.system,
-            theta,
-            problem.omega,
-            problem.response,
-            admissible=problem.stable,
-        )
-        return np.inf if fit is None else relative_error(fit, problem)
+        fit = problem.fit(problem.structure.check_params(params))
+        return np.inf if fit is None else problem.relative_error(fit)
 
     def perturbation_check(
         self, model: StateSpace, n_restarts: int = 10, size: float = 0.05
@@ -407,40 +291,90 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             Relative deviation of every parameter from `params_`, and `error_`.
         """
         check_is_fitted(self, "params_")
-        return perturbation_table(self, model, n_restarts, size)
+        rng = np.random.default_rng(0)
+        rows = []
+        for _ in range(n_restarts):
+            start = self.params_ * (1.0 + size * rng.normal(size=self.params_.shape))
+            again = clone(self).set_params(init=start, n_starts=1).fit_model(model)
+            rows.append([*(again.params_ / self.params_ - 1.0), again.error_])
+        names = [*self.structure_.parameter_names, "error_"]
+        return pd.DataFrame(rows, columns=names)
+
+    def _check_options(self) -> None:
+        one_of("norm", self.norm, ("hinf", "h2", "similarity"))
+        one_of("solver", self.solver, tuple(SOLVERS))
+        if isinstance(self.init, str) and self.init != "similarity":
+            raise ValueError(
+                "`init` must be 'similarity' or a vector of parameters. Got "
+                f"{self.init!r}."
+            )
+        whole_number("n_starts", self.n_starts, 1)
+        whole_number("max_iter", self.max_iter, 0)
+        if not isinstance(self.tol, Real) or not 0.0 <= float(self.tol) < 1.0:
+            raise ValueError(
+                "`tol` must be a relative decrease, at least 0 and below 1. Got "
+                f"{self.tol!r}."
+            )
 
     def _problem(
         self, model: StateSpace | Sequence[StateSpace]
     ) -> RestructuringProblem:
-        check_options(self)
+        """What is minimised: the distance of the structure to one or several models."""
+        self._check_options()
         models = list(model) if isinstance(model, Sequence) and model else [model]
         return problem_from_models(self.structure, models, self.frequency_weight)
 
-    def _solve(self, problem: RestructuringProblem, given: list[Array]) -> None:
-        """Candidates, least-squares fits, and the minimisation from the best."""
+    def _restructure(self, problem: RestructuringProblem, given: list[Array]) -> None:
+        """Starts and their least-squares fits, minimisation, certificates, warnings."""
         self.__dict__.pop("params_covariance_", None)  # of an earlier fit
-        self.structure_ = problem.structure
-        problem, fits = search(self, problem, given)
-        relative = [relative_error(fit, problem) for fit in fits]
+        problem, fits = search(
+            problem,
+            init=self.init,
+            n_starts=self.n_starts,
+            given=given,
+            random_state=self.random_state,
+        )
+        relative = [problem.relative_error(fit) for fit in fits]
         self.starts_ = pd.DataFrame({"relative_error": relative})
         self.fit_error_, self.start_params_ = relative[0], fits[0].x
-        self.params_, result, floor = minimise(
-            problem,
-            fits,
-            norm=self.norm,
-            solver=self.solver,
-            max_iter=self.max_iter,
-            tol=self.tol,
-        )
+        self.params_, result, floor = self._minimise(problem, fits)
         self._describe(problem, result, floor)
-        warn_about(self, problem, result)
+        self._warn(problem, result)
+
+    def _minimise(
+        self, problem: RestructuringProblem, fits: list[LeastSquaresResult]
+    ) -> tuple[Array, MinimaxResult, float]:
+        """Parameters of the least norm, their certificate, and the structural floor."""
+        system, margin = problem.system, problem.margin
+        if self.norm == "similarity":
+            found = minimise_bilinear(
+                problem.structure, problem.box, fits[0].x, self.max_iter
+            )
+            return *found, 0.0
+        options: dict[str, Any] = {
+            "max_iter": self.max_iter,
+            "tol": self.tol,
+            "negligible": _ROUNDING * problem.reference,
+        }
+        if self.norm == "h2":
+            runs = [minimise_h2(system, f, margin, **options) for f in promising(fits)]
+            return *min(runs, key=lambda run: run[1].peaks.top), 0.0
+        theta, result, floor = minimise_hinf(
+            system, fits, margin, SOLVERS[self.solver], **options
+        )
+        if result.peaks.top <= problem.lower_bound * (1.0 + _PROVEN):
+            # no model is nearer; where the error is equally high everywhere, its peaks
+            # could not tell
+            result = replace(result, stationarity=0.0, converged=True)
+        return theta, result, floor
 
     def _describe(
         self, problem: RestructuringProblem, result: MinimaxResult, floor: float
     ) -> None:
         """Attributes that describe the result."""
-        system, structure = problem.system, problem.structure
-        self.lti_ = structure.model(self.params_, system.dt)
+        system = problem.system
+        self.structure_ = problem.structure
+        self.lti_ = self.structure_.model(self.params_, system.dt)
         peaks = system.peaks(self.params_)
         self.error_ = peaks.norm
         size = problem.reference
@@ -462,12 +396,45 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             self.active_frequencies_ = np.sort(peaks.frequencies)
             self.remaining_error_ = self.error_
         J = system.response_jacobian(self.params_, problem.omega)[1]
-        balance = channel_balance(problem.response)
-        if balance is not None:  # a faint channel tells parameters, too
-            J = J * balance[..., None]
+        scaling = channel_balance(problem.response)
+        if scaling is not None:  # a faint channel tells parameters, too
+            J = J * scaling[..., None]
         self.identifiability_ = Identifiability.from_jacobian(
-            J, structure.parameter_names
+            J, self.structure_.parameter_names
         )
+
+    def _warn(self, problem: RestructuringProblem, result: MinimaxResult) -> None:
+        """Warn of a search that did not converge, a poor fit, and open parameters."""
+        if not result.converged:
+            spent = self.n_iter_ >= self.max_iter
+            warn(
+                f"the search {'ended at' if spent else 'stalled before'} "
+                f"`max_iter`={self.max_iter} steps, with `stationarity_` "
+                f"{self.stationarity_:.1g} (0 at an optimum): a lower norm may be "
+                "near. The best point is kept. "
+                + ("Raise `max_iter`" if spent else "Try another `random_state`")
+                + ", or take a structure of fewer parameters.",
+                ConvergenceWarning,
+            )
+        floor = self.structural_floor_ / max(problem.reference, 1e-300)
+        if self.fit_error_ - floor > _POOR_FIT:
+            costs = self.starts_["relative_error"].to_numpy()
+            agreeing = int((costs <= costs.min() * (1.0 + _AGREE)).sum())
+            warn(
+                f"the structure comes no nearer than {100 * self.fit_error_:.2g} % "
+                f"(root mean square over frequency) to the black box; {agreeing} of "
+                f"{len(costs)} fits from different starts end there. "
+                + (
+                    "It probably cannot represent the model any better."
+                    if agreeing > 1
+                    else "Either it cannot represent the model, or the search ended in "
+                    "a wrong basin."
+                )
+                + " Give `init`, or raise `n_starts`, to search elsewhere.",
+                ConvergenceWarning,
+            )
+        if self.identifiability_.rank < self.structure_.n_params:
+            warn(str(self.identifiability_), RankWarning)
 
     # -- use -----------------------------------------------------------------------
 

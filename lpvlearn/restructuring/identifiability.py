@@ -1,25 +1,29 @@
-"""Local identifiability of a gray-box structure from its frequency response."""
+"""What a frequency response tells of the parameters: which ones, and how exactly.
+
+Both follow from the derivative J of the response to the parameters: its rank, and to
+first order the change of the parameters with the response, ``d theta = Re(K dG)``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from scipy.linalg import qr
-from sklearn.base import clone
 
-from ..models.statespace import StateSpace
 from .error_system import ErrorSystem
 
 Array = NDArray[np.float64]
 
+Complex = NDArray[np.complex128]
+
+# Singular values smaller than that part of the largest are rounding: responses and
+# their derivatives are exact to about 1e-13, behind resolvents less so.
 _RANK_TOLERANCE = 1e-9
 
-_NAMED = 0.1
+_NAMED = 0.1  # smaller parts of an undetermined combination would only clutter its name
 
 
 @dataclass(frozen=True)
@@ -61,9 +65,7 @@ class Identifiability:
         )
 
     @classmethod
-    def from_jacobian(
-        cls, J: NDArray[np.complex128], names: Sequence[str]
-    ) -> Identifiability:
+    def from_jacobian(cls, J: Complex, names: Sequence[str]) -> Identifiability:
         """Analysis of the response Jacobian.
 
         Every column is divided by its norm: the analysis does not depend on the units
@@ -124,9 +126,6 @@ def _sparse_rows(null: Array) -> Array:
     return (rows / largest).round(12) + 0.0
 
 
-Complex = NDArray[np.complex128]
-
-
 def response_gain(system: ErrorSystem, theta: Array, omega: Array) -> Complex:
     """First-order change of the parameters with the black box's response.
 
@@ -183,18 +182,3 @@ def spread_covariance(
         K = K.reshape(*K.shape[:2], -1, G.shape[2], G.shape[3]).sum(2)
     changes = np.real(np.einsum("jkpm,rkpm->rj", K.conj(), G - G.mean(0)))
     return np.cov(changes.T, ddof=1).reshape(len(theta), -1) / len(G)
-
-
-def perturbation_table(
-    restructurer: Any, model: StateSpace, n_restarts: int, size: float
-) -> pd.DataFrame:
-    """Deviation of the parameters after restarts from perturbed ones."""
-    theta = restructurer.params_
-    rng = np.random.default_rng(0)
-    rows = []
-    for _ in range(n_restarts):
-        start = theta * (1.0 + size * rng.normal(size=theta.shape))
-        again = clone(restructurer).set_params(init=start, n_starts=1).fit_model(model)
-        rows.append([*(again.params_ / theta - 1.0), again.error_])
-    names = [*restructurer.structure_.parameter_names, "error_"]
-    return pd.DataFrame(rows, columns=names)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -131,8 +129,3 @@ class Limits:
         size = self.sizes(theta)
         gap = np.minimum(1e-3 * size, 0.25 * (upper - lower))
         return np.clip(theta, lower + gap, upper - gap)
-
-
-def stability_test(system: ErrorSystem, margin: float) -> Callable[[Array], bool]:
-    """Whether parameters give a model that keeps the stability margin."""
-    return lambda theta: keeps_margin(system, theta, margin)

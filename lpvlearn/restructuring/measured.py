@@ -1,4 +1,9 @@
-"""The error of a structure against a measured frequency response."""
+"""Measured frequency responses: tables, the error against one, and a model near one.
+
+The error is known at the measured frequencies only, so its maximum over them is a lower
+bound of the H-infinity norm. A model realised from the response is the black box that
+similarity transformations start from.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +19,80 @@ from .transfer import Target, model_derivatives
 Array = NDArray[np.float64]
 
 Complex = NDArray[np.complex128]
+
+# Relative difference of measured neighbours that count as equally high: at an optimum
+# two of them often are, up to what the search has still to gain.
+_BESIDE = 1e-3
+
+
+class MeasuredErrorSystem(ErrorSystem):
+    """The error of a structure against a measured frequency response.
+
+    The maximum runs over the measured frequencies only: a lower bound of the
+    H-infinity norm.
+    """
+
+    peaks_move = False
+
+    def __init__(
+        self,
+        structure: Structure,
+        omega: Array,
+        G: Complex,
+        weight: Complex | None = None,
+    ) -> None:
+        n_outputs, n_inputs = G.shape[1:]
+        empty = np.zeros((0, 0))
+        D = np.zeros((n_outputs, n_inputs))
+        nothing = Target(empty, np.zeros((0, n_inputs)), np.zeros((n_outputs, 0)), D)
+        super().__init__(structure, nothing)
+        order = np.argsort(omega)
+        self.omega, self.G = omega[order], G[order]
+        self.fastest = float(self.omega[-1])
+        unit = np.broadcast_to(np.eye(n_outputs), (len(omega), n_outputs, n_outputs))
+        self.W = (unit if weight is None else weight[order]).astype(complex)
+
+    def restructured(self, structure: Structure) -> ErrorSystem:
+        """The error of another structure."""
+        return MeasuredErrorSystem(structure, self.omega, self.G, self.W)
+
+    def reweighted(self, weight: Target) -> ErrorSystem:
+        """The same error behind one more weight (a scalar one)."""
+        factor = model_derivatives(weight, self.omega)[0][:, :1, :1]
+        return MeasuredErrorSystem(self.structure, self.omega, self.G, factor * self.W)
+
+    def resonances(self, poles: Complex) -> Array:
+        """None: no frequency lies between the measured ones."""
+        return np.zeros(0)
+
+    def weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        """The weight at some of the measured frequencies."""
+        W = self.W[np.searchsorted(self.omega, omega)]
+        return W, np.zeros_like(W), np.zeros_like(W)
+
+    def _target_response(self, omega: Array) -> Complex:
+        """The measured response at some of the measured frequencies."""
+        return self.G[np.searchsorted(self.omega, omega)]
+
+    def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+        G0 = self.target_response(omega)
+        return G0, np.zeros_like(G0), np.zeros_like(G0)
+
+    def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
+        """Local maxima of the error over the measured frequencies.
+
+        And their neighbours that are as high: at an optimum two often are equal.
+        """
+        E = self.W @ (self.response(theta, self.omega) - self.G)
+        sigma = np.linalg.norm(E, 2, axis=(1, 2))
+        top = float(sigma.max())
+        rising = np.r_[True, sigma[1:] >= sigma[:-1]]
+        falling = np.r_[sigma[:-1] >= sigma[1:], True]
+        level = top if within is None else (1.0 - within) * top
+        beside = sigma >= (1.0 - _BESIDE) * top
+        index = np.flatnonzero((rising & falling | beside) & (sigma >= level))
+        index = index[np.argsort(-sigma[index], kind="stable")]
+        return PeakSet(top, self.omega[index], sigma[index])
 
 
 def stack_response(G: Complex) -> Array:
@@ -31,28 +110,12 @@ def stack_response(G: Complex) -> Array:
 def read_frequency_data(
     omega: ArrayLike, frf: ArrayLike, n_outputs: int, n_inputs: int
 ) -> tuple[Array, Complex]:
-    """Frequencies and complex response, or a ValueError that teaches.
-
-    Parameters
-    ----------
-    omega : array-like of shape (n_freq,) or (n_freq, 1)
-        Angular frequencies, rad/s.
-    frf : array-like of shape (n_freq, 2 * n_outputs * n_inputs), or complex of shape
-        (n_freq, n_outputs, n_inputs)
-        Real parts of the entries row by row, then imaginary parts; or the complex
-        response.
-    n_outputs, n_inputs : int
+    """The data of `GrayBoxRestructurer.fit`, or a ValueError that teaches.
 
     Returns
     -------
     omega : ndarray of shape (n_freq,)
     G : ndarray of shape (n_freq, n_outputs, n_inputs)
-
-    Raises
-    ------
-    ValueError
-        If a shape does not fit, a value is not finite, or a frequency is negative or
-        given twice.
 
     Examples
     --------
@@ -129,12 +192,14 @@ def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
     -2.0
     """
     k, p, m = G.shape
-    rows = order + 1 + order // 2
+    rows = order + 1 + order // 2  # of blocks: half as many again as are needed
     if order < 1 or 2 * k * m < rows * m + order or rows * p <= order:
         return None
+    # on the unit circle, by the bilinear map whose quarter turn is in the middle
     positive = omega[omega > 0]
     centre = float(np.exp(0.5 * np.log(positive.min() * positive.max())))
     z = (centre + 1j * omega) / (centre - 1j * omega)
+    # what the inputs leave of [G; z G; z^2 G; ...] spans the observability matrix
     powers = z ** np.arange(rows)[:, None]
     outputs = np.einsum("ik,kpm->ipkm", powers, G).reshape(rows * p, k * m)
     inputs = np.einsum("ik,ab->iakb", powers, np.eye(m)).reshape(rows * m, k * m)
@@ -158,76 +223,3 @@ def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
         return Target(*d2c_tustin(A, BD[:order], C, BD[order:], 2.0 / centre))
     except ValueError:  # a pole on a data point or at infinity
         return None
-
-
-_BESIDE = 1e-3  # relative difference of measured neighbours that are equally high
-
-
-class MeasuredErrorSystem(ErrorSystem):
-    """The error of a structure against a measured frequency response.
-
-    The maximum runs over the measured frequencies only: a lower bound of the
-    H-infinity norm.
-    """
-
-    peaks_move = False
-
-    def __init__(
-        self,
-        structure: Structure,
-        omega: Array,
-        G: Complex,
-        weight: Complex | None = None,
-    ) -> None:
-        n_outputs, n_inputs = G.shape[1:]
-        empty = np.zeros((0, 0))
-        D = np.zeros((n_outputs, n_inputs))
-        target = Target(empty, np.zeros((0, n_inputs)), np.zeros((n_outputs, 0)), D)
-        super().__init__(structure, target)
-        order = np.argsort(omega)
-        self.omega, self.G = omega[order], G[order]
-        self.fastest = float(self.omega[-1])
-        unit = np.broadcast_to(np.eye(n_outputs), (len(omega), n_outputs, n_outputs))
-        self.W = (unit if weight is None else weight[order]).astype(complex)
-
-    def restructured(self, structure: Structure) -> ErrorSystem:
-        """The error of another structure."""
-        return MeasuredErrorSystem(structure, self.omega, self.G, self.W)
-
-    def reweighted(self, weight: Target) -> ErrorSystem:
-        """The same error behind one more weight (a scalar one)."""
-        factor = model_derivatives(weight, self.omega)[0][:, :1, :1]
-        return MeasuredErrorSystem(self.structure, self.omega, self.G, factor * self.W)
-
-    def resonances(self, poles: Complex) -> Array:
-        """None: no frequency lies between the measured ones."""
-        return np.zeros(0)
-
-    def weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
-        """The weight at some of the measured frequencies."""
-        W = self.W[np.searchsorted(self.omega, omega)]
-        return W, np.zeros_like(W), np.zeros_like(W)
-
-    def _target_response(self, omega: Array) -> Complex:
-        """The measured response at some of the measured frequencies."""
-        return self.G[np.searchsorted(self.omega, omega)]
-
-    def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
-        G0 = self.target_response(omega)
-        return G0, np.zeros_like(G0), np.zeros_like(G0)
-
-    def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
-        """Local maxima of the error over the measured frequencies.
-
-        And their neighbours that are as high: at an optimum two often are equal.
-        """
-        E = self.W @ (self.response(theta, self.omega) - self.G)
-        sigma = np.linalg.norm(E, 2, axis=(1, 2))
-        top = float(sigma.max())
-        rising = np.r_[True, sigma[1:] >= sigma[:-1]]
-        falling = np.r_[sigma[:-1] >= sigma[1:], True]
-        level = top if within is None else (1.0 - within) * top
-        beside = sigma >= (1.0 - _BESIDE) * top
-        index = np.flatnonzero((rising & falling | beside) & (sigma >= level))
-        index = index[np.argsort(-sigma[index], kind="stable")]
-        return PeakSet(top, self.omega[index], sigma[index])

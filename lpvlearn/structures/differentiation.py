@@ -13,33 +13,25 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_COMPLEX_STEP = 1e-30
+# All steps are relative to the sizes of the parameters.
+
+_COMPLEX_STEP = 1e-30  # nothing is subtracted: its square is below any rounding
 
 _CENTRAL_STEP = 6e-6  # about eps^(1/3): rounding and truncation balance
 
-_CURVATURE_STEP = 1e-5
+_CURVATURE_STEP = 1e-5  # the same for derivatives, whose scale of change is longer
 
+# Relative difference of exact and central derivatives of an analytic function: far
+# above the truncation of the latter, far below what a missing part would make.
 _AGREEMENT = 1e-4
 
-_FILTERS = threading.RLock()
+# Relative rounding error of a central difference: eps / _CENTRAL_STEP is 4e-11, and the
+# function may lose two digits of its own.
+_ROUNDING = 1e-8
 
+_LEAST_SIZE = 1e-3  # of a parameter near zero, relative to its usual size
 
-def parameter_scale(theta: Array, typical: Array | None = None) -> Array:
-    """Size of every parameter, for steps; units may differ from one to another.
-
-    Parameters
-    ----------
-    theta : ndarray of shape (n_params,)
-    typical : ndarray of shape (n_params,), default=None
-        Usual values; a parameter is not taken as smaller than a thousandth of them.
-        None, or 0, stands for 1.
-
-    Returns
-    -------
-    ndarray of shape (n_params,)
-    """
-    usual = np.ones(len(theta)) if typical is None else np.abs(typical)
-    return np.maximum(np.abs(theta), 1e-3 * np.where(usual > 0, usual, 1.0))
+_FILTERS = threading.RLock()  # the warning filters are those of all threads
 
 
 def numerical_jacobian(
@@ -68,7 +60,7 @@ def numerical_jacobian(
     array([[3., 1.],
            [0., 0.]])
     """
-    scale = parameter_scale(theta, typical)
+    scale = _parameter_scale(theta, typical)
     exact = _analytic_jacobian(f, theta, scale)
     return _central(f, theta, _CENTRAL_STEP * scale) if exact is None else exact
 
@@ -91,7 +83,6 @@ def _analytic_jacobian(
     by entry.
     """
     try:
-        # the filters are those of all threads
         with _FILTERS, warnings.catch_warnings():
             warnings.simplefilter("error", ComplexWarning)
             exact = _complex_step(f, theta, scale)
@@ -102,7 +93,7 @@ def _analytic_jacobian(
     up, down = np.asarray(f(theta + step)), np.asarray(f(theta - step))
     change = (up - down) / (2.0 * _CENTRAL_STEP)
     size = np.abs(exact * scale.reshape(-1, *[1] * (exact.ndim - 1))).sum(0)
-    rounding = 1e-8 * (np.abs(up) + np.abs(down))
+    rounding = _ROUNDING * (np.abs(up) + np.abs(down))
     error = np.abs(np.tensordot(direction, exact, axes=1) - change)
     agrees = error <= _AGREEMENT * np.maximum(np.abs(change), size) + rounding
     return exact if agrees.all() else None
@@ -113,17 +104,7 @@ def numerical_curvature(
 ) -> Array:
     """Second derivatives, by central differences of the first ones, symmetrised.
 
-    Parameters
-    ----------
-    f : callable
-        Maps (n_params,) to an array of any shape, as for `numerical_jacobian`.
-    theta : ndarray of shape (n_params,)
-    typical : ndarray of shape (n_params,), default=None
-        Usual sizes of the parameters.
-
-    Returns
-    -------
-    ndarray of shape (n_params, n_params, ...)
+    The arguments are those of `numerical_jacobian`; shape (n_params, n_params, ...).
 
     Examples
     --------
@@ -133,14 +114,14 @@ def numerical_curvature(
     array([[12., 12.],
            [12.,  0.]])
     """
-    scale = parameter_scale(theta, typical)
+    scale = _parameter_scale(theta, typical)
+    analytic = _analytic_jacobian(f, theta, scale) is not None
 
     def jacobian(point: Array) -> Array:
-        if analytic:
+        if analytic:  # as around theta: not asked again at every step
             return _complex_step(f, point, scale)
         return numerical_jacobian(f, point, typical)
 
-    analytic = _analytic_jacobian(f, theta, scale) is not None
     return symmetric_differences(jacobian, theta, typical)
 
 
@@ -148,7 +129,7 @@ def symmetric_differences(
     jacobian: Callable[[Array], Array], theta: Array, typical: Array | None = None
 ) -> Array:
     """Second derivatives from a Jacobian that maps (n_params,) to (n_params, ...)."""
-    H = _central(jacobian, theta, _CURVATURE_STEP * parameter_scale(theta, typical))
+    H = _central(jacobian, theta, _CURVATURE_STEP * _parameter_scale(theta, typical))
     return 0.5 * (H + H.swapaxes(0, 1))
 
 
@@ -159,3 +140,9 @@ def _central(f: Callable[[Any], Any], theta: Array, steps: Array) -> Array:
             for step in np.diag(steps)
         ]
     )
+
+
+def _parameter_scale(theta: Array, typical: Array | None) -> Array:
+    """Size of every parameter; None, or 0, stands for a usual value of 1."""
+    usual = np.ones(len(theta)) if typical is None else np.abs(typical)
+    return np.maximum(np.abs(theta), _LEAST_SIZE * np.where(usual > 0, usual, 1.0))

@@ -13,9 +13,11 @@ Array = NDArray[np.float64]
 
 Interval = Sequence[float | None]
 
-_SPREAD = 0.3  # standard deviation of log-parameters around a first guess
+_SPREAD = 0.3  # standard deviation of log-parameters: a guess is right to a third
 
-_DECADE = 10.0  # a range that spans more is drawn on a logarithmic scale
+_DECADE = 10.0  # a range that spans more tells an order of magnitude, not a value
+
+_LISTED = 8  # names that a message lists
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,32 +46,22 @@ class ParameterDomain:
                 array.setflags(write=False)
 
     @classmethod
-    def free(cls, names: Sequence[str], initial: Array | None) -> ParameterDomain:
+    def free(
+        cls, names: Sequence[str], initial: Array | None = None
+    ) -> ParameterDomain:
         """No bounds and no ranges.
 
         Examples
         --------
-        >>> ParameterDomain.free(["k"], None).lower
+        >>> ParameterDomain.free(["k"]).lower
         array([-inf])
         """
         q = len(names)
         infinite, unknown = np.full(q, np.inf), np.full((2, q), np.nan)
         return cls(tuple(names), -infinite, infinite, unknown, initial)
 
-    @property
-    def is_bounded(self) -> bool:
-        """Whether any parameter has a bound."""
-        return bool(np.isfinite([self.lower, self.upper]).any())
-
     def with_bounds(self, bounds: Mapping[str, Interval]) -> ParameterDomain:
-        """The domain with other bounds of the named parameters.
-
-        Raises
-        ------
-        ValueError
-            If a name is unknown, a lower bound is not below the upper one, or a range
-            or first guess is outside.
-        """
+        """The domain with other bounds, see `GrayBoxStructure.with_bounds`."""
         lower, upper = self.lower.copy(), self.upper.copy()
         for j, name, (low, high) in self._intervals("bounds", bounds):
             lower[j] = -np.inf if low is None else low
@@ -83,13 +75,7 @@ class ParameterDomain:
         return replace(self, lower=lower, upper=upper)._checked()
 
     def with_ranges(self, ranges: Mapping[str, Interval]) -> ParameterDomain:
-        """The domain with other known ranges of the named parameters.
-
-        Raises
-        ------
-        ValueError
-            If a name is unknown, or a range is infinite, empty or outside the bounds.
-        """
+        """The domain with other ranges, see `GrayBoxStructure.with_ranges`."""
         table = self.ranges.copy()
         for j, name, (low, high) in self._intervals("ranges", ranges):
             if low is None or high is None or not -np.inf < low < high < np.inf:
@@ -102,19 +88,12 @@ class ParameterDomain:
         return replace(self, ranges=table)._checked()
 
     def fixed(self, values: Any) -> tuple[Array, NDArray[np.bool_]]:
-        """A vector that holds the given values, and which parameters remain free.
-
-        Raises
-        ------
-        ValueError
-            If a name is unknown, a value is not finite or outside its bounds, or no
-            parameter remains.
-        """
+        """A vector that holds the given values, and which parameters remain free."""
         if not isinstance(values, Mapping):
             raise ValueError(f"`values` must map names to numbers. Got {values!r}.")
         full, free = np.zeros(len(self.names)), np.ones(len(self.names), bool)
         for name, value in values.items():
-            j = self.index("values", name)
+            j = self._index("values", name)
             try:
                 full[j], free[j] = _number(value), False
             except (TypeError, ValueError):
@@ -132,9 +111,8 @@ class ParameterDomain:
             )
         return full, free
 
-    def without(self, removed: NDArray[np.bool_]) -> ParameterDomain:
-        """The domain of the parameters that are not removed."""
-        keep = ~removed
+    def restricted(self, keep: NDArray[np.bool_]) -> ParameterDomain:
+        """The domain of some of the parameters."""
         return ParameterDomain(
             tuple(np.array(self.names, dtype=object)[keep]),
             self.lower[keep],
@@ -143,28 +121,13 @@ class ParameterDomain:
             None if self.initial is None else self.initial[keep],
         )
 
-    def index(self, argument: str, name: Any) -> int:
-        """Position of a parameter, or an error that names the argument."""
-        if name not in self.names:
-            known = ", ".join(self.names[:8])
-            raise ValueError(
-                f"`{argument}` must name parameters of the structure "
-                f"({known}{', ...' if len(self.names) > 8 else ''}). Got {name!r}."
-            )
-        return self.names.index(name)
-
     def draw(self, n: int, rng: np.random.Generator) -> Array | None:
-        """Random vectors, shape (n, n_params); None if a parameter tells no size.
-
-        Ranges on one side of zero that span more than a decade are drawn on a
-        logarithmic scale, other ranges uniformly; a first guess is multiplied by a
-        log-normal factor. All end within the bounds.
-        """
+        """Random vectors, see `GrayBoxStructure.draw`."""
         known = ~np.isnan(self.ranges[0])
         if self.initial is None and not known.all():
             return None
         initial = np.zeros(len(self.names)) if self.initial is None else self.initial
-        spread = np.exp(_SPREAD * rng.normal(size=(n, len(initial))))
+        around = drawn_around(initial, n, rng)
         uniform = rng.uniform(size=(n, len(initial)))
         low, high = np.where(known, self.ranges, 1.0)
         ratio = np.divide(high, low, out=np.ones_like(low), where=low != 0)
@@ -173,7 +136,7 @@ class ParameterDomain:
         drawn = np.where(
             wide, low * ratio**uniform, low * (1.0 - uniform) + high * uniform
         )
-        drawn = np.where(known, drawn, initial * spread)
+        drawn = np.where(known, drawn, around)
         return np.clip(drawn, self.lower, self.upper)
 
     def _checked(self) -> ParameterDomain:
@@ -203,7 +166,7 @@ class ParameterDomain:
             )
         found = []
         for name, pair in given.items():
-            j = self.index(argument, name)
+            j = self._index(argument, name)
             try:
                 low, high = (None if x is None else _number(x) for x in pair)
             except (TypeError, ValueError):
@@ -213,6 +176,22 @@ class ParameterDomain:
                 ) from None
             found.append((j, name, (low, high)))
         return found
+
+    def _index(self, argument: str, name: Any) -> int:
+        """Position of a parameter, or an error that names the argument."""
+        if name not in self.names:
+            known = ", ".join(self.names[:_LISTED])
+            more = ", ..." if len(self.names) > _LISTED else ""
+            raise ValueError(
+                f"`{argument}` must name parameters of the structure "
+                f"({known}{more}). Got {name!r}."
+            )
+        return self.names.index(name)
+
+
+def drawn_around(guess: Array, n: int, rng: np.random.Generator) -> Array:
+    """Random vectors around a guess that keep its signs, shape (n, n_params)."""
+    return guess * np.exp(_SPREAD * rng.normal(size=(n, len(guess))))
 
 
 def _number(value: Any) -> float:

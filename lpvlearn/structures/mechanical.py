@@ -1,6 +1,8 @@
-"""Forms that structures are written in: canonical, modal and mechanical ones.
+"""Equations of motion as structures: implicit equations, solved for accelerations.
 
-The functions return what :class:`GrayBoxStructure` is built from.
+Physics writes ``M(theta) X = N(theta)`` with M and N affine in the parameters; the
+system matrix ``S = offset + W X`` is affine only where M holds no parameter. Its
+derivatives follow from those of the equations: ``M X_i = N_i - M_i X``.
 """
 
 from __future__ import annotations
@@ -12,23 +14,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..models.system_matrix import Blocks, blocks
-from ..validation import matrix
-from .templates import Affine, affine_arrays, parse_cells
+from ..validation import matrix, one_of
+from .map import AffineMap, StructureMap
+from .templates import affine_arrays, check_shapes, parse_cells
 
 Array = NDArray[np.float64]
 
-_OUTPUTS = ("position", "velocity", "acceleration")
-
-_SINGULAR = 1e-13  # reciprocal condition number of a singular mass matrix
+# Reciprocal condition number below which a mass matrix counts as singular: fewer than
+# three digits of the accelerations would be left.
+_SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
-class ImplicitSystem:
-    """System matrices ``S = offset + W X`` with ``M(theta) X = N(theta)``, M, N affine.
+class ImplicitMap(StructureMap):
+    """``S = offset + W X`` with ``M(theta) X = N(theta)``, M and N affine.
 
-    The form that physics is written in: the equations of motion before they are
-    solved for the accelerations ``X [x; u]``.
+    Of equations of motion, ``X [x; u]`` are the accelerations.
 
     Attributes
     ----------
@@ -46,6 +47,10 @@ class ImplicitSystem:
     offset: Array
     order: int
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.offset.shape
+
     def _solved(self, theta: Array) -> tuple[Array, Array]:
         """``M^-1`` and ``X``; NaN where M is singular, for a search to step back."""
         M = self.M[0] + np.tensordot(theta, self.M[1:], 1)
@@ -56,37 +61,35 @@ class ImplicitSystem:
             inverse = np.full_like(M, np.nan)
         return inverse, inverse @ N
 
-    def __call__(self, theta: Array) -> Blocks:
-        """Matrices A, B, C, D."""
-        return blocks(self.offset + self.W @ self._solved(theta)[1], self.order)
+    def system_matrix(self, theta: Array) -> Array:
+        with np.errstate(all="ignore"):
+            return self.offset + self.W @ self._solved(theta)[1]
 
-    def jacobian(self, theta: Array) -> Blocks:
-        """Their derivatives: ``M X_i = N_i - M_i X``."""
+    def jacobian(self, theta: Array) -> Array:
         inverse, X = self._solved(theta)
-        S = self.W @ inverse @ (self.N[1:] - self.M[1:] @ X)
-        return blocks(S, self.order)
+        return self.W @ inverse @ (self.N[1:] - self.M[1:] @ X)
 
     def curvature(self, theta: Array) -> Array:
-        """Second derivatives of S: ``M X_ij = -M_i X_j - M_j X_i``."""
+        """``M X_ij = -M_i X_j - M_j X_i``."""
         inverse, X = self._solved(theta)
         first = inverse @ (self.N[1:] - self.M[1:] @ X)
         product = self.M[1:][:, None] @ first[None]
         return -self.W @ inverse @ (product + product.swapaxes(0, 1))
 
-    def fix(self, values: Array, free: NDArray[np.bool_]) -> ImplicitSystem:
-        """The equations with the parameters that are not free at given values."""
+    def fix(self, values: Array, free: NDArray[np.bool_]) -> AffineMap | ImplicitMap:
         keep, known = np.r_[True, free], values * ~free
         M, N = (
             np.concatenate([X[:1] + np.tensordot(known, X[1:], 1), X[1:]])[keep]
             for X in (self.M, self.N)
         )
-        return ImplicitSystem(M, N, self.W, self.offset, self.order)
+        return ImplicitMap(M, N, self.W, self.offset, self.order).simplest()
 
-    def affine(self) -> tuple[Array, Array]:
-        """Offset and basis of S where M holds no parameter."""
-        X = np.linalg.solve(self.M[0], self.N)
-        S = self.W @ X + 0.0  # no negative zeros
-        return self.offset + S[0], S[1:]
+    def simplest(self) -> AffineMap | ImplicitMap:
+        """The same map, affine where M holds no parameter."""
+        if self.M[1:].any():
+            return self
+        S = self.W @ np.linalg.solve(self.M[0], self.N) + 0.0  # no negative zeros
+        return AffineMap(self.offset + S[0], S[1:])
 
     def natural_sizes(self, rate: float, gains: Array) -> Array:
         """Sizes of the parameters, up to a factor, that make all terms alike.
@@ -134,6 +137,7 @@ class ImplicitSystem:
         target = (np.eye(n) - self.M[0]).ravel()
         theta = np.linalg.lstsq(self.M[1:].reshape(q, -1).T, target, rcond=None)[0]
         rng = np.random.default_rng(0)
+        # all points are regular but those of a curve; a few tries around one miss it
         for candidate in (theta, np.ones(q), *rng.uniform(0.5, 2.0, (8, q))):
             M = self.M[0] + np.tensordot(candidate, self.M[1:], 1)
             if 1.0 / np.linalg.cond(M) > _SINGULAR:
@@ -144,7 +148,7 @@ class ImplicitSystem:
         )
 
 
-def mechanical_system(
+def mechanical_map(
     M: Any,
     D: Any,
     K: Any,
@@ -152,44 +156,32 @@ def mechanical_system(
     outputs: str,
     sensors: ArrayLike | None,
     parameter_names: Sequence[str] | None,
-) -> tuple[ImplicitSystem, list[str]]:
+) -> tuple[ImplicitMap, list[str]]:
     """Equations of motion, see `GrayBoxStructure.mechanical`; and parameter names."""
-    if outputs not in _OUTPUTS:
-        raise ValueError(f"`outputs` must be one of {_OUTPUTS}. Got {outputs!r}.")
-    cells = {
-        name: parse_cells(name, block)
-        for name, block in (("M", M), ("D", D), ("K", K), ("F", F))
-    }
+    one_of("outputs", outputs, ("position", "velocity", "acceleration"))
+    given = {"M": M, "D": D, "K": K, "F": F}
+    cells = {name: parse_cells(name, block) for name, block in given.items()}
     n, m = len(cells["M"]), len(cells["F"][0]) if cells["F"] else 0
     if n == 0 or m == 0:
         raise ValueError(
             "`M` and `F` must describe at least one coordinate and one input. Got "
             f"{n} and {m}."
         )
-    for name, block in cells.items():
-        expected = (n, m if name == "F" else n)
-        shape = (len(block), len(block[0]) if block else 0)
-        if shape != expected:
-            raise ValueError(
-                f"`{name}` must have shape {expected} to fit `M` and `F`. Got {shape}."
-            )
+    square = dict.fromkeys("MDK", (n, n))
+    check_shapes(cells, square | {"F": (n, m)}, "`M` and `F`")
     H = np.eye(n) if sensors is None else matrix("sensors", sensors)
     if H.shape[1] != n or len(H) == 0:
         raise ValueError(
             f"`sensors` must have {n} columns, one for each coordinate. Got shape "
             f"{H.shape}."
         )
-    rows: list[list[Affine]] = [
-        list(mass)
-        + [_negative(entry) for entry in (*stiffness, *damping)]
-        + list(force)
-        for mass, stiffness, damping, force in zip(
-            cells["M"], cells["K"], cells["D"], cells["F"], strict=True
-        )
-    ]
+    # M q'' = -K q - D q' + F u
+    blocks = zip(cells["M"], cells["K"], cells["D"], cells["F"], strict=True)
+    rows = [[*mass, *k, *d, *force] for mass, k, d, force in blocks]
     offset, basis, names = affine_arrays(rows, parameter_names)
     stacked = np.concatenate([offset[None], basis])
-    mass, force = stacked[:, :, :n], stacked[:, :, n:]
+    mass, rest = (part.copy() for part in np.split(stacked, [n], axis=2))
+    rest[:, :, : 2 * n] = 0.0 - rest[:, :, : 2 * n]  # no negative zeros
     if not mass[1:].any() and not 1.0 / np.linalg.cond(mass[0]) > _SINGULAR:
         raise ValueError(
             "`M` must be regular: a coordinate without mass is no state. Got "
@@ -204,8 +196,4 @@ def mechanical_system(
     else:
         first = 0 if outputs == "position" else n
         fixed[2 * n :, first : first + n] = H
-    return ImplicitSystem(mass, force, W, fixed, 2 * n), names
-
-
-def _negative(entry: Affine) -> Affine:
-    return {name: -value for name, value in entry.items()}
+    return ImplicitMap(mass, rest, W, fixed, 2 * n), names

@@ -1,8 +1,10 @@
-"""Gray-box structures: parameters to state-space matrices, with Jacobians.
+"""Gray-box structures: parameters to state-space matrices, with derivatives.
 
 A structure writes the system matrix ``S = [[A, B], [C, D]]`` as a function of the
 parameter vector, Eq. (2). It is affine, ``S(theta) = S_0 + sum_j theta_j S_j``, when
-given as a template, and any smooth function otherwise.
+given as a template, and any smooth function otherwise. It is two things: the map from
+parameters to S (:mod:`~lpvlearn.structures.map`), and the domain of the parameters
+(:mod:`~lpvlearn.structures.domain`), what is known of their values.
 """
 
 from __future__ import annotations
@@ -13,13 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..models.statespace import StateSpace
-from ..validation import named_values
-from .map import StructureMap
-from .mechanical import mechanical_system
+from ..models.system_matrix import Blocks, blocks
+from ..validation import named_values, real_array
+from .domain import Interval, ParameterDomain
+from .map import AffineMap, FunctionMap, StructureMap
+from .mechanical import ImplicitMap, mechanical_map
 from .templates import (
     Entry,
     affine_system,
-    dimensions,
     full_cells,
     modal_cells,
     observable_canonical_cells,
@@ -27,10 +30,8 @@ from .templates import (
 
 Array = NDArray[np.float64]
 
-__all__ = ["GrayBoxStructure"]
 
-
-class GrayBoxStructure(StructureMap):
+class GrayBoxStructure:
     """The map from parameters to the matrices of a gray-box model, Eq. (2).
 
     Build one with :meth:`from_template` (entries affine in the parameters),
@@ -69,6 +70,27 @@ class GrayBoxStructure(StructureMap):
            [-4. , -0.5]])
     """
 
+    def __init__(self, order: int, map: StructureMap, domain: ParameterDomain) -> None:
+        self.order, self.map, self.domain = order, map, domain
+        self.n_outputs, self.n_inputs = (int(k) - order for k in map.shape)
+        self.parameter_names, self.n_params = domain.names, len(domain.names)
+        self.initial, self.ranges = domain.initial, domain.ranges
+        self.lower, self.upper = domain.lower, domain.upper
+        self.is_bounded = bool(np.isfinite([domain.lower, domain.upper]).any())
+        affine = map if isinstance(map, AffineMap) else None
+        self.is_affine = affine is not None
+        self.offset = None if affine is None else affine.offset
+        self.basis = None if affine is None else affine.basis
+
+    def __repr__(self) -> str:
+        kind = "affine" if self.is_affine else "function"
+        return (
+            f"{type(self).__name__}(order={self.order}, n_inputs={self.n_inputs}, "
+            f"n_outputs={self.n_outputs}, n_params={self.n_params}, {kind})"
+        )
+
+    # -- ways to write one ---------------------------------------------------------
+
     @classmethod
     def from_template(
         cls,
@@ -104,8 +126,8 @@ class GrayBoxStructure(StructureMap):
         >>> structure.model({"a": 4.0, "d": 1.0}).A
         array([[-2.]])
         """
-        order, offset, basis, names = affine_system(A, B, C, D, parameter_names)
-        return cls(order, names, offset, basis)
+        order, map, names = affine_system(A, B, C, D, parameter_names)
+        return cls(order, map, ParameterDomain.free(names))
 
     @classmethod
     def from_function(
@@ -155,25 +177,18 @@ class GrayBoxStructure(StructureMap):
         np.float64(2.4525)
         """
         start, names = named_values("initial", initial, parameter_names)
-        blocks = function(start)
-        if len(blocks) not in (3, 4):
+        given = function(start)
+        if len(given) not in (3, 4):
             raise ValueError(
-                f"`function` must return (A, B, C) or (A, B, C, D). Got {len(blocks)}."
+                f"`function` must return (A, B, C) or (A, B, C, D). Got {len(given)}."
             )
-        A, B, C = blocks[:3]
-        model = StateSpace(A, B, C, blocks[3] if len(blocks) == 4 else None)
-        structure = cls(
-            model.order,
-            names,
-            np.empty([model.order + k for k in (model.n_outputs, model.n_inputs)]),
-            None,
-            function=function,
-            jacobian=jacobian,
-            initial=start,
-        )
+        A, B, C = given[:3]
+        model = StateSpace(A, B, C, given[3] if len(given) == 4 else None)
+        dimensions = model.order, model.n_inputs, model.n_outputs
+        map = FunctionMap(function, jacobian, dimensions, start)
         if jacobian is not None:
-            structure.jacobian(start)  # its shapes are told of here, not in a fit
-        return structure
+            map.jacobian(start)  # its shapes are told of here, not in a fit
+        return cls(model.order, map, ParameterDomain.free(names, start))
 
     @classmethod
     def observable_canonical(
@@ -210,11 +225,9 @@ class GrayBoxStructure(StructureMap):
         array([[ 0.,  1.],
                [-4., -1.]])
         """
-        order, m, p = dimensions(order, n_inputs, n_outputs, feedthrough)
-        A, C = observable_canonical_cells(order, p)
-        B = full_cells("b", order, m)
-        D = full_cells("d", p, m) if feedthrough else None
-        return cls.from_template(A, B, C, D)
+        return cls.from_template(
+            *observable_canonical_cells(order, n_inputs, n_outputs, feedthrough)
+        )
 
     @classmethod
     def full(
@@ -222,28 +235,15 @@ class GrayBoxStructure(StructureMap):
     ) -> GrayBoxStructure:
         """Every entry of the matrices is a parameter (row by row: A, B, C, D).
 
-        Parameters
-        ----------
-        order, n_inputs, n_outputs : int
-            Order 0 is a pure gain and needs `feedthrough`.
-        feedthrough : bool, default=True
-            Also free the entries of D.
-
-        Raises
-        ------
-        ValueError
-            If a number is not a valid integer, or nothing is free.
+        The arguments are those of :meth:`observable_canonical`.
 
         Examples
         --------
         >>> GrayBoxStructure.full(1, 1, 1).parameter_names
         ('a1_1', 'b1_1', 'c1_1', 'd1_1')
         """
-        order, m, p = dimensions(order, n_inputs, n_outputs, feedthrough)
-        A, B = full_cells("a", order, order), full_cells("b", order, m)
-        C, D = full_cells("c", p, order), full_cells("d", p, m) if feedthrough else None
-        blocks = (A, B, C, D or [])
-        names = [str(name) for block in blocks for row in block for name in row]
+        A, B, C, D = full_cells(order, n_inputs, n_outputs, feedthrough)
+        names = [str(name) for row in (*A, *B, *C, *(D or [])) for name in row]
         return cls.from_template(A, B, C, D, parameter_names=names)
 
     @classmethod
@@ -289,10 +289,8 @@ class GrayBoxStructure(StructureMap):
         >>> structure.parameter_names
         ('c1_1', 'c1_2', 'c2_1', 'c2_2', 'd_1', 'w2_1')
         """
-        _, m, p = dimensions(1, n_inputs, n_outputs, feedthrough)
-        A, B, C = modal_cells(n_modes, n_real, m, p, normalize)
         return cls.from_template(
-            A, B, C, full_cells("d", p, m) if feedthrough else None
+            *modal_cells(n_modes, n_inputs, n_outputs, n_real, feedthrough, normalize)
         )
 
     @classmethod
@@ -348,10 +346,262 @@ class GrayBoxStructure(StructureMap):
         array([[ 0. ,  1. ],
                [-4. , -0.5]])
         """
-        system, names = mechanical_system(M, D, K, F, outputs, sensors, parameter_names)
-        start = None
-        if initial is not None:
-            start = named_values("initial", initial, names)[0]
-        elif system.M[1:].any():
-            system.regular_point()  # that there is none is told of here
-        return cls._from_implicit(system, names, start)
+        equations, names = mechanical_map(M, D, K, F, outputs, sensors, parameter_names)
+        guess = None if initial is None else named_values("initial", initial, names)[0]
+        domain = ParameterDomain.free(names, guess)
+        structure = cls(equations.order, equations.simplest(), domain)
+        if guess is None and structure.implicit is not None:
+            equations.regular_point()  # that there is none is told of here
+        return structure
+
+    # -- what is known of the parameters -------------------------------------------
+
+    def with_bounds(self, bounds: Mapping[str, Interval]) -> GrayBoxStructure:
+        """The structure with bounds of some parameters; the others keep theirs.
+
+        Parameters
+        ----------
+        bounds : mapping from name to (lower, upper)
+            None, or an infinity, where there is no bound.
+
+        Returns
+        -------
+        GrayBoxStructure
+            A new one; its `lower`, `upper` and `is_bounded` tell the bounds.
+
+        Raises
+        ------
+        ValueError
+            If a name is unknown, a lower bound is not below the upper one, or a known
+            range or first guess is outside.
+
+        Examples
+        --------
+        >>> from lpvlearn import GrayBoxStructure
+        >>> structure = GrayBoxStructure.observable_canonical(1)
+        >>> structure.with_bounds({"a1_1": (None, 0)}).upper
+        array([ 0., inf])
+        """
+        return type(self)(self.order, self.map, self.domain.with_bounds(bounds))
+
+    def with_ranges(self, ranges: Mapping[str, Interval]) -> GrayBoxStructure:
+        """The structure with known ranges of some parameters, where searches begin.
+
+        Unlike bounds they do not limit the result.
+
+        Parameters
+        ----------
+        ranges : mapping from name to (low, high)
+            Finite.
+
+        Returns
+        -------
+        GrayBoxStructure
+            A new one; its `ranges` tell them.
+
+        Raises
+        ------
+        ValueError
+            If a name is unknown, or a range is infinite, empty or outside the bounds.
+
+        Examples
+        --------
+        >>> from lpvlearn import GrayBoxStructure
+        >>> structure = GrayBoxStructure.observable_canonical(1)
+        >>> structure.with_ranges({"b1_1": (1, 100)}).ranges
+        array([[ nan,   1.],
+               [ nan, 100.]])
+        """
+        return type(self)(self.order, self.map, self.domain.with_ranges(ranges))
+
+    def fix(self, values: Mapping[str, float]) -> GrayBoxStructure:
+        """The structure with some parameters at known values.
+
+        Parameters
+        ----------
+        values : mapping from name to value
+
+        Returns
+        -------
+        GrayBoxStructure
+            A new one without these parameters.
+
+        Raises
+        ------
+        ValueError
+            If a name is unknown, a value is not finite or outside its bounds, or no
+            parameter remains.
+
+        Examples
+        --------
+        >>> from lpvlearn import GrayBoxStructure
+        >>> structure = GrayBoxStructure.from_template(
+        ...     A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]])
+        >>> fixed = structure.fix({"b": 2.0})
+        >>> fixed.parameter_names
+        ('c', 'k')
+        >>> fixed.model([0.5, 4.0]).B
+        array([[0.],
+               [2.]])
+        """
+        full, free = self.domain.fixed(values)
+        map, domain = self.map.fix(full, free), self.domain.restricted(free)
+        return type(self)(self.order, map, domain)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Array | None:
+        """Random parameter vectors from the ranges, or around the first guess.
+
+        Parameters
+        ----------
+        n : int
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        ndarray of shape (n, n_params) or None
+            Log-uniform where a range of one sign spans more than a decade, else
+            uniform; log-normal (standard deviation 0.3) around the first guess where
+            there is no range; within the bounds. None if a parameter has neither a
+            range nor a first guess.
+
+        Examples
+        --------
+        >>> from lpvlearn import GrayBoxStructure
+        >>> structure = GrayBoxStructure.observable_canonical(1)
+        >>> rng = np.random.default_rng(0)
+        >>> structure.draw(5, rng) is None
+        True
+        >>> ranged = structure.with_ranges({"a1_1": (-2, -1), "b1_1": (1, 100)})
+        >>> ranged.draw(5, rng).shape
+        (5, 2)
+        """
+        return self.domain.draw(n, rng)
+
+    def check_params(self, theta: ArrayLike | Mapping[str, float]) -> Array:
+        """`theta` as a finite vector.
+
+        Parameters
+        ----------
+        theta : array-like of shape (n_params,) or mapping from name to value
+
+        Returns
+        -------
+        ndarray of shape (n_params,)
+
+        Raises
+        ------
+        ValueError
+            If a name has no value or is unknown, or a value is not finite.
+        """
+        if isinstance(theta, Mapping):
+            if set(theta) != set(self.parameter_names):
+                wrong = sorted(set(theta) ^ set(self.parameter_names), key=str)
+                raise ValueError(
+                    "parameters must have a value for each name of the structure. "
+                    f"Missing or unknown: {', '.join(map(str, wrong))}."
+                )
+            theta = [theta[name] for name in self.parameter_names]
+        vector = real_array("parameters", theta).reshape(-1)
+        if vector.shape != (self.n_params,) or not np.isfinite(vector).all():
+            some = ", ".join(self.parameter_names[:4])
+            raise ValueError(
+                f"parameters must be {self.n_params} finite values "
+                f"({some}{', ...' if self.n_params > 4 else ''}). Got {vector}."
+            )
+        return vector
+
+    @property
+    def reference(self) -> Array:
+        """A point where the matrices exist, shape (n_params,).
+
+        The first guess, else the middle of the ranges, else zeros or parameters of
+        unit masses, all within the bounds.
+        """
+        if self.initial is not None:
+            return self.initial
+        zero = np.zeros(self.n_params)
+        start = self.implicit.regular_point() if self.implicit is not None else zero
+        known = ~np.isnan(self.ranges[0])
+        start = np.where(known, self.ranges.sum(0) / 2.0, start)
+        return np.clip(start, self.lower, self.upper)
+
+    # -- the matrices --------------------------------------------------------------
+
+    @property
+    def implicit(self) -> ImplicitMap | None:
+        """The equations ``M(theta) X = N(theta)`` of a structure that solves them."""
+        return self.map if isinstance(self.map, ImplicitMap) else None
+
+    @property
+    def free_feedthrough(self) -> NDArray[np.bool_]:
+        """Which entries of D hold a parameter, shape (n_outputs, n_inputs)."""
+        n = self.order
+        return (self.jacobian(self.reference)[:, n:, n:] != 0).any(0)
+
+    def system_matrix(self, theta: Array) -> Array:
+        """``S = [[A, B], [C, D]]``, shape (..., order + n_outputs, order + n_inputs).
+
+        Parameters
+        ----------
+        theta : ndarray of shape (..., n_params)
+        """
+        if self.is_affine or np.ndim(theta) == 1:
+            return self.map.system_matrix(theta)
+        rows = np.reshape(theta, (-1, self.n_params))
+        stack = np.array([self.map.system_matrix(row) for row in rows])
+        return stack.reshape(np.shape(theta)[:-1] + self.map.shape)
+
+    def jacobian(self, theta: Array) -> Array:
+        """``dS / dtheta``, shape (n_params, order + n_outputs, order + n_inputs)."""
+        return self.map.jacobian(theta)
+
+    def curvature(self, theta: Array) -> Array | None:
+        """Second derivatives of S, or None where they are zero (affine).
+
+        Parameters
+        ----------
+        theta : ndarray of shape (n_params,)
+
+        Returns
+        -------
+        ndarray of shape (n_params, n_params, order + n_outputs, order + n_inputs) or
+        None
+        """
+        return self.map.curvature(theta)
+
+    def matrices(self, theta: ArrayLike) -> Blocks:
+        """Matrices ``(A, B, C, D)`` at `theta`, stacked over its leading axes.
+
+        Parameters
+        ----------
+        theta : array-like of shape (..., n_params)
+
+        Raises
+        ------
+        ValueError
+            If the last axis does not have length n_params.
+        """
+        theta = real_array("theta", theta)
+        if theta.shape[-1:] != (self.n_params,):
+            raise ValueError(
+                f"`theta` must have shape (..., {self.n_params}). Got {theta.shape}."
+            )
+        return blocks(self.system_matrix(theta), self.order)
+
+    def model(
+        self, theta: ArrayLike | Mapping[str, float], sampling_time: float | None = None
+    ) -> StateSpace:
+        """The model at `theta`.
+
+        Parameters
+        ----------
+        theta : array-like of shape (n_params,) or mapping from name to value
+        sampling_time : float, default=None
+            Seconds; None is continuous time.
+
+        Raises
+        ------
+        ValueError
+            If `theta` does not fit the parameters.
+        """
+        return StateSpace(*self.matrices(self.check_params(theta)), sampling_time)

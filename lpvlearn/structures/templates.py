@@ -1,7 +1,7 @@
-"""Templates of gray-box structures: affine expressions of parameter names.
+"""Templates of gray-box structures: matrices of affine expressions of parameter names.
 
-A template entry is a number or a string such as ``"-p9"`` or ``"2*k - 1"``. It is
-parsed into its coefficients; no code is ever evaluated.
+A cell is a number or a string such as ``"-p9"`` or ``"2*k - 1"``. It is parsed into its
+coefficients; no code is ever evaluated. Canonical and modal forms are templates, too.
 """
 
 from __future__ import annotations
@@ -15,25 +15,105 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..validation import whole_number
+from ..validation import one_of, whole_number
+from .map import AffineMap
 
 Array = NDArray[np.float64]
 
 Entry = float | str
 
-Affine = dict[str, float]  # coefficient of every name; "" is the constant
-
 Cells = list[list[Entry]]
 
+Affine = dict[str, float]  # coefficient of every name; "" is the constant
+
+# what parsing an expression may end in: RecursionError and MemoryError are how the
+# parser refuses one that is nested too deeply
 _UNREADABLE = (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError)
 
+_SHOWN = 60  # characters of a refused expression that its message shows
 
-def ordered_names(used: set[str], given: Sequence[str] | None) -> list[str]:
+
+def affine_system(
+    A: Any, B: Any, C: Any, D: Any, parameter_names: Sequence[str] | None
+) -> tuple[int, AffineMap, list[str]]:
+    """Read templates of A, B, C, D: the order, ``[[A, B], [C, D]]``, parameter names.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit together or an entry is not affine.
+
+    Examples
+    --------
+    >>> order, map, names = affine_system([["-a"]], [["b"]], [[1]], None, None)
+    >>> names, map.basis[0].tolist()
+    (['a', 'b'], [[-1.0, 0.0], [0.0, 0.0]])
+    """
+    given = {"A": A, "B": B, "C": C}
+    cells = {name: parse_cells(name, block) for name, block in given.items()}
+    n = len(cells["A"])
+    if D is not None:
+        cells["D"] = parse_cells("D", D)
+        if n == 0:  # a pure gain: the shapes come from D
+            cells["C"] = cells["C"] or [[] for _ in cells["D"]]
+    p = len(cells["C"])
+    first = cells["B"] or cells.get("D")
+    m = len(first[0]) if first else 0
+    if 0 in (m, p):
+        raise ValueError(
+            "a structure needs at least one input and one output; a pure gain takes "
+            f"them from `D`. Got {m} inputs and {p} outputs."
+        )
+    zero: Affine = {"": 0.0}
+    cells.setdefault("D", [[zero] * m for _ in range(p)])
+    expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
+    check_shapes(cells, expected, "the other matrices")
+    rows = [a + b for a, b in zip(cells["A"], cells["B"], strict=True)]
+    rows += [c + d for c, d in zip(cells["C"], cells["D"], strict=True)]
+    offset, basis, names = affine_arrays(rows, parameter_names)
+    return n, AffineMap(offset, basis), names
+
+
+def check_shapes(
+    cells: dict[str, list[list[Affine]]], expected: dict[str, tuple[int, int]], to: str
+) -> None:
+    """Refuse blocks that do not fit to others; an empty one has no columns."""
+    for name, block in cells.items():
+        shape = (len(block), len(block[0]) if block else 0)
+        if shape != expected[name] and (block or expected[name][0]):
+            raise ValueError(
+                f"`{name}` must have shape {expected[name]} to fit {to}. Got {shape}."
+            )
+
+
+def affine_arrays(
+    rows: Sequence[Sequence[Affine]], parameter_names: Sequence[str] | None
+) -> tuple[Array, Array, list[str]]:
+    """The constant part, the part of every parameter, and the parameter names.
+
+    Examples
+    --------
+    >>> offset, basis, names = affine_arrays([[{"": 2.0}, {"k": 3.0, "": 1.0}]], None)
+    >>> offset.tolist(), basis.tolist(), names
+    ([[2.0, 1.0]], [[[0.0, 3.0]]], ['k'])
+    """
+    used = {name for row in rows for entry in row for name in entry if name}
+    names = _ordered_names(used, parameter_names)
+
+    def coefficients(name: str) -> list[list[float]]:
+        return [[entry.get(name, 0.0) for entry in row] for row in rows]
+
+    offset = np.array(coefficients(""))
+    basis = np.array([coefficients(name) for name in names])
+    return offset, basis.reshape(-1, *offset.shape), names
+
+
+def _ordered_names(used: set[str], given: Sequence[str] | None) -> list[str]:
     """The parameter names in the given order, else natural order.
 
     Examples
     --------
-    >>> ordered_names({"p10", "p2", "k"}, None)
+    >>> _ordered_names({"p10", "p2", "k"}, None)
     ['k', 'p2', 'p10']
     """
     if given is None:
@@ -87,7 +167,7 @@ def _entry(cell: str, entry: Any) -> Affine:
         try:
             affine = _affine(ast.parse(entry.strip(), mode="eval").body)
         except _UNREADABLE as error:
-            shown = entry if len(entry) <= 60 else entry[:57] + "..."
+            shown = entry if len(entry) <= _SHOWN else entry[: _SHOWN - 3] + "..."
             raise ValueError(
                 f"`{cell}` must be a number or an affine expression of parameter names "
                 f"such as '-p9' or '2*k - 1'. Got {shown!r} ({error})."
@@ -131,129 +211,64 @@ def _affine(node: ast.expr) -> Affine:
     raise ValueError("not affine; use GrayBoxStructure.from_function")
 
 
-def affine_system(
-    A: Any, B: Any, C: Any, D: Any, parameter_names: Sequence[str] | None
-) -> tuple[int, Array, Array, list[str]]:
-    """Read templates of A, B, C, D as ``S(theta) = S_0 + sum_j theta_j S_j``.
-
-    Returns
-    -------
-    order : int
-    offset : ndarray of shape (order + n_outputs, order + n_inputs)
-        ``S_0``, with ``S = [[A, B], [C, D]]``.
-    basis : ndarray of shape (n_params, order + n_outputs, order + n_inputs)
-    names : list of str
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit together or an entry is not affine.
-
-    Examples
-    --------
-    >>> _, _, basis, names = affine_system([["-a"]], [["b"]], [[1]], None, None)
-    >>> names, basis[0].tolist()
-    (['a', 'b'], [[-1.0, 0.0], [0.0, 0.0]])
-    """
-    given = {"A": A, "B": B, "C": C}
-    cells = {name: parse_cells(name, block) for name, block in given.items()}
-    n = len(cells["A"])
-    if D is not None:
-        cells["D"] = parse_cells("D", D)
-        if n == 0:  # a pure gain: the shapes come from D
-            cells["C"] = cells["C"] or [[] for _ in cells["D"]]
-    p = len(cells["C"])
-    first = cells["B"] or cells.get("D")
-    m = len(first[0]) if first else 0
-    if 0 in (m, p):
-        raise ValueError(
-            "a structure needs at least one input and one output; a pure gain takes "
-            f"them from `D`. Got {m} inputs and {p} outputs."
-        )
-    zero: Affine = {"": 0.0}
-    cells.setdefault("D", [[zero] * m for _ in range(p)])
-    expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
-    for name, block in cells.items():
-        shape = (len(block), len(block[0])) if block else (0, expected[name][1])
-        if shape != expected[name]:
-            raise ValueError(
-                f"`{name}` must have shape {expected[name]} to fit the other matrices. "
-                f"Got {shape}."
-            )
-    rows = [a + b for a, b in zip(cells["A"], cells["B"], strict=True)]
-    rows += [c + d for c, d in zip(cells["C"], cells["D"], strict=True)]
-    offset, basis, names = affine_arrays(rows, parameter_names)
-    return n, offset, basis, names
-
-
-def affine_arrays(
-    rows: Sequence[Sequence[Affine]], parameter_names: Sequence[str] | None
-) -> tuple[Array, Array, list[str]]:
-    """The constant part, the part of every parameter, and the parameter names.
-
-    Examples
-    --------
-    >>> offset, basis, names = affine_arrays([[{"": 2.0}, {"k": 3.0, "": 1.0}]], None)
-    >>> offset.tolist(), basis.tolist(), names
-    ([[2.0, 1.0]], [[[0.0, 3.0]]], ['k'])
-    """
-    used = {name for row in rows for entry in row for name in entry if name}
-    names = ordered_names(used, parameter_names)
-
-    def coefficients(name: str) -> list[list[float]]:
-        return [[entry.get(name, 0.0) for entry in row] for row in rows]
-
-    offset = np.array(coefficients(""))
-    basis = np.array([coefficients(name) for name in names])
-    return offset, basis.reshape(-1, *offset.shape), names
-
-
-def full_cells(letter: str, rows: int, columns: int) -> Cells:
-    """A matrix whose entries are all parameters: ``a1_1, a1_2, ...``."""
-    return [[f"{letter}{i + 1}_{j + 1}" for j in range(columns)] for i in range(rows)]
-
-
-_NORMALIZED = ("input", "output")
-
-
-def dimensions(
+def observable_canonical_cells(
     order: int, n_inputs: int, n_outputs: int, feedthrough: bool
-) -> tuple[int, int, int]:
-    """The numbers of states, inputs and outputs, checked."""
-    order = whole_number("order", order, 0)
-    if order == 0 and not feedthrough:
-        raise ValueError(
-            "`feedthrough` must be True for order 0: a pure gain has no other "
-            "parameters. Got False."
-        )
-    n_inputs = whole_number("n_inputs", n_inputs, 1)
-    return order, n_inputs, whole_number("n_outputs", n_outputs, 1)
+) -> tuple[Cells, Cells, Cells, Cells | None]:
+    """A, B, C, D of the observable canonical form with generic observability indices.
 
-
-def observable_canonical_cells(order: int, n_outputs: int) -> tuple[Cells, Cells]:
-    """A and C of the observable canonical form with generic observability indices."""
-    lengths = [order // n_outputs + (i < order % n_outputs) for i in range(n_outputs)]
+    Examples
+    --------
+    >>> A, B, C, D = observable_canonical_cells(2, 1, 1, False)
+    >>> A, C
+    ([[0.0, 1.0], ['a2_1', 'a2_2']], [[1.0, 0.0]])
+    """
+    _, B, C, D = full_cells(order, n_inputs, n_outputs, feedthrough)
     A: Cells = [[0.0] * order for _ in range(order)]
-    C = full_cells("c", n_outputs, order)  # rows beyond the order stay free
     first = 0
-    for i, length in enumerate(lengths[: min(order, n_outputs)]):
+    for i in range(min(order, n_outputs)):  # rows of C beyond the order stay free
+        length = order // n_outputs + (i < order % n_outputs)
         C[i] = [1.0 if j == first else 0.0 for j in range(order)]
         last = first + length - 1
         for k in range(first, last):
             A[k][k + 1] = 1.0
         A[last] = [f"a{last + 1}_{j + 1}" for j in range(order)]
         first += length
-    return A, C
+    return A, B, C, D
+
+
+def full_cells(
+    order: int, n_inputs: int, n_outputs: int, feedthrough: bool
+) -> tuple[Cells, Cells, Cells, Cells | None]:
+    """A, B, C, D whose entries are all parameters: ``a1_1, a1_2, ...``."""
+    n = whole_number("order", order, 0)
+    if n == 0 and not feedthrough:
+        raise ValueError(
+            "`feedthrough` must be True for order 0: a pure gain has no other "
+            "parameters. Got False."
+        )
+    m = whole_number("n_inputs", n_inputs, 1)
+    p = whole_number("n_outputs", n_outputs, 1)
+    D = _full_block("d", p, m) if feedthrough else None
+    return _full_block("a", n, n), _full_block("b", n, m), _full_block("c", p, n), D
+
+
+def _full_block(letter: str, rows: int, columns: int) -> Cells:
+    return [[f"{letter}{i + 1}_{j + 1}" for j in range(columns)] for i in range(rows)]
 
 
 def modal_cells(
-    n_modes: int, n_real: int, n_inputs: int, n_outputs: int, normalize: str
-) -> tuple[Cells, Cells, Cells]:
-    """A, B and C of the real modal form, see `GrayBoxStructure.modal`.
+    n_modes: int,
+    n_inputs: int,
+    n_outputs: int,
+    n_real: int,
+    feedthrough: bool,
+    normalize: str,
+) -> tuple[Cells, Cells, Cells, Cells | None]:
+    """A, B, C, D of the real modal form, see `GrayBoxStructure.modal`.
 
     Examples
     --------
-    >>> A, B, C = modal_cells(1, 1, 1, 1, "input")
+    >>> A, B, C, D = modal_cells(1, 1, 1, 1, False, "input")
     >>> A
     [[0.0, 1.0, 0.0], ['-w2_1', '-d_1', 0.0], [0.0, 0.0, '-r_1']]
     >>> B, C
@@ -261,15 +276,12 @@ def modal_cells(
     """
     n_modes = whole_number("n_modes", n_modes, 0)
     n_real = whole_number("n_real", n_real, 0)
-    order = 2 * n_modes + n_real
-    if order == 0:
+    if n_modes == n_real == 0:
         raise ValueError("`n_modes` or `n_real` must be at least 1. Got 0 and 0.")
-    if normalize not in _NORMALIZED:
-        raise ValueError(
-            f"`normalize` must be one of {_NORMALIZED}. Got {normalize!r}."
-        )
+    one_of("normalize", normalize, ("input", "output"))
+    order = 2 * n_modes + n_real
+    _, B, C, D = full_cells(order, n_inputs, n_outputs, feedthrough)
     A: Cells = [[0.0] * order for _ in range(order)]
-    B, C = full_cells("b", order, n_inputs), full_cells("c", n_outputs, order)
     for i in range(n_modes):
         k = 2 * i
         A[k][k + 1] = 1.0
@@ -281,6 +293,6 @@ def modal_cells(
         second = k < 2 * n_modes and k % 2 == 1
         if normalize == "input":  # [0, 1] for a mode, 1 for a real pole
             B[k][0] = 1.0 if second or k >= 2 * n_modes else 0.0
-        else:
+        else:  # [1, 0] and 1
             C[0][k] = 0.0 if second else 1.0
-    return A, B, C
+    return A, B, C, D

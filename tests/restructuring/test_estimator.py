@@ -2,6 +2,7 @@
 
 import pickle
 import warnings
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,82 +12,17 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.datasets import FlexibleArm
 from lpvlearn.exceptions import RankWarning
+from lpvlearn.restructuring.problem import problem_from_models
 
-
-def spring_mass():
-    """One mass; stiffness, damping and gain."""
-    return GrayBoxStructure.from_template(
-        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
-    )
-
-
-def two_masses():
-    """Two masses in a chain: five parameters, one input, both positions."""
-    return GrayBoxStructure.from_template(
-        [
-            [0, 0, 1, 0],
-            [0, 0, 0, 1],
-            ["-k1", "k2", "-c1", 0],
-            ["k3", "-k3", 0, "-c2"],
-        ],
-        [[0], [0], ["b"], [0]],
-        [[1, 0, 0, 0], [0, 1, 0, 0]],
-    )
-
-
-def heat_exchanger():
-    """First-order lags in series, three outputs, a feedthrough parameter."""
-    return GrayBoxStructure.from_template(
-        [["-a1", 0, 0], ["a2", "-a2", 0], [0, "a3", "-a3"]],
-        [["a1"], [0], [0]],
-        np.eye(3),
-        [[0], [0], ["d"]],
-    )
-
-
-CASES = {
-    "spring_mass": (spring_mass(), {"k": 9.0, "c": 0.4, "b": 2.0}),
-    "two_masses": (
-        two_masses(),
-        {"k1": 30.0, "k2": 12.0, "k3": 20.0, "c1": 0.5, "c2": 0.9, "b": 3.0},
-    ),
-    "heat_exchanger": (
-        heat_exchanger(),
-        {"a1": 0.5, "a2": 2.0, "a3": 0.3, "d": 0.1},
-    ),
-    "arm": (
-        FlexibleArm().structure(),
-        dict(
-            zip(
-                FlexibleArm().structure().parameter_names,
-                FlexibleArm().parameters(0.9),
-                strict=True,
-            )
-        ),
-    ),
-}
-
-
-def disguised(model, rng):
-    """The same transfer function in another state basis."""
-    T = rng.normal(size=model.A.shape) + 2 * np.eye(model.order)
-    return model.transform(T)
-
-
-def off_structure(model, rng, size):
-    """A black box near a model, outside of its structure."""
-    A = model.A * (1 + size * rng.normal(size=model.A.shape))
-    B = model.B * (1 + size * rng.normal(size=model.B.shape))
-    C = model.C + size * rng.normal(size=model.C.shape) * np.abs(model.C).max()
-    return StateSpace(A, B, C, model.D)
-
-
-@pytest.fixture
-def rough():
-    """Black boxes far off the structure: the warning about them is not the subject."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "the structure comes no nearer")
-        yield
+from ..conftest import spring_structure, stable_model
+from .conftest import (
+    CASES,
+    disguised,
+    far_fit,
+    heat_exchanger,
+    off_structure,
+    two_masses,
+)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -113,17 +49,6 @@ def test_measured_responses_are_recovered_from_nothing(name):
     assert fitted.score(omega, table) == 1.0
 
 
-def test_table_and_complex_responses_are_the_same_data():
-    structure, params = CASES["two_masses"]
-    omega = np.geomspace(0.1, 30, 50)
-    G = structure.model(params).frequency_response(omega)
-    flat = G.reshape(50, -1)
-    table = np.hstack([flat.real, flat.imag])
-    one = GrayBoxRestructurer(structure).fit(omega[:, None], table)
-    two = GrayBoxRestructurer(structure).fit(omega, G)
-    np.testing.assert_array_equal(one.params_, two.params_)
-
-
 def test_result_does_not_depend_on_the_basis_of_the_black_box():
     structure, params = CASES["spring_mass"]
     rng = np.random.default_rng(3)
@@ -136,10 +61,8 @@ def test_result_does_not_depend_on_the_basis_of_the_black_box():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_error_is_a_minimum_and_both_solvers_find_it(seed, rough):
-    structure, params = CASES["two_masses"]
-    rng = np.random.default_rng(seed)
-    black_box = off_structure(structure.model(params), rng, 0.03)
-    sqp = GrayBoxRestructurer(structure).fit_model(black_box)
+    structure, rng = CASES["two_masses"][0], np.random.default_rng(seed)
+    black_box, sqp = far_fit(seed)
     bundle = GrayBoxRestructurer(structure, solver="bundle", max_iter=2000)
     bundle.fit_model(black_box)
     assert np.isclose(sqp.error_, bundle.error_, rtol=1e-5)
@@ -151,10 +74,8 @@ def test_error_is_a_minimum_and_both_solvers_find_it(seed, rough):
         assert error >= sqp.error_ * (1 - 1e-9)
 
 
-def test_active_frequencies_carry_the_norm(rough):
-    structure, params = CASES["two_masses"]
-    black_box = off_structure(structure.model(params), np.random.default_rng(1), 0.03)
-    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+def test_active_frequencies_carry_the_norm():
+    black_box, fitted = far_fit(1)
     E = (fitted.lti_ - black_box).frequency_response(fitted.active_frequencies_)
     sigma = np.linalg.norm(E, 2, axis=(1, 2))
     np.testing.assert_allclose(sigma, fitted.error_, rtol=1e-5)
@@ -285,17 +206,6 @@ def test_neighbours_parameters_are_compared_by_their_fit():
     assert fitted.start_error(black_box, -theta) == np.inf  # unstable
 
 
-def test_feedthrough_that_the_structure_lacks_is_reported():
-    structure, params = CASES["spring_mass"]
-    model = structure.model(params)
-    black_box = StateSpace(model.A, model.B, model.C, [[0.25]])
-    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
-    np.testing.assert_array_equal(fitted.dropped_feedthrough_, [[0.25]])
-    np.testing.assert_allclose(
-        fitted.params_, structure.check_params(params), rtol=1e-6
-    )
-
-
 def test_unidentifiable_combination_is_named_and_a_fit_returned():
     structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [["c"]])
     black_box = StateSpace([[-2.0]], [[3.0]], [[1.0]])
@@ -308,16 +218,15 @@ def test_unidentifiable_combination_is_named_and_a_fit_returned():
 def test_structure_that_cannot_fit_warns():
     structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
     resonance = StateSpace([[0, 1], [-4, -0.2]], [[0], [1]], [[1, 0]])
-    with pytest.warns(ConvergenceWarning, match="cannot represent the model"):
+    with pytest.warns(ConvergenceWarning, match="cannot represent the model") as given:
         GrayBoxRestructurer(structure).fit_model(resonance)
+    assert given[0].filename == __file__  # it points to the caller
 
 
 def test_too_few_iterations_warn_and_keep_the_best_point(rough):
-    structure, params = CASES["two_masses"]
-    black_box = off_structure(structure.model(params), np.random.default_rng(0), 0.03)
-    full = GrayBoxRestructurer(structure).fit_model(black_box)
+    black_box, full = far_fit(0)
     with pytest.warns(ConvergenceWarning, match="`max_iter`=1"):
-        short = GrayBoxRestructurer(structure, max_iter=1).fit_model(black_box)
+        short = clone(full).set_params(max_iter=1).fit_model(black_box)
     assert full.error_ <= short.error_ < 2 * full.error_
 
 
@@ -331,58 +240,9 @@ def test_similarity_norm_solves_the_bilinear_equations():
 
 
 def test_hinf_norm_is_smaller_than_with_the_bilinear_equations(rough):
-    structure, params = CASES["two_masses"]
-    black_box = off_structure(structure.model(params), np.random.default_rng(1), 0.03)
-    bilinear = GrayBoxRestructurer(structure, norm="similarity").fit_model(black_box)
-    hinf = GrayBoxRestructurer(structure).fit_model(black_box)
+    black_box, hinf = far_fit(1)
+    bilinear = clone(hinf).set_params(norm="similarity").fit_model(black_box)
     assert hinf.error_ < bilinear.error_
-
-
-@pytest.mark.parametrize("kind", ["band", "scalar", "matrix"])
-def test_weighted_error_is_the_norm_of_the_weighted_difference(kind, rough):
-    structure, params = CASES["two_masses"]
-    black_box = off_structure(structure.model(params), np.random.default_rng(2), 0.03)
-    low = StateSpace([[-2.0]], [[2.0]], [[1.0]])
-    pair = StateSpace(-2 * np.eye(2), 2 * np.eye(2), np.diag([1.0, 0.1]))
-    weight = {"band": (None, 2.0), "scalar": low, "matrix": pair}[kind]
-    fitted = GrayBoxRestructurer(structure, frequency_weight=weight)
-    fitted.fit_model(black_box)
-    omega = np.geomspace(1e-3, 1e3, 4000)
-    E = (fitted.lti_ - black_box).frequency_response(omega)
-    W = (pair if kind == "matrix" else low).frequency_response(omega)
-    sigma = np.linalg.norm(W @ E if kind == "matrix" else W * E, 2, axis=(1, 2))
-    assert np.isclose(fitted.error_, sigma.max(), rtol=1e-3)
-    plain = GrayBoxRestructurer(structure).fit_model(black_box)
-    E = (plain.lti_ - black_box).frequency_response(omega)
-    sigma = np.linalg.norm(W @ E if kind == "matrix" else W * E, 2, axis=(1, 2))
-    assert fitted.error_ <= sigma.max() * (1 + 1e-6)
-
-
-def test_weights_of_the_samples_decide_between_frequencies(rough):
-    structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
-    omega = np.array([0.1, 0.2, 0.5, 20.0, 40.0])
-    G = np.where(omega < 1, 1.0 / (1j * omega + 1), 3.0 / (1j * omega + 2))
-    trusted = np.where(omega < 1, 1.0, 1e-6)
-    fitted = GrayBoxRestructurer(structure).fit(omega, G, sample_weight=trusted)
-    np.testing.assert_allclose(fitted.params_, [1.0, 1.0], rtol=1e-3)
-
-
-def test_several_models_of_one_point_are_matched_together(rough):
-    structure, params = CASES["spring_mass"]
-    theta = structure.check_params(params)
-    rng = np.random.default_rng(0)
-    exact = structure.model(theta)
-    same = GrayBoxRestructurer(structure).fit_model([exact, disguised(exact, rng)])
-    np.testing.assert_allclose(same.params_, theta, rtol=1e-6)
-    boxes = [off_structure(exact, rng, 5e-3) for _ in range(3)]
-    fitted = GrayBoxRestructurer(structure).fit_model(boxes)
-    omega = np.geomspace(0.01, 100, 20000)
-    stacked = np.concatenate(
-        [(fitted.lti_ - box).frequency_response(omega) for box in boxes], axis=1
-    )
-    assert np.isclose(
-        fitted.error_, np.linalg.norm(stacked, 2, axis=(1, 2)).max(), rtol=1e-4
-    )
 
 
 def test_covariance_of_the_parameters_predicts_their_spread():
@@ -401,11 +261,10 @@ def test_covariance_of_the_parameters_predicts_their_spread():
         exact, realizations=models
     )
     single = fitted.params_covariance_ * n
+    # the fits that the minimisation starts from, around the truth
     estimates = np.array(
         [
-            GrayBoxRestructurer(structure, norm="h2", init=theta, n_starts=1)
-            .fit_model(model)
-            .start_params_
+            problem_from_models(structure, [model], None).fit(theta).x
             for model in models[:150]
         ]
     )
@@ -417,21 +276,9 @@ def test_restarts_from_perturbations_agree():
     structure, params = CASES["two_masses"]
     black_box = structure.model(params)
     fitted = GrayBoxRestructurer(structure).fit_model(black_box)
-    table = fitted.perturbation_check(black_box, n_restarts=4)
-    assert table.shape == (4, 7)
+    table = fitted.perturbation_check(black_box, n_restarts=2)
+    assert table.shape == (2, 7)
     assert (table.drop(columns="error_").abs() < 1e-6).all(axis=None)
-
-
-def test_hankel_singular_value_bounds_the_error_from_below(rough):
-    structure, params = CASES["spring_mass"]
-    truth = structure.model(params)
-    A = np.zeros((3, 3))
-    A[:2, :2], A[2, 2] = truth.A, -4.0
-    black_box = StateSpace(A, np.vstack([truth.B, [[1]]]), np.hstack([truth.C, [[1]]]))
-    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
-    hankel = black_box.hankel_singular_values()[2]
-    assert fitted.lower_bound_ == hankel
-    assert hankel <= fitted.error_
 
 
 @pytest.mark.parametrize(
@@ -505,18 +352,18 @@ ERRORS = [
     (lambda: GrayBoxRestructurer("pendulum").fit_model(GOOD), "GrayBoxStructure.*str"),
     (
         lambda: GrayBoxRestructurer(norm="l1").fit_model(GOOD),
-        r"`norm` must be one of .*Got 'l1'",
+        r"`norm` must be .*Got 'l1'",
     ),
     (
         lambda: GrayBoxRestructurer(solver="adam").fit_model(GOOD),
-        r"`solver` must be one of .*Got 'adam'",
+        r"`solver` must be .*Got 'adam'",
     ),
     (
         lambda: GrayBoxRestructurer(init="random").fit_model(GOOD),
         "`init` must be 'similarity' or a vector",
     ),
     (
-        lambda: GrayBoxRestructurer(spring_mass(), init=[1.0]).fit_model(GOOD),
+        lambda: GrayBoxRestructurer(spring_structure(), init=[1.0]).fit_model(GOOD),
         r"parameters must be 3 finite values \(b, c, k",
     ),
     (
@@ -532,17 +379,19 @@ ERRORS = [
         "`frequency_weight` must be stable",
     ),
     (
-        lambda: GrayBoxRestructurer(spring_mass(), norm="similarity").fit_model(
+        lambda: GrayBoxRestructurer(spring_structure(), norm="similarity").fit_model(
             GOOD - StateSpace([[-3.0]], [[0.1]], [[0.1]])
         ),
         "needs an affine structure of the order",
     ),
     (
-        lambda: GrayBoxRestructurer(spring_mass(), norm="h2").fit([1.0], [[1.0, 0.0]]),
+        lambda: GrayBoxRestructurer(spring_structure(), norm="h2").fit(
+            [1.0], [[1.0, 0.0]]
+        ),
         "`norm` must be 'hinf'",
     ),
     (
-        lambda: GrayBoxRestructurer(spring_mass()).fit(
+        lambda: GrayBoxRestructurer(spring_structure()).fit(
             [1.0], [[1.0, 0.0]], sample_weight=[-1.0]
         ),
         "`sample_weight` must hold 1 finite weights",
@@ -552,11 +401,11 @@ ERRORS = [
         "`structure` must be given",
     ),
     (
-        lambda: GrayBoxRestructurer(spring_mass()).fit([1.0, 2.0], [[1.0], [2.0]]),
+        lambda: GrayBoxRestructurer(spring_structure()).fit([1.0, 2.0], [[1.0], [2.0]]),
         r"`frf` must have shape \(2, 2\)",
     ),
     (
-        lambda: GrayBoxRestructurer(spring_mass()).fit(
+        lambda: GrayBoxRestructurer(spring_structure()).fit(
             [1.0, 1.0], [[1.0, 0.0], [1.0, 0.0]]
         ),
         "every frequency once",
@@ -584,23 +433,19 @@ def test_scikit_learn_conventions():
     assert not hasattr(restructurer, "params_")
 
 
-def test_result_is_reproducible():
-    structure, params = CASES["arm"]
-    rng = np.random.default_rng(5)
-    black_box = off_structure(structure.model(params), rng, 1e-4)
-    first = GrayBoxRestructurer(structure, random_state=1).fit_model(black_box)
-    second = GrayBoxRestructurer(structure, random_state=1).fit_model(black_box)
+def test_result_is_reproducible(rough):
+    black_box, fitted = far_fit(1)
+    first, second = (
+        clone(fitted).set_params(random_state=1).fit_model(black_box) for _ in range(2)
+    )
     np.testing.assert_array_equal(first.params_, second.params_)
 
 
-@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
-def test_neighbours_on_a_measured_grid_are_both_active():
+def test_neighbours_on_a_measured_grid_are_both_active(rough):
     driven = StateSpace(
         [[0, 1, 0], [-1, -0.1, 1], [0, 0, -30]], [[0], [0], [30]], [[1, 0, 0]]
     )
-    spring = GrayBoxStructure.from_template(
-        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
-    )
+    spring = spring_structure()
     omega = np.geomspace(0.1, 100, 60)
     G = driven.frequency_response(omega)
     fitted = GrayBoxRestructurer(spring).fit(omega, G)
@@ -620,3 +465,221 @@ def test_neighbours_on_a_measured_grid_are_both_active():
         for _ in range(20):
             near = fitted.params_ * (1 + size * rng.normal(size=3))
             assert error(near) >= fitted.error_ * (1 - 1e-9)
+
+
+# -- what a restructuring must survive ---------------------------------------------
+
+LAG = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+GAIN = GrayBoxStructure.from_template(
+    np.zeros((0, 0)).tolist(), np.zeros((0, 1)).tolist(), [[]], [["d"]]
+)
+
+
+def driven(gain=1.0, rate=1.0):
+    A = np.array([[0, 1, 0], [-1, -0.1, 1], [0, 0, -3]])
+    return StateSpace(rate * A, [[0], [0], [3 * rate * gain]], [[1, 0, 0]])
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_the_minimum_of_a_peak_is_no_floor():
+    """The nearest gain to a half circle leaves an error that depends on the gain."""
+    omega = np.array([1e-3, 1.0, 1e3])
+    G = np.array([0.0, 1.0 + 1.0j, 2.0])[:, None, None]
+    fitted = GrayBoxRestructurer(GAIN).fit(omega, G)
+    assert np.isclose(fitted.params_[0], 1.0, atol=1e-6)
+    assert fitted.structural_floor_ == 0 and fitted.lower_bound_ == 0
+    assert np.isclose(fitted.error_, fitted.remaining_error_, rtol=1e-9)
+    assert fitted.stationarity_ < 1e-6
+
+
+def test_a_gain_that_the_structure_fixes_is_a_floor():
+    unit = GrayBoxStructure.from_template(
+        [[0, 1], ["-k", "-c"]], [[0], ["k"]], [[1, 0]]
+    )
+    model = unit.model({"k": 4.0, "c": 5.0})
+    off = StateSpace(model.A, 1.1 * model.B, model.C)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        fitted = GrayBoxRestructurer(unit).fit_model(off)
+    assert fitted.error_ >= fitted.structural_floor_ * (1 - 1e-9)
+    assert np.isclose(fitted.structural_floor_, 0.1, rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("seed", range(8))
+def test_as_many_frequencies_as_active_peaks(seed):
+    rng = np.random.default_rng(seed)
+    omega = np.array([0.3, 1.0, 4.0])
+    G = LAG.model([1.0, 2.0]).frequency_response(omega)
+    G = G + 0.05 * (rng.normal(size=G.shape) + 1j * rng.normal(size=G.shape))
+    fitted = GrayBoxRestructurer(LAG).fit(omega, G)
+    E = fitted.lti_.frequency_response(omega) - G
+    assert np.isclose(fitted.error_, np.abs(E).max(), rtol=1e-9)
+    assert fitted.relative_error_ < 0.2
+
+
+@cache
+def restructured_driven(gain=1.0, rate=1.0):
+    structure = GrayBoxStructure.observable_canonical(2, 1, 1, feedthrough=False)
+    return GrayBoxRestructurer(structure).fit_model(driven(gain, rate))
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize(
+    "gain, rate",
+    [(1e-9, 1.0), (1e9, 1.0), (1.0, 1e-9), (1.0, 1e9), (1e9, 1e9), (1e-9, 1e9)],
+)
+def test_units_change_nothing(gain, rate):
+    one, other = restructured_driven(), restructured_driven(gain, rate)
+    assert np.isclose(other.relative_error_, one.relative_error_, rtol=1e-8)
+    assert other.stationarity_ < 1e-6
+    assert np.isclose(other.second_order_, one.second_order_, rtol=1e-2)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
+def test_a_bound_holds_in_any_unit(unit):
+    bounded = LAG.with_bounds({"b": (None, unit)})
+    model = StateSpace([[-1.0]], [[3.0 * unit]], [[1.0]])
+    fitted = GrayBoxRestructurer(bounded).fit_model(model)
+    b = fitted.params_[fitted.structure_.parameter_names.index("b")]
+    assert b <= unit and np.isclose(b, unit, rtol=1e-9)
+    assert np.isclose(fitted.error_, fitted.remaining_error_, rtol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_a_slower_structure_than_the_black_box_lets_expect():
+    """The poles of a finite impulse response are at zero: they decay at once."""
+    fir = StateSpace([[0, 1], [0, 0]], [[0], [1]], [[0.5, 1.0]], [[0.0]], 1.0)
+    fitted = GrayBoxRestructurer(LAG, init=[-0.5, 1.0]).fit_model(fir)
+    assert fitted.lti_.is_stable and fitted.relative_error_ < 0.5
+
+
+def test_a_function_may_refuse_parameters():
+    def mass(theta):
+        m, k, c = theta
+        if np.real(m) <= 0.2:
+            raise ValueError("the mass must be more than 0.2.")
+        A = np.array([[0 * m, 1 + 0 * m], [-k / m, -c / m]])
+        return A, np.array([[0 * m], [1 / m]]), np.array([[1.0, 0.0]])
+
+    structure = GrayBoxStructure.from_function(mass, {"m": 5.0, "k": 9.0, "c": 3.0})
+    truth = np.array([0.3, 2.0, 0.2])
+    fitted = GrayBoxRestructurer(structure).fit_model(structure.model(truth))
+    np.testing.assert_allclose(fitted.params_, truth, rtol=1e-6)
+
+
+def test_a_gain_need_not_be_linear_in_its_parameter():
+    square = GrayBoxStructure.from_function(
+        lambda t: (
+            np.zeros((0, 0)),
+            np.zeros((0, 1)),
+            np.zeros((1, 0)),
+            np.array([[t[0] ** 2]]),
+        ),
+        [2.0],
+    )
+    model = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[9.0]])
+    fitted = GrayBoxRestructurer(square, init=[2.5]).fit_model(model)
+    assert np.isclose(fitted.params_[0], 3.0, rtol=1e-6)
+
+
+def test_nothing_stays_of_an_earlier_fit():
+    model = LAG.model([1.0, 2.0])
+    others = [LAG.model([1.0 + d, 2.0]) for d in (-0.1, 0.0, 0.1)]
+    restructurer = GrayBoxRestructurer(LAG)
+    restructurer.fit_model(model, realizations=others)
+    assert restructurer.params_covariance_.shape == (2, 2)
+    restructurer.fit_model(model)
+    assert not hasattr(restructurer, "params_covariance_")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"tol": -1.0}, {"tol": np.nan}, {"max_iter": 2.5}, {"n_starts": "a"}],
+    ids=str,
+)
+def test_options_are_checked(options):
+    (name,) = options
+    with pytest.raises(ValueError, match=f"`{name}` must be"):
+        GrayBoxRestructurer(LAG, **options).fit_model(LAG.model([1.0, 2.0]))
+
+
+@pytest.mark.parametrize(
+    "outputs, unit",
+    [
+        ("position", 1e-6),
+        ("position", 1e6),
+        ("velocity", 1.0),
+        ("acceleration", 1e-6),
+        ("acceleration", 1.0),
+    ],
+)
+def test_unknown_masses_are_found_from_nothing(outputs, unit):
+    """Neither ranges, nor bounds, nor a first guess tell the size of a parameter."""
+    structure = GrayBoxStructure.mechanical(
+        M=[["m1", 0], [0, "m2"]],
+        D=[["c1 + c2", "-c2"], ["-c2", "c2"]],
+        K=[["k1 + k2", "-k2"], ["-k2", "k2"]],
+        F=[[1], [0]],
+        outputs=outputs,
+    )
+    values = {"m1": 2.0, "m2": 0.5, "c1": 0.4, "c2": 0.05, "k1": 9.0, "k2": 3.0}
+    truth = np.array([unit * values[name] for name in structure.parameter_names])
+    model = structure.model(truth)
+    for given in (model, [model, model]):
+        found = GrayBoxRestructurer(structure).fit_model(given)
+        assert np.allclose(found.params_, truth, rtol=1e-5)
+
+
+def test_h2_optima_at_bounds_are_certified(rough):
+    spring = spring_structure()
+    names = spring.parameter_names
+    truth = np.array([{"k": 4.0, "c": 0.5, "b": 2.0}[name] for name in names])
+    box = spring.model(truth)
+    bounded = spring.with_bounds({"k": (None, 3.0), "c": (0, None)})
+    start = np.array([{"k": 2.0, "c": 1.0, "b": 1.0}[name] for name in names])
+    found = GrayBoxRestructurer(bounded, norm="h2", init=start).fit_model(box)
+    assert np.isclose(found.params_[names.index("k")], 3.0)
+    assert found.stationarity_ < 1e-4
+    for j in range(3):  # no small step within the bounds is better
+        for step in (-1e-3, 1e-3):
+            other = found.params_.copy()
+            other[j] = np.clip(other[j] + step, bounded.lower[j], bounded.upper[j])
+            assert h2_of(bounded.model(other), box) >= found.objective_ * (1 - 1e-7)
+
+
+def h2_of(one, two):
+    """H2 norm of the difference by a dense grid."""
+    omega = np.linspace(0, 200, 200001)
+    E = one.frequency_response(omega) - two.frequency_response(omega)
+    return np.sqrt(np.trapezoid(np.abs(E[:, 0, 0]) ** 2, omega) / np.pi)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_an_error_at_its_lower_bound_is_optimal(seed):
+    """Reduction by one order, with D free: Glover's bound is attained, all-pass."""
+    box = stable_model(seed, order=6)
+    structure = GrayBoxStructure.observable_canonical(5, 2, 2, feedthrough=True)
+    found = GrayBoxRestructurer(structure).fit_model(box)
+    assert np.isclose(found.error_, box.hankel_singular_values()[5], rtol=1e-7)
+    assert found.stationarity_ == 0.0
+
+
+@pytest.mark.filterwarnings("ignore:the response determines")
+@pytest.mark.parametrize("order", [3, 5, 6])
+def test_a_black_box_of_lower_order_is_matched_exactly(order):
+    """The structure has states to spare; its parameters are not unique."""
+    box = StateSpace(
+        [[0, 1, 0], [0, 0, 1], [-6, -11, -6]], [[0], [0], [1]], [[6, 5, 1]]
+    )
+    n = order
+    A = [[0.0] * n for _ in range(n)]
+    for i in range(n - 1):
+        A[i][i + 1] = 1.0
+    A[-1] = [f"-a{i}" for i in range(n)]
+    controllable = GrayBoxStructure.from_template(
+        A, [[0.0]] * (n - 1) + [[1.0]], [[f"b{i}" for i in range(n)]]
+    )
+    for structure in (controllable, GrayBoxStructure.observable_canonical(n)):
+        assert GrayBoxRestructurer(structure).fit_model(box).relative_error_ < 1e-9

@@ -6,6 +6,8 @@ import pytest
 from lpvlearn import GrayBoxStructure
 from lpvlearn.restructuring.identifiability import Identifiability
 
+from ..conftest import spring_structure
+
 OMEGA = np.array([0.1, 0.5, 1.0, 2.0, 3.0, 9.0])
 
 
@@ -47,10 +49,7 @@ def analysis(structure, theta, omega=OMEGA):
 
 
 def test_a_spring_is_identifiable():
-    structure = GrayBoxStructure.from_template(
-        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
-    )
-    found = analysis(structure, [2.0, 0.5, 4.0])
+    found = analysis(spring_structure(), [2.0, 0.5, 4.0])
     assert found.rank == found.n_params == 3 and found.directions == ()
     assert 1 < found.condition < 100
     assert "all 3 parameters are identifiable" in str(found)

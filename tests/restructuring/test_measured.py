@@ -13,6 +13,8 @@ from lpvlearn.restructuring.measured import (
     stack_response,
 )
 
+from ..conftest import stable_model
+
 
 def response(n_freq=5, n_outputs=2, n_inputs=3, seed=0):
     rng = np.random.default_rng(seed)
@@ -77,14 +79,6 @@ def realized(omega, G, order):
     return StateSpace(target.A, target.B, target.C, target.D)
 
 
-def random_model(seed, order, n_inputs, n_outputs):
-    rng = np.random.default_rng(seed)
-    A = rng.normal(size=(order, order))
-    A = A - (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(order)
-    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
-    return StateSpace(A, B, C, rng.normal(size=(n_outputs, n_inputs)))
-
-
 @settings(deadline=None, max_examples=30)
 @given(
     seed=st.integers(0, 10**6),
@@ -96,7 +90,7 @@ def random_model(seed, order, n_inputs, n_outputs):
 def test_a_response_without_noise_gives_its_model(
     seed, order, n_inputs, n_outputs, scale
 ):
-    model = random_model(seed, order, n_inputs, n_outputs)
+    model = stable_model(seed, order, n_inputs, n_outputs, feedthrough=True)
     model = StateSpace(scale * model.A, scale * model.B, model.C, model.D)
     omega = scale * np.logspace(-1, 1.3, 25)
     G = model.frequency_response(omega)
@@ -128,7 +122,7 @@ def test_unstable_models_are_realised_too():
 
 
 def test_few_points_give_no_model():
-    model = random_model(0, 4, 1, 1)
+    model = stable_model(0, 4, 1, 1, feedthrough=True)
     for count, enough in ((2, False), (5, False), (6, True)):
         omega = np.linspace(0.5, 5, count)
         found = realize_response(omega, model.frequency_response(omega), 4)

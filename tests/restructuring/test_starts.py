@@ -3,11 +3,11 @@
 import numpy as np
 
 from lpvlearn import GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.error_system import ErrorSystem
-from lpvlearn.restructuring.least_squares import fit_frequency_response, grid_and_margin
-from lpvlearn.restructuring.limits import stability_test
+from lpvlearn.restructuring.problem import problem_from_models
 from lpvlearn.restructuring.starts import continuation_candidates, hopped_fits
-from lpvlearn.restructuring.transfer import Target
+
+from ..conftest import spring_structure
+from .conftest import target_of
 
 
 def two_modes():
@@ -16,37 +16,20 @@ def two_modes():
     return StateSpace(A, [[0], [1], [0], [1]], [[1, 0, 2.0, 0]])
 
 
-def target_of(model):
-    return Target(model.A, model.B, model.C, model.D, model.sampling_time)
-
-
-def oscillator():
-    return GrayBoxStructure.from_template(
-        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
-    )
-
-
-def fit_of(structure, model, params):
-    target = target_of(model)
-    system = ErrorSystem(structure, target)
-    omega, margin = grid_and_margin(target)
-    admissible = stability_test(system, margin)
-    G0 = system.target_response(omega)
-    fit = fit_frequency_response(
-        system, structure.check_params(params), omega, G0, admissible=admissible
-    )
-    return system, omega, G0, admissible, fit
+def at_the_weak_mode(structure):
+    """The problem, and the fit that ends in the basin of its weak mode."""
+    problem = problem_from_models(structure, [two_modes()], None)
+    params = structure.check_params({"k": 9.0, "c": 0.02, "b": 2.0})
+    return problem, problem.fit(params)
 
 
 def test_a_hop_leaves_the_basin_of_the_weak_mode():
-    structure = oscillator()
-    system, omega, G0, admissible, fit = fit_of(
-        structure, two_modes(), {"k": 9.0, "c": 0.02, "b": 2.0}
-    )
+    structure = spring_structure()
+    problem, fit = at_the_weak_mode(structure)
     k = structure.parameter_names.index("k")
     assert abs(fit.x[k] - 9) < 1
     rng = np.random.default_rng(0)
-    fits = hopped_fits(system, [fit], omega, G0, admissible, rng)
+    fits = hopped_fits(problem, [fit], rng)
     costs = [found.cost for found in fits]
     assert costs == sorted(costs)
     assert costs[0] < 0.9 * fit.cost
@@ -54,11 +37,9 @@ def test_a_hop_leaves_the_basin_of_the_weak_mode():
 
 
 def test_hops_keep_the_bounds_and_what_is_good():
-    structure = oscillator().with_bounds({"k": (8, 10), "c": (0.01, None)})
-    system, omega, G0, admissible, fit = fit_of(
-        structure, two_modes(), {"k": 9.0, "c": 0.02, "b": 2.0}
-    )
-    fits = hopped_fits(system, [fit], omega, G0, admissible, np.random.default_rng(1))
+    structure = spring_structure().with_bounds({"k": (8, 10), "c": (0.01, None)})
+    problem, fit = at_the_weak_mode(structure)
+    fits = hopped_fits(problem, [fit], np.random.default_rng(1))
     assert fits[0].cost <= fit.cost
     for found in fits:
         assert (found.x >= structure.lower).all()

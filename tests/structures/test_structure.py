@@ -9,17 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lpvlearn import GrayBoxStructure, StateSpace
+from lpvlearn import GrayBoxStructure
 
-
-def spring():
-    return GrayBoxStructure.from_template(
-        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
-    )
+from ..conftest import spring_structure
+from .conftest import pendulum, pendulum_jacobian
 
 
 def test_jacobian_of_a_template_is_the_difference():
-    structure = spring()
+    structure = spring_structure()
     rng = np.random.default_rng(0)
     theta, step = rng.normal(size=(2, 3))
     S = structure.system_matrix
@@ -29,22 +26,6 @@ def test_jacobian_of_a_template_is_the_difference():
 
 
 # -- functions -------------------------------------------------------------------
-
-
-def pendulum(theta):
-    length, damping, gain = theta
-    A = np.array([[0, 1], [-9.81 / length, -damping * length**2]])
-    return A, np.array([[0], [gain * np.exp(-length)]]), np.array([[1, 0]])
-
-
-def pendulum_jacobian(theta):
-    length, damping, gain = theta
-    zero = np.zeros((2, 2))
-    by_length = np.array([[0, 0], [9.81 / length**2, -2 * damping * length]])
-    by_damping = np.array([[0, 0], [0, -(length**2)]])
-    decay = np.exp(-length)
-    B = [[[0], [-gain * decay]], [[0], [0]], [[0], [decay]]]
-    return [by_length, by_damping, zero], B, np.zeros((3, 1, 2))
 
 
 def pendulum_with_abs(theta):
@@ -199,106 +180,6 @@ def test_functions_that_change_their_shape_are_explained():
         structure.model([6.0])
 
 
-# -- canonical forms -------------------------------------------------------------
-
-
-def canonical_parameters(model, structure):
-    """Parameters of the canonical form of a model, by linear algebra alone.
-
-    In the canonical basis the states are rows ``C_i A^k`` of the observability matrix:
-    the change of basis is known, and every entry of the form can be read off.
-    """
-    n, p = model.order, model.n_outputs
-    lengths = [n // p + (i < n % p) for i in range(p)]
-    T = np.array(
-        [
-            model.C[i] @ np.linalg.matrix_power(model.A, k)
-            for i in range(p)
-            for k in range(lengths[i])
-        ]
-    )
-    canonical = model.transform(T)
-    S = np.block([[canonical.A, canonical.B], [canonical.C, canonical.D]])
-    theta = np.array(
-        [
-            S[tuple(np.argwhere(entry)[0])]
-            for entry in structure.jacobian(np.zeros(structure.n_params))
-        ]
-    )
-    return theta, S
-
-
-@pytest.mark.parametrize("feedthrough", [False, True])
-@pytest.mark.parametrize(
-    "order, n_inputs, n_outputs",
-    [(1, 1, 1), (3, 1, 1), (4, 2, 2), (5, 2, 2), (5, 1, 3), (2, 1, 3), (1, 2, 2)],
-)
-def test_canonical_form_holds_every_generic_model(
-    order, n_inputs, n_outputs, feedthrough
-):
-    rng = np.random.default_rng(order)
-    A = rng.normal(size=(order, order)) - 2 * np.eye(order)
-    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
-    D = rng.normal(size=(n_outputs, n_inputs)) * feedthrough
-    model = StateSpace(A, B, C, D)
-    structure = GrayBoxStructure.observable_canonical(
-        order, n_inputs, n_outputs, feedthrough
-    )
-    # as many parameters as a transfer function of that order has coefficients
-    assert structure.n_params == order * (n_inputs + n_outputs) + D.size * feedthrough
-    theta, S = canonical_parameters(model, structure)
-    assert_allclose(structure.system_matrix(theta), S, atol=1e-9 * np.abs(S).max())
-    omega = np.array([0.0, 0.4, 3.0, np.inf])
-    assert_allclose(
-        structure.model(theta).frequency_response(omega),
-        model.frequency_response(omega),
-        atol=1e-9,
-    )
-
-
-@pytest.mark.parametrize("make", ["observable_canonical", "full"])
-def test_order_zero_is_a_pure_gain(make):
-    structure = getattr(GrayBoxStructure, make)(0, 2, 3, feedthrough=True)
-    assert (structure.order, structure.n_inputs, structure.n_outputs) == (0, 2, 3)
-    names = ("d1_1", "d1_2", "d2_1", "d2_2", "d3_1", "d3_2")
-    assert structure.parameter_names == names
-    model = structure.model(np.arange(6.0))
-    assert_array_equal(model.D, np.arange(6.0).reshape(3, 2))
-    assert_array_equal(model.simulate([[1, 0]], sampling_time=1.0), [[0, 2, 4]])
-    with pytest.raises(ValueError, match="`feedthrough` must be True for order 0"):
-        getattr(GrayBoxStructure, make)(0, 2, 3, feedthrough=False)
-
-
-@pytest.mark.parametrize("feedthrough", [False, True])
-def test_full_structure_holds_its_entries_row_by_row(feedthrough):
-    structure = GrayBoxStructure.full(3, 2, 1, feedthrough)
-    rng = np.random.default_rng(0)
-    blocks = [rng.normal(size=s) for s in ((3, 3), (3, 2), (1, 3), (1, 2))]
-    if not feedthrough:
-        blocks[3][:] = 0
-    used = blocks if feedthrough else blocks[:3]
-    theta = np.concatenate([block.ravel() for block in used])
-    for found, expected in zip(structure.matrices(theta), blocks, strict=True):
-        assert_array_equal(found, expected)
-
-
-@pytest.mark.parametrize("make", ["observable_canonical", "full"])
-@pytest.mark.parametrize(
-    "dimensions, name",
-    [
-        ((-1, 1, 1), "order"),
-        ((2.0, 1, 1), "order"),
-        ((True, 1, 1), "order"),
-        ((2, 0, 1), "n_inputs"),
-        ((2, 1, 0), "n_outputs"),
-        ((2, 1, "1"), "n_outputs"),
-    ],
-)
-def test_dimensions_must_be_whole_numbers(make, dimensions, name):
-    with pytest.raises(ValueError, match=f"`{name}` must be an integer"):
-        getattr(GrayBoxStructure, make)(*dimensions)
-
-
 # -- evaluation ------------------------------------------------------------------
 
 
@@ -315,7 +196,7 @@ def test_stacked_parameters_give_stacked_matrices(seed, lead):
 
 
 def test_models_take_vectors_mappings_and_a_sampling_time():
-    structure = spring()
+    structure = spring_structure()
     by_name = structure.model({"k": 4, "c": 0.5, "b": 2}, sampling_time=0.1)
     by_position = structure.model([2, 0.5, 4], 0.1)
     for name in "ABCD":
@@ -335,17 +216,20 @@ def test_models_take_vectors_mappings_and_a_sampling_time():
 )
 def test_wrong_parameters_are_explained(theta, message):
     with pytest.raises(ValueError, match=message):
-        spring().model(theta)
+        spring_structure().model(theta)
 
 
 def test_matrices_need_all_parameters():
     with pytest.raises(ValueError, match=r"`theta` must have shape \(..., 3\)"):
-        spring().matrices(np.ones((5, 2)))
+        spring_structure().matrices(np.ones((5, 2)))
 
 
 @pytest.mark.parametrize(
     "structure",
-    [spring(), GrayBoxStructure.from_function(pendulum, START, pendulum_jacobian)],
+    [
+        spring_structure(),
+        GrayBoxStructure.from_function(pendulum, START, pendulum_jacobian),
+    ],
 )
 @pytest.mark.parametrize(
     "duplicate", [copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))]
@@ -361,7 +245,7 @@ def test_copies_and_pickles_give_the_same_models(structure, duplicate):
 
 
 def test_the_arrays_of_a_structure_are_read_only():
-    structure = spring()
+    structure = spring_structure()
     for array in (structure.offset, structure.jacobian(np.zeros(3))):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 1.0
@@ -369,6 +253,6 @@ def test_the_arrays_of_a_structure_are_read_only():
 
 def test_repr_tells_the_dimensions():
     text = "GrayBoxStructure(order=2, n_inputs=1, n_outputs=1, n_params=3, "
-    assert repr(spring()) == text + "affine)"
+    assert repr(spring_structure()) == text + "affine)"
     structure = GrayBoxStructure.from_function(pendulum, START)
     assert repr(structure) == text + "function)"

@@ -1,13 +1,16 @@
-"""Templates: affine expressions of parameter names, read without evaluation."""
+"""Templates: affine expressions of parameter names; canonical and modal forms."""
 
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
-from lpvlearn import GrayBoxStructure
+from lpvlearn import GrayBoxStructure, StateSpace
+
+from .conftest import OMEGA, rank
 
 TEMPLATE = GrayBoxStructure.from_template
+MODAL = GrayBoxStructure.modal
 
 
 def one(entry, **options):
@@ -150,3 +153,199 @@ def test_templates_of_order_zero():
     for A, B, C in (([], [], []), (np.zeros((0, 0)), [], [[], []])):
         structure = TEMPLATE(A, B, C, [["g"], ["-2*g"]])
         assert_array_equal(structure.model([3.0]).D, [[3], [-6]])
+
+
+# -- canonical forms -------------------------------------------------------------
+
+
+def canonical_parameters(model, structure):
+    """Parameters of the canonical form of a model, by linear algebra alone.
+
+    In the canonical basis the states are rows ``C_i A^k`` of the observability matrix:
+    the change of basis is known, and every entry of the form can be read off.
+    """
+    n, p = model.order, model.n_outputs
+    lengths = [n // p + (i < n % p) for i in range(p)]
+    T = np.array(
+        [
+            model.C[i] @ np.linalg.matrix_power(model.A, k)
+            for i in range(p)
+            for k in range(lengths[i])
+        ]
+    )
+    canonical = model.transform(T)
+    S = np.block([[canonical.A, canonical.B], [canonical.C, canonical.D]])
+    theta = np.array(
+        [
+            S[tuple(np.argwhere(entry)[0])]
+            for entry in structure.jacobian(np.zeros(structure.n_params))
+        ]
+    )
+    return theta, S
+
+
+@pytest.mark.parametrize("feedthrough", [False, True])
+@pytest.mark.parametrize(
+    "order, n_inputs, n_outputs",
+    [(1, 1, 1), (3, 1, 1), (4, 2, 2), (5, 2, 2), (5, 1, 3), (2, 1, 3), (1, 2, 2)],
+)
+def test_canonical_form_holds_every_generic_model(
+    order, n_inputs, n_outputs, feedthrough
+):
+    rng = np.random.default_rng(order)
+    A = rng.normal(size=(order, order)) - 2 * np.eye(order)
+    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
+    D = rng.normal(size=(n_outputs, n_inputs)) * feedthrough
+    model = StateSpace(A, B, C, D)
+    structure = GrayBoxStructure.observable_canonical(
+        order, n_inputs, n_outputs, feedthrough
+    )
+    # as many parameters as a transfer function of that order has coefficients
+    assert structure.n_params == order * (n_inputs + n_outputs) + D.size * feedthrough
+    theta, S = canonical_parameters(model, structure)
+    assert_allclose(structure.system_matrix(theta), S, atol=1e-9 * np.abs(S).max())
+    omega = np.array([0.0, 0.4, 3.0, np.inf])
+    assert_allclose(
+        structure.model(theta).frequency_response(omega),
+        model.frequency_response(omega),
+        atol=1e-9,
+    )
+
+
+@pytest.mark.parametrize("make", ["observable_canonical", "full"])
+def test_order_zero_is_a_pure_gain(make):
+    structure = getattr(GrayBoxStructure, make)(0, 2, 3, feedthrough=True)
+    assert (structure.order, structure.n_inputs, structure.n_outputs) == (0, 2, 3)
+    names = ("d1_1", "d1_2", "d2_1", "d2_2", "d3_1", "d3_2")
+    assert structure.parameter_names == names
+    model = structure.model(np.arange(6.0))
+    assert_array_equal(model.D, np.arange(6.0).reshape(3, 2))
+    assert_array_equal(model.simulate([[1, 0]], sampling_time=1.0), [[0, 2, 4]])
+    with pytest.raises(ValueError, match="`feedthrough` must be True for order 0"):
+        getattr(GrayBoxStructure, make)(0, 2, 3, feedthrough=False)
+
+
+@pytest.mark.parametrize("feedthrough", [False, True])
+def test_full_structure_holds_its_entries_row_by_row(feedthrough):
+    structure = GrayBoxStructure.full(3, 2, 1, feedthrough)
+    rng = np.random.default_rng(0)
+    blocks = [rng.normal(size=s) for s in ((3, 3), (3, 2), (1, 3), (1, 2))]
+    if not feedthrough:
+        blocks[3][:] = 0
+    used = blocks if feedthrough else blocks[:3]
+    theta = np.concatenate([block.ravel() for block in used])
+    for found, expected in zip(structure.matrices(theta), blocks, strict=True):
+        assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("make", ["observable_canonical", "full"])
+@pytest.mark.parametrize(
+    "dimensions, name",
+    [
+        ((-1, 1, 1), "order"),
+        ((2.0, 1, 1), "order"),
+        ((True, 1, 1), "order"),
+        ((2, 0, 1), "n_inputs"),
+        ((2, 1, 0), "n_outputs"),
+        ((2, 1, "1"), "n_outputs"),
+    ],
+)
+def test_dimensions_must_be_whole_numbers(make, dimensions, name):
+    with pytest.raises(ValueError, match=f"`{name}` must be an integer"):
+        getattr(GrayBoxStructure, make)(*dimensions)
+
+
+# -- modal -----------------------------------------------------------------------
+
+
+def modal_parameters(model, structure, normalize):
+    """Parameters of the modal form of a model, by eigenvectors alone."""
+    poles, V = np.linalg.eig(model.A)
+    Bt, Ct = np.linalg.solve(V, model.B), model.C @ V
+    values = {}
+    pairs = [i for i in range(len(poles)) if poles[i].imag > 0]
+    reals = [i for i in range(len(poles)) if poles[i].imag == 0]
+    n_modes = (structure.order - len(reals)) // 2
+    assert n_modes == len(pairs)
+    for k, i in enumerate(pairs):
+        values[f"w2_{k + 1}"] = abs(poles[i]) ** 2
+        values[f"d_{k + 1}"] = -2 * poles[i].real
+        # companion block: right eigenvector [1, lambda]; scaled by a complex number
+        lam = poles[i]
+        V0 = np.array([[1, 1], [lam, lam.conj()]])
+        if normalize == "input":  # V0 diag(s) Bt = [0, 1] for the first input
+            s = np.linalg.solve(V0, [0, 1])[0] / Bt[i, 0]
+        else:  # Ct diag(1/s) V0^-1 = [1, 0] for the first output
+            s = Ct[0, i] / 1.0
+        b, c = s * Bt[i], Ct[:, i] / s
+        B2 = (V0 @ np.array([b, b.conj()])).real
+        C2 = (np.stack([c, c.conj()], 1) @ np.linalg.inv(V0)).real
+        for row in range(2):
+            for j in range(model.n_inputs):
+                values[f"b{2 * k + row + 1}_{j + 1}"] = B2[row, j]
+            for j in range(model.n_outputs):
+                values[f"c{j + 1}_{2 * k + row + 1}"] = C2[j, row]
+    for k, i in enumerate(reals):
+        s = 1 / Bt[i, 0].real if normalize == "input" else Ct[0, i].real
+        values[f"r_{k + 1}"] = -poles[i].real
+        state = 2 * n_modes + k + 1
+        for j in range(model.n_inputs):
+            values[f"b{state}_{j + 1}"] = s * Bt[i, j].real
+        for j in range(model.n_outputs):
+            values[f"c{j + 1}_{state}"] = Ct[j, i].real / s
+    for i, j in np.ndindex(model.D.shape):
+        values[f"d{i + 1}_{j + 1}"] = model.D[i, j]
+    return np.array([values[name] for name in structure.parameter_names])
+
+
+@pytest.mark.parametrize("normalize", ["input", "output"])
+@pytest.mark.parametrize(
+    "n_modes, n_real, m, p, feedthrough",
+    [(1, 0, 1, 1, False), (2, 0, 2, 3, False), (1, 2, 2, 2, True), (0, 1, 1, 2, False)],
+)
+def test_modal_form_holds_every_diagonalizable_model(
+    n_modes, n_real, m, p, feedthrough, normalize
+):
+    rng = np.random.default_rng(n_modes + 10 * n_real)
+    n = 2 * n_modes + n_real
+    A = np.zeros((n, n))
+    for i in range(n_modes):
+        s, w = rng.uniform(0.1, 1), rng.uniform(1, 9)
+        A[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[-s, w], [-w, -s]]
+    for i in range(2 * n_modes, n):
+        A[i, i] = -rng.uniform(0.2, 5)
+    D = rng.normal(size=(p, m)) * feedthrough
+    model = StateSpace(A, rng.normal(size=(n, m)), rng.normal(size=(p, n)), D)
+    model = model.transform(rng.normal(size=(n, n)))
+    structure = MODAL(n_modes, m, p, n_real, feedthrough, normalize=normalize)
+    assert structure.n_params == n * (m + p) + D.size * feedthrough
+    theta = modal_parameters(model, structure, normalize)
+    G = model.frequency_response(OMEGA)
+    error = structure.model(theta).frequency_response(OMEGA) - G
+    assert np.abs(error).max() < 1e-10 * np.abs(G).max()
+    assert rank(structure, theta) == structure.n_params
+
+
+def test_modal_parameters_are_poles():
+    structure = MODAL(1, n_real=1)
+    theta = dict.fromkeys(structure.parameter_names, 1.0)
+    poles = structure.model(theta | {"w2_1": 9.0, "d_1": 0.5, "r_1": 7.0}).poles()
+    assert_allclose(np.prod(poles[:2]).real, 9.0)
+    assert_allclose(poles[:2].sum().real, -0.5)
+    assert_allclose(poles[2], -7.0)
+
+
+@pytest.mark.parametrize(
+    "arguments, options, message",
+    [
+        ((0,), {}, "`n_modes` or `n_real` must be at least 1"),
+        ((-1,), {}, "`n_modes` must be an integer"),
+        ((1, 0), {}, "`n_inputs` must be an integer"),
+        ((1, 1, 1.5), {}, "`n_outputs` must be an integer"),
+        ((1, 1, 1, -2), {}, "`n_real` must be an integer"),
+        ((1,), {"normalize": "both"}, "`normalize` must be 'input' or 'output'"),
+    ],
+)
+def test_wrong_modal_forms_are_explained(arguments, options, message):
+    with pytest.raises(ValueError, match=message):
+        MODAL(*arguments, **options)

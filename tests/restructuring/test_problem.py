@@ -1,0 +1,102 @@
+"""What is matched: models, alone or together, and responses, behind weights."""
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+
+from .conftest import CASES, disguised, far_fit, off_structure
+
+
+def test_feedthrough_that_the_structure_lacks_is_reported():
+    structure, params = CASES["spring_mass"]
+    model = structure.model(params)
+    black_box = StateSpace(model.A, model.B, model.C, [[0.25]])
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    np.testing.assert_array_equal(fitted.dropped_feedthrough_, [[0.25]])
+    np.testing.assert_allclose(
+        fitted.params_, structure.check_params(params), rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("kind", ["band", "scalar", "matrix"])
+def test_weighted_error_is_the_norm_of_the_weighted_difference(kind, rough):
+    black_box, plain = far_fit(2)
+    low = StateSpace([[-2.0]], [[2.0]], [[1.0]])
+    pair = StateSpace(-2 * np.eye(2), 2 * np.eye(2), np.diag([1.0, 0.1]))
+    weight = {"band": (None, 2.0), "scalar": low, "matrix": pair}[kind]
+    fitted = clone(plain).set_params(frequency_weight=weight).fit_model(black_box)
+    omega = np.geomspace(1e-3, 1e3, 4000)
+    E = (fitted.lti_ - black_box).frequency_response(omega)
+    W = (pair if kind == "matrix" else low).frequency_response(omega)
+    sigma = np.linalg.norm(W @ E if kind == "matrix" else W * E, 2, axis=(1, 2))
+    assert np.isclose(fitted.error_, sigma.max(), rtol=1e-3)
+    E = (plain.lti_ - black_box).frequency_response(omega)
+    sigma = np.linalg.norm(W @ E if kind == "matrix" else W * E, 2, axis=(1, 2))
+    assert fitted.error_ <= sigma.max() * (1 + 1e-6)
+
+
+def test_one_weight_serves_all_measured_outputs():
+    structure, params = CASES["two_masses"]
+    omega = np.geomspace(0.1, 20, 40)
+    G = structure.model(params).frequency_response(omega)
+    square = StateSpace(-5 * np.eye(2), 5 * np.eye(2), np.eye(2))
+    fits = [
+        GrayBoxRestructurer(structure, frequency_weight=weight).fit(omega, G)
+        for weight in ((None, 5.0), square)
+    ]
+    for fitted in fits:
+        np.testing.assert_allclose(
+            fitted.params_, structure.check_params(params), rtol=1e-6
+        )
+
+
+def test_weights_of_the_samples_decide_between_frequencies(rough):
+    structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+    omega = np.array([0.1, 0.2, 0.5, 20.0, 40.0])
+    G = np.where(omega < 1, 1.0 / (1j * omega + 1), 3.0 / (1j * omega + 2))
+    trusted = np.where(omega < 1, 1.0, 1e-6)
+    fitted = GrayBoxRestructurer(structure).fit(omega, G, sample_weight=trusted)
+    np.testing.assert_allclose(fitted.params_, [1.0, 1.0], rtol=1e-3)
+
+
+def test_several_models_of_one_point_are_matched_together(rough):
+    structure, params = CASES["spring_mass"]
+    theta = structure.check_params(params)
+    rng = np.random.default_rng(0)
+    exact = structure.model(theta)
+    same = GrayBoxRestructurer(structure).fit_model([exact, disguised(exact, rng)])
+    np.testing.assert_allclose(same.params_, theta, rtol=1e-6)
+    boxes = [off_structure(exact, rng, 5e-3) for _ in range(3)]
+    fitted = GrayBoxRestructurer(structure).fit_model(boxes)
+    omega = np.geomspace(0.01, 100, 20000)
+    stacked = np.concatenate(
+        [(fitted.lti_ - box).frequency_response(omega) for box in boxes], axis=1
+    )
+    assert np.isclose(
+        fitted.error_, np.linalg.norm(stacked, 2, axis=(1, 2)).max(), rtol=1e-4
+    )
+
+
+def test_hankel_singular_value_bounds_the_error_from_below(rough):
+    structure, params = CASES["spring_mass"]
+    truth = structure.model(params)
+    A = np.zeros((3, 3))
+    A[:2, :2], A[2, 2] = truth.A, -4.0
+    black_box = StateSpace(A, np.vstack([truth.B, [[1]]]), np.hstack([truth.C, [[1]]]))
+    fitted = GrayBoxRestructurer(structure).fit_model(black_box)
+    hankel = black_box.hankel_singular_values()[2]
+    assert fitted.lower_bound_ == hankel
+    assert hankel <= fitted.error_
+
+
+def test_table_and_complex_responses_are_the_same_data():
+    structure, params = CASES["two_masses"]
+    omega = np.geomspace(0.1, 30, 50)
+    G = structure.model(params).frequency_response(omega)
+    flat = G.reshape(50, -1)
+    table = np.hstack([flat.real, flat.imag])
+    one = GrayBoxRestructurer(structure).fit(omega[:, None], table)
+    two = GrayBoxRestructurer(structure).fit(omega, G)
+    np.testing.assert_array_equal(one.params_, two.params_)

@@ -1,0 +1,23 @@
+"""Numerical derivatives."""
+
+import threading
+import warnings
+
+import numpy as np
+
+from lpvlearn.structures.differentiation import numerical_jacobian
+
+
+def test_threads_leave_the_warning_filters_alone():
+    before = list(warnings.filters)
+
+    def work():
+        for _ in range(50):
+            numerical_jacobian(lambda t: np.array([t[0] ** 2]), np.array([2.0]))
+
+    threads = [threading.Thread(target=work) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert warnings.filters == before
