@@ -16,7 +16,6 @@ _PAD = 10.0  # a decade beyond the slowest and the fastest pole
 
 _SMALLEST = 1e-6  # slower poles, relative to the fastest, count as integrators
 
-_DELAY = 1e-12  # stands for a sampled model's pole at zero, whose logarithm is infinite
 
 # Places around a resonance, in half-widths: the peak is drawn round, not cut.
 _AROUND = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.3, 1.7, 2.3, 3.2, 5.0, 8.0])
