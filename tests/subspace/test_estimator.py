@@ -270,7 +270,10 @@ def test_unrelated_outputs_warn(rng):
         ({"order": 2.0}, "`order` must be"),
         ({"order": True}, "`order` must be"),
         ({"horizon": 0}, "`horizon` must be 'auto' or an integer of at least 1"),
-        ({"method": "arx"}, "`method` must be one of po-moesp"),
+        (
+            {"method": "arx"},
+            "`method` must be 'po-moesp', 'pi-moesp', 'n4sid' or 'cva'",
+        ),
         ({"stability": "maybe"}, "`stability` must be 'warn' or 'enforce'"),
         ({"sampling_time": 0.0}, "`sampling_time` must be a positive"),
         ({"horizon": 20}, "`horizon` must be at most 5 for 40 samples"),

@@ -12,6 +12,8 @@ from lpvlearn import (
     SubspaceLTI,
     from_trajectories,
 )
+from lpvlearn.data.experiments import Experiment
+from lpvlearn.pipeline.local_models import identify_point
 from lpvlearn.pipeline.structured_models import covariance_of_parameters
 from lpvlearn.subspace.statistics import deviated_models
 
@@ -96,7 +98,7 @@ def test_deviations_follow_the_units():
 def test_pairs_stand_on_both_sides_of_the_estimate(method):
     u, y = lag_record(1)
     fitted = SubspaceLTI(1, horizon=8, sampling_time=STEP).fit(u, y)
-    pairs = deviated_models(fitted, [(u, y)], lambda m: m.to_continuous(method))
+    pairs = deviated_models(fitted.lti_, [(u, y)], lambda m: m.to_continuous(method))
     assert len(pairs) == 3  # pole, gain and feedthrough
     omega = np.geomspace(0.01, 20, 20)
     here = fitted.lti_.to_continuous(method).frequency_response(omega)
@@ -110,8 +112,14 @@ def test_pairs_stand_on_both_sides_of_the_estimate(method):
 @pytest.mark.parametrize("options", [{"refine": False}, {"order": 0}])
 def test_nothing_is_claimed_where_the_covariance_is_not_known(options):
     u, y = lag_record(2)
-    fitted = SubspaceLTI(**{"order": 1, "horizon": 8, **options}).fit(u, y)
-    assert deviated_models(fitted, [(u, y)], lambda model: model) == []
+    point = identify_point(
+        SubspaceLTI(**{"order": 1, "horizon": 8, **options}),
+        [Experiment("a", np.arange(len(u)), u, y)],
+        sampling_time=STEP,
+        combine="pool",
+        discretization="zoh",
+    )
+    assert point.deviated == []
 
 
 def test_collinear_inputs_leave_the_deviations_open():
@@ -122,13 +130,13 @@ def test_collinear_inputs_leave_the_deviations_open():
     both = np.hstack([u, 2 * u])
     with pytest.warns(UserWarning, match="collinear"):
         fitted = SubspaceLTI(1, horizon=5).fit(both, y)
-    assert deviated_models(fitted, [(both, y)], lambda model: model) == []
+    assert deviated_models(fitted.lti_, [(both, y)], lambda model: model) == []
 
 
 def test_a_frequency_weight_enters_the_covariance():
     u, y = lag_record(3)
     fitted = SubspaceLTI(1, horizon=8, feedthrough=False, sampling_time=STEP).fit(u, y)
-    pairs = deviated_models(fitted, [(u, y)], StateSpace.to_continuous)
+    pairs = deviated_models(fitted.lti_, [(u, y)], StateSpace.to_continuous)
     box = fitted.lti_.to_continuous()
     theta = GrayBoxRestructurer(LAG).fit_model(box).params_
     plain, weighted = (

@@ -1,5 +1,7 @@
 """partial_fit: the model of a stream is that of one table, in bounded memory."""
 
+import pickle
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,7 +15,7 @@ from lpvlearn.subspace.hankel import data_factor, extend_hankel_sum, start_hanke
 from lpvlearn.subspace.identification import identify
 from lpvlearn.subspace.realization import METHODS, factor_input_matrices
 from lpvlearn.subspace.recursive_refinement import (
-    aligned_pair,
+    _aligned_pair,
     input_matrices,
     start_recursion,
 )
@@ -318,7 +320,7 @@ def test_memory_does_not_grow_with_the_stream(system, short_buffer):
     for seed in range(6):
         model.partial_fit(*record(system, 2000, seed))
         kept = sum(r.u.size + r.y.size for r in model._evidence.records)
-        sizes.append(model._stream.summary.size + kept)
+        sizes.append(len(pickle.dumps(model)) // 8)
     # A stretch that waits for the next batch is all that comes and goes.
     assert max(sizes) <= sizes[0] + 5 * STRETCH
 
@@ -339,7 +341,7 @@ def test_a_pair_is_brought_to_the_blocks_of_another_model(system):
     T = np.random.default_rng(1).standard_normal((5, 5))
     A = system[0] + 0.01 * np.random.default_rng(2).standard_normal((5, 5))
     A, C = np.linalg.solve(T, A @ T), 1.02 * system[2] @ T
-    blocks, C_aligned = aligned_pair(A, C, pilot)
+    blocks, C_aligned = _aligned_pair(A, C, pilot)
     assert [b.shape for b in blocks] == [b.shape for b in pilot.blocks]
     aligned = block_diag(*blocks)
 
@@ -362,7 +364,7 @@ def test_input_matrices_of_a_given_pair_solve_the_linearised_problem(system):
     recursion = start_recursion(pilot, parts, free)
     T = np.random.default_rng(1).standard_normal((5, 5))
     A, C = np.linalg.solve(T, system[0] @ T), system[2] @ T
-    found = input_matrices(recursion, A, C, free)
+    found = input_matrices(recursion, A, C)
     G = StateSpace(*found[:4], 1.0).frequency_response(OMEGA)
     whole = StateSpace(*pilot[:4], 1.0).frequency_response(OMEGA)
     np.testing.assert_allclose(G, whole, atol=1e-8)

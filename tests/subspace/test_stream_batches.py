@@ -195,7 +195,7 @@ def test_stream_that_begins_with_a_constant_input_waits_for_its_change(
         with pytest.warns(UserWarning, match="1,000 samples .* Every input must") as w:
             for k, size in zip(np.cumsum([0, *sizes]), sizes, strict=False):
                 model.partial_fit(u[k : k + size], y[k : k + size])
-                kept.append(sum(len(u) for u, _ in model._stream.pairs))
+                kept.append(sum(len(u) for u, _ in model._stream._buffer.pairs))
         assert len(w) == 1 and max(kept) <= 1000
         np.testing.assert_allclose(response(model), truth(system), atol=1e-7)
         streams.append(model)
