@@ -24,6 +24,7 @@ from scipy import linalg
 
 from ..systems.least_squares import scaled_lstsq
 from .parameters import block_parts, change_between, moved_model
+from .refinement import experiment_regressions
 from .signals import Record, signal_factor, state_coefficients
 from .simulation_fit import (
     Freedom,
@@ -90,39 +91,40 @@ class Recursion(NamedTuple):
 
 
 def start_recursion(
-    pilot: Realization,
-    regressions: Sequence[Array],
-    free: Freedom,
-    variance: float = 0.0,
-) -> Recursion:
+    pilot: Realization, records: Sequence[Record], free: Freedom
+) -> Recursion | None:
     """Local coordinates and first information, from the data of the pilot model.
+
+    What these tell of the parameters no better than the linearisation is valid, such as
+    the poles of a superfluous mode, stays with the pilot until the data tell more.
 
     Parameters
     ----------
     pilot : Realization
-    regressions : sequence of ndarray
-        One per experiment, from `jacobian_regression` at the pilot model.
+    records : sequence of Record
     free : Freedom
-    variance : float, default=0.0
-        Of the simulation error. What is known of the parameters no better than the
-        linearisation is valid, such as the poles of a superfluous mode, stays with
-        the pilot until the data tell more.
 
     Returns
     -------
-    Recursion
+    Recursion or None
+        None where the pilot cannot be linearised at: it has no section form, or its
+        responses overflow.
     """
-    own = n_own(len(pilot.A), free)
-    stacked = stack_regressions(regressions, own)
+    if pilot.blocks is None or not np.isfinite(pilot.loss):
+        return None
+    regressions = experiment_regressions(pilot, records, free)
+    if regressions is None:
+        return None
+    stacked = stack_regressions(regressions, n_own(len(pilot.A), free))
     jacobian = stacked[:, :-1]
     scale = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
     scale[scale == 0.0] = 1.0
     _, s, right = linalg.svd(jacobian / scale, full_matrices=False, check_finite=False)
     right = right[s > _RCOND * s.max(initial=0.0)]
     directions = right.T / scale[:, None]
-    k = directions.shape[1]
     rows = np.column_stack([jacobian @ directions, stacked[:, -1]])
-    information = _triangle(rows, k + 1)
+    information = _triangle(rows)
+    variance = pilot.loss / sum(record.y.size for record in records)
     restraint = np.sqrt(variance) / _ranges(pilot, directions)
     position = _solve(information, restraint)
     return Recursion(
@@ -143,9 +145,9 @@ def _ranges(pilot: Realization, directions: Array) -> Array:
     return 1.0 / speed
 
 
-def _triangle(rows: Array, size: int) -> Array:
-    """Upper triangular factor of shape (size, size)."""
-    out = np.zeros((size, size))
+def _triangle(rows: Array) -> Array:
+    """Upper triangular factor, square also of few rows."""
+    out = np.zeros((rows.shape[1],) * 2)
     upper = np.linalg.qr(rows, mode="r")
     out[: len(upper)] = upper
     return out
@@ -212,20 +214,7 @@ def _aligned_pair(
     """``(A, C)`` in the state basis of another model, with blocks as that has them.
 
     The extended observability matrices give the basis; Newton steps on the invariant
-    subspaces remove what then couples the blocks.
-
-    Parameters
-    ----------
-    A : ndarray of shape (order, order)
-    C : ndarray of shape (n_outputs, order)
-    pilot : Realization
-        In section form.
-
-    Returns
-    -------
-    blocks : tuple of ndarray
-    C : ndarray of shape (n_outputs, order)
-        None instead of both where there is no such form near the pilot's.
+    subspaces remove what then couples the blocks. None where no form is near.
     """
     assert pilot.blocks is not None
     n = len(A)
@@ -310,9 +299,7 @@ def extend_recursion(
     M = project_out(M, n_own(len(model.A), free))
     J = M[:, :-1] @ recursion.directions
     rows = np.column_stack([J, M[:, -1] + J @ position])
-    information = _triangle(
-        np.vstack([recursion.information, rows]), len(recursion.information)
-    )
+    information = _triangle(np.vstack([recursion.information, rows]))
     position = _solve(information, recursion.restraint)
     return recursion._replace(information=information, position=position), x0
 

@@ -40,7 +40,7 @@ from .recursive_refinement import (
     start_recursion,
     stretch_error,
 )
-from .refinement import experiment_regressions, in_sections
+from .refinement import in_sections
 from .signals import Record
 from .simulation_fit import Realization
 
@@ -154,15 +154,10 @@ class StreamSummary:
         )
         self._waiting = self._latest = np.zeros((0, samples[0].shape[1]))
         self._starts = False
-        pilot, recursion = in_sections(fitted.model), None
-        if pilot.blocks is not None and np.isfinite(pilot.loss):
-            parts = experiment_regressions(pilot, scaled.records, self._free)
-            if parts is not None:
-                variance = pilot.loss / sum(record.y.size for record in scaled.records)
-                recursion = start_recursion(pilot, parts, self._free, variance)
+        pilot = in_sections(fitted.model)
         self._sums = _Sums(
             hankel,
-            recursion,
+            start_recursion(pilot, scaled.records, self._free),
             pilot.initial_states[-1],
             np.sum([(z**2).sum(axis=0) for z in samples], axis=0),
             sum(len(z) for z in samples),

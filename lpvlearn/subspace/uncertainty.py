@@ -112,16 +112,7 @@ def autoregression(errors: Sequence[Array]) -> NoiseModel:
 def _yule_walker(lags: Array, order: int) -> tuple[Array, Array]:
     """Coefficients ``[Phi_1, ..., Phi_p]`` and innovation covariance.
 
-    Parameters
-    ----------
-    lags : ndarray of shape (> order, n_outputs, n_outputs)
-        ``lags[d] = E v[t] v[t + d].T``.
-    order : int
-
-    Returns
-    -------
-    coefficients : ndarray of shape (n_outputs, order * n_outputs)
-    covariance : ndarray of shape (n_outputs, n_outputs)
+    ``lags[d] = E v[t] v[t + d].T``, of more lags than the order.
     """
     ny = lags.shape[1]
     if order == 0:
@@ -178,18 +169,7 @@ def reduce_noise_model(model: NoiseModel, order: int) -> NoiseModel:
 
 
 def _spectrum(model: NoiseModel, omega: Array) -> NDArray[np.complex128]:
-    """Spectral density of v, ``H covariance H^*`` with ``H = C (zI - A)^-1 K + I``.
-
-    Parameters
-    ----------
-    model : NoiseModel
-    omega : ndarray of shape (n_freq,)
-        Radians per sample.
-
-    Returns
-    -------
-    ndarray of shape (n_freq, n_outputs, n_outputs)
-    """
+    """Spectral density of v, ``H covariance H^*``, at radians per sample."""
     ny, n = model.C.shape
     H = np.broadcast_to(np.eye(ny, dtype=complex), (len(omega), ny, ny))
     if n:
@@ -356,9 +336,9 @@ def pole_jacobian(
     parts = block_parts(model, n_parameters)
     for block, part in zip(model.blocks, parts, strict=True):
         values, right = np.linalg.eig(block)
-        left = np.linalg.pinv(right)
-        for i, value in enumerate(values):
-            poles[row] = value
-            jacobian[row, part] = np.outer(left[i], right[:, i]).ravel()
+        for value, left, vector in zip(
+            values, np.linalg.pinv(right), right.T, strict=True
+        ):
+            poles[row], jacobian[row, part] = value, np.outer(left, vector).ravel()
             row += 1
     return poles, jacobian

@@ -10,7 +10,7 @@ from lpvlearn.subspace.recursive_refinement import (
     input_matrices,
     start_recursion,
 )
-from lpvlearn.subspace.refinement import experiment_regressions, in_sections
+from lpvlearn.subspace.refinement import in_sections
 from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import freedom, simulation_fit
 
@@ -44,8 +44,7 @@ def test_input_matrices_of_a_given_pair_solve_the_linearised_problem(system):
     u, y = record(system, 3000)
     records, free = [Record(u.T, y.T)], freedom(2, 2)
     pilot = in_sections(simulation_fit(system[0], system[2], records))
-    parts = experiment_regressions(pilot, records, free)
-    recursion = start_recursion(pilot, parts, free)
+    recursion = start_recursion(pilot, records, free)
     T = np.random.default_rng(1).standard_normal((5, 5))
     A, C = np.linalg.solve(T, system[0] @ T), system[2] @ T
     found = input_matrices(recursion, A, C)
