@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Self
 
@@ -363,7 +363,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "lti_")
         experiments, n_samples = self._read(X, None, reset=False)
-        return self._simulate(experiments, [None] * len(experiments), n_samples)
+        return self._in_table(experiments, n_samples, self._simulated)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate the outputs from initial states estimated on measured outputs.
@@ -381,8 +381,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "lti_")
         experiments, n_samples = self._read(X, y, reset=False)
-        states = [self._initial_state(e) for e in experiments]
-        return self._simulate(experiments, states, n_samples)
+
+        def simulated(e: Experiment) -> Array:
+            return self._simulated(e, self._initial_state(e))
+
+        return self._in_table(experiments, n_samples, simulated)
 
     def predict_ahead(
         self, X: Any, y: Any, steps: int = 1, *, initial_state: str = "estimate"
@@ -408,9 +411,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self, "lti_")
         one_of("initial_state", initial_state, ("estimate", "rest"))
         experiments, n_samples = self._read(X, y, reset=False)
-        predictor, parts = self.predictor_, []
-        for e in experiments:
-            predicted = predictor.predict(
+        predictor = self.predictor_
+
+        def predicted(e: Experiment) -> Array:
+            return predictor.predict(
                 e.inputs - self.input_offset_,
                 _outputs_of(e) - self.output_offset_,
                 steps=steps,
@@ -418,8 +422,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
                     self._initial_state(e) if initial_state == "estimate" else None
                 ),
             )
-            parts.append(predicted)
-        return self._in_table(experiments, parts, n_samples)
+
+        return self._in_table(experiments, n_samples, predicted)
 
     @property
     def predictor_(self) -> InnovationModel:
@@ -548,31 +552,26 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             experiments = split_at_gaps(experiments)
         return experiments, n_samples
 
-    def _initial_state(self, experiment: Experiment) -> Array:
-        forced = self.lti_.simulate(experiment.inputs - self.input_offset_)
-        error = _outputs_of(experiment) - self.output_offset_ - forced
-        free = free_responses(self.lti_.A, self.lti_.C, len(error))
-        return estimate_initial_state(free, error)
+    def _simulated(self, experiment: Experiment, x0: Array | None = None) -> Array:
+        """Outputs about their offset."""
+        u = experiment.inputs - self.input_offset_
+        return self.lti_.simulate(u, initial_state=x0)
 
-    def _simulate(
-        self,
-        experiments: Sequence[Experiment],
-        states: Sequence[Array | None],
-        n_samples: int,
-    ) -> Array:
-        parts = [
-            self.lti_.simulate(e.inputs - self.input_offset_, initial_state=x0)
-            for e, x0 in zip(experiments, states, strict=True)
-        ]
-        return self._in_table(experiments, parts, n_samples)
+    def _initial_state(self, experiment: Experiment) -> Array:
+        outputs = _outputs_of(experiment) - self.output_offset_
+        free = free_responses(self.lti_.A, self.lti_.C, len(outputs))
+        return estimate_initial_state(free, outputs - self._simulated(experiment))
 
     def _in_table(
-        self, experiments: Sequence[Experiment], parts: Sequence[Array], n_samples: int
+        self,
+        experiments: Sequence[Experiment],
+        n_samples: int,
+        outputs: Callable[[Experiment], Array],
     ) -> Array:
-        """Outputs of the experiments in the rows of their samples, NaN elsewhere."""
+        """Outputs in the rows of their samples, NaN elsewhere."""
         out = np.full((n_samples, self.n_outputs_), np.nan)
-        for experiment, part in zip(experiments, parts, strict=True):
-            out[experiment.rows] = part + self.output_offset_
+        for e in experiments:
+            out[e.rows] = outputs(e) + self.output_offset_
         return out[:, 0] if self._single_output else out
 
 

@@ -75,7 +75,7 @@ def test_more_experiments_tell_more(short_springs):
 
 def test_deviations_are_the_spread_over_new_noise():
     found, told = [], []
-    for seed in range(30):
+    for seed in range(20):
         pipeline = LocalLPVPipeline(
             SubspaceLTI(order=1, horizon=8, feedthrough=False, sampling_time=STEP),
             GrayBoxRestructurer(LAG, n_starts=2),
