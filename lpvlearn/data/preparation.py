@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exceptions import RankWarning, warn
 from .experiments import Experiment
 
 Array = NDArray[np.float64]
@@ -230,35 +229,3 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
             "its effect cannot be told from the initial state. Leave it out of "
             "`inputs` or excite it."
         )
-
-
-def reduce_inputs(pairs: Pairs) -> tuple[Pairs, Array]:
-    """Replace collinear inputs by independent combinations of them, and say so.
-
-    Parameters
-    ----------
-    pairs : list of (u, y)
-
-    Returns
-    -------
-    pairs : list of (u, y)
-    basis : ndarray of shape (n_inputs, rank)
-        The input matrix in the original inputs is that of the new ones times
-        ``basis.T``; the identity in the usual case.
-
-    Warns
-    -----
-    RankWarning
-        If inputs are collinear.
-    """
-    n_inputs = pairs[0][0].shape[1]
-    basis = independent_inputs([u for u, _ in pairs])
-    if basis is None:
-        return pairs, np.eye(n_inputs)
-    warn(
-        f"The {n_inputs} inputs are collinear (rank {basis.shape[1]}): their separate "
-        "effects are not identifiable and the smallest solution was taken. Excite the "
-        "inputs independently.",
-        RankWarning,
-    )
-    return [(u @ basis, y) for u, y in pairs], basis

@@ -136,9 +136,11 @@ def identify_point(
         fitted = _fit_local(local, experiments, sampling_time)
         lti = _continuous(fitted.lti_, discretization, advice)
         deviated = deviated_models(
-            fitted,
+            fitted.lti_,
             [(e.inputs, e.outputs) for e in experiments if e.outputs is not None],
             lambda model: model.to_continuous(discretization),
+            detrend=getattr(fitted, "detrend", None),
+            refined=getattr(fitted, "refine", False) and not fitted.stability_loss_,
         )
         return LocalModel(lti, fitted.lti_.order, _horizon(fitted), deviated=deviated)
     # The first realisation chooses order and horizon, the others follow it.

@@ -18,7 +18,7 @@ from ..restructuring.identifiability import response_gain
 from ..restructuring.problem import problem_from_models
 from ..restructuring.starts import GOOD_FIT
 from ..structures.structure import GrayBoxStructure
-from ..subspace.statistics import _STEP, ModelPair
+from ..subspace.statistics import DEVIATION, ModelPair
 from .local_models import LocalModel, with_signs_of
 from .runner import PointRunner
 
@@ -212,7 +212,7 @@ def covariance_of_parameters(
     changes = []
     for above, below in deviated:
         dG = above.frequency_response(omega) - below.frequency_response(omega)
-        changes.append(np.einsum("jkpm,kpm->j", K, dG).real / (2.0 * _STEP))
+        changes.append(np.einsum("jkpm,kpm->j", K, dG).real / (2.0 * DEVIATION))
     T = np.array(changes)
     return T.T @ T
 

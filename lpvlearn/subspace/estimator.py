@@ -2,41 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
+from ..data.columns import Table, is_table
 from ..data.experiments import Experiment, read_experiments
 from ..data.preparation import split_at_gaps
+from ..models.innovation import InnovationModel
 from ..systems.simulation import estimate_initial_state, free_responses
-from .fit import LocalFit, find_better_horizon, fit_pairs
-from .options import (
-    Choices,
-    check_options,
-    selection_table,
-    selection_text,
-    warn_about,
-    warn_about_horizon,
-)
-from .statistics import SimulationErrorStatistics, outputs_of
-from .stream import StreamedFit
+from ..validation import one_of
+from .fit import LocalFit, fit_pairs, warn_about_horizon
+from .options import check_options, selection_table, selection_text, warn_about
+from .stream import SampleStream, fit_as_stream
 
 Array = NDArray[np.float64]
 
-Pairs = list[tuple[Array, Array]]
 
-
-class SubspaceLTI(
-    StreamedFit,
-    SimulationErrorStatistics,
-    MultiOutputMixin,
-    RegressorMixin,
-    BaseEstimator,
-):
+class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """Linear time-invariant state-space model by subspace identification.
 
     The observability matrix is estimated from compressed block-Hankel data by one of
@@ -228,62 +216,139 @@ class SubspaceLTI(
         UserWarning
             If the model is unstable or explains next to nothing of the outputs.
         """
-        choices = check_options(self)
+        choices = check_options(self.get_params(deep=False))
         experiments, _ = self._read(X, y, reset=True)
-        self._stream = None
+        self._stream: SampleStream | None = None
         self._single_output = np.asarray(y).ndim == 1
-        self._set_step(experiments)
-        pairs = [(e.inputs, outputs_of(e)) for e in experiments]
-        fitted = self._fit_in_one_pass(pairs, choices)
+        pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
+        gaps = self.missing == "split"
+        fitted = fit_as_stream(pairs, choices, detrend=self.detrend, gaps=gaps)
         if fitted is None:
-            fitted = self._fit_pairs(pairs, choices, self.detrend)
-        warn_about(fitted.found)
+            names = experiments[0].input_names
+            fitted = fit_pairs(pairs, choices, set(), detrend=self.detrend, names=names)
+        self._take(fitted, self._step_of(experiments))
+        warn_about(fitted.model, fitted.residual, fitted.stability_loss, set())
         if choices.order is not None and choices.horizon is not None:
-            better = find_better_horizon(fitted, self._fit_options())
-            warn_about_horizon(fitted.found.residual, choices.horizon, better)
+            warn_about_horizon(fitted, choices)
         return self
 
-    def _fit_pairs(
-        self,
-        pairs: Pairs,
-        choices: Choices,
-        detrend: str | None,
-        told: set[str] | None = None,
-    ) -> LocalFit:
-        """Identify on experiments and set the fitted attributes."""
-        fitted = fit_pairs(
-            pairs,
-            choices,
-            feedthrough=self.feedthrough,
-            initial_states=self.initial_state == "estimate",
-            detrend=detrend,
-            names=self._input_names,
-            options=self._fit_options(),
-            told=told,
-        )
+    def partial_fit(self, X: Any, y: Any) -> Self:
+        """Go on with the next batch of a stream, in memory independent of its length.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+            As in `fit`. Without an `experiment` column all batches are one
+            experiment. With one, a batch whose first label is the last one of
+            the batch before continues that experiment; every other label starts one.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+
+        Returns
+        -------
+        self
+            Without a model (`lti_`) as long as the samples are too few for one. After
+            `fit` a new stream begins.
+
+        Raises
+        ------
+        ValueError
+            If an option is unknown or not the one that the stream began with, or
+            `detrend` is set: a trend needs the whole experiment. If the `time` column
+            repeats or leaves out samples between two batches of an experiment, or
+            its step changes. If a batch has other columns than the first one.
+            Everything is then as before the batch, and the right one may follow.
+
+        Warns
+        -----
+        UserWarning, RankWarning
+            As `fit`, once per stream. If the first 131,072 samples are too few for a
+            model, such as with a constant input, and if the simulation error grows
+            far above that of the first samples.
+
+        Notes
+        -----
+        The model is the one that `fit` finds from all batches as one table, however
+        they are cut. The first 131,072 samples are kept (the last ones where the first
+        do not make a model). Then order and
+        horizon stay, and only summaries grow: the compressed Hankel data, and
+        the simulation error linearised around the model of the moment, each sample
+        once. Of a longer table `fit` makes the same summaries in the same order. It
+        alone can go back to the samples, and does so where the linearisation turns out
+        to be poor: the first 131,072 samples hardly excite what comes later, outputs
+        drift, or (``refine=False``) the order is higher than the data support.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lpvlearn import SubspaceLTI
+        >>> rng = np.random.default_rng(0)
+        >>> model, last = SubspaceLTI(1, horizon=5), 0.0
+        >>> for _ in range(3):
+        ...     u, y = rng.standard_normal((200, 1)), np.empty(200)
+        ...     for k in range(200):
+        ...         y[k] = last
+        ...         last = 0.9 * y[k] + u[k, 0]
+        ...     model = model.partial_fit(u, y)
+        >>> model.lti_.poles().round(6)
+        array([0.9+0.j])
+        """
+        options = self.get_params(deep=False)
+        choices = check_options(options)
+        if self.detrend is not None:
+            raise ValueError(
+                "`detrend` must be None in partial_fit, which never sees a whole "
+                f"experiment. Got {self.detrend!r}."
+            )
+        before = getattr(self, "_stream", None)
+        if before is not None:
+            before.check_options(options)
+        with self._unchanged_where_refused():
+            experiments, _ = self._read(X, y, reset=before is None, split=False)
+            if before is None:
+                step = self._step_of(experiments)
+                stream = SampleStream(choices, options, experiments, step)
+                self._single_output = np.asarray(y).ndim == 1
+            else:
+                stream = before.branch()
+            table = Table(X if is_table(X) else np.asarray(X))
+            times = table.one(self.time, "time")
+            fitted = stream.add(experiments, None if times is None else times[1])
+            if fitted is not None:
+                self._take(fitted, stream.step)
+            self._stream = stream
+        return self
+
+    @contextmanager
+    def _unchanged_where_refused(self) -> Iterator[None]:
+        """Put the attributes back where a batch ends in an error."""
+        before = dict(self.__dict__)
+        try:
+            yield
+        except BaseException:
+            self.__dict__ = before
+            raise
+
+    def _take(self, fitted: LocalFit, step: float) -> None:
+        """Set the fitted attributes."""
+        self.lti_ = fitted.evidence.state_space(fitted.model, step)
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
         self.selection_ = selection_table(fitted.selection)
-        self.n_outputs_ = pairs[0][1].shape[1]
+        self.n_outputs_ = self.lti_.n_outputs
+        self.initial_states_ = fitted.model.initial_states
+        self.singular_values_ = fitted.singular_values
+        self.residual_ = fitted.residual
+        self.stability_loss_ = fitted.stability_loss
         self.input_offset_ = fitted.input_offset
         self.output_offset_ = fitted.output_offset
-        self.stability_loss_ = fitted.found.stability_loss
-        self._keep_evidence(fitted.evidence)
-        found = fitted.found
-        self._set_model(found.scaled_model, found.singular_values, found.residual)
-        return fitted
+        self._evidence = fitted.evidence
 
-    def _fit_options(self) -> dict[str, Any]:
-        return {
-            "method": self.method,
-            "refine": self.refine,
-            "enforce_stability": self.stability == "enforce",
-        }
-
-    def _set_step(self, experiments: Sequence[Experiment]) -> None:
-        step = next((e.sampling_time for e in experiments if e.sampling_time), None)
-        given = 1.0 if self.sampling_time is None else float(self.sampling_time)
-        self._step = given if step is None else step
+    def _step_of(self, experiments: Sequence[Experiment]) -> float:
+        """Seconds between the samples of a table."""
+        for e in experiments:
+            if e.sampling_time:
+                return e.sampling_time
+        return 1.0 if self.sampling_time is None else float(self.sampling_time)
 
     def predict(self, X: Any) -> Array:
         """Simulate the outputs of every experiment from rest.
@@ -298,7 +363,7 @@ class SubspaceLTI(
         """
         check_is_fitted(self, "lti_")
         experiments, n_samples = self._read(X, None, reset=False)
-        return self._simulate(experiments, [None] * len(experiments), n_samples)
+        return self._in_table(experiments, n_samples, self._simulated)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate the outputs from initial states estimated on measured outputs.
@@ -316,8 +381,127 @@ class SubspaceLTI(
         """
         check_is_fitted(self, "lti_")
         experiments, n_samples = self._read(X, y, reset=False)
-        states = [self._initial_state(e) for e in experiments]
-        return self._simulate(experiments, states, n_samples)
+
+        def simulated(e: Experiment) -> Array:
+            return self._simulated(e, self._initial_state(e))
+
+        return self._in_table(experiments, n_samples, simulated)
+
+    def predict_ahead(
+        self, X: Any, y: Any, steps: int = 1, *, initial_state: str = "estimate"
+    ) -> Array:
+        """Predict every sample from the outputs up to `steps` samples before it.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Measured outputs.
+        steps : int, default=1
+            Prediction horizon in samples.
+        initial_state : {"estimate", "rest"}, default="estimate"
+            "estimate" takes the deterministic initial state from the whole experiment,
+            as `predict_with_initial_state` does; "rest" uses no later output.
+
+        Returns
+        -------
+        ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            By `predictor_`; for white noise the simulation.
+        """
+        check_is_fitted(self, "lti_")
+        one_of("initial_state", initial_state, ("estimate", "rest"))
+        experiments, n_samples = self._read(X, y, reset=False)
+        predictor = self.predictor_
+
+        def predicted(e: Experiment) -> Array:
+            return predictor.predict(
+                e.inputs - self.input_offset_,
+                _outputs_of(e) - self.output_offset_,
+                steps=steps,
+                initial_state=(
+                    self._initial_state(e) if initial_state == "estimate" else None
+                ),
+            )
+
+        return self._in_table(experiments, n_samples, predicted)
+
+    @property
+    def predictor_(self) -> InnovationModel:
+        """Innovation model: `lti_`, the noise model, K and innovation covariance."""
+        check_is_fitted(self, "lti_")
+        n_states = None if self.n_noise_states == "auto" else int(self.n_noise_states)
+        return self._evidence.predictor(self.lti_, n_states)
+
+    @property
+    def poles_std_(self) -> NDArray[np.complex128]:
+        """Standard deviations of the poles, in the order of ``lti_.poles()``.
+
+        The real part is that of a pole's real part, the imaginary part that of its
+        imaginary part.
+        """
+        check_is_fitted(self, "lti_")
+        try:
+            return self._evidence.poles_std()
+        except ValueError as error:
+            raise AttributeError(str(error)) from None
+
+    def frequency_response_covariance(self, omega: ArrayLike) -> Array:
+        """Covariance of the frequency response at every frequency.
+
+        Asymptotic, from the Gauss-Newton Jacobian of the simulation error; valid for
+        coloured noise and outputs of different quality.
+
+        Parameters
+        ----------
+        omega : array-like of shape (n_freq,)
+            Angular frequencies, rad/s.
+
+        Returns
+        -------
+        ndarray of shape (n_freq, k, k), ``k = 2 n_outputs n_inputs``
+            Of the real parts of all entries, output by output, then of the imaginary
+            parts: the columns of the frequency-response tables of
+            `GrayBoxRestructurer`.
+
+        Raises
+        ------
+        ValueError
+            If the model does not minimise the simulation error (``refine=False``).
+        """
+        check_is_fitted(self, "lti_")
+        return self._evidence.frequency_response_covariance(self._per_sample(omega))
+
+    def frequency_response_std(self, omega: ArrayLike) -> NDArray[np.complex128]:
+        """Standard deviation of the frequency response.
+
+        Parameters
+        ----------
+        omega : array-like of shape (n_freq,)
+            Angular frequencies, rad/s.
+
+        Returns
+        -------
+        ndarray of complex, shape (n_freq, n_outputs, n_inputs)
+            The real part is the standard deviation of the real part of the response,
+            the imaginary part that of the imaginary part. Its modulus is the root mean
+            square of the complex error.
+
+        Raises
+        ------
+        ValueError
+            As `frequency_response_covariance`.
+
+        Notes
+        -----
+        A 95 % band of a real part is 1.96 standard deviations to both sides.
+        """
+        check_is_fitted(self, "lti_")
+        return self._evidence.frequency_response_std(self._per_sample(omega))
+
+    def _per_sample(self, omega: ArrayLike) -> Array:
+        """Angular frequencies in radians per sample."""
+        step = self.lti_.sampling_time or 1.0
+        return np.atleast_1d(np.asarray(omega, dtype=float)) * step
 
     def selection_text(self) -> str:
         """`selection_` as a text table, the choice marked."""
@@ -363,28 +547,36 @@ class SubspaceLTI(
             reset=reset,
             allow_missing=gaps,
         )
-        if reset:
-            self._input_names = experiments[0].input_names
         n_samples = sum(len(e.rows) for e in experiments)
         if gaps and split:
             experiments = split_at_gaps(experiments)
         return experiments, n_samples
 
-    def _initial_state(self, experiment: Experiment) -> Array:
-        forced = self.lti_.simulate(experiment.inputs - self.input_offset_)
-        error = outputs_of(experiment) - self.output_offset_ - forced
-        free = free_responses(self.lti_.A, self.lti_.C, len(error))
-        return estimate_initial_state(free, error)
+    def _simulated(self, experiment: Experiment, x0: Array | None = None) -> Array:
+        """Outputs about their offset."""
+        u = experiment.inputs - self.input_offset_
+        return self.lti_.simulate(u, initial_state=x0)
 
-    def _simulate(
+    def _initial_state(self, experiment: Experiment) -> Array:
+        outputs = _outputs_of(experiment) - self.output_offset_
+        free = free_responses(self.lti_.A, self.lti_.C, len(outputs))
+        return estimate_initial_state(free, outputs - self._simulated(experiment))
+
+    def _in_table(
         self,
         experiments: Sequence[Experiment],
-        states: Sequence[Array | None],
         n_samples: int,
+        outputs: Callable[[Experiment], Array],
     ) -> Array:
+        """Outputs in the rows of their samples, NaN elsewhere."""
         out = np.full((n_samples, self.n_outputs_), np.nan)
-        for experiment, x0 in zip(experiments, states, strict=True):
-            u = experiment.inputs - self.input_offset_
-            simulated = self.lti_.simulate(u, initial_state=x0)
-            out[experiment.rows] = simulated + self.output_offset_
+        for e in experiments:
+            out[e.rows] = outputs(e) + self.output_offset_
         return out[:, 0] if self._single_output else out
+
+
+def _outputs_of(experiment: Experiment) -> Array:
+    """Outputs of an experiment, which must be there."""
+    if experiment.outputs is None:
+        raise ValueError("`y` must hold the measured outputs. Got None.")
+    return experiment.outputs

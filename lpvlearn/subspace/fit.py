@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from collections.abc import Hashable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import (
+    Pairs,
     check_excitation,
     independent_inputs,
-    reduce_inputs,
     remove_trends,
 )
+from ..exceptions import RankWarning, warn
 from .identification import Identified, ScaledRecords, identify, scale_records
-from .options import Choices, check_size, feedthrough_mask
+from .options import Choices, check_size, feedthrough_mask, tell
 from .selection import Candidate, Selection, better_horizon, select
-from .simulation_fit import Freedom
+from .simulation_fit import Freedom, Realization
 from .statistics import Evidence, shorten
 
 Array = NDArray[np.float64]
-
-Pairs = list[tuple[Array, Array]]
 
 
 class TooFewSamples(ValueError):
@@ -31,35 +29,44 @@ class TooFewSamples(ValueError):
 
 
 class LocalFit(NamedTuple):
-    """Result of `fit_pairs`.
+    """A fitted model and what is known of it.
 
     Attributes
     ----------
-    found : Identified
+    model : Realization
+        Of the scaled samples.
+    singular_values : ndarray
+    residual, stability_loss : float
+        As the attributes of `SubspaceLTI`.
     selection : Selection
     evidence : Evidence
-    scaled : ScaledRecords
     input_offset, output_offset : ndarray
+        What `detrend` subtracted.
+    found : Identified
+        From `scaled`, the samples that were fitted as one table: all of them, or the
+        first ones of a long table or a stream.
+    scaled : ScaledRecords
     """
 
-    found: Identified
+    model: Realization
+    singular_values: Array
+    residual: float
+    stability_loss: float
     selection: Selection
     evidence: Evidence
-    scaled: ScaledRecords
     input_offset: Array
     output_offset: Array
+    found: Identified
+    scaled: ScaledRecords
 
 
 def fit_pairs(
     pairs: Pairs,
     choices: Choices,
+    told: set[str],
     *,
-    feedthrough: Any,
-    initial_states: bool,
-    detrend: str | None,
-    names: Sequence[Hashable] | None,
-    options: dict[str, Any],
-    told: set[str] | None = None,
+    detrend: str | None = None,
+    names: Sequence[Hashable] | None = None,
 ) -> LocalFit:
     """Check, detrend, choose and identify.
 
@@ -68,16 +75,11 @@ def fit_pairs(
     pairs : list of (u, y)
         One per experiment.
     choices : Choices
-    feedthrough : bool or array-like of bool
-    initial_states : bool
-        False starts every experiment from rest.
-    detrend : {None, "constant", "linear"}
-    names : sequence or None
-        Of the inputs, for messages.
-    options : dict
-        `method`, `refine`, `enforce_stability` of `identify`.
-    told : set of str, default=None
+    told : set of str
         Kinds of warnings that were given and are not repeated.
+    detrend : {None, "constant", "linear"}, default=None
+    names : sequence, default=None
+        Of the inputs, for messages.
 
     Returns
     -------
@@ -88,25 +90,18 @@ def fit_pairs(
     TooFewSamples
         If an input is constant or the samples are too few.
     """
-    with _more_may_help():
-        check_excitation(pairs, names)
     n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
-    pairs, u_offset, y_offset = remove_trends(pairs, detrend)
-    known = told is not None and "collinear" in told
-    pairs, basis = _reduce_quietly(pairs) if known else reduce_inputs(pairs)
-    if told is not None and basis.shape[0] > basis.shape[1]:
-        told.add("collinear")
-    order, horizon, n_noise_states = choices
-    with _more_may_help():
-        mask = feedthrough_mask(feedthrough, n_outputs, n_inputs, basis)
-        check_size(pairs, order, horizon, options["method"])
-    settings = {
-        **options,
-        "feedthrough": mask,
-        "n_noise_states": n_noise_states,
-        "initial_states": initial_states,
-    }
+    try:
+        check_excitation(pairs, names)
+        pairs, u_offset, y_offset = remove_trends(pairs, detrend)
+        pairs, basis = _with_independent_inputs(pairs, told)
+        mask = feedthrough_mask(choices.feedthrough, n_outputs, n_inputs, basis)
+        check_size([len(u) for u, _ in pairs], basis.shape[1], n_outputs, choices)
+    except ValueError as error:
+        raise TooFewSamples(str(error)) from None
     scaled = scale_records(pairs)
+    settings = choices._replace(feedthrough=mask)._asdict()
+    order, horizon = settings.pop("order"), settings.pop("horizon")
     chosen = None
     if order is None or horizon is None:
         chosen = select(scaled.records, order, horizon, **settings)
@@ -117,76 +112,64 @@ def fit_pairs(
         chosen = Selection(order, horizon, [only])
     records, share = shorten(scaled.records)
     evidence = Evidence(
-        found.scaled_model,
-        records,
-        found.input_scale,
-        found.output_scale,
-        basis,
-        Freedom(mask, initial_states),
-        bool(options["refine"]) and found.stability_loss == 0.0,
-        share,
+        model=found.scaled_model,
+        records=records,
+        input_scale=scaled.input_scale,
+        output_scale=scaled.output_scale,
+        basis=basis,
+        free=Freedom(mask, choices.initial_states),
+        refined=choices.refine and found.stability_loss == 0.0,
+        share=share,
     )
-    return LocalFit(found, chosen, evidence, scaled, u_offset, y_offset)
+    return LocalFit(
+        found.scaled_model,
+        found.singular_values,
+        found.residual,
+        found.stability_loss,
+        chosen,
+        evidence,
+        u_offset,
+        y_offset,
+        found,
+        scaled,
+    )
 
 
-def check_for_all_samples(
-    n_samples: int,
-    n_inputs: int,
-    n_outputs: int,
-    choices: Choices,
-    feedthrough: Any,
-    method: str,
-) -> None:
-    """Refuse what no table of these channels, up to this length, can carry.
+def _with_independent_inputs(pairs: Pairs, told: set[str]) -> tuple[Pairs, Array]:
+    """Replace collinear inputs by independent combinations of them, and say so.
 
-    Parameters
-    ----------
-    n_samples, n_inputs, n_outputs : int
-    choices : Choices
-    feedthrough : bool or array-like of bool
-    method : str
-
-    Raises
-    ------
-    ValueError
-
-    Examples
-    --------
-    >>> check_for_all_samples(900, 1, 1, Choices(9, 5, 0), True, "po-moesp")
-    Traceback (most recent call last):
-    ValueError: `order` must be at most 4 for 900 samples and horizon 5. Got 9.
+    The input matrix in the original inputs is that of the new ones times ``basis.T``,
+    the second value; the identity in the usual case.
     """
-    feedthrough_mask(feedthrough, n_outputs, n_inputs, np.eye(n_inputs))
-    # Only the shapes are looked at.
-    u, y = (np.broadcast_to(0.0, (n_samples, k)) for k in (n_inputs, n_outputs))
-    check_size([(u, y)], choices.order, choices.horizon, method)
+    n_inputs = pairs[0][0].shape[1]
+    basis = independent_inputs([u for u, _ in pairs])
+    if basis is None:
+        return pairs, np.eye(n_inputs)
+    tell(
+        told,
+        "collinear",
+        f"The {n_inputs} inputs are collinear (rank {basis.shape[1]}): their separate "
+        "effects are not identifiable and the smallest solution was taken. Excite the "
+        "inputs independently.",
+        RankWarning,
+    )
+    return [(u @ basis, y) for u, y in pairs], basis
 
 
-def _reduce_quietly(pairs: Pairs) -> tuple[Pairs, Array]:
-    """`reduce_inputs` where the user was told already."""
-    found = independent_inputs([u for u, _ in pairs])
-    if found is None:
-        return pairs, np.eye(pairs[0][0].shape[1])
-    return [(u @ found, y) for u, y in pairs], found
-
-
-@contextmanager
-def _more_may_help() -> Iterator[None]:
-    """Tell refusals of this table from those of any table."""
-    try:
-        yield
-    except ValueError as error:
-        raise TooFewSamples(str(error)) from None
-
-
-def find_better_horizon(
-    fitted: LocalFit, options: dict[str, Any]
-) -> tuple[int, float] | None:
-    """Another horizon that fits clearly better than the one of a fit, if any."""
-    return better_horizon(
-        fitted.found,
+def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
+    """Tell the user when another horizon fits clearly better than the one given."""
+    better = better_horizon(
+        fitted.found._replace(residual=fitted.residual),
         fitted.scaled,
         fitted.selection.horizon,
         fitted.evidence.free,
-        **options,
+        method=choices.method,
+        refine=choices.refine,
+        enforce_stability=choices.enforce_stability,
     )
+    if better is not None:
+        warn(
+            f"horizon={choices.horizon} ends in a poor model: its simulation error is "
+            f"{100.0 * fitted.residual:.3g} % of the outputs, that of horizon "
+            f"{better[0]} is {100.0 * better[1]:.3g} %. Use horizon='auto'."
+        )

@@ -1,77 +1,27 @@
-"""Options of `SubspaceLTI`: what is allowed, and what the user is told."""
+"""Options of `SubspaceLTI`: what is allowed, chosen, and told to the user."""
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.preparation import DETRENDS, Pairs
-from ..exceptions import RankWarning
-from ..validation import positive_time
-from .identification import Identified, max_horizon, max_order
+from ..data.preparation import DETRENDS
+from ..exceptions import RankWarning, warn
+from ..validation import one_of, positive_time
+from .identification import max_horizon, max_order
 from .realization import METHODS
 from .selection import Candidate, Selection
+from .simulation_fit import Realization
 
 Array = NDArray[np.float64]
 
 
-def check_size(
-    pairs: Pairs, order: int | None, horizon: int | None, method: str
-) -> None:
-    """Refuse a horizon or an order that the number of samples cannot carry.
-
-    Parameters
-    ----------
-    pairs : list of (u, y)
-    order, horizon : int or None
-        None is still to be chosen.
-    method : str
-        As in `SubspaceLTI`.
-
-    Raises
-    ------
-    ValueError
-    """
-    lengths = [len(u) for u, _ in pairs]
-    n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
-    longest = max_horizon(lengths, n_inputs, n_outputs)
-    if horizon is not None and horizon > longest:
-        raise ValueError(
-            f"`horizon` must be at most {longest} for {sum(lengths)} samples of "
-            f"{n_inputs} input(s) and {n_outputs} output(s). Got {horizon}. Use "
-            "horizon='auto' or more samples."
-        )
-    used = longest if horizon is None else horizon
-    highest = max_order(used, n_inputs, n_outputs, method)
-    if order is not None and order > highest:
-        raise ValueError(
-            f"`order` must be at most {highest} for {sum(lengths)} samples and horizon "
-            f"{used}. Got {order}."
-        )
-
-
-# A model that explains less than this share of the outputs' size is reported.
-_USELESS_FIT = 0.1
-
-# A stream that fits worse than its first samples by this factor, and by more than this
-# share of the outputs' size.
-_MUCH_WORSE = 5.0
-
-_POOR_FIT = 0.2
-
-# Enforced stability that takes the model more than this share of the outputs' energy.
-_HALF = 0.5
-
-# An integrator's pole may lie this far outside the unit circle by rounding.
-_ROUNDING = 1e-8
-
-
 class Choices(NamedTuple):
-    """Checked options.
+    """Checked options that decide about a fit, as `identify` and `select` name them.
 
     Attributes
     ----------
@@ -79,19 +29,30 @@ class Choices(NamedTuple):
         None is to be chosen.
     n_noise_states : int
         Additional states of the subspace step.
+    method : str
+    feedthrough : bool or array-like of bool
+    refine, enforce_stability : bool
+    initial_states : bool
+        False starts every experiment from rest.
     """
 
-    order: int | None
-    horizon: int | None
-    n_noise_states: int
+    order: int | None = None
+    horizon: int | None = None
+    n_noise_states: int = 0
+    method: str = "po-moesp"
+    feedthrough: Any = True
+    refine: bool = True
+    enforce_stability: bool = False
+    initial_states: bool = True
 
 
-def check_options(estimator: Any) -> Choices:
+def check_options(options: Mapping[str, Any]) -> Choices:
     """Refuse what is not an option, naming those that are.
 
     Parameters
     ----------
-    estimator : SubspaceLTI
+    options : mapping
+        The parameters of a `SubspaceLTI` by name.
 
     Returns
     -------
@@ -101,31 +62,28 @@ def check_options(estimator: Any) -> Choices:
     ------
     ValueError
     """
-    allowed = {
-        "method": METHODS,
-        "stability": ("warn", "enforce"),
-        "initial_state": ("estimate", "rest"),
-        "missing": ("raise", "split"),
-        "detrend": DETRENDS,
-    }
-    for name, values in allowed.items():
-        value = getattr(estimator, name)
-        if not any(value is v or (isinstance(v, str) and value == v) for v in values):
-            listed = " or ".join(repr(v) for v in values)
-            if len(values) > 3:
-                listed = "one of " + ", ".join(str(v) for v in values)
-            raise ValueError(f"`{name}` must be {listed}. Got {value!r}.")
-    if estimator.sampling_time is not None:
-        positive_time("sampling_time", estimator.sampling_time)
-    if estimator.initial_state == "rest" and estimator.missing == "split":
+    one_of("method", options["method"], METHODS)
+    one_of("stability", options["stability"], ("warn", "enforce"))
+    one_of("initial_state", options["initial_state"], ("estimate", "rest"))
+    one_of("missing", options["missing"], ("raise", "split"))
+    one_of("detrend", options["detrend"], DETRENDS)
+    if options["sampling_time"] is not None:
+        positive_time("sampling_time", options["sampling_time"])
+    if options["initial_state"] == "rest" and options["missing"] == "split":
         raise ValueError(
             "`initial_state` must be 'estimate' with missing='split': what follows a "
             "gap does not start from rest. Got 'rest'."
         )
-    order = _integer_or_auto("order", estimator.order, 0)
-    horizon = _integer_or_auto("horizon", estimator.horizon, 1)
-    noise = _integer_or_auto("n_noise_states", estimator.n_noise_states, 0)
-    return Choices(order, horizon, noise or 0)
+    return Choices(
+        _integer_or_auto("order", options["order"], 0),
+        _integer_or_auto("horizon", options["horizon"], 1),
+        _integer_or_auto("n_noise_states", options["n_noise_states"], 0) or 0,
+        options["method"],
+        options["feedthrough"],
+        bool(options["refine"]),
+        options["stability"] == "enforce",
+        options["initial_state"] == "estimate",
+    )
 
 
 def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:
@@ -140,6 +98,45 @@ def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:
     return int(value)
 
 
+def check_size(
+    lengths: Sequence[int], n_inputs: int, n_outputs: int, choices: Choices
+) -> None:
+    """Refuse a horizon or an order that the number of samples cannot carry.
+
+    Parameters
+    ----------
+    lengths : sequence of int
+        Samples of every experiment.
+    n_inputs, n_outputs : int
+    choices : Choices
+
+    Raises
+    ------
+    ValueError
+
+    Examples
+    --------
+    >>> check_size([900], 1, 1, Choices(order=9, horizon=5))
+    Traceback (most recent call last):
+    ValueError: `order` must be at most 4 for 900 samples and horizon 5. Got 9.
+    """
+    order, horizon = choices.order, choices.horizon
+    longest = max_horizon(lengths, n_inputs, n_outputs)
+    if horizon is not None and horizon > longest:
+        raise ValueError(
+            f"`horizon` must be at most {longest} for {sum(lengths)} samples of "
+            f"{n_inputs} input(s) and {n_outputs} output(s). Got {horizon}. Use "
+            "horizon='auto' or more samples."
+        )
+    used = longest if horizon is None else horizon
+    highest = max_order(used, n_inputs, n_outputs, choices.method)
+    if order is not None and order > highest:
+        raise ValueError(
+            f"`order` must be at most {highest} for {sum(lengths)} samples and horizon "
+            f"{used}. Got {order}."
+        )
+
+
 def feedthrough_mask(
     feedthrough: Any, n_outputs: int, n_inputs: int, basis: Array
 ) -> NDArray[np.bool_]:
@@ -150,7 +147,7 @@ def feedthrough_mask(
     feedthrough : bool or array-like of bool, shape (n_outputs, n_inputs)
     n_outputs, n_inputs : int
     basis : ndarray of shape (n_inputs, rank)
-        From `reduce_inputs`.
+        Original inputs in terms of the independent ones.
 
     Returns
     -------
@@ -169,9 +166,9 @@ def feedthrough_mask(
             "`feedthrough` must be True, False or a table of shape (n_outputs, "
             f"n_inputs) = ({n_outputs}, {n_inputs}). Got shape {mask.shape}."
         )
-    mask = mask.astype(bool)
-    if basis.shape[0] == basis.shape[1] or mask.all() or not mask.any():
-        return mask if basis.shape[0] == basis.shape[1] else mask[:, : basis.shape[1]]
+    mask, rank = mask.astype(bool), basis.shape[1]
+    if rank == n_inputs or mask.all() or not mask.any():
+        return mask[:, :rank]
     raise ValueError(
         "`feedthrough` cannot fix single entries of D while inputs are collinear. "
         "Leave all but one of the collinear inputs out."
@@ -209,85 +206,87 @@ def selection_text(table: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
+# A model that leaves more than this share of the outputs' size unexplained is reported.
+_USELESS = 0.9
+
+# Enforced stability that takes the model more than this share of the outputs' energy.
+_HALF = 0.5
+
+# An integrator's pole may lie this far outside the unit circle by rounding.
+_ROUNDING = 1e-8
+
+# A stream fits much worse than its first samples where its error exceeds theirs by
+# this factor, and this share of the outputs' size.
+_MUCH_WORSE, _POOR = 5.0, 0.2
+
+# What was poor from the start was told then; it is told again where it grows by this.
+_GROWN = 1.1
+
+
+def tell(
+    told: set[str], kind: str, message: str, category: type[Warning] = UserWarning
+) -> None:
+    """Warn of a kind of thing that was not told before; from now on it was."""
+    if kind not in told:
+        told.add(kind)
+        warn(message, category)
+
+
 def warn_about(
-    found: Identified, told: set[str] | None = None, stacklevel: int = 3
+    model: Realization, residual: float, stability_loss: float, told: set[str]
 ) -> None:
     """Tell the user what is wrong with a model that is returned all the same.
 
     Parameters
     ----------
-    found : Identified
-    told : set of str, default=None
+    model : Realization
+    residual, stability_loss : float
+        As the attributes of `SubspaceLTI`.
+    told : set of str
         Kinds of warnings that were given and are not repeated; grows by these.
-    stacklevel : int, default=3
-        Of the caller's caller.
     """
-    if found.rank_deficit and _is_new("rank", told):
-        warnings.warn(
-            f"The data leave {found.rank_deficit} directions of B and D "
+    if model.rank_deficit:
+        tell(
+            told,
+            "rank",
+            f"The data leave {model.rank_deficit} directions of B and D "
             "undetermined; the smallest solution was taken. Excite the inputs "
             "more richly, or lower `order`.",
             RankWarning,
-            stacklevel=stacklevel,
         )
-    warn_about_pole(found.A, told, stacklevel + 1)
-    as_found = found.residual - found.stability_loss
-    useless = found.residual > 1.0 - _USELESS_FIT
-    if found.residual**2 - as_found**2 > _HALF:
-        if not _is_new("enforced", told):
-            return
-        warnings.warn(
+    warn_about_pole(model.A, told)
+    as_found = residual - stability_loss
+    if residual**2 - as_found**2 > _HALF:
+        tell(
+            told,
+            "enforced",
             "No stable model explains these outputs: the simulation error is "
-            f"{100.0 * found.residual:.0f} % of their size with stability='enforce', "
+            f"{100.0 * residual:.0f} % of their size with stability='enforce', "
             f"{100.0 * as_found:.3g} % without. The system seems to be unstable: "
             "identify it with stability='warn', or from a record of bounded outputs, "
             "with the controller's reference as input.",
-            UserWarning,
-            stacklevel=stacklevel,
         )
-    elif useless and _is_new("useless", told):
-        warnings.warn(
+    elif residual > _USELESS:
+        tell(
+            told,
+            "useless",
             "The model explains next to nothing of the outputs: its simulation "
-            f"error is {100.0 * found.residual:.0f} % of their size. Try a longer "
+            f"error is {100.0 * residual:.0f} % of their size. Try a longer "
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
-            UserWarning,
-            stacklevel=stacklevel,
         )
 
 
-def _is_new(kind: str, told: set[str] | None) -> bool:
-    """Whether a kind of warning was not given before; from now on it was."""
-    if told is None:
-        return True
-    new = kind not in told
-    told.add(kind)
-    return new
-
-
-def warn_about_pole(
-    A: Array, told: set[str] | None = None, stacklevel: int = 3
-) -> None:
+def warn_about_pole(A: Array, told: set[str]) -> None:
     """Tell the user that a model is unstable."""
     radius = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
-    if radius > 1.0 + _ROUNDING and _is_new("pole", told):
-        warnings.warn(
+    if radius > 1.0 + _ROUNDING:
+        tell(
+            told,
+            "pole",
             f"The identified model is unstable: a pole has modulus {radius:.6g}. "
             "Use stability='enforce' for a stable one, another `order`, or a "
             "longer `horizon`.",
-            UserWarning,
-            stacklevel=stacklevel,
-        )
-
-
-def warn_about_waiting(n_samples: int, error: Exception, told: set[str]) -> None:
-    """Tell the user that a stream has no model yet though its buffer is full."""
-    if _is_new("waiting", told):
-        warnings.warn(
-            f"The first {n_samples:,} samples of the stream leave it without a model, "
-            f"and its oldest samples are left out until it has one. {error}",
-            UserWarning,
-            stacklevel=4,
         )
 
 
@@ -304,30 +303,14 @@ def warn_about_drift(
         How many those were.
     told : set of str
     """
-    useless = 1.0 - _USELESS_FIT
-    poor = error > min(useless, max(_POOR_FIT, _MUCH_WORSE * first))
-    # What began as poor was reported then, unless it has become worse than no model.
-    if poor and error > 1.1 * first and _is_new("drift", told):
-        warnings.warn(
+    poor = error > min(_USELESS, max(_POOR, _MUCH_WORSE * first))
+    if poor and error > _GROWN * first:
+        tell(
+            told,
+            "drift",
             f"The simulation error of the stream is {100.0 * error:.3g} % of the "
             f"outputs, after {100.0 * first:.3g} % over its first {n_samples:,} "
             "samples: these excite the system too little to go on from their model, "
             "or the system or its noise has changed. Begin a stream with samples that "
             "excite what comes later, or `fit` the whole table.",
-            UserWarning,
-            stacklevel=3,
-        )
-
-
-def warn_about_horizon(
-    residual: float, horizon: int, better: tuple[int, float] | None
-) -> None:
-    """Tell the user when another horizon fits clearly better than the one given."""
-    if better is not None:
-        warnings.warn(
-            f"horizon={horizon} ends in a poor model: its simulation error is "
-            f"{100.0 * residual:.3g} % of the outputs, that of horizon {better[0]} is "
-            f"{100.0 * better[1]:.3g} %. Use horizon='auto'.",
-            UserWarning,
-            stacklevel=3,
         )

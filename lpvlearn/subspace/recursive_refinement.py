@@ -15,12 +15,16 @@ squares without the samples.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from ..systems.least_squares import scaled_lstsq
+from .parameters import block_parts, change_between, moved_model
+from .refinement import experiment_regressions
 from .signals import Record, signal_factor, state_coefficients
 from .simulation_fit import (
     Freedom,
@@ -30,7 +34,6 @@ from .simulation_fit import (
     linear_regression,
     n_own,
     project_out,
-    scaled_lstsq,
     stack_regressions,
 )
 
@@ -43,17 +46,18 @@ _RCOND = 1e-9
 _HEAD = 4_096
 
 # A linearisation holds for changes of a pole of this share of its distance from the
-# unit circle, taken as no smaller than a stretch of data can tell.
-_RANGE = 0.1
+# unit circle, taken as no smaller than some 10,000 samples can tell.
+_RANGE, _CLOSEST = 0.1, 1e-4
 
-_CLOSEST = 1e-4
-
+# Coordinates that move no pole are restrained by next to nothing, but not by zero.
 _SLOWEST = 1e-100
 
-# Newton steps towards the pilot's blocks, and the coupling that counts as none.
+# Newton steps towards the pilot's blocks: they converge quadratically, or not at all.
 _MAX_ALIGN = 30
 
-_COUPLING = 1e-14
+# Coupling between blocks, relative to A, that is rounding; A grown beyond the limit is
+# a pair that has no form with the pilot's blocks.
+_COUPLING, _DIVERGED = 1e-14, 1e6
 
 
 class Recursion(NamedTuple):
@@ -63,6 +67,7 @@ class Recursion(NamedTuple):
     ----------
     pilot : Realization
         In section form.
+    free : Freedom
     directions : ndarray of shape (n_parameters, k)
         Local coordinates: parameters (B, D, A, C) are those of the pilot plus
         ``directions @ position``.
@@ -77,6 +82,7 @@ class Recursion(NamedTuple):
     """
 
     pilot: Realization
+    free: Freedom
     directions: Array
     coordinates: Array
     restraint: Array
@@ -85,62 +91,63 @@ class Recursion(NamedTuple):
 
 
 def start_recursion(
-    pilot: Realization,
-    regressions: Sequence[Array],
-    free: Freedom,
-    variance: float = 0.0,
-) -> Recursion:
+    pilot: Realization, records: Sequence[Record], free: Freedom
+) -> Recursion | None:
     """Local coordinates and first information, from the data of the pilot model.
+
+    What these tell of the parameters no better than the linearisation is valid, such as
+    the poles of a superfluous mode, stays with the pilot until the data tell more.
 
     Parameters
     ----------
     pilot : Realization
-    regressions : sequence of ndarray
-        One per experiment, from `jacobian_regression` at the pilot model.
+    records : sequence of Record
     free : Freedom
-    variance : float, default=0.0
-        Of the simulation error. What is known of the parameters no better than the
-        linearisation is valid, such as the poles of a superfluous mode, stays with
-        the pilot until the data tell more.
 
     Returns
     -------
-    Recursion
+    Recursion or None
+        None where the pilot cannot be linearised at: it has no section form, or its
+        responses overflow.
     """
-    own = n_own(len(pilot.A), free)
-    stacked = stack_regressions(regressions, own)
+    if pilot.blocks is None or not np.isfinite(pilot.loss):
+        return None
+    regressions = experiment_regressions(pilot, records, free)
+    if regressions is None:
+        return None
+    stacked = stack_regressions(regressions, n_own(len(pilot.A), free))
     jacobian = stacked[:, :-1]
     scale = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
     scale[scale == 0.0] = 1.0
     _, s, right = linalg.svd(jacobian / scale, full_matrices=False, check_finite=False)
     right = right[s > _RCOND * s.max(initial=0.0)]
     directions = right.T / scale[:, None]
-    k = directions.shape[1]
     rows = np.column_stack([jacobian @ directions, stacked[:, -1]])
-    information = _triangle(rows, k + 1)
+    information = _triangle(rows)
+    variance = pilot.loss / sum(record.y.size for record in records)
     restraint = np.sqrt(variance) / _ranges(pilot, directions)
     position = _solve(information, restraint)
-    return Recursion(pilot, directions, right * scale, restraint, information, position)
+    return Recursion(
+        pilot, free, directions, right * scale, restraint, information, position
+    )
 
 
 def _ranges(pilot: Realization, directions: Array) -> Array:
     """How far every coordinate may move before a pole leaves its neighbourhood."""
     assert pilot.blocks is not None
-    stop = len(directions) - pilot.C.size
-    start = stop - sum(block.size for block in pilot.blocks)
     speed = np.full(directions.shape[1], _SLOWEST)
-    for block in pilot.blocks:
-        change = directions[start : start + block.size]
+    parts = block_parts(pilot, len(directions))
+    for block, part in zip(pilot.blocks, parts, strict=True):
+        change = directions[part]
         margin = 1.0 - np.abs(np.linalg.eigvals(block)).max()
         size = np.sqrt(np.einsum("ij,ij->j", change, change))
         speed = np.maximum(speed, size / (_RANGE * max(abs(margin), _CLOSEST)))
-        start += block.size
     return 1.0 / speed
 
 
-def _triangle(rows: Array, size: int) -> Array:
-    """Upper triangular factor of shape (size, size)."""
-    out = np.zeros((size, size))
+def _triangle(rows: Array) -> Array:
+    """Upper triangular factor, square also of few rows."""
+    out = np.zeros((rows.shape[1],) * 2)
     upper = np.linalg.qr(rows, mode="r")
     out[: len(upper)] = upper
     return out
@@ -152,7 +159,7 @@ def _solve(information: Array, restraint: Array) -> Array:
     return scaled_lstsq(rows, target)[0]
 
 
-def current_model(recursion: Recursion, free: Freedom) -> Realization:
+def current_model(recursion: Recursion) -> Realization:
     """Model at the present position.
 
     Returns
@@ -161,37 +168,18 @@ def current_model(recursion: Recursion, free: Freedom) -> Realization:
         Its loss is the sum of squared errors of the linearised problem.
     """
     step = recursion.directions @ recursion.position
-    return _moved(recursion, step, recursion.position, free)
+    return _pilot_after(recursion, step, recursion.position)
 
 
-def _moved(
-    recursion: Recursion, step: Array, position: Array, free: Freedom
-) -> Realization:
-    """The pilot model after a step of its parameters."""
-    pilot, blocks = recursion.pilot, []
-    assert pilot.blocks is not None
-    n_b, n_d = pilot.B.size, int(free.direct.sum())
-    D = pilot.D.copy()
-    D[free.direct] += step[n_b : n_b + n_d]
-    start = n_b + n_d
-    for block in pilot.blocks:
-        blocks.append(block + step[start : start + block.size].reshape(block.shape))
-        start += block.size
-    residual = recursion.information[:, -1].copy()
-    residual[:-1] -= recursion.information[:-1, :-1] @ position
-    return pilot._replace(
-        A=linalg.block_diag(*blocks) if blocks else pilot.A,
-        B=pilot.B + step[:n_b].reshape(pilot.B.shape),
-        C=pilot.C + step[start:].reshape(pilot.C.shape),
-        D=D,
-        loss=float(residual @ residual),
-        blocks=tuple(blocks),
-    )
+def _pilot_after(recursion: Recursion, step: Array, position: Array) -> Realization:
+    """The pilot model after a step of its parameters, to the given position."""
+    error = recursion.information[:, -1].copy()
+    error[:-1] -= recursion.information[:-1, :-1] @ position
+    model = moved_model(recursion.pilot, step, recursion.free)
+    return model._replace(loss=float(error @ error))
 
 
-def input_matrices(
-    recursion: Recursion, A: Array, C: Array, free: Freedom
-) -> Realization | None:
+def input_matrices(recursion: Recursion, A: Array, C: Array) -> Realization | None:
     """Model with given A and C: B and D that minimise the linearised error.
 
     Parameters
@@ -200,7 +188,6 @@ def input_matrices(
     A : ndarray of shape (order, order)
     C : ndarray of shape (n_outputs, order)
         In any state basis; near the model of the recursion.
-    free : Freedom
 
     Returns
     -------
@@ -208,91 +195,66 @@ def input_matrices(
         In the basis of the pilot model. None where ``(A, C)`` has no form with the
         pilot's blocks.
     """
-    pilot = recursion.pilot
-    pair = aligned_pair(A, C, pilot)
+    pilot, free = recursion.pilot, recursion.free
+    pair = _aligned_pair(A, C, pilot)
     if pair is None:
         return None
     blocks, C = pair
     n_bd = pilot.B.size + int(free.direct.sum())
-    step = _step_to(pilot._replace(blocks=blocks, C=C), pilot, free)
+    step = change_between(pilot, pilot._replace(blocks=blocks, C=C), free)
     R, target = recursion.information[:-1, :-1], recursion.information[:-1, -1]
     rest = target - R @ (recursion.coordinates @ step)
     step[:n_bd] = scaled_lstsq(R @ recursion.coordinates[:, :n_bd], rest)[0]
-    return _moved(recursion, step, recursion.coordinates @ step, free)
+    return _pilot_after(recursion, step, recursion.coordinates @ step)
 
 
-def _step_to(model: Realization, pilot: Realization, free: Freedom) -> Array:
-    """Change of the parameters (B, D, A, C) from the pilot to another model."""
-    assert model.blocks is not None and pilot.blocks is not None
-    changes = [new - old for new, old in zip(model.blocks, pilot.blocks, strict=True)]
-    return np.concatenate(
-        [
-            (model.B - pilot.B).ravel(),
-            (model.D - pilot.D)[free.direct],
-            *(change.ravel() for change in changes),
-            (model.C - pilot.C).ravel(),
-        ]
-    )
-
-
-def aligned_pair(
+def _aligned_pair(
     A: Array, C: Array, pilot: Realization
 ) -> tuple[tuple[Array, ...], Array] | None:
     """``(A, C)`` in the state basis of another model, with blocks as that has them.
 
     The extended observability matrices give the basis; Newton steps on the invariant
-    subspaces remove what then couples the blocks.
-
-    Parameters
-    ----------
-    A : ndarray of shape (order, order)
-    C : ndarray of shape (n_outputs, order)
-    pilot : Realization
-        In section form.
-
-    Returns
-    -------
-    blocks : tuple of ndarray
-    C : ndarray of shape (n_outputs, order)
-        None instead of both where there is no such form near the pilot's.
+    subspaces remove what then couples the blocks. None where no form is near.
     """
     assert pilot.blocks is not None
-    n, owner = (
-        len(A),
-        np.repeat(np.arange(len(pilot.blocks)), [len(block) for block in pilot.blocks]),
-    )
+    n = len(A)
     if n == 0:
         return (), C
-    stacks = []
-    for matrix, rows in ((A, [C]), (pilot.A, [pilot.C])):
-        for _ in range(2 * n - 1):
-            rows.append(rows[-1] @ matrix)
-        stacks.append(np.vstack(rows))
-    T, coupled = linalg.lstsq(*stacks)[0], owner[:, None] != owner
+    sizes = [len(block) for block in pilot.blocks]
+    stops = np.cumsum(sizes)
+    parts = [slice(k - size, k) for k, size in zip(stops, sizes, strict=True)]
+    coupled = linalg.block_diag(*(np.ones((size, size)) for size in sizes)) == 0.0
+    T = linalg.lstsq(_observability(A, C), _observability(pilot.A, pilot.C))[0]
     try:
         A, C = linalg.solve(T, A @ T), C @ T
         for _ in range(_MAX_ALIGN):
             if np.abs(A[coupled]).max(initial=0.0) <= _COUPLING * np.abs(A).max():
-                cuts = [np.flatnonzero(owner == k) for k in range(len(pilot.blocks))]
-                return tuple(A[np.ix_(cut, cut)] for cut in cuts), C
+                return tuple(A[part, part] for part in parts), C
+            # To first order, I + S brings every pair of blocks apart.
             S = np.eye(n)
-            for i, j in np.argwhere(np.triu(np.ones((owner[-1] + 1,) * 2), 1)):
-                for p, q in ((owner == i, owner == j), (owner == j, owner == i)):
-                    S[np.ix_(p, q)] = linalg.solve_sylvester(
-                        A[np.ix_(p, p)], -A[np.ix_(q, q)], -A[np.ix_(p, q)]
-                    )
+            for p, q in permutations(parts, 2):
+                S[p, q] = linalg.solve_sylvester(A[p, p], -A[q, q], -A[p, q])
             A, C = linalg.solve(S, A @ S), C @ S
-            if not np.abs(A).max() < 1e6:
+            if not np.abs(A).max() < _DIVERGED:
                 return None
     except (linalg.LinAlgError, ValueError):
         return None
     return None
 
 
+def _observability(A: Array, C: Array) -> Array:
+    """Extended observability matrix, of twice the order."""
+    rows = [C]
+    for _ in range(2 * len(A) - 1):
+        rows.append(rows[-1] @ A)
+    return np.vstack(rows)
+
+
 def extend_recursion(
     recursion: Recursion,
     record: Record,
-    free: Freedom,
+    *,
+    starts: bool,
     point: Realization | None = None,
 ) -> tuple[Recursion, Array]:
     """Add a stretch of data, linearised at the present model.
@@ -302,7 +264,8 @@ def extend_recursion(
     recursion : Recursion
     record : Record
         Scaled as the pilot's data.
-    free : Freedom
+    starts : bool
+        Whether an experiment begins with it.
     point : Realization, default=None
         Another model to linearise at, from `input_matrices`.
 
@@ -313,14 +276,14 @@ def extend_recursion(
     initial_state : ndarray of shape (order,)
         Of the stretch.
     """
-    model, position = current_model(recursion, free), recursion.position
-    if point is not None:
-        model, position = (
-            point,
-            recursion.coordinates @ _step_to(point, recursion.pilot, free),
-        )
+    if point is None:
+        model, position = current_model(recursion), recursion.position
+    else:
+        model = point
+        step = change_between(recursion.pilot, point, recursion.free)
+        position = recursion.coordinates @ step
     assert model.blocks is not None
-    own = n_own(len(model.A), free)
+    free = freedom_of_stretch(recursion.free, starts)
     # A linearisation point for the initial state; the stretch corrects it.
     head = Record(record.u[:, :_HEAD], record.y[:, :_HEAD])
     loss, x0 = stretch_error(model, head, free)
@@ -332,14 +295,18 @@ def extend_recursion(
     if R is None:
         return recursion, x0
     around = Point(model.C, model.D, driven)
-    M = project_out(jacobian_regression(R, model.blocks, around, free), own)
+    M = jacobian_regression(R, model.blocks, around, free)
+    M = project_out(M, n_own(len(model.A), free))
     J = M[:, :-1] @ recursion.directions
     rows = np.column_stack([J, M[:, -1] + J @ position])
-    information = _triangle(
-        np.vstack([recursion.information, rows]), len(recursion.information)
-    )
+    information = _triangle(np.vstack([recursion.information, rows]))
     position = _solve(information, recursion.restraint)
     return recursion._replace(information=information, position=position), x0
+
+
+def freedom_of_stretch(free: Freedom, starts: bool) -> Freedom:
+    """What continues an experiment does not start from rest."""
+    return free if starts else free._replace(initial_states=True)
 
 
 def stretch_error(
@@ -369,5 +336,5 @@ def stretch_error(
     known = np.concatenate([model.B.ravel(), model.D[free.direct]])
     error = M[:, -1] - M[:, own:-1] @ known
     x0 = scaled_lstsq(M[:, :own], error)[0]
-    error = error - M[:, :own] @ x0
+    error -= M[:, :own] @ x0
     return float(error @ error), x0 if own else np.zeros(n)

@@ -1,15 +1,19 @@
-"""Asymptotic covariance of a model that minimises the simulation error.
+"""What simulation errors tell about a model: their spectrum, and its covariance.
 
-With J the Jacobian of the simulated outputs and v the simulation error, the estimate
-moves by ``inv(J.T J) J.T v`` to first order. Its covariance is the sandwich
-``inv(H) S inv(H)`` with ``H = J.T J`` and ``S = J.T cov(v) J``; cov(v) comes from an
-autoregression of the errors, so that coloured noise and outputs of different quality
-are accounted for (Ljung, *System Identification*, 1999, Section 9.4). J is a fixed
-combination of the section signals; S is summed over frequencies.
+The errors v of a model that minimises their sum of squares are described by an
+autoregression, in innovation form ``v = H e`` with ``H = C (zI - A)^-1 K + I``, which
+predicts them as well.
+
+With J the Jacobian of the simulated outputs, the estimate moves by
+``inv(J.T J) J.T v`` to first order. Its covariance is the sandwich ``inv(H) S inv(H)``
+with ``H = J.T J`` and ``S = J.T cov(v) J``, so that coloured noise and outputs of
+different quality are accounted for (Ljung, *System Identification*, 1999, Section 9.4).
+J is a fixed combination of the section signals; S is summed over frequencies.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,27 +22,51 @@ from scipy import fft, linalg
 
 from ..models.innovation import NoiseModel
 from ..systems.balancing import balancing_transformation
+from ..systems.simulation import lti_response
 from .hankel import correlation_sequence
+from .parameters import block_parts
 from .signals import Record, signal_pieces, state_coefficients
 from .simulation_fit import Freedom, Point, Realization, jacobian_regression, n_own
 
 Array = NDArray[np.float64]
 
+# Lags that are allowed for by the number of samples: 10 log10(n), a customary limit.
+_LAGS_PER_DECADE = 10.0
 
-def autoregression(errors: Sequence[Array], order: int | None = None) -> NoiseModel:
+# Directions of past errors that are their rounding, relative to the largest.
+_RCOND_LAGS = 1e-13
+
+# Eigenvectors of a larger condition number would lose half of the spectrum's digits.
+_MAX_CONDITION = 1e8
+
+# The weakest direction of the scaled information that is told from rounding.
+_RCOND = 1e-15
+
+
+def noise_of(model: Realization, records: Sequence[Record]) -> NoiseModel:
+    """Autoregression of the simulation errors of a model on its records."""
+    A, B, C, D = model[:4]
+    return autoregression(
+        [
+            record.y.T - lti_response(A, B, C, D, record.u.T, x0)
+            for record, x0 in zip(records, model.initial_states, strict=True)
+        ]
+    )
+
+
+def autoregression(errors: Sequence[Array]) -> NoiseModel:
     """Vector autoregression of simulation errors, in innovation form.
 
     Parameters
     ----------
     errors : sequence of ndarray of shape (n_samples_i, n_outputs)
         One per experiment.
-    order : int, default=None
-        Number of lags; None takes the smallest value of Schwarz's criterion up to
-        ``10 log10(n_samples)``.
 
     Returns
     -------
     NoiseModel
+        Of the number of lags with the smallest value of Schwarz's criterion, up to
+        ``10 log10(n_samples)``.
 
     Examples
     --------
@@ -51,8 +79,9 @@ def autoregression(errors: Sequence[Array], order: int | None = None) -> NoiseMo
     """
     ny, n_samples = errors[0].shape[1], sum(len(v) for v in errors)
     longest = max(len(v) for v in errors)
-    highest = min(int(10.0 * np.log10(n_samples)), (longest - 1) // (2 * ny))
-    highest = max(0, highest if order is None else order)
+    # Half as many coefficients of an output as the longest experiment has samples.
+    allowed = (longest - 1) // (2 * ny)
+    highest = max(0, min(int(_LAGS_PER_DECADE * np.log10(n_samples)), allowed))
     lags = np.zeros((highest + 1, ny, ny))
     for v in errors:
         known = min(len(v), highest + 1)
@@ -63,8 +92,8 @@ def autoregression(errors: Sequence[Array], order: int | None = None) -> NoiseMo
     scale[scale == 0.0] = 1.0
     lags = lags / scale[:, None] / scale
     best, found = np.inf, (np.zeros((ny, 0)), lags[0])
-    for p in range(highest + 1) if order is None else [highest]:
-        coefficients, covariance = yule_walker(lags, p)
+    for p in range(highest + 1):
+        coefficients, covariance = _yule_walker(lags, p)
         sign, logdet = np.linalg.slogdet(covariance)
         if not sign > 0.0:  # errors without noise
             break
@@ -72,24 +101,18 @@ def autoregression(errors: Sequence[Array], order: int | None = None) -> NoiseMo
         if criterion < best:
             best, found = criterion, (coefficients, covariance)
     coefficients, covariance = found
-    p = coefficients.shape[1] // ny
-    blocks = coefficients.reshape(ny, p, ny) * scale[:, None, None] / scale
-    return _companion(blocks.reshape(ny, p * ny), covariance * np.outer(scale, scale))
+    n = coefficients.shape[1]
+    blocks = coefficients.reshape(ny, n // ny, ny) * scale[:, None, None] / scale
+    C = blocks.reshape(ny, n)
+    A = np.eye(n, k=-ny)  # the state holds the last errors
+    A[: min(n, ny)] = C[: min(n, ny)]
+    return NoiseModel(A, C, np.eye(n, ny), covariance * np.outer(scale, scale))
 
 
-def yule_walker(lags: Array, order: int) -> tuple[Array, Array]:
+def _yule_walker(lags: Array, order: int) -> tuple[Array, Array]:
     """Coefficients ``[Phi_1, ..., Phi_p]`` and innovation covariance.
 
-    Parameters
-    ----------
-    lags : ndarray of shape (> order, n_outputs, n_outputs)
-        ``lags[d] = E v[t] v[t + d].T``.
-    order : int
-
-    Returns
-    -------
-    coefficients : ndarray of shape (n_outputs, order * n_outputs)
-    covariance : ndarray of shape (n_outputs, n_outputs)
+    ``lags[d] = E v[t] v[t + d].T``, of more lags than the order.
     """
     ny = lags.shape[1]
     if order == 0:
@@ -100,16 +123,9 @@ def yule_walker(lags: Array, order: int) -> tuple[Array, Array]:
             block = lags[i - j] if i >= j else lags[j - i].T
             gram[i * ny : (i + 1) * ny, j * ny : (j + 1) * ny] = block
     right = lags[1 : order + 1].reshape(order * ny, ny)
-    solution = linalg.lstsq(gram, right, cond=1e-13, check_finite=False)[0]
+    solution = linalg.lstsq(gram, right, cond=_RCOND_LAGS, check_finite=False)[0]
     covariance = lags[0] - right.T @ solution
     return solution.T, 0.5 * (covariance + covariance.T)
-
-
-def _companion(coefficients: Array, covariance: Array) -> NoiseModel:
-    ny, n = coefficients.shape
-    A = np.eye(n, k=-ny)
-    A[: min(n, ny)] = coefficients[: min(n, ny)]
-    return NoiseModel(A, coefficients, np.eye(n, ny), covariance)
 
 
 def reduce_noise_model(model: NoiseModel, order: int) -> NoiseModel:
@@ -152,19 +168,8 @@ def reduce_noise_model(model: NoiseModel, order: int) -> NoiseModel:
     return NoiseModel(A, C, gain, 0.5 * (covariance + covariance.T))
 
 
-def spectrum(model: NoiseModel, omega: Array) -> NDArray[np.complex128]:
-    """Spectral density of v, ``H covariance H^*`` with ``H = C (zI - A)^-1 K + I``.
-
-    Parameters
-    ----------
-    model : NoiseModel
-    omega : ndarray of shape (n_freq,)
-        Radians per sample.
-
-    Returns
-    -------
-    ndarray of shape (n_freq, n_outputs, n_outputs)
-    """
+def _spectrum(model: NoiseModel, omega: Array) -> NDArray[np.complex128]:
+    """Spectral density of v, ``H covariance H^*``, at radians per sample."""
     ny, n = model.C.shape
     H = np.broadcast_to(np.eye(ny, dtype=complex), (len(omega), ny, ny))
     if n:
@@ -172,17 +177,13 @@ def spectrum(model: NoiseModel, omega: Array) -> NDArray[np.complex128]:
         left = linalg.lstsq(vectors, model.K + 0j)[0]
         z = np.exp(1j * omega)
         # A nearly defective A would lose accuracy in modal form.
-        if np.linalg.cond(vectors) < 1e8:
+        if np.linalg.cond(vectors) < _MAX_CONDITION:
             weights = 1.0 / (z[:, None] - poles)
             H = H + np.einsum("oi,fi,ij->foj", model.C @ vectors, weights, left)
         else:
             resolvent = z[:, None, None] * np.eye(n) - model.A
             H = H + model.C @ np.linalg.solve(resolvent, model.K + 0j)
     return H @ model.covariance @ H.conj().transpose(0, 2, 1)
-
-
-# The weakest direction of the scaled information that is told from rounding.
-_RCOND = 1e-15
 
 
 def parameter_covariance(
@@ -257,11 +258,9 @@ def _experiment_terms(
         )
     size = fft.next_fast_len(2 * X.shape[1], real=True)
     transformed = fft.rfft(X, size, axis=1)
-    density = spectrum(noise, 2.0 * np.pi * np.arange(size // 2 + 1) / size)
-    weight = np.full(size // 2 + 1, 2.0 / size)
-    weight[0] = 1.0 / size
-    if size % 2 == 0:
-        weight[-1] = 1.0 / size
+    density = _spectrum(noise, 2.0 * np.pi * np.arange(size // 2 + 1) / size)
+    weight = np.full(size // 2 + 1, 2.0 / size)  # for the negative frequencies too
+    weight[0 if size % 2 else [0, -1]] = 1.0 / size
     S = np.zeros_like(H)
     for i in range(ny):
         for j in range(ny):
@@ -293,29 +292,25 @@ def frequency_response_jacobian(
     (ny, n), m = model.C.shape, model.B.shape[1]
     z = np.exp(1j * np.asarray(omega))
     resolvent = np.linalg.inv(z[:, None, None] * np.eye(n) - model.A)
-    to_output = model.C @ resolvent  # (f, ny, n)
-    from_input = resolvent @ model.B  # (f, n, m)
-    where = np.argwhere(free.direct)
-    n_a = sum(block.size for block in model.blocks)
-    out = np.zeros((len(z), ny, m, n * m + len(where) + n_a + ny * n), dtype=complex)
-    for p in range(n):
-        for j in range(m):
-            out[:, :, j, p * m + j] = to_output[:, :, p]
-    for column, (i, j) in enumerate(where, start=n * m):
-        out[:, i, j, column] = 1.0
-    column, start = n * m + len(where), 0
+    # Axes: frequency, output, input, and two that tell the parameters apart.
+    to_output = (model.C @ resolvent)[:, :, None, :, None]
+    from_input = (resolvent @ model.B).transpose(0, 2, 1)[:, None, :, None, :]
+    by_parameter = [to_output * np.eye(m)[:, None, :]]
+    by_direct = np.zeros((len(z), ny, m, 1, int(free.direct.sum())))
+    i, j = np.nonzero(free.direct)
+    by_direct[:, i, j, 0, np.arange(len(i))] = 1.0
+    by_parameter.append(by_direct)
+    start = 0
     for block in model.blocks:
-        for p in range(start, start + len(block)):
-            for q in range(start, start + len(block)):
-                effect = to_output[:, :, p, None] * from_input[:, None, q, :]
-                out[:, :, :, column] = effect
-                column += 1
-        start += len(block)
-    for i in range(ny):
-        out[:, i, :, column + i * n : column + (i + 1) * n] = from_input.transpose(
-            0, 2, 1
-        )
-    return out
+        rows = slice(start, start + len(block))
+        by_parameter.append(to_output[..., rows, :] * from_input[..., rows])
+        start = rows.stop
+    by_parameter.append(np.eye(ny)[:, None, :, None] * from_input)
+    columns = [
+        part.reshape(*part.shape[:3], math.prod(part.shape[3:]))
+        for part in by_parameter
+    ]
+    return np.concatenate(columns, axis=-1)
 
 
 def pole_jacobian(
@@ -335,18 +330,15 @@ def pole_jacobian(
     jacobian : ndarray of shape (order, n_parameters)
     """
     assert model.blocks is not None
-    n_a = sum(block.size for block in model.blocks)
-    start = n_parameters - model.C.size - n_a
     poles = np.zeros(len(model.A), dtype=complex)
     jacobian = np.zeros((len(model.A), n_parameters), dtype=complex)
     row = 0
-    for block in model.blocks:
+    parts = block_parts(model, n_parameters)
+    for block, part in zip(model.blocks, parts, strict=True):
         values, right = np.linalg.eig(block)
-        left = np.linalg.pinv(right)
-        for i, value in enumerate(values):
-            poles[row] = value
-            effect = np.outer(left[i], right[:, i])
-            jacobian[row, start : start + block.size] = effect.ravel()
+        for value, left, vector in zip(
+            values, np.linalg.pinv(right), right.T, strict=True
+        ):
+            poles[row], jacobian[row, part] = value, np.outer(left, vector).ravel()
             row += 1
-        start += block.size
     return poles, jacobian

@@ -5,7 +5,6 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.linalg import block_diag
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.utils.estimator_checks import parametrize_with_checks
@@ -13,6 +12,8 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.systems.simulation import lti_response
+
+from ..conftest import modes
 
 
 @pytest.mark.filterwarnings("ignore:The model explains:UserWarning")
@@ -35,14 +36,7 @@ def noisy(y, snr_db, rng):
 
 def arm_like(rng, n_samples=3000):
     """The difficulty of the arm at 1 ms: a slow pole beside fast modes."""
-    poles = [-0.7, -45.0, -3.8 + 52.6j, -46.0 + 121.0j]
-    blocks = [
-        np.array([[p.real, p.imag], [-p.imag, p.real]])
-        if np.imag(p)
-        else np.array([[np.real(p)]])
-        for p in poles
-    ]
-    A = block_diag(*blocks)
+    A = modes(-0.7, -45.0, -3.8 + 52.6j, -46.0 + 121.0j)
     B = np.array(
         [[0.3, 0.2], [20.0, 12.0], [2.0, -3.0], [1.0, 2.0], [9.0, 6.0], [-8.0, 9.0]]
     )
@@ -56,14 +50,9 @@ def arm_like(rng, n_samples=3000):
 def resonant(rng):
     """Order 6, two inputs, two outputs, damping 0.01 to 0.02, feedthrough."""
     omega, zeta = rng.uniform(0.1, 2.5, 3), rng.uniform(0.01, 0.02, 3)
-    blocks = []
-    for w, z in zip(omega, zeta, strict=True):
-        c, s = np.cos(w), np.sin(w)
-        blocks.append(np.exp(-z * w) * np.array([[c, s], [-s, c]]))
+    A = modes(*np.exp(-zeta * omega + 1j * omega))
     shapes = (6, 2), (2, 6), (2, 2)
-    return StateSpace(
-        block_diag(*blocks), *(rng.standard_normal(s) for s in shapes), 1.0
-    )
+    return StateSpace(A, *(rng.standard_normal(s) for s in shapes), 1.0)
 
 
 @pytest.fixture
@@ -172,7 +161,7 @@ def test_automatic_horizon_is_as_good_as_the_best_of_a_full_scan(method, refine)
         auto = bft(z, SubspaceLTI(6, **options).fit(u, y).predict(v)).mean()
         scan = [
             bft(z, SubspaceLTI(6, horizon=h, **options).fit(u, y).predict(v)).mean()
-            for h in (40, 60, 80, 100, 120)
+            for h in (40, 80, 120)
         ]
         assert auto > max(scan) - 0.3
 
@@ -270,7 +259,10 @@ def test_unrelated_outputs_warn(rng):
         ({"order": 2.0}, "`order` must be"),
         ({"order": True}, "`order` must be"),
         ({"horizon": 0}, "`horizon` must be 'auto' or an integer of at least 1"),
-        ({"method": "arx"}, "`method` must be one of po-moesp"),
+        (
+            {"method": "arx"},
+            "`method` must be 'po-moesp', 'pi-moesp', 'n4sid' or 'cva'",
+        ),
         ({"stability": "maybe"}, "`stability` must be 'warn' or 'enforce'"),
         ({"sampling_time": 0.0}, "`sampling_time` must be a positive"),
         ({"horizon": 20}, "`horizon` must be at most 5 for 40 samples"),

@@ -11,6 +11,8 @@ from lpvlearn.data.preparation import remove_trends
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.systems.simulation import lti_response
 
+from ..conftest import modes
+
 A = 0.9 * np.array([[np.cos(0.6), np.sin(0.6)], [-np.sin(0.6), np.cos(0.6)]])
 SYSTEM = (
     A,
@@ -156,7 +158,7 @@ def test_experiments_that_start_at_rest_have_zero_initial_states(rng):
 def test_knowing_that_short_experiments_start_at_rest_helps(rng):
     errors = {"rest": [], "estimate": []}
     truth, omega = StateSpace(*SYSTEM, 1.0), np.linspace(0.05, 3.0, 20)
-    for _ in range(15):
+    for _ in range(8):
         runs = [record(rng, 4) for _ in range(60)]
         X = np.vstack(
             [np.column_stack([u, np.full(4, k)]) for k, (u, _) in enumerate(runs)]
@@ -191,19 +193,13 @@ def test_constant_inputs_are_called_by_their_names(rng):
 
 def test_a_given_horizon_that_ends_in_a_poor_minimum_warns():
     """A pole a hundred times slower than the horizon, past inputs as instruments."""
-    poles = np.exp(1e-3 * np.array([-0.7, -45.0]))
-    fast = np.exp(1e-3 * np.array([-3.8 + 52.6j, -46.0 + 121.0j]))
-    blocks = np.diag(poles)
-    big = np.zeros((6, 6))
-    big[:2, :2] = blocks
-    for k, p in enumerate(fast):
-        i = 2 + 2 * k
-        big[i : i + 2, i : i + 2] = [[p.real, p.imag], [-p.imag, p.real]]
+    poles = np.exp(1e-3 * np.array([-0.7, -45.0, -3.8 + 52.6j, -46.0 + 121.0j]))
+    A = modes(*poles)
     B = np.array([[0.3, 0.2], [20, 12], [2, -3], [1, 2], [9, 6], [-8, 9.0]]) * 1e-3
     C = np.array([[1, 0.6, 1, 0.5, 0.7, 0.4], [-0.8, 1, 0.7, -1, 0.5, -0.6]])
     rng = np.random.default_rng(0)
     u = 0.1 * np.repeat(rng.choice([-1.0, 1.0], (300, 2)), 10, axis=0)
-    y = lti_response(big, B, C, np.zeros((2, 2)), u)
+    y = lti_response(A, B, C, np.zeros((2, 2)), u)
     y = y + 0.03 * y.std(axis=0) * rng.standard_normal(y.shape)
     options = {"method": "pi-moesp", "feedthrough": False}
     with pytest.warns(UserWarning, match="ends in a poor model"):

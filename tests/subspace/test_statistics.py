@@ -6,15 +6,16 @@ from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from lpvlearn import SubspaceLTI
+from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.models.innovation import NoiseModel
 from lpvlearn.subspace.simulation_fit import Freedom, Realization
+from lpvlearn.subspace.statistics import deviated_models
 from lpvlearn.subspace.uncertainty import (
+    _spectrum,
     autoregression,
     frequency_response_jacobian,
     pole_jacobian,
     reduce_noise_model,
-    spectrum,
 )
 from lpvlearn.systems.simulation import lti_response, state_trajectory
 
@@ -67,19 +68,21 @@ def test_white_and_vanishing_errors_have_no_noise_states():
 
 def test_reduced_noise_model_has_a_stable_predictor_and_the_riccati_gain():
     e = np.random.default_rng(1).standard_normal((20_000, 1))
-    long = autoregression([lfilter([1.0, 0.7], [1.0, -0.9], e, axis=0)], order=12)
+    long = autoregression([lfilter([1.0, 0.7], [1.0, -0.9], e, axis=0)])
     short = reduce_noise_model(long, 1)
     np.testing.assert_allclose(short.A, [[0.9]], atol=0.02)
     assert abs(np.linalg.eigvals(short.A - short.K @ short.C)).max() < 1.0
     omega = 2.0 * np.pi * np.arange(256) / 256
-    np.testing.assert_allclose(spectrum(short, omega), spectrum(long, omega), rtol=0.2)
+    np.testing.assert_allclose(
+        _spectrum(short, omega), _spectrum(long, omega), rtol=0.2
+    )
     # An innovation form is its own Kalman filter: the Riccati solution is zero.
     Q, S = short.K @ short.covariance @ short.K.T, short.K @ short.covariance
     P = solve_discrete_are(short.A.T, short.C.T, Q, short.covariance, s=S)
     np.testing.assert_allclose(P, 0.0, atol=1e-8)
     white = reduce_noise_model(long, 0)
     np.testing.assert_allclose(
-        white.covariance, spectrum(long, omega).real.mean(), rtol=0.1
+        white.covariance, _spectrum(long, omega).real.mean(), rtol=0.1
     )
 
 
@@ -87,14 +90,21 @@ def test_spectrum_integrates_to_the_variance():
     one = np.ones((1, 1))
     model = NoiseModel(0.8 * one, 0.8 * one, one, 2.0 * one)
     omega = 2.0 * np.pi * np.arange(512) / 512
-    variance = spectrum(model, omega).mean().real
+    variance = _spectrum(model, omega).mean().real
     assert variance == pytest.approx(2.0 / (1.0 - 0.64), rel=1e-9)
 
 
+@pytest.fixture(scope="module")
+def coloured_fit():
+    """Model of a long record in coloured noise."""
+    return SubspaceLTI(2, horizon=12).fit(*experiment(0, 20_000, pole=0.9))
+
+
 @pytest.mark.parametrize("steps", [1, 3])
-def test_prediction_error_under_coloured_noise_is_that_of_the_true_predictor(steps):
-    u, y = experiment(0, 20_000, pole=0.9)
-    model = SubspaceLTI(2, horizon=12).fit(u, y)
+def test_prediction_error_under_coloured_noise_is_that_of_the_true_predictor(
+    coloured_fit, steps
+):
+    model = coloured_fit
     predictor = model.predictor_
     assert predictor.n_noise_states == 2
     np.testing.assert_allclose(np.linalg.eigvals(predictor.noise.A), 0.9, atol=0.02)
@@ -109,9 +119,9 @@ def test_prediction_error_under_coloured_noise_is_that_of_the_true_predictor(ste
         )
 
 
-def test_far_prediction_and_white_noise_are_the_simulation():
+def test_far_prediction_and_white_noise_are_the_simulation(coloured_fit):
+    model = coloured_fit
     u, y = experiment(0, 3000, pole=0.9)
-    model = SubspaceLTI(2, horizon=12).fit(u, y)
     simulated = model.predict_with_initial_state(u, y)
     np.testing.assert_allclose(model.predict_ahead(u, y, 400), simulated, atol=1e-9)
     u, y = experiment(0, 3000)
@@ -122,9 +132,9 @@ def test_far_prediction_and_white_noise_are_the_simulation():
     )
 
 
-def test_prediction_uses_no_later_output():
+def test_prediction_uses_no_later_output(coloured_fit):
+    model = coloured_fit
     u, y = experiment(0, 500, pole=0.9)
-    model = SubspaceLTI(2, horizon=12).fit(u, y)
     changed = y.copy()
     changed[300:] += 5.0
     pair = [model.predict_ahead(u, z, 2, initial_state="rest") for z in (y, changed)]
@@ -147,7 +157,7 @@ def test_noise_states_make_the_unrefined_po_moesp_consistent():
     for extra in (0, 2):
         gaps = []
         for seed in range(3):
-            u, y = experiment(seed, 30_000, pole=0.9, level=0.5)
+            u, y = experiment(seed, 20_000, pole=0.9, level=0.5)
             model = SubspaceLTI(2, horizon=12, refine=False, n_noise_states=extra)
             response = model.fit(u, y).lti_.frequency_response(OMEGA)
             gaps.append(np.linalg.norm(response - truth(OMEGA)))
@@ -203,6 +213,7 @@ def test_jacobians_equal_finite_differences():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 def test_bands_of_95_percent_cover_the_truth(pole):
     """Within what 60 runs can tell, entry by entry; 300 runs are a benchmark."""
@@ -268,11 +279,10 @@ def test_covariance_of_an_unrefined_model_is_refused():
         ({"initial_state": "zero"}, "`initial_state` must be 'estimate' or 'rest'"),
     ],
 )
-def test_wrong_prediction_arguments_are_refused(arguments, message):
+def test_wrong_prediction_arguments_are_refused(coloured_fit, arguments, message):
     u, y = experiment(0, 300, pole=0.9)
-    model = SubspaceLTI(2, horizon=10).fit(u, y)
     with pytest.raises(ValueError, match=message):
-        model.predict_ahead(u, y, **arguments)
+        coloured_fit.predict_ahead(u, y, **arguments)
 
 
 def test_process_noise_is_predicted_as_well_as_by_the_kalman_filter():
@@ -292,3 +302,31 @@ def test_process_noise_is_predicted_as_well_as_by_the_kalman_filter():
     error = (y - model.predict_ahead(u, y)).std(axis=0)
     np.testing.assert_allclose(error, best, rtol=0.03)
     assert (error < 0.7 * (y - model.predict(u)).std(axis=0)).all()
+
+
+@pytest.mark.parametrize("method", ["zoh", "tustin"])
+def test_pairs_stand_on_both_sides_of_the_estimate(method):
+    rng = np.random.default_rng(1)
+    u = rng.choice([-1.0, 1.0], (100, 1)).repeat(3, axis=0)
+    lag = StateSpace([[-0.8]], [[1.5]], [[1.0]])
+    y = lag.simulate(u, sampling_time=0.1) + 0.05 * rng.standard_normal((300, 1))
+    fitted = SubspaceLTI(1, horizon=8, sampling_time=0.1).fit(u, y)
+    pairs = deviated_models(fitted.lti_, [(u, y)], lambda m: m.to_continuous(method))
+    assert len(pairs) == 3  # pole, gain and feedthrough
+    omega = np.geomspace(0.01, 20, 20)
+    here = fitted.lti_.to_continuous(method).frequency_response(omega)
+    for above, below in pairs:
+        step = above.frequency_response(omega) - here
+        middle = above.frequency_response(omega) + below.frequency_response(omega)
+        assert np.abs(middle - 2 * here).max() < 0.02 * np.abs(step).max()
+
+
+def test_collinear_inputs_leave_the_deviations_open():
+    rng = np.random.default_rng(0)
+    u = rng.choice([-1.0, 1.0], (200, 1))
+    y = StateSpace([[0.8]], [[1.0]], [[1.0]], sampling_time=1.0).simulate(u)
+    y = y + 0.01 * rng.standard_normal(y.shape)
+    both = np.hstack([u, 2 * u])
+    with pytest.warns(UserWarning, match="collinear"):
+        fitted = SubspaceLTI(1, horizon=5).fit(both, y)
+    assert deviated_models(fitted.lti_, [(both, y)], lambda model: model) == []
