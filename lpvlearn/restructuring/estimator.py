@@ -25,7 +25,7 @@ from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from .identifiability import Identifiability, perturbation_table, spread_covariance
-from .least_squares import LeastSquaresResult, channel_balance, fit_frequency_response
+from .least_squares import LeastSquaresResult, channel_scaling, fit_frequency_response
 from .measured import stack_response
 from .minimise_h2 import minimise_h2
 from .minimise_hinf import SOLVERS, minimise_hinf, promising
@@ -125,7 +125,8 @@ def warn_about(
             f"the search {'ended at' if spent else 'stalled before'} "
             f"`max_iter`={restructurer.max_iter} steps, with `stationarity_` "
             f"{restructurer.stationarity_:.1g} (0 at an optimum): a lower norm may be "
-            "near. The best point is kept. "
+            f"near. {f'It ended because {result.cause}. ' if result.cause else ''}"
+            "The best point is kept. "
             + ("Raise `max_iter`" if spent else "Try another `random_state`")
             + ", or take a structure of fewer parameters.",
             ConvergenceWarning,
@@ -462,7 +463,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             self.active_frequencies_ = np.sort(peaks.frequencies)
             self.remaining_error_ = self.error_
         J = system.response_jacobian(self.params_, problem.omega)[1]
-        balance = channel_balance(problem.response)
+        balance = channel_scaling(problem.response)
         if balance is not None:  # a faint channel tells parameters, too
             J = J * balance[..., None]
         self.identifiability_ = Identifiability.from_jacobian(

@@ -353,7 +353,9 @@ def _from_least_squares(
         path = replace(path, theta=inner, mu=mu_end)
     assert best is not None
     exact = best[1].peaks.top <= options["negligible"]
-    converged = exact or idle or best[1].stationarity <= _NEARLY
+    # the end of a solver that failed needs the better proof
+    enough = _STATIONARY if best[1].cause else _NEARLY
+    converged = exact or idle or best[1].stationarity <= enough
     result = replace(best[1], n_iter=used, history=history, converged=converged)
     return best[0], result, floor
 
