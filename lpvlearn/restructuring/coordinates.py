@@ -39,12 +39,15 @@ _REACH = 2.0
 _DAMPING = 1e-5  # of the acceleration along directions that the response hardly sees
 
 
-def metric_coordinates(R: Array, size: float) -> Array:
-    """`T` with ``|R T y| = size |y|`` on the directions that `R` sees.
+def metric_coordinates(J: Complex, size: float) -> Array:
+    """`T` with which a step y changes the response by ``size |y|`` (root mean square).
 
-    `R` is the triangular factor of the response Jacobian. Directions that it does not
-    see (unidentifiable ones) are capped, in units in which all parameters count alike.
+    `J` holds the derivatives of the response, (k, n_outputs, n_inputs, n_params).
+    Directions that it does not see (unidentifiable ones) are capped, in units in which
+    all parameters count alike.
     """
+    flat = J.reshape(-1, J.shape[3]) / np.sqrt(len(J))
+    R = np.asarray(np.linalg.qr(np.vstack([flat.real, flat.imag]), mode="r"))
     unit = _units(R)
     _, s, Vt = np.linalg.svd(R / unit)
     s = np.maximum(s, _FIT_CAP * s.max(initial=0.0))

@@ -17,7 +17,7 @@ from .continuation import continued_fits
 from .error_system import ErrorSystem
 from .least_squares import (
     LeastSquaresResult,
-    channel_balance,
+    channel_scaling,
     fit_frequency_response,
     frequency_grid,
 )
@@ -139,10 +139,10 @@ def _similar(
     else:
         scales = [float(np.exp(np.log(poles).mean())), float(poles.max())]
     grid = frequency_grid(np.linalg.eigvals(box.A).astype(complex), box.dt)
-    balance = channel_balance(model_derivatives(box, grid)[0])
+    balance = channel_scaling(model_derivatives(box, grid)[0])
     if balance is not None:  # rank one: factors of the outputs and of the inputs
         outputs, inputs = balance[:, 0] / balance[0, 0], balance[0]
-        box, offset, basis = balanced_channels(box, offset, basis, outputs, inputs)
+        box, offset, basis = scaled_channels(box, offset, basis, outputs, inputs)
     found = []
     for rate in scales:
         problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, rate)
@@ -215,7 +215,7 @@ def _natural_sizes(
     return np.asarray(size * np.exp(rng.normal(size=(count, len(size)))))
 
 
-def balanced_channels(
+def scaled_channels(
     box: Target, offset: Array, basis: Array, outputs: Array, inputs: Array
 ) -> tuple[Target, Array, Array]:
     """Black box and structure with outputs and inputs in other units."""
@@ -270,7 +270,7 @@ def best_fits(
         return []
     thetas = np.array(usable)
     W = system.weight_response(omega)[0]
-    balance = channel_balance(W @ G0)
+    balance = channel_scaling(W @ G0)
     scale = 1.0 if balance is None else balance
     errors = np.array(
         [np.linalg.norm(scale * (W @ (system.response(t, omega) - G0))) for t in thetas]
@@ -282,7 +282,7 @@ def best_fits(
     for theta in thetas[:n_fits]:
         if balance is not None:  # all channels alike first, then as they are
             first = fit_frequency_response(
-                system, theta, omega, G0, admissible=admissible, balance=balance
+                system, theta, omega, G0, admissible=admissible, scaling=balance
             )
             theta = theta if first is None else first.x
         fit = fit_frequency_response(system, theta, omega, G0, admissible=admissible)
