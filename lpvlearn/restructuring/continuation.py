@@ -32,7 +32,7 @@ _LONGEST = 1.5  # of a step, in logarithms of the parameters
 
 _SMALL = 1e-3  # relative decrease that ends a stage
 
-_LOST = 1e12
+_ROUNDING = 1e-20  # squared relative error that is reached exactly
 
 _HOLD = 1e-4  # pull to the start of a stage, times the shift
 
@@ -45,7 +45,7 @@ def continued_fits(
     *,
     shifts: tuple[float, ...] = SHIFTS,
     n_points: int = 25,
-    max_iter: int = 20,
+    max_iter: int = 32,
 ) -> tuple[Array, Array]:
     """Fit the response on contours that approach the frequency axis.
 
@@ -63,7 +63,7 @@ def continued_fits(
     n_points : int
         Frequencies of a contour.
     max_iter : int
-        Steps on each contour.
+        Steps that are tried on each contour.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def continued_fits(
             longest=_LONGEST,
             max_iter=max_iter,
             tol=_SMALL,
-            exact=1e-20,
+            exact=_ROUNDING,
         )
     found = search.thetas(X, np.arange(len(X)))
     good = np.isfinite(cost) & np.isfinite(found).all(1)

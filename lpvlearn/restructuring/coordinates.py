@@ -32,11 +32,19 @@ Complex = NDArray[np.complex128]
 # that length all the same: further along them its second derivative takes over.
 _METRIC_CAP = 1e-3
 
-_FIT_CAP = 1e-5
+_FIT_CAP = 1e-5  # the same for the H2 norm, whose steps are straight
 
-_REACH = 2.0
+_REACH = 2.0  # change of the logarithm of a distance to a bound in a unit step
 
 _DAMPING = 1e-5  # of the acceleration along directions that the response hardly sees
+
+_EXACT = 1e-7  # relative residual of a realisation in a canonical form
+
+_NUDGE = 1e-2  # relative change of all entries that makes a model a generic one
+
+_MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
+
+_SAME_NORM = 1e-7  # relative difference that rounding may make
 
 
 def metric_coordinates(J: Complex, size: float) -> Array:
@@ -169,15 +177,6 @@ class ResponseGeometry:
         if self._bend is not None:
             H = H + np.tensordot(self._bend, np.real(P.sum(0)).T, axes=2)
         return self.T.T @ H @ self.T
-
-
-_EXACT = 1e-7  # relative residual of a realisation in a canonical form
-
-_NUDGE = 1e-2
-
-_MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
-
-_SAME_NORM = 1e-7  # relative difference that rounding may make
 
 
 class LocalChart:

@@ -60,7 +60,7 @@ def fit_frequency_response(
     *,
     admissible: Callable[[Array], bool],
     scaling: Array | float = 1.0,
-    max_iter: int = 60,
+    max_iter: int = 100,
 ) -> LeastSquaresResult | None:
     """Least-squares fit of ``G(theta)`` to `G0` over a frequency grid.
 

@@ -26,9 +26,14 @@ Array = NDArray[Any]
 
 _EXACT = 4  # starts that reach the structure exactly; no more are needed
 
+# relative singular value of the linear equations that noise of a black box may leave
 _NULL_TOLERANCE = 1e-6
 
+# A start ends when its squared distance falls by less than _SLOW that often in a row:
+# far from the structure progress is slow and then fast again.
 _SLOW, _PATIENCE = 1e-4, 4
+
+_ROUNDING = 1e-24  # squared distance, relative to the structure: it is reached exactly
 
 
 @dataclass(frozen=True)
@@ -139,7 +144,7 @@ def similarity_starts(
         max_iter=max_iter,
         tol=_SLOW,
         patience=_PATIENCE,
-        exact=1e-24 * (1.0 + np.abs(problem.offset).sum()) ** 2,
+        exact=_ROUNDING * (1.0 + np.abs(problem.offset).sum()) ** 2,
         enough=_EXACT,
     )
     Z, cost = Z[np.isfinite(cost)], cost[np.isfinite(cost)]  # regular ones

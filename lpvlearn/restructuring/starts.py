@@ -52,7 +52,7 @@ _N_SMOOTH_SEEDS = 6  # of the continuation
 
 _N_QUICK_SEEDS = 3
 
-_QUICK = {"shifts": (1.0, 0.2, 0.05, 0.0), "n_points": 18, "max_iter": 10}
+_QUICK = {"shifts": (1.0, 0.2, 0.05, 0.0), "n_points": 18, "max_iter": 16}
 
 _SPREAD = 0.3  # standard deviation of log-parameters around a given first guess
 
