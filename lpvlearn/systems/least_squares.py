@@ -154,14 +154,16 @@ def levenberg_marquardt(
         left = c[rows] + (R[rows] @ (trial - x[rows])[:, :, None])[:, :, 0]
         promised = np.sum(c[rows] ** 2 - left**2, axis=1)
         before = cost[rows]
-        hopeful = (promised > _NOISE * before) & (damping[rows] < _LARGEST_DAMPING)
+        # a step that a bound cuts off may promise nothing where a shorter one does
+        hopeful = (promised > _NOISE * before) | (trial != x[rows] + d).any(1)
+        hopeful &= damping[rows] < _LARGEST_DAMPING
         active[rows[~hopeful]] = False
         rows, before, promised = rows[hopeful], before[hopeful], promised[hopeful]
         if len(rows) == 0:
             break
         better = move(rows, trial[hopeful])
         fall = before - cost[rows]
-        good = np.where(fall > _AS_PROMISED * promised, _LESS, 1.0)
+        good = np.where(fall > _AS_PROMISED * np.abs(promised), _LESS, 1.0)
         damping[rows] *= np.where(better, good, _MORE)
         damping[rows] = np.maximum(damping[rows], _LEAST_DAMPING)
         slow = better & (fall <= tol * before)
