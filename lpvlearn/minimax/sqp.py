@@ -103,12 +103,12 @@ def minimax_sqp(
             omega = np.concatenate([problem.grid, extra])
             local = _local_model(problem, y, own, omega, radius)
         step = local.step(radius)
-        while step is None and radius >= _SHORTEST:
-            radius, local = _NO_PROGRAM * radius, local.stiffer()
-            step = local.step(radius)
+        cause = NO_STEP if step is None else ""
         if step is None:
-            cause = NO_STEP
-            break
+            radius, local = _NO_PROGRAM * radius, local.stiffer()
+            if radius < _SHORTEST:
+                break
+            continue
         d, multipliers = step
         linear, predicted = local.decrease(d)
         if _stalled(history, f):
