@@ -117,6 +117,9 @@ ACTIVE_PEAK = 1e-6  # peaks within that fraction of the highest one are active
 
 ACTIVE_MULTIPLIER = 1e-8  # smaller multipliers do not count
 
+# Why a search ended short of an optimum, beside the number of its iterations
+NO_STEP = "the quadratic program of a step had no solution"
+
 
 @dataclass(frozen=True)
 class Peaks:
@@ -197,6 +200,9 @@ class MinimaxResult:
     n_iter : int
     history : list of dict
         One row per iteration: objective, predicted decrease, radius, active peaks.
+    cause : str
+        What ended the search short of an optimum; empty where it converged or ran out
+        of iterations.
     """
 
     y: Array
@@ -206,6 +212,7 @@ class MinimaxResult:
     converged: bool
     n_iter: int
     history: list[dict[str, float]] = field(default_factory=list)
+    cause: str = ""
 
 
 def tangent_spaces(G: Array, dc: Array) -> tuple[Array, Array]:

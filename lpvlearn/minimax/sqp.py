@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .problem import (
     ACTIVE_MULTIPLIER,
+    NO_STEP,
     Curve,
     MinimaxProblem,
     MinimaxResult,
@@ -29,10 +30,28 @@ Array = NDArray[np.float64]
 _MAX_EXTRA = 40  # frequencies beside the grid: those at which a step failed
 
 _PATIENCE = 25  # iterations without progress that end the search
+_NOTHING = 1e-8  # relative decrease that is no progress over so many iterations
+_SHORTEST = 1e-14  # radius: a step that short changes no digit
 
-_NOTHING = 1e-8
+# The trust region: a step is taken if it brings any of the promised decrease, ...
+_TAKEN = 1e-4
+# ... is followed by a longer one if the model was good and the radius held it back,
+_GOOD, _HELD, _LONGER, _LONGEST = 0.75, 0.8, 2.5, 10.0
+# by a shorter one if the model was poor, and repeated shorter if it failed.
+_POOR, _SHORTER, _FAILED = 0.25, 0.5, 0.35
+# Where the quadratic program has no solution: a smaller radius, and a Hessian that is
+# more definite by part of its mean curvature.
+_NO_PROGRAM, _STIFFER = 0.25, 0.1
 
-_CORRECTIONS = 3
+_ROUNDING = 1e-12  # a promised relative decrease that rounding may hide
+
+_CORRECTIONS = 3  # second-order corrections: each removes most of the bend that is left
+_WORTHWHILE = 0.1  # part of the decrease that a correction must add for a further one
+
+_FIRST_CURVATURE = (
+    1e-2  # of the first program, relative to gradient over radius: little
+)
+_SHOULDER = 1e-9  # rounding of a singular value beside the objective
 
 _SAME = 1e-6  # relative distance of frequencies that are the same
 
@@ -73,7 +92,7 @@ def minimax_sqp(
     y, extra = y0.copy(), np.zeros(0)
     local: _Local | None = None
     history: list[dict[str, float]] = []
-    converged, n_iter = False, 0
+    converged, cause, n_iter = False, "", 0
     while n_iter < max_iter and not converged:
         f = own.top
         if f <= negligible:
@@ -84,14 +103,15 @@ def minimax_sqp(
             omega = np.concatenate([problem.grid, extra])
             local = _local_model(problem, y, own, omega, radius)
         step = local.step(radius)
+        cause = NO_STEP if step is None else ""
         if step is None:
-            radius *= 0.25
-            local = local.stiffer()
-            converged = radius < 1e-14
+            radius, local = _NO_PROGRAM * radius, local.stiffer()
+            if radius < _SHORTEST:
+                break
             continue
         d, multipliers = step
         linear, predicted = local.decrease(d)
-        if stalled(history, f):
+        if _stalled(history, f):
             converged = True
             break
         history.append(
@@ -102,7 +122,7 @@ def minimax_sqp(
                 "active": float((multipliers > ACTIVE_MULTIPLIER).sum()),
             }
         )
-        if linear <= tol or radius < 1e-14:
+        if linear <= tol or radius < _SHORTEST:
             converged = True
             break
         d, high = _corrected(problem, y, local, d, radius)
@@ -115,22 +135,24 @@ def minimax_sqp(
                 new = new[~_among(new, omega)]
                 extra = np.concatenate([extra, new])[-_MAX_EXTRA:]
                 local = None if new.size else local
-        if trial is not None and ratio > 1e-4 and trial.top < f:
+        if trial is not None and ratio > _TAKEN and trial.top < f:
             y, own, local = y + d, trial, None
-            if ratio > 0.75 and np.abs(d).max() > 0.8 * radius:
-                radius = min(2.5 * radius, 10.0)
-            elif ratio < 0.25:
-                radius *= 0.5
-        elif predicted < 1e-12:
+            if ratio > _GOOD and np.abs(d).max() > _HELD * radius:
+                radius = min(_LONGER * radius, _LONGEST)
+            elif ratio < _POOR:
+                radius *= _SHORTER
+        elif predicted < _ROUNDING:
             converged = True
         else:
-            radius = 0.35 * min(radius, float(np.abs(d).max()))
+            radius = _FAILED * min(radius, float(np.abs(d).max()))
     constraints = problem.constraints(y)
     stationarity, second_order = certificate(problem, y, own, constraints, negligible)
-    return MinimaxResult(y, own, stationarity, second_order, converged, n_iter, history)
+    return MinimaxResult(
+        y, own, stationarity, second_order, converged, n_iter, history, cause
+    )
 
 
-def stalled(history: list[dict[str, float]], f: float) -> bool:
+def _stalled(history: list[dict[str, float]], f: float) -> bool:
     """Whether the last iterations lowered the objective by next to nothing."""
     if len(history) < _PATIENCE:
         return False
@@ -160,7 +182,7 @@ class _Local:
     curve: Curve | None = None
 
     def stiffer(self) -> _Local:
-        shift = 0.1 * max(float(np.trace(self.H)) / len(self.H), 1e-8)
+        shift = _STIFFER * max(float(np.trace(self.H)) / len(self.H), 1e-8)
         H = self.H + shift * np.eye(len(self.H))
         return replace(self, H=H)
 
@@ -212,7 +234,7 @@ def _corrected(
         if not gain > 0:
             break
         d, end, ends = step[0], new_end, new
-        if gain < 0.1 * (f - float(ends.max())):
+        if gain < _WORTHWHILE * (f - float(ends.max())):
             break
     return end, float(ends.max())
 
@@ -225,7 +247,7 @@ def _local_model(
     cuts = problem.samples(y, omega[~_among(omega, own.frequencies)])
     # Above the objective is only the shoulder of a constant peak that has been set
     # aside: there the error shall not grow, or a new peak would rise on the shoulder.
-    below = cuts.values <= own.top * (1.0 + 1e-9)
+    below = cuts.values <= own.top * (1.0 + _SHOULDER)
     caps = cuts.values[~below]
     c = np.concatenate([np.minimum(c, 0.0), np.zeros(len(caps))])
     dc = np.vstack([dc, cuts.gradients[~below] / caps[:, None]])
@@ -237,7 +259,12 @@ def _local_model(
     )
     f, q = own.top, len(y)
     G = entries.gradients / f
-    H = 1e-2 * np.linalg.norm(G, axis=1).max() * np.eye(q) / max(radius, 1e-6)
+    H = (
+        _FIRST_CURVATURE
+        * np.linalg.norm(G, axis=1).max()
+        * np.eye(q)
+        / max(radius, 1e-6)
+    )
     curve = None if problem.curve is None else problem.curve(y)
     first = _Local(entries, H, c, dc, curve)
     solution = epigraph_step(H, entries.values / f - 1.0, G, c, dc, radius)

@@ -1,10 +1,12 @@
-"""The logarithmic barrier of the error's largest singular value, and its derivatives.
+"""The central path from the least-squares fit to the least H-infinity norm.
 
 With a level t above the largest singular value of the error E at every frequency,
 
     psi(theta, mu) = min_t  log t - mu sum_k log det(I - E_k^H E_k / t^2)
 
 is smooth: least squares for a large mu, the highest singular value for a small one.
+Its minimisers for a falling mu are the central path, which Newton's method follows in
+a trust region, along geodesics of the response.
 """
 
 from __future__ import annotations
@@ -24,7 +26,29 @@ Array = NDArray[np.float64]
 
 Complex = NDArray[np.complex128]
 
-_BARRIER = 1e-2  # weight of the logarithms of the limits, relative to mu
+# weight of the logarithms of the limits, relative to mu: they keep steps off the limits
+# and hardly move the minimum
+_BARRIER = 1e-2
+
+_SHRINK = 0.3  # of mu, from one stage to the next
+
+_FIRST_LEVEL = 2.0  # level of the first stage, relative to the largest singular value
+
+_NEGLIGIBLE = 1e-14  # decrease of psi, or radius, that is rounding noise
+
+_TAKEN = 1e-2  # part of the promised decrease that a step must bring
+
+# of the trust region: longer after steps as good as promised, shorter after poor ones,
+# and shorter still after those that failed
+_GOOD, _LONGER, _POOR, _SHORTER, _FAILED = 0.7, 3.0, 0.25, 0.5, 0.3
+
+_WORSE = 1.05  # end above the least norm met by more: that point is kept instead
+
+_DEPTH = 0.5  # local maxima down to there join the frequencies
+
+_BENT = 1.5  # a step whose geodesic bends more than that is too long
+
+_HALVINGS = 6  # of a step along the path; beyond, Newton's method does better
 
 
 def level_of(squares: Array, mu: float) -> float:
@@ -194,23 +218,6 @@ def _psi(squares: Array, tau: float, mu: float) -> float:
     return float(0.5 * np.log(tau) - mu * np.log1p(-squares / tau).sum())
 
 
-_SHRINK = 0.3  # of mu, from one stage to the next
-
-_FIRST_LEVEL = 2.0  # level of the first stage, relative to the largest singular value
-
-_NEGLIGIBLE = 1e-14
-
-_TAKEN = 1e-2  # part of the promised decrease that a step must bring
-
-_WORSE = 1.05
-
-_DEPTH = 0.5  # local maxima down to there join the frequencies
-
-_BENT = 1.5  # a step whose geodesic bends more than that is too long
-
-_HALVINGS = 6
-
-
 def search_grid(system: ErrorSystem) -> Array:
     """Frequencies at which a search watches the error, rad/s."""
     if isinstance(system, MeasuredErrorSystem):
@@ -365,19 +372,19 @@ def _newton(
             break
         trial = _along(theta, model, Q @ x)
         if trial is None:
-            radius = 0.5 * min(length, radius)
+            radius = _SHORTER * min(length, radius)
             continue
         ratio = (model.value - barrier.value(trial, mu)) / promised
         missed = np.union1d(missed, barrier.missed)
         if ratio > _TAKEN:
             if missed.size:
                 barrier.watch(np.union1d(barrier.omega, missed))
-            if ratio > 0.7:
-                radius = max(radius, 3.0 * length)
-            elif ratio < 0.25:
-                radius *= 0.5
+            if ratio > _GOOD:
+                radius = max(radius, _LONGER * length)
+            elif ratio < _POOR:
+                radius *= _SHORTER
             return trial, radius, promised
-        radius = 0.3 * min(length, radius)
+        radius = _FAILED * min(length, radius)
     return theta, radius, 0.0
 
 

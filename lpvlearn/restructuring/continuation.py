@@ -9,10 +9,13 @@ needs no similarity transformation, so the structure may be any smooth function.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from .error_system import Structure
+from ..systems.least_squares import levenberg_marquardt
+from .error_system import Structure, derivatives
 from .transfer import Target, resolvent
 
 Array = NDArray[np.float64]
@@ -29,7 +32,7 @@ _LONGEST = 1.5  # of a step, in logarithms of the parameters
 
 _SMALL = 1e-3  # relative decrease that ends a stage
 
-_LOST = 1e12
+_ROUNDING = 1e-20  # squared relative error that is reached exactly
 
 _HOLD = 1e-4  # pull to the start of a stage, times the shift
 
@@ -42,7 +45,7 @@ def continued_fits(
     *,
     shifts: tuple[float, ...] = SHIFTS,
     n_points: int = 25,
-    max_iter: int = 20,
+    max_iter: int = 32,
 ) -> tuple[Array, Array]:
     """Fit the response on contours that approach the frequency axis.
 
@@ -60,7 +63,7 @@ def continued_fits(
     n_points : int
         Frequencies of a contour.
     max_iter : int
-        Steps on each contour.
+        Steps that are tried on each contour.
 
     Returns
     -------
@@ -89,7 +92,14 @@ def continued_fits(
     cost = np.full(len(X), np.inf)
     for shift in shifts:
         search.move(shift, n_points, X)
-        X, cost = _batched_steps(search, X, max_iter)
+        X, cost = levenberg_marquardt(
+            search.residuals,
+            X,
+            longest=_LONGEST,
+            max_iter=max_iter,
+            tol=_SMALL,
+            exact=_ROUNDING,
+        )
     found = search.thetas(X, np.arange(len(X)))
     good = np.isfinite(cost) & np.isfinite(found).all(1)
     order = np.argsort(cost[good], kind="stable")
@@ -149,8 +159,8 @@ class _Search:
         self.weight = 1.0 / (count * (size + _FLOOR * top))
 
     def residuals(
-        self, X: Array, rows: NDArray[np.intp], jacobian: bool
-    ) -> tuple[Array, Array]:
+        self, X: Array, rows: NDArray[np.intp]
+    ) -> tuple[Array, Callable[..., Array]]:
         """Weighted errors of every start, and their derivatives."""
         theta = self.thetas(X, rows)
         n, q = self.structure.order, theta.shape[1]
@@ -169,76 +179,21 @@ class _Search:
         E[~good] = np.nan
         flat = E.reshape(len(X), -1)
         pull = self.hold * (X - self.center[rows])
-        r = np.concatenate([flat.real, flat.imag, pull], 1)
-        if not jacobian:
-            return r, np.zeros((0, 0, 0))
-        left = CVm @ inverse[:, None]  # C (s I - A)^-1, (k, f, p, n)
-        k, f, p = left.shape[:3]
-        L = np.concatenate([left, np.broadcast_to(np.eye(p), (k, f, p, p))], 3)
-        m = B.shape[2]
-        R = V[:, None] @ (modes[..., None] * VB[:, None])
-        R = np.concatenate([R, np.broadcast_to(np.eye(m), (k, f, m, m))], 2)
-        J = np.empty((k, f, p, m, q), complex)
-        slope = np.where(self.signed, theta, self.size[rows])
-        for i in range(k):
-            dS = self.structure.jacobian(theta[i])
-            products = np.tensordot(L[i], dS, axes=(2, 1))  # (f, p, q, n + m)
-            J[i] = (products @ R[i][:, None]).swapaxes(2, 3) * slope[i]
-        J = (self.weight[..., None] * J).reshape(k, -1, q)
-        held = np.broadcast_to(self.hold * np.eye(q), (k, q, q))
-        return r, np.concatenate([J.real, J.imag, held], 1)
 
+        def jacobian(kept: NDArray[np.intp]) -> Array:
+            left = CVm[kept] @ inverse[kept, None]  # C (s I - A)^-1, (k, f, p, n)
+            right = V[kept, None] @ (modes[kept, ..., None] * VB[kept, None])
+            slope = np.where(self.signed, theta[kept], self.size[rows[kept]])
+            (k, f, p, _), m = left.shape, B.shape[2]
+            J = np.empty((k, f, p, m, q), complex)
+            ones = [np.broadcast_to(np.eye(size), (f, size, size)) for size in (p, m)]
+            for i in range(k):
+                dS = self.structure.jacobian(theta[kept[i]])
+                L = np.concatenate([left[i], ones[0]], 2)
+                R = np.concatenate([right[i], ones[1]], 1)
+                J[i] = derivatives(L, dS, R) * slope[i]
+            J = (self.weight[..., None] * J).reshape(k, -1, q)
+            held = np.broadcast_to(self.hold * np.eye(q), (k, q, q))
+            return np.concatenate([J.real, J.imag, held], 1)
 
-def _batched_steps(search: _Search, X: Array, max_iter: int) -> tuple[Array, Array]:
-    """Levenberg's method on every row of `X`; a row stops when it gains little."""
-
-    def costs(X: Array, rows: NDArray[np.intp]) -> Array:
-        with np.errstate(all="ignore"):
-            try:
-                r = search.residuals(X, rows, False)[0]
-            except np.linalg.LinAlgError:
-                return np.full(len(X), np.inf)
-            cost = np.einsum("ij,ij->i", r, r)
-        return np.where(np.isfinite(cost), cost, np.inf)
-
-    X = X.copy()
-    cost = costs(X, np.arange(len(X)))
-    damping = np.full(len(X), 1e-3)
-    active = cost < _LOST
-    idle = np.zeros(len(X), int)
-    for _ in range(max_iter):
-        rows = np.flatnonzero(active)
-        if len(rows) == 0:
-            break
-        r, J = search.residuals(X[rows], rows, True)
-        finite = np.isfinite(J).all((1, 2))
-        active[rows[~finite]] = False
-        rows, r, J = rows[finite], r[finite], J[finite]
-        Jt = J.swapaxes(1, 2)
-        H, g = Jt @ J, (Jt @ r[:, :, None])[:, :, 0]
-        eye = np.eye(X.shape[1])
-        level = np.trace(H, axis1=1, axis2=2) / len(eye) + 1e-300
-        pending = np.ones(len(rows), bool)
-        for _ in range(8):
-            todo = np.flatnonzero(pending)
-            if len(todo) == 0:
-                break
-            own = rows[todo]
-            extra = (damping[own] * level[todo])[:, None, None] * eye
-            step = -np.linalg.solve(H[todo] + extra, g[todo][:, :, None])[:, :, 0]
-            longest = np.abs(step).max(1)
-            step *= np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-300))[:, None]
-            new = costs(X[own] + step, own)
-            better = new < cost[own]
-            taken = own[better]
-            slow = new[better] > (1.0 - _SMALL) * cost[taken]
-            idle[taken] = np.where(slow, idle[taken] + 1, 0)
-            X[taken] += step[better]
-            cost[taken] = new[better]
-            damping[own] = np.where(
-                better, np.maximum(damping[own] * 0.2, 1e-10), damping[own] * 5.0
-            )
-            pending[todo[better]] = False
-        active[rows[pending]] = False
-        active[rows] &= (idle[rows] < 2) & (cost[rows] > 1e-20)
-    return X, cost
+        return np.concatenate([flat.real, flat.imag, pull], 1), jacobian

@@ -32,19 +32,30 @@ Complex = NDArray[np.complex128]
 # that length all the same: further along them its second derivative takes over.
 _METRIC_CAP = 1e-3
 
-_FIT_CAP = 1e-5
+_FIT_CAP = 1e-5  # the same for the H2 norm, whose steps are straight
 
-_REACH = 2.0
+_REACH = 2.0  # change of the logarithm of a distance to a bound in a unit step
 
 _DAMPING = 1e-5  # of the acceleration along directions that the response hardly sees
 
+_EXACT = 1e-7  # relative residual of a realisation in a canonical form
 
-def metric_coordinates(R: Array, size: float) -> Array:
-    """`T` with ``|R T y| = size |y|`` on the directions that `R` sees.
+_NUDGE = 1e-2  # relative change of all entries that makes a model a generic one
 
-    `R` is the triangular factor of the response Jacobian. Directions that it does not
-    see (unidentifiable ones) are capped, in units in which all parameters count alike.
+_MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
+
+_SAME_NORM = 1e-7  # relative difference that rounding may make
+
+
+def metric_coordinates(J: Complex, size: float) -> Array:
+    """`T` with which a step y changes the response by ``size |y|`` (root mean square).
+
+    `J` holds the derivatives of the response, (k, n_outputs, n_inputs, n_params).
+    Directions that it does not see (unidentifiable ones) are capped, in units in which
+    all parameters count alike.
     """
+    flat = J.reshape(-1, J.shape[3]) / np.sqrt(len(J))
+    R = np.asarray(np.linalg.qr(np.vstack([flat.real, flat.imag]), mode="r"))
     unit = _units(R)
     _, s, Vt = np.linalg.svd(R / unit)
     s = np.maximum(s, _FIT_CAP * s.max(initial=0.0))
@@ -166,15 +177,6 @@ class ResponseGeometry:
         if self._bend is not None:
             H = H + np.tensordot(self._bend, np.real(P.sum(0)).T, axes=2)
         return self.T.T @ H @ self.T
-
-
-_EXACT = 1e-7  # relative residual of a realisation in a canonical form
-
-_NUDGE = 1e-2
-
-_MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
-
-_SAME_NORM = 1e-7  # relative difference that rounding may make
 
 
 class LocalChart:

@@ -20,37 +20,12 @@ from ..systems.hinf_norm import PeakSet, linf_norm
 from .transfer import Target, laplace_variable, model_derivatives, resolvent, series
 
 Array = NDArray[np.float64]
-
-
-def remembering(f: Callable[[NDArray], Any], points: int = 4) -> Callable[..., Any]:
-    """The function `f` of one array, with its values at the last points remembered.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> calls = []
-    >>> square = remembering(lambda x: calls.append(x) or x**2)
-    >>> square(np.array([2.0])), square(np.array([2.0])), len(calls)
-    (array([4.]), array([4.]), 1)
-    """
-    known: dict[bytes, Any] = {}
-
-    def remembered(x: NDArray) -> Any:
-        key = x.tobytes()
-        if key not in known:
-            value = f(x)
-            while len(known) >= points:
-                known.pop(next(iter(known)), None)
-            known[key] = value
-        return known[key]
-
-    return remembered
-
-
 Complex = NDArray[np.complex128]
 
-
 _CONSTANT = 1e-7  # relative change of an error that no parameter changes
+
+# singular values are told apart down to that fraction of the largest: their gap divides
+_GAP = 1e-10
 
 
 class Structure(Protocol):
@@ -79,6 +54,39 @@ class ErrorPoint:
     R: Complex  # (k, n + n_inputs, n_inputs)
     E: Complex  # (k, n_outputs, n_inputs)
     Phi: Complex  # (k, n, n)
+
+
+def derivatives(L: Complex, S: Array, R: Complex) -> Complex:
+    """``dE_j = L S_j R``, Eq. (24)-(25), shape (k, n_outputs, n_inputs, n_params)."""
+    k, p, _ = L.shape
+    # contract the short axes first: (k, p, a) (j, a, b) -> (k, p, j, b)
+    left = np.tensordot(L, S, axes=(2, 1)).reshape(k, p * len(S), -1)
+    return (left @ R).reshape(k, p, len(S), -1).swapaxes(2, 3)
+
+
+def remembering(f: Callable[[NDArray], Any], points: int = 4) -> Callable[..., Any]:
+    """The function `f` of one array, with its values at the last points remembered.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> calls = []
+    >>> square = remembering(lambda x: calls.append(x) or x**2)
+    >>> square(np.array([2.0])), square(np.array([2.0])), len(calls)
+    (array([4.]), array([4.]), 1)
+    """
+    known: dict[bytes, Any] = {}
+
+    def remembered(x: NDArray) -> Any:
+        key = x.tobytes()
+        if key not in known:
+            value = f(x)
+            while len(known) >= points:
+                known.pop(next(iter(known)), None)
+            known[key] = value
+        return known[key]
+
+    return remembered
 
 
 class _Remembered:
@@ -193,12 +201,7 @@ class ErrorSystem:
         at = self.point(
             theta, omega, np.zeros((1, self.n_outputs, self.n_inputs), complex)
         )
-        S = self.structure.jacobian(theta)
-        k, p, _ = at.L.shape
-        # contract the short axes first: (k, p, a) (j, a, b) -> (k, p, j, b)
-        left = np.tensordot(at.L, S, axes=(2, 1)).reshape(k, p * len(S), -1)
-        J = (left @ at.R).reshape(k, p, len(S), -1)
-        return at.E, J.swapaxes(2, 3)
+        return at.E, derivatives(at.L, self.structure.jacobian(theta), at.R)
 
     def point(self, theta: Array, omega: Array, G0: Complex) -> ErrorPoint:
         """The error without its weight, and what its derivatives are made of."""
@@ -362,7 +365,7 @@ def _coupling(dE: Complex, U: Complex, sigma: Array, Vh: Complex) -> Array:
     a = Ev @ U.conj()  # u_a^H dE v
     b = (uE @ Vh.conj().T).conj()  # v_a^H dE^H u
     total = np.zeros((len(dE), len(dE)))
-    floor = 1e-10 * sigma[0]
+    floor = _GAP * sigma[0]
     for i in range(max(p, m)):
         if i < r:
             terms = [

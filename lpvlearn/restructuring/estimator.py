@@ -25,7 +25,7 @@ from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..validation import one_of, whole_number
 from .identifiability import Identifiability, spread_covariance
-from .least_squares import LeastSquaresResult, channel_balance
+from .least_squares import LeastSquaresResult, channel_scaling
 from .measured import stack_response
 from .minimise_h2 import minimise_h2
 from .minimise_hinf import SOLVERS, minimise_hinf, promising
@@ -396,7 +396,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             self.active_frequencies_ = np.sort(peaks.frequencies)
             self.remaining_error_ = self.error_
         J = system.response_jacobian(self.params_, problem.omega)[1]
-        scaling = channel_balance(problem.response)
+        scaling = channel_scaling(problem.response)
         if scaling is not None:  # a faint channel tells parameters, too
             J = J * scaling[..., None]
         self.identifiability_ = Identifiability.from_jacobian(
@@ -411,7 +411,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 f"the search {'ended at' if spent else 'stalled before'} "
                 f"`max_iter`={self.max_iter} steps, with `stationarity_` "
                 f"{self.stationarity_:.1g} (0 at an optimum): a lower norm may be "
-                "near. The best point is kept. "
+                f"near. {f'It ended because {result.cause}. ' if result.cause else ''}"
+                "The best point is kept. "
                 + ("Raise `max_iter`" if spent else "Try another `random_state`")
                 + ", or take a structure of fewer parameters.",
                 ConvergenceWarning,

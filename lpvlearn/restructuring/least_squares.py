@@ -1,15 +1,16 @@
-"""Levenberg-Marquardt, and the frequency-response fit that starts the minimax."""
+"""The least-squares fit of a frequency response, which starts the minimax."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..systems.least_squares import levenberg_marquardt
 from ..systems.response import pole_grid, pole_rates
-from .error_system import ErrorSystem
+from .error_system import ErrorSystem, derivatives
 from .limits import growth
 from .transfer import Target
 
@@ -17,86 +18,16 @@ Array = NDArray[np.float64]
 
 Complex = NDArray[np.complex128]
 
-_BALANCED_DECADES = 1.5  # channels that differ by less are left as they are
+_MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
 
-# residuals and Jacobian at a point, None where the point is not admissible
-Residuals = Callable[[Array], tuple[Array, Array] | None]
+_DECADES = 1.5  # channels whose sizes differ by less are left as they are
 
 
-@dataclass(frozen=True)
-class LeastSquaresResult:
-    """Minimiser, cost ``|r|^2``, and the triangular factor of the Jacobian there."""
+class LeastSquaresResult(NamedTuple):
+    """Minimiser and mean square error there."""
 
     x: Array
     cost: float
-    R: Array
-    n_iter: int
-
-
-def levenberg_marquardt(
-    residuals: Residuals,
-    x0: Array,
-    *,
-    lower: Array | float = -np.inf,
-    upper: Array | float = np.inf,
-    max_iter: int = 50,
-    tol: float = 1e-6,
-) -> LeastSquaresResult | None:
-    """Minimise ``|r(x)|^2`` with Marquardt's scaling; None if `x0` is not admissible.
-
-    Steps are projected on the bounds; a variable whose bound the gradient presses
-    against is left out of the step.
-
-    Stops when the cost falls by less than `tol` relative, twice in a row, or when the
-    predicted decrease is rounding noise.
-    """
-    x = np.clip(x0, lower, upper)
-    state = residuals(x)
-    if state is None:
-        return None
-    r, J = state
-    cost = float(r @ r)
-    damping, small = 1e-3, 0
-    scale = np.zeros(len(x))
-    n_iter = 0
-    Q, R = np.linalg.qr(J)
-    while n_iter < max_iter:
-        n_iter += 1
-        scale = np.maximum(scale, np.linalg.norm(R, axis=0))
-        d = np.where(scale > 0, scale, 1.0)
-        g = R.T @ (Q.T @ r)
-        held = ((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0))
-        free = np.where(held, 0.0, 1.0)
-        rhs = np.concatenate([-(Q.T @ r), np.zeros(len(x))])
-        accepted: tuple[Array, Array] | None = None
-        while damping < 1e12:
-            stacked = np.vstack([R * (free / d), np.sqrt(damping) * np.eye(len(x))])
-            step = free / d * np.linalg.lstsq(stacked, rhs, rcond=None)[0]
-            step = np.clip(x + step, lower, upper) - x
-            predicted = (
-                cost
-                - float(np.sum((Q.T @ r + R @ step) ** 2))
-                - (float(r @ r) - float(np.sum((Q.T @ r) ** 2)))
-            )
-            if predicted <= 1e-14 * cost:
-                break
-            trial = residuals(x + step)
-            if trial is not None:
-                new = float(trial[0] @ trial[0])
-                if new < cost:
-                    accepted = trial
-                    gain = (cost - new) / predicted
-                    damping = max(damping * (0.1 if gain > 0.75 else 1.0), 1e-12)
-                    break
-            damping *= 4.0
-        if accepted is None:
-            break
-        small = small + 1 if cost - new <= tol * cost else 0
-        x, (r, J), cost = x + step, accepted, new
-        Q, R = np.linalg.qr(J)
-        if small >= 2 or cost == 0.0:
-            break
-    return LeastSquaresResult(x, cost, R, n_iter)
 
 
 def frequency_grid(poles: Complex, dt: float | None, n_points: int = 60) -> Array:
@@ -127,14 +58,13 @@ def fit_frequency_response(
     G0: Complex,
     *,
     admissible: Callable[[Array], bool],
-    balance: Array | float = 1.0,
-    max_iter: int = 60,
+    scaling: Array | float = 1.0,
+    max_iter: int = 100,
 ) -> LeastSquaresResult | None:
     """Least-squares fit of ``G(theta)`` to `G0` over a frequency grid.
 
-    Minimises ``mean_k |W_k (G(j omega_k, theta) - G0_k)|_F^2``. The triangular factor
-    of its Jacobian is the Gauss-Newton metric: ``|R d|`` is the root-mean-square
-    change of the response that a change `d` of the parameters makes.
+    Minimises ``mean_k |W_k (G(j omega_k, theta) - G0_k)|_F^2``; None where the start
+    is not admissible.
 
     Parameters
     ----------
@@ -144,35 +74,37 @@ def fit_frequency_response(
     G0 : ndarray of shape (k, n_outputs, n_inputs)
     admissible : callable
         False where the model may not go (an unstable one).
-    balance : ndarray of shape (n_outputs, n_inputs), default=1.0
-        Factors of the residuals' entries, as from `channel_balance`.
+    scaling : ndarray of shape (n_outputs, n_inputs), default=1.0
+        Factors of the residuals' entries, as from `channel_scaling`.
     """
     W = system.weight_response(omega)[0] / np.sqrt(len(omega))
-    target = W @ G0
 
-    def residuals(theta: Array) -> tuple[Array, Array] | None:
+    def residuals(x: Array, _: Any) -> tuple[Array, Callable[..., Array]]:
+        theta = x[0]
         if not admissible(theta):
-            return None
-        G, J = system.response_jacobian(theta, omega)
-        r = (balance * (W @ G - target)).ravel()
-        k, p, m, q = J.shape
-        J = (W @ J.reshape(k, p, m * q)).reshape(k, p, m, q)
-        J = (np.asarray(balance)[..., None] * J).reshape(len(r), -1)
-        if not np.isfinite(J).all():
-            return None
-        return np.concatenate([r.real, r.imag]), np.vstack([J.real, J.imag])
+            return np.full((1, 1), np.nan), lambda _: np.zeros((1, 1, len(theta)))
+        at = system.point(theta, omega, G0)
+
+        def jacobian(_: Any) -> Array:
+            J = derivatives(W @ at.L, system.structure.jacobian(theta), at.R)
+            J = (np.asarray(scaling)[..., None] * J).reshape(-1, len(theta))
+            return np.vstack([J.real, J.imag])[None]
+
+        r = (scaling * (W @ at.E)).ravel()
+        return np.concatenate([r.real, r.imag])[None], jacobian
 
     structure = system.structure
-    return levenberg_marquardt(
+    x, cost = levenberg_marquardt(
         residuals,
-        theta0,
+        theta0[None],
         lower=structure.lower,
         upper=structure.upper,
         max_iter=max_iter,
     )
+    return LeastSquaresResult(x[0], float(cost[0])) if np.isfinite(cost[0]) else None
 
 
-def channel_balance(G: Complex) -> Array | None:
+def channel_scaling(G: Complex) -> Array | None:
     """Factors of rows and columns that bring all channels to one size.
 
     None where they differ little. Channels in micrometres and in percent then count
@@ -194,12 +126,9 @@ def channel_balance(G: Complex) -> Array | None:
     columns = np.linalg.norm(size / rows[:, None], axis=0)
     columns = np.where(columns > 0, columns, columns.max())
     spread = np.ptp(np.log10(rows)), np.ptp(np.log10(columns))
-    if max(spread) < _BALANCED_DECADES:
+    if max(spread) < _DECADES:
         return None
     return 1.0 / (rows[:, None] * columns)
-
-
-_MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
 
 
 def grid_and_margin(target: Target) -> tuple[Array, float]:

@@ -13,8 +13,9 @@ from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 from scipy.optimize import minimize
 
 from ..minimax.problem import MinimaxResult, Peaks
+from .central_path import search_grid
 from .coordinates import metric_coordinates
-from .error_system import ErrorSystem
+from .error_system import ErrorSystem, derivatives
 from .least_squares import LeastSquaresResult
 from .limits import Limits, keeps_margin, within_bounds
 from .transfer import series
@@ -82,7 +83,7 @@ def minimise_h2(
     ----------
     system : ErrorSystem
     fit : LeastSquaresResult
-        Start; its Jacobian gives the coordinates.
+        Start.
     margin : float
         Stability margin, 1/s.
 
@@ -94,7 +95,11 @@ def minimise_h2(
     theta0, active = _matched_feedthrough(system, fit.x)
     J0, _ = squared_h2(system, theta0)
     scale = np.sqrt(J0) if J0 > 0 else 1.0
-    T = metric_coordinates(fit.R[:, active], max(np.sqrt(fit.cost), negligible, 1e-300))
+    grid = search_grid(system)
+    at = system.point(theta0, grid, system.target_response(grid))
+    L = system.weight_response(grid)[0] @ at.L
+    J = derivatives(L, system.structure.jacobian(theta0)[active], at.R)
+    T = metric_coordinates(J, max(np.sqrt(fit.cost), negligible, 1e-300))
     bounded = np.isfinite([system.structure.lower, system.structure.upper]).any()
     if bounded:  # coordinates in which the bounds stay bounds
         T = np.diag(Limits(system, margin).sizes(theta0)[active])

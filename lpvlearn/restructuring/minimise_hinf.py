@@ -28,13 +28,46 @@ _DEPTH = 0.6  # peaks down to that fraction below the objective enter the local 
 
 _FLAT = 1e-7  # a peak with a smaller relative gradient does not depend on theta
 
-_CAP_TOLERANCE = 1e-7
+_CAP_TOLERANCE = 1e-7  # relative excess over the cap that rounding may make
 
-_MAX_CAPS = 12
+_MAX_CAPS = 12  # frequencies at which the cap is a constraint: the last ones met
 
 _BENT = 1.0  # part of a step that its bend may be at most
 
+# depths at which peaks that move are looked for below high constant ones
 _HARD_STEPS = (0.99, 0.9999)
+
+_STATIONARY = 1e-8  # shortest subgradient of an optimum, relative to the objective
+
+_NEARLY = 1e-3  # stationarity up to which no more is said
+
+# mu at the end of a round on the central path, and iterations of the solver from there;
+# the next round if these do not converge
+_ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
+
+_BUNDLE_PACE = 10  # as many iterations of a first-order method
+
+_PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
+
+_PROGRESS = 1e-9  # a round that converged and brings less is the last one
+
+_AHEAD = 0.98  # the path is left for a point that much below it
+
+# mu to which the path is followed from several fits, how many are kept there, and the
+# most steps of each: its norm soon tells more of a basin than the least-squares error
+_EXPLORED = ((1e-2, 2, 40), (1e-3, 1, 60))
+
+_FITS = 6  # basins that are followed at most
+
+_APART = 1e-4  # relative difference of the costs of different basins
+
+_ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
+
+_RADIUS = 0.1  # first trust-region radius of the solver
+
+_REMAINDER_TOLERANCE = 1e-3  # the choice among optimal points is soon good enough
+
+_REMAINDER_STEPS = 20  # iterations for that choice
 
 
 @dataclass
@@ -194,38 +227,6 @@ class Geodesics:
         return self._local.T @ self._geometry.second_derivatives(normal) @ self._local
 
 
-_STATIONARY = 1e-8
-
-_NEARLY = 1e-3  # stationarity up to which no more is said
-
-# mu at the end of a round on the central path, and iterations of the solver from there;
-# the next round if these do not converge
-_ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
-
-_BUNDLE_PACE = 10  # as many iterations of a first-order method
-
-_PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
-
-_PROGRESS = 1e-9  # a round that converged and brings less is the last one
-
-_AHEAD = 0.98  # the path is left for a point that much below it
-
-# mu to which the path is followed from several fits, how many are kept there, and the
-# most steps of each: its norm soon tells more of a basin than the least-squares error
-_EXPLORED = ((1e-2, 2, 40), (1e-3, 1, 60))
-
-_FITS = 6
-
-_APART = 1e-4  # relative difference of the costs of different basins
-
-_ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
-
-_RADIUS = 0.1  # first trust-region radius of the solver
-
-_REMAINDER_TOLERANCE = 1e-3  # the choice among optimal points is soon good enough
-
-_REMAINDER_STEPS = 20
-
 Solver = Callable[..., MinimaxResult]
 
 SOLVERS: dict[str, Solver] = {"sqp": minimax_sqp, "bundle": proximal_bundle}
@@ -353,7 +354,9 @@ def _from_least_squares(
         path = replace(path, theta=inner, mu=mu_end)
     assert best is not None
     exact = best[1].peaks.top <= options["negligible"]
-    converged = exact or idle or best[1].stationarity <= _NEARLY
+    # the end of a solver that failed needs the better proof
+    enough = _STATIONARY if best[1].cause else _NEARLY
+    converged = exact or idle or best[1].stationarity <= enough
     result = replace(best[1], n_iter=used, history=history, converged=converged)
     return best[0], result, floor
 

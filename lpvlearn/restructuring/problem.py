@@ -95,7 +95,7 @@ class RestructuringProblem:
             self.omega,
             self.response,
             admissible=self.is_stable,
-            balance=scaling,
+            scaling=scaling,
         )
 
     def relative_error(self, fit: LeastSquaresResult) -> float:

@@ -8,6 +8,7 @@ structure is minimised over z by a Levenberg-Marquardt method, from many starts 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from scipy.linalg import null_space
 from scipy.optimize import least_squares
 
 from ..minimax.problem import MinimaxResult, Peaks
+from ..systems.least_squares import Residuals, levenberg_marquardt
 from .error_system import Structure
 from .transfer import Target
 
@@ -24,7 +26,14 @@ Array = NDArray[Any]
 
 _EXACT = 4  # starts that reach the structure exactly; no more are needed
 
+# relative singular value of the linear equations that noise of a black box may leave
 _NULL_TOLERANCE = 1e-6
+
+# A start ends when its squared distance falls by less than _SLOW that often in a row:
+# far from the structure progress is slow and then fast again.
+_SLOW, _PATIENCE = 1e-4, 4
+
+_ROUNDING = 1e-24  # squared distance, relative to the structure: it is reached exactly
 
 
 @dataclass(frozen=True)
@@ -107,7 +116,7 @@ def similarity_starts(
     n_starts: int,
     rng: np.random.Generator,
     *,
-    max_iter: int = 30,
+    max_iter: int = 40,
 ) -> tuple[Array, Array]:
     """Parameter vectors from random similarities, all starts in one batch.
 
@@ -129,7 +138,15 @@ def similarity_starts(
         Z = rng.normal(size=(n_starts, N.shape[1])) * spread
     flat = problem.basis.reshape(len(problem.basis), -1)
     directions = np.linalg.qr(flat.T)[0]
-    Z, cost = _batched_lm(problem, T0, N, Z, directions, max_iter)
+    Z, cost = levenberg_marquardt(
+        _distances(problem, T0, N, directions),
+        Z,
+        max_iter=max_iter,
+        tol=_SLOW,
+        patience=_PATIENCE,
+        exact=_ROUNDING * (1.0 + np.abs(problem.offset).sum()) ** 2,
+        enough=_EXACT,
+    )
     Z, cost = Z[np.isfinite(cost)], cost[np.isfinite(cost)]  # regular ones
     if len(Z) == 0:
         return np.zeros((0, len(flat))), cost
@@ -160,93 +177,39 @@ def _transformed(problem: AffineProblem, T: Array) -> tuple[Array, Array, Array]
     return (S - problem.offset).reshape(len(T), -1), S, inverse
 
 
-def _residuals(
-    problem: AffineProblem, T: Array, N: Array, directions: Array
-) -> tuple[Array, Array]:
+def _distances(
+    problem: AffineProblem, T0: Array, N: Array, directions: Array
+) -> Residuals:
     """Distance to the affine set and its Jacobian in z.
 
     With ``Delta = N_l T^-1``: ``dA = Delta A - A Delta``, ``dB = Delta B``,
     ``dC = -C Delta`` for the transformed matrices.
     """
     n = len(problem.A)
-    d, S, inverse = _transformed(problem, T)
-    Delta = N.T.reshape(1, -1, n, n) @ inverse[:, None]
-    J = np.zeros((len(T), N.shape[1], *problem.offset.shape))
-    J[:, :, :n] = Delta @ S[:, None, :n]
-    J[..., :n] -= S[:, None, :, :n] @ Delta
-    J = J.reshape(len(T), N.shape[1], -1)
-    r = d - (d @ directions) @ directions.T
-    J = J - (J @ directions) @ directions.T
-    return r, J
 
+    def rest(d: Array) -> Array:
+        return d - (d @ directions) @ directions.T
 
-def _batched_lm(
-    problem: AffineProblem,
-    T0: Array,
-    N: Array,
-    Z: Array,
-    directions: Array,
-    max_iter: int,
-) -> tuple[Array, Array]:
-    """Levenberg-Marquardt on every row of `Z`; a row stops when it stalls."""
-    n = len(problem.A)
-
-    def matrices(z: Array) -> Array:
-        return (T0 + z @ N.T).reshape(-1, n, n)
-
-    def cost_of(z: Array) -> Array:
-        T = matrices(z)
-        with np.errstate(all="ignore"):
-            good = np.asarray(np.isfinite(T).all((1, 2)), dtype=bool)
-            good[good] = np.abs(np.linalg.det(T[good])) > 0
-            cost = np.full(len(z), np.inf)
-            if good.any():
-                d = _transformed(problem, T[good])[0]
-                r = d - (d @ directions) @ directions.T
-                cost[good] = np.einsum("ij,ij->i", r, r)
-        return np.where(np.isfinite(cost), cost, np.inf)
-
-    Z = Z.copy()
-    cost = cost_of(Z)
-    if Z.shape[1] == 0:
-        return Z, cost
-    damping = np.full(len(Z), 1e-2)
-    stalled = np.zeros(len(Z), int)
-    active = np.isfinite(cost)
-    eye = np.eye(Z.shape[1])
-    for _ in range(max_iter):
-        rows = np.flatnonzero(active)
-        if len(rows) == 0:
-            break
-        r, J = _residuals(problem, matrices(Z[rows]), N, directions)
-        H = J @ J.swapaxes(1, 2)
-        g = (J @ r[:, :, None])[:, :, 0]
-        weight = (
-            np.einsum("kii->ki", H) + 1e-12 * np.trace(H, axis1=1, axis2=2)[:, None]
+    def residuals(z: Array, _: Any) -> tuple[Array, Callable[..., Array]]:
+        T = (T0 + z @ N.T).reshape(-1, n, n)
+        r = np.full((len(T), problem.offset.size), np.nan)
+        good = np.asarray(np.isfinite(T).all((1, 2)), dtype=bool)
+        good[good] = np.abs(np.linalg.det(T[good])) > 0
+        d, S, inverse = _transformed(
+            problem, np.where(good[:, None, None], T, np.eye(n))
         )
-        damped = H + (damping[rows, None] * weight)[:, :, None] * eye
-        try:
-            step = -np.linalg.solve(damped, g[:, :, None])[:, :, 0]
-        except np.linalg.LinAlgError:
-            damping[rows] *= 10.0
-            if (damping[rows] > 1e12).all():
-                break
-            continue
-        new = cost_of(Z[rows] + step)
-        better = new < cost[rows]
-        gain = np.where(better, cost[rows] - new, 0.0)
-        slow = gain <= 1e-4 * cost[rows]
-        stalled[rows] = np.where(better & ~slow, 0, stalled[rows] + 1)
-        Z[rows[better]] += step[better]
-        cost[rows[better]] = new[better]
-        damping[rows] = np.where(
-            better, np.maximum(damping[rows] * 0.3, 1e-12), damping[rows] * 4.0
-        )
-        tiny = cost <= 1e-24 * (1.0 + np.abs(problem.offset).sum()) ** 2
-        active[rows] = (stalled[rows] < 12) & ~tiny[rows]
-        if tiny.sum() >= _EXACT:
-            break
-    return Z, cost
+        r[good] = rest(d[good])
+
+        def jacobian(kept: Array) -> Array:
+            Delta = N.T.reshape(1, -1, n, n) @ inverse[kept, None]
+            J = np.zeros((len(kept), N.shape[1], *problem.offset.shape))
+            J[:, :, :n] = Delta @ S[kept, None, :n]
+            J[..., :n] -= S[kept, None, :, :n] @ Delta
+            return rest(J.reshape(*J.shape[:2], problem.offset.size)).swapaxes(1, 2)
+
+        return r, jacobian
+
+    return residuals
 
 
 def bilinear_fit(

@@ -22,7 +22,7 @@ from ..structures.mechanical import ImplicitMap
 from ..structures.structure import GrayBoxStructure
 from ..systems.balancing import balancing_transformation
 from .continuation import continued_fits
-from .least_squares import LeastSquaresResult, channel_balance, frequency_grid
+from .least_squares import LeastSquaresResult, channel_scaling, frequency_grid
 from .limits import growth
 from .problem import RestructuringProblem
 from .similarity import scaled_problem, similarity_starts
@@ -70,7 +70,7 @@ _N_QUICK = 3  # seeds of the second round
 
 # Its contours, frequencies and steps, about a third of the thorough ones: what a few
 # seeds find that way is found, and what they miss the third round looks for.
-_QUICK = {"shifts": (1.0, 0.2, 0.05, 0.0), "n_points": 18, "max_iter": 10}
+_QUICK = {"shifts": (1.0, 0.2, 0.05, 0.0), "n_points": 18, "max_iter": 16}
 
 
 def search(
@@ -147,7 +147,7 @@ def best_fits(
         return []
     system, omega, G0 = problem.system, problem.omega, problem.response
     W = system.weight_response(omega)[0]
-    scaling = channel_balance(problem.weighted_response)
+    scaling = channel_scaling(problem.weighted_response)
     scale = 1.0 if scaling is None else scaling
     errors = [
         np.linalg.norm(scale * (W @ (system.response(theta, omega) - G0)))
@@ -299,7 +299,7 @@ def _random_similarities(
     if box.dt is None and sizes.size:
         scales = [_mean_rate(sizes), float(sizes.max())]
     offset, basis = affine.offset, affine.basis
-    scaling = channel_balance(model_derivatives(box, frequency_grid(poles, box.dt))[0])
+    scaling = channel_scaling(model_derivatives(box, frequency_grid(poles, box.dt))[0])
     if scaling is not None:  # rank one: factors of the outputs and of the inputs
         outputs, inputs = scaling[:, 0] / scaling[0, 0], scaling[0]
         ones = np.ones(len(box.A))

@@ -1,16 +1,28 @@
-"""Linear least squares with scaled columns."""
+"""Least squares: linear with scaled columns, and Levenberg-Marquardt for the rest."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
 # Directions of the normalised regressors below this are left out (minimum norm): what
 # remains of sixteen digits after the squaring of a condition number in a Gram matrix.
 RCOND = 1e-11
+
+# Marquardt's damping, relative to the squared lengths of the Jacobian's columns
+_FIRST_DAMPING = 1e-3  # nearly Gauss-Newton: starts that need more soon have it
+_LEAST_DAMPING = 1e-12  # below, it is rounding noise beside the squared columns
+_LARGEST_DAMPING = 1e12  # a step that short changes no digit
+_LESS, _MORE = 0.1, 4.0  # after a step that came as promised, or one that failed
+_AS_PROMISED = 0.75  # of the decrease of the linear model
+_NOISE = 1e-14  # a promised relative decrease below it cannot be seen in sixteen digits
 
 
 def scaled_lstsq(M: Array, rhs: Array, rcond: float = RCOND) -> tuple[Array, int]:
@@ -36,3 +48,125 @@ def scaled_lstsq(M: Array, rhs: Array, rcond: float = RCOND) -> tuple[Array, int
         M / scale, rhs, cond=rcond, lapack_driver="gelsy", check_finite=False
     )
     return (solution.T / scale).T, int(rank)
+
+
+# Residuals (k, n_residuals) of some rows of the stack of starts, not finite where a
+# point is not admissible, and a function that gives the Jacobians (n_kept,
+# n_residuals, n_unknowns) of those of them that are kept.
+Residuals = Callable[[Array, Rows], tuple[Array, Callable[[Rows], Array]]]
+
+
+class Minima(NamedTuple):
+    """Where the starts ended: minimisers (k, n_unknowns) and costs ``|r|^2`` (k,).
+
+    The cost of a start that was not admissible is infinite.
+    """
+
+    x: Array
+    cost: Array
+
+
+def levenberg_marquardt(
+    residuals: Residuals,
+    starts: Array,
+    *,
+    lower: Array | float = -np.inf,
+    upper: Array | float = np.inf,
+    longest: float = np.inf,
+    max_iter: int = 50,
+    tol: float = 1e-6,
+    patience: int = 2,
+    exact: float = 0.0,
+    enough: int | None = None,
+) -> Minima:
+    r"""Minimise ``|r(x)|^2`` from every row of a stack of starts, all in one batch.
+
+    A step solves :math:`\min_d |r + J d|^2 + \lambda |S d|^2`, where S holds the
+    largest lengths that the columns of J had so far (Marquardt's scaling), through the
+    singular values of :math:`J S^{-1}`: all dampings :math:`\lambda` share them, and
+    the condition of J is not squared. Steps are projected on the bounds; a variable
+    whose bound the gradient presses against is left out of the step.
+
+    Parameters
+    ----------
+    residuals : callable
+        ``(x, rows) -> (r, jacobian)`` for x of shape (k, n_unknowns), that belong to
+        these rows of `starts`; ``jacobian(kept)`` gives the Jacobians of some of the k.
+    starts : ndarray of shape (n_starts, n_unknowns)
+    lower, upper : ndarray of shape (n_unknowns,) or float
+    longest : float
+        Largest change of a variable in a step.
+    max_iter : int
+        Steps that are tried.
+    tol : float
+    patience : int
+        A start ends when its cost falls by less than `tol` (relative) that many times
+        in a row, or when no step lowers it.
+    exact : float
+        A start ends at a cost not above that.
+    enough : int, default=None
+        All end when that many costs are that low.
+    """
+    x = np.clip(starts, lower, upper)
+    k, q = x.shape
+    cost, damping = np.full(k, np.inf), np.full(k, _FIRST_DAMPING)
+    # J = Q R at x, c = Q^T r, the longest columns so far, and R / S = U diag(s) V^T
+    # with the coordinates b = U^T c and the directions W = V^T / S
+    R, c, S = np.zeros((k, q, q)), np.zeros((k, q)), np.zeros((k, q))
+    s, b, W = np.zeros((k, q)), np.zeros((k, q)), np.zeros((k, q, q))
+
+    def move(rows: Rows, trial: Array) -> NDArray[np.bool_]:
+        """Take the trial points that lower the cost; which these are."""
+        with np.errstate(all="ignore"):
+            r, jacobian = residuals(trial, rows)
+            new = np.einsum("ij,ij->i", r, r)
+            better = new < cost[rows]
+            if not better.any():
+                return better
+            J = jacobian(np.flatnonzero(better))
+        finite = np.isfinite(J).all((1, 2))
+        better[better] = finite
+        own, J = rows[better], J[finite]
+        x[own], cost[own] = trial[better], new[better]
+        square = np.zeros((len(own), q + 1, q + 1))
+        stacked = np.concatenate([J, r[better, :, None]], axis=2)
+        corner = np.asarray(np.linalg.qr(stacked, mode="r"))
+        square[:, : corner.shape[1]] = corner
+        R[own], c[own] = square[:, :q, :q], square[:, :q, q]
+        S[own] = np.maximum(S[own], np.linalg.norm(R[own], axis=1))
+        slope = (c[own, None] @ R[own])[:, 0]
+        held = ((x[own] <= lower) & (slope > 0)) | ((x[own] >= upper) & (slope < 0))
+        unit = np.where(held, 0.0, 1.0 / np.where(S[own] > 0, S[own], 1.0))
+        U, s[own], Vt = np.linalg.svd(R[own] * unit[:, None])
+        b[own], W[own] = (c[own, None] @ U)[:, 0], Vt * unit[:, None]
+        return better
+
+    move(np.arange(k), x.copy())
+    active, idle = np.isfinite(cost) & (cost > exact) & (q > 0), np.zeros(k, int)
+    for _ in range(max_iter):
+        rows = np.flatnonzero(active)
+        if len(rows) == 0 or (enough is not None and (cost <= exact).sum() >= enough):
+            break
+        level = damping[rows, None]
+        d = -((b[rows] * s[rows] / (s[rows] ** 2 + level))[:, None] @ W[rows])[:, 0]
+        d *= np.minimum(1.0, longest / np.maximum(np.abs(d).max(1), 1e-300))[:, None]
+        trial = np.clip(x[rows] + d, lower, upper)
+        left = c[rows] + (R[rows] @ (trial - x[rows])[:, :, None])[:, :, 0]
+        promised = np.sum(c[rows] ** 2 - left**2, axis=1)
+        before = cost[rows]
+        # a step that a bound cuts off may promise nothing where a shorter one does
+        hopeful = (promised > _NOISE * before) | (trial != x[rows] + d).any(1)
+        hopeful &= damping[rows] < _LARGEST_DAMPING
+        active[rows[~hopeful]] = False
+        rows, before, promised = rows[hopeful], before[hopeful], promised[hopeful]
+        if len(rows) == 0:
+            break
+        better = move(rows, trial[hopeful])
+        fall = before - cost[rows]
+        good = np.where(fall > _AS_PROMISED * np.abs(promised), _LESS, 1.0)
+        damping[rows] *= np.where(better, good, _MORE)
+        damping[rows] = np.maximum(damping[rows], _LEAST_DAMPING)
+        slow = better & (fall <= tol * before)
+        idle[rows] = np.where(better & ~slow, 0, idle[rows] + slow)
+        active[rows] = (idle[rows] < patience) & (cost[rows] > exact)
+    return Minima(x, cost)

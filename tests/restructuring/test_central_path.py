@@ -1,11 +1,14 @@
-"""The central path from least squares to the minimum of the H-infinity norm."""
+"""The barrier of the error, and the path from least squares to its minimum."""
 
 import numpy as np
 import pytest
 
+import lpvlearn.restructuring.central_path as barrier_module
 from lpvlearn import GrayBoxStructure, StateSpace
 from lpvlearn.restructuring.central_path import (
+    Barrier,
     central_path,
+    level_of,
     search_grid,
     trust_region_step,
 )
@@ -13,19 +16,81 @@ from lpvlearn.restructuring.error_system import ErrorSystem
 from lpvlearn.restructuring.least_squares import fit_frequency_response
 from lpvlearn.restructuring.limits import Limits
 from lpvlearn.restructuring.measured import MeasuredErrorSystem
-from lpvlearn.restructuring.transfer import Target
+
+from .conftest import SYSTEMS, stable_model, system_of, target_of
 
 
-def target_of(model):
-    return Target(model.A, model.B, model.C, model.D, model.sampling_time)
+@pytest.mark.parametrize("case", SYSTEMS, ids=str)
+@pytest.mark.parametrize("mu", [0.3, 1e-3])
+def test_the_quadratic_is_that_of_the_value_along_geodesics(case, mu, monkeypatch):
+    # the second derivatives of the poles are left out, and with them the barrier here
+    monkeypatch.setattr(barrier_module, "_BARRIER", 0.0)
+    system, theta = system_of(**case)
+    peaks = system.peaks(theta, 0.5)
+    omega = np.union1d(search_grid(system), peaks.frequencies)
+    barrier = Barrier(system, Limits(system, 0.01), omega, 1e-2 * peaks.norm)
+    model = barrier.quadratic(theta, mu)
+    assert np.isclose(model.value, barrier.value(theta, mu), rtol=1e-12)
+    rng, h = np.random.default_rng(0), 1e-3
+    for _ in range(3):
+        d = rng.normal(size=len(theta))
+        d /= np.linalg.norm(d)
+        a = model.geometry.acceleration(d)
+        up, down = (
+            barrier.value(theta + model.geometry.T @ (s * h * d + 0.5 * h * h * a), mu)
+            for s in (1, -1)
+        )
+        slope, bend = (up - down) / (2 * h), (up - 2 * model.value + down) / h**2
+        top = np.linalg.norm(model.hessian, 2)
+        steepest = np.linalg.norm(model.gradient)
+        assert np.isclose(model.gradient @ d, slope, rtol=1e-3, atol=1e-4 * steepest)
+        assert np.isclose(d @ model.hessian @ d, bend, rtol=1e-3, atol=1e-3 * top)
 
 
-def stable_model(rng, order, n_inputs, n_outputs, dt=None):
-    A = rng.normal(size=(order, order))
-    A -= (np.linalg.eigvals(A).real.max() + 0.5) * np.eye(order)
-    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
-    model = StateSpace(A, B, C)
-    return model if dt is None else model.to_discrete(dt)
+@pytest.mark.parametrize("case", SYSTEMS, ids=str)
+def test_drift_is_the_derivative_of_the_gradient_by_mu(case):
+    system, theta = system_of(**case)
+    barrier = Barrier(system, Limits(system, 0.01), search_grid(system), 0.1)
+    mu, h = 1e-2, 1e-7
+    up, down = (barrier.quadratic(theta, mu + s * h).gradient for s in (1, -1))
+    drift = barrier.quadratic(theta, mu).drift
+    assert np.allclose(drift, (up - down) / (2 * h), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("mu", [1e4, 1.0, 1e-3, 1e-9])
+def test_level_solves_its_equation(mu):
+    s = np.random.default_rng(1).exponential(size=50)
+    tau = level_of(s, mu)
+    assert np.isclose(2 * mu * np.sum(s / (tau - s)), 1.0, rtol=1e-6)
+    assert tau > s.max()
+
+
+def test_for_a_large_mu_psi_is_the_sum_of_squares():
+    system, theta = system_of((2, 2))
+    limits, omega, mu = Limits(system, 0.01), search_grid(system), 1e6
+    E = system.response(theta, omega) - system.target_response(omega)
+    c = limits.rows(theta)[0]
+    logarithms = -1e-2 * mu * np.log(-c).sum()
+    expected = 0.5 * np.log(2 * mu * np.sum(np.abs(E) ** 2)) + 0.5
+    value = Barrier(system, limits, omega, 1.0).value(theta, mu)
+    assert np.isclose(value - logarithms, expected, rtol=1e-3)
+
+
+def test_a_resonance_between_the_frequencies_is_not_passed_over():
+    """A mode of damping 1e-4 rises between two frequencies that do not see it."""
+    structure = GrayBoxStructure.from_template(
+        [[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]]
+    )
+    model = StateSpace([[0, 1], [-4, -0.4]], [[0], [1]], [[1, 0]])
+    system = ErrorSystem(structure, target_of(model))
+    barrier = Barrier(system, Limits(system, 1e-6), np.array([0.5, 1.0, 3.0]), 1.0)
+    names = structure.parameter_names
+    theta = np.array([{"k": 4.0, "c": 2e-4, "b": 1.0}[name] for name in names])
+    assert barrier.value(theta, 1e-3) == np.inf
+    assert np.allclose(barrier.missed, 2.0, rtol=1e-6)
+    barrier.watch(np.append(barrier.omega, barrier.missed))
+    assert np.isfinite(barrier.value(theta, 1e-3))
+    assert barrier.missed.size == 0
 
 
 def test_the_path_of_a_gain_ends_at_its_chebyshev_approximation():

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from sklearn.exceptions import ConvergenceWarning
 
-from lpvlearn import GrayBoxStructure, StateSpace
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn.minimax import problem as minimax_problem
 from lpvlearn.restructuring.central_path import search_grid
 from lpvlearn.restructuring.coordinates import ResponseGeometry
 from lpvlearn.restructuring.error_system import ErrorSystem
@@ -78,3 +80,18 @@ def test_curves_leave_in_the_direction_of_the_step():
     for h in (1e-3, 1e-4):
         off = np.linalg.norm(curve.step(h * d) - h * d)
         assert off <= 2 * h**2 * np.linalg.norm(d) ** 2 * len(d)
+
+
+@pytest.mark.parametrize("solver", ["sqp", "bundle"])
+def test_a_failed_quadratic_program_is_warned_about(solver, monkeypatch):
+    def infeasible(P, *_, **__):
+        return np.full(len(P), np.nan), np.nan, -1, {"lam": np.zeros(0)}
+
+    monkeypatch.setattr(minimax_problem.daqp, "solve", infeasible)
+    objective, _ = objective_of()
+    lag = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+    t = objective.system.target
+    box = StateSpace(t.A, t.B, t.C[:1])
+    with pytest.warns(ConvergenceWarning) as caught:
+        GrayBoxRestructurer(lag, solver=solver).fit_model(box)
+    assert any("quadratic program of a step had no" in str(w.message) for w in caught)

@@ -1,25 +1,64 @@
-"""Charts of the set of models, and canonical forms in their coordinates."""
+"""Geodesics of the response, charts of models, and canonical forms in them."""
 
 import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.coordinates import CanonicalForm, LocalChart, view_at
+from lpvlearn.restructuring.central_path import search_grid
+from lpvlearn.restructuring.coordinates import (
+    CanonicalForm,
+    LocalChart,
+    ResponseGeometry,
+    view_at,
+)
 from lpvlearn.restructuring.error_system import ErrorSystem
 from lpvlearn.restructuring.limits import Limits
-from lpvlearn.restructuring.transfer import Target
+
+from .conftest import SYSTEMS, stable_model, system_of, target_of
 
 
-def stable_model(rng, order, n_inputs, n_outputs, dt=None, rate=1.0):
-    A = rng.normal(size=(order, order))
-    A -= (np.linalg.eigvals(A).real.max() + 0.5) * np.eye(order)
-    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
-    model = StateSpace(rate * A, rate * B, C)
-    return model if dt is None else model.to_discrete(dt)
+def weighted_response(system, theta, omega):
+    """The response as one real vector, its norm the root mean square."""
+    G = system.weight_response(omega)[0] @ system.response(theta, omega)
+    return np.concatenate([G.real.ravel(), G.imag.ravel()]) / np.sqrt(len(omega))
 
 
-def target_of(model):
-    return Target(model.A, model.B, model.C, model.D, model.sampling_time)
+@pytest.mark.parametrize("case", SYSTEMS, ids=str)
+def test_a_unit_step_changes_the_response_by_the_given_size(case):
+    system, theta = system_of(**case)
+    omega = search_grid(system)
+    geometry = ResponseGeometry(system, theta, omega, 1e-5)
+    assert np.allclose(geometry.T @ geometry.inverse, np.eye(len(theta)), atol=1e-9)
+    here = weighted_response(system, theta, omega)
+    changes = [
+        np.linalg.norm(weighted_response(system, theta + step, omega) - here)
+        for step in geometry.T.T
+    ]
+    assert np.allclose(changes, 1e-5, rtol=1e-2)
+
+
+@pytest.mark.parametrize("case", SYSTEMS, ids=str)
+def test_the_response_turns_away_from_its_tangent_along_a_geodesic(case):
+    """G'' along ``theta + T (h d + h^2 a / 2)`` has no tangential part."""
+    system, theta = system_of(**case)
+    omega = search_grid(system)
+    size = np.linalg.norm(weighted_response(system, theta, omega))
+    geometry = ResponseGeometry(system, theta, omega, 0.1 * size)
+    rng, h = np.random.default_rng(1), 1e-3
+
+    def along(d, a, h):
+        return weighted_response(
+            system, theta + geometry.T @ (h * d + 0.5 * h * h * a), omega
+        )
+
+    for _ in range(3):
+        d = rng.normal(size=len(theta))
+        a = geometry.acceleration(d)
+        tangential = []
+        for bend in (0 * a, a):
+            second = along(d, bend, h) - 2 * along(d, bend, 0) + along(d, bend, -h)
+            tangential.append(np.linalg.norm(geometry._J.T @ second) / h**2)
+        assert tangential[1] < 1e-3 * tangential[0]
 
 
 def matrix_of(model):

@@ -1,0 +1,52 @@
+"""Levenberg-Marquardt from a stack of starts."""
+
+import numpy as np
+import pytest
+
+from lpvlearn.systems.least_squares import levenberg_marquardt
+
+
+def rosenbrock(x, _):
+    r = np.stack([10.0 * (x[:, 1] - x[:, 0] ** 2), 1.0 - x[:, 0]], axis=1)
+
+    def jacobian(kept):
+        J = np.zeros((len(kept), 2, 2))
+        J[:, 0, 0], J[:, 0, 1], J[:, 1, 0] = -20.0 * x[kept, 0], 10.0, -1.0
+        return J
+
+    r[x[:, 0] < -1.5] = np.nan  # not admissible
+    return r, jacobian
+
+
+def test_every_start_reaches_the_minimum_as_it_does_alone():
+    starts = np.array([[-1.2, 1.0], [0.0, 0.0], [3.0, -2.0], [-2.0, 0.0]])
+    x, cost = levenberg_marquardt(rosenbrock, starts, max_iter=200, tol=1e-12)
+    assert np.allclose(x[:3], 1.0, atol=1e-8)
+    assert cost[:3].max() < 1e-16
+    assert cost[3] == np.inf and (x[3] == starts[3]).all()
+    for k, start in enumerate(starts):
+        alone = levenberg_marquardt(rosenbrock, start[None], max_iter=200, tol=1e-12)
+        assert np.allclose(alone.x[0], x[k], rtol=1e-12)
+
+
+def test_bounds_hold_and_the_gradient_presses_against_them():
+    x, cost = levenberg_marquardt(
+        rosenbrock, np.zeros((1, 2)), upper=np.array([0.5, 9.0]), max_iter=200
+    )
+    assert np.allclose(x, [[0.5, 0.25]], atol=1e-6)
+    assert np.isclose(cost[0], 0.25)
+
+
+@pytest.mark.parametrize("enough", [1, 2])
+def test_enough_exact_starts_end_all(enough):
+    starts = np.array([[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]])
+    x, cost = levenberg_marquardt(rosenbrock, starts, exact=1e-20, enough=enough)
+    assert (x[2] == 0.0).all() and cost[2] == 1.0
+
+
+def test_parameters_without_effect_stay():
+    def residuals(x, _):
+        return x[:, :1] - 2.0, lambda kept: np.tile([[[1.0, 0.0]]], (len(kept), 1, 1))
+
+    x, _ = levenberg_marquardt(residuals, np.array([[0.0, 7.0]]), max_iter=50)
+    assert np.allclose(x, [[2.0, 7.0]])
