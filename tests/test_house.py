@@ -1,0 +1,122 @@
+"""The house stands: no import upward, scikit-learn only where estimators live."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import lpvlearn
+
+ROOT = Path(lpvlearn.__file__).parent
+
+# From the ground up: a room (a package, or a file at the top) imports from the floors
+# below its own only.
+FLOORS = (
+    ("exceptions", "minimax", "systems", "validation"),
+    ("data", "models"),
+    ("model_selection", "structures", "subspace"),
+    ("datasets", "lpv", "restructuring"),
+    ("metrics",),
+    ("inspection", "pipeline"),
+    ("__init__",),
+    ("paper",),
+    ("__main__",),
+)
+
+# Whatever speaks scikit-learn's language; the mathematics does without.
+SPEAKS_SKLEARN = (
+    "data/*",
+    "*/estimator.py",
+    "lpv/polynomial.py",
+    "metrics/*",
+    "pipeline/*",
+    "model_selection.py",
+    "inspection/parameters.py",
+    "datasets/*",
+    "paper/*",
+)
+
+FILES = sorted(ROOT.rglob("*.py"))
+
+
+def room_of(path: Path) -> str:
+    """The package of a file, or the file itself at the top."""
+    parts = path.relative_to(ROOT).parts
+    return parts[0] if len(parts) > 1 else path.stem
+
+
+def imports_of(path: Path):
+    """Import statements of a file, those within functions too."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return [n for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom)]
+
+
+def imported_rooms(path: Path) -> set[str]:
+    """Rooms of this library that a file imports, its own left out."""
+    depth = len(path.relative_to(ROOT).parts) - 1
+    rooms = set()
+    for node in imports_of(path):
+        if isinstance(node, ast.ImportFrom) and node.level == depth + 1:
+            if node.module is not None:
+                rooms.add(node.module.split(".")[0])
+                continue
+            for name in node.names:  # from .. import X: a room, or the public face
+                room = ROOT / name.name
+                is_room = room.is_dir() or room.with_suffix(".py").is_file()
+                rooms.add(name.name if is_room else "__init__")
+    return rooms - {room_of(path)}
+
+
+def arrows() -> set[tuple[str, str]]:
+    return {(room_of(path), room) for path in FILES for room in imported_rooms(path)}
+
+
+def test_every_room_has_a_floor():
+    placed = [room for floor in FLOORS for room in floor]
+    assert sorted(placed) == sorted({room_of(path) for path in FILES})
+
+
+def test_no_import_runs_upward():
+    floor = {room: i for i, rooms in enumerate(FLOORS) for room in rooms}
+    assert [pair for pair in sorted(arrows()) if floor[pair[0]] <= floor[pair[1]]] == []
+
+
+def test_the_house_is_small_enough_to_be_seen_at_once():
+    assert sum(len(rooms) for rooms in FLOORS) <= 20
+    assert len(FLOORS) <= 9
+    assert len(arrows()) <= 60
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_are_relative_and_rooms_bear_plain_names(path):
+    for node in imports_of(path):
+        names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        names += [alias.name for alias in node.names]
+        level = getattr(node, "level", 0)
+        assert level or not any(name.split(".")[0] == "lpvlearn" for name in names)
+    assert path.stem.startswith("__") or not path.stem.startswith("_")
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_scikit_learn_stays_with_the_estimators(path):
+    speaks = any(path.relative_to(ROOT).match(pattern) for pattern in SPEAKS_SKLEARN)
+    modules = {getattr(node, "module", None) or "" for node in imports_of(path)}
+    modules |= {a.name for node in imports_of(path) for a in node.names}
+    assert speaks or not any(name.split(".")[0] == "sklearn" for name in modules)
+
+
+def test_packages_hand_on_what_they_list():
+    for package in (p for p in ROOT.iterdir() if (p / "__init__.py").is_file()):
+        tree = ast.parse((package / "__init__.py").read_text(encoding="utf-8"))
+        handed = {
+            alias.asname or alias.name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        listed = [
+            ast.literal_eval(node.value)
+            for node in tree.body
+            if isinstance(node, ast.Assign) and node.targets[0].id == "__all__"
+        ]
+        assert handed == set(listed[0] if listed else ()), package.name
