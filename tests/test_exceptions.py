@@ -44,7 +44,9 @@ def test_called_by_another_library_its_call_is_named():
 
 
 def test_predictions_outside_of_the_range_name_the_caller():
-    model = PolynomialLPV(1, extrapolation="warn").fit([[0.0], [1.0], [2.0]], [0.0, 1.0, 2.0])
+    model = PolynomialLPV(1, extrapolation="warn").fit(
+        [[0.0], [1.0], [2.0]], [0.0, 1.0, 2.0]
+    )
     with pytest.warns(ExtrapolationWarning) as caught:
         model.predict([[3.0]])
     assert [w.filename for w in caught] == [__file__]
