@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
 from ..models.statespace import StateSpace
-from ..structures.map import RowsMap
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
 from .error_system import ErrorSystem
@@ -123,16 +122,14 @@ def problem_from_models(
     structure = _structure_for(structure, first)
     p, dt = structure.n_outputs, first.sampling_time
     for model in models:
-        own = (model.n_outputs, model.n_inputs, model.sampling_time)
+        own = (*model.D.shape, model.sampling_time)
         if own != (p, structure.n_inputs, dt):
             raise ValueError(
                 f"`structure` has {p} outputs and {structure.n_inputs} inputs, `model` "
                 f"has {own[0]} and {own[1]} (sampling time {own[2]}). They must agree."
             )
-    free = structure.free_feedthrough
-    fixed = structure.matrices(structure.reference)[3]
     boxes = [
-        Target(m.A, m.B, m.C, np.where(free, m.D, fixed), m.sampling_time)
+        Target(m.A, m.B, m.C, structure.feedthrough_of(m.D), m.sampling_time)
         for m in models
     ]
     filter_ = _weight_model(weight, p, dt)
@@ -141,8 +138,10 @@ def problem_from_models(
         behind = Target(filter_.A, filter_.B, filter_.C, filter_.D, dt)
         if behind.D.shape != (1, 1):  # one for every black box
             behind = behind.repeated(len(boxes))
-    target = _stacked(boxes) if len(boxes) > 1 else boxes[0]
-    system = ErrorSystem(_repeated_outputs(structure, len(boxes)), target, behind)
+    target, matched = boxes[0], structure
+    if len(boxes) > 1:
+        target, matched = _stacked(boxes), structure.with_stacked_outputs(len(boxes))
+    system = ErrorSystem(matched, target, behind)
     omega, margin = grid_and_margin(target)
     bound = 0.0
     if len(models) == 1 and filter_ is None and first.order > structure.order:
@@ -184,17 +183,6 @@ def _structure_for(
             f"{type(structure).__name__}."
         )
     return structure
-
-
-def _repeated_outputs(structure: GrayBoxStructure, copies: int) -> GrayBoxStructure:
-    """The structure with its outputs once for each of several black boxes."""
-    if copies == 1:
-        return structure
-    states, outputs = np.split(np.arange(structure.map.shape[0]), [structure.order])
-    rows = np.concatenate([states, np.tile(outputs, copies)])
-    return GrayBoxStructure(
-        structure.order, RowsMap(structure.map, rows), structure.domain
-    )
 
 
 def _stacked(boxes: Sequence[Target]) -> Target:

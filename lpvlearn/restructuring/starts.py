@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_random_state
 
-from ..structures.domain import drawn_around
 from ..structures.map import AffineMap
 from ..structures.mechanical import ImplicitMap
-from ..structures.structure import GrayBoxStructure
+from ..structures.structure import GrayBoxStructure, drawn_around
 from ..systems.balancing import balancing_transformation
 from .continuation import continued_fits
 from .least_squares import LeastSquaresResult, channel_scaling, frequency_grid
