@@ -2,7 +2,8 @@
 
 That is the norm of the weighted error ``W (G(theta) - G0)``, Eq. (6), where ``G0`` is
 one black-box model, several ones of an operating point with their outputs below each
-other, or a measured frequency response.
+other, or a measured frequency response. What a response tells of the parameters follows
+from its derivative J: which ones, by its rank; and to first order how exactly.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, qr
 
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
@@ -22,6 +23,7 @@ from ..systems.hinf_norm import hinf_norm
 from .error_system import ErrorSystem
 from .least_squares import (
     LeastSquaresResult,
+    channel_scaling,
     fit_frequency_response,
     grid_and_margin,
 )
@@ -30,45 +32,37 @@ from .measured import MeasuredErrorSystem, read_frequency_data, realize_response
 from .transfer import Target, series
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
 
 FrequencyWeight = StateSpace | Sequence[float | None] | None
+
+GOOD_FIT = 3e-3  # relative least-squares error that no wrong basin comes down to
+
+_SAME = 1e-6  # relative distance of candidates that would end in the same fit
 
 # A measured response does not tell how slowly modes may decay: they must be stable, by
 # a rate that no response down to the lowest frequency could show.
 _LEAST_DECAY = 1e-4
 
+# Singular values smaller than that part of the largest are rounding: responses and
+# their derivatives are exact to about 1e-13, behind resolvents less so.
+_RANK_TOLERANCE = 1e-9
+
+_NAMED = 0.1  # smaller parts of an undetermined combination would only clutter its name
+
 
 @dataclass(frozen=True, eq=False)
 class RestructuringProblem:
-    """A structure beside what it shall match.
-
-    Attributes
-    ----------
-    structure : GrayBoxStructure
-    system : ErrorSystem
-    box : Target or None
-        One black-box model, from which similarity transformations start.
-    omega : ndarray of shape (k,)
-        Frequencies of the least-squares fit, rad/s.
-    margin : float
-        Stability margin, 1/s.
-    reference : float
-        H-infinity norm of the weighted black box.
-    dropped_feedthrough : ndarray of shape (n_outputs, n_inputs)
-    lower_bound : float
-        No parameters have a smaller error.
-    """
+    """A structure beside what it shall match."""
 
     structure: GrayBoxStructure
     system: ErrorSystem
-    box: Target | None
-    omega: Array
-    margin: float
-    reference: float
-    dropped_feedthrough: Array
-    lower_bound: float
+    box: Target | None  # one black box, from which similarity transformations start
+    omega: Array  # (k,) frequencies of the least-squares fit, rad/s
+    margin: float  # stability margin, 1/s
+    reference: float  # H-infinity norm of the weighted black box
+    dropped_feedthrough: Array  # (n_outputs, n_inputs)
+    lower_bound: float  # no parameters have a smaller error
 
     @cached_property
     def response(self) -> Complex:
@@ -76,9 +70,12 @@ class RestructuringProblem:
         return self.system.target_response(self.omega)
 
     @cached_property
-    def weighted_response(self) -> Complex:
-        """The black box behind the weight."""
-        return self.system.weight_response(self.omega)[0] @ self.response
+    def _weighted(self) -> tuple[Complex, Complex, float]:
+        """The weight, the black box behind it, and its root mean square."""
+        W = self.system.weight_response(self.omega)[0]
+        G = W @ self.response
+        square = np.mean(np.sum(np.abs(G) ** 2, axis=(1, 2)))
+        return W, G, max(float(np.sqrt(square)), 1e-300)
 
     def is_stable(self, theta: Array) -> bool:
         """Whether parameters give a model that keeps the stability margin."""
@@ -88,7 +85,7 @@ class RestructuringProblem:
         self, theta: Array, scaling: Array | float = 1.0
     ) -> LeastSquaresResult | None:
         """Least-squares fit of the response from given parameters; None if unstable."""
-        return fit_frequency_response(
+        fit = fit_frequency_response(
             self.system,
             theta,
             self.omega,
@@ -96,11 +93,100 @@ class RestructuringProblem:
             admissible=self.is_stable,
             scaling=scaling,
         )
+        if fit is None:
+            return None
+        error = float(np.sqrt(fit.cost)) / self._weighted[2]
+        return fit._replace(relative_error=error)
 
-    def relative_error(self, fit: LeastSquaresResult) -> float:
-        """Root-mean-square error of a fit over frequency, relative to the black box."""
-        square = np.mean(np.sum(np.abs(self.weighted_response) ** 2, axis=(1, 2)))
-        return float(np.sqrt(fit.cost)) / max(float(np.sqrt(square)), 1e-300)
+    def best_fits(self, candidates: Array, n_fits: int) -> list[LeastSquaresResult]:
+        """Least-squares fits from the best distinct candidates, until one is good.
+
+        They are ranked by the error of their response, not of their parameters.
+        """
+        system, structure = self.system, self.structure
+        candidates = np.clip(candidates, structure.lower, structure.upper)
+        usable = [theta for theta in candidates if self.is_stable(theta)]
+        if not usable:
+            return []
+        W, weighted, _ = self._weighted
+        scaling = channel_scaling(weighted)
+        scale = 1.0 if scaling is None else scaling
+        errors = [
+            np.linalg.norm(
+                scale * (W @ (system.response(theta, self.omega) - self.response))
+            )
+            for theta in usable
+        ]
+        thetas = _distinct(np.array(usable)[np.argsort(errors, kind="stable")])
+        fits = []
+        for theta in thetas[:n_fits]:
+            if scaling is not None:  # all channels alike first, then as they are
+                first = self.fit(theta, scaling)
+                theta = theta if first is None else first.x
+            fit = self.fit(theta)
+            if fit is None:
+                continue
+            fits.append(fit)
+            if fit.relative_error <= GOOD_FIT:
+                break
+        return fits
+
+    def identifiability(self, theta: Array) -> Identifiability:
+        """Which parameters the response determines."""
+        J = self.system.response_jacobian(theta, self.omega)[1]
+        scaling = channel_scaling(self.response)
+        if scaling is not None:  # a faint channel tells parameters, too
+            J = J * scaling[..., None]
+        return Identifiability.from_jacobian(J, self.structure.parameter_names)
+
+    def parameter_changes(self, theta: Array, dG: Complex) -> Array:
+        """First-order changes of the parameters with the black box's response.
+
+        Minimising the weighted mean square error, ``d theta = Re(K dG)`` with
+        ``K = (J^T J)^-1 J^H W`` in real arithmetic. `dG` (r, k, n_outputs, n_inputs)
+        are changes of the response; several black boxes change alike.
+        """
+        W = self._weighted[0]
+        J = self.system.response_jacobian(theta, self.omega)[1]
+        WJ = np.einsum("kpq,kqmj->kpmj", W, J)
+        flat = WJ.reshape(-1, J.shape[-1])
+        inverse = np.linalg.pinv(np.vstack([flat.real, flat.imag]))
+        real, imaginary = np.split(inverse, 2, axis=1)
+        K = (real + 1j * imaginary).reshape(-1, *WJ.shape[:-1])
+        K = np.einsum("jkpm,kpq->jkqm", K, W.conj())
+        if K.shape[2] != dG.shape[2]:  # several black boxes were stacked
+            K = K.reshape(*K.shape[:2], -1, *dG.shape[2:]).sum(2)
+        return np.asarray(np.einsum("jkpm,rkpm->rj", K.conj(), dG).real)
+
+    def spread_covariance(self, theta: Array, models: Sequence[StateSpace]) -> Array:
+        """Covariance of the parameters of an averaged model from single realizations.
+
+        Every realization's response is carried to the parameters to first order; the
+        covariance of their mean is that of one divided by their number.
+
+        Raises
+        ------
+        ValueError
+            If there are fewer than two realizations.
+        """
+        if len(models) < 2:
+            raise ValueError(
+                "`realizations` must be at least 2 models to have a spread. Got "
+                f"{len(models)}."
+            )
+        G = np.array([model.frequency_response(self.omega) for model in models])
+        changes = self.parameter_changes(theta, G - G.mean(0))
+        return np.cov(changes.T, ddof=1).reshape(len(theta), -1) / len(G)
+
+
+def _distinct(thetas: Array) -> Array:
+    """The rows that differ from all rows before them."""
+    kept: list[Array] = []
+    for theta in thetas:
+        least = _SAME * np.linalg.norm(theta)
+        if all(np.linalg.norm(theta - other) > least for other in kept):
+            kept.append(theta)
+    return np.array(kept)
 
 
 def problem_from_models(
@@ -144,7 +230,7 @@ def problem_from_models(
     system = ErrorSystem(matched, target, behind)
     omega, margin = grid_and_margin(target)
     bound = 0.0
-    if len(models) == 1 and filter_ is None and first.order > structure.order:
+    if len(models) == 1 and filter_ is None and len(first.A) > structure.order:
         bound = float(first.hankel_singular_values()[structure.order])
     return RestructuringProblem(
         structure,
@@ -307,3 +393,93 @@ def _band(edges: Any) -> StateSpace:
     if np.isfinite(high):
         parts = series(*parts, Target(-high * one, high * one, one, 0.0 * one))
     return StateSpace(*parts)
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """Rank analysis of the derivative of the response to the parameters.
+
+    Attributes
+    ----------
+    rank : int
+        Number of parameter combinations that the response determines.
+    n_params : int
+    condition : float
+        Largest over smallest singular value; relative errors of the response grow into
+        the parameters by up to this factor. Infinite or huge if the rank is deficient.
+    directions : tuple of dict
+        One for every undetermined combination: change by parameter name, in steps that
+        have the same effect on the response, the largest 1; below 0.1 it is left out.
+    """
+
+    rank: int
+    n_params: int
+    condition: float
+    directions: tuple[dict[str, float], ...]
+
+    def __str__(self) -> str:
+        if not self.directions:
+            return (
+                f"all {self.n_params} parameters are identifiable "
+                f"(condition {self.condition:.2g})."
+            )
+        parts = [
+            " ".join(f"{value:+.2g} {name}" for name, value in direction.items())
+            for direction in self.directions
+        ]
+        return (
+            f"the response determines {self.rank} of the {self.n_params} parameters. "
+            f"It does not change along: {'; '.join(parts)} (in steps of equal effect). "
+            "Fix a parameter of each combination in the template."
+        )
+
+    @classmethod
+    def from_jacobian(cls, J: Complex, names: Sequence[str]) -> Identifiability:
+        """Analysis of the response Jacobian, (n_freq, n_outputs, n_inputs, n_params).
+
+        Every column is divided by its norm: the analysis does not depend on the units
+        of the parameters, nor on parameters that happen to be zero.
+
+        Examples
+        --------
+        The gain ``b c`` of a response does not tell ``b`` from ``c``:
+
+        >>> J = np.array([[[[2.0 + 0j, 3.0]]]])  # at b = 3, c = 2
+        >>> found = Identifiability.from_jacobian(J, ["b", "c"])
+        >>> found.rank, found.directions
+        (1, ({'b': 1.0, 'c': -1.0},))
+        """
+        n = J.shape[-1]
+        flat = J.reshape(int(np.prod(J.shape[:-1])), n)
+        # Rows of zeros: few frequencies must not hide undetermined combinations.
+        columns = np.vstack([flat.real, flat.imag, np.zeros((n, n))])
+        effect = np.linalg.norm(columns, axis=0)
+        columns = columns / np.where(effect > 0, effect, 1.0)
+        _, s, Vt = np.linalg.svd(columns, full_matrices=False)
+        top = float(s.max(initial=0.0))
+        rank = int((s > _RANK_TOLERANCE * top).sum())
+        directions = tuple(
+            {
+                name: float(value)
+                for name, value in zip(names, row, strict=True)
+                if abs(value) > _NAMED
+            }
+            for row in _sparse_rows(Vt[rank:])
+        )
+        low = float(s.min(initial=top))
+        condition = top / low if low > 0 else np.inf
+        return cls(rank, n, condition, directions)
+
+
+def _sparse_rows(null: Array) -> Array:
+    """Basis of the row space, each row with one entry of its own, largest entry 1.
+
+    Combinations that have nothing to do with one another come apart; an orthonormal
+    basis would mix them.
+    """
+    if len(null) == 0:
+        return null
+    own = qr(null, mode="r", pivoting=True)[1][: len(null)]
+    rows = np.linalg.solve(null[:, own], null)
+    largest = np.take_along_axis(rows, np.abs(rows).argmax(1)[:, None], 1)
+    return (rows / largest).round(12) + 0.0
