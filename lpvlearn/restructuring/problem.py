@@ -163,11 +163,6 @@ class RestructuringProblem:
 
         Every realization's response is carried to the parameters to first order; the
         covariance of their mean is that of one divided by their number.
-
-        Raises
-        ------
-        ValueError
-            If there are fewer than two realizations.
         """
         if len(models) < 2:
             raise ValueError(
@@ -196,11 +191,6 @@ def problem_from_models(
 
     The feedthrough of the black boxes is left out where the structure has none,
     as in Eq. (4). Several models are stacked.
-
-    Raises
-    ------
-    ValueError
-        If a model is unstable, or the shapes or time domains do not fit.
     """
     for model in models:
         _check_model(model)
@@ -293,13 +283,7 @@ def problem_from_response(
     weight: Any,
     sample_weight: ArrayLike | None,
 ) -> RestructuringProblem:
-    """Match a measured frequency response over its frequencies.
-
-    Raises
-    ------
-    ValueError
-        If there is no structure, or the table does not fit it.
-    """
+    """Match a measured frequency response over its frequencies."""
     if not isinstance(structure, GrayBoxStructure):
         raise ValueError(
             "`structure` must be given to fit a frequency response, which does not "
@@ -337,13 +321,7 @@ def problem_from_response(
 def _weight_model(
     weight: Any, n_outputs: int, sampling_time: float | None
 ) -> StateSpace | None:
-    """The `frequency_weight`, model or band, in the time domain of the black boxes.
-
-    Raises
-    ------
-    ValueError
-        If the weight is unstable, or does not fit the outputs or the time domain.
-    """
+    """The `frequency_weight`, model or band, in the time domain of the black boxes."""
     if weight is None:
         return None
     if not isinstance(weight, StateSpace):

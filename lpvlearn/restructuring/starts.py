@@ -82,12 +82,6 @@ def search(
     stability margin is given up.
 
     The options are those of `GrayBoxRestructurer`; further candidates may be `given`.
-    Every search begins with a generator of the `seed`.
-
-    Raises
-    ------
-    ValueError
-        If no stable starting point is found.
     """
     guess = None if isinstance(init, str) else problem.structure.check_params(init)
     for share in (1.0, _LEAST_MARGIN):

@@ -407,7 +407,6 @@ class GrayBoxStructure:
 
         Examples
         --------
-        >>> from lpvlearn import GrayBoxStructure
         >>> structure = GrayBoxStructure.observable_canonical(1)
         >>> structure.with_bounds({"a1_1": (None, 0)}).upper
         array([ 0., inf])
@@ -446,7 +445,6 @@ class GrayBoxStructure:
 
         Examples
         --------
-        >>> from lpvlearn import GrayBoxStructure
         >>> structure = GrayBoxStructure.observable_canonical(1)
         >>> structure.with_ranges({"b1_1": (1, 100)}).ranges
         array([[ nan,   1.],
@@ -483,7 +481,6 @@ class GrayBoxStructure:
 
         Examples
         --------
-        >>> from lpvlearn import GrayBoxStructure
         >>> structure = GrayBoxStructure.from_template(
         ...     A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]])
         >>> fixed = structure.fix({"b": 2.0})
@@ -604,7 +601,6 @@ class GrayBoxStructure:
 
         Examples
         --------
-        >>> from lpvlearn import GrayBoxStructure
         >>> structure = GrayBoxStructure.observable_canonical(1)
         >>> rng = np.random.default_rng(0)
         >>> structure.draw(5, rng) is None
