@@ -43,9 +43,7 @@ Array = NDArray[np.float64]
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows in plots
 
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
-
 _PROVEN = 1e-8  # an error that much above its lower bound, its rounding, is optimal
-
 _ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
 
 
@@ -325,13 +323,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
     def _restructure(self, problem: RestructuringProblem, given: list[Array]) -> None:
         """Starts and their least-squares fits, minimisation, certificates, warnings."""
         self.__dict__.pop("params_covariance_", None)  # of an earlier fit
-        problem, fits = search(
-            problem,
-            init=self.init,
-            n_starts=self.n_starts,
-            given=given,
-            seed=check_random_state(self.random_state).randint(2**31),
-        )
+        seed = check_random_state(self.random_state).randint(2**31)
+        problem, fits = search(problem, self.init, self.n_starts, given, seed)
         errors = [fit.relative_error for fit in fits]
         self.starts_ = pd.DataFrame({"relative_error": errors})
         self.fit_error_, self.start_params_ = errors[0], fits[0].x

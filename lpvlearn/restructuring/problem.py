@@ -37,8 +37,7 @@ Complex = NDArray[np.complex128]
 FrequencyWeight = StateSpace | Sequence[float | None] | None
 
 GOOD_FIT = 3e-3  # relative least-squares error that no wrong basin comes down to
-
-_SAME = 1e-6  # relative distance of candidates that would end in the same fit
+_DISTINCT = 1e-6  # relative distance of candidates that would end in the same fit
 
 # A measured response does not tell how slowly modes may decay: they must be stable, by
 # a rate that no response down to the lowest frequency could show.
@@ -178,7 +177,7 @@ def _distinct(thetas: Array) -> Array:
     """The rows that differ from all rows before them."""
     kept: list[Array] = []
     for theta in thetas:
-        least = _SAME * np.linalg.norm(theta)
+        least = _DISTINCT * np.linalg.norm(theta)
         if all(np.linalg.norm(theta - other) > least for other in kept):
             kept.append(theta)
     return np.array(kept)
@@ -218,6 +217,9 @@ def problem_from_models(
     if len(boxes) > 1:
         target, matched = _stacked(boxes), structure.with_stacked_outputs(len(boxes))
     system = ErrorSystem(matched, target, behind)
+    parts = (target.A, target.B, target.C, target.D)
+    if system.weight is not None:
+        parts = series(*parts, system.weight)
     omega, margin = grid_and_margin(target)
     bound = 0.0
     if len(models) == 1 and filter_ is None and len(first.A) > structure.order:
@@ -228,7 +230,7 @@ def problem_from_models(
         boxes[0],
         omega,
         margin,
-        _weighted_norm(system),
+        hinf_norm(*parts, dt=dt).norm,
         first.D - boxes[0].D,
         bound,
     )
@@ -266,14 +268,6 @@ def _stacked(boxes: Sequence[Target]) -> Target:
     A, C = block_diag(*(box.A for box in boxes)), block_diag(*(box.C for box in boxes))
     B, D = np.vstack([box.B for box in boxes]), np.vstack([box.D for box in boxes])
     return Target(A, B, C, D, boxes[0].dt)
-
-
-def _weighted_norm(system: ErrorSystem) -> float:
-    t = system.target
-    parts = (t.A, t.B, t.C, t.D)
-    if system.weight is not None:
-        parts = series(*parts, system.weight)
-    return hinf_norm(*parts, dt=t.dt).norm
 
 
 def problem_from_response(

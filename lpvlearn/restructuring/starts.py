@@ -34,7 +34,6 @@ _FAR_FIT = 0.1
 _ROUNDS = 3  # more starts; then a smoother response; then both, thoroughly
 
 _N_FITS = 3  # of a round, from the best candidates: their ranking is seldom far off
-
 _SAME = 1e-4  # relative difference of the costs of fits in one basin: they end at 1e-6
 
 # A structure slower than the black box lets expect is searched for with that part of
@@ -44,17 +43,11 @@ _LEAST_MARGIN = 1e-6
 _HOP_FIT = 0.03  # error of a fit so far off that better basins may lie beside its own
 
 _HOPS = (0.1, 0.3, 1.0) * 4  # sizes of the hops of logarithms: 10 %, to a factor of 3
-
 _HOP_RETURNS = 5  # to the fit itself, after which its basin counts as wide
-
 _HOP_ROUNDS = 4  # from ever better fits
-
 _HOP_GAIN = 1e-3  # relative decrease of the cost that is worth another round
-
 _FAINT = 0.03  # size of modes that only fill the order: seen, but hardly disturbing
-
 _FAST = 3.0  # decay of these modes, relative to the fastest: they are out of the way
-
 _SLOWEST = 1e-9  # poles smaller than that part of the largest are integrators
 
 # Starts at each time scale that are carried through a continuation: its steps cost as
@@ -70,7 +63,6 @@ _QUICK = {"shifts": (1.0, 0.2, 0.05, 0.0), "n_points": 18, "max_iter": 16}
 
 def search(
     problem: RestructuringProblem,
-    *,
     init: str | ArrayLike,
     n_starts: int,
     given: list[Array],

@@ -186,14 +186,6 @@ def numerical_jacobian(f: Callable[[Any], Any], theta: Array, typical: Array) ->
 
     Where it cannot take complex parameters, or is not analytic, it is that of central
     differences.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> numerical_jacobian(lambda t: np.array([t[0] * t[1], np.exp(t[0])]),
-    ...                    np.array([0.0, 3.0]), typical=np.ones(2))
-    array([[3., 1.],
-           [0., 0.]])
     """
     scale = _parameter_scale(theta, typical)
     exact = _analytic_jacobian(f, theta, scale)

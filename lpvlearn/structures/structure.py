@@ -35,7 +35,6 @@ Interval = Sequence[float | None]
 _SPREAD = 0.3  # standard deviation of log-parameters: a guess is right to a third
 
 _DECADE = 10.0  # a range that spans more tells an order of magnitude, not a value
-
 _LISTED = 8  # names that a message lists
 
 
@@ -573,12 +572,7 @@ class GrayBoxStructure:
         return self
 
     def with_stacked_outputs(self, copies: int) -> GrayBoxStructure:
-        """The structure with all of its outputs several times, below each other.
-
-        Parameters
-        ----------
-        copies : int
-        """
+        """The structure with all of its outputs several times, below each other."""
         states, outputs = np.split(np.arange(self.map.shape[0]), [self.order])
         rows = np.concatenate([states, np.tile(outputs, copies)])
         return self._changed(map=RowsMap(self.map, rows))

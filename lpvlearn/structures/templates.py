@@ -75,14 +75,7 @@ def check_shapes(
 def affine_arrays(
     rows: Sequence[Sequence[Affine]], parameter_names: Sequence[str] | None
 ) -> tuple[Array, Array, list[str]]:
-    """The constant part, the part of every parameter, and the parameter names.
-
-    Examples
-    --------
-    >>> offset, basis, names = affine_arrays([[{"": 2.0}, {"k": 3.0, "": 1.0}]], None)
-    >>> offset.tolist(), basis.tolist(), names
-    ([[2.0, 1.0]], [[[0.0, 3.0]]], ['k'])
-    """
+    """The constant part, the part of every parameter, and the parameter names."""
     used = {name for row in rows for entry in row for name in entry if name}
     names = _ordered_names(used, parameter_names)
 
@@ -95,7 +88,7 @@ def affine_arrays(
 
 
 def _ordered_names(used: set[str], given: Sequence[str] | None) -> list[str]:
-    """The parameter names in the given order, else natural order (p2 before p10)."""
+    """The parameter names in the given order, else natural order."""
     if given is None:
         return sorted(used, key=_natural)
     if isinstance(given, str):
@@ -110,6 +103,7 @@ def _ordered_names(used: set[str], given: Sequence[str] | None) -> list[str]:
 
 
 def _natural(name: str) -> list[tuple[bool, int, str]]:
+    """Sorting key by which p2 comes before p10."""
     parts = re.findall(r"\d+|\D+", name)
     return [(not t.isdigit(), int(t) if t.isdigit() else 0, t) for t in parts]
 
@@ -231,16 +225,7 @@ def modal_cells(
     feedthrough: bool,
     normalize: str,
 ) -> tuple[Cells, Cells, Cells, Cells | None]:
-    """A, B, C, D of the real modal form, see `GrayBoxStructure.modal`.
-
-    Examples
-    --------
-    >>> A, B, C, D = modal_cells(1, 1, 1, 1, False, "input")
-    >>> A
-    [[0.0, 1.0, 0.0], ['-w2_1', '-d_1', 0.0], [0.0, 0.0, '-r_1']]
-    >>> B, C
-    ([[0.0], [1.0], [1.0]], [['c1_1', 'c1_2', 'c1_3']])
-    """
+    """A, B, C, D of the real modal form, see `GrayBoxStructure.modal`."""
     n_modes = whole_number("n_modes", n_modes, 0)
     n_real = whole_number("n_real", n_real, 0)
     if n_modes == n_real == 0:
