@@ -110,12 +110,8 @@ class RestructuringProblem:
         W, weighted, _ = self._weighted
         scaling = channel_scaling(weighted)
         scale = 1.0 if scaling is None else scaling
-        errors = [
-            np.linalg.norm(
-                scale * (W @ (system.response(theta, self.omega) - self.response))
-            )
-            for theta in usable
-        ]
+        differences = [system.response(x, self.omega) - self.response for x in usable]
+        errors = [np.linalg.norm(scale * (W @ dG)) for dG in differences]
         thetas = _distinct(np.array(usable)[np.argsort(errors, kind="stable")])
         fits = []
         for theta in thetas[:n_fits]:

@@ -71,9 +71,8 @@ def search(
     """Least-squares fits, by ascending cost, and the problem that they solve.
 
     Where no model of the structure decays as fast as the black box lets expect, its
-    stability margin is given up.
-
-    The options are those of `GrayBoxRestructurer`; further candidates may be `given`.
+    stability margin is given up. The options are those of `GrayBoxRestructurer`;
+    further candidates may be `given`.
     """
     guess = None if isinstance(init, str) else problem.structure.check_params(init)
     for share in (1.0, _LEAST_MARGIN):
