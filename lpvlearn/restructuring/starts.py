@@ -9,6 +9,7 @@ fits.
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -31,8 +32,8 @@ Array = NDArray[np.float64]
 # that far from what it is meant to describe, and starts may agree on a wrong basin.
 _FAR_FIT = 0.1
 
+_COST = attrgetter("cost")  # by which fits are sorted
 _ROUNDS = 3  # more starts; then a smoother response; then both, thoroughly
-
 _N_FITS = 3  # of a round, from the best candidates: their ranking is seldom far off
 _SAME = 1e-4  # relative difference of the costs of fits in one basin: they end at 1e-6
 
@@ -41,7 +42,6 @@ _SAME = 1e-4  # relative difference of the costs of fits in one basin: they end 
 _LEAST_MARGIN = 1e-6
 
 _HOP_FIT = 0.03  # error of a fit so far off that better basins may lie beside its own
-
 _HOPS = (0.1, 0.3, 1.0) * 4  # sizes of the hops of logarithms: 10 %, to a factor of 3
 _HOP_RETURNS = 5  # to the fit itself, after which its basin counts as wide
 _HOP_ROUNDS = 4  # from ever better fits
@@ -102,7 +102,7 @@ def _rounds(
             candidates = np.vstack([*given, candidates])
         elif len(candidates) == 0:
             break
-        fits = _sorted(fits + problem.best_fits(candidates, n_fits))
+        fits = sorted(fits + problem.best_fits(candidates, n_fits), key=_COST)
         best = fits[0].relative_error if fits else np.inf
         if best <= GOOD_FIT:
             break
@@ -111,10 +111,6 @@ def _rounds(
         if best <= _FAR_FIT and agreeing >= (2 if number else n_fits):
             break
     return hopped_fits(problem, fits, rng) if fits and best > _HOP_FIT else fits
-
-
-def _sorted(fits: list[LeastSquaresResult]) -> list[LeastSquaresResult]:
-    return sorted(fits, key=lambda fit: fit.cost)
 
 
 def hopped_fits(
@@ -137,7 +133,7 @@ def hopped_fits(
             if fit is not None:
                 fits = [*fits, fit]
                 returned += abs(fit.cost - best.cost) <= _SAME * best.cost
-        fits = _sorted(fits)
+        fits = sorted(fits, key=_COST)
         if fits[0].cost > best.cost * (1.0 - _HOP_GAIN):
             break
     return fits
