@@ -155,12 +155,14 @@ def levenberg_marquardt(
         promised = np.sum(c[rows] ** 2 - left**2, axis=1)
         before = cost[rows]
         # a step that a bound cuts off may promise nothing where a shorter one does
-        hopeful = (promised > _NOISE * before) | (trial != x[rows] + d).any(1)
-        hopeful &= damping[rows] < _LARGEST_DAMPING
-        active[rows[~hopeful]] = False
+        hopeful = promised > _NOISE * before
+        cut = ~hopeful & (trial != x[rows] + d).any(1)
+        damping[rows[cut]] *= _MORE
+        active[rows] = (hopeful | cut) & (damping[rows] < _LARGEST_DAMPING)
+        hopeful &= active[rows]
         rows, before, promised = rows[hopeful], before[hopeful], promised[hopeful]
         if len(rows) == 0:
-            break
+            continue
         better = move(rows, trial[hopeful])
         fall = before - cost[rows]
         good = np.where(fall > _AS_PROMISED * np.abs(promised), _LESS, 1.0)
