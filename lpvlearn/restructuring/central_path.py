@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 
 from .coordinates import ResponseGeometry
 from .error_system import ErrorSystem
-from .least_squares import frequency_grid
 from .limits import Limits
-from .measured import MeasuredErrorSystem
 
 Array = NDArray[np.float64]
 
@@ -121,22 +119,15 @@ class Barrier:
         self, system: ErrorSystem, limits: Limits, omega: Array, size: float
     ) -> None:
         self.system, self.limits, self.size = system, limits, size
-        self.missed = np.zeros(0)
-        self.watch(omega)
-
-    def watch(self, omega: Array) -> None:
-        """Take that set of frequencies."""
-        self.omega = omega
-        self._G0 = self.system.target_response(omega)
-        self._W = self.system.weight_response(omega)[0]
+        self.omega, self.missed = omega, np.zeros(0)
 
     def mu_of_level(self, theta: Array, ratio: float) -> float:
         """mu for which the level is `ratio` times the largest singular value."""
-        s = self._squares(theta, self.omega, self._G0, self._W)
+        s = self._squares(theta)
         return float(0.5 / (s / (ratio**2 * s.max() - s)).sum())
 
-    def _squares(self, theta: Array, omega: Array, G0: Complex, W: Complex) -> Array:
-        E = W @ (self.system.response(theta, omega) - G0)
+    def _squares(self, theta: Array) -> Array:
+        E = self.system.weighted_error(theta, self.omega)
         return np.asarray(np.linalg.svd(E, compute_uv=False) ** 2).ravel()
 
     def value(self, theta: Array, mu: float) -> float:
@@ -155,7 +146,7 @@ class Barrier:
         c = self.limits.values(theta, poles)
         if not c.max(initial=-1.0) < 0:
             return np.inf
-        s = self._squares(theta, self.omega, self._G0, self._W)
+        s = self._squares(theta)
         if not np.isfinite(s).all():
             return np.inf
         level = level_of(s, mu)
@@ -176,11 +167,10 @@ class Barrier:
         """
         c, dc, _ = self.limits.rows(theta)
         pull, weight = dc / -c[:, None], _BARRIER * mu
-        geometry = ResponseGeometry(
-            self.system, theta, self.omega, self.size, self._G0, pull
-        )
+        system, omega = self.system, self.omega
+        geometry = ResponseGeometry(system, theta, omega, self.size, pull)
         at, L, S = geometry.at, geometry.L, geometry.S
-        E = self._W @ at.E
+        E = system.weight_response(omega)[0] @ (at.G - system.target_response(omega))
         k, p, m = E.shape
         q = len(S)
         _, sigma, Vh = np.linalg.svd(E)
@@ -216,14 +206,6 @@ class Barrier:
 
 def _psi(squares: Array, tau: float, mu: float) -> float:
     return float(0.5 * np.log(tau) - mu * np.log1p(-squares / tau).sum())
-
-
-def search_grid(system: ErrorSystem) -> Array:
-    """Frequencies at which a search watches the error, rad/s."""
-    if isinstance(system, MeasuredErrorSystem):
-        return system.omega
-    poles = np.linalg.eigvals(system.target.A).astype(complex)
-    return frequency_grid(poles, system.dt)
 
 
 @dataclass
@@ -282,7 +264,6 @@ def central_path(
     frequencies : ndarray, default=None
         Local maxima that are known already.
     """
-    grid = search_grid(system)
     inside = theta if limits.strict(theta) else limits.inside(theta)
     if not limits.strict(inside):  # at the margin: nothing to follow
         return PathPoint(theta, mu, np.zeros(0), 0, [])
@@ -295,7 +276,7 @@ def central_path(
     while n_iter < max_iter:
         if system.peaks_move:
             seen = np.union1d(seen, found.frequencies)
-        barrier = Barrier(system, limits, np.union1d(grid, seen), found.norm)
+        barrier = Barrier(system, limits, np.union1d(system.grid, seen), found.norm)
         if mu is None:
             mu = barrier.mu_of_level(theta, _FIRST_LEVEL)
         ahead = max(_SHRINK * mu, min(mu_end, mu))
@@ -378,7 +359,7 @@ def _newton(
         missed = np.union1d(missed, barrier.missed)
         if ratio > _TAKEN:
             if missed.size:
-                barrier.watch(np.union1d(barrier.omega, missed))
+                barrier.omega = np.union1d(barrier.omega, missed)
             if ratio > _GOOD:
                 radius = max(radius, _LONGER * length)
             elif ratio < _POOR:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.least_squares import levenberg_marquardt
-from .error_system import Structure, derivatives
-from .transfer import Target, resolvent
+from ..systems.response import pole_grid, pole_rates
+from .error_system import Structure, Target, derivatives, resolvent
 
 Array = NDArray[np.float64]
 
@@ -117,11 +117,8 @@ class _Search:
         size = np.where(thetas == 0, np.where(typical > 0, typical, 1.0), thetas)
         self.size = np.where(signed, np.sign(thetas), np.abs(size))
         self.center, self.hold = thetas, 0.0
-        rates = np.linalg.eigvals(target.A).astype(complex)
-        if target.dt is not None:
-            rates = np.log(np.where(rates == 0, 1e-300, rates)) / target.dt
-        sizes = np.abs(rates)
-        self.rates = rates
+        self.rates = pole_rates(np.linalg.eigvals(target.A), target.dt)
+        sizes = np.abs(self.rates)
         self.low = float(sizes[sizes > 0].min(initial=sizes.max(initial=1.0)))
         self.high = float(sizes.max(initial=self.low))
 
@@ -141,11 +138,11 @@ class _Search:
         Parameters that a blurred response hardly shows are held where they are.
         """
         self.center, self.hold = X, np.sqrt(_HOLD * shift)
-        omega = np.geomspace(self.low / 3.0, 2.0 * self.high, n_points)
-        if shift == 0:  # the resonances are narrow here
-            turn, decay = np.abs(self.rates.imag), np.abs(self.rates.real)
-            near = (turn[:, None] + decay[:, None] * np.array([-1.0, 0.0, 1.0])).ravel()
-            omega = np.unique(np.concatenate([omega, near[near > 0]]))
+        # the resonances are narrow on the axis itself
+        narrow = self.rates[:0] if shift else self.rates
+        ends = self.low / 3.0, 2.0 * self.high
+        omega = pole_grid(narrow, *ends, n_points, [-1.0, 0.0, 1.0])
+        omega = omega[omega > 0]
         t = self.target
         s = shift * self.high + 1j * omega
         self.s = np.asarray(s if t.dt is None else np.exp(s * t.dt), dtype=complex)

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.balancing import balancing_transformation
-from .error_system import ErrorPoint, ErrorSystem
-from .limits import Limits
+from .error_system import ErrorSystem
+from .limits import Limits, within_bounds
 from .similarity import linear_equations, nearest_parameters, scaled_problem
 
 Array = NDArray[np.float64]
@@ -37,6 +37,8 @@ _FIT_CAP = 1e-5  # the same for the H2 norm, whose steps are straight
 _REACH = 2.0  # change of the logarithm of a distance to a bound in a unit step
 
 _DAMPING = 1e-5  # of the acceleration along directions that the response hardly sees
+
+_BENT = 1.0  # part of a step that its bend may be at most
 
 _EXACT = 1e-7  # relative residual of a realisation in a canonical form
 
@@ -80,8 +82,6 @@ class ResponseGeometry:
         Frequencies, rad/s.
     size : float
         Change of the response (root mean square over frequency) of a unit step.
-    G0 : ndarray of shape (k, n_outputs, n_inputs), default=None
-        Response that `at` holds the error to; by default zero.
     pull : ndarray of shape (k, n_params), default=None
         Gradients of logarithms that a unit step shall change by less than about
         `_REACH`: those of the distances to bounds.
@@ -90,7 +90,7 @@ class ResponseGeometry:
     ----------
     T, inverse : ndarray of shape (n_params, n_params)
         ``theta + T y``, and back.
-    at : ErrorPoint
+    at : ResponsePoint
         Without the weight.
     S : ndarray of shape (n_params, n + n_outputs, n + n_inputs)
         Derivatives of the system matrix.
@@ -106,12 +106,10 @@ class ResponseGeometry:
         theta: Array,
         omega: Array,
         size: float,
-        G0: Complex | None = None,
         pull: Array | None = None,
     ) -> None:
         structure, self.n = system.structure, system.n
-        zero = np.zeros((1, system.n_outputs, system.n_inputs), complex)
-        self.at: ErrorPoint = system.point(theta, omega, zero if G0 is None else G0)
+        self.at = system.point(theta, omega)
         self.S = structure.jacobian(theta)
         self._bend = structure.curvature(theta)
         self.L = system.weight_response(omega)[0] @ self.at.L
@@ -177,6 +175,33 @@ class ResponseGeometry:
         if self._bend is not None:
             H = H + np.tensordot(self._bend, np.real(P.sum(0)).T, axes=2)
         return self.T.T @ H @ self.T
+
+
+class Geodesics:
+    """Geodesics of the response through one theta, in coordinates ``theta + T d``."""
+
+    def __init__(
+        self, system: ErrorSystem, theta: Array, omega: Array, T: Array
+    ) -> None:
+        self._geometry = ResponseGeometry(system, theta, omega, 1.0)
+        self._system, self._theta, self._T = system, theta, T
+        self._inverse = np.linalg.inv(T)
+        self._local = self._geometry.inverse @ T
+
+    def step(self, d: Array) -> Array:
+        """End of the geodesic that leaves along `d`, within the parameters' bounds."""
+        local = self._local @ d
+        a = self._geometry.acceleration(local)
+        most = _BENT * float(np.linalg.norm(local))
+        a *= min(1.0, most / max(float(np.linalg.norm(a)), 1e-300))
+        end = self._theta + self._T @ d + 0.5 * self._geometry.T @ a
+        return self._inverse @ (within_bounds(self._system, end) - self._theta)
+
+    def curvature(self, gradient: Array) -> Array:
+        """What the bend of the geodesics adds to a Hessian of that gradient."""
+        local = np.asarray(np.linalg.solve(self._local.T, gradient))
+        normal = -self._geometry.tangential(local)
+        return self._local.T @ self._geometry.second_derivatives(normal) @ self._local
 
 
 class LocalChart:

@@ -13,12 +13,10 @@ from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 from scipy.optimize import minimize
 
 from ..minimax.problem import MinimaxResult, Peaks
-from .central_path import search_grid
 from .coordinates import metric_coordinates
-from .error_system import ErrorSystem, derivatives
+from .error_system import ErrorSystem, series
 from .least_squares import LeastSquaresResult
 from .limits import Limits, keeps_margin, within_bounds
-from .transfer import series
 
 Array = NDArray[np.float64]
 
@@ -95,10 +93,7 @@ def minimise_h2(
     theta0, active = _matched_feedthrough(system, fit.x)
     J0, _ = squared_h2(system, theta0)
     scale = np.sqrt(J0) if J0 > 0 else 1.0
-    grid = search_grid(system)
-    at = system.point(theta0, grid, system.target_response(grid))
-    L = system.weight_response(grid)[0] @ at.L
-    J = derivatives(L, system.structure.jacobian(theta0)[active], at.R)
+    J = system.linearised_error(theta0, system.grid)[1]()[..., active]
     T = metric_coordinates(J, max(np.sqrt(fit.cost), negligible, 1e-300))
     bounded = np.isfinite([system.structure.lower, system.structure.upper]).any()
     if bounded:  # coordinates in which the bounds stay bounds

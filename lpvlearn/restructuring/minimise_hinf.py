@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ..minimax.bundle import proximal_bundle
 from ..minimax.problem import Flags, MinimaxProblem, MinimaxResult, Peaks
 from ..minimax.sqp import minimax_sqp
-from .central_path import PathPoint, central_path, search_grid
-from .coordinates import CanonicalForm, ResponseGeometry, view_at
+from .central_path import PathPoint, central_path
+from .coordinates import CanonicalForm, Geodesics, ResponseGeometry, view_at
 from .error_system import ErrorSystem, vanishing_weight
 from .least_squares import LeastSquaresResult, fit_frequency_response
 from .limits import Limits, within_bounds
@@ -31,8 +31,6 @@ _FLAT = 1e-7  # a peak with a smaller relative gradient does not depend on theta
 _CAP_TOLERANCE = 1e-7  # relative excess over the cap that rounding may make
 
 _MAX_CAPS = 12  # frequencies at which the cap is a constraint: the last ones met
-
-_BENT = 1.0  # part of a step that its bend may be at most
 
 # depths at which peaks that move are looked for below high constant ones
 _HARD_STEPS = (0.99, 0.9999)
@@ -187,7 +185,7 @@ class HinfObjective:
 
     def curve(self, y: Array) -> Geodesics:
         """Geodesics of the response through `y`."""
-        return Geodesics(self, self.theta(y))
+        return Geodesics(self.system, self.theta(y), self.grid, self.T)
 
     def problem(self) -> MinimaxProblem:
         """The callbacks of the minimax solvers."""
@@ -200,31 +198,6 @@ class HinfObjective:
             self.grid,
             self.curve,
         )
-
-
-class Geodesics:
-    """Geodesics of the response through one theta, in the coordinates of a problem."""
-
-    def __init__(self, objective: HinfObjective, theta: Array) -> None:
-        self._geometry = ResponseGeometry(objective.system, theta, objective.grid, 1.0)
-        self._system, self._theta, self._T = objective.system, theta, objective.T
-        self._inverse = np.linalg.inv(objective.T)
-        self._local = self._geometry.inverse @ objective.T
-
-    def step(self, d: Array) -> Array:
-        """End of the geodesic that leaves along `d`, within the parameters' bounds."""
-        local = self._local @ d
-        a = self._geometry.acceleration(local)
-        most = _BENT * float(np.linalg.norm(local))
-        a *= min(1.0, most / max(float(np.linalg.norm(a)), 1e-300))
-        end = self._theta + self._T @ d + 0.5 * self._geometry.T @ a
-        return self._inverse @ (within_bounds(self._system, end) - self._theta)
-
-    def curvature(self, gradient: Array) -> Array:
-        """What the bend of the geodesics adds to a Hessian of that gradient."""
-        local = np.asarray(np.linalg.solve(self._local.T, gradient))
-        normal = -self._geometry.tangential(local)
-        return self._local.T @ self._geometry.second_derivatives(normal) @ self._local
 
 
 Solver = Callable[..., MinimaxResult]
@@ -281,7 +254,7 @@ def minimise_hinf(
         peaks = Peaks(start.values, start.frequencies, flat, still)
         return theta0, MinimaxResult(theta0, peaks, 0.0, np.inf, True, 0), 0.0
     origin = np.zeros(len(theta0))
-    limits, grid = Limits(system, margin), search_grid(system)
+    limits, grid = Limits(system, margin), system.grid
     T = ResponseGeometry(system, theta0, grid, start.norm).T
     objective = HinfObjective(system, theta0, T, limits, grid)
     first = objective.peaks(origin)
@@ -438,7 +411,7 @@ def _ended(
 ) -> tuple[Array, MinimaxResult, float]:
     """End of a solver that starts at `theta`, its result, and the highest floor met."""
     view = view_at(system, theta, limits, form)
-    grid = search_grid(system)
+    grid = system.grid
     size = max(view.system.peaks(view.theta).norm, 1e-300)
     T = ResponseGeometry(view.system, view.theta, grid, size).T
     objective = HinfObjective(view.system, view.theta, T, view.limits, grid)
@@ -460,14 +433,13 @@ def _minimise_remainder(
     options: dict[str, Any],
 ) -> tuple[Array, MinimaxResult]:
     """Minimise the weighted remainder while the error stays on its floor."""
-    grid = search_grid(system)
+    grid = system.grid
     eye = np.eye(len(theta0))
     bound = HinfObjective(remainder, theta0, eye, limits, grid, floor, system)
     fit = fit_frequency_response(
         remainder,
         theta0,
         grid,
-        remainder.target_response(grid),
         admissible=bound.admissible,
     )
     assert fit is not None  # theta0 is admissible

@@ -20,15 +20,10 @@ from ..models.statespace import StateSpace
 from ..structures.map import RowsMap
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
-from .error_system import ErrorSystem
-from .least_squares import (
-    LeastSquaresResult,
-    fit_frequency_response,
-    grid_and_margin,
-)
-from .limits import growth, keeps_margin
+from .error_system import ErrorSystem, Target, series
+from .least_squares import LeastSquaresResult, fit_frequency_response
+from .limits import growth, keeps_margin, natural_margin
 from .measured import MeasuredErrorSystem, read_frequency_data, realize_response
-from .transfer import Target, series
 
 Array = NDArray[np.float64]
 
@@ -93,7 +88,6 @@ class RestructuringProblem:
             self.system,
             theta,
             self.omega,
-            self.response,
             admissible=self.is_stable,
             scaling=scaling,
         )
@@ -143,7 +137,6 @@ def problem_from_models(
             behind = behind.repeated(len(boxes))
     target = _stacked(boxes) if len(boxes) > 1 else boxes[0]
     system = ErrorSystem(_repeated_outputs(structure, len(boxes)), target, behind)
-    omega, margin = grid_and_margin(target)
     bound = 0.0
     if len(models) == 1 and filter_ is None and first.order > structure.order:
         bound = float(first.hankel_singular_values()[structure.order])
@@ -151,8 +144,8 @@ def problem_from_models(
         structure,
         system,
         boxes[0],
-        omega,
-        margin,
+        system.grid,
+        natural_margin(target),
         _weighted_norm(system),
         first.D - boxes[0].D,
         bound,

@@ -19,8 +19,7 @@ from scipy.optimize import least_squares
 
 from ..minimax.problem import MinimaxResult, Peaks
 from ..systems.least_squares import Residuals, levenberg_marquardt
-from .error_system import Structure
-from .transfer import Target
+from .error_system import Structure, Target
 
 Array = NDArray[Any]
 

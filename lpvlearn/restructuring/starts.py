@@ -22,11 +22,11 @@ from ..structures.mechanical import ImplicitMap
 from ..structures.structure import GrayBoxStructure
 from ..systems.balancing import balancing_transformation
 from .continuation import continued_fits
-from .least_squares import LeastSquaresResult, channel_scaling, frequency_grid
+from .error_system import Target, frequency_grid, model_derivatives
+from .least_squares import LeastSquaresResult, channel_scaling
 from .limits import growth
 from .problem import RestructuringProblem
 from .similarity import scaled_problem, similarity_starts
-from .transfer import Target, model_derivatives
 
 Array = NDArray[np.float64]
 
@@ -145,12 +145,10 @@ def best_fits(
     usable = [theta for theta in candidates if problem.is_stable(theta)]
     if not usable:
         return []
-    system, omega, G0 = problem.system, problem.omega, problem.response
-    W = system.weight_response(omega)[0]
     scaling = channel_scaling(problem.weighted_response)
     scale = 1.0 if scaling is None else scaling
     errors = [
-        np.linalg.norm(scale * (W @ (system.response(theta, omega) - G0)))
+        np.linalg.norm(scale * problem.system.weighted_error(theta, problem.omega))
         for theta in usable
     ]
     thetas = _distinct(np.array(usable)[np.argsort(errors, kind="stable")])
