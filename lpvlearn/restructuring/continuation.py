@@ -19,21 +19,14 @@ from ..systems.response import pole_grid, pole_rates
 from .error_system import Structure, Target, derivatives, resolvent
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
-
 Flags = NDArray[np.bool_]
 
 SHIFTS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015, 0.0)  # relative to the fastest pole
-
 _FLOOR = 1e-2  # errors are relative to the response, where it is not below that
-
 _LONGEST = 1.5  # of a step, in logarithms of the parameters
-
 _SMALL = 1e-3  # relative decrease that ends a stage
-
 _ROUNDING = 1e-20  # squared relative error that is reached exactly
-
 _HOLD = 1e-4  # pull to the start of a stage, times the shift
 
 
@@ -49,28 +42,11 @@ def continued_fits(
 ) -> tuple[Array, Array]:
     """Fit the response on contours that approach the frequency axis.
 
-    Parameters
-    ----------
-    structure : Structure
-    target : Target
-        The black box.
-    thetas : ndarray of shape (k, n_params)
-        Starting points; a wrong size by a factor of ten does no harm.
-    signed : ndarray of bool, shape (n_params,)
-        Parameters that keep their signs: their logarithms are searched.
-    shifts : tuple of float
-        Distances from the frequency axis, relative to the fastest pole.
-    n_points : int
-        Frequencies of a contour.
-    max_iter : int
-        Steps that are tried on each contour.
-
-    Returns
-    -------
-    thetas : ndarray of shape (k, n_params)
-        By ascending cost; starts that were lost are left out.
-    costs : ndarray of shape (k,)
-        Root mean square of the relative errors on the last contour.
+    `thetas` (k, n_params) are the starts, where a size wrong by a factor of ten does no
+    harm; the logarithms of parameters that are `signed` are searched: they keep their
+    signs. `shifts` are the contours' distances from the axis, relative to the fastest
+    pole. Returns parameters by ascending cost, without starts that were lost, and the
+    root mean squares of their relative errors on the last contour.
 
     Examples
     --------

@@ -25,27 +25,18 @@ from .limits import Limits, within_bounds
 from .similarity import linear_equations, nearest_parameters, scaled_problem
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
 
 # Directions that the response sees a thousand times less than others are steps of
 # that length all the same: further along them its second derivative takes over.
 _METRIC_CAP = 1e-3
-
 _FIT_CAP = 1e-5  # the same for the H2 norm, whose steps are straight
-
 _REACH = 2.0  # change of the logarithm of a distance to a bound in a unit step
-
 _DAMPING = 1e-5  # of the acceleration along directions that the response hardly sees
-
 _BENT = 1.0  # part of a step that its bend may be at most
-
 _EXACT = 1e-7  # relative residual of a realisation in a canonical form
-
 _NUDGE = 1e-2  # relative change of all entries that makes a model a generic one
-
 _MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
-
 _SAME_NORM = 1e-7  # relative difference that rounding may make
 
 
@@ -74,30 +65,12 @@ def _units(R: Array) -> Array:
 class ResponseGeometry:
     """Response at one theta, its derivatives, and coordinates of its metric.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    theta : ndarray of shape (n_params,)
-    omega : ndarray of shape (k,)
-        Frequencies, rad/s.
-    size : float
-        Change of the response (root mean square over frequency) of a unit step.
-    pull : ndarray of shape (k, n_params), default=None
-        Gradients of logarithms that a unit step shall change by less than about
-        `_REACH`: those of the distances to bounds.
-
-    Attributes
-    ----------
-    T, inverse : ndarray of shape (n_params, n_params)
-        ``theta + T y``, and back.
-    at : ResponsePoint
-        Without the weight.
-    S : ndarray of shape (n_params, n + n_outputs, n + n_inputs)
-        Derivatives of the system matrix.
-    L : ndarray of shape (k, n_outputs, n + n_outputs)
-        That of `at` behind the weight.
-    products : ndarray of shape (k, n_outputs * n_params, n + n_inputs)
-        ``L S_j``: the derivatives of the error are ``L S_j R``.
+    A unit step in y, ``theta + T y``, changes the response at the frequencies `omega`
+    by `size` (root mean square), and the logarithms whose gradients are the rows of
+    `pull` (those of distances to bounds) by less than about `_REACH`. `S` holds the
+    derivatives of the system matrix, `L` that of the point `at` behind the weight, and
+    `products` ``L S_j`` (k, n_outputs * n_params, n + n_inputs): the error changes by
+    ``L S_j R``.
     """
 
     def __init__(
@@ -207,19 +180,8 @@ class Geodesics:
 class LocalChart:
     """The models near one, as an affine structure; zero is that model.
 
-    Parameters
-    ----------
-    S : ndarray of shape (order + n_outputs, order + n_inputs)
-        System matrix of a stable, minimal model.
-    order : int
-    dt : float or None
-    feedthrough : bool
-        Whether D is free.
-
-    Raises
-    ------
-    ValueError
-        If the model is not minimal: no neighbourhood of it is smooth.
+    From the system matrix `S` of a stable model; where it is not minimal, no
+    neighbourhood of it is smooth: ValueError. `feedthrough`: whether D is free.
     """
 
     is_affine = True
@@ -291,13 +253,7 @@ def _without_basis_changes(S: Array, n: int) -> Array:
 
 
 class CanonicalForm:
-    """An affine structure in which every model of its order has its own parameters.
-
-    Parameters
-    ----------
-    structure : GrayBoxStructure
-    dt : float or None
-    """
+    """An affine structure in which every model of its order has its own parameters."""
 
     def __init__(self, structure: Any, dt: float | None) -> None:
         self.structure, self.dt = structure, dt
@@ -352,33 +308,18 @@ class CanonicalForm:
 
 @dataclass(frozen=True)
 class View:
-    """The problem near one point, in coordinates that suit it.
-
-    Attributes
-    ----------
-    system : ErrorSystem
-    theta : ndarray of shape (n_params,)
-        The point.
-    limits : Limits
-    back : callable
-        Coordinates to parameters of the structure, or None where these do not exist.
-    """
+    """The problem near one point, in coordinates that suit it."""
 
     system: ErrorSystem
-    theta: Array
+    theta: Array  # the point
     limits: Limits
-    back: Callable[[Array], Array | None]
+    back: Callable[[Array], Array | None]  # to the structure's parameters, or None
 
 
 def view_at(
     system: ErrorSystem, theta: Array, limits: Limits, form: CanonicalForm | None
 ) -> View:
-    """The structure's own parameters, or a chart around the model of a canonical form.
-
-    Parameters
-    ----------
-    form : CanonicalForm or None
-    """
+    """The parameters themselves, or a chart around the model of a canonical form."""
     plain = View(system, theta, limits, lambda x: x)
     if form is None:
         return plain

@@ -12,7 +12,6 @@ from ..systems.least_squares import levenberg_marquardt
 from .error_system import ErrorSystem
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
 
 _DECADES = 1.5  # channels whose sizes differ by less are left as they are

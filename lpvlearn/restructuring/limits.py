@@ -8,15 +8,12 @@ from numpy.typing import NDArray
 from .error_system import ErrorSystem, Target
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
 
 # Poles that much faster than the black box are those of a mass that went to zero:
 # they change nothing any more, and take the digits of all others.
 _FASTEST = 1e6
-
 _MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
-
 _LEEWAY = 0.2  # part of the margin that a step may use
 
 
@@ -58,11 +55,7 @@ def within_bounds(system: ErrorSystem, theta: Array) -> Array:
 class Limits:
     """The limits as smooth constraints ``c(theta) <= 0``.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    margin : float
-        Growth rates stay below ``-margin`` (1/s).
+    Growth rates stay below ``-margin`` (1/s).
     """
 
     def __init__(self, system: ErrorSystem, margin: float) -> None:

@@ -21,7 +21,6 @@ from .limits import Limits, keeps_margin, within_bounds
 Array = NDArray[np.float64]
 
 _NO_FEEDTHROUGH = 1e-9  # relative size of a feedthrough that is rounding noise
-
 _REFUSED = 1e3  # squared error, relative to the start, of a model that is not stable
 
 
@@ -29,11 +28,6 @@ def squared_h2(system: ErrorSystem, theta: Array) -> tuple[float, Array]:
     """Squared H2 norm of the weighted error, and its gradient.
 
     In continuous time the feedthrough of the error must vanish; it is left out.
-
-    Returns
-    -------
-    J : float
-    gradient : ndarray of shape (n_params,)
     """
     structure, t, n = system.structure, system.target, system.n
     A, B, C, D = system.split(structure.system_matrix(theta))
@@ -77,18 +71,8 @@ def minimise_h2(
 ) -> tuple[Array, MinimaxResult]:
     """Minimise the H2 norm by a quasi-Newton method from a least-squares fit.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    fit : LeastSquaresResult
-        Start.
-    margin : float
-        Stability margin, 1/s.
-
-    Raises
-    ------
-    ValueError
-        If the error has a feedthrough in continuous time: its H2 norm is infinite.
+    A ValueError where the error has a feedthrough in continuous time: its H2 norm is
+    infinite.
     """
     theta0, active = _matched_feedthrough(system, fit.x)
     J0, _ = squared_h2(system, theta0)

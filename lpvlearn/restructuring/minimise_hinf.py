@@ -25,46 +25,31 @@ from .limits import Limits, within_bounds
 Array = NDArray[np.float64]
 
 _DEPTH = 0.6  # peaks down to that fraction below the objective enter the local model
-
 _FLAT = 1e-7  # a peak with a smaller relative gradient does not depend on theta
-
 _CAP_TOLERANCE = 1e-7  # relative excess over the cap that rounding may make
-
 _MAX_CAPS = 12  # frequencies at which the cap is a constraint: the last ones met
 
 # depths at which peaks that move are looked for below high constant ones
 _HARD_STEPS = (0.99, 0.9999)
-
 _STATIONARY = 1e-8  # shortest subgradient of an optimum, relative to the objective
-
 _NEARLY = 1e-3  # stationarity up to which no more is said
 
 # mu at the end of a round on the central path, and iterations of the solver from there;
 # the next round if these do not converge
 _ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
-
 _BUNDLE_PACE = 10  # as many iterations of a first-order method
-
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
-
 _PROGRESS = 1e-9  # a round that converged and brings less is the last one
-
 _AHEAD = 0.98  # the path is left for a point that much below it
 
 # mu to which the path is followed from several fits, how many are kept there, and the
 # most steps of each: its norm soon tells more of a basin than the least-squares error
 _EXPLORED = ((1e-2, 2, 40), (1e-3, 1, 60))
-
 _FITS = 6  # basins that are followed at most
-
 _APART = 1e-4  # relative difference of the costs of different basins
-
 _ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
-
 _RADIUS = 0.1  # first trust-region radius of the solver
-
 _REMAINDER_TOLERANCE = 1e-3  # the choice among optimal points is soon good enough
-
 _REMAINDER_STEPS = 20  # iterations for that choice
 
 
@@ -72,31 +57,18 @@ _REMAINDER_STEPS = 20  # iterations for that choice
 class HinfObjective:
     """Peaks of the error in the coordinates y, with constant peaks set aside.
 
-    Attributes
-    ----------
-    system : ErrorSystem
-    theta0 : ndarray of shape (n_params,)
-    T : ndarray of shape (n_params, n_params)
-    limits : Limits
-        Of stability, speed, and the parameters' bounds.
-    grid : ndarray
-        Frequencies (rad/s) at which the search watches the error.
-    cap : float
-        With `capped`: its norm stays below that.
-    capped : ErrorSystem or None
-        The error whose norm is bounded while that of `system` is minimised.
-    floor, floor_frequency : float
-        Highest peak met so far whose value does not depend on the parameters.
+    With `capped`, the norm of that error stays below `cap` while that of `system` is
+    minimised.
     """
 
     system: ErrorSystem
     theta0: Array
     T: Array
-    limits: Limits
-    grid: Array
+    limits: Limits  # of stability, speed, and the parameters' bounds
+    grid: Array  # frequencies (rad/s) at which the search watches the error
     cap: float = np.inf
     capped: ErrorSystem | None = None
-    floor: float = 0.0
+    floor: float = 0.0  # highest peak met whose value does not depend on parameters
     floor_frequency: float = 0.0
     _top: float = 0.0
     _cap_frequencies: Array = field(default_factory=lambda: np.zeros(0))
@@ -217,34 +189,16 @@ def minimise_hinf(
 ) -> tuple[Array, MinimaxResult, float]:
     """Minimise the H-infinity norm of the error from least-squares fits.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    fits : list of LeastSquaresResult
-        Stable starts, by ascending cost; the first one gives the metric of the steps.
-    margin : float
-        Stability margin, 1/s.
-    solver : callable
-        One of `SOLVERS`.
-    max_iter : int
-        Newton steps on the central path and iterations of the solver, in all.
-    negligible : float
-        Errors at or below it are rounding noise.
+    `fits` are stable starts by ascending cost, of which the first gives the metric of
+    the steps; errors not above `negligible` are rounding noise; `max_iter` counts
+    Newton steps on the central path and iterations of the solver, in all. Returns the
+    parameters, the result for the peaks that depend on them, and the highest constant
+    peak (0 for none).
 
-    Returns
-    -------
-    theta : ndarray of shape (n_params,)
-    result : MinimaxResult
-        Of the peaks that depend on the parameters.
-    floor : float
-        Highest constant peak (0 where there is none).
-
-    Notes
-    -----
-    Where the floor is above all other peaks, the start is already optimal, and so is
+    Where that floor is above all other peaks, the start is already optimal, and so is
     every theta that keeps the others below it. Then a weight that vanishes at the
     floor's frequency sets it aside, and the norm of what remains is minimised among
-    these optimal points.
+    these points.
     """
     theta0 = fits[0].x
     start = system.peaks(theta0)
