@@ -153,10 +153,8 @@ class ResponseGeometry:
 class Geodesics:
     """Geodesics of the response through one theta, in coordinates ``theta + T d``."""
 
-    def __init__(
-        self, system: ErrorSystem, theta: Array, omega: Array, T: Array
-    ) -> None:
-        self._geometry = ResponseGeometry(system, theta, omega, 1.0)
+    def __init__(self, system: ErrorSystem, theta: Array, T: Array) -> None:
+        self._geometry = ResponseGeometry(system, theta, system.grid, 1.0)
         self._system, self._theta, self._T = system, theta, T
         self._inverse = np.linalg.inv(T)
         self._local = self._geometry.inverse @ T

@@ -45,10 +45,8 @@ class Target:
     def repeated(self, copies: int) -> Target:
         """The model side by side, once for every channel: block-diagonal."""
         eye = np.eye(copies)
-        A, B, C, D = (
-            np.asarray(np.kron(eye, M), dtype=float)
-            for M in (self.A, self.B, self.C, self.D)
-        )
+        parts = (self.A, self.B, self.C, self.D)
+        A, B, C, D = (np.asarray(np.kron(eye, M), dtype=float) for M in parts)
         return Target(A, B, C, D, self.dt)
 
 
@@ -247,15 +245,16 @@ class ErrorSystem:
         The gray-box model must be stable: the level-set method measures the
         L-infinity norm, which stays finite (and meaningless) beyond the boundary.
         """
+        return linf_norm(*self.realisation(theta), dt=self.dt, within=within)
+
+    def realisation(self, theta: Array) -> tuple[Array, Array, Array, Array]:
+        """Matrices of the error: states of the gray box, the target, the weight."""
         A, B, C, D = self.split(self.structure.system_matrix(theta))
-        t = self.target
-        n, n0 = self.n, len(t.A)
-        Ae = np.zeros((n + n0, n + n0))
+        t, n, N = self.target, self.n, self.n + len(self.target.A)
+        Ae = np.zeros((N, N))
         Ae[:n, :n], Ae[n:, n:] = A, t.A
-        Be, Ce, De = np.vstack([B, t.B]), np.hstack([C, -t.C]), D - t.D
-        if self.weight is not None:
-            Ae, Be, Ce, De = series(Ae, Be, Ce, De, self.weight)
-        return linf_norm(Ae, Be, Ce, De, dt=self.dt, within=within)
+        parts = Ae, np.vstack([B, t.B]), np.hstack([C, -t.C]), D - t.D
+        return parts if self.weight is None else series(*parts, self.weight)
 
     def restructured(self, structure: Structure) -> ErrorSystem:
         """The error of another structure."""

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from ..minimax.problem import MinimaxResult, Peaks
 from .coordinates import metric_coordinates
-from .error_system import ErrorSystem, series
+from .error_system import ErrorSystem
 from .least_squares import LeastSquaresResult
 from .limits import Limits, keeps_margin, within_bounds
 
@@ -29,15 +29,9 @@ def squared_h2(system: ErrorSystem, theta: Array) -> tuple[float, Array]:
 
     In continuous time the feedthrough of the error must vanish; it is left out.
     """
-    structure, t, n = system.structure, system.target, system.n
-    A, B, C, D = system.split(structure.system_matrix(theta))
-    N, p = n + len(t.A), system.n_outputs
-    Ae = np.zeros((N, N))
-    Ae[:n, :n], Ae[n:, n:] = A, t.A
-    Be, Ce, De = np.vstack([B, t.B]), np.hstack([C, -t.C]), D - t.D
-    As, Bs, Cs, Ds, w = Ae, Be, Ce, De, system.weight
-    if w is not None:
-        As, Bs, Cs, Ds = series(Ae, Be, Ce, De, w)
+    structure, n, p, w = system.structure, system.n, system.n_outputs, system.weight
+    N = n + len(system.target.A)
+    As, Bs, Cs, Ds = system.realisation(theta)
     if system.dt is None:
         P = solve_continuous_lyapunov(As, -Bs @ Bs.T)
         Q = solve_continuous_lyapunov(As.T, -Cs.T @ Cs)

@@ -65,7 +65,6 @@ class HinfObjective:
     theta0: Array
     T: Array
     limits: Limits  # of stability, speed, and the parameters' bounds
-    grid: Array  # frequencies (rad/s) at which the search watches the error
     cap: float = np.inf
     capped: ErrorSystem | None = None
     floor: float = 0.0  # highest peak met whose value does not depend on parameters
@@ -157,7 +156,7 @@ class HinfObjective:
 
     def curve(self, y: Array) -> Geodesics:
         """Geodesics of the response through `y`."""
-        return Geodesics(self.system, self.theta(y), self.grid, self.T)
+        return Geodesics(self.system, self.theta(y), self.T)
 
     def problem(self) -> MinimaxProblem:
         """The callbacks of the minimax solvers."""
@@ -167,7 +166,7 @@ class HinfObjective:
             self.values,
             self.hessians,
             self.constraints,
-            self.grid,
+            self.system.grid,
             self.curve,
         )
 
@@ -208,9 +207,9 @@ def minimise_hinf(
         peaks = Peaks(start.values, start.frequencies, flat, still)
         return theta0, MinimaxResult(theta0, peaks, 0.0, np.inf, True, 0), 0.0
     origin = np.zeros(len(theta0))
-    limits, grid = Limits(system, margin), system.grid
-    T = ResponseGeometry(system, theta0, grid, start.norm).T
-    objective = HinfObjective(system, theta0, T, limits, grid)
+    limits = Limits(system, margin)
+    T = ResponseGeometry(system, theta0, system.grid, start.norm).T
+    objective = HinfObjective(system, theta0, T, limits)
     first = objective.peaks(origin)
     options: dict[str, Any] = {"tol": tol, "negligible": negligible}
     if first is None or objective.floor < first.top:
@@ -365,10 +364,9 @@ def _ended(
 ) -> tuple[Array, MinimaxResult, float]:
     """End of a solver that starts at `theta`, its result, and the highest floor met."""
     view = view_at(system, theta, limits, form)
-    grid = system.grid
     size = max(view.system.peaks(view.theta).norm, 1e-300)
-    T = ResponseGeometry(view.system, view.theta, grid, size).T
-    objective = HinfObjective(view.system, view.theta, T, view.limits, grid)
+    T = ResponseGeometry(view.system, view.theta, view.system.grid, size).T
+    objective = HinfObjective(view.system, view.theta, T, view.limits)
     result = solver(
         objective.problem(), np.zeros(len(view.theta)), radius=_RADIUS, **options
     )
@@ -387,19 +385,13 @@ def _minimise_remainder(
     options: dict[str, Any],
 ) -> tuple[Array, MinimaxResult]:
     """Minimise the weighted remainder while the error stays on its floor."""
-    grid = system.grid
-    eye = np.eye(len(theta0))
-    bound = HinfObjective(remainder, theta0, eye, limits, grid, floor, system)
-    fit = fit_frequency_response(
-        remainder,
-        theta0,
-        grid,
-        admissible=bound.admissible,
-    )
+    grid, eye = system.grid, np.eye(len(theta0))
+    bound = HinfObjective(remainder, theta0, eye, limits, floor, system)
+    fit = fit_frequency_response(remainder, theta0, grid, admissible=bound.admissible)
     assert fit is not None  # theta0 is admissible
     size = max(remainder.peaks(fit.x).norm, 1e-300)
     T = ResponseGeometry(remainder, fit.x, grid, size).T
-    objective = HinfObjective(remainder, fit.x, T, limits, grid, floor, system)
+    objective = HinfObjective(remainder, fit.x, T, limits, floor, system)
     # the optimum is certified by the floor; what follows chooses among optimal points
     options = options | {
         "tol": max(options["tol"], _REMAINDER_TOLERANCE),

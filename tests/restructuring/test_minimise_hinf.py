@@ -30,16 +30,15 @@ def objective_of(bounds=None):
     if bounds:
         structure = structure.with_bounds(bounds)
     system = ErrorSystem(structure, Target(box.A, box.B, box.C, box.D))
-    grid = system.grid
     size = system.peaks(theta).norm
-    T = ResponseGeometry(system, theta, grid, size).T
-    return HinfObjective(system, theta, T, Limits(system, 1e-4), grid), names
+    T = ResponseGeometry(system, theta, system.grid, size).T
+    return HinfObjective(system, theta, T, Limits(system, 1e-4)), names
 
 
 def test_hessians_along_the_curves_are_second_derivatives():
     objective, _ = objective_of()
     y = np.zeros(len(objective.theta0))
-    omega = objective.grid[[5, 30, 60]]
+    omega = objective.system.grid[[5, 30, 60]]
     curve = objective.curve(y)
     slopes = objective.samples(y, omega).gradients
     H = objective.hessians(y, omega, np.zeros(3, bool))
