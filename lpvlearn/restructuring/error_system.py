@@ -313,13 +313,13 @@ class ErrorSystem:
         return self.weight_response(omega)[0] @ E
 
     def linearised_error(
-        self, theta: Array, omega: Array
+        self, theta: Array, omega: Array, unit: float = 1.0
     ) -> tuple[Complex, Callable[[], Complex]]:
-        """The weighted error, and a function that gives its derivatives.
+        """The weighted error in that unit, and a function that gives its derivatives.
 
         Shapes (k, n_outputs, n_inputs) and (k, n_outputs, n_inputs, n_params).
         """
-        at, W = self.point(theta, omega), self.weight_response(omega)[0]
+        at, W = self.point(theta, omega), self.weight_response(omega)[0] / unit
 
         def slopes() -> Complex:
             return derivatives(W @ at.L, self.structure.jacobian(theta), at.R)

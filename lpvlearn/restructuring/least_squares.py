@@ -39,21 +39,19 @@ def fit_frequency_response(
     is not admissible (an unstable model). `scaling` (n_outputs, n_inputs) holds factors
     of the residuals' entries, as from `channel_scaling`.
     """
-    factor = np.broadcast_to(
-        np.asarray(scaling) / np.sqrt(len(omega)), (system.n_outputs, system.n_inputs)
-    )
+    unit = float(np.sqrt(len(omega)))
 
     def residuals(x: Array, _: Any) -> tuple[Array, Callable[..., Array]]:
         theta = x[0]
         if not admissible(theta):
             return np.full((1, 1), np.nan), lambda _: np.zeros((1, 1, len(theta)))
-        E, slopes = system.linearised_error(theta, omega)
+        E, slopes = system.linearised_error(theta, omega, unit)
 
         def jacobian(_: Any) -> Array:
-            J = (factor[..., None] * slopes()).reshape(-1, len(theta))
+            J = (np.asarray(scaling)[..., None] * slopes()).reshape(-1, len(theta))
             return np.vstack([J.real, J.imag])[None]
 
-        r = (factor * E).ravel()
+        r = (scaling * E).ravel()
         return np.concatenate([r.real, r.imag])[None], jacobian
 
     structure = system.structure
