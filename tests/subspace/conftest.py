@@ -75,6 +75,7 @@ class Found(NamedTuple):
     C: np.ndarray
     D: np.ndarray
     initial_states: np.ndarray
+    singular_values: np.ndarray
     residual: float
 
 
@@ -84,6 +85,6 @@ def identify(pairs, order, horizon, *, feedthrough=True, **options):
     free = Freedom(np.full((len(sy), len(su)), feedthrough))
     settings = identification.Settings(free, **options)
     found = identification.identify(records, order, horizon, settings)
-    A, B, C, D, initial_states = found.model[:5]
+    A, B, C, D, x0 = found.model[:5]
     C, D = sy[:, None] * C, sy[:, None] * D / su
-    return Found(A, B / su, C, D, initial_states, found.residual)
+    return Found(A, B / su, C, D, x0, found.singular_values, found.residual)
