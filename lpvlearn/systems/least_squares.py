@@ -33,12 +33,18 @@ def scaled_lstsq(M: Array, rhs: Array, rcond: float = RCOND) -> tuple[Array, int
     """
     if M.shape[1] == 0:
         return np.zeros((0, *rhs.shape[1:])), 0
-    scale = np.sqrt(np.einsum("ij,ij->j", M, M))
-    scale[scale == 0.0] = 1.0
+    scale = column_scale(M)
     solution, _, rank, _ = linalg.lstsq(
         M / scale, rhs, cond=rcond, lapack_driver="gelsy", check_finite=False
     )
     return (solution.T / scale).T, int(rank)
+
+
+def column_scale(M: Array) -> Array:
+    """Norm of every column; 1 for a column of zeros."""
+    scale = np.sqrt(np.einsum("ij,ij->j", M, M))
+    scale[scale == 0.0] = 1.0
+    return scale
 
 
 # Residuals (k, n_residuals) of some rows of the stack of starts, not finite where a
