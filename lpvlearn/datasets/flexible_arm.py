@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import GrayBoxStructure, StateSpace
+from ..models.statespace import StateSpace
+from ..structures.structure import GrayBoxStructure
 from .excitation import check_size
 from .mechanics import (
     arm_tables,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import StateSpace
+from ..models.statespace import StateSpace
 from .drawing import ACCENT, INK, MUTED, legend_above, single_axes, tidy
 from .fitted import check_model
 from .frequency import (

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .. import StateSpace
+from ..models.statespace import StateSpace
 
 
 def unwrapped(estimator: Any) -> Any:
@@ -65,13 +65,11 @@ def fitted_pipeline(pipeline: Any, attribute: str) -> Any:
     return pipeline
 
 
-def check_model(name: str, model: Any, kind: type = StateSpace, hint: str = "") -> None:
-    """A ValueError unless the argument is a model of that kind."""
-    if not isinstance(model, kind):
-        article = "an" if kind.__name__[0] in "AEILO" else "a"
+def check_model(name: str, model: Any, hint: str = "") -> None:
+    """A ValueError unless the argument is a StateSpace."""
+    if not isinstance(model, StateSpace):
         raise ValueError(
-            f"`{name}` must be {article} {kind.__name__}. Got {type(model).__name__}"
-            f"{hint}."
+            f"`{name}` must be a StateSpace. Got {type(model).__name__}{hint}."
         )
 
 

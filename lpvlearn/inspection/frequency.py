@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import StateSpace
+from ..models.statespace import StateSpace
 from ..systems.response import pole_grid, pole_rates
 
 Array = NDArray[np.float64]

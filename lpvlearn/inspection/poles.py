@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import LPVStateSpace
 from .drawing import LABEL_SIZE, MUTED, TEXT_SIZE, single_axes, tidy
 from .fitted import (
-    check_model,
     check_one_scheduling,
     fitted_pipeline,
     scheduling_name,
@@ -86,7 +84,7 @@ class PoleDisplay:
     @classmethod
     def from_model(
         cls,
-        model: LPVStateSpace,
+        model: Any,
         *,
         kappa: ArrayLike | None = None,
         damping: bool = False,
@@ -115,8 +113,11 @@ class PoleDisplay:
         ValueError
             If the model has several scheduling variables.
         """
-        hint = "; a fitted LocalLPVPipeline holds one in `lpv_`"
-        check_model("model", model, LPVStateSpace, hint)
+        if not hasattr(model, "frozen_poles"):
+            raise ValueError(
+                f"`model` must be an LPVStateSpace. Got {type(model).__name__}; a "
+                "fitted LocalLPVPipeline holds one in `lpv_`."
+            )
         grid = _grid(model, kappa)
         display = cls(grid, model.frozen_poles(grid), scheduling_label=scheduling_label)
         return display.plot(ax, damping=damping)
@@ -266,7 +267,7 @@ def _draw_damping(ax: Any) -> None:
     ax.set(**limits)
 
 
-def _grid(model: LPVStateSpace, kappa: ArrayLike | None) -> Array:
+def _grid(model: Any, kappa: ArrayLike | None) -> Array:
     check_one_scheduling(model.n_scheduling, "PoleDisplay")
     if kappa is not None:
         return np.asarray(kappa, dtype=float).reshape(-1)

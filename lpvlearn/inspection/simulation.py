@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import bft_score
 from ..data.columns import Table, is_table
 from ..data.experiments import read_outputs
 from ..data.timestamps import time_in_seconds
-from ..validation import one_of
+from ..metrics.scorers import check_options, simulate
+from ..metrics.scores import bft_score
 from .drawing import (
     ACCENT,
     axes_grid,
@@ -198,7 +198,7 @@ class SimulationDisplay:
         ValueError
             If there is no such experiment, or an option is unknown.
         """
-        one_of("initial_state", initial_state, ("rest", "estimate"))
+        check_options(initial_state)
         estimator = unwrapped(estimator)
         if not hasattr(estimator, "split_experiments"):
             raise ValueError(
@@ -210,10 +210,7 @@ class SimulationDisplay:
         outputs, names = read_outputs(y)
         rows = _rows_of(estimator, X, experiment)
         part = X.iloc[rows] if hasattr(X, "iloc") else X[rows]
-        if initial_state == "rest":
-            y_pred = estimator.predict(part)
-        else:
-            y_pred = estimator.predict_with_initial_state(part, outputs[rows])
+        y_pred = simulate(estimator, part, outputs[rows], initial_state)
         time, label = _time_of(estimator, Table(part))
         display = cls(
             time,
