@@ -43,20 +43,16 @@ class PaperExperiment:
     ----------
     data : Bunch
         From `make_flexible_arm`.
-    pipeline : LocalLPVPipeline
-        The method, fitted.
-    comparison : LocalLPVPipeline
-        The local models by the other subspace method.
+    pipeline, comparison : LocalLPVPipeline
+        The method, fitted; the local models by the other subspace method.
     parameters : dict of str to ParameterSet
         "restructured", "analytic" and "balanced".
     lpv : dict of str to LPVStateSpace
         Interpolated with the requested degree.
     tables : dict of str to DataFrame
         "table1", "table1_other", "table2", "table3", "table4", "timing".
-    degree : int
-        Of the interpolation.
-    n_realizations : int
-        Noise realizations at each operating point.
+    degree, n_realizations : int
+        Of the interpolation; of the noise at each operating point.
     method, other_method : str
         Subspace methods of `pipeline` and `comparison`.
     watch : Stopwatch
