@@ -296,7 +296,7 @@ def _rows_of(estimator: Any, X: Any, label: Hashable) -> NDArray[np.intp]:
             "`experiment` must be None, as the estimator takes the table for one "
             f"experiment. Got {label!r}."
         )
-    labels = column[1].labels([rows[0] for rows in groups])
+    labels = column.labels([rows[0] for rows in groups])
     if label not in labels:
         shown = ", ".join(map(repr, labels[:10]))
         shown += ", ..." if len(labels) > 10 else ""
@@ -311,7 +311,7 @@ def _time_of(estimator: Any, table: Table) -> tuple[Array, str]:
     """Time of every row in seconds, else sample numbers; and the axis label."""
     column = table.one(getattr(estimator, "time", None), "time")
     if column is not None:
-        seconds = time_in_seconds(column[1].values, column[1].name)
+        seconds = time_in_seconds(column.values, column.name)
         return np.asarray(seconds, dtype=float), "Time (s)"
     number = np.arange(table.n_rows, dtype=np.float64)
     step = getattr(estimator, "sampling_time_", None)

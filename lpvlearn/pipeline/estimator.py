@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
 from sklearn.utils.validation import check_is_fitted
 
-from ..data.columns import ROLES, as_list
+from ..data.columns import as_list, roles_of
 from ..data.experiments import Experiment, read_experiments, read_outputs
 from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
 from ..data.preparation import split_at_gaps
@@ -353,12 +353,11 @@ list, default=None
     # -- helpers -------------------------------------------------------------------
 
     def _read(self, X: Any, y: Any, *, reset: bool) -> list[Experiment]:
-        roles: dict[str, Any] = {name: getattr(self, name) for name in ROLES}
         gaps = reset and getattr(self.local, "missing", None) == "split"
         options: dict[str, Any] = {"reset": reset, "allow_missing": gaps}
         if reset:
             options["sampling_time"] = self.sampling_time
-        experiments = read_experiments(self, X, y, **roles, **options)
+        experiments = read_experiments(self, X, y, **roles_of(self), **options)
         return split_at_gaps(experiments) if gaps else experiments
 
     def _sampling_time(self, experiments: list[Experiment]) -> float:

@@ -15,10 +15,9 @@ from ..data.columns import ROLES
 from ..data.experiments import Experiment
 from ..data.operating_points import OperatingPoints
 from ..exceptions import warn
-from ..models.statespace import StateSpace
+from ..models.statespace import StateSpace, with_signs_of
 from ..structures.structure import GrayBoxStructure
 from ..subspace.statistics import ModelPair, deviated_models
-from ..systems.balancing import align_signs
 from .runner import PointRunner
 
 Array = NDArray[np.float64]
@@ -209,14 +208,6 @@ def _average(models: Sequence[StateSpace]) -> StateSpace:
     """Average balanced models of one order, state signs aligned to the first."""
     aligned = [with_signs_of(models[0], model) for model in models]
     return StateSpace(*(np.mean([getattr(m, M) for m in aligned], 0) for M in "ABCD"))
-
-
-def with_signs_of(reference: StateSpace, model: StateSpace) -> StateSpace:
-    """A balanced model with the signs of its states turned to those of another."""
-    s = align_signs(model.B, model.C, reference.B, reference.C)
-    return StateSpace(
-        s[:, None] * model.A * s, s[:, None] * model.B, model.C * s, model.D
-    )
 
 
 def _has_auto_order(local: Any) -> bool:

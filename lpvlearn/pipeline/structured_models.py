@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..models.statespace import StateSpace
+from ..models.statespace import StateSpace, with_signs_of
 from ..restructuring.identifiability import response_gain
 from ..restructuring.problem import problem_from_models
 from ..restructuring.starts import GOOD_FIT
 from ..structures.structure import GrayBoxStructure
 from ..subspace.statistics import DEVIATION, ModelPair
-from .local_models import LocalModel, with_signs_of
+from .local_models import LocalModel
 from .runner import PointRunner
 
 Array = NDArray[np.float64]
