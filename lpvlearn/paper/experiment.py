@@ -22,8 +22,8 @@ from .. import (
     SubspaceLTI,
 )
 from ..datasets import make_flexible_arm
-from ..pipeline.runner import Stopwatch
-from ..pipeline.structured_models import balanced_entries
+from ..pipeline.estimator import Stopwatch
+from ..pipeline.points import balanced_entries
 from .tables import (
     ParameterSet,
     interpolation_table,

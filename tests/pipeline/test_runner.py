@@ -11,7 +11,8 @@ import pytest
 from joblib import Memory
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, SubspaceLTI
-from lpvlearn.pipeline.runner import PointRunner, Stopwatch
+from lpvlearn.pipeline.estimator import Stopwatch
+from lpvlearn.pipeline.points import PointRunner
 
 from ..conftest import spring_pipeline, spring_structure, spring_tables
 

@@ -13,8 +13,7 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.pipeline.local_models import identify_point
-from lpvlearn.pipeline.structured_models import covariance_of_parameters
+from lpvlearn.pipeline.points import covariance_of_parameters, identify_point
 from lpvlearn.subspace.statistics import deviated_models
 
 from ..conftest import spring_pipeline, spring_tables
