@@ -19,13 +19,7 @@ def unwrapped(estimator: Any) -> Any:
 def models_of(
     estimator: Any, kappa: float | ArrayLike | None = None
 ) -> dict[str, StateSpace]:
-    """State-space models of a fitted estimator, by name.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or the scheduling value is missing.
-    """
+    """State-space models of a fitted estimator, by name; a pipeline's at `kappa`."""
     estimator = unwrapped(estimator)
     if hasattr(estimator, "lti_"):
         return {type(estimator).__name__: estimator.lti_}

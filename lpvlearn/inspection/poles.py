@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .drawing import LABEL_SIZE, MUTED, TEXT_SIZE, single_axes, tidy
+from .drawing import LABEL_SIZE, MUTED, TEXT_SIZE, legend_above, single_axes, tidy
 from .fitted import (
     check_one_scheduling,
     fitted_pipeline,
@@ -204,18 +204,9 @@ class PoleDisplay:
                 linewidths=1.4,
                 zorder=4,
             )
-            ring = Line2D(
-                [], [], color=MUTED, marker="o", markerfacecolor="none", linestyle=""
-            )
-            one.legend(
-                handles=[ring],
-                labels=["local models"],
-                loc="lower left",
-                bbox_to_anchor=(0.0, 1.0),
-                frameon=False,
-                borderaxespad=0.1,
-                fontsize=TEXT_SIZE,
-            )
+            ring = {"color": MUTED, "marker": "o", "markerfacecolor": "none"}
+            label = "local models"
+            legend_above(one, [Line2D([], [], linestyle="", label=label, **ring)])
         tidy(one)
         one.autoscale_view()
         # The border of stability is part of the picture.

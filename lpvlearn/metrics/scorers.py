@@ -165,7 +165,7 @@ def _make_scorer(
 
 
 def check_options(initial_state: str, burn_in: int = 0) -> None:
-    """Refuse options that scorers and reports do not know."""
+    """Refuse options that scorers, reports and pictures do not know."""
     one_of("initial_state", initial_state, ("rest", "estimate"))
     whole_number("burn_in", burn_in, 0)
 

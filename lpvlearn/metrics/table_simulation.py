@@ -58,22 +58,10 @@ def simulate_experiments(
     *,
     estimate: bool,
 ) -> Array:
-    """Simulate a model along the experiments of a table.
+    """Outputs (n_samples, n_outputs) of a model along the experiments of a table.
 
-    Parameters
-    ----------
-    model : StateSpace or LPVStateSpace
-    experiments : sequence of Experiment
-    sampling_time : float
-        Of experiments that do not tell it themselves.
-    estimate : bool
-        Whether to begin in initial states estimated on the outputs by least squares
-        (else at rest).
-
-    Returns
-    -------
-    ndarray of shape (n_samples, n_outputs)
-        Rows of all experiments where they stand in the table.
+    Rows stand where they do in the table; `sampling_time` is that of experiments that
+    do not tell it. From rest, or from initial states estimated on the outputs.
     """
     table = np.empty((sum(len(e.rows) for e in experiments), model.n_outputs))
     for e in experiments:

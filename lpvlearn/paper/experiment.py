@@ -129,14 +129,11 @@ def run_paper_experiment(
         ).fit(data.X, data.y)
     with watch.step("validation"):
         kappa = pipeline.operating_points_
+        analytic = [data.arm.parameters(np.arccos(k)) for k in kappa[:, 0]]
+        own = pipeline.parameters_.to_numpy()
         parameters = {
-            "restructured": ParameterSet(
-                data.structure, pipeline.parameters_.to_numpy()
-            ),
-            "analytic": ParameterSet(
-                data.structure,
-                np.array([data.arm.parameters(np.arccos(k)) for k in kappa[:, 0]]),
-            ),
+            "restructured": ParameterSet(data.structure, own),
+            "analytic": ParameterSet(data.structure, np.array(analytic)),
             "balanced": ParameterSet(*balanced_entries(pipeline.local_models_)),
         }
         lpv = {

@@ -53,7 +53,7 @@ def tables(found: StructuredModels, lpv: LPVStateSpace, sampling_time: float) ->
         if found.restructurers:
             row["structured_BFT"] = fit_of(gray_box, group, sampling_time)
             row |= _restructuring(found.restructurers[k])
-        distance = (gray_box - lpv.at(points.kappa[k])).hinf_norm()
+        distance = (gray_box - found.structure.model(interpolated[k])).hinf_norm()
         size = gray_box.hinf_norm()
         row["interpolation_error"] = distance / size if size > 0 else np.nan
         row["interpolation_FIT"] = parameter_fit(theta[k], interpolated[k])
