@@ -204,9 +204,9 @@ class PoleDisplay:
                 linewidths=1.4,
                 zorder=4,
             )
-            ring = {"color": MUTED, "marker": "o", "markerfacecolor": "none"}
-            label = "local models"
-            legend_above(one, [Line2D([], [], linestyle="", label=label, **ring)])
+            ring = Line2D([], [], color=MUTED, marker="o", markerfacecolor="none")
+            ring.set(linestyle="", label="local models")
+            legend_above(one, [ring])
         tidy(one)
         one.autoscale_view()
         # The border of stability is part of the picture.
