@@ -69,10 +69,10 @@ class FlexibleArm:
     >>> arm = FlexibleArm()
     >>> arm.linearize(np.pi / 2).order
     6
-    >>> step = np.full((500, 2), 0.1)
+    >>> step = np.full((50, 2), 0.1)
     >>> response = arm.simulate(step, np.pi / 2, 1e-3)
     >>> response.y.shape, response.kappa.shape
-    ((500, 2), (500,))
+    ((50, 2), (50,))
     """
 
     l1: float = 0.3
