@@ -253,8 +253,10 @@ list, default=None
             an operating point (which the message names).
         """
         self._check_options()
-        runner, watch = self._runner(), Stopwatch()
-        restructurer = self._restructurer()
+        steps = {"local": self.local, "restructurer": self.restructurer}
+        memory = _checked_memory(self.memory, steps)
+        runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
+        restructurer, watch = self._restructurer(), Stopwatch()
 
         with watch.step("reading of the table"):  # steps 1 and 2, and their groups
             experiments = self._read(X, y, reset=True)
@@ -388,18 +390,11 @@ list, default=None
             return positive_time("sampling_time", self.sampling_time)
         return float(getattr(self.local, "sampling_time", None) or 1.0)
 
-    def _runner(self) -> PointRunner:
-        steps = {"local": self.local, "restructurer": self.restructurer}
-        memory = _checked_memory(self.memory, steps)
-        return PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
-
     def _restructurer(self) -> Any:
         """The restructurer to clone, or None for "passthrough"."""
-        if isinstance(self.restructurer, str):
-            return None
         if self.restructurer is None:
             return GrayBoxRestructurer()
-        return self.restructurer
+        return None if isinstance(self.restructurer, str) else self.restructurer
 
     def _interpolator(self, n_points: int) -> Any:
         if n_points == 1:

@@ -74,7 +74,7 @@ def identify_points(
     one, "auto" becomes the highest order that a point takes. Options as in
     `identify_point`.
     """
-    chooses = _has_auto_order(local)
+    chooses = local.get_params(deep=False).get("order") == "auto"
     if chooses and isinstance(structure, GrayBoxStructure):
         local = clone(local).set_params(order=structure.order)
     # Where a record stood in the table does not matter: splits share their results.
@@ -188,11 +188,6 @@ def _average(models: Sequence[StateSpace]) -> StateSpace:
     """Average balanced models of one order, state signs aligned to the first."""
     aligned = [with_signs_of(models[0], model) for model in models]
     return StateSpace(*(np.mean([getattr(m, M) for m in aligned], 0) for M in "ABCD"))
-
-
-def _has_auto_order(local: Any) -> bool:
-    order = local.get_params(deep=False).get("order")
-    return isinstance(order, str) and order == "auto"
 
 
 def _bare(experiment: Experiment) -> Experiment:
