@@ -30,7 +30,7 @@ def real_array(name: str, value: Any) -> Array:
     try:
         array = np.asarray(value)
         if array.dtype.kind in "biufO":
-            return np.array(array, dtype=np.float64, order="C")
+            return np.array(array, dtype=np.float64)
     except (TypeError, ValueError):
         pass
     shown = repr(value)

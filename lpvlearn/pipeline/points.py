@@ -265,7 +265,10 @@ def restructure_points(
         unknown = np.full(theta.shape, np.nan)
         return StructuredModels(points, local, structure, theta, unknown, balanced, [])
     # What a fit is about: the model, and where they are known its realizations.
-    tasks = [(model.lti, model.realizations) for model in local]
+    tasks = [
+        (_plain(model.lti), [_plain(other) for other in model.realizations])
+        for model in local
+    ]
     found = runner.run(
         "restructuring",
         _restructure_point,
@@ -285,16 +288,16 @@ def restructure_points(
     )
     theta = np.array([fitted.params_ for fitted in helped])
     std = np.full(theta.shape, np.nan)
-    for row, fitted, black_box in zip(std, helped, local, strict=True):
+    for row, fitted, model in zip(std, helped, local, strict=True):
         known = getattr(fitted, "params_covariance_", None)  # where it tells its own
-        if known is None and black_box.deviated:
+        if known is None and model.deviated:
             known = runner.call(
                 covariance_of_parameters,
                 fitted.structure_,
                 fitted.params_,
                 getattr(fitted, "frequency_weight", None),
-                black_box.lti,
-                black_box.deviated,
+                _plain(model.lti),
+                model.deviated,
             )
         if known is not None:
             row[:] = np.sqrt(np.diag(known))
@@ -377,6 +380,12 @@ def covariance_of_parameters(
         changes.append(np.einsum("jkpm,kpm->j", K, dG).real / (2.0 * DEVIATION))
     T = np.array(changes)
     return T.T @ T
+
+
+def _plain(model: StateSpace) -> StateSpace:
+    """The model with matrices laid out as a memory returns them, to be found there."""
+    A, B, C, D = (np.array(M, order="C") for M in (model.A, model.B, model.C, model.D))
+    return StateSpace(A, B, C, D, model.sampling_time)
 
 
 def balanced_entries(models: Sequence[StateSpace]) -> tuple[GrayBoxStructure, Array]:
