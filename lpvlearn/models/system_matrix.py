@@ -34,20 +34,8 @@ def stack_system(
 ) -> NDArray[Any]:
     """``[[A, B], [C, D]]`` from (A, B, C) or (A, B, C, D), after `lead` axes.
 
-    Parameters
-    ----------
-    source : str
-        Name of the function that returned the blocks, for the message.
-    blocks : sequence of array-like
-    shape : tuple of int
-        order, n_inputs, n_outputs.
-    lead : tuple of int
-        Leading axes that all blocks have.
-
-    Raises
-    ------
-    ValueError
-        If a block has another shape.
+    `shape` is order, n_inputs, n_outputs. A ValueError about the function `source`
+    that returned the blocks, if one has another shape.
     """
     n, m, p = shape
     given = [np.asarray(block) for block in blocks if block is not None]

@@ -87,15 +87,9 @@ def balancing_transformation(
 ) -> tuple[Array, Array, Array]:
     """Hankel singular values and the balancing projections of a stable model.
 
-    Returns
-    -------
-    hankel : ndarray of shape (n,)
-        Hankel singular values, descending.
-    left : ndarray of shape (r, n)
-    right : ndarray of shape (n, r)
-        ``left @ right = I``; ``(left A right, left B, C right)`` is balanced. `r` is
-        less than `n` when the remaining singular values are rounding noise
-        (states that are not controllable or not observable).
+    Values (n,), descending; `left` (r, n) and `right` (n, r) with ``left @ right = I``:
+    ``(left A right, left B, C right)`` is balanced. `r` is less than `n` when the
+    remaining values are rounding noise (states not controllable or not observable).
 
     Examples
     --------

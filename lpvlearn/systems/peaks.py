@@ -17,8 +17,7 @@ from .response import FrequencyEngine
 
 _TINY = float(np.finfo(float).tiny)
 
-# Relative gap below which two singular values count as one: rounding of their squares.
-_TIE = 1e-14
+_TIE = 1e-14  # relative gap of two equal singular values: rounding of their squares
 
 # Two maxima are one unless the singular value dips by this much between them: above
 # the rounding of a modal sum, 1e-13 to 1e-12 of its size.
@@ -32,21 +31,15 @@ _SAME = 1e-6
 # few parts in 1e7.
 _COVERED = 1e-3
 
-# Modal values with a smaller bound on their relative error are not solved anew.
-_TRUSTED = 1e-9
+_TRUSTED = 1e-9  # bound on the error of modal values that are not solved anew
 
 # Rounds of subdivision, by four each, where samples leave the sign of the slope in
 # doubt: a thousandth of the distance of two samples.
 _MAX_SPLITS = 5
 
-# Newton's method needs three to six steps; the rest is for bisection of a bracket.
-_MAX_NEWTON = 40
-
-# Convergence is quadratic: a step that gains this part of the value is the last.
-_LAST_GAIN = 1e-9
-
-# Stands for an infinite frequency, where nothing but the feedthrough is left.
-_FAR = 1e200
+_MAX_NEWTON = 40  # three to six steps; the rest is for bisection of a bracket
+_LAST_GAIN = 1e-9  # a step that gains less is the last: convergence is quadratic
+_FAR = 1e200  # for an infinite frequency, where only the feedthrough is left
 
 # Places of the samples in an interval that may hold maxima: ten tell three apart.
 TENTHS = (np.arange(10) + 0.5) / 10
@@ -56,8 +49,7 @@ TENTHS = (np.arange(10) + 0.5) / 10
 _MAX_CANDIDATES = 6
 _SAMPLED = 0.02
 
-# How far a search may go from the last sample towards infinity, as a factor.
-_REACH = 1e3
+_REACH = 1e3  # factor by which a search may go beyond the last sample, to infinity
 
 
 class Peak(NamedTuple):
@@ -86,14 +78,7 @@ class _Bracket(NamedTuple):
 class PeakRefiner:
     """Finds the maxima of the largest singular value near given samples.
 
-    Parameters
-    ----------
-    engine : FrequencyEngine
-
-    Attributes
-    ----------
-    end : float
-        The end of the frequency axis: infinity, or pi in discrete time.
+    `end` is that of the frequency axis: infinity, or pi in discrete time.
 
     Examples
     --------
@@ -188,8 +173,8 @@ class PeakRefiner:
     def _climb(self, w: float, lower: float, upper: float, quick: bool = False) -> Peak:
         """Safeguarded Newton steps on 1 / sigma**2, a parabola near one mode.
 
-        The values are those of factorisations; if `quick`, only the first step
-        is by modes. Rounding may have moved the bracket a little off the peak.
+        By factorisations; if `quick`, the first step is by modes. Rounding may have
+        moved the bracket a little off the peak.
         """
         margin = 3e-3 * (upper - lower)  # rounding is far below, another peak above
         lower, upper = max(lower - margin, 0.0), min(upper + margin, self.end)
@@ -447,9 +432,8 @@ def _square_derivatives(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Square of the largest singular value and its two derivatives.
 
-    From the response and its two derivatives in frequency. Where the largest singular
-    value is not simple and not smooth, the curvature is large and positive: such a
-    point is never a maximum.
+    From G and its two derivatives. Where the value is not simple and not smooth, the
+    curvature is large and positive: such a point is never a maximum.
 
     Examples
     --------
@@ -490,11 +474,8 @@ def _derivatives_of_two(
     coordinates = np.array(
         ((k11 + k22).real, (k11 - k22).real, (k12 + k21).real, (k12 - k21).imag)
     ).reshape(4, 4, -1)
-    m, m1, m2 = (
-        0.5 * coordinates[:, 0],
-        coordinates[:, 1],
-        coordinates[:, 2] + coordinates[:, 3],
-    )
+    m, m1 = 0.5 * coordinates[:, 0], coordinates[:, 1]
+    m2 = coordinates[:, 2] + coordinates[:, 3]
     d, d1, d2 = m[1:], m1[1:], m2[1:]
     radius = np.sqrt((d * d).sum(0))
     safe = np.maximum(radius, _TIE * m[0]) + _TINY
