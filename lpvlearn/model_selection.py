@@ -59,8 +59,7 @@ from sklearn.model_selection import BaseCrossValidator
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_consistent_length
 
-from .data.columns import Column, Table
-from .data.experiments import Experiment, group_rows, operating_point_of
+from .data.experiments import Column, Experiment, Table, group_rows, operating_point_of
 from .data.operating_points import group_operating_points
 from .validation import one_of, whole_number
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import bft_score
-from ..data.columns import Table, is_table
-from ..data.experiments import read_outputs
+from ..data.experiments import Table, is_table, read_outputs
 from ..data.timestamps import time_in_seconds
 from ..validation import one_of
 from .drawing import (

@@ -11,8 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..data.columns import ROLES
-from ..data.experiments import Experiment
+from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
 from ..exceptions import warn
 from ..models.statespace import StateSpace, with_signs_of
