@@ -34,8 +34,7 @@ Array = NDArray[np.float64]
 # differences carry rounding (1e-9 s at 1000 s, beside steps of a millisecond).
 _SAME_TIME = 1e-6
 
-# A change of basis worse conditioned than this, after scaling, leaves two digits.
-_SINGULAR = 1e14
+_SINGULAR = 1e14  # a change of basis worse conditioned, once scaled, leaves two digits
 
 _METHODS = ("zoh", "tustin")
 
@@ -128,11 +127,8 @@ class StateSpace:
         return type(self), (self.A, self.B, self.C, self.D, self.sampling_time)
 
     def __repr__(self) -> str:
-        time = (
-            "continuous time"
-            if self.sampling_time is None
-            else f"sampling_time={self.sampling_time:g}"
-        )
+        dt = self.sampling_time
+        time = "continuous time" if dt is None else f"sampling_time={dt:g}"
         return (
             f"{type(self).__name__}(order={self.order}, n_inputs={self.n_inputs}, "
             f"n_outputs={self.n_outputs}, {time})"

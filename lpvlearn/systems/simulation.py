@@ -86,14 +86,6 @@ def estimate_initial_state(responses: Array, error: Array) -> Array:
     ``min || error - sum_i responses[:, :, i] x0[i] ||``, of minimum norm where the
     responses (of every unit initial state) do not determine it. The error has shape
     (n_samples, n_outputs), and one more axis for several runs.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> A, C = np.array([[0.5]]), np.array([[2.0]])
-    >>> responses = free_responses(A, C, 3)
-    >>> estimate_initial_state(responses, np.array([[6.0], [3.0], [1.5]]))
-    array([3.])
     """
     n_rows = error.shape[0] * error.shape[1]
     columns = responses.reshape(n_rows, -1)
