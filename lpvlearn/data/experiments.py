@@ -232,17 +232,6 @@ def read_experiments(
     outputs with `allow_missing` excepted), infinite or not a number, time within an
     experiment does not increase evenly or disagrees with `sampling_time`, or an
     operating point changes within an experiment.
-
-    Examples
-    --------
-    >>> import pandas as pd
-    >>> from sklearn.base import BaseEstimator
-    >>> from lpvlearn.data.experiments import read_experiments
-    >>> X = pd.DataFrame({"u": [1.0, 0.0, 2.0, 1.0], "run": ["a", "b", "a", "b"]})
-    >>> for run in read_experiments(BaseEstimator(), X, experiment="run"):
-    ...     print(run.label, run.rows, run.inputs.ravel())
-    a [0 2] [1. 2.]
-    b [1 3] [0. 1.]
     """
     roles = roles_of(estimator) | roles
     if not is_table(X):
@@ -390,12 +379,6 @@ def read_outputs(y: Any) -> tuple[Array, list[Hashable]]:
 
     From a DataFrame, a Series or an array-like, not checked for missing values. Raises
     a ValueError when a column does not hold real numbers.
-
-    Examples
-    --------
-    >>> read_outputs([0.5, 1.5])
-    (array([[0.5],
-           [1.5]]), ['y1'])
     """
     if is_table(y):
         table = Table(y, "y")

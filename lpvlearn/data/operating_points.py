@@ -154,17 +154,6 @@ def group_operating_points(
     The values (n_points, n_scheduling) are the means over a point's experiments, in
     lexicographic order; without scheduling columns `n_scheduling` is 0, and points are
     in the order of first appearance.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> runs = [
-    ...     Experiment(k, np.arange(1), np.ones((1, 1)), scheduling=np.array([[kappa]]))
-    ...     for k, kappa in enumerate([0.9, 0.1, 0.9])
-    ... ]
-    >>> index, kappa = group_operating_points(runs)
-    >>> index, kappa.ravel()
-    (array([1, 0, 1]), array([0.1, 0.9]))
     """
     signals = [run.scheduling for run in experiments if run.scheduling is not None]
     means = None

@@ -41,12 +41,6 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
 
     A float32 column stays float32: its rounding is part of the guard's tolerance.
     Raises a ValueError on what is neither a finite number nor a date, naming `column`.
-
-    Examples
-    --------
-    >>> import pandas as pd
-    >>> time_in_seconds(pd.to_datetime(["2024-01-01 12:00", "2024-01-01 12:01"]), "t")
-    array([ 0., 60.])
     """
     series = pd.Series(values).infer_objects()
     kind = getattr(series.dtype, "kind", "O")
@@ -88,12 +82,6 @@ def check_uniform_time(
     long as that unit is less than half the step. Raises a ValueError when time does
     not increase, is uneven, or has another step than declared to the estimator
     (`sampling_time`) or found in the other experiments (`other_step`).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> check_uniform_time(np.arange(5) / 8, column="t", experiment=0)
-    0.125
     """
     n_samples = len(seconds)
     if n_samples < 2:

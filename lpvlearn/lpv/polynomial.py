@@ -232,11 +232,6 @@ def total_degree_powers(degree: int, n_variables: int) -> NDArray[np.intp]:
     """Exponents (n_terms, n_variables) of all monomials up to a total degree.
 
     By increasing total degree, lexicographic within one.
-
-    Examples
-    --------
-    >>> total_degree_powers(2, 2).tolist()
-    [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]]
     """
     factors = (
         product

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,11 @@ class StateSpace:
     sampling_time : float, default=None
         Seconds between samples; None is continuous time.
 
+    Attributes
+    ----------
+    order, n_inputs, n_outputs : int
+        Numbers of states, inputs and outputs.
+
     Raises
     ------
     ValueError
@@ -81,6 +86,9 @@ class StateSpace:
     C: Array
     D: Array
     sampling_time: float | None
+    order: int = field(init=False)
+    n_inputs: int = field(init=False)
+    n_outputs: int = field(init=False)
 
     def __init__(
         self,
@@ -118,9 +126,11 @@ class StateSpace:
         for name, value in zip("ABCD", (A, B, C, D), strict=True):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        if sampling_time is not None:
-            sampling_time = positive_time("sampling_time", sampling_time)
-        object.__setattr__(self, "sampling_time", sampling_time)
+        dt = sampling_time
+        dt = None if dt is None else positive_time("sampling_time", dt)
+        names = ("sampling_time", "order", "n_outputs", "n_inputs")
+        for name, number in zip(names, (dt, n, *shape), strict=True):
+            object.__setattr__(self, name, number)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles are built anew, so that their arrays are read-only too.
@@ -133,21 +143,6 @@ class StateSpace:
             f"{type(self).__name__}(order={self.order}, n_inputs={self.n_inputs}, "
             f"n_outputs={self.n_outputs}, {time})"
         )
-
-    @property
-    def order(self) -> int:
-        """Number of states."""
-        return self.A.shape[0]
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of inputs."""
-        return self.D.shape[1]
-
-    @property
-    def n_outputs(self) -> int:
-        """Number of outputs."""
-        return self.D.shape[0]
 
     @property
     def is_continuous(self) -> bool:

@@ -14,14 +14,7 @@ Blocks = tuple[Array, Array, Array, Array]
 
 
 def blocks(S: Array, order: int) -> Blocks:
-    """A, B, C, D of ``S = [[A, B], [C, D]]``, stacked over its leading axes.
-
-    Examples
-    --------
-    >>> A, B, C, D = blocks(np.arange(4.0).reshape(2, 2), 1)
-    >>> float(B[0, 0])
-    1.0
-    """
+    """A, B, C, D of ``S = [[A, B], [C, D]]``, stacked over its leading axes."""
     n = order
     return S[..., :n, :n], S[..., :n, n:], S[..., n:, :n], S[..., n:, n:]
 

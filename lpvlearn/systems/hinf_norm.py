@@ -128,20 +128,7 @@ def hinf_norm(
     dt: float | None = None,
     within: float | None = None,
 ) -> PeakSet:
-    """H-infinity norm and peaks: `linf_norm` of a stable system, else infinity.
-
-    There are no frequencies if a pole lies in the closed right half plane, or not
-    inside the open unit disc.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> one = np.ones((1, 1))
-    >>> hinf_norm(-one, one, one, 0 * one).norm
-    1.0
-    >>> hinf_norm(one, one, one, 0 * one).norm
-    inf
-    """
+    """H-infinity norm and peaks: `linf_norm` of a stable system, else inf and none."""
     return linf_norm(A, B, C, D, dt=dt, within=within, stable=True)
 
 
@@ -299,16 +286,6 @@ class _LevelSets:
     then stays well conditioned also just above a peak at the other end.
 
     No pole may lie on the boundary.
-
-    Examples
-    --------
-    The gain of 1 / (s + 1) is 0.5 at the square root of 3:
-
-    >>> import numpy as np
-    >>> one = np.ones((1, 1))
-    >>> engine = FrequencyEngine(-one, one, one, 0 * one)
-    >>> _LevelSets(engine).crossings(0.5).round(12)
-    array([1.73205081])
     """
 
     def __init__(self, engine: FrequencyEngine) -> None:

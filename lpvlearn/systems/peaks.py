@@ -79,16 +79,6 @@ class PeakRefiner:
     """Finds the maxima of the largest singular value near given samples.
 
     `end` is that of the frequency axis: infinity, or pi in discrete time.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> A, B = np.array([[0.0, 1.0], [-1.0, -0.2]]), np.array([[0.0], [1.0]])
-    >>> C, D = np.array([[1.0, 0.0]]), np.zeros((1, 1))
-    >>> refiner = PeakRefiner(FrequencyEngine(A, B, C, D))
-    >>> w, s = refiner.sampled(np.array([np.inf, 0.0, 0.5, 1.0, 2.0]))
-    >>> [round(peak.frequency, 9) for peak in refiner.every(w, s, floor=1.0)]
-    [0.989949494]
     """
 
     def __init__(self, engine: FrequencyEngine) -> None:
@@ -106,10 +96,10 @@ class PeakRefiner:
     def highest(
         self, w: NDArray, s: NDArray, floor: float, known: list[Peak] | None = None
     ) -> list[Peak]:
-        """Refine the highest local maxima of the samples, one after the other.
+        """Refine the highest local maxima of the samples that are not known.
 
-        The known ones are left out, and those that their samples put clearly
-        below the best: the level set above it shows whether that was wrong.
+        Those that their samples put clearly below the best are left out: the level set
+        above it shows whether that was wrong.
         """
         padded = np.concatenate(([-1.0], s, [-1.0]))
         tops = (s >= floor) & (s >= padded[:-2]) & (s >= padded[2:])
@@ -129,10 +119,7 @@ class PeakRefiner:
         return peaks
 
     def _bracket(self, w: NDArray, s: NDArray, k: int) -> _Bracket:
-        """A maximum of the samples, its neighbours and the vertex between them.
-
-        One mode alone makes 1 / s**2 a parabola, whose vertex is then the peak.
-        """
+        """Of one mode alone the vertex of the parabola 1 / s**2 is the peak."""
         at, top = float(w[k]), float(s[k])
         if k == 0 or at == self.end:
             return _Bracket(at, at, at, at, top, top)
@@ -355,8 +342,7 @@ def _stepped(aimed: NDArray) -> NDArray:
 def _aimed(left: NDArray, right: NDArray) -> NDArray:
     """Newton starts (jets) and brackets, for intervals with a maximum inside.
 
-    Both ends start if both aim into the interval: where two branches of the
-    singular value cross they find one maximum each.
+    Both ends start if both aim into it: two branches that cross have a maximum each.
     """
     turns = (left[2] >= 0) & (right[2] <= 0)
     left, right = left[:, turns], right[:, turns]

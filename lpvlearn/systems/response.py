@@ -41,15 +41,6 @@ def frequency_response(
     give D (a ValueError in discrete time); at a pole on the axis every entry is
     infinite. Modal coordinates of the equilibrated system, checked for cancellation;
     the frequencies where digits would be lost are solved one by one.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> G = frequency_response(np.array([[-2.0]]), np.array([[2.0]]),
-    ...                        np.array([[1.0]]), np.array([[3.0]]),
-    ...                        [0.0, 2.0, np.inf])
-    >>> G[:, 0, 0]
-    array([4. +0.j , 3.5-0.5j, 3. +0.j ])
     """
     omega = np.atleast_1d(np.asarray(omega, float))
     finite = np.isfinite(omega)

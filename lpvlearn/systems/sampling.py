@@ -38,19 +38,6 @@ def sample_zoh(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
 
     ``exp([A B; 0 0] dt) = [Ad Bd; 0 I]``: exact for inputs held over `dt`. Raises a
     ValueError if it overflows (an unstable pole, far too fast for `dt`).
-
-    Examples
-    --------
-    A double integrator:
-
-    >>> import numpy as np
-    >>> Ad, Bd = sample_zoh(np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]]), 0.5)
-    >>> Ad
-    array([[1. , 0.5],
-           [0. , 1. ]])
-    >>> Bd
-    array([[0.125],
-           [0.5  ]])
     """
     n, m = B.shape[-2:]
     M = np.zeros(A.shape[:-2] + (n + m, n + m))
