@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 from threadpoolctl import ThreadpoolController
 
-from ..data.columns import ROLES
-from ..data.experiments import Experiment
+from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
 from ..exceptions import warn
 from ..models.statespace import StateSpace, with_signs_of

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
-from ..data.columns import Table, roles_of
-from ..data.experiments import Experiment, read_experiments
+from ..data.experiments import Experiment, Table, read_experiments
 from ..data.preparation import split_at_gaps
 from ..models.innovation import InnovationModel
 from ..validation import one_of
@@ -535,7 +534,6 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self,
             X,
             y,
-            **roles_of(self),
             sampling_time=self.sampling_time,
             reset=reset,
             allow_missing=gaps,

@@ -18,8 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.columns import Column
-from ..data.experiments import Experiment
+from ..data.experiments import Column, Experiment
 from ..data.preparation import (
     Pairs,
     complete_runs,
