@@ -92,10 +92,11 @@ def levenberg_marquardt(
     x = np.clip(starts, lower, upper)
     k, q = x.shape
     cost, damping = np.full(k, np.inf), np.full(k, _FIRST_DAMPING)
-    # J = Q R at x, c = Q^T r, the longest columns so far, and R / S = U diag(s) V^T
-    # with the coordinates b = U^T c and the directions W = V^T / S
-    R, c, S = np.zeros((k, q, q)), np.zeros((k, q)), np.zeros((k, q))
-    s, b, W = np.zeros((k, q)), np.zeros((k, q)), np.zeros((k, q, q))
+    # At x: J^T J, J^T r, the longest columns of J so far, and their inverses, 0 where
+    # a bound holds the variable
+    H, g = np.zeros((k, q, q)), np.zeros((k, q))
+    S, unit = np.zeros((k, q)), np.zeros((k, q))
+    diagonal = np.arange(q)
 
     def move(rows: Rows, trial: Array) -> NDArray[np.bool_]:
         """Take the trial points that lower the cost; which these are."""
@@ -110,17 +111,11 @@ def levenberg_marquardt(
         better[better] = finite
         own, J = rows[better], J[finite]
         x[own], cost[own] = trial[better], new[better]
-        square = np.zeros((len(own), q + 1, q + 1))
-        stacked = np.concatenate([J, r[better, :, None]], axis=2)
-        corner = np.asarray(np.linalg.qr(stacked, mode="r"))
-        square[:, : corner.shape[1]] = corner
-        R[own], c[own] = square[:, :q, :q], square[:, :q, q]
-        S[own] = np.maximum(S[own], np.linalg.norm(R[own], axis=1))
-        slope = (c[own, None] @ R[own])[:, 0]
-        held = ((x[own] <= lower) & (slope > 0)) | ((x[own] >= upper) & (slope < 0))
-        unit = np.where(held, 0.0, 1.0 / np.where(S[own] > 0, S[own], 1.0))
-        U, s[own], Vt = np.linalg.svd(R[own] * unit[:, None])
-        b[own], W[own] = (c[own, None] @ U)[:, 0], Vt * unit[:, None]
+        transposed = J.swapaxes(1, 2)
+        H[own], g[own] = transposed @ J, (transposed @ r[better, :, None])[:, :, 0]
+        S[own] = np.maximum(S[own], np.sqrt(H[own][:, diagonal, diagonal]))
+        held = ((x[own] <= lower) & (g[own] > 0)) | ((x[own] >= upper) & (g[own] < 0))
+        unit[own] = np.where(held, 0.0, 1.0 / np.where(S[own] > 0, S[own], 1.0))
         return better
 
     move(np.arange(k), x.copy())
@@ -129,12 +124,15 @@ def levenberg_marquardt(
         rows = np.flatnonzero(active)
         if len(rows) == 0 or (enough is not None and (cost <= exact).sum() >= enough):
             break
-        level = damping[rows, None]
-        d = -((b[rows] * s[rows] / (s[rows] ** 2 + level))[:, None] @ W[rows])[:, 0]
+        D = unit[rows]
+        damped = H[rows] * D[:, :, None] * D[:, None]
+        damped[:, diagonal, diagonal] += damping[rows, None]
+        d = -D * np.linalg.solve(damped, (D * g[rows])[:, :, None])[:, :, 0]
         d *= np.minimum(1.0, longest / np.maximum(np.abs(d).max(1), 1e-300))[:, None]
         trial = np.clip(x[rows] + d, lower, upper)
-        left = c[rows] + (R[rows] @ (trial - x[rows])[:, :, None])[:, :, 0]
-        promised = np.sum(c[rows] ** 2 - left**2, axis=1)
+        taken = trial - x[rows]
+        bend = (H[rows] @ taken[:, :, None])[:, :, 0]
+        promised = -np.sum(taken * (2.0 * g[rows] + bend), axis=1)
         before = cost[rows]
         # a step that a bound cuts off may promise nothing where a shorter one does
         hopeful = promised > _NOISE * before
