@@ -18,19 +18,8 @@ from ..conftest import modes
 ROLES = {"inputs": ["torque", "valve"], "experiment": "run", "time": "time"}
 
 
-@pytest.fixture(autouse=True)
-def plt():
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as pyplot
-
-    yield pyplot
-    pyplot.close("all")
-
-
 @pytest.fixture(scope="module")
-def tables():
+def plant():
     """Two experiments on a plant of three states, 2 x 2, with white noise."""
     rng = np.random.default_rng(0)
     A = modes(0.9, 0.7 * np.exp(0.8j))
@@ -51,8 +40,8 @@ def tables():
 
 
 @pytest.fixture(scope="module")
-def fitted(tables):
-    return SubspaceLTI(order=3, horizon=8, **ROLES).fit(*tables)
+def fitted(plant):
+    return SubspaceLTI(order=3, horizon=8, **ROLES).fit(*plant)
 
 
 def drawn(display, place):
@@ -67,8 +56,8 @@ def drawn(display, place):
 
 
 @pytest.mark.parametrize("errors", ["simulation", "prediction"])
-def test_panels_are_the_correlations_of_the_estimators_errors(tables, fitted, errors):
-    X, y = tables
+def test_panels_are_the_correlations_of_the_estimators_errors(plant, fitted, errors):
+    X, y = plant
     display = ResidualDisplay.from_estimator(fitted, X, y, errors=errors, n_lags=12)
     predicted = (
         fitted.predict_with_initial_state(X, y)
@@ -101,11 +90,11 @@ def test_panels_are_the_correlations_of_the_estimators_errors(tables, fitted, er
     assert set(display.tests["input"]) == {"", "torque", "valve"}
 
 
-def test_a_model_that_lacks_states_is_seen_and_said(tables, fitted):
-    poor = SubspaceLTI(order=2, horizon=8, **ROLES).fit(*tables)
+def test_a_model_that_lacks_states_is_seen_and_said(plant, fitted):
+    poor = SubspaceLTI(order=2, horizon=8, **ROLES).fit(*plant)
     shown = {}
     for name, model in (("good", fitted), ("poor", poor)):
-        display = ResidualDisplay.from_estimator(model, *tables)
+        display = ResidualDisplay.from_estimator(model, *plant)
         shown[name] = display.tests.groupby("test")["p_value"].min()
         texts = {t.get_text() for ax in display.axes_.flat for t in ax.texts}
         assert any(text.startswith("past p") for text in texts)
@@ -119,8 +108,25 @@ def test_a_model_that_lacks_states_is_seen_and_said(tables, fitted):
     assert min(s["future inputs"] for s in shown.values()) > 1e-3
 
 
-def test_missing_samples_are_left_out(tables):
-    X, y = tables[0].copy(), tables[1].copy()
+def test_pvalues_are_those_of_the_estimator_and_zero_errors_can_be_drawn(plant, fitted):
+    display = ResidualDisplay.from_estimator(fitted, *plant, confidence=0.9)
+    expected = fitted.residual_tests(*plant, level=0.1)
+    pd.testing.assert_frame_equal(display.tests, expected)
+    silent = ResidualDisplay.from_residuals(np.zeros((50, 1)), E[:50])
+    assert silent.tests["passed"].all()
+
+
+def test_a_pipeline_is_drawn_from_its_simulation(tables, pipeline):
+    X, y = tables
+    display = ResidualDisplay.from_estimator(pipeline, X, y)
+    wrong = y.to_numpy() - pipeline.predict_with_initial_state(X, y)
+    e = [wrong[rows] for rows in pipeline.split_experiments(X)]
+    assert_allclose(display.autocorrelations, autocorrelations(e, 25))
+    assert display.output_names == ["angle"] and display.input_names == ["u"]
+
+
+def test_missing_samples_are_left_out(plant):
+    X, y = plant[0].copy(), plant[1].copy()
     y.loc[[100, 101, 640], "angle"] = np.nan
     model = SubspaceLTI(order=3, horizon=8, missing="split", **ROLES).fit(X, y)
     display = ResidualDisplay.from_estimator(model, X, y)
@@ -140,10 +146,10 @@ def test_arrays_get_numbered_names_and_a_search_shows_its_best():
     assert found.input_names == ["u1"]
 
 
-def test_texts_can_be_read_and_a_subplot_is_divided(tables, fitted, plt):
+def test_texts_can_be_read_and_a_subplot_is_divided(plant, fitted, plt):
     from matplotlib.text import Text
 
-    display = ResidualDisplay.from_estimator(fitted, *tables)
+    display = ResidualDisplay.from_estimator(fitted, *plant)
     display.figure_.canvas.draw()
     sizes = [
         text.get_fontsize()
@@ -174,7 +180,7 @@ E = np.ones((100, 1))
             lambda m, X, y: ResidualDisplay.from_estimator(
                 SimpleNamespace(predict_with_initial_state=1), X, y, errors="prediction"
             ),
-            r"must have predict_ahead\(\) for errors='prediction'. Got SimpleNamespace",
+            "must be a SubspaceLTI for errors='prediction'. Got SimpleNamespace",
         ),
         (
             lambda m, X, y: ResidualDisplay(E, E[:50]),
@@ -199,6 +205,6 @@ E = np.ones((100, 1))
         ),
     ],
 )
-def test_errors_teach(tables, fitted, call, message):
+def test_errors_teach(plant, fitted, call, message):
     with pytest.raises(ValueError, match=message):
-        call(fitted, *tables)
+        call(fitted, *plant)
