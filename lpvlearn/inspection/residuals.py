@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from .. import SubspaceLTI
 from ..data.columns import is_table
 from ..data.experiments import read_experiments, read_outputs
+from ..subspace import SubspaceLTI
 from ..subspace.residuals import (
     Residuals,
     autocorrelations,
@@ -49,10 +49,11 @@ class ResidualDisplay:
     """Correlations of a model's errors with themselves and with the inputs.
 
     One row of panels for each output. On the left the autocorrelations: beyond the
-    band the errors are coloured. Then the cross-correlations with each input: beyond
-    the band at positive lags (past inputs) the model lacks something, at negative
-    lags (future inputs) the errors went back to the input: feedback. At lag 0 it is
-    either, and the p-value is shown where it is small. The p-values are those of
+    band the errors are coloured. Then the cross-correlations with each input, errors
+    and inputs whitened by autoregressions first: beyond the band at positive lags
+    (past inputs) the model lacks something, at negative lags (future inputs) the errors
+    went back to the input: feedback. At lag 0 it is either, and the p-value is
+    shown where it is small. The p-values are those of
     `SubspaceLTI.residual_tests`: of all lags of a part together, given the parts before
     it. Make it with `from_estimator` or `from_residuals`.
 
@@ -73,10 +74,10 @@ class ResidualDisplay:
     Attributes
     ----------
     autocorrelations : ndarray of shape (n_lags + 1, n_outputs)
-    autocorrelation_band : float
-        Half the width of the bands.
     cross_correlations : CrossCorrelations
-        `lags`, `values` and `deviations`.
+        `lags` and `values` of shape (2 * n_lags + 1, n_outputs, n_inputs).
+    autocorrelation_band, cross_correlation_band : float
+        Half the width of the bands.
     tests : DataFrame
         As `SubspaceLTI.residual_tests` returns.
     ax_ : Axes
@@ -135,7 +136,7 @@ class ResidualDisplay:
         self.autocorrelations = autocorrelations(errors, n_lags)
         self.autocorrelation_band = quantile / np.sqrt(sum(map(len, errors)))
         self.cross_correlations = cross_correlations(errors, u, n_lags)
-        self._bands = quantile * self.cross_correlations.deviations
+        self.cross_correlation_band = quantile * self.cross_correlations.deviation
         level = 1.0 - self.confidence
         self.tests = residual_tests(residuals, n_lags=n_lags, level=level)
 
@@ -249,47 +250,33 @@ class ResidualDisplay:
             name: np.empty((ny, 1 + m), dtype=object) for name in ("inside", "outside")
         }
         lags = self.cross_correlations.lags
-        n_lags = lags[-1]
         for i, output in enumerate(self.output_names):
-            first = i * (1 + 3 * m)  # row of the table; names may stand twice
-            self._panel(
-                (i, 0),
-                np.arange(1, n_lags + 1),
-                self.autocorrelations[1:, i],
-                self.autocorrelation_band,
-            )
-            white = self.tests.iloc[first]
-            self._say(self.axes_[i, 0], white, "whiteness", "left")
             self.axes_[i, 0].set_ylabel(output)
+            tests = self.tests.iloc[i * (1 + 3 * m) :]  # whiteness, then m at a time
+            own = self.autocorrelations[1:, i]
+            self._panel((i, 0), lags[lags > 0], own, self.autocorrelation_band)
+            self._say(self.axes_[i, 0], tests.iloc[0], "whiteness", "left")
             for j in range(m):
-                self._panel(
-                    (i, 1 + j),
-                    lags,
-                    self.cross_correlations.values[:, i, j],
-                    self._bands[i, j],
-                )
+                values = self.cross_correlations.values[:, i, j]
+                self._panel((i, 1 + j), lags, values, self.cross_correlation_band)
                 one = self.axes_[i, 1 + j]
                 one.axvline(0.0, color=MUTED, linewidth=0.8, linestyle=":", zorder=0.5)
-                past, now, ahead = (
-                    self.tests.iloc[first + 1 + part * m + j] for part in range(3)
-                )
-                self._say(one, ahead, "future", "left")
+                past, present, future = (tests.iloc[1 + j + k * m] for k in range(3))
+                self._say(one, future, "future", "left")
                 # In narrow panels two texts do not fit side by side.
                 self._say(one, past, "past", "right", low=m > 2)
-                if not now["passed"]:
-                    self._say(one, now, "lag 0", "left", low=True)
+                if not present["passed"]:
+                    self._say(one, present, "lag 0", "left", low=True)
         titles = ["with itself", *(f"with {name}" for name in self.input_names)]
         for k, title in enumerate(titles):
             self.axes_[0, k].set_title(title, fontsize=LABEL_SIZE)
             self.axes_[-1, k].set_xlabel("Lag (samples)")
-        handles = [
-            Patch(
-                color="0.85",
-                label=f"{100 * self.confidence:g} % band of independent signals",
-            ),
-            Line2D([], [], color=ACCENT, marker="o", markersize=4, label="beyond"),
-        ]
         if ax is None:
+            band = f"{100 * self.confidence:g} % band of independent signals"
+            handles = [
+                Patch(color="0.85", label=band),
+                Line2D([], [], color=ACCENT, marker="o", markersize=4, label="beyond"),
+            ]
             legend = figure_legend(self.figure_, self.ax_, handles, own=True)
             legend.set_title(f"Correlations of {self.what}", {"size": LABEL_SIZE})
             legend.set_alignment("left")
@@ -303,19 +290,12 @@ class ResidualDisplay:
         one.axhspan(-band, band, color="0.88", linewidth=0, zorder=0.4)
         one.axhline(0.0, color="0.5", linewidth=0.7, zorder=0.6)
         beyond = np.abs(values) > band
-        for name, shown, colour in (
-            ("inside", ~beyond, INK),
-            ("outside", beyond, ACCENT),
-        ):
-            one.vlines(lags[shown], 0.0, values[shown], color=colour, linewidth=1.1)
-            (self.lines_[name][place],) = one.plot(
-                lags[shown],
-                values[shown],
-                linestyle="none",
-                marker="o",
-                markersize=3.0,
-                color=colour,
-            )
+        dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 3.0}
+        shares = {"inside": (~beyond, INK), "outside": (beyond, ACCENT)}
+        for name, (shown, colour) in shares.items():
+            x, y = lags[shown], values[shown]
+            one.vlines(x, 0.0, y, color=colour, linewidth=1.1)
+            (self.lines_[name][place],) = one.plot(x, y, color=colour, **dots)
         reach = max(np.abs(values).max(), 1.2 * band) or 1.0  # errors may be zero
         one.set_ylim(-_HEADROOM * reach, _HEADROOM * reach)
         one.set_xlim(lags[0] - 0.8, lags[-1] + 0.8)

@@ -79,7 +79,7 @@ def test_panels_are_the_correlations_of_the_estimators_errors(plant, fitted, err
             assert_allclose(
                 [values[k] for k in range(-12, 13)], with_inputs.values[:, i, j]
             )
-            limit = quantile * with_inputs.deviations[i, j]
+            limit = quantile * with_inputs.deviation
             assert outside == {k for k, r in values.items() if abs(r) > limit}
     assert [ax.get_title() for ax in display.axes_[0]] == [
         "with itself",

@@ -73,7 +73,10 @@ def test_autocorrelations_are_sums_within_experiments(two_experiments):
 
 def test_cross_correlations_are_sums_within_experiments(two_experiments):
     errors, inputs = two_experiments
+    filters = _whitening_filters(errors) + _whitening_filters(inputs)
+    assert all(len(a) == 1 for a in filters)  # they are white
     found = cross_correlations(errors, inputs, 6)
+    assert_allclose(found.deviation, 43**-0.5)
     assert_array_equal(found.lags, np.arange(-6, 7))
     for row, i, j in np.ndindex(found.values.shape):
         lag, total = found.lags[row], 0.0
@@ -87,23 +90,22 @@ def test_cross_correlations_are_sums_within_experiments(two_experiments):
         assert_allclose(found.values[row, i, j], total / np.sqrt(np.prod(size)))
 
 
-def test_deviations_of_white_signals_are_those_of_bartlett():
-    rng = np.random.default_rng(1)
-    e, u = rng.standard_normal((2, 900, 1))
-    assert_allclose(cross_correlations([e], [u], 5).deviations, 1 / 30, rtol=0.01)
-
-
-def test_deviations_are_the_spread_of_coloured_signals():
+def test_cross_correlations_of_coloured_strangers_stay_in_their_band():
     rng, runs = np.random.default_rng(2), []
     for _ in range(25):
-        found = cross_correlations(
-            [coloured(rng, 600, 0.9)], [held(rng, 600)], n_lags=12
-        )
-        runs.append(found.values[:, 0, 0] / found.deviations[0, 0])
-    # 25 lags, neighbours alike: some 150 independent values
-    assert 0.8 < np.std(runs) < 1.2
-    # Taken as white they would be far too narrow.
-    assert found.deviations.min() > 1.7 / np.sqrt(600)
+        found = cross_correlations([coloured(rng, 600, 0.9)], [held(rng, 600)], 12)
+        runs.append(found.values[:, 0, 0] / found.deviation)
+    assert 0.9 < np.std(runs) < 1.1  # of 625 values; without whitening 2
+
+
+def test_cross_correlations_show_what_follows_what():
+    """A white input acts three samples later, on an error that is coloured besides."""
+    rng = np.random.default_rng(2)
+    u, v = rng.standard_normal((900, 1)), coloured(rng, 900, 0.9)
+    e = lfilter([0.0, 0.0, 0.0, 0.5], [1.0, -0.9], u, axis=0) + v
+    found = cross_correlations([e], [u], 10)
+    beyond = np.abs(found.values[:, 0, 0]) > 5.0 * found.deviation
+    assert_array_equal(found.lags[beyond], [3])
 
 
 @pytest.mark.parametrize("n_experiments", [1, 3])
@@ -231,7 +233,7 @@ def test_feedback_shows_in_future_inputs():
     assert table.loc["future inputs", "p_value"] < 1e-6
 
 
-def test_sensitivities_are_spanned_by_poles_taken_several_times():
+def test_sensitivities_are_spanned_by_every_pole_taken_twice():
     """Finite differences of the simulated output, for every entry of A, B and C."""
     rng = np.random.default_rng(7)
     A = modes(0.9, 0.7 * np.exp(0.8j))
@@ -240,6 +242,7 @@ def test_sensitivities_are_spanned_by_poles_taken_several_times():
     direct = np.zeros((1, 2), dtype=bool)
     fitted = Fitted(np.linalg.eigvals(A), direct, np.eye(1)[None])
     (span,) = _sensitivities(fitted, 0, u)
+    assert span.shape == (200, 12)
     Q = np.linalg.qr(span)[0]
     for k, M in enumerate((A, B, C)):
         for place in np.ndindex(M.shape):
