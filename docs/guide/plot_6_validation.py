@@ -104,8 +104,7 @@ tests[~tests["passed"]]
 # :class:`~lpvlearn.inspection.ResidualDisplay` shows the correlations behind it: the
 # errors leave the band at positive lags, most with the torque of the second motor.
 
-ResidualDisplay.from_estimator(few, data.X[first], data.y[first])
-plt.show()
+display = ResidualDisplay.from_estimator(few, data.X[first], data.y[first])
 
 # %%
 # Six states pass. These are the samples of the fit, and the p-values allow for the

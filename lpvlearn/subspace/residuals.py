@@ -145,9 +145,10 @@ def model_residuals(
     pairs, errors = remove_trends(list(pairs), detrend)[0], []
     for u, y in pairs:
         free = free_responses(lti.A, lti.C, len(y))
-        x0 = estimate_initial_state(free, y - lti.simulate(u))
+        error = y - lti.simulate(u)
+        x0 = estimate_initial_state(free, error)
         if predictor is None:
-            errors.append(y - lti.simulate(u, initial_state=x0))
+            errors.append(error - free @ x0)
         else:
             errors.append(y - predictor.predict(u, y, initial_state=x0))
     inputs = [u for u, _ in pairs]
@@ -173,8 +174,7 @@ def model_residuals(
     known = {record.y[:, :head].tobytes() for record in records}
     fitted = None
     if any((y[:head] / scale).T.tobytes() in known for _, y in pairs):
-        eye, n_noise = np.eye(lti.n_outputs), 0
-        response = [eye]
+        response, n_noise = [np.eye(lti.n_outputs)], 0
         if predictor is not None:
             n_noise = -(-predictor.n_noise_states // lti.n_outputs)
             noise = predictor.noise
@@ -214,19 +214,14 @@ def with_windows(residuals: Residuals, n_lags: int | None) -> tuple[Residuals, i
         kept = [i for i, n in enumerate(lengths) if n > 4 * k]
         windows = sum(lengths[i] - 2 * k for i in kept)
         needed = each * 2 * k * m + _FEWEST_WINDOWS * n_own
-        if windows >= max(needed, 1):
-            parts = [errors[i] for i in kept], [inputs[i] for i in kept]
-            return residuals._replace(errors=parts[0], inputs=parts[1]), k
-    longest = max(lengths)
-    if n_lags is None:
-        raise ValueError(
-            f"residual tests need an experiment of at least {needed + 2} samples for "
-            f"{m} input(s){' of a model fitted to it' if n_own else ''}. Got {longest}."
-        )
+        if windows >= needed:
+            errors, inputs = ([x[i] for i in kept] for x in (errors, inputs))
+            return residuals._replace(errors=errors, inputs=inputs), k
     raise ValueError(
-        f"`n_lags` of {n_lags} needs {needed} windows of {2 * k + 1} samples, in "
-        f"experiments of more than {4 * k}. Got {windows} windows; the longest "
-        f"experiment has {longest} samples. Lower `n_lags`."
+        f"residual tests of {k} lag(s) need an experiment of at least "
+        f"{max(needed + 2 * k, 4 * k + 1)} samples for {m} input(s)"
+        f"{' of a model fitted to it' if n_own else ''}. Got {max(lengths)}"
+        f"{'.' if n_lags is None else '; lower `n_lags`.'}"
     )
 
 

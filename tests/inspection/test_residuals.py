@@ -108,7 +108,9 @@ def test_a_model_that_lacks_states_is_seen_and_said(plant, fitted):
     assert min(s["future inputs"] for s in shown.values()) > 1e-3
 
 
-def test_pvalues_are_those_of_the_estimator_and_zero_errors_can_be_drawn(plant, fitted):
+def test_p_values_are_those_of_the_estimator_and_zero_errors_can_be_drawn(
+    plant, fitted
+):
     display = ResidualDisplay.from_estimator(fitted, *plant, confidence=0.9)
     expected = fitted.residual_tests(*plant, level=0.1)
     pd.testing.assert_frame_equal(display.tests, expected)

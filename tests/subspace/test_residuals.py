@@ -92,10 +92,10 @@ def test_cross_correlations_are_sums_within_experiments(two_experiments):
 
 def test_cross_correlations_of_coloured_strangers_stay_in_their_band():
     rng, runs = np.random.default_rng(2), []
-    for _ in range(25):
+    for _ in range(12):
         found = cross_correlations([coloured(rng, 600, 0.9)], [held(rng, 600)], 12)
         runs.append(found.values[:, 0, 0] / found.deviation)
-    assert 0.9 < np.std(runs) < 1.1  # of 625 values; without whitening 2
+    assert 0.85 < np.std(runs) < 1.15  # of 300 values; without whitening 2
 
 
 def test_cross_correlations_show_what_follows_what():
@@ -380,7 +380,9 @@ def test_short_experiments_are_refused_with_what_they_need():
         lags(21, 1)
     with pytest.raises(ValueError, match="at least 42 samples for 2 input.*Got 20"):
         lags(20, 2)
-    with pytest.raises(ValueError, match="`n_lags` of 30 needs 120 windows.*Lower"):
+    with pytest.raises(
+        ValueError, match="of 30 lag.* at least 180 samples .*; lower `n_lags`"
+    ):
         lags(120, 1, 30)
     with pytest.raises(ValueError, match="`n_lags` must be an integer, at least 1"):
         lags(100, 1, 0)
