@@ -143,14 +143,20 @@ def model_residuals(
     and no test becomes wrong.
     """
     pairs, errors = remove_trends(list(pairs), detrend)[0], []
-    for u, y in pairs:
-        free = free_responses(lti.A, lti.C, len(y))
-        error = y - lti.simulate(u)
-        x0 = estimate_initial_state(free, error)
-        if predictor is None:
-            errors.append(error - free @ x0)
-        else:
-            errors.append(y - predictor.predict(u, y, initial_state=x0))
+    with np.errstate(over="ignore", invalid="ignore"):  # refused below
+        for u, y in pairs:
+            free = free_responses(lti.A, lti.C, len(y))
+            error = y - lti.simulate(u)
+            x0 = estimate_initial_state(free, error)
+            if predictor is None:
+                errors.append(error - free @ x0)
+            else:
+                errors.append(y - predictor.predict(u, y, initial_state=x0))
+    if not all(np.isfinite(e).all() for e in errors):
+        raise ValueError(
+            "residual tests need a simulation that stays finite. The model is unstable "
+            "and diverges over these samples: use stability='enforce'."
+        )
     inputs = [u for u, _ in pairs]
     # The trend of an answer is not quite the answer to the trend of an input.
     cleaned = remove_trends(list(zip(inputs, errors, strict=True)), detrend)[0]

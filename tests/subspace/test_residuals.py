@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from lpvlearn import SubspaceLTI
+from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.subspace.residuals import (
     Fitted,
     Residuals,
@@ -425,3 +425,11 @@ def test_errors_teach(options, message):
     model = SubspaceLTI(1, horizon=3).fit(u, np.cumsum(u, axis=0) + e)
     with pytest.raises(ValueError, match=message):
         model.residual_tests(u, **{"y": e, **options})
+
+
+def test_a_model_that_diverges_is_refused():
+    u, e = np.random.default_rng(14).standard_normal((2, 3000, 1))
+    model = SubspaceLTI(1, horizon=3).fit(u, lfilter([1.0], [1.0, -0.5], u, axis=0) + e)
+    model.lti_ = StateSpace([[1.5]], [[1.0]], [[1.0]], sampling_time=1.0)
+    with pytest.raises(ValueError, match="unstable .*: use stability='enforce'"):
+        model.residual_tests(u, e)
