@@ -321,10 +321,8 @@ class ResidualDisplay:
 
 def _as_parts(argument: str, values: Any) -> list[Array]:
     """One finite matrix per experiment."""
-    several = isinstance(values, (list, tuple)) and np.ndim(values[0]) > 0
-    parts = [
-        np.asarray(part, dtype=float) for part in (values if several else [values])
-    ]
+    several = isinstance(values, (list, tuple)) and np.ndim([*values, 0.0][0]) > 0
+    parts = [np.asarray(x, dtype=float) for x in (values if several else [values])]
     parts = [part[:, None] if part.ndim == 1 else part for part in parts]
     if len({part.shape[1:] for part in parts}) > 1 or parts[0].ndim != 2:
         raise ValueError(
