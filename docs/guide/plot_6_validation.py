@@ -82,6 +82,40 @@ compare_models(
 ).pivot_table(["BFT", "VAF"], "model", "output").round(1)
 
 # %%
+# Residuals
+# ---------
+# A good fit may hide what the errors know. A complete model leaves errors that are
+# independent of the *past inputs*, else it lacks states, a delay or a nonlinearity; of
+# the *present* one, else it lacks a feedthrough; and of *future inputs*, else there
+# was feedback from the outputs to the inputs, and the identification is biased. Where
+# the errors are *white* as well, simulating is as good as predicting.
+# :meth:`~lpvlearn.SubspaceLTI.residual_tests` tests all of it; coloured noise raises no
+# alarm with the inputs. Here a local model has five states, one less than the arm:
+
+from lpvlearn.inspection import ResidualDisplay
+
+first = data.X["experiment"] == 0
+few = SubspaceLTI(5, feedthrough=False, horizon=60, inputs=["u1", "u2"])
+few.fit(data.X[first], data.y[first])
+tests = few.residual_tests(data.X[first], data.y[first])
+tests[~tests["passed"]]
+
+# %%
+# :class:`~lpvlearn.inspection.ResidualDisplay` shows the correlations behind it: the
+# errors leave the band at positive lags, most with the torque of the second motor.
+
+display = ResidualDisplay.from_estimator(few, data.X[first], data.y[first])
+
+# %%
+# Six states pass. These are the samples of the fit, and the p-values allow for the
+# parameters that were fitted to them; on others a model is tested as it is, with the
+# errors that its parameters have.
+
+SubspaceLTI(6, feedthrough=False, horizon=60, inputs=["u1", "u2"]).fit(
+    data.X[first], data.y[first]
+).residual_tests(data.X[first], data.y[first])
+
+# %%
 # Leave one operating point out
 # -----------------------------
 # The honest question to an LPV model: how well does it describe the system where it was

@@ -8,6 +8,7 @@ from .bode import BodeDisplay
 from .error import ErrorDisplay
 from .parameters import ParameterDisplay
 from .poles import PoleDisplay
+from .residuals import ResidualDisplay
 from .simulation import SimulationDisplay
 from .singular_values import SingularValueDisplay
 
@@ -16,6 +17,7 @@ __all__ = [
     "ErrorDisplay",
     "ParameterDisplay",
     "PoleDisplay",
+    "ResidualDisplay",
     "SimulationDisplay",
     "SingularValueDisplay",
 ]

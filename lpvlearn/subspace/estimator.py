@@ -7,15 +7,22 @@ from contextlib import contextmanager
 from typing import Any, Self
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
-from ..data.experiments import Experiment, Table, read_experiments
+from ..data.experiments import (
+    Experiment,
+    Table,
+    read_experiments,
+    read_outputs,
+)
 from ..data.preparation import split_at_gaps
 from ..models.innovation import InnovationModel
 from ..validation import one_of
 from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
+from .residuals import Residuals, input_labels, model_residuals, residual_tests
 from .selection import selection_text
 from .stream import SampleStream, fit_as_stream
 
@@ -420,6 +427,119 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             )
 
         return self._in_table(experiments, n_samples, predicted)
+
+    def residual_tests(
+        self,
+        X: Any,
+        y: Any,
+        *,
+        errors: str = "simulation",
+        n_lags: int | None = None,
+        level: float = 0.01,
+    ) -> pd.DataFrame:
+        r"""Test whether the errors are white, and independent of the inputs.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Measured outputs. Initial states are estimated from them, `detrend` and
+            `missing` act as in `fit`.
+        errors : {"simulation", "prediction"}, default="simulation"
+            Of `predict_with_initial_state`, or of `predict_ahead`. Only the latter
+            should be white: they test the noise model too.
+        n_lags : int, default=None
+            Samples to the past and to the future that are looked at. None: 25, fewer
+            where experiments are short. Experiments of ``4 * n_lags`` samples or fewer
+            are left out.
+        level : float, default=0.01
+            Share of the correct models that each test refuses.
+
+        Returns
+        -------
+        DataFrame
+            For every output the tests "whiteness", "past inputs", "present input" and
+            "future inputs", the latter three for every input. Columns:
+
+            - output, test, input (empty for whiteness);
+            - statistic, dof : chi-squared with that many degrees of freedom, about,
+              where there is nothing to be found (for inputs ``dof * F``);
+            - p_value : probability of such a statistic by chance;
+            - passed : whether the p-value is not below `level`.
+
+        Raises
+        ------
+        ValueError
+            If an option is out of range, or no experiment is long enough.
+
+        Warns
+        -----
+        UserWarning
+            If the errors of an output are rounding: its tests then pass.
+
+        Notes
+        -----
+        Errors that depend on *past* inputs tell of a model that lacks states, a delay
+        or a nonlinearity; on the *present* input, of a lacking feedthrough; on *future*
+        inputs, of feedback. The errors are whitened by an autoregression before
+        they are regressed on the inputs, so that coloured noise raises no alarm.
+
+        On the samples of the fit, the errors have lost what the parameters could
+        explain: sensitivities of the errors to the parameters join the regressions, and
+        the p-values are right there as well, as far as the model is close to the truth
+        (weakly excited modes in coloured noise may not be). A table is taken for
+        that where one of its experiments begins with the same outputs as one of the
+        fit. On other samples the model is tested as it is, with the errors that its
+        parameters have.
+
+        References
+        ----------
+        G. M. Ljung and G. E. P. Box, "On a measure of lack of fit in time series
+        models", Biometrika 65, 1978.
+
+        L. D. Haugh, "Checking the independence of two covariance-stationary time
+        series", Journal of the American Statistical Association 71, 1976.
+
+        L. Ljung, *System Identification: Theory for the User*, Prentice Hall, 1999,
+        Section 16.6.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from scipy.signal import lfilter
+        >>> from lpvlearn import SubspaceLTI
+        >>> u, e = np.random.default_rng(0).standard_normal((2, 600))
+        >>> y = lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.8], u) + 0.1 * e
+        >>> for order in (1, 2):
+        ...     model = SubspaceLTI(order, horizon=10).fit(u[:, None], y)
+        ...     tests = model.residual_tests(u[:, None], y).set_index("test")
+        ...     print(order, tests["passed"].to_dict())
+        1 {'whiteness': False, 'past inputs': False, ...}
+        2 {'whiteness': True, 'past inputs': True, ...}
+        """
+        residuals = self._residuals(X, y, errors)
+        return residual_tests(residuals, n_lags=n_lags, level=level)
+
+    def _residuals(self, X: Any, y: Any, errors: str) -> Residuals:
+        """What is tested; `ResidualDisplay` draws it."""
+        check_is_fitted(self, "lti_")
+        one_of("errors", errors, ("simulation", "prediction"))
+        experiments, _ = self._read(X, y, reset=False)
+        names = [] if y is None else read_outputs(y)[1]
+        if y is not None and len(names) != self.n_outputs_:
+            raise ValueError(
+                f"`y` must hold the {self.n_outputs_} output(s) of the model. Got "
+                f"{len(names)}."
+            )
+        return model_residuals(
+            self.lti_,
+            self.predictor_ if errors == "prediction" else None,
+            [(e.inputs, _outputs_of(e)) for e in experiments],
+            self._evidence,
+            names,
+            input_labels(experiments[0].input_names),
+            self.detrend,
+        )
 
     @property
     def predictor_(self) -> InnovationModel:

@@ -243,7 +243,7 @@ def _square_root(covariance: Array) -> Array:
 
 def _noise_of(model: Realization, records: Sequence[Record]) -> NoiseModel:
     """Autoregression of the simulation errors of a model on its records."""
-    return _autoregression(
+    return autoregression(
         [
             record.y.T - lti_response(*model[:4], record.u.T, x0)
             for record, x0 in zip(records, model.initial_states, strict=True)
@@ -251,7 +251,7 @@ def _noise_of(model: Realization, records: Sequence[Record]) -> NoiseModel:
     )
 
 
-def _autoregression(errors: Sequence[Array]) -> NoiseModel:
+def autoregression(errors: Sequence[Array]) -> NoiseModel:
     """Vector autoregression of simulation errors, in innovation form.
 
     One array (n_samples_i, n_outputs) per experiment. The number of lags is that with
@@ -259,7 +259,7 @@ def _autoregression(errors: Sequence[Array]) -> NoiseModel:
 
     >>> from scipy.signal import lfilter
     >>> e = np.random.default_rng(0).standard_normal((5000, 1))
-    >>> model = _autoregression([lfilter([1.0], [1.0, -0.9], e, axis=0)])
+    >>> model = autoregression([lfilter([1.0], [1.0, -0.9], e, axis=0)])
     >>> model.A.round(2)
     array([[0.9]])
     """

@@ -78,11 +78,11 @@ def levenberg_marquardt(
 ) -> Minima:
     r"""Minimise ``|r(x)|^2`` from every row of a stack of starts, all in one batch.
 
-    A step solves :math:`\min_d |r + J d|^2 + \lambda |S d|^2`, where S holds the
-    largest lengths that the columns of J had so far (Marquardt's scaling), through the
-    singular values of :math:`J S^{-1}`: all dampings :math:`\lambda` share them, and
-    the condition of J is not squared. Steps are projected on the bounds; a variable
-    whose bound the gradient presses against is left out of the step.
+    A step solves :math:`(J^T J + \lambda S^2) d = -J^T r`, where S holds the largest
+    lengths that the columns of J had so far (Marquardt's scaling). The normal equations
+    cost a third of an orthogonal factor of every Jacobian, and what they lose in the
+    weakest directions the next step mends: the gradient is exact. Steps are projected
+    on the bounds; a variable whose bound the gradient presses against is left out.
 
     `longest` is the largest change of a variable in a step; `max_iter` counts the steps
     that are tried. A start ends when its cost falls by less than `tol` (relative)

@@ -10,11 +10,11 @@ from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.models.innovation import NoiseModel
 from lpvlearn.subspace.simulation_fit import Freedom, Realization
 from lpvlearn.subspace.statistics import (
-    _autoregression,
     _frequency_response_jacobian,
     _pole_jacobian,
     _reduce_noise_model,
     _spectrum,
+    autoregression,
     deviated_models,
 )
 from lpvlearn.systems.simulation import lti_response, state_trajectory
@@ -54,7 +54,7 @@ def test_autoregression_recovers_a_vector_process():
     v = np.zeros_like(e)
     for t in range(1, len(e)):
         v[t] = Phi @ v[t - 1] + e[t]
-    model = _autoregression([v[:15_000], v[15_000:]])
+    model = autoregression([v[:15_000], v[15_000:]])
     np.testing.assert_allclose(model.A, Phi, atol=0.02)
     np.testing.assert_allclose(model.covariance, np.cov(e.T), rtol=0.05, atol=0.02)
     assert abs(np.linalg.eigvals(model.A - model.K @ model.C)).max() < 1e-9
@@ -62,13 +62,13 @@ def test_autoregression_recovers_a_vector_process():
 
 def test_white_and_vanishing_errors_have_no_noise_states():
     white = np.random.default_rng(0).standard_normal((3000, 2))
-    assert len(_autoregression([white]).A) == 0
-    assert len(_autoregression([np.zeros((50, 2))]).A) == 0
+    assert len(autoregression([white]).A) == 0
+    assert len(autoregression([np.zeros((50, 2))]).A) == 0
 
 
 def test_reduced_noise_model_has_a_stable_predictor_and_the_riccati_gain():
     e = np.random.default_rng(1).standard_normal((20_000, 1))
-    long = _autoregression([lfilter([1.0, 0.7], [1.0, -0.9], e, axis=0)])
+    long = autoregression([lfilter([1.0, 0.7], [1.0, -0.9], e, axis=0)])
     short = _reduce_noise_model(long, 1)
     np.testing.assert_allclose(short.A, [[0.9]], atol=0.02)
     assert abs(np.linalg.eigvals(short.A - short.K @ short.C)).max() < 1.0

@@ -1,0 +1,461 @@
+r"""Residual analysis: are the errors of a model white, and do they know the inputs?
+
+Errors e of a model, of simulation or of one-step prediction, are examined for
+
+- **whiteness**: ``Q = n (n + 2) sum_k r_k^2 / (n - k)`` of their autocorrelations r
+  (Ljung and Box, 1978);
+- **past inputs**: what correlates with ``u[t-1], ..., u[t-M]`` is left of the plant's
+  answer: the model lacks states, a delay, a nonlinearity;
+- **the present input**: what correlates with ``u[t]``, given the past ones, is a
+  feedthrough that the model lacks, or a controller that answers within the sample;
+- **future inputs**: what correlates with ``u[t+1], ..., u[t+M]``, given all of these,
+  did not come from the input but went to it: feedback.
+
+Errors and inputs are usually both coloured, and correlations of two coloured signals
+spread beyond ``1 / sqrt(n)`` without any relation between them (Bartlett). An
+autoregression of the errors, ``a(q) e = w`` with white w, takes that away (Haugh,
+1976): given the inputs, whatever they are, the regression of w on M of their samples
+has exactly the F distribution of ordinary least squares, up to the error of a(q). As
+a(q) is causal, it moves no dependence from the past to the future.
+
+On the samples that a model was fitted to, its errors have lost what its parameters
+could explain, so that p-values are too large; where the fit did not weight them by
+a(q), they also keep what a better fit would have taken. Both lie in the span of the
+filtered sensitivities ``a(q) de/dtheta`` of the errors to the parameters. `Fitted`
+says what these are; they are regressors before all others (the C(alpha) test of
+Neyman), and p-values are right again.
+
+`SubspaceLTI.residual_tests` has the references.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import linalg, signal, stats
+
+from ..data.preparation import remove_trends
+from ..exceptions import warn
+from ..models.innovation import InnovationModel
+from ..models.statespace import StateSpace
+from ..systems.simulation import estimate_initial_state, free_responses
+from ..validation import whole_number
+from .hankel import cholesky_factor, correlation_sequence, stack_factors
+from .statistics import Evidence, autoregression
+
+Array = NDArray[np.float64]
+
+_N_LAGS = 25  # as in MATLAB's `resid`
+
+# Windows for each lagged input: an autoregression of fewer errors is itself too
+# uncertain for the tail of the F distribution. A number of lags that the user wants is
+# held to the second, as are the sensitivities: so many, that a fair F test remains.
+_WINDOWS_PER_LAG, _FEWEST_WINDOWS = 10, 2
+
+# Part of a regressor's size that others do not explain, below which it is taken for a
+# combination of them: inputs of a few sines, or held for many samples.
+_DEPENDENT = 1e-4
+
+# Errors that are rounding, relative to the spread of the output (24-bit converters and
+# single precision resolve 6e-8) or to its largest value (double precision: 2e-16, some
+# of it lost in the least squares).
+_ROUNDING, _ROUNDING_OF_LARGEST = 1e-8, 1e-13
+
+_HEAD = 50  # outputs by which an experiment is recognised: measured, hardly the same
+
+_LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligible
+
+_PIECE = 8192  # windows worked on at a time: they stay in memory
+
+
+class Fitted(NamedTuple):
+    """What was fitted to the samples that are tested.
+
+    The errors are ``W(q)`` times those of simulation: 1, or the predictor's filter.
+    """
+
+    poles: NDArray[np.complex128]  # of the deterministic model, with their conjugates
+    direct: NDArray[np.bool_]  # (n_outputs, n_inputs), free entries of D
+    filter: Array  # (n_terms, n_outputs, n_outputs), impulse response of W
+    n_noise: int = 0  # lags of the noise model for each output
+
+
+class Residuals(NamedTuple):
+    """Errors and inputs, an array of one row per sample for each experiment."""
+
+    errors: list[Array]
+    inputs: list[Array]
+    output_names: Sequence[Hashable]
+    input_names: Sequence[Hashable]
+    fitted: Fitted | None = None  # None: the model was not fitted to these samples
+
+
+class CrossCorrelations(NamedTuple):
+    """Correlations of every whitened error with every whitened input."""
+
+    lags: NDArray[np.intp]  # -n_lags, ..., n_lags; positive for past inputs
+    values: Array  # (n_values, n_outputs, n_inputs): sum_t w[t] v[t - lag] over RMS
+    deviation: float  # of independent errors and inputs, at any lag
+
+
+class ResidualTest(NamedTuple):
+    """Statistic, about chi-squared by its degrees of freedom where all is well.
+
+    For an F test it is ``dof * F``. The p-value is 1 where there is nothing to test:
+    no regressor that is independent of the rest, or errors that are zero.
+    """
+
+    statistic: float
+    dof: int
+    p_value: float
+
+
+class InputTests(NamedTuple):
+    """Tests ``[output][input]``, each of all samples of that part together.
+
+    The present is tested given the past of all inputs, the future given both.
+    """
+
+    past: list[list[ResidualTest]]
+    present: list[list[ResidualTest]]
+    future: list[list[ResidualTest]]
+
+
+def model_residuals(
+    lti: StateSpace,
+    predictor: InnovationModel | None,
+    pairs: Sequence[tuple[Array, Array]],
+    evidence: Evidence,
+    output_names: Sequence[Hashable],
+    input_names: Sequence[Hashable],
+    detrend: str | None,
+) -> Residuals:
+    """Errors of one-step prediction (None: of simulation) from estimated states.
+
+    Errors that are rounding become zero, with a warning. The fit is recognised by the
+    samples that `evidence` keeps: it is allowed for where an experiment begins with
+    the outputs of one of theirs. Where only a part was fitted that costs some power,
+    and no test becomes wrong.
+    """
+    pairs, errors = remove_trends(list(pairs), detrend)[0], []
+    with np.errstate(over="ignore", invalid="ignore"):  # refused below
+        for u, y in pairs:
+            free = free_responses(lti.A, lti.C, len(y))
+            error = y - lti.simulate(u)
+            x0 = estimate_initial_state(free, error)
+            if predictor is None:
+                errors.append(error - free @ x0)
+            else:
+                errors.append(y - predictor.predict(u, y, initial_state=x0))
+    if not all(np.isfinite(e).all() for e in errors):
+        raise ValueError(
+            "residual tests need a simulation that stays finite. The model is unstable "
+            "and diverges over these samples: use stability='enforce'."
+        )
+    inputs = [u for u, _ in pairs]
+    # The trend of an answer is not quite the answer to the trend of an input.
+    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), detrend)[0]
+    errors = [e for _, e in cleaned]
+    y, e = np.vstack([y for _, y in pairs]), np.vstack(errors)
+    size, largest = np.sqrt(np.mean(e**2, axis=0)), np.abs(y).max(axis=0)
+    rounding = size <= _ROUNDING * y.std(axis=0)
+    rounding |= size <= _ROUNDING_OF_LARGEST * largest
+    if rounding.any():
+        share = (size[rounding] / np.where(largest > 0, largest, 1.0)[rounding]).max()
+        names = ", ".join(
+            str(name) for name, bad in zip(output_names, rounding, strict=True) if bad
+        )
+        warn(
+            f"The errors of {names} are rounding ({share:.1g} of the output): there is "
+            "nothing to test, and all their tests pass."
+        )
+        errors = [np.where(rounding, 0.0, part) for part in errors]
+    records, scale = evidence.records, evidence.output_scale
+    head = min(_HEAD, min(record.y.shape[1] for record in records))
+    known = {record.y[:, :head].tobytes() for record in records}
+    fitted = None
+    if any((y[:head] / scale).T.tobytes() in known for _, y in pairs):
+        response, n_noise = [np.eye(lti.n_outputs)], 0
+        if predictor is not None:
+            n_noise = -(-predictor.n_noise_states // lti.n_outputs)
+            noise = predictor.noise
+            state, A = noise.K, noise.A - noise.K @ noise.C
+            while len(response) < _LONGEST_RESPONSE and state.any():
+                response.append(-noise.C @ state)
+                state = A @ state
+        fitted = Fitted(lti.poles(), lti.D != 0.0, np.array(response), n_noise)
+    return Residuals(errors, inputs, output_names, input_names, fitted)
+
+
+def input_labels(names: Sequence[Hashable]) -> list[str]:
+    """Names of columns; positions become u1, u2, ..."""
+    return [
+        name if isinstance(name, str) else f"u{j + 1}" for j, name in enumerate(names)
+    ]
+
+
+def with_windows(residuals: Residuals, n_lags: int | None) -> tuple[Residuals, int]:
+    """The experiments long enough for `n_lags` to both sides, and that number.
+
+    None: 25 lags, or what short experiments carry. An experiment must be more than
+    four times as long, for the autoregression may take half of its samples. A
+    ValueError where too little is left.
+    """
+    errors, inputs, fitted = residuals.errors, residuals.inputs, residuals.fitted
+    m, lengths = inputs[0].shape[1], [len(e) for e in errors]
+    n_own = 0
+    if fitted is not None:
+        n_filters = np.count_nonzero(np.abs(fitted.filter).sum(axis=0), axis=1).max()
+        n_own = (2 * len(fitted.poles) + 1) * m * int(n_filters)
+    tried, each = range(_N_LAGS, 0, -1), _WINDOWS_PER_LAG
+    if n_lags is not None:
+        wanted = whole_number("n_lags", n_lags, 1)
+        tried, each = range(wanted, wanted - 1, -1), _FEWEST_WINDOWS
+    for k in tried:
+        kept = [i for i, n in enumerate(lengths) if n > 4 * k]
+        windows = sum(lengths[i] - 2 * k for i in kept)
+        needed = each * 2 * k * m + _FEWEST_WINDOWS * n_own
+        if windows >= needed:
+            errors, inputs = ([x[i] for i in kept] for x in (errors, inputs))
+            return residuals._replace(errors=errors, inputs=inputs), k
+    raise ValueError(
+        f"residual tests of {k} lag(s) need an experiment of at least "
+        f"{max(needed + 2 * k, 4 * k + 1)} samples for {m} input(s)"
+        f"{' of a model fitted to it' if n_own else ''}. Got {max(lengths)}"
+        f"{'.' if n_lags is None else '; lower `n_lags`.'}"
+    )
+
+
+def residual_tests(
+    residuals: Residuals, *, n_lags: int | None = None, level: float = 0.01
+) -> pd.DataFrame:
+    """All tests as a table.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> e, u = np.random.default_rng(1).standard_normal((2, 1000, 1))
+    >>> e[3:] += 0.2 * u[:-3]
+    >>> table = residual_tests(Residuals([e], [u], ["y1"], ["u1"]))
+    >>> table[["output", "test", "input", "dof", "passed"]]
+      output           test input  dof  passed
+    0     y1      whiteness         25    True
+    1     y1    past inputs    u1   25   False
+    2     y1  present input    u1    1    True
+    3     y1  future inputs    u1   25    True
+    """
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"`level` must lie between 0 and 1. Got {level!r}.")
+    residuals, n_lags = with_windows(residuals, n_lags)
+    errors, inputs, output_names, input_names, fitted = residuals
+    white = whiteness_tests(errors, n_lags, 0 if fitted is None else fitted.n_noise)
+    by_input = input_tests(errors, inputs, n_lags, fitted)
+    names = "past inputs", "present input", "future inputs"
+    rows: list[tuple[object, ...]] = []
+    for i, output in enumerate(output_names):
+        rows.append((output, "whiteness", "", *white[i]))
+        for test, found in zip(names, by_input, strict=True):
+            for name, one in zip(input_names, found[i], strict=True):
+                rows.append((output, test, name, *one))
+    table = pd.DataFrame(
+        rows, columns=["output", "test", "input", "statistic", "dof", "p_value"]
+    )
+    table["passed"] = table["p_value"] >= level
+    return table
+
+
+def autocorrelations(errors: Sequence[Array], n_lags: int) -> Array:
+    """Autocorrelations of every output, shape (n_lags + 1, n_outputs).
+
+    Pooled over experiments; products never cross the border between two. The first row
+    is 1, 0 for errors that are all zero.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> autocorrelations([np.array([[1.0], [-1.0], [1.0]])], 1).ravel().round(3)
+    array([ 1.   , -0.667])
+    """
+    sums = np.zeros((n_lags + 1, errors[0].shape[1]))
+    for e in errors:
+        known = min(len(e), n_lags + 1)
+        for i, one in enumerate(e.T):
+            sums[:known, i] += correlation_sequence(one[:, None], known)[:, 0, 0]
+    return sums / np.where(sums[0] > 0.0, sums[0], 1.0)
+
+
+def cross_correlations(
+    errors: Sequence[Array], inputs: Sequence[Array], n_lags: int
+) -> CrossCorrelations:
+    """Correlations with past and future inputs, both whitened first (Haugh).
+
+    Those of the signals as they are would spread over all lags, in a band so wide that
+    little were to be seen. Causal filters leave past and future apart.
+    """
+    ny = errors[0].shape[1]
+    filters = _whitening_filters(errors) + _whitening_filters(inputs)
+    start, n_samples = max(map(len, filters)) - 1, 0
+    sums = np.zeros((n_lags + 1, len(filters), len(filters)))
+    for pair in zip(errors, inputs, strict=True):
+        signals = zip(filters, np.hstack(pair).T, strict=True)
+        z = np.column_stack([signal.lfilter(a, [1.0], x)[start:] for a, x in signals])
+        known = min(len(z), n_lags + 1)
+        if known:
+            n_samples += len(z)
+            sums[:known] += correlation_sequence(z, known)  # of t with t + lag
+    size = np.sqrt(np.diagonal(sums[0]))
+    size = np.where(size > 0.0, size, 1.0)
+    r = sums / size[:, None] / size
+    values = np.concatenate([r[:0:-1, :ny, ny:], r[:, ny:, :ny].swapaxes(1, 2)])
+    lags = np.arange(-n_lags, n_lags + 1)
+    return CrossCorrelations(lags, values, n_samples**-0.5)
+
+
+def whiteness_tests(
+    errors: Sequence[Array], n_lags: int, n_fitted: int = 0
+) -> list[ResidualTest]:
+    """Ljung-Box test of every output.
+
+    A noise model fitted to these samples takes `n_fitted` degrees of freedom of each;
+    as many lags are added, so that `n_lags` of them remain.
+    """
+    r = autocorrelations(errors, n_lags + n_fitted)[1:]
+    n = sum(map(len, errors))
+    # Products that the sum at each lag holds; n - k for one experiment.
+    counts = np.array(
+        [sum(max(0, len(e) - k - 1) for e in errors) for k in range(len(r))]
+    )
+    seen = counts > 0
+    dof = max(1, int(seen.sum()) - n_fitted)
+    statistics = n * (n + 2) * np.sum(r[seen] ** 2 / counts[seen, None], axis=0)
+    return [
+        ResidualTest(float(q), dof, float(stats.chi2.sf(q, dof))) for q in statistics
+    ]
+
+
+def input_tests(
+    errors: Sequence[Array],
+    inputs: Sequence[Array],
+    n_lags: int,
+    fitted: Fitted | None = None,
+) -> InputTests:
+    """Do errors depend on past, present and future inputs?"""
+    m, n_rows = inputs[0].shape[1], 2 * n_lags + 1
+    tests = InputTests([], [], [])
+    for i, a in enumerate(_whitening_filters(errors)):
+        start, parts = len(a) - 1, []
+        for e, u in zip(errors, inputs, strict=True):
+            if len(e) < start + n_rows:
+                continue
+            own = [] if fitted is None else _sensitivities(fitted, i, u)
+            present = np.column_stack([*own, e[:, i]])
+            white = signal.lfilter(a, [1.0], present, axis=0)
+            parts.append((white[start + n_lags : len(e) - n_lags].T, u[start:]))
+        n = sum(white.shape[1] for white, _ in parts)
+        columns = _factor(parts, n_rows)
+        n_own = columns.shape[1] - 1 - n_rows * m
+        starts = n_own + m * np.array([0, n_lags, n_lags + 1, n_rows])
+        for found, first, stop in zip(tests, starts[:-1], starts[1:], strict=True):
+            added = [np.arange(first + j, stop, m) for j in range(m)]
+            found.append([_f_test(columns, first, part, n) for part in added])
+    return tests
+
+
+def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:
+    r"""Signals that span the change of one output's errors by A, B, C and free D.
+
+    The simulated outputs change by combinations of ``u_j / (z - p_k)`` and
+    ``u_j / ((z - p_k) (z - p_l))``: of all inputs through every pole taken twice. Each
+    follows an all-pass of the poles before it (Takenaka and Malmquist), so that they
+    are orthogonal for a white input and close poles do no harm. Thrice would allow for
+    curvature, but then a mode that is missing beside another one goes unseen.
+    """
+    poles = np.asarray(fitted.poles, dtype=complex)
+    outside = np.abs(poles) > 1.0  # reflected: their own answers would overflow
+    poles = np.where(outside, 1.0 / np.where(outside, poles, 1.0).conj(), poles)
+    spanned, signals = [np.zeros((len(u), 0))], u
+    for pole in np.tile(poles[poles.imag >= 0.0], 2):
+        late = signals.astype(complex)
+        answer = signal.lfilter([0.0, 1.0], [1.0, -pole], late, axis=0)
+        spanned += [answer.real, answer.imag] if pole.imag else [answer.real]
+        denominator = np.poly([pole, pole.conj()] if pole.imag else [pole]).real
+        signals = signal.lfilter(denominator[::-1], denominator, signals, axis=0)
+    states = np.hstack(spanned)
+    return [
+        signal.lfilter(h, [1.0], np.hstack([states, u[:, fitted.direct[k]]]), axis=0)
+        for k, h in enumerate(fitted.filter[:, output].T)
+        if h.any()
+    ]
+
+
+def _factor(parts: Sequence[tuple[Array, Array]], n_rows: int) -> Array:
+    """Upper triangular factor of the windows of all experiments.
+
+    Columns: filtered sensitivities, `n_rows` samples of all inputs, filtered error.
+    """
+
+    def pieces() -> Iterator[Array]:
+        for white, u in parts:
+            view = np.lib.stride_tricks.sliding_window_view(u, n_rows, axis=0)
+            for start in range(0, len(view), _PIECE):
+                piece = slice(start, start + _PIECE)
+                lagged = view[piece].transpose(2, 1, 0).reshape(n_rows * u.shape[1], -1)
+                yield np.vstack([white[:-1, piece], lagged, white[-1:, piece]])
+
+    gram = np.asarray(sum(piece @ piece.T for piece in pieces()))
+    lower = cholesky_factor(gram)
+    if lower is None:
+        lower = np.zeros((len(gram), 0))
+        for piece in pieces():
+            lower = stack_factors([lower, piece])
+    return lower.T
+
+
+def _whitening_filters(errors: Sequence[Array]) -> list[Array]:
+    """Coefficients ``[1, a_1, ..., a_p]`` that whiten the errors of every output."""
+    models = [
+        autoregression([e[:, [i]] for e in errors]) for i in range(errors[0].shape[1])
+    ]
+    return [np.concatenate([[1.0], -model.C[0]]) for model in models]
+
+
+def _f_test(
+    columns: Array, n_base: int, added: NDArray[np.intp], n: int
+) -> ResidualTest:
+    """What added columns explain of the last one, beyond the first `n_base`.
+
+    `columns` is a triangular factor of `n` rows.
+    """
+    Q = _basis(columns[:, :n_base])
+    target, new = columns[:, -1], columns[:, added]
+    target = target - Q @ (Q.T @ target)
+    size = np.linalg.norm(new, axis=0)
+    for _ in range(2):  # once more: what is left may be small
+        new = new - Q @ (Q.T @ new)
+    P = _basis(new[:, np.linalg.norm(new, axis=0) > _DEPENDENT * size])
+    explained = P.T @ target
+    left = target - P @ explained
+    q = P.shape[1]
+    error = n - Q.shape[1] - q
+    if q == 0 or error < 1 or not target.any():
+        return ResidualTest(0.0, q, 1.0)
+    loss = max(float(left @ left), np.finfo(float).tiny)
+    statistic = float(explained @ explained) / loss * error
+    return ResidualTest(statistic, q, float(stats.f.sf(statistic / q, q, error)))
+
+
+def _basis(columns: Array) -> Array:
+    """Orthonormal basis of the independent columns."""
+    if not columns.shape[1]:
+        return columns
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0.0] = 1.0
+    Q, R, _ = linalg.qr(
+        columns / size, mode="economic", pivoting=True, check_finite=False
+    )
+    pivots = np.abs(np.diagonal(R))
+    return Q[:, pivots > _DEPENDENT * pivots[0]]
