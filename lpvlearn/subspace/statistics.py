@@ -18,6 +18,7 @@ from ..systems.simulation import (
     free_responses,
     lti_response,
 )
+from .identification import scale_records
 from .parameters import moved_model
 from .refinement import in_sections
 from .signals import Record
@@ -197,6 +198,7 @@ def deviated_models(
     *,
     detrend: str | None = None,
     refined: bool = True,
+    output_scale: Array | None = None,
 ) -> list[ModelPair]:
     """Models to either side of an estimate, along its directions of uncertainty.
 
@@ -212,6 +214,8 @@ def deviated_models(
         What was subtracted from the experiments before.
     refined : bool, default=True
         Whether the model minimises the simulation error.
+    output_scale : ndarray of shape (n_outputs,), default=None
+        Units in which its errors were weighed equally; None is those of `SubspaceLTI`.
 
     Returns
     -------
@@ -226,8 +230,11 @@ def deviated_models(
     if independent_inputs([u for u, _ in pairs]) is not None:  # they are collinear
         return []
     centred = remove_trends(list(pairs), detrend)[0]
-    records, share = shorten([Record(u.T, y.T) for u, y in centred])
-    A, B, C, D = lti.A, lti.B, lti.C, lti.D
+    scale = output_scale
+    if scale is None:
+        scale = scale_records(centred).output_scale
+    records, share = shorten([Record(u.T, (y / scale).T) for u, y in centred])
+    A, B, C, D = lti.A, lti.B, lti.C / scale[:, None], lti.D / scale[:, None]
     states = [
         estimate_initial_state(
             free_responses(A, C, y.shape[1]), y.T - lti_response(A, B, C, D, u.T)
@@ -238,7 +245,7 @@ def deviated_models(
         model=Realization(A, B, C, D, np.array(states), np.nan),
         records=records,
         input_scale=np.ones(lti.n_inputs),
-        output_scale=np.ones(lti.n_outputs),
+        output_scale=scale,
         basis=np.eye(lti.n_inputs),
         free=Freedom(D != 0.0),
         refined=True,
