@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -165,7 +166,8 @@ def identify_point(
             f"{len(failures)} of {len(labels)} realisations were left out of the "
             f"average; the first, {failures[0][0]!r}: {failures[0][1]}"
         )
-    models = [model for model in models if model.order == models[0].order]
+    lowest = min(model.order for model in models)  # where none grew
+    models = [model for model in models if model.order == lowest]
     return LocalModel(_average(models), fitted.lti_.order, _horizon(fitted), models)
 
 
@@ -252,13 +254,25 @@ def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
 
 
 def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpace:
-    lti = model.to_continuous(discretization)
+    with warnings.catch_warnings():  # said below, at this point
+        warnings.filterwarnings("ignore", ".*negative real axis", RuntimeWarning)
+        lti = model.to_continuous(discretization)
     if not lti.is_stable:
         worst = lti.poles()[np.argmax(lti.poles().real)]
         raise ValueError(
             f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
             "local=SubspaceLTI(stability='enforce'), another `order`, a longer "
             "`horizon` or more data, or leave the point out by on_error='skip'."
+        )
+    if lti.order > model.order:
+        poles = model.poles()
+        poles = poles[(poles.real < 0) & (poles.imag == 0)].real
+        warn(
+            f"the identified model of order {model.order} has "
+            f"{lti.order - model.order} pole(s) on the negative real axis "
+            f"({', '.join(f'{p:.3g}' for p in poles)}), as no continuous-time model of "
+            "that order has: what becomes of the point is the nearest one. A shorter "
+            "sampling time or a lower `order` avoids it."
         )
     return lti.balance()
 

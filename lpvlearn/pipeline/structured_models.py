@@ -73,12 +73,16 @@ def restructure_points(
     runner : PointRunner
     """
     if restructurer is None:
-        structure, theta = balanced_entries([model.lti for model in local])
+        # poles on the negative real axis make the order grow in continuous time
+        structure, theta = balanced_entries(
+            [model.lti.balance(min(model.order, model.lti.order)) for model in local]
+        )
         balanced = [structure.model(row) for row in theta]
         every = list(range(len(theta)))
         return StructuredModels(
             structure, theta, balanced, [], every, [None] * len(theta)
         )
+    restructurer = _with_structure(restructurer, local)
     # What a fit is about: the model, and where they are known its realizations.
     tasks = [
         (_plain(model.lti), [_plain(other) for other in model.realizations])
@@ -117,6 +121,33 @@ def restructure_points(
         kept,
         covariances,
     )
+
+
+def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
+    """One canonical form for all points, of the identified order, where none is given.
+
+    Raises
+    ------
+    ValueError
+        If the models differ in order.
+    """
+    if getattr(restructurer, "structure", "its own") is not None:
+        return restructurer
+    orders = sorted({model.order for model in local})
+    if len(orders) > 1:
+        raise ValueError(
+            "`structure=None` interpolates the parameters of a canonical form and "
+            f"needs local models of one order. Got orders {orders}. Fix the order: "
+            "local=SubspaceLTI(order=...)."
+        )
+    first = local[0].lti
+    form = GrayBoxStructure.observable_canonical(
+        orders[0],
+        first.n_inputs,
+        first.n_outputs,
+        orders[0] == 0 or any(model.lti.D.any() for model in local),
+    )
+    return clone(restructurer).set_params(structure=form)
 
 
 def _restructure_point(

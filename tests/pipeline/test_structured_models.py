@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from joblib import Memory
 
 from lpvlearn import (
     GrayBoxRestructurer,
@@ -13,8 +14,12 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.pipeline.local_models import identify_point
-from lpvlearn.pipeline.structured_models import covariance_of_parameters
+from lpvlearn.pipeline.local_models import LocalModel, identify_point
+from lpvlearn.pipeline.runner import PointRunner
+from lpvlearn.pipeline.structured_models import (
+    covariance_of_parameters,
+    restructure_points,
+)
 from lpvlearn.subspace.statistics import deviated_models
 
 from ..conftest import spring_pipeline, spring_tables
@@ -146,3 +151,53 @@ def test_memory_tells_the_same_deviations(tmp_path):
     ]
     for other in fits[1:]:
         pd.testing.assert_frame_equal(fits[0].parameters_std_, other.parameters_std_)
+
+
+@pytest.fixture(scope="module")
+def with_a_negative_pole():
+    """Three points; at the middle one a pole of the sampled system is -0.3."""
+    rng = np.random.default_rng(0)
+    points = []
+    for kappa, pole in zip((0.0, 1.0, 2.0), (0.3, -0.3, 0.3), strict=True):
+        A, B, C = np.diag([0.8, pole]), np.ones((2, 1)), np.array([[1.0, 0.7]])
+        u = rng.standard_normal((400, 1))
+        y = StateSpace(A, B, C, sampling_time=STEP).simulate(u)
+        points.append((u, kappa, y + 0.01 * rng.standard_normal(y.shape)))
+    return from_trajectories(points, sampling_time=STEP)
+
+
+TWO_LAGS = GrayBoxStructure.from_template(
+    [["-a", 0], [0, "-b"]], [["g"], ["h"]], [[1, 1]]
+)
+
+
+@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
+@pytest.mark.parametrize(
+    "restructurer", [None, "passthrough", GrayBoxRestructurer(TWO_LAGS)]
+)
+def test_an_order_that_grows_in_continuous_time_is_that_of_the_others(
+    with_a_negative_pole, restructurer
+):
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(order=2, horizon=8),
+        restructurer,
+        scheduling="kappa",
+        experiment="experiment",
+        time="time",
+    )
+    with pytest.warns(UserWarning, match=r"1 pole\(s\) on the negative real.*-0\.3"):
+        pipeline.fit(*with_a_negative_pole)
+    assert [model.order for model in pipeline.local_models_] == [2, 3, 2]
+    assert [model.order for model in pipeline.structured_models_] == [2, 2, 2]
+    if restructurer != "passthrough":
+        assert pipeline.report_["structured_BFT"].min() > 60
+
+
+def test_one_canonical_form_needs_one_order():
+    models = [
+        LocalModel(StateSpace(-np.eye(n), np.ones((n, 1)), np.ones((1, n))), n, None)
+        for n in (1, 2)
+    ]
+    kappa, runner = np.arange(2.0)[:, None], PointRunner(None, 0, "raise", Memory(None))
+    with pytest.raises(ValueError, match=r"one order. Got orders \[1, 2\]"):
+        restructure_points(GrayBoxRestructurer(), models, kappa, runner)
