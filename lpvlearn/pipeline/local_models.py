@@ -17,7 +17,9 @@ from ..data.experiments import Experiment
 from ..data.operating_points import OperatingPoints
 from ..exceptions import warn
 from ..models.statespace import StateSpace
+from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
+from ..subspace.noise_weights import noise_weighted
 from ..subspace.statistics import ModelPair, deviated_models
 from ..systems.balancing import align_signs
 from .runner import PointRunner
@@ -46,6 +48,9 @@ class LocalModel:
     deviated : list of (StateSpace, StateSpace)
         Continuous-time models to either side of a pooled fit, as `deviated_models`
         has them.
+    estimates : list of (StateSpace, list of (StateSpace, StateSpace))
+        The model as identified (of every realization), and models to either side of it;
+        none where the covariance is not known. With "zoh" in discrete time.
     """
 
     lti: StateSpace
@@ -53,6 +58,7 @@ class LocalModel:
     horizon: int | None
     realizations: list[StateSpace] = field(default_factory=list)
     deviated: list[ModelPair] = field(default_factory=list)
+    estimates: list[Estimate] = field(default_factory=list)
 
 
 def identify_points(
@@ -110,6 +116,7 @@ def identify_point(
     sampling_time: float,
     combine: str,
     discretization: str,
+    efficient: bool = False,
 ) -> LocalModel:
     """Identify the local model of one operating point.
 
@@ -124,6 +131,8 @@ def identify_point(
         One fit of all experiments, or one model each, balanced, signs aligned, and the
         matrices averaged (the paper's Monte Carlo).
     discretization : {"zoh", "tustin"}
+    efficient : bool
+        Whether to weigh the outputs by their noise, and to give `estimates`.
 
     Raises
     ------
@@ -135,15 +144,17 @@ def identify_point(
     labels = list(dict.fromkeys(e.label for e in experiments))
     if combine == "pool" or len(labels) == 1:
         fitted = _fit_local(local, experiments, sampling_time)
-        lti = _continuous(fitted.lti_, discretization, advice)
-        deviated = deviated_models(
-            fitted.lti_,
-            [(e.inputs, e.outputs) for e in experiments if e.outputs is not None],
-            lambda model: model.to_continuous(discretization),
-            detrend=getattr(fitted, "detrend", None),
-            refined=getattr(fitted, "refine", False) and not fitted.stability_loss_,
+        model, pairs = _estimate(fitted, experiments, efficient)
+        lti = _continuous(model, discretization, advice)
+        found = LocalModel(
+            lti,
+            fitted.lti_.order,
+            _horizon(fitted),
+            deviated=_all_continuous(pairs, discretization),
         )
-        return LocalModel(lti, fitted.lti_.order, _horizon(fitted), deviated=deviated)
+        if efficient and pairs:
+            found.estimates.append(_in_own_time(model, pairs, discretization))
+        return found
     # The first realisation chooses order and horizon, the others follow it.
     # A realisation with gaps is several experiments of one label.
     realisations = [[e for e in experiments if e.label == label] for label in labels]
@@ -153,10 +164,15 @@ def identify_point(
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
     models, failures = [], []
+    estimates: list[Estimate] = []
     for realisation in realisations:
-        model = _fit_local(chosen, realisation, sampling_time).lti_
+        refitted = _fit_local(chosen, realisation, sampling_time)
+        model, pairs = refitted.lti_, []
+        if efficient:
+            model, pairs = _estimate(refitted, realisation, efficient)
         try:
             models.append(_continuous(model, discretization, advice))
+            estimates.append(_in_own_time(model, pairs, discretization))
         except ValueError as error:
             failures.append((realisation[0].label, error))
     if not models:
@@ -168,7 +184,49 @@ def identify_point(
         )
     lowest = min(model.order for model in models)  # where none grew
     models = [model for model in models if model.order == lowest]
-    return LocalModel(_average(models), fitted.lti_.order, _horizon(fitted), models)
+    known = all(pairs for _, pairs in estimates)
+    return LocalModel(
+        _average(models),
+        fitted.lti_.order,
+        _horizon(fitted),
+        models,
+        estimates=estimates if known else [],
+    )
+
+
+def _estimate(
+    fitted: Any, experiments: Sequence[Experiment], efficient: bool
+) -> tuple[StateSpace, list[ModelPair]]:
+    """The model, its outputs weighed by their noise if so wished, and its pairs."""
+    samples = [(e.inputs, e.outputs) for e in experiments if e.outputs is not None]
+    model, scale = fitted.lti_, None
+    detrend = getattr(fitted, "detrend", None)
+    refined = getattr(fitted, "refine", False) and not fitted.stability_loss_
+    if refined and efficient:
+        model, scale = noise_weighted(model, samples, detrend=detrend)
+    return model, deviated_models(
+        model,
+        samples,
+        lambda other: other,
+        detrend=detrend,
+        refined=refined,
+        output_scale=scale,
+    )
+
+
+def _in_own_time(
+    model: StateSpace, pairs: list[ModelPair], method: str
+) -> tuple[StateSpace, list[ModelPair]]:
+    """In discrete time where inputs are held, else as the continuous-time model."""
+    if method == "zoh":
+        return model, pairs
+    return model.to_continuous(method), _all_continuous(pairs, method)
+
+
+def _all_continuous(pairs: list[ModelPair], method: str) -> list[ModelPair]:
+    with warnings.catch_warnings():  # the estimate's own conversion says it once
+        warnings.simplefilter("ignore")
+        return [(a.to_continuous(method), b.to_continuous(method)) for a, b in pairs]
 
 
 def _fit_local(

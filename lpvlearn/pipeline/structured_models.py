@@ -15,6 +15,7 @@ from sklearn.base import clone
 
 from ..models.statespace import StateSpace
 from ..restructuring.identifiability import response_gain
+from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import problem_from_models
 from ..restructuring.starts import GOOD_FIT
 from ..structures.structure import GrayBoxStructure
@@ -24,6 +25,8 @@ from .runner import PointRunner
 
 Array = NDArray[np.float64]
 
+
+_Task = tuple[StateSpace, list[StateSpace], list[Estimate]]
 
 _SWEEPS = 4  # passes over the points: help travels that far from a good one
 
@@ -83,9 +86,20 @@ def restructure_points(
             structure, theta, balanced, [], every, [None] * len(theta)
         )
     restructurer = _with_structure(restructurer, local)
-    # What a fit is about: the model, and where they are known its realizations.
-    tasks = [
-        (_plain(model.lti), [_plain(other) for other in model.realizations])
+    # What a fit is about: the model, and where they are known its realizations and
+    # estimates. Another norm or a weight is what the user wants minimised.
+    weighed = getattr(restructurer, "norm", None) in ("hinf", "covariance")
+    weighed = weighed and restructurer.frequency_weight is None
+    tasks: list[_Task] = [
+        (
+            _plain(model.lti),
+            [_plain(other) for other in model.realizations],
+            [
+                (_plain(one), [(_plain(a), _plain(b)) for a, b in pairs])
+                for one, pairs in model.estimates
+                if weighed
+            ],
+        )
         for model in local
     ]
     found = runner.run(
@@ -153,19 +167,26 @@ def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
 def _restructure_point(
     model: StateSpace,
     realizations: Sequence[StateSpace],
+    estimates: Sequence[Estimate],
     *,
     restructurer: Any,
     **options: Any,
 ) -> Any:
     """A clone of the restructurer, fitted to one local model."""
+    restructurer = clone(restructurer)
     if len(realizations) > 1:
         options["realizations"] = realizations
-    return clone(restructurer).fit_model(model, **options)
+    if estimates:
+        restructurer.set_params(norm="covariance")
+        options["estimates"] = estimates
+    elif getattr(restructurer, "norm", None) == "covariance":  # it is not known
+        restructurer.set_params(norm="hinf")
+    return restructurer.fit_model(model, **options)
 
 
 def _help_neighbours(
     fitted: Sequence[Any],
-    tasks: Sequence[tuple[StateSpace, list[StateSpace]]],
+    tasks: Sequence[_Task],
     kappa: Array,
     restructurer: Any,
 ) -> list[Any]:
@@ -179,7 +200,7 @@ def _help_neighbours(
     fitted : sequence of estimators
         The restructurer fitted to every model: they follow from the other arguments.
     tasks : sequence of tuple
-        Model and realizations of every point.
+        Model, realizations and estimates of every point.
     kappa : ndarray of shape (n_points, n_scheduling)
     restructurer : estimator
     """
