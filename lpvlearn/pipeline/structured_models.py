@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 
 from ..models.statespace import StateSpace
-from ..restructuring.identifiability import response_gain
 from ..restructuring.minimise_covariance import Estimate
-from ..restructuring.problem import problem_from_models
-from ..restructuring.starts import GOOD_FIT
+from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..structures.structure import GrayBoxStructure
 from ..subspace.statistics import DEVIATION, ModelPair
 from .local_models import LocalModel, with_signs_of
@@ -260,12 +258,11 @@ def covariance_of_parameters(
     """
     problem = problem_from_models(structure, [model], weight)
     omega = problem.omega
-    K = response_gain(problem.system, theta, omega).conj()
-    changes = []
-    for above, below in deviated:
-        dG = above.frequency_response(omega) - below.frequency_response(omega)
-        changes.append(np.einsum("jkpm,kpm->j", K, dG).real / (2.0 * DEVIATION))
-    T = np.array(changes)
+    dG = [
+        above.frequency_response(omega) - below.frequency_response(omega)
+        for above, below in deviated
+    ]
+    T = problem.parameter_changes(theta, np.array(dG)) / (2.0 * DEVIATION)
     return T.T @ T
 
 

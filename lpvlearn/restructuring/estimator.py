@@ -17,6 +17,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from ..exceptions import RankWarning, warn
@@ -24,8 +25,7 @@ from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..validation import one_of, whole_number
-from .identifiability import Identifiability, spread_covariance
-from .least_squares import LeastSquaresResult, channel_scaling
+from .least_squares import LeastSquaresResult
 from .measured import stack_response
 from .minimise_covariance import Estimate, efficient_parameters
 from .minimise_h2 import minimise_h2
@@ -44,7 +44,6 @@ Array = NDArray[np.float64]
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows in plots
 
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
-
 _PROVEN = 1e-8  # an error that much above its lower bound, its rounding, is optimal
 
 # A structure is doubted where chance explains it that rarely, and the parameters would
@@ -251,10 +250,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         given = [problem.structure.check_params(s) for s in starts]
         self._restructure(problem, given, estimates)
         if len(realizations) and not hasattr(self, "params_covariance_"):
-            responses = [m.frequency_response(problem.omega) for m in realizations]
-            self.params_covariance_ = spread_covariance(
-                problem.system, self.params_, problem.omega, responses
-            )
+            spread = problem.spread_covariance(self.params_, realizations)
+            self.params_covariance_ = spread
         return self
 
     def fit(
@@ -311,7 +308,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         """
         problem = self._problem(model)
         fit = problem.fit(problem.structure.check_params(params))
-        return np.inf if fit is None else problem.relative_error(fit)
+        return np.inf if fit is None else fit.relative_error
 
     def perturbation_check(
         self, model: StateSpace, n_restarts: int = 10, size: float = 0.05
@@ -382,16 +379,11 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         """Starts and their least-squares fits, minimisation, certificates, warnings."""
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
-        problem, fits = search(
-            problem,
-            init=self.init,
-            n_starts=self.n_starts,
-            given=given,
-            random_state=self.random_state,
-        )
-        relative = [problem.relative_error(fit) for fit in fits]
-        self.starts_ = pd.DataFrame({"relative_error": relative})
-        self.fit_error_, self.start_params_ = relative[0], fits[0].x
+        seed = check_random_state(self.random_state).randint(2**31)
+        problem, fits = search(problem, self.init, self.n_starts, given, seed)
+        errors = [fit.relative_error for fit in fits]
+        self.starts_ = pd.DataFrame({"relative_error": errors})
+        self.fit_error_, self.start_params_ = errors[0], fits[0].x
         self.params_, result, floor = self._minimise(problem, fits)
         self._describe(problem, result, floor)
         if self.norm == "covariance":
@@ -453,13 +445,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         else:
             self.active_frequencies_ = np.sort(peaks.frequencies)
             self.remaining_error_ = self.error_
-        J = system.response_jacobian(self.params_, problem.omega)[1]
-        scaling = channel_scaling(problem.response)
-        if scaling is not None:  # a faint channel tells parameters, too
-            J = J * scaling[..., None]
-        self.identifiability_ = Identifiability.from_jacobian(
-            J, self.structure_.parameter_names
-        )
+        self.identifiability_ = problem.identifiability(self.params_)
 
     def _weigh(
         self, problem: RestructuringProblem, estimates: Sequence[Estimate]

@@ -28,6 +28,7 @@ class LeastSquaresResult(NamedTuple):
 
     x: Array
     cost: float
+    relative_error: float = np.nan  # root mean square, relative to what is fitted
 
 
 def frequency_grid(poles: Complex, dt: float | None, n_points: int = 60) -> Array:

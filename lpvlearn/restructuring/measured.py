@@ -17,7 +17,6 @@ from .error_system import ErrorSystem, Structure
 from .transfer import Target, model_derivatives
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
 
 # Relative difference of measured neighbours that count as equally high: at an optimum
@@ -96,13 +95,7 @@ class MeasuredErrorSystem(ErrorSystem):
 
 
 def stack_response(G: Complex) -> Array:
-    """(n_freq, n_outputs, n_inputs) to (n_freq, 2 n_outputs n_inputs).
-
-    Examples
-    --------
-    >>> stack_response(np.array([[[1 + 2j, 3 + 4j]]]))
-    array([[1., 3., 2., 4.]])
-    """
+    """(n_freq, n_outputs, n_inputs) to (n_freq, 2 n_outputs n_inputs), real first."""
     flat = G.reshape(len(G), -1)
     return np.hstack([flat.real, flat.imag])
 
@@ -112,16 +105,7 @@ def read_frequency_data(
 ) -> tuple[Array, Complex]:
     """The data of `GrayBoxRestructurer.fit`, or a ValueError that teaches.
 
-    Returns
-    -------
-    omega : ndarray of shape (n_freq,)
-    G : ndarray of shape (n_freq, n_outputs, n_inputs)
-
-    Examples
-    --------
-    >>> omega, G = read_frequency_data([1.0, 2.0], [[0.5, -0.5], [0.2, -0.4]], 1, 1)
-    >>> G[:, 0, 0]
-    array([0.5-0.5j, 0.2-0.4j])
+    Frequencies (n_freq,) and the response there (n_freq, n_outputs, n_inputs).
     """
     grid = real_array("omega", omega)
     if grid.ndim == 2 and grid.shape[1] == 1:
@@ -143,7 +127,7 @@ def read_frequency_data(
                 f"complex `frf` must have shape ({len(grid)}, {n_outputs}, "
                 f"{n_inputs}). Got {table.shape}."
             )
-        G = table.reshape(len(grid), n_outputs, n_inputs)
+        G = table
     else:
         table = real_array("frf", frf)
         if table.shape != (len(grid), 2 * entries):
@@ -152,30 +136,18 @@ def read_frequency_data(
                 f"the {n_outputs} x {n_inputs} entries row by row, then imaginary. "
                 f"Got {table.shape}."
             )
-        G = (table[:, :entries] + 1j * table[:, entries:]).reshape(
-            len(grid), n_outputs, n_inputs
-        )
+        G = table[:, :entries] + 1j * table[:, entries:]
     if not np.isfinite(G).all():
         k = int(np.argwhere(~np.isfinite(G))[0, 0])
         raise ValueError(f"`frf` must be finite. Got a NaN or infinity in row {k}.")
-    return grid, G.astype(complex)
+    return grid, G.reshape(len(grid), n_outputs, n_inputs).astype(complex)
 
 
 def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
-    """Model of the given order near a response, or None where the data are too few.
+    """Continuous-time model near a response, or None where the data are too few.
 
-    Parameters
-    ----------
-    omega : ndarray of shape (k,)
-        Distinct angular frequencies, rad/s, not negative and not only zero.
-    G : ndarray of shape (k, n_outputs, n_inputs)
-    order : int
-
-    Returns
-    -------
-    Target or None
-        A continuous-time model: exact where `G` is the response of a model of that
-        order. Not necessarily stable.
+    Exact where `G` (k, n_outputs, n_inputs) is the response of a model of that order at
+    the distinct frequencies `omega` (rad/s); not necessarily stable.
 
     References
     ----------
@@ -185,7 +157,6 @@ def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
 
     Examples
     --------
-    >>> import numpy as np
     >>> omega = np.linspace(0.5, 10.0, 12)
     >>> model = realize_response(omega, (1 / (1j * omega + 2))[:, None, None], order=1)
     >>> float(model.A[0, 0].round(9))

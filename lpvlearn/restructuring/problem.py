@@ -2,7 +2,8 @@
 
 That is the norm of the weighted error ``W (G(theta) - G0)``, Eq. (6), where ``G0`` is
 one black-box model, several ones of an operating point with their outputs below each
-other, or a measured frequency response.
+other, or a measured frequency response. What a response tells of the parameters follows
+from its derivative J: which ones, by its rank; and to first order how exactly.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, qr
 
 from ..models.statespace import StateSpace
-from ..structures.map import RowsMap
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
 from .error_system import ErrorSystem
 from .least_squares import (
     LeastSquaresResult,
+    channel_scaling,
     fit_frequency_response,
     grid_and_margin,
 )
@@ -31,45 +32,36 @@ from .measured import MeasuredErrorSystem, read_frequency_data, realize_response
 from .transfer import Target, series
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
 
 FrequencyWeight = StateSpace | Sequence[float | None] | None
+
+GOOD_FIT = 3e-3  # relative least-squares error that no wrong basin comes down to
+_DISTINCT = 1e-6  # relative distance of candidates that would end in the same fit
 
 # A measured response does not tell how slowly modes may decay: they must be stable, by
 # a rate that no response down to the lowest frequency could show.
 _LEAST_DECAY = 1e-4
 
+# Singular values smaller than that part of the largest are rounding: responses and
+# their derivatives are exact to about 1e-13, behind resolvents less so.
+_RANK_TOLERANCE = 1e-9
+
+_NAMED = 0.1  # smaller parts of an undetermined combination would only clutter its name
+
 
 @dataclass(frozen=True, eq=False)
 class RestructuringProblem:
-    """A structure beside what it shall match.
-
-    Attributes
-    ----------
-    structure : GrayBoxStructure
-    system : ErrorSystem
-    box : Target or None
-        One black-box model, from which similarity transformations start.
-    omega : ndarray of shape (k,)
-        Frequencies of the least-squares fit, rad/s.
-    margin : float
-        Stability margin, 1/s.
-    reference : float
-        H-infinity norm of the weighted black box.
-    dropped_feedthrough : ndarray of shape (n_outputs, n_inputs)
-    lower_bound : float
-        No parameters have a smaller error.
-    """
+    """A structure beside what it shall match."""
 
     structure: GrayBoxStructure
     system: ErrorSystem
-    box: Target | None
-    omega: Array
-    margin: float
-    reference: float
-    dropped_feedthrough: Array
-    lower_bound: float
+    box: Target | None  # one black box, from which similarity transformations start
+    omega: Array  # (k,) frequencies of the least-squares fit, rad/s
+    margin: float  # stability margin, 1/s
+    reference: float  # H-infinity norm of the weighted black box
+    dropped_feedthrough: Array  # (n_outputs, n_inputs)
+    lower_bound: float  # no parameters have a smaller error
 
     @cached_property
     def response(self) -> Complex:
@@ -77,9 +69,12 @@ class RestructuringProblem:
         return self.system.target_response(self.omega)
 
     @cached_property
-    def weighted_response(self) -> Complex:
-        """The black box behind the weight."""
-        return self.system.weight_response(self.omega)[0] @ self.response
+    def _weighted(self) -> tuple[Complex, Complex, float]:
+        """The weight, the black box behind it, and its root mean square."""
+        W = self.system.weight_response(self.omega)[0]
+        G = W @ self.response
+        square = np.mean(np.sum(np.abs(G) ** 2, axis=(1, 2)))
+        return W, G, max(float(np.sqrt(square)), 1e-300)
 
     def is_stable(self, theta: Array) -> bool:
         """Whether parameters give a model that keeps the stability margin."""
@@ -89,7 +84,7 @@ class RestructuringProblem:
         self, theta: Array, scaling: Array | float = 1.0
     ) -> LeastSquaresResult | None:
         """Least-squares fit of the response from given parameters; None if unstable."""
-        return fit_frequency_response(
+        fit = fit_frequency_response(
             self.system,
             theta,
             self.omega,
@@ -97,11 +92,91 @@ class RestructuringProblem:
             admissible=self.is_stable,
             scaling=scaling,
         )
+        if fit is None:
+            return None
+        error = float(np.sqrt(fit.cost)) / self._weighted[2]
+        return fit._replace(relative_error=error)
 
-    def relative_error(self, fit: LeastSquaresResult) -> float:
-        """Root-mean-square error of a fit over frequency, relative to the black box."""
-        square = np.mean(np.sum(np.abs(self.weighted_response) ** 2, axis=(1, 2)))
-        return float(np.sqrt(fit.cost)) / max(float(np.sqrt(square)), 1e-300)
+    def best_fits(self, candidates: Array, n_fits: int) -> list[LeastSquaresResult]:
+        """Least-squares fits from the best distinct candidates, until one is good.
+
+        They are ranked by the error of their response, not of their parameters.
+        """
+        system, structure = self.system, self.structure
+        candidates = np.clip(candidates, structure.lower, structure.upper)
+        usable = [theta for theta in candidates if self.is_stable(theta)]
+        if not usable:
+            return []
+        W, weighted, _ = self._weighted
+        scaling = channel_scaling(weighted)
+        scale = 1.0 if scaling is None else scaling
+        differences = [system.response(x, self.omega) - self.response for x in usable]
+        errors = [np.linalg.norm(scale * (W @ dG)) for dG in differences]
+        thetas = _distinct(np.array(usable)[np.argsort(errors, kind="stable")])
+        fits = []
+        for theta in thetas[:n_fits]:
+            if scaling is not None:  # all channels alike first, then as they are
+                first = self.fit(theta, scaling)
+                theta = theta if first is None else first.x
+            fit = self.fit(theta)
+            if fit is None:
+                continue
+            fits.append(fit)
+            if fit.relative_error <= GOOD_FIT:
+                break
+        return fits
+
+    def identifiability(self, theta: Array) -> Identifiability:
+        """Which parameters the response determines."""
+        J = self.system.response_jacobian(theta, self.omega)[1]
+        scaling = channel_scaling(self.response)
+        if scaling is not None:  # a faint channel tells parameters, too
+            J = J * scaling[..., None]
+        return Identifiability.from_jacobian(J, self.structure.parameter_names)
+
+    def parameter_changes(self, theta: Array, dG: Complex) -> Array:
+        """First-order changes of the parameters with the black box's response.
+
+        Minimising the weighted mean square error, ``d theta = Re(K dG)`` with
+        ``K = (J^T J)^-1 J^H W`` in real arithmetic. `dG` (r, k, n_outputs, n_inputs)
+        are changes of the response; several black boxes change alike.
+        """
+        W = self._weighted[0]
+        J = self.system.response_jacobian(theta, self.omega)[1]
+        WJ = np.einsum("kpq,kqmj->kpmj", W, J)
+        flat = WJ.reshape(-1, J.shape[-1])
+        inverse = np.linalg.pinv(np.vstack([flat.real, flat.imag]))
+        real, imaginary = np.split(inverse, 2, axis=1)
+        K = (real + 1j * imaginary).reshape(-1, *WJ.shape[:-1])
+        K = np.einsum("jkpm,kpq->jkqm", K, W.conj())
+        if K.shape[2] != dG.shape[2]:  # several black boxes were stacked
+            K = K.reshape(*K.shape[:2], -1, *dG.shape[2:]).sum(2)
+        return np.asarray(np.einsum("jkpm,rkpm->rj", K.conj(), dG).real)
+
+    def spread_covariance(self, theta: Array, models: Sequence[StateSpace]) -> Array:
+        """Covariance of the parameters of an averaged model from single realizations.
+
+        Every realization's response is carried to the parameters to first order; the
+        covariance of their mean is that of one divided by their number.
+        """
+        if len(models) < 2:
+            raise ValueError(
+                "`realizations` must be at least 2 models to have a spread. Got "
+                f"{len(models)}."
+            )
+        G = np.array([model.frequency_response(self.omega) for model in models])
+        changes = self.parameter_changes(theta, G - G.mean(0))
+        return np.cov(changes.T, ddof=1).reshape(len(theta), -1) / len(G)
+
+
+def _distinct(thetas: Array) -> Array:
+    """The rows that differ from all rows before them."""
+    kept: list[Array] = []
+    for theta in thetas:
+        least = _DISTINCT * np.linalg.norm(theta)
+        if all(np.linalg.norm(theta - other) > least for other in kept):
+            kept.append(theta)
+    return np.array(kept)
 
 
 def problem_from_models(
@@ -111,11 +186,6 @@ def problem_from_models(
 
     The feedthrough of the black boxes is left out where the structure has none,
     as in Eq. (4). Several models are stacked.
-
-    Raises
-    ------
-    ValueError
-        If a model is unstable, or the shapes or time domains do not fit.
     """
     for model in models:
         _check_model(model)
@@ -123,16 +193,14 @@ def problem_from_models(
     structure = _structure_for(structure, first)
     p, dt = structure.n_outputs, first.sampling_time
     for model in models:
-        own = (model.n_outputs, model.n_inputs, model.sampling_time)
+        own = (*model.D.shape, model.sampling_time)
         if own != (p, structure.n_inputs, dt):
             raise ValueError(
                 f"`structure` has {p} outputs and {structure.n_inputs} inputs, `model` "
                 f"has {own[0]} and {own[1]} (sampling time {own[2]}). They must agree."
             )
-    free = structure.free_feedthrough
-    fixed = structure.matrices(structure.reference)[3]
     boxes = [
-        Target(m.A, m.B, m.C, np.where(free, m.D, fixed), m.sampling_time)
+        Target(m.A, m.B, m.C, structure.feedthrough_of(m.D), m.sampling_time)
         for m in models
     ]
     filter_ = _weight_model(weight, p, dt)
@@ -141,11 +209,16 @@ def problem_from_models(
         behind = Target(filter_.A, filter_.B, filter_.C, filter_.D, dt)
         if behind.D.shape != (1, 1):  # one for every black box
             behind = behind.repeated(len(boxes))
-    target = _stacked(boxes) if len(boxes) > 1 else boxes[0]
-    system = ErrorSystem(_repeated_outputs(structure, len(boxes)), target, behind)
+    target, matched = boxes[0], structure
+    if len(boxes) > 1:
+        target, matched = _stacked(boxes), structure.with_stacked_outputs(len(boxes))
+    system = ErrorSystem(matched, target, behind)
+    parts = (target.A, target.B, target.C, target.D)
+    if system.weight is not None:
+        parts = series(*parts, system.weight)
     omega, margin = grid_and_margin(target)
     bound = 0.0
-    if len(models) == 1 and filter_ is None and first.order > structure.order:
+    if len(models) == 1 and filter_ is None and len(first.A) > structure.order:
         bound = float(first.hankel_singular_values()[structure.order])
     return RestructuringProblem(
         structure,
@@ -153,7 +226,7 @@ def problem_from_models(
         boxes[0],
         omega,
         margin,
-        _weighted_norm(system),
+        hinf_norm(*parts, dt=dt).norm,
         first.D - boxes[0].D,
         bound,
     )
@@ -186,30 +259,11 @@ def _structure_for(
     return structure
 
 
-def _repeated_outputs(structure: GrayBoxStructure, copies: int) -> GrayBoxStructure:
-    """The structure with its outputs once for each of several black boxes."""
-    if copies == 1:
-        return structure
-    states, outputs = np.split(np.arange(structure.map.shape[0]), [structure.order])
-    rows = np.concatenate([states, np.tile(outputs, copies)])
-    return GrayBoxStructure(
-        structure.order, RowsMap(structure.map, rows), structure.domain
-    )
-
-
 def _stacked(boxes: Sequence[Target]) -> Target:
     """The black boxes with their outputs below each other, inputs in common."""
     A, C = block_diag(*(box.A for box in boxes)), block_diag(*(box.C for box in boxes))
     B, D = np.vstack([box.B for box in boxes]), np.vstack([box.D for box in boxes])
     return Target(A, B, C, D, boxes[0].dt)
-
-
-def _weighted_norm(system: ErrorSystem) -> float:
-    t = system.target
-    parts = (t.A, t.B, t.C, t.D)
-    if system.weight is not None:
-        parts = series(*parts, system.weight)
-    return hinf_norm(*parts, dt=t.dt).norm
 
 
 def problem_from_response(
@@ -219,13 +273,7 @@ def problem_from_response(
     weight: Any,
     sample_weight: ArrayLike | None,
 ) -> RestructuringProblem:
-    """Match a measured frequency response over its frequencies.
-
-    Raises
-    ------
-    ValueError
-        If there is no structure, or the table does not fit it.
-    """
+    """Match a measured frequency response over its frequencies."""
     if not isinstance(structure, GrayBoxStructure):
         raise ValueError(
             "`structure` must be given to fit a frequency response, which does not "
@@ -263,13 +311,7 @@ def problem_from_response(
 def _weight_model(
     weight: Any, n_outputs: int, sampling_time: float | None
 ) -> StateSpace | None:
-    """The `frequency_weight`, model or band, in the time domain of the black boxes.
-
-    Raises
-    ------
-    ValueError
-        If the weight is unstable, or does not fit the outputs or the time domain.
-    """
+    """The `frequency_weight`, model or band, in the time domain of the black boxes."""
     if weight is None:
         return None
     if not isinstance(weight, StateSpace):
@@ -319,3 +361,93 @@ def _band(edges: Any) -> StateSpace:
     if np.isfinite(high):
         parts = series(*parts, Target(-high * one, high * one, one, 0.0 * one))
     return StateSpace(*parts)
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """Rank analysis of the derivative of the response to the parameters.
+
+    Attributes
+    ----------
+    rank : int
+        Number of parameter combinations that the response determines.
+    n_params : int
+    condition : float
+        Largest over smallest singular value; relative errors of the response grow into
+        the parameters by up to this factor. Infinite or huge if the rank is deficient.
+    directions : tuple of dict
+        One for every undetermined combination: change by parameter name, in steps that
+        have the same effect on the response, the largest 1; below 0.1 it is left out.
+    """
+
+    rank: int
+    n_params: int
+    condition: float
+    directions: tuple[dict[str, float], ...]
+
+    def __str__(self) -> str:
+        if not self.directions:
+            return (
+                f"all {self.n_params} parameters are identifiable "
+                f"(condition {self.condition:.2g})."
+            )
+        parts = [
+            " ".join(f"{value:+.2g} {name}" for name, value in direction.items())
+            for direction in self.directions
+        ]
+        return (
+            f"the response determines {self.rank} of the {self.n_params} parameters. "
+            f"It does not change along: {'; '.join(parts)} (in steps of equal effect). "
+            "Fix a parameter of each combination in the template."
+        )
+
+    @classmethod
+    def from_jacobian(cls, J: Complex, names: Sequence[str]) -> Identifiability:
+        """Analysis of the response Jacobian, (n_freq, n_outputs, n_inputs, n_params).
+
+        Every column is divided by its norm: the analysis does not depend on the units
+        of the parameters, nor on parameters that happen to be zero.
+
+        Examples
+        --------
+        The gain ``b c`` of a response does not tell ``b`` from ``c``:
+
+        >>> J = np.array([[[[2.0 + 0j, 3.0]]]])  # at b = 3, c = 2
+        >>> found = Identifiability.from_jacobian(J, ["b", "c"])
+        >>> found.rank, found.directions
+        (1, ({'b': 1.0, 'c': -1.0},))
+        """
+        n = J.shape[-1]
+        flat = J.reshape(int(np.prod(J.shape[:-1])), n)
+        # Rows of zeros: few frequencies must not hide undetermined combinations.
+        columns = np.vstack([flat.real, flat.imag, np.zeros((n, n))])
+        effect = np.linalg.norm(columns, axis=0)
+        columns = columns / np.where(effect > 0, effect, 1.0)
+        _, s, Vt = np.linalg.svd(columns, full_matrices=False)
+        top = float(s.max(initial=0.0))
+        rank = int((s > _RANK_TOLERANCE * top).sum())
+        directions = tuple(
+            {
+                name: float(value)
+                for name, value in zip(names, row, strict=True)
+                if abs(value) > _NAMED
+            }
+            for row in _sparse_rows(Vt[rank:])
+        )
+        low = float(s.min(initial=top))
+        condition = top / low if low > 0 else np.inf
+        return cls(rank, n, condition, directions)
+
+
+def _sparse_rows(null: Array) -> Array:
+    """Basis of the row space, each row with one entry of its own, largest entry 1.
+
+    Combinations that have nothing to do with one another come apart; an orthonormal
+    basis would mix them.
+    """
+    if len(null) == 0:
+        return null
+    own = qr(null, mode="r", pivoting=True)[1][: len(null)]
+    rows = np.linalg.solve(null[:, own], null)
+    largest = np.take_along_axis(rows, np.abs(rows).argmax(1)[:, None], 1)
+    return (rows / largest).round(12) + 0.0

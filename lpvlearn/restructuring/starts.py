@@ -2,44 +2,39 @@
 
 Candidates are parameters from whatever is known: a first guess, ranges, similarity
 transformations of the black box, sizes that equations of motion make natural, and, from
-the second round on, fits of a smoother response. They are ranked by the error of their
-frequency response, not by their distance to the structure, and the best ones start
-least-squares fits.
+the second round on, fits of a smoother response. The best ones start least-squares
+fits.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.utils import check_random_state
 
-from ..structures.domain import drawn_around
 from ..structures.map import AffineMap
 from ..structures.mechanical import ImplicitMap
-from ..structures.structure import GrayBoxStructure
+from ..structures.structure import GrayBoxStructure, drawn_around
 from ..systems.balancing import balancing_transformation
 from .continuation import continued_fits
 from .least_squares import LeastSquaresResult, channel_scaling, frequency_grid
 from .limits import growth
-from .problem import RestructuringProblem
+from .problem import GOOD_FIT, RestructuringProblem
 from .similarity import scaled_problem, similarity_starts
 from .transfer import Target, model_derivatives
 
 Array = NDArray[np.float64]
 
-GOOD_FIT = 3e-3  # relative least-squares error that no wrong basin comes down to
-
 # A worse fit is searched on for, even where starts agree on it: a structure seldom is
 # that far from what it is meant to describe, and starts may agree on a wrong basin.
 _FAR_FIT = 0.1
 
+_COST = attrgetter("cost")  # by which fits are sorted
 _ROUNDS = 3  # more starts; then a smoother response; then both, thoroughly
-
 _N_FITS = 3  # of a round, from the best candidates: their ranking is seldom far off
-
 _SAME = 1e-4  # relative difference of the costs of fits in one basin: they end at 1e-6
 
 # A structure slower than the black box lets expect is searched for with that part of
@@ -47,19 +42,12 @@ _SAME = 1e-4  # relative difference of the costs of fits in one basin: they end 
 _LEAST_MARGIN = 1e-6
 
 _HOP_FIT = 0.03  # error of a fit so far off that better basins may lie beside its own
-
 _HOPS = (0.1, 0.3, 1.0) * 4  # sizes of the hops of logarithms: 10 %, to a factor of 3
-
 _HOP_RETURNS = 5  # to the fit itself, after which its basin counts as wide
-
 _HOP_ROUNDS = 4  # from ever better fits
-
 _HOP_GAIN = 1e-3  # relative decrease of the cost that is worth another round
-
 _FAINT = 0.03  # size of modes that only fill the order: seen, but hardly disturbing
-
 _FAST = 3.0  # decay of these modes, relative to the fastest: they are out of the way
-
 _SLOWEST = 1e-9  # poles smaller than that part of the largest are integrators
 
 # Starts at each time scale that are carried through a continuation: its steps cost as
@@ -75,26 +63,18 @@ _QUICK = {"shifts": (1.0, 0.2, 0.05, 0.0), "n_points": 18, "max_iter": 16}
 
 def search(
     problem: RestructuringProblem,
-    *,
     init: str | ArrayLike,
     n_starts: int,
     given: list[Array],
-    random_state: Any,
+    seed: int,
 ) -> tuple[RestructuringProblem, list[LeastSquaresResult]]:
     """Least-squares fits, by ascending cost, and the problem that they solve.
 
     Where no model of the structure decays as fast as the black box lets expect, its
-    stability margin is given up.
-
-    The options are those of `GrayBoxRestructurer`; further candidates may be `given`.
-
-    Raises
-    ------
-    ValueError
-        If no stable starting point is found.
+    stability margin is given up. The options are those of `GrayBoxRestructurer`;
+    further candidates may be `given`.
     """
     guess = None if isinstance(init, str) else problem.structure.check_params(init)
-    seed = check_random_state(random_state).randint(2**31)
     for share in (1.0, _LEAST_MARGIN):
         problem = replace(problem, margin=share * problem.margin)
         fits = _rounds(problem, guess, n_starts, given, np.random.default_rng(seed))
@@ -122,8 +102,8 @@ def _rounds(
             candidates = np.vstack([*given, candidates])
         elif len(candidates) == 0:
             break
-        fits = _sorted(fits + best_fits(problem, candidates, n_fits))
-        best = problem.relative_error(fits[0]) if fits else np.inf
+        fits = sorted(fits + problem.best_fits(candidates, n_fits), key=_COST)
+        best = fits[0].relative_error if fits else np.inf
         if best <= GOOD_FIT:
             break
         # the structure comes no nearer: different starts end at the same best cost
@@ -131,51 +111,6 @@ def _rounds(
         if best <= _FAR_FIT and agreeing >= (2 if number else n_fits):
             break
     return hopped_fits(problem, fits, rng) if fits and best > _HOP_FIT else fits
-
-
-def _sorted(fits: list[LeastSquaresResult]) -> list[LeastSquaresResult]:
-    return sorted(fits, key=lambda fit: fit.cost)
-
-
-def best_fits(
-    problem: RestructuringProblem, candidates: Array, n_fits: int
-) -> list[LeastSquaresResult]:
-    """Least-squares fits from the best distinct candidates, until one is good."""
-    candidates = np.clip(candidates, problem.structure.lower, problem.structure.upper)
-    usable = [theta for theta in candidates if problem.is_stable(theta)]
-    if not usable:
-        return []
-    system, omega, G0 = problem.system, problem.omega, problem.response
-    W = system.weight_response(omega)[0]
-    scaling = channel_scaling(problem.weighted_response)
-    scale = 1.0 if scaling is None else scaling
-    errors = [
-        np.linalg.norm(scale * (W @ (system.response(theta, omega) - G0)))
-        for theta in usable
-    ]
-    thetas = _distinct(np.array(usable)[np.argsort(errors, kind="stable")])
-    fits = []
-    for theta in thetas[:n_fits]:
-        if scaling is not None:  # all channels alike first, then as they are
-            first = problem.fit(theta, scaling)
-            theta = theta if first is None else first.x
-        fit = problem.fit(theta)
-        if fit is None:
-            continue
-        fits.append(fit)
-        if problem.relative_error(fit) <= GOOD_FIT:
-            break
-    return fits
-
-
-def _distinct(thetas: Array) -> Array:
-    """The rows that differ from all rows before them."""
-    kept: list[Array] = []
-    for theta in thetas:
-        least = 1e-6 * np.linalg.norm(theta)  # nearer ones end in the same fit
-        if all(np.linalg.norm(theta - other) > least for other in kept):
-            kept.append(theta)
-    return np.array(kept)
 
 
 def hopped_fits(
@@ -198,7 +133,7 @@ def hopped_fits(
             if fit is not None:
                 fits = [*fits, fit]
                 returned += abs(fit.cost - best.cost) <= _SAME * best.cost
-        fits = _sorted(fits)
+        fits = sorted(fits, key=_COST)
         if fits[0].cost > best.cost * (1.0 - _HOP_GAIN):
             break
     return fits
@@ -362,14 +297,8 @@ def continuation_candidates(
     Seeds are given parameters, stable or not, and random ones of a natural size where
     bounds or ranges tell signs. Continuous time only.
 
-    Parameters
-    ----------
-    structure : GrayBoxStructure
-    box : Target or None
-    seeds : ndarray of shape (k, n_params)
-    thorough : bool, default=False
-        More seeds and smaller steps, and positive parameters where no sign is known,
-        as physical ones are.
+    A `thorough` call takes more seeds and smaller steps, and positive parameters where
+    no sign is known, as physical ones are.
     """
     nothing = np.zeros((0, structure.n_params))
     if box is None or box.dt is not None or len(box.A) == 0:

@@ -2,29 +2,44 @@
 
 A structure holds one of them: an :class:`AffineMap`, the :class:`FunctionMap` of a
 user's function, or the :class:`~lpvlearn.structures.mechanical.ImplicitMap` of
-equations of motion.
+equations of motion. A function without derivatives is differentiated by a complex
+step, or by differences.
 """
 
 from __future__ import annotations
 
+import threading
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.exceptions import ComplexWarning
 from numpy.typing import NDArray
 
 from ..models.system_matrix import stack_system
-from .differentiation import (
-    numerical_curvature,
-    numerical_jacobian,
-    symmetric_differences,
-)
 
 Array = NDArray[np.float64]
-
 Flags = NDArray[np.bool_]
+
+# All steps are relative to the sizes of the parameters.
+_COMPLEX_STEP = 1e-30  # nothing is subtracted: its square is below any rounding
+_CENTRAL_STEP = 6e-6  # about eps^(1/3): rounding and truncation balance
+_CURVATURE_STEP = 1e-5  # the same for derivatives, whose scale of change is longer
+
+# Relative difference of exact and central derivatives of an analytic function: far
+# above the truncation of the latter, far below what a missing part would make.
+_AGREEMENT = 1e-4
+
+# Relative rounding error of a central difference: eps / _CENTRAL_STEP is 4e-11, and the
+# function may lose two digits of its own.
+_ROUNDING = 1e-8
+
+_LEAST_SIZE = 1e-3  # of a parameter near zero, relative to its usual size
+
+_FILTERS = threading.RLock()  # the warning filters are those of all threads
 
 
 class StructureMap(ABC):
@@ -84,24 +99,12 @@ class AffineMap(StructureMap):
 
 @dataclass(frozen=True, eq=False)
 class FunctionMap(StructureMap):
-    """A smooth function of the user.
+    """A smooth function of the user."""
 
-    Attributes
-    ----------
-    function : callable
-        Maps theta to A, B, C, D.
-    derivatives : callable or None
-        Maps theta to the derivatives of the blocks; None differentiates numerically.
-    dimensions : tuple of int
-        order, n_inputs, n_outputs.
-    typical : ndarray of shape (n_params,)
-        Usual values: their sizes set the steps of numerical derivatives.
-    """
-
-    function: Callable[[Any], Any]
-    derivatives: Callable[[Any], Any] | None
-    dimensions: tuple[int, int, int]
-    typical: Array
+    function: Callable[[Any], Any]  # theta to A, B, C, D
+    derivatives: Callable[[Any], Any] | None  # theta to those of the blocks
+    dimensions: tuple[int, int, int]  # order, n_inputs, n_outputs
+    typical: Array  # values whose sizes set the steps of numerical derivatives
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -124,8 +127,8 @@ class FunctionMap(StructureMap):
 
     def curvature(self, theta: Array) -> Array:
         if self.derivatives is None:
-            return numerical_curvature(self.system_matrix, theta, self.typical)
-        return symmetric_differences(self.jacobian, theta, self.typical)
+            return _numerical_curvature(self.system_matrix, theta, self.typical)
+        return _symmetric_differences(self.jacobian, theta, self.typical)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,3 +179,86 @@ class RowsMap(StructureMap):
     def curvature(self, theta: Array) -> Array | None:
         H = self.parent.curvature(theta)
         return None if H is None else H[:, :, self.rows]
+
+
+def numerical_jacobian(f: Callable[[Any], Any], theta: Array, typical: Array) -> Array:
+    """Derivative of `f` at `theta`, shape (n_params, ...); exact where `f` is analytic.
+
+    Where it cannot take complex parameters, or is not analytic, it is that of central
+    differences.
+    """
+    scale = _parameter_scale(theta, typical)
+    exact = _analytic_jacobian(f, theta, scale)
+    return _central(f, theta, _CENTRAL_STEP * scale) if exact is None else exact
+
+
+def _complex_step(f: Callable[[Any], Any], theta: Array, scale: Array) -> Array:
+    columns = [
+        np.imag(f(theta + 1j * step)) / step.max()
+        for step in np.diag(_COMPLEX_STEP * scale)
+    ]
+    return np.array(columns, dtype=float)
+
+
+def _analytic_jacobian(
+    f: Callable[[Any], Any], theta: Array, scale: Array
+) -> Array | None:
+    """The derivative by complex steps; None where `f` is not analytic.
+
+    A function that is not (abs, real, conj) fails the complex step in silence. Its
+    change along one direction, in which no two parameters change alike, tells, entry
+    by entry.
+    """
+    try:
+        with _FILTERS, warnings.catch_warnings():
+            warnings.simplefilter("error", ComplexWarning)
+            exact = _complex_step(f, theta, scale)
+    except (TypeError, ValueError, NotImplementedError, ComplexWarning):
+        return None
+    direction = scale * np.cos(1.0 + np.arange(len(theta)) ** 2)
+    step = _CENTRAL_STEP * direction
+    up, down = np.asarray(f(theta + step)), np.asarray(f(theta - step))
+    change = (up - down) / (2.0 * _CENTRAL_STEP)
+    size = np.abs(exact * scale.reshape(-1, *[1] * (exact.ndim - 1))).sum(0)
+    rounding = _ROUNDING * (np.abs(up) + np.abs(down))
+    error = np.abs(np.tensordot(direction, exact, axes=1) - change)
+    agrees = error <= _AGREEMENT * np.maximum(np.abs(change), size) + rounding
+    return exact if agrees.all() else None
+
+
+def _numerical_curvature(
+    f: Callable[[Any], Any], theta: Array, typical: Array
+) -> Array:
+    """Second derivatives, (n_params, n_params, ...): differences of the first ones."""
+    scale = _parameter_scale(theta, typical)
+    analytic = _analytic_jacobian(f, theta, scale) is not None
+
+    def jacobian(point: Array) -> Array:
+        if analytic:  # as around theta: not asked again at every step
+            return _complex_step(f, point, scale)
+        return numerical_jacobian(f, point, typical)
+
+    return _symmetric_differences(jacobian, theta, typical)
+
+
+def _symmetric_differences(
+    jacobian: Callable[[Array], Array], theta: Array, typical: Array
+) -> Array:
+    """Second derivatives from a Jacobian that maps (n_params,) to (n_params, ...)."""
+    H = _central(jacobian, theta, _CURVATURE_STEP * _parameter_scale(theta, typical))
+    return 0.5 * (H + H.swapaxes(0, 1))
+
+
+def _central(f: Callable[[Any], Any], theta: Array, steps: Array) -> Array:
+    return np.array(
+        [
+            (f(theta + step) - f(theta - step)) / (2.0 * step.max())
+            for step in np.diag(steps)
+        ]
+    )
+
+
+def _parameter_scale(theta: Array, typical: Array) -> Array:
+    """Size of every parameter; 0 stands for a usual value of 1."""
+    usual = np.abs(typical)
+    return np.maximum(np.abs(theta), _LEAST_SIZE * np.where(usual > 0, usual, 1.0))

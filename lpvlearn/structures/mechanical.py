@@ -29,22 +29,14 @@ _SINGULAR = 1e-13
 class ImplicitMap(StructureMap):
     """``S = offset + W X`` with ``M(theta) X = N(theta)``, M and N affine.
 
-    Of equations of motion, ``X [x; u]`` are the accelerations.
-
-    Attributes
-    ----------
-    M : ndarray of shape (1 + n_params, n_dof, n_dof)
-        Constant part, then the part of every parameter.
-    N : ndarray of shape (1 + n_params, n_dof, order + n_inputs)
-    W : ndarray of shape (order + n_outputs, n_dof)
-    offset : ndarray of shape (order + n_outputs, order + n_inputs)
-    order : int
+    Of equations of motion, ``X [x; u]`` are the accelerations. M and N hold their
+    constant part, then the part of every parameter.
     """
 
-    M: Array
-    N: Array
-    W: Array
-    offset: Array
+    M: Array  # (1 + n_params, n_dof, n_dof)
+    N: Array  # (1 + n_params, n_dof, order + n_inputs)
+    W: Array  # (order + n_outputs, n_dof)
+    offset: Array  # (order + n_outputs, order + n_inputs)
     order: int
 
     @property
@@ -85,26 +77,22 @@ class ImplicitMap(StructureMap):
         return ImplicitMap(M, N, self.W, self.offset, self.order).simplest()
 
     def simplest(self) -> AffineMap | ImplicitMap:
-        """The same map, affine where M holds no parameter."""
+        """The same map, affine where M holds no parameter; then it must be regular."""
         if self.M[1:].any():
             return self
+        if not 1.0 / np.linalg.cond(self.M[0]) > _SINGULAR:
+            raise ValueError(
+                "`M` must be regular: a coordinate without mass is no state. Got "
+                f"{self.M[0].tolist()}."
+            )
         S = self.W @ np.linalg.solve(self.M[0], self.N) + 0.0  # no negative zeros
         return AffineMap(self.offset + S[0], S[1:])
 
     def natural_sizes(self, rate: float, gains: Array) -> Array:
-        """Sizes of the parameters, up to a factor, that make all terms alike.
+        """Positive sizes of the parameters, up to a factor, that make all terms alike.
 
-        Parameters
-        ----------
-        rate : float
-            1 / s, at which the states move.
-        gains : ndarray of shape (n_outputs,)
-            Sizes of the outputs for inputs of size one.
-
-        Returns
-        -------
-        ndarray of shape (n_params,)
-            Positive.
+        States move at `rate` (1 / s); `gains` (n_outputs,) are the sizes of the outputs
+        for inputs of size one.
         """
         n, dof = self.order, len(self.M[0])
         # x_i' = a x_j: log s_j - log s_i = log rate - log |a|; the same for X
@@ -182,11 +170,6 @@ def mechanical_map(
     stacked = np.concatenate([offset[None], basis])
     mass, rest = (part.copy() for part in np.split(stacked, [n], axis=2))
     rest[:, :, : 2 * n] = 0.0 - rest[:, :, : 2 * n]  # no negative zeros
-    if not mass[1:].any() and not 1.0 / np.linalg.cond(mass[0]) > _SINGULAR:
-        raise ValueError(
-            "`M` must be regular: a coordinate without mass is no state. Got "
-            f"{mass[0].tolist()}."
-        )
     p = len(H)
     W, fixed = np.zeros((2 * n + p, n)), np.zeros((2 * n + p, 2 * n + m))
     W[n : 2 * n] = np.eye(n)

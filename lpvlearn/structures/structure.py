@@ -3,13 +3,14 @@
 A structure writes the system matrix ``S = [[A, B], [C, D]]`` as a function of the
 parameter vector, Eq. (2). It is affine, ``S(theta) = S_0 + sum_j theta_j S_j``, when
 given as a template, and any smooth function otherwise. It is two things: the map from
-parameters to S (:mod:`~lpvlearn.structures.map`), and the domain of the parameters
-(:mod:`~lpvlearn.structures.domain`), what is known of their values.
+parameters to S (:mod:`~lpvlearn.structures.map`), and what is known of their values:
+bounds, ranges and a first guess.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,8 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..models.statespace import StateSpace
 from ..models.system_matrix import Blocks, blocks
 from ..validation import named_values, real_array
-from .domain import Interval, ParameterDomain
-from .map import AffineMap, FunctionMap, StructureMap
+from .map import AffineMap, FunctionMap, RowsMap, StructureMap
 from .mechanical import ImplicitMap, mechanical_map
 from .templates import (
     Entry,
@@ -29,6 +29,13 @@ from .templates import (
 )
 
 Array = NDArray[np.float64]
+
+Interval = Sequence[float | None]
+
+_SPREAD = 0.3  # standard deviation of log-parameters: a guess is right to a third
+
+_DECADE = 10.0  # a range that spans more tells an order of magnitude, not a value
+_LISTED = 8  # names that a message lists
 
 
 class GrayBoxStructure:
@@ -70,17 +77,44 @@ class GrayBoxStructure:
            [-4. , -0.5]])
     """
 
-    def __init__(self, order: int, map: StructureMap, domain: ParameterDomain) -> None:
-        self.order, self.map, self.domain = order, map, domain
+    def __init__(
+        self,
+        order: int,
+        map: StructureMap,
+        parameter_names: Sequence[str],
+        *,
+        initial: Array | None = None,
+        lower: Array | None = None,
+        upper: Array | None = None,
+        ranges: Array | None = None,
+    ) -> None:
+        q = len(parameter_names)
+        self.order, self.map = order, map
+        self.parameter_names, self.n_params = tuple(parameter_names), q
         self.n_outputs, self.n_inputs = (int(k) - order for k in map.shape)
-        self.parameter_names, self.n_params = domain.names, len(domain.names)
-        self.initial, self.ranges = domain.initial, domain.ranges
-        self.lower, self.upper = domain.lower, domain.upper
-        self.is_bounded = bool(np.isfinite([domain.lower, domain.upper]).any())
+        self.initial = initial
+        self.lower = np.full(q, -np.inf) if lower is None else lower
+        self.upper = np.full(q, np.inf) if upper is None else upper
+        self.ranges = np.full((2, q), np.nan) if ranges is None else ranges
+        self.is_bounded = bool(np.isfinite([self.lower, self.upper]).any())
         affine = map if isinstance(map, AffineMap) else None
         self.is_affine = affine is not None
         self.offset = None if affine is None else affine.offset
         self.basis = None if affine is None else affine.basis
+        # the equations M(theta) X = N(theta) of a structure that solves them
+        self.implicit = map if isinstance(map, ImplicitMap) else None
+        if self.implicit is not None and initial is None:
+            self.implicit.regular_point()  # that there is none is told of here
+        for array in (self.initial, self.lower, self.upper, self.ranges):
+            if array is not None:
+                array.setflags(write=False)
+
+    def _changed(self, **changes: Any) -> GrayBoxStructure:
+        """Another one, which differs in some of the constructor's arguments."""
+        names = ("order", "map", "parameter_names")
+        known = ("initial", "lower", "upper", "ranges")
+        own = {name: getattr(self, name) for name in (*names, *known)}
+        return type(self)(**own | changes)
 
     def __repr__(self) -> str:
         kind = "affine" if self.is_affine else "function"
@@ -126,8 +160,7 @@ class GrayBoxStructure:
         >>> structure.model({"a": 4.0, "d": 1.0}).A
         array([[-2.]])
         """
-        order, map, names = affine_system(A, B, C, D, parameter_names)
-        return cls(order, map, ParameterDomain.free(names))
+        return cls(*affine_system(A, B, C, D, parameter_names))
 
     @classmethod
     def from_function(
@@ -188,7 +221,7 @@ class GrayBoxStructure:
         map = FunctionMap(function, jacobian, dimensions, start)
         if jacobian is not None:
             map.jacobian(start)  # its shapes are told of here, not in a fit
-        return cls(model.order, map, ParameterDomain.free(names, start))
+        return cls(model.order, map, names, initial=start)
 
     @classmethod
     def observable_canonical(
@@ -348,11 +381,7 @@ class GrayBoxStructure:
         """
         equations, names = mechanical_map(M, D, K, F, outputs, sensors, parameter_names)
         guess = None if initial is None else named_values("initial", initial, names)[0]
-        domain = ParameterDomain.free(names, guess)
-        structure = cls(equations.order, equations.simplest(), domain)
-        if guess is None and structure.implicit is not None:
-            equations.regular_point()  # that there is none is told of here
-        return structure
+        return cls(equations.order, equations.simplest(), names, initial=guess)
 
     # -- what is known of the parameters -------------------------------------------
 
@@ -377,12 +406,21 @@ class GrayBoxStructure:
 
         Examples
         --------
-        >>> from lpvlearn import GrayBoxStructure
         >>> structure = GrayBoxStructure.observable_canonical(1)
         >>> structure.with_bounds({"a1_1": (None, 0)}).upper
         array([ 0., inf])
         """
-        return type(self)(self.order, self.map, self.domain.with_bounds(bounds))
+        lower, upper = self.lower.copy(), self.upper.copy()
+        for j, name, (low, high) in self._intervals("bounds", bounds):
+            lower[j] = -np.inf if low is None else low
+            upper[j] = np.inf if high is None else high
+            if not lower[j] < upper[j]:
+                raise ValueError(
+                    f"`bounds` of {name!r} must have the lower one below the upper "
+                    f"one. Got ({lower[j]:g}, {upper[j]:g}). A parameter of one value "
+                    "is fixed: structure.fix()."
+                )
+        return self._changed(lower=lower, upper=upper)._agreeing()
 
     def with_ranges(self, ranges: Mapping[str, Interval]) -> GrayBoxStructure:
         """The structure with known ranges of some parameters, where searches begin.
@@ -406,13 +444,21 @@ class GrayBoxStructure:
 
         Examples
         --------
-        >>> from lpvlearn import GrayBoxStructure
         >>> structure = GrayBoxStructure.observable_canonical(1)
         >>> structure.with_ranges({"b1_1": (1, 100)}).ranges
         array([[ nan,   1.],
                [ nan, 100.]])
         """
-        return type(self)(self.order, self.map, self.domain.with_ranges(ranges))
+        table = self.ranges.copy()
+        for j, name, (low, high) in self._intervals("ranges", ranges):
+            if low is None or high is None or not -np.inf < low < high < np.inf:
+                raise ValueError(
+                    f"`ranges` of {name!r} must be two finite values, the lower first. "
+                    f"Got ({low}, {high}). A limit on one side is a bound: "
+                    "structure.with_bounds()."
+                )
+            table[:, j] = low, high
+        return self._changed(ranges=table)._agreeing()
 
     def fix(self, values: Mapping[str, float]) -> GrayBoxStructure:
         """The structure with some parameters at known values.
@@ -429,12 +475,11 @@ class GrayBoxStructure:
         Raises
         ------
         ValueError
-            If a name is unknown, a value is not finite or outside its bounds, or no
-            parameter remains.
+            If a name is unknown, a value is not finite or outside its bounds, no
+            parameter remains, or a coordinate of equations of motion loses its mass.
 
         Examples
         --------
-        >>> from lpvlearn import GrayBoxStructure
         >>> structure = GrayBoxStructure.from_template(
         ...     A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]])
         >>> fixed = structure.fix({"b": 2.0})
@@ -444,9 +489,93 @@ class GrayBoxStructure:
         array([[0.],
                [2.]])
         """
-        full, free = self.domain.fixed(values)
-        map, domain = self.map.fix(full, free), self.domain.restricted(free)
-        return type(self)(self.order, map, domain)
+        if not isinstance(values, Mapping):
+            raise ValueError(f"`values` must map names to numbers. Got {values!r}.")
+        full, free = np.zeros(self.n_params), np.ones(self.n_params, bool)
+        for name, value in values.items():
+            j = self._index("values", name)
+            try:
+                full[j], free[j] = _number(value), False
+            except (TypeError, ValueError):
+                full[j] = np.nan
+            low, high = self.lower[j], self.upper[j]
+            if not np.isfinite(full[j]) or not low <= full[j] <= high:
+                raise ValueError(
+                    f"`values` of {name!r} must be finite and within its bounds "
+                    f"({low:g}, {high:g}). Got {value!r}."
+                )
+        if not free.any():
+            raise ValueError(
+                "`values` must leave a parameter free: a structure without parameters "
+                "is a model, structure.model(). Got values for all."
+            )
+        return self._changed(
+            map=self.map.fix(full, free),
+            parameter_names=[self.parameter_names[j] for j in np.flatnonzero(free)],
+            initial=None if self.initial is None else self.initial[free],
+            lower=self.lower[free],
+            upper=self.upper[free],
+            ranges=self.ranges[:, free],
+        )
+
+    def _intervals(
+        self, argument: str, given: Any
+    ) -> list[tuple[int, str, tuple[float | None, float | None]]]:
+        """Index, name and limits of every parameter that is named."""
+        if not isinstance(given, Mapping):
+            raise ValueError(
+                f"`{argument}` must map names to pairs such as {{'k': (0, None)}}. "
+                f"Got {given!r}."
+            )
+        found = []
+        for name, pair in given.items():
+            j = self._index(argument, name)
+            try:
+                low, high = (None if x is None else _number(x) for x in pair)
+            except (TypeError, ValueError):
+                raise ValueError(
+                    f"`{argument}` of {name!r} must be a pair of numbers, None where "
+                    f"there is no limit. Got {pair!r}."
+                ) from None
+            found.append((j, name, (low, high)))
+        return found
+
+    def _index(self, argument: str, name: Any) -> int:
+        """Position of a parameter, or an error that names the argument."""
+        if name not in self.parameter_names:
+            known = ", ".join(self.parameter_names[:_LISTED])
+            more = ", ..." if self.n_params > _LISTED else ""
+            raise ValueError(
+                f"`{argument}` must name parameters of the structure "
+                f"({known}{more}). Got {name!r}."
+            )
+        return self.parameter_names.index(name)
+
+    def _agreeing(self) -> GrayBoxStructure:
+        """The structure, if its ranges and first guess lie within its bounds."""
+        for j, name in enumerate(self.parameter_names):
+            (low, high), (lower, upper) = (
+                self.ranges[:, j],
+                (self.lower[j], self.upper[j]),
+            )
+            if low < lower or high > upper:
+                raise ValueError(
+                    f"`ranges` of {name!r} must lie within its bounds "
+                    f"({lower:g}, {upper:g}). Got ({low:g}, {high:g})."
+                )
+            value = np.nan if self.initial is None else self.initial[j]
+            if value < lower or value > upper:
+                raise ValueError(
+                    f"`bounds` of {name!r} must hold its initial value {value:g}. Got "
+                    f"({lower:g}, {upper:g})."
+                )
+        return self
+
+    def with_stacked_outputs(self, copies: int) -> GrayBoxStructure:
+        """The structure with all of its outputs several times, below each other."""
+        states, outputs = np.split(np.arange(self.map.shape[0]), [self.order])
+        rows = np.concatenate([states, np.tile(outputs, copies)])
+        return self._changed(map=RowsMap(self.map, rows))
 
     def draw(self, n: int, rng: np.random.Generator) -> Array | None:
         """Random parameter vectors from the ranges, or around the first guess.
@@ -466,7 +595,6 @@ class GrayBoxStructure:
 
         Examples
         --------
-        >>> from lpvlearn import GrayBoxStructure
         >>> structure = GrayBoxStructure.observable_canonical(1)
         >>> rng = np.random.default_rng(0)
         >>> structure.draw(5, rng) is None
@@ -475,7 +603,20 @@ class GrayBoxStructure:
         >>> ranged.draw(5, rng).shape
         (5, 2)
         """
-        return self.domain.draw(n, rng)
+        known = ~np.isnan(self.ranges[0])
+        if self.initial is None and not known.all():
+            return None
+        initial = np.zeros(self.n_params) if self.initial is None else self.initial
+        around = drawn_around(initial, n, rng)
+        uniform = rng.uniform(size=(n, len(initial)))
+        low, high = np.where(known, self.ranges, 1.0)
+        ratio = np.divide(high, low, out=np.ones_like(low), where=low != 0)
+        ratio = np.where(ratio > 0, ratio, 1.0)  # of one sign only
+        wide = np.maximum(ratio, 1.0 / ratio) > _DECADE
+        drawn = np.where(
+            wide, low * ratio**uniform, low * (1.0 - uniform) + high * uniform
+        )
+        return np.clip(np.where(known, drawn, around), self.lower, self.upper)
 
     def check_params(self, theta: ArrayLike | Mapping[str, float]) -> Array:
         """`theta` as a finite vector.
@@ -528,15 +669,14 @@ class GrayBoxStructure:
     # -- the matrices --------------------------------------------------------------
 
     @property
-    def implicit(self) -> ImplicitMap | None:
-        """The equations ``M(theta) X = N(theta)`` of a structure that solves them."""
-        return self.map if isinstance(self.map, ImplicitMap) else None
-
-    @property
     def free_feedthrough(self) -> NDArray[np.bool_]:
         """Which entries of D hold a parameter, shape (n_outputs, n_inputs)."""
         n = self.order
         return (self.jacobian(self.reference)[:, n:, n:] != 0).any(0)
+
+    def feedthrough_of(self, D: Array) -> Array:
+        """`D` where the structure has a parameter in it, else the structure's own D."""
+        return np.where(self.free_feedthrough, D, self.matrices(self.reference)[3])
 
     def system_matrix(self, theta: Array) -> Array:
         """``S = [[A, B], [C, D]]``, shape (..., order + n_outputs, order + n_inputs).
@@ -605,3 +745,16 @@ class GrayBoxStructure:
             If `theta` does not fit the parameters.
         """
         return StateSpace(*self.matrices(self.check_params(theta)), sampling_time)
+
+
+def drawn_around(guess: Array, n: int, rng: np.random.Generator) -> Array:
+    """Random vectors around a guess that keep its signs, shape (n, n_params)."""
+    return guess * np.exp(_SPREAD * rng.normal(size=(n, len(guess))))
+
+
+def _number(value: Any) -> float:
+    """`value` as a float that is not NaN; strings are refused."""
+    number = np.nan if isinstance(value, str | bool) else float(value)
+    if np.isnan(number):
+        raise ValueError(f"not a number: {value!r}")
+    return number

@@ -21,9 +21,7 @@ from .map import AffineMap
 Array = NDArray[np.float64]
 
 Entry = float | str
-
 Cells = list[list[Entry]]
-
 Affine = dict[str, float]  # coefficient of every name; "" is the constant
 
 # what parsing an expression may end in: RecursionError and MemoryError are how the
@@ -36,19 +34,7 @@ _SHOWN = 60  # characters of a refused expression that its message shows
 def affine_system(
     A: Any, B: Any, C: Any, D: Any, parameter_names: Sequence[str] | None
 ) -> tuple[int, AffineMap, list[str]]:
-    """Read templates of A, B, C, D: the order, ``[[A, B], [C, D]]``, parameter names.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit together or an entry is not affine.
-
-    Examples
-    --------
-    >>> order, map, names = affine_system([["-a"]], [["b"]], [[1]], None, None)
-    >>> names, map.basis[0].tolist()
-    (['a', 'b'], [[-1.0, 0.0], [0.0, 0.0]])
-    """
+    """Read templates of A, B, C, D: the order, the map, and the parameter names."""
     given = {"A": A, "B": B, "C": C}
     cells = {name: parse_cells(name, block) for name, block in given.items()}
     n = len(cells["A"])
@@ -89,14 +75,7 @@ def check_shapes(
 def affine_arrays(
     rows: Sequence[Sequence[Affine]], parameter_names: Sequence[str] | None
 ) -> tuple[Array, Array, list[str]]:
-    """The constant part, the part of every parameter, and the parameter names.
-
-    Examples
-    --------
-    >>> offset, basis, names = affine_arrays([[{"": 2.0}, {"k": 3.0, "": 1.0}]], None)
-    >>> offset.tolist(), basis.tolist(), names
-    ([[2.0, 1.0]], [[[0.0, 3.0]]], ['k'])
-    """
+    """The constant part, the part of every parameter, and the parameter names."""
     used = {name for row in rows for entry in row for name in entry if name}
     names = _ordered_names(used, parameter_names)
 
@@ -109,13 +88,7 @@ def affine_arrays(
 
 
 def _ordered_names(used: set[str], given: Sequence[str] | None) -> list[str]:
-    """The parameter names in the given order, else natural order.
-
-    Examples
-    --------
-    >>> _ordered_names({"p10", "p2", "k"}, None)
-    ['k', 'p2', 'p10']
-    """
+    """The parameter names in the given order, else natural order."""
     if given is None:
         return sorted(used, key=_natural)
     if isinstance(given, str):
@@ -130,18 +103,13 @@ def _ordered_names(used: set[str], given: Sequence[str] | None) -> list[str]:
 
 
 def _natural(name: str) -> list[tuple[bool, int, str]]:
+    """Sorting key by which p2 comes before p10."""
     parts = re.findall(r"\d+|\D+", name)
     return [(not t.isdigit(), int(t) if t.isdigit() else 0, t) for t in parts]
 
 
 def parse_cells(name: str, block: Any) -> list[list[Affine]]:
-    """Parse a matrix of template entries; errors name the cell.
-
-    Examples
-    --------
-    >>> parse_cells("A", [[0, "2*k - 1"]])
-    [[{'': 0.0}, {'k': 2.0, '': -1.0}]]
-    """
+    """Parse a matrix of template entries; errors name the cell."""
     if hasattr(block, "__array__"):  # arrays and tables
         block = np.asarray(block, dtype=object).tolist()
     if (
@@ -214,14 +182,7 @@ def _affine(node: ast.expr) -> Affine:
 def observable_canonical_cells(
     order: int, n_inputs: int, n_outputs: int, feedthrough: bool
 ) -> tuple[Cells, Cells, Cells, Cells | None]:
-    """A, B, C, D of the observable canonical form with generic observability indices.
-
-    Examples
-    --------
-    >>> A, B, C, D = observable_canonical_cells(2, 1, 1, False)
-    >>> A, C
-    ([[0.0, 1.0], ['a2_1', 'a2_2']], [[1.0, 0.0]])
-    """
+    """A, B, C, D of the form, see `GrayBoxStructure.observable_canonical`."""
     _, B, C, D = full_cells(order, n_inputs, n_outputs, feedthrough)
     A: Cells = [[0.0] * order for _ in range(order)]
     first = 0
@@ -264,16 +225,7 @@ def modal_cells(
     feedthrough: bool,
     normalize: str,
 ) -> tuple[Cells, Cells, Cells, Cells | None]:
-    """A, B, C, D of the real modal form, see `GrayBoxStructure.modal`.
-
-    Examples
-    --------
-    >>> A, B, C, D = modal_cells(1, 1, 1, 1, False, "input")
-    >>> A
-    [[0.0, 1.0, 0.0], ['-w2_1', '-d_1', 0.0], [0.0, 0.0, '-r_1']]
-    >>> B, C
-    ([[0.0], [1.0], [1.0]], [['c1_1', 'c1_2', 'c1_3']])
-    """
+    """A, B, C, D of the real modal form, see `GrayBoxStructure.modal`."""
     n_modes = whole_number("n_modes", n_modes, 0)
     n_real = whole_number("n_real", n_real, 0)
     if n_modes == n_real == 0:

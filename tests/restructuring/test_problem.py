@@ -1,11 +1,13 @@
-"""What is matched: models, alone or together, and responses, behind weights."""
+"""What is matched, behind weights, and what it tells of the parameters."""
 
 import numpy as np
 import pytest
 from sklearn.base import clone
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn.restructuring.problem import Identifiability
 
+from ..conftest import spring_structure
 from .conftest import CASES, disguised, far_fit, off_structure
 
 
@@ -100,3 +102,108 @@ def test_table_and_complex_responses_are_the_same_data():
     one = GrayBoxRestructurer(structure).fit(omega[:, None], table)
     two = GrayBoxRestructurer(structure).fit(omega, G)
     np.testing.assert_array_equal(one.params_, two.params_)
+
+
+# -- identifiability -----------------------------------------------------------
+
+OMEGA = np.array([0.1, 0.5, 1.0, 2.0, 3.0, 9.0])
+
+
+def response_jacobian(structure, theta, omega=OMEGA):
+    """Derivative of the response by central differences."""
+    theta = np.asarray(theta, dtype=float)
+    columns = []
+    for step in np.diag(1e-6 * np.maximum(np.abs(theta), 1e-3)):
+        ahead = structure.model(theta + step).frequency_response(omega)
+        behind = structure.model(theta - step).frequency_response(omega)
+        columns.append((ahead - behind) / (2 * step.max()))
+    return np.moveaxis(columns, 0, -1)
+
+
+def exact_jacobian(structure, theta, omega=OMEGA):
+    """``dG = dC X B + C X dA X B + C X dB + dD`` with ``X = (j omega - A)^-1``."""
+    theta = np.asarray(theta, dtype=float)
+    A, B, C, _ = structure.matrices(theta)
+    n = structure.order
+    X = np.linalg.inv(1j * omega[:, None, None] * np.eye(n) - A)
+    p, m = structure.n_outputs, structure.n_inputs
+    left = np.concatenate([C @ X, np.broadcast_to(np.eye(p), (len(omega), p, p))], 2)
+    right = np.concatenate([X @ B, np.broadcast_to(np.eye(m), (len(omega), m, m))], 1)
+    return np.einsum("kia,qab,kbj->kijq", left, structure.jacobian(theta), right)
+
+
+def test_the_exact_jacobian_is_the_difference():
+    structure = GrayBoxStructure.full(2, 2, 1)
+    theta = np.random.default_rng(0).normal(size=structure.n_params)
+    exact = exact_jacobian(structure, theta)
+    scale = np.abs(exact).max()
+    error = np.abs(exact - response_jacobian(structure, theta)).max()
+    assert error < 1e-7 * scale
+
+
+def analysis(structure, theta, omega=OMEGA):
+    J = exact_jacobian(structure, theta, omega)
+    return Identifiability.from_jacobian(J, structure.parameter_names)
+
+
+def test_a_spring_is_identifiable():
+    found = analysis(spring_structure(), [2.0, 0.5, 4.0])
+    assert found.rank == found.n_params == 3 and found.directions == ()
+    assert 1 < found.condition < 100
+    assert "all 3 parameters are identifiable" in str(found)
+
+
+def test_a_product_of_gains_is_named():
+    structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [["c"]])
+    found = analysis(structure, [1.0, 3.0, -0.2])
+    assert found.rank == 2 and found.condition > 1e9
+    (direction,) = found.directions
+    # b grows as c, which is negative, falls in size
+    assert set(direction) == {"b", "c"}
+    assert direction["b"] == pytest.approx(direction["c"])
+    assert "determines 2 of the 3 parameters" in str(found)
+    assert "+1 b +1 c" in str(found)
+
+
+def test_independent_products_are_named_apart():
+    structure = GrayBoxStructure.from_template(
+        [["-a", 0], [0, "-2*a"]], [["b", 0], [0, "e"]], [["c", 0], [0, "f"]]
+    )
+    found = analysis(structure, [1.0, 3.0, 0.2, 5.0, 7.0])
+    assert found.rank == 3
+    names = {frozenset(direction) for direction in found.directions}
+    assert names == {frozenset("bc"), frozenset("ef")}
+
+
+def test_a_parameter_without_effect_is_named_alone():
+    structure = GrayBoxStructure.from_template(
+        [["-a", 0], [0, "-q"]], [["b"], [0]], [[1, 1]]
+    )
+    found = analysis(structure, [1.0, 3.0, 0.2])
+    assert found.rank == 2 and found.directions == ({"q": 1.0},)
+    assert found.condition == np.inf
+
+
+def test_too_few_frequencies_leave_combinations_open():
+    structure = GrayBoxStructure.observable_canonical(2)
+    theta = [-4.0, -0.5, 1.0, 2.0]
+    assert analysis(structure, theta).rank == 4
+    found = analysis(structure, theta, OMEGA[:1])
+    assert found.rank == 2 and len(found.directions) == 2
+
+
+@pytest.mark.parametrize("order, n_inputs, n_outputs", [(2, 1, 1), (3, 2, 2)])
+def test_a_full_structure_leaves_the_basis_open(order, n_inputs, n_outputs):
+    structure = GrayBoxStructure.full(order, n_inputs, n_outputs)
+    theta = np.random.default_rng(order).normal(size=structure.n_params)
+    found = analysis(structure, theta, np.linspace(0.1, 9, 30))
+    assert structure.n_params - found.rank == order**2 == len(found.directions)
+
+
+def test_units_of_the_parameters_do_not_matter():
+    J = exact_jacobian(GrayBoxStructure.observable_canonical(2), [-4.0, -0.5, 1.0, 2.0])
+    names = ["a", "b", "c", "d"]
+    one = Identifiability.from_jacobian(J, names)
+    other = Identifiability.from_jacobian(J * 10.0 ** np.array([-9, 0, 9, 3]), names)
+    assert one.rank == other.rank == 4
+    assert other.condition == pytest.approx(one.condition)

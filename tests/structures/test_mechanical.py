@@ -144,3 +144,18 @@ def test_wrong_equations_of_motion_are_explained(change, message):
     arguments = {"M": M2, "D": D2, "K": K2, "F": [[1], [0]]} | change
     with pytest.raises(ValueError, match=message):
         MECHANICAL(**arguments)
+
+
+@pytest.mark.parametrize(
+    "mass, values",
+    [
+        ([["m1"]], {"m1": 0.0}),  # affine then
+        ([["m1", 0], [0, "m2"]], {"m1": 0.0}),  # singular whatever m2 is
+    ],
+)
+def test_a_coordinate_does_not_lose_its_mass(mass, values):
+    n = len(mass)
+    stiffness = [[f"k{i}" if i == j else 0 for j in range(n)] for i in range(n)]
+    structure = MECHANICAL(mass, stiffness, stiffness, [[1]] * n)
+    with pytest.raises(ValueError, match=r"`M` must be regular.* without mass"):
+        structure.fix(values)

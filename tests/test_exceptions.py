@@ -1,0 +1,52 @@
+"""Warnings point to the line of the user, however deep in the library they arise."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.signal import lfilter
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from lpvlearn import LocalLPVPipeline, PolynomialLPV, SubspaceLTI
+from lpvlearn.exceptions import ExtrapolationWarning, RankWarning
+
+
+def collinear():
+    u = np.random.default_rng(0).standard_normal((200, 1))
+    return np.hstack([u, 2 * u]), lfilter([0.0, 1.0], [1.0, -0.8], u[:, 0])
+
+
+def test_a_direct_call_is_named():
+    with pytest.warns(RankWarning) as caught:
+        SubspaceLTI(1, horizon=5).fit(*collinear())
+    assert [w.filename for w in caught] == [__file__] * len(caught)
+
+
+def test_what_lies_between_is_passed_over():
+    X, y = collinear()
+    table = pd.DataFrame(X, columns=["a", "b"]).assign(kappa=np.repeat([0.0, 1.0], 100))
+    with pytest.warns(RankWarning) as caught:
+        LocalLPVPipeline(
+            SubspaceLTI(1, horizon=5),
+            "passthrough",
+            PolynomialLPV(1),
+            scheduling="kappa",
+            experiment="kappa",
+        ).fit(table, y)
+    assert {w.filename for w in caught} == {__file__}
+
+
+def test_called_by_another_library_its_call_is_named():
+    X, y = collinear()
+    with pytest.warns(RankWarning) as caught:
+        make_pipeline(StandardScaler(), SubspaceLTI(1, horizon=5)).fit(X, y)
+    assert all("sklearn" in w.filename for w in caught)
+
+
+def test_predictions_outside_of_the_range_name_the_caller():
+    model = PolynomialLPV(1, extrapolation="warn").fit(
+        [[0.0], [1.0], [2.0]], [0.0, 1.0, 2.0]
+    )
+    with pytest.warns(ExtrapolationWarning) as caught:
+        model.predict([[3.0]])
+    assert [w.filename for w in caught] == [__file__]
