@@ -59,7 +59,7 @@ from sklearn.model_selection import BaseCrossValidator
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_consistent_length
 
-from .data.columns import Column, Table, is_table
+from .data.columns import Column, Table
 from .data.experiments import Experiment, group_rows, operating_point_of
 from .data.operating_points import group_operating_points
 from .validation import one_of, whole_number
@@ -370,14 +370,14 @@ def _read_rows(
 
     `groups` are labels of the experiments where no column has them.
     """
-    table = Table(X if is_table(X) or hasattr(X, "dtype") else np.asarray(X, object))
+    table = Table(X)
     by_label = table.one(experiment, "experiment")
     if by_label is None and groups is not None:
         check_consistent_length(X, groups)
-        by_label = None, Column("groups", groups)
+        by_label = Column("groups", groups)
     by_point = table.one(operating_point, "operating_point")
     by_kappa = table.several(scheduling, "scheduling")
-    kappa = [column.numbers("X") for _, column in by_kappa]
+    kappa = [column.numbers("X") for column in by_kappa]
     labels, rows = group_rows(by_label, table.n_rows)
     return [
         Experiment(

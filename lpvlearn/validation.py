@@ -96,14 +96,17 @@ def one_of(name: str, value: Any, allowed: Sequence[Any]) -> None:
     raise ValueError(f"`{name}` must be {last}{listed[-1]}. Got {value!r}.")
 
 
-def input_samples(u: ArrayLike, n_inputs: int) -> Array:
-    """`u` as a finite array of shape (n_samples, n_inputs), or a ValueError."""
-    u = real_array("u", u)
-    if u.ndim == 1:
-        u = u[:, None]
-    if u.ndim != 2 or u.shape[1] != n_inputs:
-        raise ValueError(f"`u` must have shape (n_samples, {n_inputs}). Got {u.shape}.")
-    return _finite("u", u, "sample {}, input {}")
+def finite_samples(name: str, value: ArrayLike, width: int) -> Array:
+    """Inputs `u` or outputs `y` as a finite array of shape (n_samples, width)."""
+    array = real_array(name, value)
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2 or array.shape[1] != width:
+        raise ValueError(
+            f"`{name}` must have shape (n_samples, {width}). Got {array.shape}."
+        )
+    channel = "input" if name == "u" else "output"
+    return _finite(name, array, f"sample {{}}, {channel} {{}}")
 
 
 def state_vector(x0: ArrayLike, order: int) -> Array:

@@ -19,36 +19,27 @@ Role = str | int | None
 
 Roles = str | int | Sequence[str | int] | None
 
-# Likeness (ratio of difflib, its default) from which a name may have been meant.
-_ALIKE = 0.6
+_ALIKE = 0.6  # likeness (difflib's, its default) from which a name may have been meant
+_N_SHOWN = 10  # names in an error message, lest a wide table fills the screen
 
-# Names listed in an error message, lest a wide table fills the screen.
-_N_SHOWN = 10
+
+def roles_of(estimator: Any) -> dict[str, Any]:
+    """The roles that an estimator gives to columns, by argument; None without one."""
+    return {name: getattr(estimator, name, None) for name in ROLES}
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a table: its name (or position) and its raw values."""
+    """One column of a table, or one level of its index."""
 
-    name: Hashable
-    values: Any
+    name: Hashable  # its position in an array without names
+    values: Any  # as they stand in the table
+    position: int | None = None  # None for a level of the index
 
     def numbers(self, argument: str) -> NDArray[np.float64]:
-        """Return the values as floats, missing ones as NaN.
+        """Values as floats, missing ones as NaN; `argument` names the table in errors.
 
-        Parameters
-        ----------
-        argument : str
-            Name of the table, for the error message.
-
-        Returns
-        -------
-        ndarray of shape (n_samples,)
-
-        Raises
-        ------
-        ValueError
-            When a value is not a real number.
+        Raises a ValueError where one is not a real number.
         """
         series = self.values
         if not isinstance(series, pd.Series):
@@ -71,12 +62,12 @@ class Column:
         )
 
     def labels(self, rows: Sequence[int]) -> list[Hashable]:
-        """Return the values at some rows as plain Python objects."""
+        """Values at some rows as plain Python objects."""
         return [as_scalar(value) for value in pd.Series(self.values).iloc[list(rows)]]
 
 
 def as_scalar(value: Any) -> Hashable:
-    """Return a NumPy scalar as a plain Python one."""
+    """A NumPy scalar as a plain Python one."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -106,26 +97,19 @@ def as_list(keys: Any) -> list[Any]:
 
 
 def is_table(X: Any) -> bool:
-    """Tell whether `X` has named columns, as a pandas or polars DataFrame has."""
+    """Whether `X` has named columns, as a pandas or polars DataFrame has."""
     return hasattr(X, "columns") and hasattr(X, "__getitem__") and hasattr(X, "shape")
 
 
 class Table:
     """Columns of a DataFrame (pandas or polars) or of a two-dimensional array.
 
-    Parameters
-    ----------
-    X : DataFrame or ndarray of shape (n_samples, n_features)
-    argument : str, default="X"
-        Name of the table, for the error message.
-
-    Raises
-    ------
-    ValueError
-        When two columns have the same name.
+    A list is read as objects, lest numpy turns its numbers into text. `argument` names
+    the table in errors: a ValueError when two columns have the same name.
     """
 
     def __init__(self, X: Any, argument: str = "X") -> None:
+        X = X if is_table(X) or hasattr(X, "dtype") else np.asarray(X, object)
         self.X = X
         self.n_rows: int = X.shape[0]
         self.named = is_table(X)
@@ -136,47 +120,30 @@ class Table:
                 f"{argument} must have distinct column names. Got {name!r} "
                 f"{self.names.count(name)} times; rename these columns."
             )
-        self.levels: list[Any] = (
-            list(X.index.names) if isinstance(X, pd.DataFrame) else []
-        )
+        indexed = isinstance(X, pd.DataFrame)
+        self.levels: list[Any] = list(X.index.names) if indexed else []
 
     def at(self, position: int) -> Column:
-        """Return the column at a position."""
+        """The column at a position."""
         name = self.names[position]
         if isinstance(self.X, pd.DataFrame):
-            return Column(name, self.X.iloc[:, position])
-        return Column(name, self.X[name] if self.named else self.X[:, position])
+            return Column(name, self.X.iloc[:, position], position)
+        values = self.X[name] if self.named else self.X[:, position]
+        return Column(name, values, position)
 
-    def find(self, key: Any, role: str) -> tuple[int | None, Column]:
-        """Find the column (or index level) that has a role.
+    def _find(self, key: Any, role: str) -> Column:
+        """The column of a name, else a level of the index, else that of a position.
 
-        Parameters
-        ----------
-        key : str or int
-            A column's name, else a level of the index, else a column's position.
-        role : str
-            Name of the argument, for the error message.
-
-        Returns
-        -------
-        position : int or None
-            None for a level of the index.
-        column : Column
-
-        Raises
-        ------
-        ValueError
-            When `key` names no column.
+        Raises a ValueError about the argument `role` when `key` is none of these.
         """
         if self.named and key in self.names:
-            position = self.names.index(key)
-            return position, self.at(position)
+            return self.at(self.names.index(key))
         if key is not None and key in self.levels:
-            return None, Column(key, self.X.index.get_level_values(key))
+            return Column(key, self.X.index.get_level_values(key))
         n_columns = len(self.names)
         is_position = isinstance(key, Integral) and not isinstance(key, bool)
         if is_position and -n_columns <= key < n_columns:
-            return int(key) % n_columns, self.at(int(key) % n_columns)
+            return self.at(int(key) % n_columns)
         if is_position:
             rule = f"be a position among the {n_columns} columns of X"
         elif not self.named:
@@ -190,29 +157,15 @@ class Table:
         hint = _did_you_mean(key, [*self.names, *self.levels])
         raise ValueError(f"`{role}` must {rule}. Got {key!r}.{hint}")
 
-    def one(self, key: Role, role: str) -> tuple[int | None, Column] | None:
-        """Find the column that has a role; None for `key=None`."""
-        return None if key is None else self.find(key, role)
+    def one(self, key: Role, role: str) -> Column | None:
+        """The column that has a role; None for `key=None`."""
+        return None if key is None else self._find(key, role)
 
-    def inputs(
-        self, keys: Any, others: Sequence[tuple[int | None, Column] | None]
-    ) -> list[Column]:
-        """Find the inputs: the columns named, else those without another role.
-
-        Parameters
-        ----------
-        keys : column name, position, list or None
-        others : sequence of (position, column) or None
-            Columns that have another role.
-
-        Raises
-        ------
-        ValueError
-            When there is no input.
-        """
+    def inputs(self, keys: Any, others: Sequence[Column | None]) -> list[Column]:
+        """The inputs: the columns named, else those that are none of the `others`."""
         if keys is not None:
-            return [column for _, column in self.several(keys, "inputs")]
-        taken = {found[0] for found in others if found}
+            return self.several(keys, "inputs")
+        taken = {column.position for column in others if column is not None}
         free = [p for p in range(len(self.names)) if p not in taken]
         if taken and not free:
             raise ValueError(
@@ -221,12 +174,12 @@ class Table:
             )
         return [self.at(p) for p in free]
 
-    def several(self, keys: Any, role: str) -> list[tuple[int | None, Column]]:
-        """Find the columns that share a role; none for `keys=None`."""
+    def several(self, keys: Any, role: str) -> list[Column]:
+        """The columns that share a role; none for `keys=None`."""
         if keys is None:
             return []
-        found = [self.find(key, role) for key in as_list(keys)]
-        names = [column.name for _, column in found]
+        found = [self._find(key, role) for key in as_list(keys)]
+        names = [column.name for column in found]
         if not found or len(set(names)) < len(names):
             raise ValueError(
                 f"`{role}` must list at least one column, each once. Got {keys!r}."

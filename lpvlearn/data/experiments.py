@@ -23,41 +23,19 @@ Array = NDArray[np.float64]
 
 Indices = NDArray[np.intp]
 
-# A column that has a role, and where it stands; None where none has it.
-Found = tuple[int | None, Column] | None
-
 
 @dataclass(frozen=True)
 class Experiment:
-    """The samples of one experiment, in the order of time.
+    """The samples of one experiment, in the order of time."""
 
-    Attributes
-    ----------
-    label : hashable
-        The value of the experiment column; 0 where the table is one experiment.
-    rows : ndarray of int, shape (n_samples,)
-        Positions of the samples in the table.
-    inputs : ndarray of shape (n_samples, n_inputs)
-    outputs : ndarray of shape (n_samples, n_outputs) or None
-        None when the table was read without `y`.
-    scheduling : ndarray of shape (n_samples, n_scheduling) or None
-        None when no column has the scheduling role.
-    operating_point : hashable or None
-        The value of the operating-point column, constant within an experiment.
-    sampling_time : float or None
-        Time step in seconds read from the time column; None without such a column.
-    input_names : tuple
-        Names of the input columns, or their positions.
-    """
-
-    label: Hashable
-    rows: Indices
-    inputs: Array
-    outputs: Array | None = None
-    scheduling: Array | None = None
-    operating_point: Hashable = None
-    sampling_time: float | None = None
-    input_names: tuple[Hashable, ...] = ()
+    label: Hashable  # of the experiment column; 0 where the table is one experiment
+    rows: Indices  # (n_samples,), positions of the samples in the table
+    inputs: Array  # (n_samples, n_inputs)
+    outputs: Array | None = None  # (n_samples, n_outputs); None when read without `y`
+    scheduling: Array | None = None  # (n_samples, n_scheduling)
+    operating_point: Hashable = None  # label of the column with that role
+    sampling_time: float | None = None  # seconds, of the time column; None without
+    input_names: tuple[Hashable, ...] = ()  # of the columns, or their positions
 
 
 def read_experiments(
@@ -74,42 +52,18 @@ def read_experiments(
     reset: bool = True,
     allow_missing: bool = False,
 ) -> list[Experiment]:
-    """Read a table as a list of experiments.
+    """Read a table as a list of experiments, in the order of first appearance.
 
-    Parameters
-    ----------
-    estimator : estimator
-        Its `n_features_in_` and `feature_names_in_` are set when `reset`, else checked.
-    X : DataFrame or array-like of shape (n_samples, n_features)
-        One row per sample. Rows of an experiment must be in the order of time but need
-        not be adjacent.
-    y : DataFrame, Series or array-like of shape (n_samples,) or (n_samples, n_outputs)
-        Outputs. None leaves `Experiment.outputs` empty (when predicting).
-    inputs, scheduling : str, int or list of them, optional
-        Names of columns of `X`, else of levels of its index, else integer positions.
-        Default: every column without another role is an input; no column is a
-        scheduling variable.
-    experiment, time, operating_point : str or int, optional
-        Likewise. Labels are of any hashable type; times are seconds or datetimes.
-        Default: the table is one experiment, and its time is not checked.
-    sampling_time : float, optional
-        Declared time step in seconds, compared with the time column.
-    reset : bool, default=True
-        True when fitting.
-    allow_missing : bool, default=False
-        Whether inputs and outputs may hold NaN.
+    Rows of an experiment must be in the order of time but need not be adjacent. Roles
+    are names of columns of `X`, else of levels of its index, else positions; without
+    `inputs`, every column without another role is one. `n_features_in_` and
+    `feature_names_in_` of the estimator are set when `reset` (fitting), else checked.
+    The declared `sampling_time` is compared with the time column.
 
-    Returns
-    -------
-    list of Experiment
-        In the order of first appearance.
-
-    Raises
-    ------
-    ValueError
-        When a role names no column, a value is missing, infinite or not a number, time
-        within an experiment does not increase evenly or disagrees with
-        `sampling_time`, or an operating point changes within an experiment.
+    Raises a ValueError when a role names no column, a value is missing (inputs and
+    outputs with `allow_missing` excepted), infinite or not a number, time within an
+    experiment does not increase evenly or disagrees with `sampling_time`, or an
+    operating point changes within an experiment.
 
     Examples
     --------
@@ -138,14 +92,14 @@ def read_experiments(
     u = table.inputs(inputs, [by_label, by_time, by_point, *kappa])
     U = _numbers(u, table.n_rows, "X")
     check_array(U, ensure_all_finite=False, estimator=estimator, input_name="X")
-    K = _numbers([c for _, c in kappa], table.n_rows, "X") if kappa else None
+    K = _numbers(kappa, table.n_rows, "X") if kappa else None
     Y, y_names = (None, []) if y is None else read_outputs(y)
     if Y is not None:
         check_consistent_length(U, Y)
     labels, groups = group_rows(by_label, table.n_rows)
     _check_finite(U, [c.name for c in u], "X", labels, groups, allow_missing)
     if K is not None:
-        _check_finite(K, [c.name for _, c in kappa], "X", labels, groups)
+        _check_finite(K, [c.name for c in kappa], "X", labels, groups)
     if Y is not None:
         _check_finite(Y, y_names, "y", labels, groups, allow_missing)
     steps = _sampling_times(by_time, labels, groups, sampling_time)
@@ -205,15 +159,14 @@ def _check_finite(
 
 
 def _sampling_times(
-    found: Found,
+    column: Column | None,
     labels: Sequence[Hashable],
     groups: Sequence[Indices],
     sampling_time: float | None,
 ) -> list[float | None]:
     """Check the time column, and return each experiment's step."""
-    if found is None:
+    if column is None:
         return [None] * len(labels)
-    column = found[1]
     seconds = time_in_seconds(column.values, column.name)
     steps: list[float | None] = []
     common = None
@@ -230,11 +183,12 @@ def _sampling_times(
     return steps
 
 
-def group_rows(found: Found, n_rows: int) -> tuple[list[Hashable], list[Indices]]:
+def group_rows(
+    column: Column | None, n_rows: int
+) -> tuple[list[Hashable], list[Indices]]:
     """Labels of experiments in the order of first appearance, and the rows of each."""
-    if found is None:
+    if column is None:
         return [0], [np.arange(n_rows)]
-    column = found[1]
     codes, uniques = pd.factorize(pd.Series(column.values))
     if (codes < 0).any():
         raise ValueError(
@@ -247,14 +201,11 @@ def group_rows(found: Found, n_rows: int) -> tuple[list[Hashable], list[Indices]
 
 
 def operating_point_of(
-    found: Found,
-    rows: Indices,
-    label: Hashable,
+    column: Column | None, rows: Indices, label: Hashable
 ) -> Hashable:
     """The one value that the operating-point column has in an experiment."""
-    if found is None:
+    if column is None:
         return None
-    column = found[1]
     values = pd.unique(pd.Series(column.values).iloc[rows])
     if len(values) > 1 or pd.isna(values[0]):
         raise ValueError(
@@ -267,23 +218,10 @@ def operating_point_of(
 
 
 def read_outputs(y: Any) -> tuple[Array, list[Hashable]]:
-    """Read outputs as a matrix with names.
+    """Outputs as a matrix (n_samples, n_outputs), and their names (y1, y2, ...).
 
-    Parameters
-    ----------
-    y : DataFrame, Series or array-like of shape (n_samples,) or (n_samples, n_outputs)
-
-    Returns
-    -------
-    outputs : ndarray of shape (n_samples, n_outputs)
-        Not checked for missing values.
-    names : list
-        The columns' names, else `"y1"`, `"y2"`, ...
-
-    Raises
-    ------
-    ValueError
-        When a column does not hold real numbers.
+    From a DataFrame, a Series or an array-like, not checked for missing values. Raises
+    a ValueError when a column does not hold real numbers.
 
     Examples
     --------

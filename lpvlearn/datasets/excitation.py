@@ -84,23 +84,10 @@ def prbs(
 def measurement_noise(
     y: Array, snr_db: float, n_realizations: int, rng: Generator
 ) -> Array:
-    """White Gaussian noise at a signal-to-noise ratio for each channel.
+    """White noise (..., n_realizations, n_samples, n_outputs) for noise-free outputs.
 
-    Parameters
-    ----------
-    y : ndarray of shape (..., n_samples, n_outputs)
-        Noise-free outputs.
-    snr_db : float
-        ``10 log10(cov(y_k) / cov(v_k))`` in dB (footnote 5 of the paper), for each
-        output and experiment; infinity is no noise.
-    n_realizations : int
-        Number of independent draws.
-    rng : numpy.random.Generator
-        Source of the draws.
-
-    Returns
-    -------
-    noise : ndarray of shape (..., n_realizations, n_samples, n_outputs)
+    For each output and experiment ``10 log10(cov(y_k) / cov(v_k)) = snr_db``, footnote
+    5 of the paper; infinity is no noise.
     """
     scale = y.std(axis=-2, keepdims=True) * 10.0 ** (-snr_db / 20.0)
     shape = (*y.shape[:-2], n_realizations, *y.shape[-2:])

@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import GrayBoxStructure, StateSpace
+from ..models.statespace import StateSpace
+from ..structures.structure import GrayBoxStructure
 from .excitation import check_size
 from .mechanics import (
     arm_tables,
@@ -41,14 +42,10 @@ class FlexibleArm:
 
     Parameters
     ----------
-    l1, l2 : float
-        Lengths of the links in m.
-    rho1, rho2 : float
-        Masses per length in kg/m.
-    EI1, EI2 : float
-        Bending stiffnesses in N m2.
-    J1, J2 : float
-        Hub inertias in kg m2.
+    l1, l2, rho1, rho2 : float
+        Lengths of the links in m, masses per length in kg/m.
+    EI1, EI2, J1, J2 : float
+        Bending stiffnesses in N m2, hub inertias in kg m2.
     elbow_mass, tip_mass : float
         Point masses at the ends of link 1 and link 2 in kg.
     gains : sequence of two floats
@@ -72,10 +69,10 @@ class FlexibleArm:
     >>> arm = FlexibleArm()
     >>> arm.linearize(np.pi / 2).order
     6
-    >>> step = np.full((500, 2), 0.1)
+    >>> step = np.full((50, 2), 0.1)
     >>> response = arm.simulate(step, np.pi / 2, 1e-3)
     >>> response.y.shape, response.kappa.shape
-    ((500, 2), (500,))
+    ((50, 2), (50,))
     """
 
     l1: float = 0.3
@@ -130,12 +127,6 @@ class FlexibleArm:
         -------
         M : ndarray of shape (..., 4, 4)
             Symmetric positive definite, in kg m2 (angles), kg m3 and kg m4 (bending).
-
-        Examples
-        --------
-        >>> M = FlexibleArm().mass_matrix([0.0, 1.0, 0.0, 0.0])
-        >>> bool((M == M.T).all())
-        True
         """
         q = check_coordinates("q", q)
         mass, _ = self._inertial_terms(q, np.zeros_like(q))
@@ -214,11 +205,6 @@ class FlexibleArm:
         -------
         model : StateSpace
             Continuous, of order 2, in the state ``(theta1', theta2')``.
-
-        Examples
-        --------
-        >>> FlexibleArm().rigid(1.0).order
-        2
         """
         M = self._rest_mass(theta2)[:2, :2]
         loops = np.linalg.solve(M, self._damping[:2, :2])
@@ -229,11 +215,6 @@ class FlexibleArm:
 
         The parameters fill rows 3 to 6 of A column by column; B repeats columns 3
         and 4 with the opposite sign; C holds the lengths of the links and is known.
-
-        Examples
-        --------
-        >>> FlexibleArm().structure().n_params
-        16
         """
         p = np.array([f"p{i}" for i in range(1, 17)]).reshape(4, 4).T
         A: list[list[float | str]] = [[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]]
@@ -308,12 +289,6 @@ class FlexibleArm:
             If shapes do not fit, the step is too long for the fastest pole, or the
             arm comes to a singular position (stretched or folded), where y does not
             exist.
-
-        Examples
-        --------
-        >>> arm = FlexibleArm()
-        >>> arm.simulate(np.zeros((10, 2)), [1.0, 2.0], 1e-3).theta2[:, -1]
-        array([1., 2.])
         """
         reference, angles = _pair_experiments(velocity_reference, theta2)
         single = np.ndim(velocity_reference) == 2 and np.ndim(theta2) == 0
@@ -403,13 +378,6 @@ class ArmResponse:
         Joint rates of the rigid arm with the same end-effector position, rad/s.
     q, qdot : ndarray of shape (n_experiments, n_samples, 4)
         Coordinates ``(theta1, theta2, v1, v2)`` (rad, rad, 1/m, 1/m) and their rates.
-
-    Examples
-    --------
-    >>> from lpvlearn.datasets import FlexibleArm
-    >>> response = FlexibleArm().simulate(np.zeros((5, 2)), np.pi / 3, 1e-3)
-    >>> response.kappa.round(6)
-    array([0.5, 0.5, 0.5, 0.5, 0.5])
     """
 
     y: Array

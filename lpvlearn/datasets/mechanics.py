@@ -42,21 +42,9 @@ _ONE, _TURNING2, _CORIOLIS, _BENDING2 = 0, 1, 2, 3
 
 
 def _link_moments(length: float, density: float, end_mass: float) -> Array:
-    """Moments ``int x^k dm``, k = 0..6, of a uniform link with a mass at its end.
+    """Moments ``int x^k dm`` (kg m^k), k = 0..6, of a uniform link with an end mass.
 
-    Parameters
-    ----------
-    length : float
-        Length in metres.
-    density : float
-        Mass per length in kg/m.
-    end_mass : float
-        Point mass at the end in kg.
-
-    Returns
-    -------
-    moments : ndarray of shape (7,)
-        In kg m^k.
+    `length` in m, `density` in kg/m, `end_mass` in kg.
 
     Examples
     --------
@@ -72,25 +60,13 @@ def _link_table(
 ) -> Array:
     """Matrix from the monomials of one link to its share of M, F and the coupling.
 
-    Parameters
-    ----------
-    moments : ndarray of shape (7,)
-        Moments of everything that moves with the link, in kg m^k.
-    lever : ndarray of shape (4,)
-        Coefficients ``(., x, x^2, x^3)`` of the vector z through which the link
-        couples with the other one.
-    hub_inertia : float
-        Moment of inertia that turns with the link, in kg m^2.
-    conjugate : bool
-        Whether the coupling vectors are stored conjugated.
+    `moments` are those of everything that moves with the link, `lever` the
+    coefficients ``(., x, x^2, x^3)`` of the vector z through which it couples with the
+    other link (stored conjugated if `conjugate`), `hub_inertia` in kg m2.
 
-    Returns
-    -------
-    table : ndarray of shape (12, 20)
-        Rows 0-3: own mass matrix over (angle, bending), row-major. Rows 4-5: own
-        Coriolis and centrifugal force. Rows 6-8 and 9-11: real and imaginary parts
-        of ``dz/da``, ``dz/dv`` and the acceleration of the lever, all three in the
-        frame of the link.
+    Rows of the result, (12, 20). 0-3: own mass matrix over (angle, bending), row-major.
+    4-5: own Coriolis and centrifugal force. 6-8 and 9-11: real and imaginary parts of
+    ``dz/da``, ``dz/dv`` and the acceleration of the lever, in the frame of the link.
     """
     s, m = _SHORTENING, moments
     table = np.zeros((12, 4, _N_POWERS))
@@ -144,16 +120,7 @@ def arm_tables(
 
 
 def coordinate_change(l1: float) -> Array:
-    """Matrix T of ``(a1, v1, a2, v2) = T (theta1, theta2, v1, v2)``.
-
-    Examples
-    --------
-    >>> coordinate_change(0.5)
-    array([[1., 0., 0., 0.],
-           [0., 0., 1., 0.],
-           [1., 1., 1., 0.],
-           [0., 0., 0., 1.]])
-    """
+    """Matrix T of ``(a1, v1, a2, v2) = T (theta1, theta2, v1, v2)``."""
     return np.array(
         [
             [1.0, 0.0, 0.0, 0.0],
@@ -165,19 +132,9 @@ def coordinate_change(l1: float) -> Array:
 
 
 def inertial_terms(position: Array, rate: Array, tables: Array) -> tuple[Array, Array]:
-    """Mass matrix and Coriolis and centrifugal forces in the coordinates r.
+    """Mass matrix (4, 4, n), Coriolis and centrifugal forces (2, 2, n) over r.
 
-    Parameters
-    ----------
-    position, rate : ndarray of shape (2, 2, n)
-        Coordinates r and their time derivatives.
-    tables : ndarray of shape (2, 12, 20)
-        From `arm_tables`.
-
-    Returns
-    -------
-    mass : ndarray of shape (4, 4, n)
-    force : ndarray of shape (2, 2, n)
+    `position` and `rate` (2, 2, n) are r and r', `tables` come from `arm_tables`.
     """
     n = position.shape[-1]
     powers = np.empty((2, _N_POWERS, n))
@@ -219,25 +176,11 @@ def integrate(
 ) -> Array:
     """Integrate several experiments together by Runge-Kutta 4 with a fixed step.
 
-    Parameters
-    ----------
-    state : ndarray of shape (8, n)
-        Initial r and r'.
-    inputs : ndarray of shape (n_samples, 4, n)
-        Generalised forces due to the velocity references, held over each sample.
-    linear_force : ndarray of shape (4, 8)
-        Elastic and velocity-loop forces as a linear function of the state.
-    tables : ndarray of shape (2, 12, 20)
-        From `arm_tables`.
-    step : float
-        Integration step in seconds.
-    n_substeps : int
-        Integration steps per sample.
-
-    Returns
-    -------
-    states : ndarray of shape (n_samples, 8, n)
-        The states at the sampling instants, before the input of that sample acts.
+    From the initial `state` (8, n), r and r', to the states (n_samples, 8, n) at the
+    sampling instants, before the input of that sample acts. `inputs` (n_samples, 4, n)
+    are generalised forces due to the velocity references, held over each sample of
+    `n_substeps` steps; `linear_force` (4, 8) times the state is the elastic and
+    velocity-loop force; `tables` come from `arm_tables`.
     """
     n = state.shape[1]
     states = np.empty((len(inputs), 8, n))
@@ -285,31 +228,7 @@ def _chord(length: float, v: Array) -> tuple[ComplexArray, ComplexArray]:
 
 
 def rigid_joint_rates(q: Array, qdot: Array, l1: float, l2: float) -> Array:
-    """Joint rates of the rigid arm with the same end-effector position and velocity.
-
-    Parameters
-    ----------
-    q, qdot : ndarray of shape (..., 4)
-        ``(theta1, theta2, v1, v2)`` and its time derivative.
-    l1, l2 : float
-        Lengths of the links in m.
-
-    Returns
-    -------
-    y : ndarray of shape (..., 2)
-        In rad/s.
-
-    Raises
-    ------
-    ValueError
-        If the end-effector is out of the rigid arm's reach, or the arm is stretched
-        or folded.
-
-    Examples
-    --------
-    >>> rigid_joint_rates(np.array([0.0, 1, 0, 0]), np.array([0.3, 0.2, 0, 0]), 1, 1)
-    array([0.3, 0.2])
-    """
+    """Joint rates (..., 2) of the rigid arm with the same end-effector motion."""
     _, theta2, v1, v2 = np.moveaxis(q, -1, 0)
     rate1, rate2, w1, w2 = np.moveaxis(qdot, -1, 0)
     chord1, slope1 = _chord(l1, v1)

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from sklearn.utils import Bunch
 
-from .. import GrayBoxStructure
+from ..structures.structure import GrayBoxStructure
 from .flexible_arm import FlexibleArm
 from .generator import INPUTS, OUTPUTS, describe_arm, make_flexible_arm
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import StateSpace
+from ..models.statespace import StateSpace
 from .drawing import axes_grid, figure_legend, line_style, named, names_of, tidy
 from .fitted import check_model, models_of, unwrapped, with_others
 from .frequency import check_frequencies, frequency_axis, response_up_to_nyquist

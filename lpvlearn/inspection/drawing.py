@@ -67,20 +67,8 @@ def axes_grid(
 ) -> tuple[Any, Any]:
     """A figure and an array of axes of shape (n_rows, n_columns) to draw in.
 
-    Parameters
-    ----------
-    ax : None, Axes or array of Axes
-        None makes a figure; a single Axes is divided where more than one is needed.
-    n_rows, n_columns : int
-    height : float
-        Of a new figure, in inches.
-    sharex, sharey : bool or {"row", "col", "all"}, default=False
-    height_ratios : sequence of float, default=None
-
-    Raises
-    ------
-    ValueError
-        If `ax` holds another number of axes.
+    `ax` None makes a figure of `height` inches; a single Axes is divided where more
+    than one is needed; an array must hold as many as that.
     """
     from matplotlib import pyplot as plt
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import StateSpace
+from ..models.statespace import StateSpace
 from .drawing import ACCENT, INK, MUTED, legend_above, single_axes, tidy
 from .fitted import check_model
 from .frequency import (
@@ -258,23 +258,19 @@ class ErrorDisplay:
         self.figure_, self.axes_ = single_axes(ax, height=3.6)
         self.ax_ = one = self.axes_[0]
         self.lines_: dict[str, Any] = {}
-        (self.lines_["error"],) = one.loglog(
-            self.omega,
-            _positive(self.error),
-            color=INK,
-            linewidth=1.6,
-            zorder=2.5,
-            label=self._label("error"),
-        )
-        if self.start is not None:
-            (self.lines_["start"],) = one.loglog(
-                self.omega,
-                _positive(self.start),
-                color=MUTED,
-                linewidth=1.1,
-                linestyle=(0, (6, 1.5, 1.2, 1.5)),
-                label=self._label("start"),
-            )
+        dashes = (0, (6, 1.5, 1.2, 1.5))
+        for name, curve, style in (
+            ("error", self.error, {"color": INK, "lw": 1.6, "zorder": 2.5}),
+            ("start", self.start, {"color": MUTED, "lw": 1.1, "linestyle": dashes}),
+        ):
+            if curve is not None:
+                label = name
+                if name in self.norms:
+                    label += f", H∞ norm {self.norms[name]:.3g}"
+                seen = np.where(curve > 0, curve, np.nan)
+                (self.lines_[name],) = one.loglog(
+                    self.omega, seen, label=label, **style
+                )
         if self.floor > 0:
             self.lines_["floor"] = one.axhline(
                 self.floor,
@@ -292,11 +288,6 @@ class ErrorDisplay:
         handles = [*self.lines_.values(), *self.active_points_[:1]]
         legend_above(one, handles, n_columns=4 if len(handles) < 4 else 2)
         return self
-
-    def _label(self, name: str) -> str:
-        if name not in self.norms:
-            return name
-        return f"{name}, H∞ norm {self.norms[name]:.3g}"
 
     def _mark_active(self, ax: Any) -> None:
         """Peaks as dots; beyond the ends of the axis, arrow heads that point there."""
@@ -338,10 +329,6 @@ def _sigma(model: StateSpace, omega: Array) -> Array:
     seen = np.isfinite(response).all((1, 2))
     values[seen] = np.linalg.norm(response[seen], 2, axis=(1, 2))
     return values
-
-
-def _positive(values: Array) -> Array:
-    return np.where(values > 0, values, np.nan)
 
 
 def _vector(values: ArrayLike | None) -> Array:

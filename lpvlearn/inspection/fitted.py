@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .. import StateSpace
+from ..models.statespace import StateSpace
 
 
 def unwrapped(estimator: Any) -> Any:
@@ -19,13 +19,7 @@ def unwrapped(estimator: Any) -> Any:
 def models_of(
     estimator: Any, kappa: float | ArrayLike | None = None
 ) -> dict[str, StateSpace]:
-    """State-space models of a fitted estimator, by name.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or the scheduling value is missing.
-    """
+    """State-space models of a fitted estimator, by name; a pipeline's at `kappa`."""
     estimator = unwrapped(estimator)
     if hasattr(estimator, "lti_"):
         return {type(estimator).__name__: estimator.lti_}
@@ -65,13 +59,11 @@ def fitted_pipeline(pipeline: Any, attribute: str) -> Any:
     return pipeline
 
 
-def check_model(name: str, model: Any, kind: type = StateSpace, hint: str = "") -> None:
-    """A ValueError unless the argument is a model of that kind."""
-    if not isinstance(model, kind):
-        article = "an" if kind.__name__[0] in "AEILO" else "a"
+def check_model(name: str, model: Any, hint: str = "") -> None:
+    """A ValueError unless the argument is a StateSpace."""
+    if not isinstance(model, StateSpace):
         raise ValueError(
-            f"`{name}` must be {article} {kind.__name__}. Got {type(model).__name__}"
-            f"{hint}."
+            f"`{name}` must be a StateSpace. Got {type(model).__name__}{hint}."
         )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import StateSpace
+from ..models.statespace import StateSpace
 from ..systems.response import pole_grid, pole_rates
 
 Array = NDArray[np.float64]
@@ -27,17 +27,9 @@ def frequency_axis(models: Sequence[StateSpace], n_points: int = 400) -> Array:
     Logarithmic, with further points around resonances. Ends at the highest Nyquist
     frequency where all models are in discrete time.
 
-    Parameters
-    ----------
-    models : sequence of StateSpace
-    n_points : int, default=400
-
     Examples
     --------
-    >>> from lpvlearn import StateSpace
-    >>> from lpvlearn.inspection.frequency import frequency_axis
-    >>> omega = frequency_axis([StateSpace([[-2.0]], [[1.0]], [[1.0]])])
-    >>> omega[[0, -1]]
+    >>> frequency_axis([StateSpace([[-2.0]], [[1.0]], [[1.0]])])[[0, -1]]
     array([ 0.2, 20. ])
     """
     poles = np.concatenate([pole_rates(m.poles(), m.sampling_time) for m in models])

@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import LPVStateSpace
-from .drawing import LABEL_SIZE, MUTED, TEXT_SIZE, single_axes, tidy
+from .drawing import LABEL_SIZE, MUTED, TEXT_SIZE, legend_above, single_axes, tidy
 from .fitted import (
-    check_model,
     check_one_scheduling,
     fitted_pipeline,
     scheduling_name,
@@ -86,7 +84,7 @@ class PoleDisplay:
     @classmethod
     def from_model(
         cls,
-        model: LPVStateSpace,
+        model: Any,
         *,
         kappa: ArrayLike | None = None,
         damping: bool = False,
@@ -115,8 +113,11 @@ class PoleDisplay:
         ValueError
             If the model has several scheduling variables.
         """
-        hint = "; a fitted LocalLPVPipeline holds one in `lpv_`"
-        check_model("model", model, LPVStateSpace, hint)
+        if not hasattr(model, "frozen_poles"):
+            raise ValueError(
+                f"`model` must be an LPVStateSpace. Got {type(model).__name__}; a "
+                "fitted LocalLPVPipeline holds one in `lpv_`."
+            )
         grid = _grid(model, kappa)
         display = cls(grid, model.frozen_poles(grid), scheduling_label=scheduling_label)
         return display.plot(ax, damping=damping)
@@ -203,18 +204,9 @@ class PoleDisplay:
                 linewidths=1.4,
                 zorder=4,
             )
-            ring = Line2D(
-                [], [], color=MUTED, marker="o", markerfacecolor="none", linestyle=""
-            )
-            one.legend(
-                handles=[ring],
-                labels=["local models"],
-                loc="lower left",
-                bbox_to_anchor=(0.0, 1.0),
-                frameon=False,
-                borderaxespad=0.1,
-                fontsize=TEXT_SIZE,
-            )
+            ring = Line2D([], [], color=MUTED, marker="o", markerfacecolor="none")
+            ring.set(linestyle="", label="local models")
+            legend_above(one, [ring])
         tidy(one)
         one.autoscale_view()
         # The border of stability is part of the picture.
@@ -266,7 +258,7 @@ def _draw_damping(ax: Any) -> None:
     ax.set(**limits)
 
 
-def _grid(model: LPVStateSpace, kappa: ArrayLike | None) -> Array:
+def _grid(model: Any, kappa: ArrayLike | None) -> Array:
     check_one_scheduling(model.n_scheduling, "PoleDisplay")
     if kappa is not None:
         return np.asarray(kappa, dtype=float).reshape(-1)

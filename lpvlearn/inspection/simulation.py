@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import bft_score
 from ..data.columns import Table, is_table
 from ..data.experiments import read_outputs
 from ..data.timestamps import time_in_seconds
-from ..validation import one_of
+from ..metrics.scorers import check_options, simulate
+from ..metrics.scores import bft_score
 from .drawing import (
     ACCENT,
     axes_grid,
@@ -198,7 +198,7 @@ class SimulationDisplay:
         ValueError
             If there is no such experiment, or an option is unknown.
         """
-        one_of("initial_state", initial_state, ("rest", "estimate"))
+        check_options(initial_state)
         estimator = unwrapped(estimator)
         if not hasattr(estimator, "split_experiments"):
             raise ValueError(
@@ -210,10 +210,7 @@ class SimulationDisplay:
         outputs, names = read_outputs(y)
         rows = _rows_of(estimator, X, experiment)
         part = X.iloc[rows] if hasattr(X, "iloc") else X[rows]
-        if initial_state == "rest":
-            y_pred = estimator.predict(part)
-        else:
-            y_pred = estimator.predict_with_initial_state(part, outputs[rows])
+        y_pred = simulate(estimator, part, outputs[rows], initial_state)
         time, label = _time_of(estimator, Table(part))
         display = cls(
             time,
@@ -299,7 +296,7 @@ def _rows_of(estimator: Any, X: Any, label: Hashable) -> NDArray[np.intp]:
             "`experiment` must be None, as the estimator takes the table for one "
             f"experiment. Got {label!r}."
         )
-    labels = column[1].labels([rows[0] for rows in groups])
+    labels = column.labels([rows[0] for rows in groups])
     if label not in labels:
         shown = ", ".join(map(repr, labels[:10]))
         shown += ", ..." if len(labels) > 10 else ""
@@ -314,7 +311,7 @@ def _time_of(estimator: Any, table: Table) -> tuple[Array, str]:
     """Time of every row in seconds, else sample numbers; and the axis label."""
     column = table.one(getattr(estimator, "time", None), "time")
     if column is not None:
-        seconds = time_in_seconds(column[1].values, column[1].name)
+        seconds = time_in_seconds(column.values, column.name)
         return np.asarray(seconds, dtype=float), "Time (s)"
     number = np.arange(table.n_rows, dtype=np.float64)
     step = getattr(estimator, "sampling_time_", None)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import warnings
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import ExtrapolationWarning
 from ..models.statespace import StateSpace, sorted_poles
 from ..models.system_matrix import blocks
 from ..structures.structure import GrayBoxStructure
 from ..systems.sampling import sample_zoh
 from ..systems.simulation import state_trajectory
 from ..systems.tabulation import tabulate
-from ..validation import input_samples, positive_time, real_array, state_vector
+from ..validation import finite_samples, positive_time, real_array, state_vector
 
 Array = NDArray[np.float64]
 
@@ -207,7 +206,7 @@ class LPVStateSpace:
             If shapes do not fit, a value is not finite, or the structure gives no
             finite matrices at a scheduling value.
         """
-        u = input_samples(u, self.n_inputs)
+        u = finite_samples("u", u, self.n_inputs)
         x = np.zeros(self.order)
         if initial_state is not None:
             x = state_vector(initial_state, self.order)
@@ -237,6 +236,19 @@ class LPVStateSpace:
         none = np.zeros((len(kappa), 0, self.order))
         return self._response(none, kappa, sampling_time, np.eye(self.order))
 
+    def silenced(self) -> LPVStateSpace:
+        """The model whose interpolator extrapolates without a warning."""
+        known: dict[str, Any] = getattr(self.interpolator, "get_params", dict)()
+        loud = [
+            name
+            for name, value in known.items()
+            if name.split("__")[-1] == "extrapolation" and value == "warn"
+        ]
+        quiet = copy.deepcopy(self.interpolator) if loud else self.interpolator
+        for name in loud:
+            quiet.set_params(**{name: "ignore"})
+        return replace(self, interpolator=quiet)
+
     def _response(self, u: Array, kappa: Array, dt: float, x: Array) -> Array:
         """Outputs of runs along one trajectory: inputs (n_samples, n_inputs, n_runs).
 
@@ -250,15 +262,14 @@ class LPVStateSpace:
                 f"`u`. Got {len(kappa)}."
             )
         low, high = self.scheduling_range
+        model = self
         if ((kappa < low) | (kappa > high)).any():
             self.interpolator.predict(kappa)  # which says how far out the samples are
+            model = self.silenced()  # not once more, of the nodes of the table
         y = np.empty((len(u), self.n_outputs, u.shape[2]))
         for start in range(0, len(u), _BLOCK):
             rows = slice(start, start + _BLOCK)
-            with warnings.catch_warnings():
-                # said above, of the samples: not once more, of the table's nodes
-                warnings.simplefilter("ignore", ExtrapolationWarning)
-                S = self._held_matrices(kappa[rows], dt)
+            S = model._held_matrices(kappa[rows], dt)
             A, B, C, D = blocks(S[:, :, : self.order + u.shape[1]], self.order)
             forcing = B @ u[rows]
             states = state_trajectory(A, forcing, x)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.columns import ROLES, Table, is_table
+from ..data.columns import ROLES, Table, roles_of
 from ..data.experiments import read_outputs
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
@@ -107,18 +107,18 @@ def _labels(
     roles: Mapping[str, Any], X: Any, groups: Sequence[NDArray[np.intp]]
 ) -> list[tuple[Hashable, Hashable]]:
     """The experiment's and operating point's label for each group of rows."""
-    table = Table(X if is_table(X) else np.asarray(X, dtype=object))
+    table = Table(X)
     label = table.one(roles.get("experiment"), "experiment")
     point = table.one(roles.get("operating_point"), "operating_point")
     kappa = table.several(roles.get("scheduling"), "scheduling")
     names: list[Hashable] = [0] * len(groups)
     points: list[Hashable] = [None] * len(groups)
     if label is not None:
-        names = label[1].labels([rows[0] for rows in groups])
+        names = label.labels([rows[0] for rows in groups])
     if point is not None:
-        points = point[1].labels([rows[0] for rows in groups])
+        points = point.labels([rows[0] for rows in groups])
     elif kappa:
-        values = np.column_stack([column.numbers("X") for _, column in kappa])
+        values = np.column_stack([column.numbers("X") for column in kappa])
         means = [tuple(values[rows].mean(axis=0).tolist()) for rows in groups]
         points = [mean if len(mean) > 1 else mean[0] for mean in means]
     return list(zip(names, points, strict=True))
@@ -295,7 +295,6 @@ def _roles_of(models: Any) -> dict[str, Any]:
     for model in models:
         owner = owner_of_experiments(model)
         if owner is not None:
-            roles = {name: getattr(owner, name, None) for name in ROLES}
             step = getattr(owner, "sampling_time_", owner.sampling_time)
-            return {**roles, "sampling_time": step}
+            return {**roles_of(owner), "sampling_time": step}
     return {}

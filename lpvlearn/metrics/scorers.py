@@ -164,8 +164,8 @@ def _make_scorer(
     return TrajectoryScorer(metric, initial_state, burn_in, multioutput, average)
 
 
-def check_options(initial_state: str, burn_in: int) -> None:
-    """Refuse options that scorers and reports do not know."""
+def check_options(initial_state: str, burn_in: int = 0) -> None:
+    """Refuse options that scorers, reports and pictures do not know."""
     one_of("initial_state", initial_state, ("rest", "estimate"))
     whole_number("burn_in", burn_in, 0)
 
@@ -208,9 +208,7 @@ def owner_of_experiments(estimator: Any) -> Any:
     return estimator
 
 
-def simulate(
-    estimator: Any, X: Any, y: Any, initial_state: InitialState
-) -> NDArray[np.float64]:
+def simulate(estimator: Any, X: Any, y: Any, initial_state: str) -> NDArray[np.float64]:
     """Simulated outputs of a table, one column for each output."""
     if initial_state == "rest":
         return read_outputs(estimator.predict(X))[0]

@@ -145,23 +145,7 @@ def parameter_fit(params_true: ArrayLike, params_pred: ArrayLike) -> float:
 
 
 def r2_ratio(y_true: ArrayLike, y_pred: ArrayLike) -> NDArray[np.float64]:
-    """Coefficient of determination of each output, for any number of samples.
-
-    Parameters
-    ----------
-    y_true, y_pred : array-like of shape (n_samples,) or (n_samples, n_outputs)
-
-    Returns
-    -------
-    ndarray of shape (n_outputs,)
-        As :func:`sklearn.metrics.r2_score`, but defined for a single sample too.
-
-    Examples
-    --------
-    >>> from lpvlearn.metrics.scores import r2_ratio
-    >>> r2_ratio([1.0, 2.0, 3.0, 4.0], [1.5, 2.5, 2.5, 3.5])
-    array([0.8])
-    """
+    """Coefficient of determination of each output, defined for a single sample too."""
     true, pred = _read_pair(y_true, y_pred)
     with np.errstate(over="ignore"):
         error = np.sum((true - pred) ** 2, axis=0)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.columns import ROLES
+from ..data.columns import roles_of
 from ..data.experiments import Experiment, read_experiments
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
@@ -58,22 +58,10 @@ def simulate_experiments(
     *,
     estimate: bool,
 ) -> Array:
-    """Simulate a model along the experiments of a table.
+    """Outputs (n_samples, n_outputs) of a model along the experiments of a table.
 
-    Parameters
-    ----------
-    model : StateSpace or LPVStateSpace
-    experiments : sequence of Experiment
-    sampling_time : float
-        Of experiments that do not tell it themselves.
-    estimate : bool
-        Whether to begin in initial states estimated on the outputs by least squares
-        (else at rest).
-
-    Returns
-    -------
-    ndarray of shape (n_samples, n_outputs)
-        Rows of all experiments where they stand in the table.
+    Rows stand where they do in the table; `sampling_time` is that of experiments that
+    do not tell it. From rest, or from initial states estimated on the outputs.
     """
     table = np.empty((sum(len(e.rows) for e in experiments), model.n_outputs))
     for e in experiments:
@@ -94,9 +82,8 @@ def _simulate(
         return model.simulate(e.inputs, kappa, dt, x0)
     sampled = model.to_discrete(dt) if model.is_continuous else model
     if estimate:
-        error = _outputs(e, model.n_outputs) - sampled.simulate(e.inputs)
-        free = free_responses(sampled.A, sampled.C, len(e.rows))
-        x0 = estimate_initial_state(free, error)
+        y = _outputs(e, model.n_outputs)
+        x0 = sampled.estimate_initial_state(e.inputs, y)
     return sampled.simulate(e.inputs, initial_state=x0)
 
 
@@ -149,8 +136,8 @@ class TableSimulator(BaseEstimator):
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
                 "that the LPV model follows. Got None."
             )
-        roles = {name: getattr(self, name) for name in ROLES}
-        return read_experiments(self, X, y, **roles, sampling_time=self.sampling_time)
+        step = self.sampling_time
+        return read_experiments(self, X, y, **roles_of(self), sampling_time=step)
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
         step = self.sampling_time or 1.0  # where the table does not tell it

@@ -8,13 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..systems.balancing import balancing_transformation
+from ..exceptions import warn
+from ..systems.balancing import align_signs, balancing_transformation
 from ..systems.hinf_norm import hinf_norm
 from ..systems.response import frequency_response
 from ..systems.sampling import c2d_tustin, d2c_tustin, d2c_zoh, sample_zoh
-from ..systems.simulation import lti_response
+from ..systems.simulation import (
+    estimate_initial_state,
+    free_responses,
+    lti_response,
+)
 from ..validation import (
-    input_samples,
+    finite_samples,
     matrix,
     one_of,
     positive_time,
@@ -262,7 +267,7 @@ class StateSpace:
         >>> StateSpace(0.5, 1, 1, sampling_time=1.0).simulate([1, 1, 1]).ravel()
         array([0. , 1. , 1.5])
         """
-        u = input_samples(u, self.n_inputs)
+        u = finite_samples("u", u, self.n_inputs)
         x0 = None if initial_state is None else state_vector(initial_state, self.order)
         A, B, dt = self.A, self.B, self.sampling_time
         if dt is None or sampling_time is not None:
@@ -275,6 +280,52 @@ class StateSpace:
                     f"Got {sampling_time}. Convert with to_continuous() first."
                 )
         return lti_response(A, B, self.C, self.D, u, x0)
+
+    def estimate_initial_state(self, u: ArrayLike, y: ArrayLike) -> Array:
+        """Initial state of a discrete-time model with which it fits a record best.
+
+        The least-squares solution over all samples; of minimum norm where the record
+        does not determine it.
+
+        Parameters
+        ----------
+        u : array-like of shape (n_samples, n_inputs) or (n_samples,)
+        y : array-like of shape (n_samples, n_outputs) or (n_samples,)
+
+        Returns
+        -------
+        ndarray of shape (order,)
+            To be given to `simulate` as `initial_state`.
+
+        Raises
+        ------
+        ValueError
+            If the model is in continuous time, a shape does not fit, or a value is
+            not finite.
+
+        Examples
+        --------
+        >>> model = StateSpace(0.5, 1, 2, sampling_time=1.0)
+        >>> y = model.simulate([1, 1, 1], initial_state=[3])
+        >>> model.estimate_initial_state([1, 1, 1], y)
+        array([3.])
+        """
+        if self.is_continuous:
+            raise ValueError(
+                "`estimate_initial_state` needs a discrete-time model. Got "
+                f"{self}. Convert with to_discrete(sampling_time) first."
+            )
+        u = finite_samples("u", u, self.n_inputs)
+        y = finite_samples("y", y, self.n_outputs)
+        if len(u) == 0 or len(u) != len(y):
+            raise ValueError(
+                "`u` and `y` must have one row for each of the same samples, at least "
+                f"one. Got {len(u)} and {len(y)}."
+            )
+        free = free_responses(self.A, self.C, len(y))
+        return estimate_initial_state(
+            free, y - lti_response(self.A, self.B, self.C, self.D, u)
+        )
 
     def transform(self, T: ArrayLike) -> StateSpace:
         """Change the state basis: ``(T A T^-1, T B, C T^-1, D)``.
@@ -434,11 +485,19 @@ class StateSpace:
         one_of("method", method, _METHODS)
         if self.sampling_time is None:
             return self
-        if method == "zoh":
-            A, B, C = d2c_zoh(self.A, self.B, self.C, self.sampling_time)
-            return StateSpace(A, B, C, self.D)
         dt = self.sampling_time
-        return StateSpace(*d2c_tustin(self.A, self.B, self.C, self.D, dt))
+        if method == "tustin":
+            return StateSpace(*d2c_tustin(self.A, self.B, self.C, self.D, dt))
+        A, B, C, doubled = d2c_zoh(self.A, self.B, self.C, dt)
+        if len(doubled):
+            warn(
+                f"{len(doubled)} pole(s) on the negative real axis "
+                f"({', '.join(f'{p:.3g}' for p in doubled)}) have no real "
+                "logarithm; each becomes a pair at the Nyquist frequency and the order "
+                "grows by one. A shorter sampling time or a lower order avoids it.",
+                RuntimeWarning,
+            )
+        return StateSpace(A, B, C, self.D)
 
     def to_control(self) -> Any:
         """The model as a ``control.StateSpace`` (needs python-control)."""
@@ -467,6 +526,12 @@ class StateSpace:
                 f"`model.dt` must be 0 or a sampling time in seconds. Got {dt}."
             )
         return cls(model.A, model.B, model.C, model.D, dt if dt > 0 else None)
+
+
+def with_signs_of(reference: StateSpace, model: StateSpace) -> StateSpace:
+    """A balanced model with the signs of its states turned to those of another."""
+    s = align_signs(model.B, model.C, reference.B, reference.C)[:, None]
+    return StateSpace(s * model.A * s.T, s * model.B, model.C * s.T, model.D)
 
 
 def sorted_poles(A: Array) -> NDArray[np.complex128]:

@@ -22,8 +22,8 @@ from .. import (
     SubspaceLTI,
 )
 from ..datasets import make_flexible_arm
-from ..pipeline.runner import Stopwatch
-from ..pipeline.structured_models import balanced_entries
+from ..pipeline.estimator import Stopwatch
+from ..pipeline.points import balanced_entries
 from .tables import (
     ParameterSet,
     interpolation_table,
@@ -43,20 +43,16 @@ class PaperExperiment:
     ----------
     data : Bunch
         From `make_flexible_arm`.
-    pipeline : LocalLPVPipeline
-        The method, fitted.
-    comparison : LocalLPVPipeline
-        The local models by the other subspace method.
+    pipeline, comparison : LocalLPVPipeline
+        The method, fitted; the local models by the other subspace method.
     parameters : dict of str to ParameterSet
         "restructured", "analytic" and "balanced".
     lpv : dict of str to LPVStateSpace
         Interpolated with the requested degree.
     tables : dict of str to DataFrame
         "table1", "table1_other", "table2", "table3", "table4", "timing".
-    degree : int
-        Of the interpolation.
-    n_realizations : int
-        Noise realizations at each operating point.
+    degree, n_realizations : int
+        Of the interpolation; of the noise at each operating point.
     method, other_method : str
         Subspace methods of `pipeline` and `comparison`.
     watch : Stopwatch
@@ -134,14 +130,11 @@ def run_paper_experiment(
         ).fit(data.X, data.y)
     with watch.step("validation"):
         kappa = pipeline.operating_points_
+        analytic = [data.arm.parameters(np.arccos(k)) for k in kappa[:, 0]]
+        own = pipeline.parameters_.to_numpy()
         parameters = {
-            "restructured": ParameterSet(
-                data.structure, pipeline.parameters_.to_numpy()
-            ),
-            "analytic": ParameterSet(
-                data.structure,
-                np.array([data.arm.parameters(np.arccos(k)) for k in kappa[:, 0]]),
-            ),
+            "restructured": ParameterSet(data.structure, own),
+            "analytic": ParameterSet(data.structure, np.array(analytic)),
             "balanced": ParameterSet(*balanced_entries(pipeline.local_models_)),
         }
         lpv = {

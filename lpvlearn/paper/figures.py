@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -220,21 +221,16 @@ def draw_sweep_angle(experiment: PaperExperiment) -> tuple[Any, str]:
     return figure, "θ₂ during the validation of the LPV models"
 
 
-def _sweep_drawer(name: str) -> Callable[[PaperExperiment], tuple[Any, str]]:
-    """The function that draws one LPV model on the sweep: Fig. 8, 9 or 10."""
-
-    def draw(experiment: PaperExperiment) -> tuple[Any, str]:
-        data = experiment.data
-        model = experiment.lpv[name]
-        display = SimulationDisplay.from_predictions(
-            data.X_sweep["time"],
-            data.y_sweep,
-            {f"LPV, {name}": simulate_sweep(model, data)},
-            units=_RATE,
-        )
-        return display.figure_, f"LPV model from the {name} local models on the sweep"
-
-    return draw
+def draw_sweep(experiment: PaperExperiment, name: str) -> tuple[Any, str]:
+    """Fig. 8, 9 or 10: one LPV model on the sweep."""
+    data = experiment.data
+    display = SimulationDisplay.from_predictions(
+        data.X_sweep["time"],
+        data.y_sweep,
+        {f"LPV, {name}": simulate_sweep(experiment.lpv[name], data)},
+        units=_RATE,
+    )
+    return display.figure_, f"LPV model from the {name} local models on the sweep"
 
 
 def _nearest_angle(theta2: Array, kappa: float) -> str:
@@ -251,7 +247,7 @@ _FIGURES: dict[int, Callable[[PaperExperiment], tuple[Any, str]]] = {
     5: draw_parameters,
     6: draw_balanced,
     7: draw_sweep_angle,
-    8: _sweep_drawer("restructured"),
-    9: _sweep_drawer("analytic"),
-    10: _sweep_drawer("balanced"),
+    8: partial(draw_sweep, name="restructured"),
+    9: partial(draw_sweep, name="analytic"),
+    10: partial(draw_sweep, name="balanced"),
 }

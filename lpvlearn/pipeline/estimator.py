@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-import warnings
+import pickle
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from joblib import Memory, hash
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
-from sklearn.utils.validation import check_is_fitted
+from sklearn.utils.validation import check_is_fitted, check_memory
 
-from ..data.columns import ROLES, as_list
+from ..data.columns import as_list, roles_of
 from ..data.experiments import Experiment, read_experiments, read_outputs
 from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
 from ..data.preparation import split_at_gaps
-from ..exceptions import ExtrapolationWarning
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time
-from .local_models import identify_points
+from .points import PointRunner, identify_points, restructure_points
 from .reports import Tables, summarise, tables
-from .runner import PointRunner, Stopwatch, checked_memory
-from .structured_models import restructure_points
 
 Array = NDArray[np.float64]
 
@@ -40,6 +43,25 @@ _STEPS = {
     "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", "passthrough"),
     "interpolator": (("fit", "predict"), "PolynomialLPV()", None),
 }
+
+
+@dataclass
+class Stopwatch:
+    """Wall-clock seconds of each step, in the order of the steps."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Add the time that the block takes to the step."""
+        start = perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + perf_counter() - start
+
+    def table(self) -> pd.DataFrame:
+        """Columns step and seconds, with the total."""
+        rows = [*self.seconds.items(), ("total", sum(self.seconds.values()))]
+        return pd.DataFrame(rows, columns=["step", "seconds"])
 
 
 class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -247,8 +269,10 @@ list, default=None
             an operating point (which the message names).
         """
         self._check_options()
-        runner, watch = self._runner(), Stopwatch()
-        restructurer = self._restructurer()
+        steps = {"local": self.local, "restructurer": self.restructurer}
+        memory = _checked_memory(self.memory, steps)
+        runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
+        restructurer, watch = self._restructurer(), Stopwatch()
         efficient = getattr(restructurer, "norm", None) == "covariance"
 
         with watch.step("reading of the table"):  # steps 1 and 2, and their groups
@@ -273,27 +297,26 @@ list, default=None
             )
 
         with watch.step("restructuring"):  # step 4: all of them in one structure
-            structured = restructure_points(restructurer, local, points.kappa, runner)
-            local = [local[k] for k in structured.kept]
-            points = points.keep(structured.kept)
-            self.local_models_ = [model.lti for model in local]
-            self.structured_models_ = structured.models
-            self.restructurers_ = structured.restructurers
+            found = restructure_points(restructurer, local, points, runner)
+            self.local_models_ = [model.lti for model in found.local]
+            self.structured_models_ = found.models
+            self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
-            theta, kappa = structured.theta, points.kappa
-            self.interpolator_ = self._interpolator(len(kappa)).fit(kappa, theta)
-            self.lpv_ = LPVStateSpace(
-                structured.structure, self.interpolator_, points.span
-            )
-            self.operating_points_ = kappa
-            self.scheduling_range_ = points.identified_range
+            kappa = self.operating_points_ = found.points.kappa
+            self.interpolator_ = self._interpolator(len(kappa)).fit(kappa, found.theta)
+            span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
+            self.lpv_ = LPVStateSpace(found.structure, self.interpolator_, span)
+            self.scheduling_range_ = found.points.identified_range
             self.scheduling_names_ = as_list(self.scheduling)
-            found = tables(points, local, structured, self.lpv_, self.sampling_time_)
-            self.parameters_, self.parameters_std_ = found.parameters, found.deviations
-            self.report_, self.parameter_report_ = found.points, found.by_parameter
-            self.hinf_parameters_ = found.parameters.copy()
-            for row, fitted in enumerate(structured.restructurers):
+            report = tables(found, self.lpv_, self.sampling_time_)
+            self.parameters_, self.parameters_std_ = (
+                report.parameters,
+                report.deviations,
+            )
+            self.report_, self.parameter_report_ = report.points, report.by_parameter
+            self.hinf_parameters_ = report.parameters.copy()
+            for row, fitted in enumerate(found.restructurers):
                 self.hinf_parameters_.iloc[row] = getattr(
                     fitted, "hinf_params_", fitted.params_
                 )
@@ -366,22 +389,20 @@ list, default=None
             warn_extrapolation(
                 experiments, self.scheduling_range_, self.scheduling_names_
             )
-        with warnings.catch_warnings():  # said above, of all experiments at once
-            warnings.simplefilter("ignore", ExtrapolationWarning)
-            out = simulate_experiments(
-                self.lpv_, experiments, self.sampling_time_, estimate=estimate
-            )
+        model = self.lpv_.silenced()  # said above, of all experiments at once
+        out = simulate_experiments(
+            model, experiments, self.sampling_time_, estimate=estimate
+        )
         return out[:, 0] if self._single_output else out
 
     # -- helpers -------------------------------------------------------------------
 
     def _read(self, X: Any, y: Any, *, reset: bool) -> list[Experiment]:
-        roles: dict[str, Any] = {name: getattr(self, name) for name in ROLES}
         gaps = reset and getattr(self.local, "missing", None) == "split"
         options: dict[str, Any] = {"reset": reset, "allow_missing": gaps}
         if reset:
             options["sampling_time"] = self.sampling_time
-        experiments = read_experiments(self, X, y, **roles, **options)
+        experiments = read_experiments(self, X, y, **roles_of(self), **options)
         return split_at_gaps(experiments) if gaps else experiments
 
     def _sampling_time(self, experiments: list[Experiment]) -> float:
@@ -392,18 +413,11 @@ list, default=None
             return positive_time("sampling_time", self.sampling_time)
         return float(getattr(self.local, "sampling_time", None) or 1.0)
 
-    def _runner(self) -> PointRunner:
-        steps = {"local": self.local, "restructurer": self.restructurer}
-        memory = checked_memory(self.memory, steps)
-        return PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
-
     def _restructurer(self) -> Any:
         """The restructurer to clone, or None for "passthrough"."""
-        if isinstance(self.restructurer, str):
-            return None
         if self.restructurer is None:
             return GrayBoxRestructurer()
-        return self.restructurer
+        return None if isinstance(self.restructurer, str) else self.restructurer
 
     def _interpolator(self, n_points: int) -> Any:
         if n_points == 1:
@@ -423,6 +437,30 @@ list, default=None
         tags = super().__sklearn_tags__()
         tags.regressor_tags.poor_score = True
         return tags
+
+
+def _checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
+    """A joblib.Memory from the argument `memory`, usable for steps (by their names)."""
+    path = str(memory) if hasattr(memory, "__fspath__") else memory
+    try:
+        memory = check_memory(path)  # which takes a path as text only
+    except ValueError as error:
+        raise ValueError(
+            "`memory` must be None, a folder, or a joblib.Memory. Got "
+            f"{type(memory).__name__}."
+        ) from error
+    if getattr(memory, "location", None) is None:
+        return memory
+    for name, step in steps.items():
+        try:
+            hash(step)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ValueError(
+                f"`memory` needs steps that can be pickled. Got a `{name}` that cannot "
+                f"({error}): replace lambda and nested functions by functions at the "
+                "top of a module, or leave `memory` out."
+            ) from error
+    return memory
 
 
 def _name_of_step(step: Any, name: str) -> str:

@@ -9,14 +9,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.operating_points import OperatingPoints
 from ..lpv.model import LPVStateSpace
 from ..metrics.reports import as_shown, readable_report
 from ..metrics.scores import parameter_fit
 from ..metrics.table_simulation import fit_of
 from ..restructuring.estimator import GrayBoxRestructurer
-from .local_models import LocalModel
-from .structured_models import StructuredModels
+from .points import StructuredModels
 
 Array = NDArray[np.float64]
 
@@ -24,57 +22,27 @@ _NO_FLOOR = 1e-8  # share of the black box's norm below which a floor is roundin
 
 
 class Tables(NamedTuple):
-    """What a pipeline found.
+    """What a pipeline found, as its attributes have it."""
 
-    Attributes
-    ----------
-    parameters, deviations : DataFrame of shape (n_points, n_params)
-        Gray-box parameters, and their standard deviations: NaN where not known.
-    points : DataFrame
-        One row per operating point: how good each step was; columns as in
-        `LocalLPVPipeline.report_`.
-    by_parameter : DataFrame
-        One row per parameter: how it varies over the points, and how it is met;
-        columns as in `LocalLPVPipeline.parameter_report_`.
-    """
-
-    parameters: pd.DataFrame
-    deviations: pd.DataFrame
-    points: pd.DataFrame
-    by_parameter: pd.DataFrame
+    parameters: pd.DataFrame  # (n_points, n_params)
+    deviations: pd.DataFrame  # their standard deviations: NaN where not known
+    points: pd.DataFrame  # `report_`: a row per operating point, how good each step was
+    by_parameter: pd.DataFrame  # `parameter_report_`: a row per parameter
 
 
-def tables(
-    points: OperatingPoints,
-    local: Sequence[LocalModel],
-    structured: StructuredModels,
-    lpv: LPVStateSpace,
-    sampling_time: float,
-) -> Tables:
-    """Tabulate the results of steps 3 to 5 at the operating points.
-
-    Parameters
-    ----------
-    points : OperatingPoints
-    local : sequence of LocalModel
-    structured : StructuredModels
-    lpv : LPVStateSpace
-    sampling_time : float
-        Seconds.
-    """
+def tables(found: StructuredModels, lpv: LPVStateSpace, sampling_time: float) -> Tables:
+    """Tabulate the results of steps 3 to 5 at the operating points."""
+    points, theta, spread = found.points, found.theta, found.std
     labels = [row[0] if len(row) == 1 else tuple(row) for row in points.kappa.tolist()]
     index = pd.Index(labels, name="operating_point", tupleize_cols=False)
-    names = pd.Index(structured.structure.parameter_names)
-    theta, interpolated = structured.theta, lpv.parameters(points.kappa)
-    spread = np.full(theta.shape, np.nan)
-    for k, covariance in enumerate(structured.covariances):
-        if covariance is not None:
-            spread[k] = np.sqrt(np.diag(covariance))
+    names = pd.Index(found.structure.parameter_names)
+    interpolated = lpv.parameters(points.kappa)
     deviations = pd.DataFrame(spread, index, list(names))
 
     rows = []
-    for k, (group, model) in enumerate(zip(points.experiments, local, strict=True)):
-        gray_box = structured.models[k]
+    for k, (group, model, gray_box) in enumerate(
+        zip(points.experiments, found.local, found.models, strict=True)
+    ):
         row: dict[str, Any] = {
             "n_experiments": len({e.label for e in group}),
             "n_samples": sum(len(e.rows) for e in group),
@@ -82,14 +50,14 @@ def tables(
             "horizon": model.horizon,
             "local_BFT": fit_of(model.lti, group, sampling_time),
         }
-        if structured.restructurers:
+        if found.restructurers:
             row["structured_BFT"] = fit_of(gray_box, group, sampling_time)
-            row |= _restructuring(structured.restructurers[k])
-        distance = (gray_box - lpv.at(points.kappa[k])).hinf_norm()
+            row |= _restructuring(found.restructurers[k])
+        distance = (gray_box - found.structure.model(interpolated[k])).hinf_norm()
         size = gray_box.hinf_norm()
         row["interpolation_error"] = distance / size if size > 0 else np.nan
         row["interpolation_FIT"] = parameter_fit(theta[k], interpolated[k])
-        if structured.restructurers:
+        if found.restructurers:
             row |= dict(zip("param_" + names, theta[k], strict=True))
             if not np.isnan(spread).all():
                 row |= dict(zip("std_" + names, spread[k], strict=True))
@@ -147,16 +115,8 @@ def summarise(
 ) -> str:
     """What a fitted pipeline found, as text.
 
-    Parameters
-    ----------
-    found : Tables
-    lpv : LPVStateSpace
-    sampling_time : float
-        Seconds.
-    scheduling : sequence of hashable
-        Names of the scheduling variables; none for a time-invariant model.
-    local, restructurer : str
-        Names of the estimators of steps 3 and 4.
+    `scheduling` names the variables (none: a time-invariant model), `local` and
+    `restructurer` the classes of steps 3 and 4.
     """
     report = found.points
     kappa = np.array([np.atleast_1d(label) for label in report.index], dtype=float)

@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
-from ..data.columns import Table, is_table
+from ..data.columns import Table, roles_of
 from ..data.experiments import Experiment, read_experiments
 from ..data.preparation import split_at_gaps
 from ..models.innovation import InnovationModel
-from ..systems.simulation import estimate_initial_state, free_responses
 from ..validation import one_of
 from .fit import LocalFit, fit_pairs, warn_about_horizon
 from .options import check_options, selection_table, selection_text, warn_about
@@ -310,9 +309,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 self._single_output = np.asarray(y).ndim == 1
             else:
                 stream = before.branch()
-            table = Table(X if is_table(X) else np.asarray(X))
-            times = table.one(self.time, "time")
-            fitted = stream.add(experiments, None if times is None else times[1])
+            fitted = stream.add(experiments, Table(X).one(self.time, "time"))
             if fitted is not None:
                 self._take(fitted, stream.step)
             self._stream = stream
@@ -538,11 +535,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self,
             X,
             y,
-            inputs=self.inputs,
-            scheduling=self.scheduling,
-            experiment=self.experiment,
-            time=self.time,
-            operating_point=self.operating_point,
+            **roles_of(self),
             sampling_time=self.sampling_time,
             reset=reset,
             allow_missing=gaps,
@@ -558,9 +551,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self.lti_.simulate(u, initial_state=x0)
 
     def _initial_state(self, experiment: Experiment) -> Array:
-        outputs = _outputs_of(experiment) - self.output_offset_
-        free = free_responses(self.lti_.A, self.lti_.C, len(outputs))
-        return estimate_initial_state(free, outputs - self._simulated(experiment))
+        u = experiment.inputs - self.input_offset_
+        y = _outputs_of(experiment) - self.output_offset_
+        return self.lti_.estimate_initial_state(u, y)
 
     def _in_table(
         self,

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import logm, matrix_balance, schur, solve_sylvester
 from scipy.special import factorial
-
-from ..exceptions import warn
 
 Array = NDArray[Any]
 
@@ -95,37 +93,36 @@ def _expm(M: Array) -> Array:
     return F + eye
 
 
-def d2c_zoh(A: Array, B: Array, C: Array, dt: float) -> tuple[Array, Array, Array]:
+class Held(NamedTuple):
+    """A continuous-time model whose inputs are held over a sampling period."""
+
+    A: Array
+    B: Array
+    C: Array
+    doubled: Array  # the sampled model's poles on the negative axis: pairs now
+
+
+def d2c_zoh(A: Array, B: Array, C: Array, dt: float) -> Held:
     """Inverse of `sample_zoh` by the matrix logarithm.
 
     A real pole on the negative axis has no real logarithm. As in the control
     literature, it becomes a complex pair at the Nyquist frequency: the response at
-    the sampling instants stays exact and the order grows by one (with a warning).
+    the sampling instants stays exact and the order grows by one.
 
     The model keeps its state basis (the states of poles on the negative axis come
-    twice) and its feedthrough.
-
-    Raises
-    ------
-    ValueError
-        If a pole is at the origin (a pure delay has no continuous equivalent), or the
-        logarithm is lost in rounding.
-
-    Warns
-    -----
-    RuntimeWarning
-        If a pole lies on the negative real axis.
+    twice) and its feedthrough. Raises a ValueError if a pole is at the origin (a pure
+    delay has no continuous equivalent), or the logarithm is lost in rounding.
 
     Examples
     --------
     >>> import numpy as np
-    >>> A, B, C = d2c_zoh(np.array([[1.0]]), np.array([[1.5]]), np.ones((1, 1)), 0.5)
-    >>> A, B
+    >>> found = d2c_zoh(np.array([[1.0]]), np.array([[1.5]]), np.ones((1, 1)), 0.5)
+    >>> found.A, found.B
     (array([[0.]]), array([[3.]]))
     """
     n = len(A)
     if n == 0:
-        return A.copy(), B.copy(), C.copy()
+        return Held(A.copy(), B.copy(), C.copy(), np.empty(0))
     A, (scale, _) = matrix_balance(A, permute=False, separate=True)
     poles = np.linalg.eigvals(A)
     size = np.abs(poles)
@@ -137,13 +134,6 @@ def d2c_zoh(A: Array, B: Array, C: Array, dt: float) -> tuple[Array, Array, Arra
         )
     negative = _on_negative_axis(poles.real, poles.imag)
     if negative.any():
-        warn(
-            f"{int(negative.sum())} pole(s) on the negative real axis "
-            f"({', '.join(f'{p:.3g}' for p in poles[negative].real)}) have no real "
-            "logarithm; each becomes a pair at the Nyquist frequency and the order "
-            "grows by one. A shorter sampling time or a lower order avoids it.",
-            RuntimeWarning,
-        )
         L = _extended_logarithm(A)
         extra = len(L) - n
         scale = np.concatenate([scale, np.ones(extra)])
@@ -160,7 +150,8 @@ def d2c_zoh(A: Array, B: Array, C: Array, dt: float) -> tuple[Array, Array, Arra
             "origin. Use `method='tustin'` or a lower order."
         )
     B_c = scale[:, None] * np.linalg.solve(hold, B / scale[:, None]) / dt
-    return scale[:, None] * L / scale / dt, B_c, C.copy()
+    A_c = scale[:, None] * L / scale / dt
+    return Held(A_c, B_c, C.copy(), poles[negative].real)
 
 
 def _has_eigenvalue(A: Array, poles: NDArray, value: float, tol: float) -> bool:

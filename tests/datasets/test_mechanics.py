@@ -184,7 +184,7 @@ def test_output_is_eq_31c_to_first_order():
 def test_power_of_the_velocity_loops_is_the_change_of_energy():
     arm = LOPSIDED
     reference = np.tile([1.0, -0.7], (1000, 1))
-    response = arm.simulate(reference, 1.2, 1e-3, integration_step=2.5e-4)
+    response = arm.simulate(reference, 1.2, 1e-3, integration_step=5e-4)
     E = energy(arm, response.q, response.qdot)
     rates = response.qdot[:, :2]
     power = ((reference - rates) * arm.gains * rates).sum(axis=1)

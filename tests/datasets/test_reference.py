@@ -20,6 +20,7 @@ def reference():
     return load_flexible_arm()
 
 
+@pytest.mark.slow
 def test_files_hold_what_the_generator_makes(reference):
     made = make_flexible_arm(
         random_state=reference_module.REFERENCE_SEED, integration_step=5e-4
@@ -34,6 +35,7 @@ def test_files_hold_what_the_generator_makes(reference):
     np.testing.assert_array_equal(made.theta2, reference.theta2)
 
 
+@pytest.mark.slow
 def test_writing_twice_gives_the_same_bytes(tmp_path, monkeypatch, reference):
     monkeypatch.setattr(reference_module, "make_flexible_arm", lambda **_: reference)
     reference_module.write_reference(tmp_path)

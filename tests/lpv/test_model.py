@@ -3,6 +3,7 @@
 import copy
 import pickle
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 from sklearn.neighbors import KNeighborsRegressor
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV, StateSpace
 from lpvlearn.exceptions import ExtrapolationWarning
@@ -212,6 +215,17 @@ def test_extrapolation_is_told_once_and_of_the_samples():
         spring("ignore").simulate(u, kappa, DT)
     with pytest.raises(ValueError, match="of 500 outside"):
         spring("error").simulate(u, kappa, DT)
+
+
+def test_the_warning_of_a_nested_interpolator_is_told_once_too():
+    model, u = spring(), inputs(500)
+    nested = make_pipeline(StandardScaler(with_std=False), PolynomialLPV(2))
+    nested.set_params(polynomiallpv__extrapolation="warn")
+    points = np.linspace(0, 2, 4)[:, None]
+    nested.fit(points, model.parameters(points))
+    with pytest.warns(ExtrapolationWarning, match="of 500 outside") as caught:
+        replace(model, interpolator=nested).simulate(u, np.linspace(0, 2.2, 500), DT)
+    assert len(caught) == 1
 
 
 @pytest.mark.parametrize("beyond", [1e-4, 0.01, 0.5])

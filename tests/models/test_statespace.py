@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace
 
@@ -348,3 +349,39 @@ def test_control_models_of_unknown_time_or_kind_are_refused():
             StateSpace.from_control(types.SimpleNamespace(**known, dt=dt))
     with pytest.raises(ValueError, match="must be a control.StateSpace.*int"):
         StateSpace.from_control(3)
+
+
+# -- initial states --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_outputs", [1, 2])
+def test_the_estimated_initial_state_is_the_one_simulated_from(n_outputs):
+    rng = np.random.default_rng(0)
+    model = StateSpace(
+        [[0.9, 0.2], [-0.2, 0.8]], [[1.0], [0.5]], np.eye(2)[:n_outputs], None, 0.1
+    )
+    u, x0 = rng.normal(size=30), np.array([2.0, -3.0])
+    y = model.simulate(u, initial_state=x0)
+    assert_allclose(model.estimate_initial_state(u, y), x0, rtol=1e-10)
+    # a least-squares solution: what remains is orthogonal to the free responses
+    noisy = y + rng.normal(size=y.shape)
+    rest = noisy - model.simulate(
+        u, initial_state=model.estimate_initial_state(u, noisy)
+    )
+    free = [model.simulate(0 * u, initial_state=unit) for unit in np.eye(2)]
+    assert_allclose(np.tensordot(free, rest, 2), 0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "model, u, y, message",
+    [
+        (StateSpace(-1, 1, 1), [1.0], [1.0], "needs a discrete-time model"),
+        (StateSpace(0.5, 1, 1, None, 1.0), [1.0, 2.0], [1.0], "Got 2 and 1"),
+        (StateSpace(0.5, 1, 1, None, 1.0), [], [], "at least one. Got 0 and 0"),
+        (StateSpace(0.5, 1, 1, None, 1.0), [1.0], [np.nan], "`y` must be finite"),
+        (StateSpace(0.5, 1, 1, None, 1.0), [1.0], [[1.0, 2.0]], r"`y`.*samples, 1\)"),
+    ],
+)
+def test_an_initial_state_needs_a_record_of_a_sampled_model(model, u, y, message):
+    with pytest.raises(ValueError, match=message):
+        model.estimate_initial_state(u, y)

@@ -18,6 +18,7 @@ from lpvlearn import (
     fit_report,
 )
 from lpvlearn.exceptions import ExtrapolationWarning
+from lpvlearn.pipeline.estimator import Stopwatch
 
 from ..conftest import (
     KAPPA,
@@ -468,3 +469,17 @@ def test_motion_about_a_single_point_is_no_sweep():
     spring_pipeline().fit(X.assign(kappa=wobble), y)
     with pytest.raises(ValueError, match="'p0r0' must be local"):
         spring_pipeline().fit(X.assign(kappa=np.linspace(-1, 1, len(X))), y)
+
+
+# -- time ------------------------------------------------------------------------------
+
+
+def test_a_stopwatch_adds_up_the_times_of_the_steps():
+    watch = Stopwatch({"a": 1.0})
+    for name in ("b", "a", "b"):
+        with watch.step(name):
+            pass
+    table = watch.table()
+    assert table["step"].tolist() == ["a", "b", "total"]
+    assert watch.seconds["a"] > 1.0 and watch.seconds["b"] > 0.0
+    assert table["seconds"].tolist()[-1] == sum(watch.seconds.values())

@@ -60,7 +60,7 @@ CONTINUOUS = {
 @pytest.mark.parametrize("similar", [True, False])
 def test_zoh_is_undone_by_the_logarithm(name, similar):
     A, B, C, _ = system(CONTINUOUS[name], similar=similar)
-    A2, B2, C2 = d2c_zoh(*sample_zoh(A, B, 0.1), C, 0.1)
+    A2, B2, C2, _ = d2c_zoh(*sample_zoh(A, B, 0.1), C, 0.1)
     # a pole that decays to 5e-5 within a sample has lost these digits
     tol = 1e-8 if name == "time scales" else 1e-10
     assert_allclose(A2, A, atol=tol * np.abs(A).max())
@@ -207,7 +207,7 @@ def test_a_pole_at_the_origin_has_no_logarithm(A):
 
 def test_faint_poles_that_are_not_zero_are_converted():
     A, B, C, _ = system(np.diag([1e-5, 0.5]))
-    Ac, Bc, _ = d2c_zoh(A, B, C, 1.0)
+    Ac, Bc, *_ = d2c_zoh(A, B, C, 1.0)
     assert_allclose(np.sort(np.linalg.eigvals(Ac)), np.log([1e-5, 0.5]), rtol=1e-9)
     assert_allclose(sample_zoh(Ac, Bc, 1.0)[0], A, atol=1e-14)
 
@@ -230,8 +230,8 @@ def test_units_of_the_states_do_not_matter():
     A, B, C, D = system(block_diag(jordan(0.9, 2), -0.4, 0.2))
     units = 10.0 ** np.array([-6.0, 6.0, 0.0, 3.0])
     scaled = units[:, None] * A / units, units[:, None] * B, C / units
-    with pytest.warns(RuntimeWarning, match="negative real axis"):
-        a, b, c = d2c_zoh(*scaled, 0.1)
+    a, b, c, doubled = d2c_zoh(*scaled, 0.1)
+    assert_allclose(doubled, [-0.4])
     expected = markov(A, B, C)
     found = markov(*sample_zoh(a, b, 0.1), c)
     assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())

@@ -1,0 +1,685 @@
+"""Steps 3 and 4 at the operating points: a black box each, then all in one structure.
+
+`identify_points` makes the experiments of every point a continuous-time model,
+`restructure_points` brings these into the structure; there the points help one another:
+the parameters of a neighbour lead out of a wrong basin. A `PointRunner` does either at
+several points at a time, tells progress and failures, and keeps results in a memory.
+"""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from joblib import Memory, Parallel, delayed, hash
+from numpy.typing import NDArray
+from sklearn.base import clone
+from threadpoolctl import ThreadpoolController
+
+from ..data.columns import ROLES
+from ..data.experiments import Experiment
+from ..data.operating_points import OperatingPoints
+from ..exceptions import warn
+from ..models.statespace import StateSpace, with_signs_of
+from ..restructuring.minimise_covariance import Estimate
+from ..restructuring.problem import GOOD_FIT, problem_from_models
+from ..structures.structure import GrayBoxStructure
+from ..subspace.noise_weights import noise_weighted
+from ..subspace.statistics import DEVIATION, ModelPair, deviated_models
+
+Array = NDArray[np.float64]
+
+# Mean of an output in standard deviations, from which it looks like an offset (a record
+# that rises steadily from rest has a mean of 1.7).
+_OFFSET = 5.0
+
+_Task = tuple[StateSpace, list[StateSpace], list[Estimate]]
+
+_SWEEPS = 4  # passes over the points: help travels that far from a good one
+
+_NEIGHBOURS = 2  # points that help one: those to either side along one variable
+
+_BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
+
+_SKIP = " (Mend the experiments there, or leave the point out by on_error='skip'.)"
+
+# -- step 3: a black box at every point ------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LocalModel:
+    """The black-box model of one operating point."""
+
+    lti: StateSpace  # continuous time, balanced
+    order: int  # as identified, in discrete time
+    horizon: int | None  # of the subspace step, where the estimator tells it
+    realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
+    deviated: list[ModelPair] = field(default_factory=list)  # from `deviated_models`
+    # the model as identified (of every realization) with models to either side of it,
+    # where the covariance is known; with "zoh" in discrete time
+    estimates: list[Estimate] = field(default_factory=list)
+
+
+def identify_points(
+    local: Any,
+    points: OperatingPoints,
+    runner: PointRunner,
+    *,
+    structure: GrayBoxStructure | None,
+    **options: Any,
+) -> tuple[list[LocalModel], OperatingPoints]:
+    """Local models of the operating points, and which of these did not fail.
+
+    The order of the structure replaces ``order="auto"`` of the local estimator; without
+    one, "auto" becomes the highest order that a point takes. Options as in
+    `identify_point`.
+    """
+    chooses = local.get_params(deep=False).get("order") == "auto"
+    if chooses and isinstance(structure, GrayBoxStructure):
+        local = clone(local).set_params(order=structure.order)
+    # Where a record stood in the table does not matter: splits share their results.
+    groups = [[_bare(e) for e in group] for group in points.experiments]
+
+    def identify(estimator: Any) -> list[LocalModel | None]:
+        arguments = [(estimator, group) for group in groups]
+        return runner.run(
+            "local models", identify_point, arguments, points.kappa, **options
+        )
+
+    found = identify(local)
+    orders = {model.order for model in found if model is not None}
+    if chooses and structure is None and len(orders) > 1:
+        found = identify(clone(local).set_params(order=max(orders)))
+    kept = [k for k, model in enumerate(found) if model is not None]
+    return [model for model in found if model is not None], points.keep(kept)
+
+
+def identify_point(
+    local: Any,
+    experiments: Sequence[Experiment],
+    *,
+    sampling_time: float,
+    combine: str,
+    discretization: str,
+    efficient: bool = False,
+) -> LocalModel:
+    """Identify the local model of one operating point by a clone of `local`.
+
+    Fitted, it has `lti_`, a discrete-time StateSpace. `combine` is "pool", one fit of
+    all experiments, or "average": one model each, balanced, signs aligned, and the
+    matrices averaged (the paper's Monte Carlo). Refuses outputs that do not vary, and
+    an unstable model, which cannot be balanced. `efficient` weighs the outputs by their
+    noise, and gives `estimates`.
+    """
+    advice = _look_at_outputs(experiments)
+    labels = list(dict.fromkeys(e.label for e in experiments))
+    if combine == "pool" or len(labels) == 1:
+        fitted = _fit_local(local, experiments, sampling_time)
+        model, pairs = _estimate(fitted, experiments, efficient)
+        lti = _continuous(model, discretization, advice)
+        found = LocalModel(
+            lti,
+            fitted.lti_.order,
+            _horizon(fitted),
+            deviated=_all_continuous(pairs, discretization),
+        )
+        if efficient and pairs:
+            found.estimates.append(_in_own_time(model, pairs, discretization))
+        return found
+    # The first realisation chooses order and horizon, the others follow it.
+    # A realisation with gaps is several experiments of one label.
+    realisations = [[e for e in experiments if e.label == label] for label in labels]
+    fitted = _fit_local(local, realisations[0], sampling_time)
+    chosen = clone(local)
+    for name in ("order", "horizon"):
+        if name in chosen.get_params() and hasattr(fitted, name + "_"):
+            chosen.set_params(**{name: getattr(fitted, name + "_")})
+    models, failures = [], []
+    estimates: list[Estimate] = []
+    for realisation in realisations:
+        refitted = _fit_local(chosen, realisation, sampling_time)
+        model, pairs = refitted.lti_, []
+        if efficient:
+            model, pairs = _estimate(refitted, realisation, efficient)
+        try:
+            models.append(_continuous(model, discretization, advice))
+            estimates.append(_in_own_time(model, pairs, discretization))
+        except ValueError as error:
+            failures.append((realisation[0].label, error))
+    if not models:
+        raise failures[0][1]
+    if failures:
+        warn(
+            f"{len(failures)} of {len(labels)} realisations were left out of the "
+            f"average; the first, {failures[0][0]!r}: {failures[0][1]}"
+        )
+    lowest = min(model.order for model in models)  # where none grew
+    models = [model for model in models if model.order == lowest]
+    known = all(pairs for _, pairs in estimates)
+    return LocalModel(
+        _average(models),
+        fitted.lti_.order,
+        _horizon(fitted),
+        models,
+        estimates=estimates if known else [],
+    )
+
+
+def _estimate(
+    fitted: Any, experiments: Sequence[Experiment], efficient: bool
+) -> tuple[StateSpace, list[ModelPair]]:
+    """The model, its outputs weighed by their noise if so wished, and its pairs."""
+    samples = [(e.inputs, e.outputs) for e in experiments if e.outputs is not None]
+    model, scale = fitted.lti_, None
+    detrend = getattr(fitted, "detrend", None)
+    refined = getattr(fitted, "refine", False) and not fitted.stability_loss_
+    if refined and efficient:
+        model, scale = noise_weighted(model, samples, detrend=detrend)
+    return model, deviated_models(
+        model,
+        samples,
+        lambda other: other,
+        detrend=detrend,
+        refined=refined,
+        output_scale=scale,
+    )
+
+
+def _in_own_time(
+    model: StateSpace, pairs: list[ModelPair], method: str
+) -> tuple[StateSpace, list[ModelPair]]:
+    """In discrete time where inputs are held, else as the continuous-time model."""
+    if method == "zoh":
+        return model, pairs
+    return model.to_continuous(method), _all_continuous(pairs, method)
+
+
+def _all_continuous(pairs: list[ModelPair], method: str) -> list[ModelPair]:
+    with warnings.catch_warnings():  # the estimate's own conversion says it once
+        warnings.simplefilter("ignore")
+        return [(a.to_continuous(method), b.to_continuous(method)) for a, b in pairs]
+
+
+def _fit_local(
+    local: Any, experiments: Sequence[Experiment], sampling_time: float
+) -> Any:
+    """A clone of the local estimator, fitted on the experiments as one table."""
+    u = np.vstack([e.inputs for e in experiments])
+    y = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    label = np.repeat(np.arange(len(experiments)), [len(e.rows) for e in experiments])
+    names = _column_names(experiments[0].input_names, u.shape[1])
+    table = pd.DataFrame(np.column_stack([u, label]), columns=names)
+    own: dict[str, Any] = {
+        **dict.fromkeys(ROLES),
+        "inputs": names[:-1],
+        "experiment": names[-1],
+        "sampling_time": sampling_time,
+    }
+    estimator = clone(local)
+    known = estimator.get_params(deep=False)
+    estimator.set_params(**{name: own[name] for name in own if name in known})
+    fitted = estimator.fit(table, y)
+    if not isinstance(getattr(fitted, "lti_", None), StateSpace):
+        raise ValueError(
+            "`local` must be an estimator that identifies a StateSpace model, its "
+            f"attribute `lti_`, as SubspaceLTI does. Got {type(local).__name__}."
+        )
+    return fitted
+
+
+def _column_names(inputs: Sequence[Hashable], n_inputs: int) -> list[str]:
+    """Names of the inputs as the user knows them, and of a column of labels."""
+    names = [str(name) for name in inputs or range(n_inputs)]
+    label = "experiment"
+    while label in names:
+        label += "_"
+    return [*names, label]
+
+
+def _average(models: Sequence[StateSpace]) -> StateSpace:
+    """Average balanced models of one order, state signs aligned to the first."""
+    aligned = [with_signs_of(models[0], model) for model in models]
+    return StateSpace(*(np.mean([getattr(m, M) for m in aligned], 0) for M in "ABCD"))
+
+
+def _bare(experiment: Experiment) -> Experiment:
+    """An experiment without its place in the table."""
+    return replace(
+        experiment,
+        rows=np.arange(len(experiment.rows)),
+        scheduling=None,
+        operating_point=None,
+    )
+
+
+def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
+    """What to try first if the model turns out unstable."""
+    outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    spread = outputs.std(axis=0)
+    if len(outputs) > len(experiments) and not np.ptp(outputs, axis=0).any():
+        raise ValueError(
+            f"An output must vary. Got {outputs[0].tolist()} throughout: no dynamics "
+            "can be identified from it."
+        )
+    if (np.abs(outputs.mean(axis=0)) > _OFFSET * spread).any():
+        return (
+            "The outputs stand far from zero: subtract their value at rest from y (a "
+            "simulation begins there). Else try "
+        )
+    return "Try "
+
+
+def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpace:
+    with warnings.catch_warnings():  # said below, at this point
+        warnings.filterwarnings("ignore", ".*negative real axis", RuntimeWarning)
+        lti = model.to_continuous(discretization)
+    if not lti.is_stable:
+        worst = lti.poles()[np.argmax(lti.poles().real)]
+        raise ValueError(
+            f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
+            "local=SubspaceLTI(stability='enforce'), another `order`, a longer "
+            "`horizon` or more data, or leave the point out by on_error='skip'."
+        )
+    if lti.order > model.order:
+        poles = model.poles()
+        poles = poles[(poles.real < 0) & (poles.imag == 0)].real
+        warn(
+            f"the identified model of order {model.order} has "
+            f"{lti.order - model.order} pole(s) on the negative real axis "
+            f"({', '.join(f'{p:.3g}' for p in poles)}), as no continuous-time model of "
+            "that order has: what becomes of the point is the nearest one. A shorter "
+            "sampling time or a lower `order` avoids it."
+        )
+    return lti.balance()
+
+
+def _horizon(fitted: Any) -> int | None:
+    horizon = getattr(fitted, "horizon_", None)
+    return None if horizon is None else int(horizon)
+
+
+# -- step 4: all of them in one structure ----------------------------------------------
+
+
+class StructuredModels(NamedTuple):
+    """Models of one structure at the operating points that did not fail."""
+
+    points: OperatingPoints
+    local: list[LocalModel]  # the black boxes
+    structure: GrayBoxStructure
+    theta: Array  # (n_points, n_params), parameters
+    std: Array  # (n_points, n_params), their standard deviations: NaN where not known
+    models: list[StateSpace]
+    restructurers: list[Any]  # fitted; empty without that step
+
+
+def restructure_points(
+    restructurer: Any,
+    local: list[LocalModel],
+    points: OperatingPoints,
+    runner: PointRunner,
+) -> StructuredModels:
+    """Bring the local models of all operating points into one structure.
+
+    Without a restructurer (None), the entries of the balanced models are parameters.
+    """
+    if restructurer is None:
+        # poles on the negative real axis make the order grow in continuous time
+        structure, theta = balanced_entries(
+            [model.lti.balance(min(model.order, model.lti.order)) for model in local]
+        )
+        balanced = [structure.model(row) for row in theta]
+        unknown = np.full(theta.shape, np.nan)
+        return StructuredModels(points, local, structure, theta, unknown, balanced, [])
+    restructurer = _with_structure(restructurer, local)
+    # What a fit is about: the model, and where they are known its realizations and
+    # estimates. Another norm or a weight is what the user wants minimised.
+    weighed = getattr(restructurer, "norm", None) in ("hinf", "covariance")
+    weighed = weighed and restructurer.frequency_weight is None
+    tasks: list[_Task] = [
+        (
+            _plain(model.lti),
+            [_plain(other) for other in model.realizations],
+            [
+                (_plain(one), [(_plain(a), _plain(b)) for a, b in pairs])
+                for one, pairs in model.estimates
+                if weighed
+            ],
+        )
+        for model in local
+    ]
+    found = runner.run(
+        "restructuring",
+        _restructure_point,
+        tasks,
+        points.kappa,
+        restructurer=restructurer,
+    )
+    kept = [k for k, result in enumerate(found) if result is not None]
+    points, local = points.keep(kept), [local[k] for k in kept]
+    helped = runner.call(
+        _help_neighbours,
+        [found[k] for k in kept],
+        [tasks[k] for k in kept],
+        points.kappa,
+        restructurer,
+        ignore=["fitted"],
+    )
+    theta = np.array([fitted.params_ for fitted in helped])
+    std = np.full(theta.shape, np.nan)
+    for row, fitted, model in zip(std, helped, local, strict=True):
+        known = getattr(fitted, "params_covariance_", None)  # where it tells its own
+        if known is None and model.deviated:
+            known = runner.call(
+                covariance_of_parameters,
+                fitted.structure_,
+                fitted.params_,
+                getattr(fitted, "frequency_weight", None),
+                _plain(model.lti),
+                model.deviated,
+            )
+        if known is not None:
+            row[:] = np.sqrt(np.diag(known))
+    models = [fitted.lti_ for fitted in helped]
+    return StructuredModels(
+        points, local, helped[0].structure_, theta, std, models, helped
+    )
+
+
+def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
+    """One canonical form for all points, of the identified order, where none is given.
+
+    Raises
+    ------
+    ValueError
+        If the models differ in order.
+    """
+    if getattr(restructurer, "structure", "its own") is not None:
+        return restructurer
+    orders = sorted({model.order for model in local})
+    if len(orders) > 1:
+        raise ValueError(
+            "`structure=None` interpolates the parameters of a canonical form and "
+            f"needs local models of one order. Got orders {orders}. Fix the order: "
+            "local=SubspaceLTI(order=...)."
+        )
+    first = local[0].lti
+    form = GrayBoxStructure.observable_canonical(
+        orders[0],
+        first.n_inputs,
+        first.n_outputs,
+        orders[0] == 0 or any(model.lti.D.any() for model in local),
+    )
+    return clone(restructurer).set_params(structure=form)
+
+
+def _restructure_point(
+    model: StateSpace,
+    realizations: Sequence[StateSpace],
+    estimates: Sequence[Estimate],
+    *,
+    restructurer: Any,
+    **options: Any,
+) -> Any:
+    """A clone of the restructurer, fitted to one local model."""
+    restructurer = clone(restructurer)
+    if len(realizations) > 1:
+        options["realizations"] = realizations
+    if estimates:
+        restructurer.set_params(norm="covariance")
+        options["estimates"] = estimates
+    elif getattr(restructurer, "norm", None) == "covariance":  # it is not known
+        restructurer.set_params(norm="hinf")
+    return restructurer.fit_model(model, **options)
+
+
+def _help_neighbours(
+    fitted: Sequence[Any],
+    tasks: Sequence[_Task],
+    kappa: Array,
+    restructurer: Any,
+) -> list[Any]:
+    """Try the parameters of neighbouring points as starts, until nothing improves.
+
+    A point in a wrong basin is one that its neighbours' parameters lead out of. Points
+    that fit well need no help. `fitted` follows from the other arguments.
+    """
+    fitted = list(fitted)
+    span = np.ptp(kappa, axis=0)
+    scaled = kappa / np.where(span > 0, span, 1.0)
+    distance = np.linalg.norm(scaled[:, None] - scaled[None], axis=2)
+    tried: set[tuple[int, bytes]] = set()
+    for _ in range(_SWEEPS):
+        improved = False
+        for i, task in enumerate(tasks):
+            if fitted[i].fit_error_ <= GOOD_FIT:
+                continue
+            for j in np.argsort(distance[i], kind="stable")[1 : 1 + _NEIGHBOURS]:
+                start = fitted[j].params_
+                key = (i, start.tobytes())
+                if key in tried:
+                    continue
+                tried.add(key)
+                own = fitted[i].fit_error_
+                if fitted[i].start_error(task[0], start) < _BETTER * own:
+                    fitted[i] = _restructure_point(
+                        *task, restructurer=restructurer, starts=[start]
+                    )
+                    improved = True
+        if not improved:
+            break
+    return fitted
+
+
+def covariance_of_parameters(
+    structure: GrayBoxStructure,
+    theta: Array,
+    weight: Any,
+    model: StateSpace,
+    deviated: Sequence[ModelPair],
+) -> Array:
+    """Covariance of gray-box parameters from that of the black box `model`.
+
+    The deviations of the response (`deviated_models`) are carried to the parameters to
+    first order, as the least-squares fit of the response does. `weight` is the
+    `frequency_weight` of `GrayBoxRestructurer`.
+    """
+    problem = problem_from_models(structure, [model], weight)
+    omega = problem.omega
+    dG = [
+        above.frequency_response(omega) - below.frequency_response(omega)
+        for above, below in deviated
+    ]
+    T = problem.parameter_changes(theta, np.array(dG)) / (2.0 * DEVIATION)
+    return T.T @ T
+
+
+def _plain(model: StateSpace) -> StateSpace:
+    """The model with matrices laid out as a memory returns them, to be found there."""
+    A, B, C, D = (np.array(M, order="C") for M in (model.A, model.B, model.C, model.D))
+    return StateSpace(A, B, C, D, model.sampling_time)
+
+
+def balanced_entries(models: Sequence[StateSpace]) -> tuple[GrayBoxStructure, Array]:
+    """The entries of balanced models as parameters, signs aligned along the points.
+
+    The baseline of the paper: no common state basis is guaranteed. Orders must agree.
+    """
+    orders = sorted({model.order for model in models})
+    if len(orders) > 1:
+        raise ValueError(
+            "`restructurer='passthrough'` interpolates matrices and needs local models "
+            f"of one order. Got orders {orders}. Fix the order: "
+            "local=SubspaceLTI(order=...)."
+        )
+    first = models[0]
+    structure = GrayBoxStructure.full(orders[0], first.n_inputs, first.n_outputs)
+    rows = []
+    previous = first
+    for model in models:
+        previous = with_signs_of(previous, model)
+        rows.append(np.concatenate([getattr(previous, M).ravel() for M in "ABCD"]))
+    return structure, np.array(rows)
+
+
+# -- any step: processes, progress, failures, memory -----------------------------------
+
+
+@dataclass(frozen=True)
+class PointRunner:
+    """How a step is applied to the operating points."""
+
+    n_jobs: int | None  # points worked on at the same time
+    verbose: int  # 1 shows a progress bar
+    on_error: str  # "raise" or "skip": whether a point that fails stops the others
+    memory: Memory  # where results are kept; without a location, nowhere
+
+    def run(
+        self,
+        what: str,
+        function: Callable[..., Any],
+        arguments: Sequence[tuple[Any, ...]],
+        kappa: Array,
+        **shared: Any,
+    ) -> list[Any]:
+        """Results of a step at every operating point; None where it failed and may.
+
+        The function takes the arguments of a point and the shared keywords; the memory
+        knows its results by the values of all of them. `what` labels the progress bar.
+        A failure names the point (by `kappa`), unless another one fails in the same
+        words: the cause is an option then.
+        """
+        kept = self._remembered(function)
+        stop = self.on_error == "raise"
+        tasks = (
+            delayed(_attempt)(kept, args, shared, k if stop else None)
+            for k, args in enumerate(arguments)
+        )
+        results = Parallel(n_jobs=self.n_jobs, return_as="generator")(tasks)
+        if self.verbose:
+            from tqdm import tqdm  # slow to import
+
+            results = tqdm(results, desc=what, total=len(arguments))
+        try:
+            found = list(results)
+        except _Stopped as stopped:
+            k, error = stopped.args
+            # The point, or an option? A neighbour (the last for the first) tells.
+            other = _attempt(kept, arguments[k - 1], shared, None)
+            if isinstance(other, _Failure) and other.text == str(error):
+                raise ValueError(str(error)) from error
+            skip = "" if "on_error" in str(error) else _SKIP
+            raise ValueError(f"{_place(k, kappa)}: {error}{skip}") from error
+        failures = {k: r for k, r in enumerate(found) if isinstance(r, _Failure)}
+        if len(failures) == len(found):
+            first = found[0]
+            if all(failure.text == first.text for failure in failures.values()):
+                raise ValueError(first.text) from first.error
+            raise ValueError(
+                f"{what}: every operating point failed. First {_place(0, kappa)}: "
+                f"{first.text}"
+            ) from first.error
+        for k, failure in failures.items():
+            warn(f"left out {_place(k, kappa)}: {failure.text}")
+        return [None if isinstance(r, _Failure) else r for r in found]
+
+    def call(
+        self, function: Callable[..., Any], *args: Any, ignore: Sequence[str] = ()
+    ) -> Any:
+        """Call a function at the top of a module, or take its result from the memory.
+
+        The arguments to `ignore` follow from the others and do not tell results apart.
+        """
+        return self._remembered(function, ignore)(*args)
+
+    def _remembered(
+        self, function: Callable[..., Any], ignore: Sequence[str] = ()
+    ) -> Callable[..., Any]:
+        if hasattr(self.memory, "store_backend"):
+            return _Remembered(function, self.memory.store_backend, tuple(ignore))
+        # An object with the interface of joblib.Memory: its own affair.
+        return self.memory.cache(function, ignore=list(ignore))
+
+
+@dataclass(frozen=True)
+class _Remembered:
+    """A function whose results a store keeps by the values of its arguments.
+
+    What ``joblib.Memory.cache`` does, without its record of the arguments as text:
+    joblib warns the user where writing that took long, as under load it may.
+    """
+
+    function: Callable[..., Any]  # at the top of a module
+    store: Any  # joblib's store backend; None keeps nothing
+    ignore: tuple[str, ...] = ()  # as in `PointRunner.call`
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """The result for these arguments: the one kept, else a new one."""
+        if self.store is None:
+            return self.function(*args, **kwargs)
+        item = self._item(args, kwargs)
+        if self.store.contains_item(item):
+            try:
+                return self.store.load_item(item, verbose=0)
+            except Exception:  # cleared meanwhile, or damaged: it is made again
+                pass
+        result = self.function(*args, **kwargs)
+        self.store.dump_item(item, result, verbose=0)
+        return result
+
+    def _item(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[str]:
+        """Place in the store: folders of the function, and of source and arguments."""
+        named = inspect.signature(self.function).bind(*args, **kwargs).arguments
+        told = {name: v for name, v in named.items() if name not in self.ignore}
+        folder = f"{self.function.__module__}.{self.function.__qualname__}"
+        # Results of another version of the function are not taken for its own.
+        source = inspect.getsource(self.function)
+        return [folder, hash((source, told), coerce_mmap=True)]
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """Why a point failed."""
+
+    error: Exception
+
+    @property
+    def text(self) -> str:
+        return str(self.error)
+
+
+class _Stopped(Exception):
+    """A failure that ends the step: number of the point, and error."""
+
+
+def _attempt(
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
+    shared: dict[str, Any],
+    stop_as: int | None,
+) -> Any:
+    """Run a step at one operating point; `stop_as` is its number if it must succeed."""
+    try:
+        with _blas().limit(limits=1, user_api="blas"):
+            return function(*args, **shared)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        if stop_as is not None:
+            raise _Stopped(stop_as, error) from error
+        return _Failure(error)  # told by the runner, who knows the other points
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """Found once in every process: the search takes longer than a small step."""
+    return ThreadpoolController()
+
+
+def _place(number: int, kappa: Array) -> str:
+    values = ", ".join(f"{value:.4g}" for value in kappa[number])
+    return f"operating point {number} (scheduling {values})"
