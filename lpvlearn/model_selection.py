@@ -59,8 +59,14 @@ from sklearn.model_selection import BaseCrossValidator
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_consistent_length
 
-from .data.columns import Column, Table
-from .data.experiments import Experiment, group_rows, operating_point_of
+from .data.experiments import (
+    Column,
+    Experiment,
+    Table,
+    group_rows,
+    operating_point_of,
+    roles_of,
+)
 from .data.operating_points import group_operating_points
 from .validation import one_of, whole_number
 
@@ -80,7 +86,6 @@ class _SplitOfExperiments(BaseCrossValidator):
     """
 
     n_splits: int | str
-    experiment: Any
 
     def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
         """Number of folds.
@@ -127,7 +132,29 @@ class _SplitOfExperiments(BaseCrossValidator):
             yield np.concatenate(train), np.concatenate(test)
 
     def _read(self, X: Any, groups: Any) -> list[Experiment]:
-        return _read_rows(X, groups, self.experiment)
+        """Rows of the experiments, and what tells their operating points.
+
+        `groups` are labels of the experiments where no column has them.
+        """
+        table, roles = Table(X), roles_of(self)
+        by_label = table.one(roles["experiment"], "experiment")
+        if by_label is None and groups is not None:
+            check_consistent_length(X, groups)
+            by_label = Column("groups", groups)
+        by_point = table.one(roles["operating_point"], "operating_point")
+        by_kappa = table.several(roles["scheduling"], "scheduling")
+        kappa = [column.numbers("X") for column in by_kappa]
+        labels, rows = group_rows(by_label, table.n_rows)
+        return [
+            Experiment(
+                label,
+                own,
+                inputs=np.empty((len(own), 0)),
+                scheduling=np.column_stack(kappa)[own] if kappa else None,
+                operating_point=operating_point_of(by_point, own, label),
+            )
+            for label, own in zip(labels, rows, strict=True)
+        ]
 
     @abstractmethod
     def _count(self, X: Any, groups: Any) -> int: ...
@@ -241,9 +268,7 @@ class ExperimentSplit(_SplitOfExperiments):
                 "`scheduling` or `operating_point` must name a column to hold out "
                 "operating points. Got None for both."
             )
-        return _read_rows(
-            X, groups, self.experiment, self.scheduling, self.operating_point
-        )
+        return super()._read(X, groups)
 
     @property
     def _knows_points(self) -> bool:
@@ -357,38 +382,6 @@ class BlockedTimeSeriesSplit(_SplitOfExperiments):
                 train.append(e.rows[begin : edges[fold]])
                 test.append(e.rows[edges[fold] + gap : edges[fold + 1]])
             yield train, test
-
-
-def _read_rows(
-    X: Any,
-    groups: Any,
-    experiment: Any,
-    scheduling: Any = None,
-    operating_point: Any = None,
-) -> list[Experiment]:
-    """Experiments of a table: their rows, and what tells their operating points.
-
-    `groups` are labels of the experiments where no column has them.
-    """
-    table = Table(X)
-    by_label = table.one(experiment, "experiment")
-    if by_label is None and groups is not None:
-        check_consistent_length(X, groups)
-        by_label = Column("groups", groups)
-    by_point = table.one(operating_point, "operating_point")
-    by_kappa = table.several(scheduling, "scheduling")
-    kappa = [column.numbers("X") for column in by_kappa]
-    labels, rows = group_rows(by_label, table.n_rows)
-    return [
-        Experiment(
-            label,
-            own,
-            inputs=np.empty((len(own), 0)),
-            scheduling=np.column_stack(kappa)[own] if kappa else None,
-            operating_point=operating_point_of(by_point, own, label),
-        )
-        for label, own in zip(labels, rows, strict=True)
-    ]
 
 
 def _turns(point: Indices) -> Indices:

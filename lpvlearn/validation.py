@@ -17,15 +17,6 @@ def real_array(name: str, value: Any) -> Array:
 
     Strings that look like numbers and complex numbers are refused: converting them
     silently hides a mistake.
-
-    Examples
-    --------
-    >>> real_array("A", [[1, 2]])
-    array([[1., 2.]])
-    >>> real_array("A", [["k", 2]])
-    Traceback (most recent call last):
-        ...
-    ValueError: `A` must hold real numbers only. Got [['k', 2]].
     """
     try:
         array = np.asarray(value)

@@ -19,39 +19,23 @@ Array = NDArray[np.float64]
 # A single record tells a sweep from noise and from oscillations about a point by the
 # means of its parts: those of a sweep differ by that share of the whole spread. (White
 # noise: below 0.2 of 600 samples; the flexible arm at one point: 0.54 to 0.66.)
-_PARTS = 10
-
-_SWEEP = 0.8
+_PARTS, _SWEEP = 10, 0.8
 
 # Largest spread of a scheduling variable within a local experiment, relative to its
 # range over the points: what moves further has seen several of the models.
 _MAX_SPREAD = 0.25
 
-# Rounding of scheduling values, relative to the range they are compared with.
-_ROUNDING = 1e-6
-
-# Experiments of a point are closer than this share of the range of all, if not more.
-_CLOSE = 0.01
-
-# A chain of neighbours longer than this many tolerances is no single point.
-_CHAIN = 3
-
-# Digits of a range that a message shows.
-_DIGITS = 3
+_ROUNDING = 1e-6  # of scheduling values, relative to the range they are compared with
+_CLOSE = 0.01  # share of the range within which means are one point, if not more
+_CHAIN = 3  # a chain of neighbours longer than this many tolerances is no single point
+_DIGITS = 3  # of a range that a message shows
 
 
 @dataclass(frozen=True)
 class OperatingPoints:
-    """Local experiments by operating point.
+    """Local experiments by operating point."""
 
-    Attributes
-    ----------
-    kappa : ndarray of shape (n_points, n_scheduling)
-        Scheduling values; one column of zeros where no variable is scheduled.
-    experiments : list of lists of Experiment
-    """
-
-    kappa: Array
+    kappa: Array  # (n_points, n_scheduling); a column of zeros without scheduling
     experiments: list[list[Experiment]]
 
     def __len__(self) -> int:
@@ -81,23 +65,9 @@ class OperatingPoints:
 def local_experiments(
     experiments: Sequence[Experiment], tol: ArrayLike | None = None
 ) -> OperatingPoints:
-    """Local experiments by operating point, checked.
+    """Group experiments by operating point, and check that every one is local.
 
-    Parameters
-    ----------
-    experiments : list of Experiment
-    tol : float or array-like of shape (n_scheduling,), optional
-        As in `group_operating_points`.
-
-    Raises
-    ------
-    ValueError
-        Also where an experiment is not local.
-
-    Warns
-    -----
-    UserWarning
-        When all experiments with a scheduling variable are at one point.
+    Warns when all experiments with a scheduling variable are at one point.
     """
     index, kappa = group_operating_points(experiments, tol)
     groups: list[list[Experiment]] = [[] for _ in kappa]
@@ -131,18 +101,6 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
     points `kappa`. Where that is zero: with its largest magnitude, and only if the
     variable travels; noise and oscillations about one point have no scale to compare
     with.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lpvlearn.data.experiments import Experiment
-    >>> sweep = Experiment(
-    ...     "sweep", np.arange(2), np.ones((2, 1)), scheduling=np.array([[0.0], [1.0]])
-    ... )
-    >>> _check_local([sweep], np.array([[0.0], [1.0]]))
-    Traceback (most recent call last):
-        ...
-    ValueError: Experiment 'sweep' must be local. Its scheduling variable 1 spreads ...
     """
     extent = np.ptp(kappa, axis=0)
     for run in experiments:
@@ -186,45 +144,16 @@ def _travel(scheduling: Array) -> Array:
 def group_operating_points(
     experiments: Sequence[Experiment], tol: ArrayLike | None = None
 ) -> tuple[NDArray[np.intp], Array]:
-    """Group experiments by operating point.
+    """The operating point of every experiment, and the points' scheduling values.
 
     Experiments with an operating-point label are grouped by it; the others by the mean
-    of their scheduling variable.
+    of their scheduling variable: means of one point are within `tol` of a neighbour, by
+    default the larger of 1 % of their range and the median spread of the variable
+    within an experiment. A ValueError where they form a longer chain.
 
-    Parameters
-    ----------
-    experiments : list of Experiment
-    tol : float or array-like of shape (n_scheduling,), optional
-        Largest distance, in units of each scheduling variable, between the means of
-        experiments of one point. Default: the larger of 1 % of the range of the means
-        and the median spread of the variable within an experiment.
-
-    Returns
-    -------
-    index : ndarray of int, shape (n_experiments,)
-        Operating point of each experiment.
-    kappa : ndarray of shape (n_points, n_scheduling)
-        Scheduling value of each point, the mean of its experiments' means, in
-        lexicographic order; `n_scheduling` is 0 without scheduling columns (points are
-        then in the order of first appearance).
-
-    Raises
-    ------
-    ValueError
-        When experiments form a chain closer than `tol`, so that groups are not clear.
-
-    Examples
-    --------
-    >>> import pandas as pd
-    >>> from sklearn.base import BaseEstimator
-    >>> from lpvlearn.data.experiments import read_experiments
-    >>> X = pd.DataFrame({"u": 1.0, "kappa": [0.9, 0.1, 0.9], "run": [7, 8, 9]})
-    >>> runs = read_experiments(
-    ...     BaseEstimator(), X, scheduling="kappa", experiment="run"
-    ... )
-    >>> index, kappa = group_operating_points(runs)
-    >>> index, kappa.ravel()
-    (array([1, 0, 1]), array([0.1, 0.9]))
+    The values (n_points, n_scheduling) are the means over a point's experiments, in
+    lexicographic order; without scheduling columns `n_scheduling` is 0, and points are
+    in the order of first appearance.
     """
     signals = [run.scheduling for run in experiments if run.scheduling is not None]
     means = None
@@ -246,11 +175,7 @@ def group_operating_points(
     return np.argsort(order)[group], kappa[order]
 
 
-def _tolerance(
-    signals: Sequence[Array],
-    means: Array,
-    tol: ArrayLike | None,
-) -> Array:
+def _tolerance(signals: Sequence[Array], means: Array, tol: ArrayLike | None) -> Array:
     if tol is None:
         spreads = [np.ptp(signal, axis=0) for signal in signals]
         return np.maximum(_CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0))
@@ -283,14 +208,7 @@ def _cluster(means: Array, tol: Array) -> NDArray[np.intp]:
 
 
 def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:
-    """Refuse outputs that are constant, or stand among the inputs.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-    names : sequence
-        Names of the outputs.
-    """
+    """Refuse outputs (of these names) that are constant, or stand among the inputs."""
     outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
     constant = np.ptp(outputs, axis=0) == 0
     if len(outputs) > len(experiments) and constant.any():
@@ -316,19 +234,9 @@ def warn_extrapolation(
     identified_range: Array,
     names: Sequence[object],
 ) -> None:
-    """Warn, once, of scheduling values outside the range of identification.
+    """Warn, once, of scheduling values outside the (2, n_scheduling) range identified.
 
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-    identified_range : ndarray of shape (2, n_scheduling)
-    names : sequence
-        Names of the scheduling variables.
-
-    Warns
-    -----
-    ExtrapolationWarning
-        With the variable, its range and the farthest value.
+    The message names the variable, its range and the farthest value.
     """
     signals = [e.scheduling for e in experiments if e.scheduling is not None]
     if not signals:

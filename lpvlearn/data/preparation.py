@@ -24,37 +24,20 @@ DETRENDS = (None, "constant", "linear")
 # Relative singular value below which inputs count as collinear, and the ratio of the
 # eigenvalues of their Gram matrix below which that is looked into: its rounding hides
 # ratios of singular values below 1e-8, well above the first.
-_COLLINEAR = 1e-10
-
-_SUSPECTED = 1e-12
+_COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 
 
 def has_gaps(experiment: Experiment) -> bool:
     """Whether an input or an output of an experiment is missing."""
-    found = np.isnan(experiment.inputs).any()
-    if experiment.outputs is not None:
-        found |= np.isnan(experiment.outputs).any()
-    return bool(found)
+    signals = (experiment.inputs, experiment.outputs)
+    return any(np.isnan(values).any() for values in signals if values is not None)
 
 
 def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Cut experiments where an input or an output is missing.
+    """Cut experiments where an input or an output is missing (NaN).
 
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-        Inputs and outputs may hold NaN.
-
-    Returns
-    -------
-    list of Experiment
-        Every run of at least two complete samples, with the label it had. It starts
-        from an initial state of its own.
-
-    Raises
-    ------
-    ValueError
-        If no two consecutive samples are complete.
+    Every run of at least two complete samples keeps its label, and starts from an
+    initial state of its own. Raises a ValueError if there is none.
 
     Examples
     --------
@@ -102,17 +85,8 @@ def _rows(experiment: Experiment, part: slice) -> Experiment:
 def remove_trends(pairs: Pairs, detrend: str | None) -> tuple[Pairs, Array, Array]:
     """Subtract its mean or its straight line from every channel of every experiment.
 
-    Parameters
-    ----------
-    pairs : list of (u, y)
-    detrend : {None, "constant", "linear"}
-
-    Returns
-    -------
-    pairs : list of (u, y)
-    input_offset : ndarray of shape (n_inputs,)
-        Mean over all samples; zero with ``detrend=None``.
-    output_offset : ndarray of shape (n_outputs,)
+    The pairs come back with the offsets of the inputs and of the outputs: means over
+    all samples, zero with ``detrend=None``.
 
     Examples
     --------
@@ -143,44 +117,18 @@ def _trend(values: Array, degree: int) -> Array:
 
 
 def constant_inputs(inputs: Sequence[Array]) -> NDArray[np.intp]:
-    """Inputs that have one and the same value in all samples of all experiments.
-
-    Parameters
-    ----------
-    inputs : sequence of ndarray of shape (n_samples, n_inputs)
-        One per experiment.
-
-    Returns
-    -------
-    ndarray of int
-        Their column numbers.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> constant_inputs([np.array([[1.0, 2.0], [3.0, 2.0]])])
-    array([1])
-    """
+    """Columns that have one and the same value in all samples of all experiments."""
     low = np.min([u.min(axis=0) for u in inputs], axis=0)
     high = np.max([u.max(axis=0) for u in inputs], axis=0)
     return np.flatnonzero(low == high)
 
 
 def independent_inputs(inputs: Sequence[Array]) -> Array | None:
-    """Combinations that make collinear inputs independent.
+    """P (n_inputs, rank) such that the columns of ``u P`` are independent, or None.
 
-    Parameters
-    ----------
-    inputs : sequence of ndarray of shape (n_samples, n_inputs)
-        One per experiment; no column zero.
-
-    Returns
-    -------
-    ndarray of shape (n_inputs, rank) or None
-        P such that the columns of ``u P`` are independent; a model of these inputs
-        with input matrix ``B`` is the smallest one of the original inputs with
-        ``B P.T``, inputs scaled to their largest value. None where the inputs are
-        independent as they are, or the samples too few to tell.
+    A model of ``u P`` with input matrix B is the smallest one of the original inputs
+    (no column zero) with ``B P.T``, inputs scaled to their largest value. None where
+    they are independent as they are, or the samples too few to tell.
 
     Examples
     --------
@@ -205,15 +153,7 @@ def independent_inputs(inputs: Sequence[Array]) -> Array | None:
 
 
 def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> None:
-    """Refuse a single sample and inputs that never change.
-
-    Parameters
-    ----------
-    pairs : list of (u, y)
-        Arrays (n_samples, n_inputs) and (n_samples, n_outputs), one per experiment.
-    names : sequence, default=None
-        Of the inputs; None numbers them.
-    """
+    """Refuse a single sample and inputs that never change; None numbers the inputs."""
     inputs = [u for u, _ in pairs]
     if max(len(u) for u in inputs) < 2:
         raise ValueError(

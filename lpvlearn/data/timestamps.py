@@ -11,15 +11,12 @@ from numpy.typing import NDArray
 
 # Relative tolerance on a single time step (beyond the rounding of its stamps), and on
 # the mean step against a declared one, which may be a rounded number itself.
-_STEP_RTOL = 1e-6
-
-_SAMPLING_TIME_RTOL = 1e-4
+_STEP_RTOL, _SAMPLING_TIME_RTOL = 1e-6, 1e-4
 
 # Decimals that stamps are tried for, down to nanoseconds. A stamp counts as a multiple
 # of the unit within the first slop, or its own rounding if that is larger; beyond the
 # second every number is one.
 _MAX_DECIMALS = 9
-
 _SLOP, _LARGEST_SLOP = 1e-6, 0.01
 
 _USE_INSTEAD = (
@@ -40,32 +37,10 @@ _FEW = 0.05
 
 
 def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
-    """Convert a time column to seconds.
+    """Seconds from numbers (seconds already), or datetimes (from the earliest).
 
-    Parameters
-    ----------
-    values : array-like of shape (n_samples,)
-        Numbers (taken as seconds), datetimes or timedeltas.
-    column : hashable
-        Name of the column, for the error message.
-
-    Returns
-    -------
-    ndarray of shape (n_samples,)
-        Seconds; counted from the earliest value for datetimes. A float32 column stays
-        float32: its rounding is part of the guard's tolerance.
-
-    Raises
-    ------
-    ValueError
-        When a value is neither a finite number nor a date.
-
-    Examples
-    --------
-    >>> import pandas as pd
-    >>> from lpvlearn.data.timestamps import time_in_seconds
-    >>> time_in_seconds(pd.to_datetime(["2024-01-01 12:00", "2024-01-01 12:01"]), "t")
-    array([ 0., 60.])
+    A float32 column stays float32: its rounding is part of the guard's tolerance.
+    Raises a ValueError on what is neither a finite number nor a date, naming `column`.
     """
     series = pd.Series(values).infer_objects()
     kind = getattr(series.dtype, "kind", "O")
@@ -100,39 +75,13 @@ def check_uniform_time(
     sampling_time: float | None = None,
     other_step: float | None = None,
 ) -> float | None:
-    """Check that time increases evenly, and return its step.
+    """Check that time increases evenly; its mean step (None for a single sample).
 
     Stamps may be rounded, to a number of decimals or to single precision: they then
     scatter around an even grid by one unit of the last place, which is accepted as
-    long as that unit is less than half the step.
-
-    Parameters
-    ----------
-    seconds : ndarray of shape (n_samples,)
-        Times of one experiment, in the order of the table.
-    column, experiment : hashable
-        Names for the error message.
-    sampling_time : float, optional
-        Step declared to the estimator, in seconds.
-    other_step : float, optional
-        Step found in the other experiments of the table, in seconds.
-
-    Returns
-    -------
-    float or None
-        Mean step in seconds; None for a single sample.
-
-    Raises
-    ------
-    ValueError
-        When time does not increase, is uneven, or has another step than expected.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from lpvlearn.data.timestamps import check_uniform_time
-    >>> check_uniform_time(np.arange(5) / 8, column="t", experiment=0)
-    0.125
+    long as that unit is less than half the step. Raises a ValueError when time does
+    not increase, is uneven, or has another step than declared to the estimator
+    (`sampling_time`) or found in the other experiments (`other_step`).
     """
     n_samples = len(seconds)
     if n_samples < 2:
@@ -186,13 +135,13 @@ def check_uniform_time(
 
 
 def _float_precision(seconds: NDArray[Any]) -> float:
-    """Return the relative rounding of stamps, single even when stored as double."""
+    """Relative rounding of stamps, single even when stored as double."""
     is_single = (seconds.astype(np.float32) == seconds).all()
     return float(np.finfo(np.float32 if is_single else np.float64).eps)
 
 
 def _decimal_unit(seconds: NDArray[np.float64]) -> float:
-    """Return the unit of the last decimal place that the stamps use, 0 if none."""
+    """Unit of the last decimal place that the stamps use, 0 if none."""
     for decimals in range(_MAX_DECIMALS + 1):
         scaled = seconds * 10.0**decimals
         slop = max(_SLOP, 4 * np.finfo(float).eps * float(np.abs(scaled).max()))

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..data.columns import Table, is_table
-from ..data.experiments import read_outputs
+from ..data.experiments import Table, is_table, read_outputs
 from ..data.timestamps import time_in_seconds
 from ..metrics.scorers import check_options, simulate
 from ..metrics.scores import bft_score

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,11 @@ class LPVStateSpace:
         n_params). Says itself what it makes of values outside of the range.
     scheduling_range : array-like of shape (2, n_scheduling)
         Smallest and largest scheduling values that the model was identified on.
+
+    Attributes
+    ----------
+    order, n_inputs, n_outputs, n_scheduling : int
+        Numbers of states, inputs, outputs and scheduling variables.
 
     Raises
     ------
@@ -79,6 +84,10 @@ class LPVStateSpace:
     structure: GrayBoxStructure
     interpolator: Any
     scheduling_range: Array
+    order: int = field(init=False)
+    n_inputs: int = field(init=False)
+    n_outputs: int = field(init=False)
+    n_scheduling: int = field(init=False)
 
     def __post_init__(self) -> None:
         bounds = real_array("scheduling_range", self.scheduling_range)
@@ -89,32 +98,15 @@ class LPVStateSpace:
             )
         bounds.setflags(write=False)
         object.__setattr__(self, "scheduling_range", bounds)
+        object.__setattr__(self, "n_scheduling", bounds.shape[1])
+        for name in ("order", "n_inputs", "n_outputs"):
+            object.__setattr__(self, name, getattr(self.structure, name))
 
     def __repr__(self) -> str:
         return (
             f"LPVStateSpace(order={self.order}, n_inputs={self.n_inputs}, "
             f"n_outputs={self.n_outputs}, n_scheduling={self.n_scheduling})"
         )
-
-    @property
-    def order(self) -> int:
-        """Number of states."""
-        return self.structure.order
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of inputs."""
-        return self.structure.n_inputs
-
-    @property
-    def n_outputs(self) -> int:
-        """Number of outputs."""
-        return self.structure.n_outputs
-
-    @property
-    def n_scheduling(self) -> int:
-        """Number of scheduling variables."""
-        return self.scheduling_range.shape[1]
 
     def parameters(self, kappa: ArrayLike) -> Array:
         """Parameters at scheduling values.

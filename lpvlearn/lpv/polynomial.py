@@ -21,7 +21,6 @@ from ..exceptions import ExtrapolationWarning, RankWarning, warn
 from ..validation import one_of, whole_number
 
 _BASES = ("power", "chebyshev", "legendre")
-
 _EXTRAPOLATIONS = ("ignore", "warn", "clip", "error")
 
 # Values this close to the identified range, relative to its width, are in it: a
@@ -200,7 +199,7 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._terms(kappa) @ self._chebyshev_coef
 
     def _terms(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Chebyshev terms at scheduling values, (n_points, n_terms)."""
+        """The Chebyshev terms at scheduling values, (n_points, n_terms)."""
         terms = np.ones((len(kappa), len(self.powers_)))
         for j, (low, high) in enumerate(_domains(self.scheduling_range_)):
             scaled = (2 * kappa[:, j] - (low + high)) / (high - low)
@@ -230,23 +229,9 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 def total_degree_powers(degree: int, n_variables: int) -> NDArray[np.intp]:
-    """List the exponents of all monomials up to a total degree.
+    """Exponents (n_terms, n_variables) of all monomials up to a total degree.
 
-    Parameters
-    ----------
-    degree : int
-    n_variables : int
-
-    Returns
-    -------
-    ndarray of int, shape (n_terms, n_variables)
-        By increasing total degree, lexicographic within one.
-
-    Examples
-    --------
-    >>> from lpvlearn.lpv.polynomial import total_degree_powers
-    >>> total_degree_powers(2, 2).tolist()
-    [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]]
+    By increasing total degree, lexicographic within one.
     """
     factors = (
         product
@@ -259,7 +244,7 @@ def total_degree_powers(degree: int, n_variables: int) -> NDArray[np.intp]:
 
 
 def _domains(scheduling_range: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """Return the interval of each variable; of width 2 around a constant one."""
+    """The interval of each variable; of width 2 around a constant one."""
     return [
         (low, high) if high > low else (low - 1.0, low + 1.0)
         for low, high in scheduling_range.T.tolist()
@@ -269,18 +254,18 @@ def _domains(scheduling_range: NDArray[np.float64]) -> list[tuple[float, float]]
 def _conversion(
     basis: str, powers: NDArray[np.intp], scheduling_range: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the matrix from Chebyshev coefficients to those of `basis`."""
+    """The matrix from Chebyshev coefficients to those of `basis`."""
     degree = int(powers.max(initial=0))
-    kinds: dict[str, Any] = {"chebyshev": Chebyshev, "legendre": Legendre}
     matrix = np.ones((len(powers), len(powers)))
     for j, domain in enumerate(_domains(scheduling_range)):
+        kinds: dict[str, dict[str, Any]] = {
+            "power": {"kind": Polynomial},
+            "chebyshev": {"kind": Chebyshev, "domain": domain},
+            "legendre": {"kind": Legendre, "domain": domain},
+        }
         single = np.zeros((degree + 1, degree + 1))
         for k in range(degree + 1):
-            term = Chebyshev.basis(k, domain=domain)
-            if basis == "power":
-                converted = term.convert(kind=Polynomial)
-            else:
-                converted = term.convert(kind=kinds[basis], domain=domain)
+            converted = Chebyshev.basis(k, domain=domain).convert(**kinds[basis])
             single[: len(converted.coef), k] = converted.coef
         matrix *= single[powers[:, None, j], powers[None, :, j]]
     return matrix
@@ -308,7 +293,7 @@ def _check_weight(
 
 
 def _resolvable_powers(degree: int, kappa: NDArray[np.float64]) -> NDArray[np.intp]:
-    """List the terms up to a degree whose powers the points can tell apart."""
+    """The terms up to a degree whose powers the points can tell apart."""
     highest = np.array([len(np.unique(column)) - 1 for column in kappa.T])
     if len(highest) == 1 and degree > highest[0]:
         n_points = highest[0] + 1

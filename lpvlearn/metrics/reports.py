@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.columns import ROLES, Table, roles_of
-from ..data.experiments import read_outputs
+from ..data.experiments import ROLES, Table, read_outputs, roles_of
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..validation import one_of

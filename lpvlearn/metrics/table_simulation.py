@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.columns import roles_of
 from ..data.experiments import Experiment, read_experiments
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
@@ -136,8 +135,7 @@ class TableSimulator(BaseEstimator):
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
                 "that the LPV model follows. Got None."
             )
-        step = self.sampling_time
-        return read_experiments(self, X, y, **roles_of(self), sampling_time=step)
+        return read_experiments(self, X, y, sampling_time=self.sampling_time)
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
         step = self.sampling_time or 1.0  # where the table does not tell it

@@ -35,7 +35,6 @@ _MAX_CUTS = (
     60  # some times as many as the peaks of an optimum; the rest only costs time
 )
 _ROOM = 10  # cuts for which room is made at once
-
 _SERIOUS = 0.1  # a step is taken when it brings that part of the promised decrease
 _GOOD = 0.7  # the model was good: the next step may be longer
 
@@ -44,16 +43,13 @@ _GOOD = 0.7  # the model was good: the next step may be longer
 _DOWNSHIFT = 1e-4
 # ... and those that come along to a new point by more: they were already old.
 _OLD_DOWNSHIFT = 0.05
-
 _KEPT = 1e-10  # cuts with a smaller multiplier did not shape the step, and are dropped
 
 # Factors of tau: where the model holds, where its new cuts do not explain the failure,
 # and where it says nothing of it (a step that is not admissible, or none)
 _LOOSER, _TIGHTER, _TIGHTEST = 0.5, 2.0, 4.0
 _UNEXPLAINED = 0.5  # part of the promise that the new cuts leave standing
-
 _STIFFEST = 1e14  # of tau: a step that short changes no digit
-
 _FIRST_STEP = 0.1  # of the radius, along the steepest cut
 _REACH = 1e3  # box around a step, in radii: tau bounds it, the box only its rounding
 
@@ -133,19 +129,11 @@ def proximal_bundle(
 
 @dataclass(frozen=True)
 class _Model:
-    """Cutting planes ``alpha + g^T d`` of ``f(y + d) / f(y) - 1``, Eq. (19).
-
-    Attributes
-    ----------
-    offsets : ndarray of shape (k,)
-    gradients : ndarray of shape (k, q)
-    n_own : int
-        The first ones are those of the peaks of y itself.
-    """
+    """Cutting planes ``alpha + g^T d`` of ``f(y + d) / f(y) - 1``, Eq. (19)."""
 
     offsets: Array
     gradients: Array
-    n_own: int
+    n_own: int  # the first ones are those of the peaks of y itself
 
     @classmethod
     def of(cls, peaks: Peaks) -> _Model:

@@ -17,7 +17,14 @@ from scipy.optimize import nnls
 
 Array = NDArray[np.float64]
 
-_INFINITY = 1e30
+_INFINITY = 1e30  # what daqp takes for no bound
+_PRIMAL, _DUAL = 1e-11, 1e-12  # its tolerances: no promise below them is acted on
+_RANK = 1e-10  # relative singular value of a span: gradients are known to less
+_BINDING = -1e-9  # relative value from which a constraint binds: a step's rounding
+# Least curvatures of a convexified Hessian, relative to that of the Lagrangian: along
+# the tangent space, across it, and of all directions once more against rounding
+_TANGENT, _ACROSS, _EVERYWHERE = 1e-9, 1e-8, 1e-11
+_STRAIGHT = 1e-12  # curvature of a Lagrangian that has none
 
 # The solver wants a positive definite Hessian. A little curvature of t makes the
 # multipliers add up to 1 + 1e-3 t: exact where t, the promised decrease, vanishes.
@@ -37,13 +44,8 @@ def epigraph_step(
     Subject to ``values_i + G_i d <= t``, ``constraint_values_j + gradients_j d <= 0``
     and ``|d|_inf <= radius``, for a positive definite `H`.
 
-    Returns
-    -------
-    d : ndarray of shape (q,)
-    multipliers : ndarray of shape (k,)
-        Of the peaks; non-negative, they add up to one at a stationary point.
-    constraint_multipliers : ndarray
-        None instead of the triple where the program has no solution.
+    Returns the step, the multipliers of the peaks (not negative, they add up to one at
+    a stationary point) and those of the constraints; None where there is no solution.
     """
     q, k, c = len(H), len(values), len(constraint_values)
     P = np.zeros((q + 1, q + 1))
@@ -64,8 +66,8 @@ def epigraph_step(
         upper,
         lower,
         np.zeros(q + 1 + k + c, dtype=np.int32),
-        primal_tol=1e-11,
-        dual_tol=1e-12,
+        primal_tol=_PRIMAL,
+        dual_tol=_DUAL,
     )
     if flag < 1 or not np.isfinite(x).all():
         return None
@@ -81,17 +83,8 @@ def shortest_in_hull(G: Array, normals: Array | None = None) -> tuple[float, Arr
     ``min |G^T x + N^T y|^2 + (1 - sum x)^2``, ``x, y >= 0``, whose solution is
     proportional to the weights.
 
-    Parameters
-    ----------
-    G : ndarray of shape (k, q)
-    normals : ndarray of shape (c, q), default=None
-        Gradients N of binding constraints, of which any non-negative multiple is added.
-
-    Returns
-    -------
-    distance : float
-    weights : ndarray of shape (k,)
-        Non-negative, adding up to one.
+    `normals` are gradients N of binding constraints, of which any non-negative multiple
+    is added. Returns the norm and the weights of the rows, which add up to one.
     """
     scale = max(float(np.linalg.norm(G, axis=1).max()), 1e-300)
     N = np.zeros((0, G.shape[1])) if normals is None else normals
@@ -114,7 +107,6 @@ def shortest_in_hull(G: Array, normals: Array | None = None) -> tuple[float, Arr
 Flags = NDArray[np.bool_]
 
 ACTIVE_PEAK = 1e-6  # peaks within that fraction of the highest one are active
-
 ACTIVE_MULTIPLIER = 1e-8  # smaller multipliers do not count
 
 # Why a search ended short of an optimum, beside the number of its iterations
@@ -152,57 +144,29 @@ class Curve(Protocol):
 
 @dataclass(frozen=True)
 class MinimaxProblem:
-    """What the minimax solvers ask of a problem.
+    """What the minimax solvers ask of a problem."""
 
-    Attributes
-    ----------
-    peaks : callable
-        ``y -> Peaks``, or None where `y` is not admissible (an unstable model).
-    samples : callable
-        ``(y, frequencies) -> Peaks``: the singular value at fixed frequencies.
-    values : callable
-        The same without gradients; infinite where there is no model.
-    hessians : callable
-        ``(y, frequencies, moving) -> (k, q, q)``, second derivatives of the values.
-    constraints : callable
-        ``y -> (c, dc)``: smooth constraints ``c(y) <= 0`` and their gradients.
-    grid : ndarray
-        Frequencies to watch beside the peaks.
-    curve : callable, default=None
-        ``y -> Curve``; by default steps are straight.
-    """
-
-    peaks: Callable[[Array], Peaks | None]
-    samples: Callable[[Array, Array], Peaks]
-    values: Callable[[Array, Array], Array]
-    hessians: Callable[[Array, Array, Flags], Array]
-    constraints: Callable[[Array], tuple[Array, Array]]
-    grid: Array = field(default_factory=lambda: np.zeros(0))
-    curve: Callable[[Array], Curve] | None = None
+    peaks: Callable[[Array], Peaks | None]  # of y; None where it is not admissible
+    samples: Callable[[Array, Array], Peaks]  # the values at fixed frequencies
+    values: Callable[[Array, Array], Array]  # without gradients; inf for no model
+    hessians: Callable[[Array, Array, Flags], Array]  # (y, frequencies, moving)
+    constraints: Callable[[Array], tuple[Array, Array]]  # c(y) <= 0 and gradients
+    grid: Array = field(default_factory=lambda: np.zeros(0))  # watched beside the peaks
+    curve: Callable[[Array], Curve] | None = None  # of y; by default straight steps
 
 
 @dataclass(frozen=True)
 class MinimaxResult:
     """Best point, its peaks, and what certifies it.
 
-    Attributes
-    ----------
-    y : ndarray of shape (q,)
-    peaks : Peaks
-    stationarity : float
-        Shortest vector in the convex hull of the active gradients, relative to the
-        objective; what binding constraints hold back is left out.
-    second_order : float
-        Smallest eigenvalue of the Hessian of the Lagrangian on the subspace along
-        which all active peaks stay equal, relative to the objective; positive for a
-        strict local minimum, NaN where the solver has no second-order model.
-    converged : bool
-    n_iter : int
-    history : list of dict
-        One row per iteration: objective, predicted decrease, radius, active peaks.
-    cause : str
-        What ended the search short of an optimum; empty where it converged or ran out
-        of iterations.
+    `stationarity` is the shortest vector in the convex hull of the active gradients,
+    relative to the objective, without what binding constraints hold back.
+    `second_order` is the smallest eigenvalue of the Hessian of the Lagrangian on the
+    subspace along which all active peaks stay equal, relative to the objective:
+    positive for a strict local minimum, NaN where the solver has no second-order model.
+    `history` has a row per iteration: objective, predicted decrease, radius, active
+    peaks. `cause` says what ended the search short of an optimum; empty where it
+    converged or ran out of iterations.
     """
 
     y: Array
@@ -223,7 +187,7 @@ def tangent_spaces(G: Array, dc: Array) -> tuple[Array, Array]:
     if D.size == 0:
         return np.zeros((G.shape[1], 0)), np.eye(G.shape[1])
     U, s, _ = np.linalg.svd(D, full_matrices=True)
-    r = int((s > 1e-10 * s.max(initial=0.0)).sum())
+    r = int((s > _RANK * s.max(initial=0.0)).sum())
     return U[:, :r], U[:, r:]
 
 
@@ -234,12 +198,12 @@ def convexified(L: Array, G: Array, dc: Array) -> Array:
     multiple of the projector on its complement, where the peaks themselves bend the
     objective, makes the rest positive.
     """
-    scale = max(float(np.abs(np.linalg.eigvalsh(L)).max()), 1e-12)
+    scale = max(float(np.abs(np.linalg.eigvalsh(L)).max()), _STRAIGHT)
     Y, Z = tangent_spaces(G, dc)
     H = L.copy()
     if Z.shape[1]:
         values, vectors = np.linalg.eigh(Z.T @ L @ Z)
-        positive = np.maximum(np.abs(values), 1e-9 * scale)
+        positive = np.maximum(np.abs(values), _TANGENT * scale)
         W = Z @ vectors
         H += (W * (positive - values)) @ W.T
     if Y.shape[1]:
@@ -248,8 +212,8 @@ def convexified(L: Array, G: Array, dc: Array) -> Array:
             C = Y.T @ H @ Z
             S = S - C @ np.linalg.solve(Z.T @ H @ Z, C.T)
         low = float(np.linalg.eigvalsh(0.5 * (S + S.T)).min())
-        H += (max(0.0, -low) + 1e-8 * scale) * Y @ Y.T
-    return 0.5 * (H + H.T) + 1e-11 * scale * np.eye(len(H))
+        H += (max(0.0, -low) + _ACROSS * scale) * Y @ Y.T
+    return 0.5 * (H + H.T) + _EVERYWHERE * scale * np.eye(len(H))
 
 
 def certificate(
@@ -266,7 +230,7 @@ def certificate(
     active = peaks.values >= f * (1.0 - ACTIVE_PEAK)
     G = peaks.gradients[active] / f
     c, dc = constraints
-    binding = dc[c >= -1e-9]
+    binding = dc[c >= _BINDING]
     distance, weights = shortest_in_hull(G, binding)
     hessians = problem.hessians(y, peaks.frequencies[active], peaks.moving[active])
     L = np.tensordot(weights, hessians, axes=1) / f

@@ -28,7 +28,6 @@ from .problem import (
 Array = NDArray[np.float64]
 
 _MAX_EXTRA = 40  # frequencies beside the grid: those at which a step failed
-
 _PATIENCE = 25  # iterations without progress that end the search
 _NOTHING = 1e-8  # relative decrease that is no progress over so many iterations
 _SHORTEST = 1e-14  # radius: a step that short changes no digit
@@ -42,9 +41,7 @@ _POOR, _SHORTER, _FAILED = 0.25, 0.5, 0.35
 # Where the quadratic program has no solution: a smaller radius, and a Hessian that is
 # more definite by part of its mean curvature.
 _NO_PROGRAM, _STIFFER = 0.25, 0.1
-
 _ROUNDING = 1e-12  # a promised relative decrease that rounding may hide
-
 _CORRECTIONS = 3  # second-order corrections: each removes most of the bend that is left
 _WORTHWHILE = 0.1  # part of the decrease that a correction must add for a further one
 
@@ -52,9 +49,7 @@ _FIRST_CURVATURE = (
     1e-2  # of the first program, relative to gradient over radius: little
 )
 _SHOULDER = 1e-9  # rounding of a singular value beside the objective
-
 _SAME = 1e-6  # relative distance of frequencies that are the same
-
 _SURPRISE = 0.2  # part of the decrease that a peak between the frequencies took away
 
 
@@ -69,22 +64,10 @@ def minimax_sqp(
 ) -> MinimaxResult:
     """Minimise the highest peak from an admissible point.
 
-    Parameters
-    ----------
-    problem : MinimaxProblem
-        In coordinates where a unit step changes the response by about the objective.
-    y0 : ndarray of shape (q,)
-    tol : float
-        Stop when the linear model predicts a relative decrease below it.
-    radius : float
-        First trust-region radius (maximum norm).
-    negligible : float
-        An objective at or below it is rounding noise: nothing is left to minimise.
-
-    Raises
-    ------
-    ValueError
-        If `y0` is not admissible.
+    In coordinates where a unit step changes the response by about the objective; the
+    first trust-region `radius` is in the maximum norm. Ends where the linear model
+    predicts a relative decrease below `tol`, or at an objective not above `negligible`:
+    rounding noise. A ValueError where `y0` is not admissible.
     """
     own = problem.peaks(y0)
     if own is None:
@@ -161,25 +144,13 @@ def _stalled(history: list[dict[str, float]], f: float) -> bool:
 
 @dataclass(frozen=True)
 class _Local:
-    """The quadratic program at one point, relative to the objective.
+    """The quadratic program at one point, relative to the objective."""
 
-    Attributes
-    ----------
-    entries : Peaks
-        Local maxima, and singular values at fixed frequencies.
-    H : ndarray of shape (q, q)
-        Convexified Hessian of the Lagrangian.
-    c, dc : ndarray
-        Constraints ``c + dc d <= 0``.
-    curve : Curve or None
-        That of the steps.
-    """
-
-    entries: Peaks
-    H: Array
-    c: Array
+    entries: Peaks  # local maxima, and singular values at fixed frequencies
+    H: Array  # convexified Hessian of the Lagrangian
+    c: Array  # constraints c + dc d <= 0
     dc: Array
-    curve: Curve | None = None
+    curve: Curve | None = None  # that of the steps
 
     def stiffer(self) -> _Local:
         shift = _STIFFER * max(float(np.trace(self.H)) / len(self.H), 1e-8)

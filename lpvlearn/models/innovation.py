@@ -17,22 +17,12 @@ Array = NDArray[np.float64]
 
 
 class NoiseModel(NamedTuple):
-    """``x[t+1] = A x[t] + K e[t]``, ``v[t] = C x[t] + e[t]``.
+    """``x[t+1] = A x[t] + K e[t]``, ``v[t] = C x[t] + e[t]``."""
 
-    Attributes
-    ----------
-    A : ndarray of shape (n_states, n_states)
-    C : ndarray of shape (n_outputs, n_states)
-    K : ndarray of shape (n_states, n_outputs)
-        Innovation gain; ``A - K C`` is stable.
-    covariance : ndarray of shape (n_outputs, n_outputs)
-        Of the innovations e.
-    """
-
-    A: Array
-    C: Array
-    K: Array
-    covariance: Array
+    A: Array  # (n_states, n_states)
+    C: Array  # (n_outputs, n_states)
+    K: Array  # (n_states, n_outputs), innovation gain; A - K C is stable
+    covariance: Array  # (n_outputs, n_outputs), of the innovations e
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -80,9 +80,7 @@ def peak_gains(
         model.A, model.B, model.C, model.D, dt=model.sampling_time, within=within
     )
     omega, sigma = found.frequencies, found.values
-    if not np.isfinite(
-        found.norm
-    ):  # also at a pole on the axis, where no direction exists
+    if not np.isfinite(found.norm):  # at a pole on the axis no direction exists
         omega, sigma = omega[:0], sigma[:0]
     U, _, Vh = np.linalg.svd(model.frequency_response(omega))
     return PeakGains(found.norm, omega, sigma, U[:, :, 0], Vh[:, 0].conj())

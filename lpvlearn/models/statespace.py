@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -34,8 +34,7 @@ Array = NDArray[np.float64]
 # differences carry rounding (1e-9 s at 1000 s, beside steps of a millisecond).
 _SAME_TIME = 1e-6
 
-# A change of basis worse conditioned than this, after scaling, leaves two digits.
-_SINGULAR = 1e14
+_SINGULAR = 1e14  # a change of basis worse conditioned, once scaled, leaves two digits
 
 _METHODS = ("zoh", "tustin")
 
@@ -56,6 +55,11 @@ class StateSpace:
         None is no feedthrough.
     sampling_time : float, default=None
         Seconds between samples; None is continuous time.
+
+    Attributes
+    ----------
+    order, n_inputs, n_outputs : int
+        Numbers of states, inputs and outputs.
 
     Raises
     ------
@@ -82,6 +86,9 @@ class StateSpace:
     C: Array
     D: Array
     sampling_time: float | None
+    order: int = field(init=False)
+    n_inputs: int = field(init=False)
+    n_outputs: int = field(init=False)
 
     def __init__(
         self,
@@ -119,39 +126,23 @@ class StateSpace:
         for name, value in zip("ABCD", (A, B, C, D), strict=True):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        if sampling_time is not None:
-            sampling_time = positive_time("sampling_time", sampling_time)
-        object.__setattr__(self, "sampling_time", sampling_time)
+        dt = sampling_time
+        dt = None if dt is None else positive_time("sampling_time", dt)
+        names = ("sampling_time", "order", "n_outputs", "n_inputs")
+        for name, number in zip(names, (dt, n, *shape), strict=True):
+            object.__setattr__(self, name, number)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles are built anew, so that their arrays are read-only too.
         return type(self), (self.A, self.B, self.C, self.D, self.sampling_time)
 
     def __repr__(self) -> str:
-        time = (
-            "continuous time"
-            if self.sampling_time is None
-            else f"sampling_time={self.sampling_time:g}"
-        )
+        dt = self.sampling_time
+        time = "continuous time" if dt is None else f"sampling_time={dt:g}"
         return (
             f"{type(self).__name__}(order={self.order}, n_inputs={self.n_inputs}, "
             f"n_outputs={self.n_outputs}, {time})"
         )
-
-    @property
-    def order(self) -> int:
-        """Number of states."""
-        return self.A.shape[0]
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of inputs."""
-        return self.D.shape[1]
-
-    @property
-    def n_outputs(self) -> int:
-        """Number of outputs."""
-        return self.D.shape[0]
 
     @property
     def is_continuous(self) -> bool:

@@ -14,14 +14,7 @@ Blocks = tuple[Array, Array, Array, Array]
 
 
 def blocks(S: Array, order: int) -> Blocks:
-    """A, B, C, D of ``S = [[A, B], [C, D]]``, stacked over its leading axes.
-
-    Examples
-    --------
-    >>> A, B, C, D = blocks(np.arange(4.0).reshape(2, 2), 1)
-    >>> float(B[0, 0])
-    1.0
-    """
+    """A, B, C, D of ``S = [[A, B], [C, D]]``, stacked over its leading axes."""
     n = order
     return S[..., :n, :n], S[..., :n, n:], S[..., n:, :n], S[..., n:, n:]
 
@@ -34,20 +27,8 @@ def stack_system(
 ) -> NDArray[Any]:
     """``[[A, B], [C, D]]`` from (A, B, C) or (A, B, C, D), after `lead` axes.
 
-    Parameters
-    ----------
-    source : str
-        Name of the function that returned the blocks, for the message.
-    blocks : sequence of array-like
-    shape : tuple of int
-        order, n_inputs, n_outputs.
-    lead : tuple of int
-        Leading axes that all blocks have.
-
-    Raises
-    ------
-    ValueError
-        If a block has another shape.
+    `shape` is order, n_inputs, n_outputs. A ValueError about the function `source`
+    that returned the blocks, if one has another shape.
     """
     n, m, p = shape
     given = [np.asarray(block) for block in blocks if block is not None]

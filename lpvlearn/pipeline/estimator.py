@@ -16,8 +16,12 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
 from sklearn.utils.validation import check_is_fitted, check_memory
 
-from ..data.columns import as_list, roles_of
-from ..data.experiments import Experiment, read_experiments, read_outputs
+from ..data.experiments import (
+    Experiment,
+    as_list,
+    read_experiments,
+    read_outputs,
+)
 from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
 from ..data.preparation import split_at_gaps
 from ..lpv.model import LPVStateSpace
@@ -402,7 +406,7 @@ list, default=None
         options: dict[str, Any] = {"reset": reset, "allow_missing": gaps}
         if reset:
             options["sampling_time"] = self.sampling_time
-        experiments = read_experiments(self, X, y, **roles_of(self), **options)
+        experiments = read_experiments(self, X, y, **options)
         return split_at_gaps(experiments) if gaps else experiments
 
     def _sampling_time(self, experiments: list[Experiment]) -> float:

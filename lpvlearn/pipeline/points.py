@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 from threadpoolctl import ThreadpoolController
 
-from ..data.columns import ROLES
-from ..data.experiments import Experiment
+from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
 from ..exceptions import warn
 from ..models.statespace import StateSpace, with_signs_of
@@ -491,12 +490,12 @@ def covariance_of_parameters(
     `frequency_weight` of `GrayBoxRestructurer`.
     """
     problem = problem_from_models(structure, [model], weight)
-    omega = problem.omega
-    dG = [
-        above.frequency_response(omega) - below.frequency_response(omega)
+    changes = [
+        above.frequency_response(problem.omega)
+        - below.frequency_response(problem.omega)
         for above, below in deviated
     ]
-    T = problem.parameter_changes(theta, np.array(dG)) / (2.0 * DEVIATION)
+    T = problem.parameter_changes(theta, np.array(changes)) / (2.0 * DEVIATION)
     return T.T @ T
 
 

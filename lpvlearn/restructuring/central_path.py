@@ -18,46 +18,37 @@ from numpy.typing import NDArray
 
 from .coordinates import ResponseGeometry
 from .error_system import ErrorSystem
-from .least_squares import frequency_grid
 from .limits import Limits
-from .measured import MeasuredErrorSystem
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
 
 # weight of the logarithms of the limits, relative to mu: they keep steps off the limits
 # and hardly move the minimum
 _BARRIER = 1e-2
-
 _SHRINK = 0.3  # of mu, from one stage to the next
-
 _FIRST_LEVEL = 2.0  # level of the first stage, relative to the largest singular value
-
+_SINGULAR = 1e-12  # relative curvature: flatter directions are taken as that steep
+# Of a trust-region step: relative curvature that still counts as positive, the excess
+# of the shift over the lowest eigenvalue, and digits of the shift, of which few matter
+_POSITIVE, _EXCESS, _CLOSE = 1e-13, 1e-14, 1.001
+_BISECTIONS = 60  # halve the logarithm of any bracket of doubles down to `_CLOSE`
 _NEGLIGIBLE = 1e-14  # decrease of psi, or radius, that is rounding noise
-
 _TAKEN = 1e-2  # part of the promised decrease that a step must bring
 
 # of the trust region: longer after steps as good as promised, shorter after poor ones,
 # and shorter still after those that failed
 _GOOD, _LONGER, _POOR, _SHORTER, _FAILED = 0.7, 3.0, 0.25, 0.5, 0.3
-
 _WORSE = 1.05  # end above the least norm met by more: that point is kept instead
-
 _DEPTH = 0.5  # local maxima down to there join the frequencies
-
 _BENT = 1.5  # a step whose geodesic bends more than that is too long
-
 _HALVINGS = 6  # of a step along the path; beyond, Newton's method does better
 
 
 def level_of(squares: Array, mu: float) -> float:
     """Square of the level t, where ``2 mu sum s / (t^2 - s) = 1``.
 
-    Parameters
-    ----------
-    squares : ndarray
-        Squared singular values s, of all frequencies.
+    `squares` are the squared singular values s of all frequencies.
     """
     top = float(squares.max())
     gap, low = squares - top, 2.0 * mu * top
@@ -77,66 +68,36 @@ def level_of(squares: Array, mu: float) -> float:
 
 @dataclass(frozen=True)
 class Quadratic:
-    """psi near one theta, along geodesics of the response.
-
-    Attributes
-    ----------
-    value : float
-    gradient : ndarray of shape (q,)
-    hessian : ndarray of shape (q, q)
-    drift : ndarray of shape (q,)
-        Derivative of the gradient by mu.
-    geometry : ResponseGeometry
-        Of which y are the coordinates.
-    """
+    """psi near one theta, along geodesics of the response."""
 
     value: float
     gradient: Array
     hessian: Array
-    drift: Array
-    geometry: ResponseGeometry
+    drift: Array  # derivative of the gradient by mu
+    geometry: ResponseGeometry  # of which y are the coordinates
 
 
 class Barrier:
     """psi for one set of frequencies.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    limits : Limits
-        Kept by logarithms of their own.
-    omega : ndarray
-        Frequencies, rad/s.
-    size : float
-        Change of the response that a unit step makes.
-
-    Attributes
-    ----------
-    missed : ndarray
-        Frequencies (rad/s) of resonances between the others that rose above the level
-        at the point of the last `value`.
+    The limits are kept by logarithms of their own; a unit step changes the response by
+    `size`. `missed` are frequencies of resonances between the others that rose above
+    the level at the point of the last `value`.
     """
 
     def __init__(
         self, system: ErrorSystem, limits: Limits, omega: Array, size: float
     ) -> None:
         self.system, self.limits, self.size = system, limits, size
-        self.missed = np.zeros(0)
-        self.watch(omega)
-
-    def watch(self, omega: Array) -> None:
-        """Take that set of frequencies."""
-        self.omega = omega
-        self._G0 = self.system.target_response(omega)
-        self._W = self.system.weight_response(omega)[0]
+        self.omega, self.missed = omega, np.zeros(0)
 
     def mu_of_level(self, theta: Array, ratio: float) -> float:
         """mu for which the level is `ratio` times the largest singular value."""
-        s = self._squares(theta, self.omega, self._G0, self._W)
+        s = self._squares(theta)
         return float(0.5 / (s / (ratio**2 * s.max() - s)).sum())
 
-    def _squares(self, theta: Array, omega: Array, G0: Complex, W: Complex) -> Array:
-        E = W @ (self.system.response(theta, omega) - G0)
+    def _squares(self, theta: Array) -> Array:
+        E = self.system.weighted_error(theta, self.omega)
         return np.asarray(np.linalg.svd(E, compute_uv=False) ** 2).ravel()
 
     def value(self, theta: Array, mu: float) -> float:
@@ -155,7 +116,7 @@ class Barrier:
         c = self.limits.values(theta, poles)
         if not c.max(initial=-1.0) < 0:
             return np.inf
-        s = self._squares(theta, self.omega, self._G0, self._W)
+        s = self._squares(theta)
         if not np.isfinite(s).all():
             return np.inf
         level = level_of(s, mu)
@@ -176,11 +137,10 @@ class Barrier:
         """
         c, dc, _ = self.limits.rows(theta)
         pull, weight = dc / -c[:, None], _BARRIER * mu
-        geometry = ResponseGeometry(
-            self.system, theta, self.omega, self.size, self._G0, pull
-        )
+        system, omega = self.system, self.omega
+        geometry = ResponseGeometry(system, theta, omega, self.size, pull)
         at, L, S = geometry.at, geometry.L, geometry.S
-        E = self._W @ at.E
+        E = system.weight_response(omega)[0] @ (at.G - system.target_response(omega))
         k, p, m = E.shape
         q = len(S)
         _, sigma, Vh = np.linalg.svd(E)
@@ -218,37 +178,15 @@ def _psi(squares: Array, tau: float, mu: float) -> float:
     return float(0.5 * np.log(tau) - mu * np.log1p(-squares / tau).sum())
 
 
-def search_grid(system: ErrorSystem) -> Array:
-    """Frequencies at which a search watches the error, rad/s."""
-    if isinstance(system, MeasuredErrorSystem):
-        return system.omega
-    poles = np.linalg.eigvals(system.target.A).astype(complex)
-    return frequency_grid(poles, system.dt)
-
-
 @dataclass
 class PathPoint:
-    """Where the central path was left.
+    """Where the central path was left."""
 
-    Attributes
-    ----------
-    theta : ndarray of shape (n_params,)
-        Its end; the point of least norm met where the end is much above that.
-    mu : float or None
-        Its last value; None for a point that is not on the path yet.
-    frequencies : ndarray
-        Local maxima met on the way, rad/s.
-    n_iter : int
-        Newton steps.
-    history : list of dict
-        One row per value of mu: objective, mu, steps.
-    """
-
-    theta: Array
-    mu: float | None
-    frequencies: Array
-    n_iter: int
-    history: list[dict[str, float]]
+    theta: Array  # its end, or the point of least norm met if that is much lower
+    mu: float | None  # its last value; None for a point that is not on the path yet
+    frequencies: Array  # local maxima met on the way
+    n_iter: int  # Newton steps
+    history: list[dict[str, float]]  # a row per value of mu: objective, mu, steps
 
 
 def central_path(
@@ -264,25 +202,13 @@ def central_path(
 ) -> PathPoint:
     """Follow the path from `theta` to `mu_end`.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    theta : ndarray of shape (n_params,)
-        Stable; the least-squares fit, or a point met on the path.
-    limits : Limits
-    mu_end : float
-        There the level is about ``mu_end * n_active`` (relative) above the minimum.
-    max_iter : int
-        Newton steps.
-    decrement : float
-        A stage ends when Newton's method promises less, relative to mu. The steps that
-        a point far from the path needs are longest while mu is large.
-    mu : float, default=None
-        First value; by default that of a level of twice the norm.
-    frequencies : ndarray, default=None
-        Local maxima that are known already.
+    `theta` is stable: the least-squares fit, or a point met on the path. At `mu_end`
+    the level is about ``mu_end * n_active`` (relative) above the minimum. The first
+    `mu` is by default that of a level of twice the norm; `frequencies` are local maxima
+    known already; `max_iter` counts Newton steps. A stage ends when Newton's method
+    promises less than `decrement`, relative to mu: the steps that a point far from the
+    path needs are longest while mu is large.
     """
-    grid = search_grid(system)
     inside = theta if limits.strict(theta) else limits.inside(theta)
     if not limits.strict(inside):  # at the margin: nothing to follow
         return PathPoint(theta, mu, np.zeros(0), 0, [])
@@ -295,7 +221,7 @@ def central_path(
     while n_iter < max_iter:
         if system.peaks_move:
             seen = np.union1d(seen, found.frequencies)
-        barrier = Barrier(system, limits, np.union1d(grid, seen), found.norm)
+        barrier = Barrier(system, limits, np.union1d(system.grid, seen), found.norm)
         if mu is None:
             mu = barrier.mu_of_level(theta, _FIRST_LEVEL)
         ahead = max(_SHRINK * mu, min(mu_end, mu))
@@ -378,7 +304,7 @@ def _newton(
         missed = np.union1d(missed, barrier.missed)
         if ratio > _TAKEN:
             if missed.size:
-                barrier.watch(np.union1d(barrier.omega, missed))
+                barrier.omega = np.union1d(barrier.omega, missed)
             if ratio > _GOOD:
                 radius = max(radius, _LONGER * length)
             elif ratio < _POOR:
@@ -400,7 +326,7 @@ def _predicted(
     spectrum, Q = eigen
     slopes = Q.T @ (model.gradient + (ahead - mu) * model.drift)
     size = np.abs(spectrum)
-    d = -Q @ (slopes / np.maximum(size, 1e-12 * size.max(initial=1e-300)))
+    d = -Q @ (slopes / np.maximum(size, _SINGULAR * size.max(initial=1e-300)))
     here = barrier.value(theta, ahead)
     for _ in range(_HALVINGS):
         trial = _along(theta, model, d)
@@ -422,11 +348,11 @@ def trust_region_step(spectrum: Array, slopes: Array, radius: float) -> Array:
     """Minimise ``slopes x + sum(spectrum x^2) / 2`` over ``|x| <= radius``."""
     size = max(float(np.abs(spectrum).max(initial=0.0)), 1e-300)
     low = float(spectrum.min())
-    if low > 1e-13 * size:
+    if low > _POSITIVE * size:
         x = -slopes / spectrum
         if np.linalg.norm(x) <= radius:
             return x
-    shift = max(0.0, -low) + 1e-14 * size
+    shift = max(0.0, -low) + _EXCESS * size
     x = -slopes / (spectrum + shift)
     short = radius**2 - float(x @ x)
     if short > 0:  # the hard case: the rest along the lowest curvature
@@ -434,12 +360,12 @@ def trust_region_step(spectrum: Array, slopes: Array, radius: float) -> Array:
         x[i] += np.sqrt(short) if slopes[i] <= 0 else -np.sqrt(short)
         return x
     high = shift + float(np.linalg.norm(slopes)) / radius + size
-    for _ in range(60):
+    for _ in range(_BISECTIONS):
         middle = np.sqrt(shift * high)
         if np.linalg.norm(slopes / (spectrum + middle)) > radius:
             shift = middle
         else:
             high = middle
-        if high < 1.001 * shift:
+        if high < _CLOSE * shift:
             break
     return -slopes / (spectrum + high)

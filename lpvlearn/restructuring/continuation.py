@@ -15,25 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.least_squares import levenberg_marquardt
-from .error_system import Structure, derivatives
-from .transfer import Target, resolvent
+from ..systems.response import pole_grid, pole_rates
+from .error_system import Structure, Target, derivatives, resolvent
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
-
 Flags = NDArray[np.bool_]
 
 SHIFTS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015, 0.0)  # relative to the fastest pole
-
 _FLOOR = 1e-2  # errors are relative to the response, where it is not below that
-
 _LONGEST = 1.5  # of a step, in logarithms of the parameters
-
 _SMALL = 1e-3  # relative decrease that ends a stage
-
 _ROUNDING = 1e-20  # squared relative error that is reached exactly
-
 _HOLD = 1e-4  # pull to the start of a stage, times the shift
 
 
@@ -49,28 +42,11 @@ def continued_fits(
 ) -> tuple[Array, Array]:
     """Fit the response on contours that approach the frequency axis.
 
-    Parameters
-    ----------
-    structure : Structure
-    target : Target
-        The black box.
-    thetas : ndarray of shape (k, n_params)
-        Starting points; a wrong size by a factor of ten does no harm.
-    signed : ndarray of bool, shape (n_params,)
-        Parameters that keep their signs: their logarithms are searched.
-    shifts : tuple of float
-        Distances from the frequency axis, relative to the fastest pole.
-    n_points : int
-        Frequencies of a contour.
-    max_iter : int
-        Steps that are tried on each contour.
-
-    Returns
-    -------
-    thetas : ndarray of shape (k, n_params)
-        By ascending cost; starts that were lost are left out.
-    costs : ndarray of shape (k,)
-        Root mean square of the relative errors on the last contour.
+    `thetas` (k, n_params) are the starts, where a size wrong by a factor of ten does no
+    harm; the logarithms of parameters that are `signed` are searched: they keep their
+    signs. `shifts` are the contours' distances from the axis, relative to the fastest
+    pole. Returns parameters by ascending cost, without starts that were lost, and the
+    root mean squares of their relative errors on the last contour.
 
     Examples
     --------
@@ -117,11 +93,8 @@ class _Search:
         size = np.where(thetas == 0, np.where(typical > 0, typical, 1.0), thetas)
         self.size = np.where(signed, np.sign(thetas), np.abs(size))
         self.center, self.hold = thetas, 0.0
-        rates = np.linalg.eigvals(target.A).astype(complex)
-        if target.dt is not None:
-            rates = np.log(np.where(rates == 0, 1e-300, rates)) / target.dt
-        sizes = np.abs(rates)
-        self.rates = rates
+        self.rates = pole_rates(np.linalg.eigvals(target.A), target.dt)
+        sizes = np.abs(self.rates)
         self.low = float(sizes[sizes > 0].min(initial=sizes.max(initial=1.0)))
         self.high = float(sizes.max(initial=self.low))
 
@@ -141,11 +114,11 @@ class _Search:
         Parameters that a blurred response hardly shows are held where they are.
         """
         self.center, self.hold = X, np.sqrt(_HOLD * shift)
-        omega = np.geomspace(self.low / 3.0, 2.0 * self.high, n_points)
-        if shift == 0:  # the resonances are narrow here
-            turn, decay = np.abs(self.rates.imag), np.abs(self.rates.real)
-            near = (turn[:, None] + decay[:, None] * np.array([-1.0, 0.0, 1.0])).ravel()
-            omega = np.unique(np.concatenate([omega, near[near > 0]]))
+        # the resonances are narrow on the axis itself
+        narrow = self.rates[:0] if shift else self.rates
+        ends = self.low / 3.0, 2.0 * self.high
+        omega = pole_grid(narrow, *ends, n_points, [-1.0, 0.0, 1.0])
+        omega = omega[omega > 0]
         t = self.target
         s = shift * self.high + 1j * omega
         self.s = np.asarray(s if t.dt is None else np.exp(s * t.dt), dtype=complex)

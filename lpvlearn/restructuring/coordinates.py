@@ -20,30 +20,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.balancing import balancing_transformation
-from .error_system import ErrorPoint, ErrorSystem
-from .limits import Limits
+from .error_system import ErrorSystem
+from .limits import Limits, within_bounds
 from .similarity import linear_equations, nearest_parameters, scaled_problem
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
 
 # Directions that the response sees a thousand times less than others are steps of
 # that length all the same: further along them its second derivative takes over.
 _METRIC_CAP = 1e-3
-
 _FIT_CAP = 1e-5  # the same for the H2 norm, whose steps are straight
-
 _REACH = 2.0  # change of the logarithm of a distance to a bound in a unit step
-
 _DAMPING = 1e-5  # of the acceleration along directions that the response hardly sees
-
+_BENT = 1.0  # part of a step that its bend may be at most
 _EXACT = 1e-7  # relative residual of a realisation in a canonical form
-
 _NUDGE = 1e-2  # relative change of all entries that makes a model a generic one
-
 _MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
-
 _SAME_NORM = 1e-7  # relative difference that rounding may make
 
 
@@ -72,32 +65,12 @@ def _units(R: Array) -> Array:
 class ResponseGeometry:
     """Response at one theta, its derivatives, and coordinates of its metric.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    theta : ndarray of shape (n_params,)
-    omega : ndarray of shape (k,)
-        Frequencies, rad/s.
-    size : float
-        Change of the response (root mean square over frequency) of a unit step.
-    G0 : ndarray of shape (k, n_outputs, n_inputs), default=None
-        Response that `at` holds the error to; by default zero.
-    pull : ndarray of shape (k, n_params), default=None
-        Gradients of logarithms that a unit step shall change by less than about
-        `_REACH`: those of the distances to bounds.
-
-    Attributes
-    ----------
-    T, inverse : ndarray of shape (n_params, n_params)
-        ``theta + T y``, and back.
-    at : ErrorPoint
-        Without the weight.
-    S : ndarray of shape (n_params, n + n_outputs, n + n_inputs)
-        Derivatives of the system matrix.
-    L : ndarray of shape (k, n_outputs, n + n_outputs)
-        That of `at` behind the weight.
-    products : ndarray of shape (k, n_outputs * n_params, n + n_inputs)
-        ``L S_j``: the derivatives of the error are ``L S_j R``.
+    A unit step in y, ``theta + T y``, changes the response at the frequencies `omega`
+    by `size` (root mean square), and the logarithms whose gradients are the rows of
+    `pull` (those of distances to bounds) by less than about `_REACH`. `S` holds the
+    derivatives of the system matrix, `L` that of the point `at` behind the weight, and
+    `products` ``L S_j`` (k, n_outputs * n_params, n + n_inputs): the error changes by
+    ``L S_j R``.
     """
 
     def __init__(
@@ -106,12 +79,10 @@ class ResponseGeometry:
         theta: Array,
         omega: Array,
         size: float,
-        G0: Complex | None = None,
         pull: Array | None = None,
     ) -> None:
         structure, self.n = system.structure, system.n
-        zero = np.zeros((1, system.n_outputs, system.n_inputs), complex)
-        self.at: ErrorPoint = system.point(theta, omega, zero if G0 is None else G0)
+        self.at = system.point(theta, omega)
         self.S = structure.jacobian(theta)
         self._bend = structure.curvature(theta)
         self.L = system.weight_response(omega)[0] @ self.at.L
@@ -179,22 +150,36 @@ class ResponseGeometry:
         return self.T.T @ H @ self.T
 
 
+class Geodesics:
+    """Geodesics of the response through one theta, in coordinates ``theta + T d``."""
+
+    def __init__(self, system: ErrorSystem, theta: Array, T: Array) -> None:
+        self._geometry = ResponseGeometry(system, theta, system.grid, 1.0)
+        self._system, self._theta, self._T = system, theta, T
+        self._inverse = np.linalg.inv(T)
+        self._local = self._geometry.inverse @ T
+
+    def step(self, d: Array) -> Array:
+        """End of the geodesic that leaves along `d`, within the parameters' bounds."""
+        local = self._local @ d
+        a = self._geometry.acceleration(local)
+        most = _BENT * float(np.linalg.norm(local))
+        a *= min(1.0, most / max(float(np.linalg.norm(a)), 1e-300))
+        end = self._theta + self._T @ d + 0.5 * self._geometry.T @ a
+        return self._inverse @ (within_bounds(self._system, end) - self._theta)
+
+    def curvature(self, gradient: Array) -> Array:
+        """What the bend of the geodesics adds to a Hessian of that gradient."""
+        local = np.asarray(np.linalg.solve(self._local.T, gradient))
+        normal = -self._geometry.tangential(local)
+        return self._local.T @ self._geometry.second_derivatives(normal) @ self._local
+
+
 class LocalChart:
     """The models near one, as an affine structure; zero is that model.
 
-    Parameters
-    ----------
-    S : ndarray of shape (order + n_outputs, order + n_inputs)
-        System matrix of a stable, minimal model.
-    order : int
-    dt : float or None
-    feedthrough : bool
-        Whether D is free.
-
-    Raises
-    ------
-    ValueError
-        If the model is not minimal: no neighbourhood of it is smooth.
+    From the system matrix `S` of a stable model; where it is not minimal, no
+    neighbourhood of it is smooth: ValueError. `feedthrough`: whether D is free.
     """
 
     is_affine = True
@@ -266,13 +251,7 @@ def _without_basis_changes(S: Array, n: int) -> Array:
 
 
 class CanonicalForm:
-    """An affine structure in which every model of its order has its own parameters.
-
-    Parameters
-    ----------
-    structure : GrayBoxStructure
-    dt : float or None
-    """
+    """An affine structure in which every model of its order has its own parameters."""
 
     def __init__(self, structure: Any, dt: float | None) -> None:
         self.structure, self.dt = structure, dt
@@ -327,33 +306,18 @@ class CanonicalForm:
 
 @dataclass(frozen=True)
 class View:
-    """The problem near one point, in coordinates that suit it.
-
-    Attributes
-    ----------
-    system : ErrorSystem
-    theta : ndarray of shape (n_params,)
-        The point.
-    limits : Limits
-    back : callable
-        Coordinates to parameters of the structure, or None where these do not exist.
-    """
+    """The problem near one point, in coordinates that suit it."""
 
     system: ErrorSystem
-    theta: Array
+    theta: Array  # the point
     limits: Limits
-    back: Callable[[Array], Array | None]
+    back: Callable[[Array], Array | None]  # to the structure's parameters, or None
 
 
 def view_at(
     system: ErrorSystem, theta: Array, limits: Limits, form: CanonicalForm | None
 ) -> View:
-    """The structure's own parameters, or a chart around the model of a canonical form.
-
-    Parameters
-    ----------
-    form : CanonicalForm or None
-    """
+    """The parameters themselves, or a chart around the model of a canonical form."""
     plain = View(system, theta, limits, lambda x: x)
     if form is None:
         return plain

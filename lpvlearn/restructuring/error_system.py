@@ -11,21 +11,111 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.hinf_norm import PeakSet, linf_norm
-from .transfer import Target, laplace_variable, model_derivatives, resolvent, series
+from ..systems.response import pole_grid, pole_rates
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _CONSTANT = 1e-7  # relative change of an error that no parameter changes
+_MOVE = 0.1  # of the parameters that tells: far beyond rounding, the same model still
+_TINY_PART = 1e-3  # of the largest parameter: smaller ones move as if they were that
+_RESPONSE_ROUNDING = 1e-12  # of a response, whose digits the error has lost
 
 # singular values are told apart down to that fraction of the largest: their gap divides
 _GAP = 1e-10
+
+
+@dataclass(frozen=True)
+class Target:
+    """A model by its matrices; `dt` None is continuous time."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    dt: float | None = None
+
+    def repeated(self, copies: int) -> Target:
+        """The model side by side, once for every channel: block-diagonal."""
+        eye = np.eye(copies)
+        parts = (self.A, self.B, self.C, self.D)
+        A, B, C, D = (np.asarray(np.kron(eye, M), dtype=float) for M in parts)
+        return Target(A, B, C, D, self.dt)
+
+
+def laplace_variable(
+    omega: Array, dt: float | None
+) -> tuple[Complex, Complex, Complex]:
+    """``s(omega)`` and its two derivatives: ``j omega`` or ``exp(j omega dt)``."""
+    if dt is None:
+        zero = np.zeros(len(omega), complex)
+        s = zero.copy()
+        s.imag = omega  # 1j * inf is not a number
+        return s, zero + 1j, zero
+    z = np.exp(1j * omega * dt)
+    return z, 1j * dt * z, -(dt**2) * z
+
+
+def resolvent(A: Array, s: Complex) -> Complex:
+    """``(s I - A)^-1`` for every `s`; zero at infinity."""
+    finite = np.isfinite(s)
+    M = np.where(finite, s, 0.0)[:, None, None] * np.eye(len(A)) - A
+    if not finite.all():
+        M[~finite] = np.eye(len(A))
+    inverse: Complex = np.linalg.inv(M.astype(complex))
+    inverse[~finite] = 0.0
+    return inverse
+
+
+def model_derivatives(model: Target, omega: Array) -> tuple[Complex, Complex, Complex]:
+    """Frequency response of a model and its first two derivatives in frequency."""
+    s, s1, s2 = laplace_variable(omega, model.dt)
+    s1, s2 = s1[:, None, None], s2[:, None, None]
+    P = resolvent(model.A, s)
+    PB = P @ model.B
+    X = P @ PB
+    first = -s1 * (model.C @ X)
+    second = 2.0 * s1**2 * (model.C @ (P @ X)) - s2 * (model.C @ X)
+    return model.C @ PB + model.D, first, second
+
+
+def series(
+    A: Array, B: Array, C: Array, D: Array, weight: Target
+) -> tuple[Array, Array, Array, Array]:
+    """Realisation of the weight after a model."""
+    n, k = len(A), len(weight.A)
+    As = np.zeros((n + k, n + k))
+    As[:n, :n], As[n:, n:] = A, weight.A
+    As[n:, :n] = weight.B @ C
+    return (
+        As,
+        np.vstack([B, weight.B @ D]),
+        np.hstack([weight.D @ C, weight.C]),
+        weight.D @ D,
+    )
+
+
+def frequency_grid(poles: NDArray, dt: float | None, n_points: int = 60) -> Array:
+    """Frequencies (rad/s) that see every pole: logarithmic, and around resonances.
+
+    From `poles` in the time domain of `dt`; ends at the Nyquist frequency.
+    """
+    rates = pole_rates(poles, dt)
+    size = np.abs(rates)
+    size = size[size > 0]
+    low, high = (size.min(), size.max()) if size.size else (1.0, 1.0)
+    around = pole_grid(rates, low / 20, high * 10, n_points, [-1.0, 0.0, 1.0])
+    grid = np.append(around, size)
+    if dt is not None:
+        grid = grid[grid < np.pi / dt]
+    return np.unique(grid[grid > 0])
 
 
 class Structure(Protocol):
@@ -44,15 +134,15 @@ class Structure(Protocol):
 
 
 @dataclass(frozen=True)
-class ErrorPoint:
-    """Quantities at one theta and several frequencies (leading axis k).
+class ResponsePoint:
+    """The gray-box response at one theta and several frequencies (leading axis k).
 
-    ``E = G(theta) - G0``, ``dE_j = L S_j R``, and ``Phi = (s I - A)^-1``.
+    ``dG_j = L S_j R``, and ``Phi = (s I - A)^-1``.
     """
 
     L: Complex  # (k, n_outputs, n + n_outputs)
     R: Complex  # (k, n + n_inputs, n_inputs)
-    E: Complex  # (k, n_outputs, n_inputs)
+    G: Complex  # (k, n_outputs, n_inputs), the response
     Phi: Complex  # (k, n, n)
 
 
@@ -118,6 +208,7 @@ class ErrorSystem:
         self.n = structure.order
         # steps and trial steps watch the same frequencies
         self.target_response = remembering(self._target_response)
+        self.weight_response = remembering(self._weight_response)
         self.n_outputs, self.n_inputs = target.D.shape
         self.fastest = float(np.abs(np.linalg.eigvals(target.A)).max(initial=0.0))
         self.weight = weight
@@ -143,21 +234,27 @@ class ErrorSystem:
             turns = np.angle(poles) / self.dt
         return turns[turns > 0]
 
+    @cached_property
+    def grid(self) -> Array:
+        """Frequencies at which a search watches the error, rad/s."""
+        return frequency_grid(np.linalg.eigvals(self.target.A), self.dt)
+
     def peaks(self, theta: Array, within: float | None = None) -> PeakSet:
         """H-infinity norm of the error and its local maxima over frequency.
 
         The gray-box model must be stable: the level-set method measures the
         L-infinity norm, which stays finite (and meaningless) beyond the boundary.
         """
+        return linf_norm(*self.realisation(theta), dt=self.dt, within=within)
+
+    def realisation(self, theta: Array) -> tuple[Array, Array, Array, Array]:
+        """Matrices of the error: states of the gray box, the target, the weight."""
         A, B, C, D = self.split(self.structure.system_matrix(theta))
-        t = self.target
-        n, n0 = self.n, len(t.A)
-        Ae = np.zeros((n + n0, n + n0))
+        t, n, N = self.target, self.n, self.n + len(self.target.A)
+        Ae = np.zeros((N, N))
         Ae[:n, :n], Ae[n:, n:] = A, t.A
-        Be, Ce, De = np.vstack([B, t.B]), np.hstack([C, -t.C]), D - t.D
-        if self.weight is not None:
-            Ae, Be, Ce, De = series(Ae, Be, Ce, De, self.weight)
-        return linf_norm(Ae, Be, Ce, De, dt=self.dt, within=within)
+        parts = Ae, np.vstack([B, t.B]), np.hstack([C, -t.C]), D - t.D
+        return parts if self.weight is None else series(*parts, self.weight)
 
     def restructured(self, structure: Structure) -> ErrorSystem:
         """The error of another structure."""
@@ -171,14 +268,11 @@ class ErrorSystem:
             weight = Target(*total, weight.dt)
         return ErrorSystem(self.structure, self.target, weight)
 
-    def weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+    def _weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
         """``W`` and its first two derivatives along the frequency, (k, p, p)."""
         if self.weight is None:
-            eye = np.broadcast_to(
-                np.eye(self.n_outputs), (len(omega),) + (self.n_outputs,) * 2
-            )
-            zero = np.zeros_like(eye)
-            return eye.astype(complex), zero.astype(complex), zero.astype(complex)
+            eye = np.tile(np.eye(self.n_outputs, dtype=complex), (len(omega), 1, 1))
+            return eye, np.zeros_like(eye), np.zeros_like(eye)
         return model_derivatives(self.weight, omega)
 
     def _target_response(self, omega: Array) -> Complex:
@@ -198,13 +292,11 @@ class ErrorSystem:
 
     def response_jacobian(self, theta: Array, omega: Array) -> tuple[Complex, Complex]:
         """Response and its derivatives, shapes (k, p, m) and (k, p, m, n_params)."""
-        at = self.point(
-            theta, omega, np.zeros((1, self.n_outputs, self.n_inputs), complex)
-        )
-        return at.E, derivatives(at.L, self.structure.jacobian(theta), at.R)
+        at = self.point(theta, omega)
+        return at.G, derivatives(at.L, self.structure.jacobian(theta), at.R)
 
-    def point(self, theta: Array, omega: Array, G0: Complex) -> ErrorPoint:
-        """The error without its weight, and what its derivatives are made of."""
+    def point(self, theta: Array, omega: Array) -> ResponsePoint:
+        """The response, and what its derivatives are made of."""
         A, B, C, D = self.split(self.structure.system_matrix(theta))
         Phi = resolvent(A, laplace_variable(omega, self.dt)[0])
         k, p, m = len(omega), self.n_outputs, self.n_inputs
@@ -212,25 +304,40 @@ class ErrorSystem:
         L[:, :, : self.n], L[:, :, self.n :] = C @ Phi, np.eye(p)
         R = np.empty((k, self.n + m, m), complex)
         R[:, : self.n], R[:, self.n :] = Phi @ B, np.eye(m)
-        return ErrorPoint(L, R, C @ R[:, : self.n] + D - G0, Phi)
+        G = np.asarray(C @ R[:, : self.n] + D, dtype=complex)
+        return ResponsePoint(L, R, G, Phi)
+
+    def weighted_error(self, theta: Array, omega: Array) -> Complex:
+        """``W (G(theta) - G0)``, shape (k, n_outputs, n_inputs)."""
+        E = self.response(theta, omega) - self.target_response(omega)
+        return self.weight_response(omega)[0] @ E
+
+    def linearised_error(
+        self, theta: Array, omega: Array, unit: float = 1.0
+    ) -> tuple[Complex, Callable[[], Complex]]:
+        """The weighted error in that unit, and a function that gives its derivatives.
+
+        Shapes (k, n_outputs, n_inputs) and (k, n_outputs, n_inputs, n_params).
+        """
+        at, W = self.point(theta, omega), self.weight_response(omega)[0] / unit
+
+        def slopes() -> Complex:
+            return derivatives(W @ at.L, self.structure.jacobian(theta), at.R)
+
+        return W @ (at.G - self.target_response(omega)), slopes
 
     def values(self, theta: Array, omega: Array) -> Array:
         """Largest singular values at the frequencies, shape (k,)."""
-        E = self.response(theta, omega) - self.target_response(omega)
-        W = self.weight_response(omega)[0]
-        return np.asarray(np.linalg.norm(W @ E, 2, axis=(1, 2)))
+        E = self.weighted_error(theta, omega)
+        return np.asarray(np.linalg.norm(E, 2, axis=(1, 2)))
 
     def gradients(self, theta: Array, omega: Array) -> tuple[Array, Array]:
         """Largest singular values and their gradients, Eq. (20) for sigma itself.
 
-        Returns
-        -------
-        sigma : ndarray of shape (k,)
-        gradients : ndarray of shape (k, n_params)
+        Shapes (k,) and (k, n_params).
         """
-        at = self.point(theta, omega, self.target_response(omega))
-        W = self.weight_response(omega)[0]
-        U, sigma, Vh = np.linalg.svd(W @ at.E)
+        at, W = self.point(theta, omega), self.weight_response(omega)[0]
+        U, sigma, Vh = np.linalg.svd(W @ (at.G - self.target_response(omega)))
         left = np.einsum("kp,kpq,kqa->ka", U[:, :, 0].conj(), W, at.L)
         right = np.einsum("kbm,km->kb", at.R, Vh[:, 0].conj())
         outer = np.real(left[:, :, None] * right[:, None, :])
@@ -245,30 +352,25 @@ class ErrorSystem:
         """
         structure = self.structure
         size = np.abs(theta)
-        size = np.maximum(size, 1e-3 * size.max(initial=0.0))
+        size = np.maximum(size, _TINY_PART * size.max(initial=0.0))
         size = np.where(size > 0, size, 1.0)
-        G0 = self.target_response(omega)
-        here = self.point(theta, omega, G0).E
-        top = np.abs(here).max((1, 2))
+        G0, here = self.target_response(omega), self.response(theta, omega)
+        noise = _RESPONSE_ROUNDING * np.abs(G0).max((1, 2))
+        most = _CONSTANT * np.abs(here - G0).max((1, 2)) + noise
         same = np.ones(len(omega), bool)
-        for turn in (1.0, 2.0):
-            step = 0.1 * size * np.cos(turn + np.arange(len(theta)) ** 2)
+        for turn in (1.0, 2.0):  # two moves in directions that no structure prefers
+            step = _MOVE * size * np.cos(turn + np.arange(len(theta)) ** 2)
             other = np.clip(theta + step, structure.lower, structure.upper)
             if not np.isfinite(self.poles(other)).all():
                 continue
-            change = np.abs(self.point(other, omega, G0).E - here).max((1, 2))
-            same &= change <= _CONSTANT * top + 1e-12 * np.abs(G0).max((1, 2))
+            same &= np.abs(self.response(other, omega) - here).max((1, 2)) <= most
         return same
 
     def hessians(self, theta: Array, omega: Array, moving: NDArray[np.bool_]) -> Array:
         """Second derivatives of the singular values at the given frequencies.
 
         Where `moving`, the frequency is a local maximum that follows the parameters,
-        ``H = sigma_tt - sigma_tw sigma_tw^T / sigma_ww``.
-
-        Returns
-        -------
-        ndarray of shape (k, n_params, n_params)
+        ``H = sigma_tt - sigma_tw sigma_tw^T / sigma_ww``; (k, n_params, n_params).
         """
         q = self.structure.n_params
         joint = self.joint_hessians(theta, omega)
@@ -287,10 +389,11 @@ class ErrorSystem:
         p, m = self.n_outputs, self.n_inputs
         _, s1, s2 = laplace_variable(omega, self.dt)
         G0, G0_1, G0_2 = self._target_derivatives(omega)
-        at = self.point(theta, omega, G0)
-        A, B, C, _ = self.split(self.structure.system_matrix(theta))
+        at = self.point(theta, omega)
+        E = at.G - G0
+        _, B, C, _ = self.split(self.structure.system_matrix(theta))
         W, W1, W2 = self.weight_response(omega)
-        U, sigma, Vh = np.linalg.svd(W @ at.E)
+        U, sigma, Vh = np.linalg.svd(W @ E)
         out = np.empty((len(omega), q + 1, q + 1))
         for k in range(len(omega)):
             u, v = U[k, :, 0], Vh[k, 0].conj()
@@ -301,7 +404,7 @@ class ErrorSystem:
             dE[:q] = W[k] @ L @ S @ R
             first, second = _frequency_derivatives(Phi, B, C, s1[k], s2[k])
             first, second = first - G0_1[k], second - G0_2[k]
-            dE[q] = W1[k] @ at.E[k] + W[k] @ first
+            dE[q] = W1[k] @ E[k] + W[k] @ first
             # u^H (d2E) v: pairs of parameters, parameter and frequency, frequency
             mixed = (left @ S)[:, :n] @ Phi @ (S[:, :n] @ right).T
             d2 = np.zeros((q + 1, q + 1), complex)
@@ -313,7 +416,7 @@ class ErrorSystem:
             dright = -s1[k] * (Phi @ right[:n])
             cross = (dleft @ S) @ right + (left @ S[:, :, :n]) @ dright
             d2[:q, q] = d2[q, :q] = cross
-            bend = u.conj() @ W2[k] @ at.E[k] + 2.0 * (uW1 @ first) + uW @ second
+            bend = u.conj() @ W2[k] @ E[k] + 2.0 * (uW1 @ first) + uW @ second
             d2[q, q] = bend @ v
             out[k] = np.real(d2) + _coupling(dE, U[k], sigma[k], Vh[k])
         return out
@@ -325,11 +428,8 @@ def vanishing_weight(system: ErrorSystem, omega: float) -> Target | None:
     ``s / (s + c)`` with `c` the fastest pole of the black box, or ``c / (s + c)`` with
     the slowest; None for a frequency in between.
     """
-    poles = np.linalg.eigvals(system.target.A).astype(complex)
     dt = system.dt
-    if dt is not None:
-        poles = np.log(np.where(poles == 0, 1e-300, poles)) / dt
-    size = np.abs(poles)
+    size = np.abs(pole_rates(np.linalg.eigvals(system.target.A), dt))
     size = size[size > 0]
     if size.size == 0 or (0 < omega < np.inf):
         return None

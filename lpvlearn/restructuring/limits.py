@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .error_system import ErrorSystem
+from .error_system import ErrorSystem, Target
 
 Array = NDArray[np.float64]
-
 Complex = NDArray[np.complex128]
 
 # Poles that much faster than the black box are those of a mass that went to zero:
 # they change nothing any more, and take the digits of all others.
 _FASTEST = 1e6
-
+_MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
 _LEEWAY = 0.2  # part of the margin that a step may use
 
 
@@ -23,6 +22,13 @@ def growth(poles: Complex, dt: float | None) -> Array:
     if dt is None:
         return poles.real
     return np.log(np.maximum(np.abs(poles), 1e-300)) / dt
+
+
+def natural_margin(target: Target) -> float:
+    """The stability margin (1/s) that a black box lets expect."""
+    poles = np.linalg.eigvals(target.A).astype(complex)
+    slowest = np.abs(growth(poles, target.dt)).min(initial=np.inf)
+    return _MARGIN * float(slowest) if np.isfinite(slowest) else 0.0
 
 
 def keeps_margin(system: ErrorSystem, theta: Array, margin: float) -> bool:
@@ -49,11 +55,7 @@ def within_bounds(system: ErrorSystem, theta: Array) -> Array:
 class Limits:
     """The limits as smooth constraints ``c(theta) <= 0``.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    margin : float
-        Growth rates stay below ``-margin`` (1/s).
+    Growth rates stay below ``-margin`` (1/s).
     """
 
     def __init__(self, system: ErrorSystem, margin: float) -> None:

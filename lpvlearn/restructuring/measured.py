@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..systems.hinf_norm import PeakSet
 from ..systems.sampling import d2c_tustin
 from ..validation import real_array
-from .error_system import ErrorSystem, Structure
-from .transfer import Target, model_derivatives
+from .error_system import ErrorSystem, Structure, Target, model_derivatives
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -48,6 +47,7 @@ class MeasuredErrorSystem(ErrorSystem):
         order = np.argsort(omega)
         self.omega, self.G = omega[order], G[order]
         self.fastest = float(self.omega[-1])
+        self.grid = self.omega
         unit = np.broadcast_to(np.eye(n_outputs), (len(omega), n_outputs, n_outputs))
         self.W = (unit if weight is None else weight[order]).astype(complex)
 
@@ -64,7 +64,7 @@ class MeasuredErrorSystem(ErrorSystem):
         """None: no frequency lies between the measured ones."""
         return np.zeros(0)
 
-    def weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
+    def _weight_response(self, omega: Array) -> tuple[Complex, Complex, Complex]:
         """The weight at some of the measured frequencies."""
         W = self.W[np.searchsorted(self.omega, omega)]
         return W, np.zeros_like(W), np.zeros_like(W)

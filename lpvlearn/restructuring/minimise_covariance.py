@@ -38,11 +38,9 @@ from scipy.stats import chi2
 from ..models.statespace import StateSpace
 from ..subspace.statistics import DEVIATION, ModelPair
 from ..systems.least_squares import levenberg_marquardt
-from .error_system import ErrorSystem, Structure
-from .least_squares import grid_and_margin
-from .limits import Limits
+from .error_system import ErrorSystem, Structure, Target, frequency_grid
+from .limits import Limits, natural_margin
 from .sampled_structure import SampledStructure
-from .transfer import Target
 
 Array = NDArray[np.float64]
 
@@ -170,7 +168,7 @@ def efficient_parameters(
     """
     first = estimates[0][0]
     target = Target(first.A, first.B, first.C, first.D, first.sampling_time)
-    omega, margin = grid_and_margin(target)
+    omega, margin = frequency_grid(first.poles(), target.dt), natural_margin(target)
     found = [uncertain_response(model, pairs, omega) for model, pairs in estimates]
     boxes = [box for box in found if box is not None]
     if len(boxes) < len(found):

@@ -13,17 +13,14 @@ from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 from scipy.optimize import minimize
 
 from ..minimax.problem import MinimaxResult, Peaks
-from .central_path import search_grid
 from .coordinates import metric_coordinates
-from .error_system import ErrorSystem, derivatives
+from .error_system import ErrorSystem
 from .least_squares import LeastSquaresResult
 from .limits import Limits, keeps_margin, within_bounds
-from .transfer import series
 
 Array = NDArray[np.float64]
 
 _NO_FEEDTHROUGH = 1e-9  # relative size of a feedthrough that is rounding noise
-
 _REFUSED = 1e3  # squared error, relative to the start, of a model that is not stable
 
 
@@ -31,21 +28,10 @@ def squared_h2(system: ErrorSystem, theta: Array) -> tuple[float, Array]:
     """Squared H2 norm of the weighted error, and its gradient.
 
     In continuous time the feedthrough of the error must vanish; it is left out.
-
-    Returns
-    -------
-    J : float
-    gradient : ndarray of shape (n_params,)
     """
-    structure, t, n = system.structure, system.target, system.n
-    A, B, C, D = system.split(structure.system_matrix(theta))
-    N, p = n + len(t.A), system.n_outputs
-    Ae = np.zeros((N, N))
-    Ae[:n, :n], Ae[n:, n:] = A, t.A
-    Be, Ce, De = np.vstack([B, t.B]), np.hstack([C, -t.C]), D - t.D
-    As, Bs, Cs, Ds, w = Ae, Be, Ce, De, system.weight
-    if w is not None:
-        As, Bs, Cs, Ds = series(Ae, Be, Ce, De, w)
+    structure, n, p, w = system.structure, system.n, system.n_outputs, system.weight
+    N = n + len(system.target.A)
+    As, Bs, Cs, Ds = system.realisation(theta)
     if system.dt is None:
         P = solve_continuous_lyapunov(As, -Bs @ Bs.T)
         Q = solve_continuous_lyapunov(As.T, -Cs.T @ Cs)
@@ -79,26 +65,13 @@ def minimise_h2(
 ) -> tuple[Array, MinimaxResult]:
     """Minimise the H2 norm by a quasi-Newton method from a least-squares fit.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    fit : LeastSquaresResult
-        Start.
-    margin : float
-        Stability margin, 1/s.
-
-    Raises
-    ------
-    ValueError
-        If the error has a feedthrough in continuous time: its H2 norm is infinite.
+    A ValueError where the error has a feedthrough in continuous time: its H2 norm is
+    infinite.
     """
     theta0, active = _matched_feedthrough(system, fit.x)
     J0, _ = squared_h2(system, theta0)
     scale = np.sqrt(J0) if J0 > 0 else 1.0
-    grid = search_grid(system)
-    at = system.point(theta0, grid, system.target_response(grid))
-    L = system.weight_response(grid)[0] @ at.L
-    J = derivatives(L, system.structure.jacobian(theta0)[active], at.R)
+    J = system.linearised_error(theta0, system.grid)[1]()[..., active]
     T = metric_coordinates(J, max(np.sqrt(fit.cost), negligible, 1e-300))
     bounded = np.isfinite([system.structure.lower, system.structure.upper]).any()
     if bounded:  # coordinates in which the bounds stay bounds

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ..minimax.bundle import proximal_bundle
 from ..minimax.problem import Flags, MinimaxProblem, MinimaxResult, Peaks
 from ..minimax.sqp import minimax_sqp
-from .central_path import PathPoint, central_path, search_grid
-from .coordinates import CanonicalForm, ResponseGeometry, view_at
+from .central_path import PathPoint, central_path
+from .coordinates import CanonicalForm, Geodesics, ResponseGeometry, view_at
 from .error_system import ErrorSystem, vanishing_weight
 from .least_squares import LeastSquaresResult, fit_frequency_response
 from .limits import Limits, within_bounds
@@ -25,48 +25,31 @@ from .limits import Limits, within_bounds
 Array = NDArray[np.float64]
 
 _DEPTH = 0.6  # peaks down to that fraction below the objective enter the local model
-
 _FLAT = 1e-7  # a peak with a smaller relative gradient does not depend on theta
-
 _CAP_TOLERANCE = 1e-7  # relative excess over the cap that rounding may make
-
 _MAX_CAPS = 12  # frequencies at which the cap is a constraint: the last ones met
-
-_BENT = 1.0  # part of a step that its bend may be at most
 
 # depths at which peaks that move are looked for below high constant ones
 _HARD_STEPS = (0.99, 0.9999)
-
 _STATIONARY = 1e-8  # shortest subgradient of an optimum, relative to the objective
-
 _NEARLY = 1e-3  # stationarity up to which no more is said
 
 # mu at the end of a round on the central path, and iterations of the solver from there;
 # the next round if these do not converge
 _ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
-
 _BUNDLE_PACE = 10  # as many iterations of a first-order method
-
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
-
 _PROGRESS = 1e-9  # a round that converged and brings less is the last one
-
 _AHEAD = 0.98  # the path is left for a point that much below it
 
 # mu to which the path is followed from several fits, how many are kept there, and the
 # most steps of each: its norm soon tells more of a basin than the least-squares error
 _EXPLORED = ((1e-2, 2, 40), (1e-3, 1, 60))
-
 _FITS = 6  # basins that are followed at most
-
 _APART = 1e-4  # relative difference of the costs of different basins
-
 _ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
-
 _RADIUS = 0.1  # first trust-region radius of the solver
-
 _REMAINDER_TOLERANCE = 1e-3  # the choice among optimal points is soon good enough
-
 _REMAINDER_STEPS = 20  # iterations for that choice
 
 
@@ -74,31 +57,17 @@ _REMAINDER_STEPS = 20  # iterations for that choice
 class HinfObjective:
     """Peaks of the error in the coordinates y, with constant peaks set aside.
 
-    Attributes
-    ----------
-    system : ErrorSystem
-    theta0 : ndarray of shape (n_params,)
-    T : ndarray of shape (n_params, n_params)
-    limits : Limits
-        Of stability, speed, and the parameters' bounds.
-    grid : ndarray
-        Frequencies (rad/s) at which the search watches the error.
-    cap : float
-        With `capped`: its norm stays below that.
-    capped : ErrorSystem or None
-        The error whose norm is bounded while that of `system` is minimised.
-    floor, floor_frequency : float
-        Highest peak met so far whose value does not depend on the parameters.
+    With `capped`, the norm of that error stays below `cap` while that of `system` is
+    minimised.
     """
 
     system: ErrorSystem
     theta0: Array
     T: Array
-    limits: Limits
-    grid: Array
+    limits: Limits  # of stability, speed, and the parameters' bounds
     cap: float = np.inf
     capped: ErrorSystem | None = None
-    floor: float = 0.0
+    floor: float = 0.0  # highest peak met whose value does not depend on parameters
     floor_frequency: float = 0.0
     _top: float = 0.0
     _cap_frequencies: Array = field(default_factory=lambda: np.zeros(0))
@@ -187,7 +156,7 @@ class HinfObjective:
 
     def curve(self, y: Array) -> Geodesics:
         """Geodesics of the response through `y`."""
-        return Geodesics(self, self.theta(y))
+        return Geodesics(self.system, self.theta(y), self.T)
 
     def problem(self) -> MinimaxProblem:
         """The callbacks of the minimax solvers."""
@@ -197,34 +166,9 @@ class HinfObjective:
             self.values,
             self.hessians,
             self.constraints,
-            self.grid,
+            self.system.grid,
             self.curve,
         )
-
-
-class Geodesics:
-    """Geodesics of the response through one theta, in the coordinates of a problem."""
-
-    def __init__(self, objective: HinfObjective, theta: Array) -> None:
-        self._geometry = ResponseGeometry(objective.system, theta, objective.grid, 1.0)
-        self._system, self._theta, self._T = objective.system, theta, objective.T
-        self._inverse = np.linalg.inv(objective.T)
-        self._local = self._geometry.inverse @ objective.T
-
-    def step(self, d: Array) -> Array:
-        """End of the geodesic that leaves along `d`, within the parameters' bounds."""
-        local = self._local @ d
-        a = self._geometry.acceleration(local)
-        most = _BENT * float(np.linalg.norm(local))
-        a *= min(1.0, most / max(float(np.linalg.norm(a)), 1e-300))
-        end = self._theta + self._T @ d + 0.5 * self._geometry.T @ a
-        return self._inverse @ (within_bounds(self._system, end) - self._theta)
-
-    def curvature(self, gradient: Array) -> Array:
-        """What the bend of the geodesics adds to a Hessian of that gradient."""
-        local = np.asarray(np.linalg.solve(self._local.T, gradient))
-        normal = -self._geometry.tangential(local)
-        return self._local.T @ self._geometry.second_derivatives(normal) @ self._local
 
 
 Solver = Callable[..., MinimaxResult]
@@ -244,34 +188,16 @@ def minimise_hinf(
 ) -> tuple[Array, MinimaxResult, float]:
     """Minimise the H-infinity norm of the error from least-squares fits.
 
-    Parameters
-    ----------
-    system : ErrorSystem
-    fits : list of LeastSquaresResult
-        Stable starts, by ascending cost; the first one gives the metric of the steps.
-    margin : float
-        Stability margin, 1/s.
-    solver : callable
-        One of `SOLVERS`.
-    max_iter : int
-        Newton steps on the central path and iterations of the solver, in all.
-    negligible : float
-        Errors at or below it are rounding noise.
+    `fits` are stable starts by ascending cost, of which the first gives the metric of
+    the steps; errors not above `negligible` are rounding noise; `max_iter` counts
+    Newton steps on the central path and iterations of the solver, in all. Returns the
+    parameters, the result for the peaks that depend on them, and the highest constant
+    peak (0 for none).
 
-    Returns
-    -------
-    theta : ndarray of shape (n_params,)
-    result : MinimaxResult
-        Of the peaks that depend on the parameters.
-    floor : float
-        Highest constant peak (0 where there is none).
-
-    Notes
-    -----
-    Where the floor is above all other peaks, the start is already optimal, and so is
+    Where that floor is above all other peaks, the start is already optimal, and so is
     every theta that keeps the others below it. Then a weight that vanishes at the
     floor's frequency sets it aside, and the norm of what remains is minimised among
-    these optimal points.
+    these points.
     """
     theta0 = fits[0].x
     start = system.peaks(theta0)
@@ -281,9 +207,9 @@ def minimise_hinf(
         peaks = Peaks(start.values, start.frequencies, flat, still)
         return theta0, MinimaxResult(theta0, peaks, 0.0, np.inf, True, 0), 0.0
     origin = np.zeros(len(theta0))
-    limits, grid = Limits(system, margin), search_grid(system)
-    T = ResponseGeometry(system, theta0, grid, start.norm).T
-    objective = HinfObjective(system, theta0, T, limits, grid)
+    limits = Limits(system, margin)
+    T = ResponseGeometry(system, theta0, system.grid, start.norm).T
+    objective = HinfObjective(system, theta0, T, limits)
     first = objective.peaks(origin)
     options: dict[str, Any] = {"tol": tol, "negligible": negligible}
     if first is None or objective.floor < first.top:
@@ -438,10 +364,9 @@ def _ended(
 ) -> tuple[Array, MinimaxResult, float]:
     """End of a solver that starts at `theta`, its result, and the highest floor met."""
     view = view_at(system, theta, limits, form)
-    grid = search_grid(system)
     size = max(view.system.peaks(view.theta).norm, 1e-300)
-    T = ResponseGeometry(view.system, view.theta, grid, size).T
-    objective = HinfObjective(view.system, view.theta, T, view.limits, grid)
+    T = ResponseGeometry(view.system, view.theta, view.system.grid, size).T
+    objective = HinfObjective(view.system, view.theta, T, view.limits)
     result = solver(
         objective.problem(), np.zeros(len(view.theta)), radius=_RADIUS, **options
     )
@@ -460,20 +385,13 @@ def _minimise_remainder(
     options: dict[str, Any],
 ) -> tuple[Array, MinimaxResult]:
     """Minimise the weighted remainder while the error stays on its floor."""
-    grid = search_grid(system)
-    eye = np.eye(len(theta0))
-    bound = HinfObjective(remainder, theta0, eye, limits, grid, floor, system)
-    fit = fit_frequency_response(
-        remainder,
-        theta0,
-        grid,
-        remainder.target_response(grid),
-        admissible=bound.admissible,
-    )
+    grid, eye = system.grid, np.eye(len(theta0))
+    bound = HinfObjective(remainder, theta0, eye, limits, floor, system)
+    fit = fit_frequency_response(remainder, theta0, grid, admissible=bound.admissible)
     assert fit is not None  # theta0 is admissible
     size = max(remainder.peaks(fit.x).norm, 1e-300)
     T = ResponseGeometry(remainder, fit.x, grid, size).T
-    objective = HinfObjective(remainder, fit.x, T, limits, grid, floor, system)
+    objective = HinfObjective(remainder, fit.x, T, limits, floor, system)
     # the optimum is certified by the floor; what follows chooses among optimal points
     options = options | {
         "tol": max(options["tol"], _REMAINDER_TOLERANCE),

@@ -20,16 +20,14 @@ from scipy.linalg import block_diag, qr
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
-from .error_system import ErrorSystem
+from .error_system import ErrorSystem, Target, series
 from .least_squares import (
     LeastSquaresResult,
     channel_scaling,
     fit_frequency_response,
-    grid_and_margin,
 )
-from .limits import growth, keeps_margin
+from .limits import growth, keeps_margin, natural_margin
 from .measured import MeasuredErrorSystem, read_frequency_data, realize_response
-from .transfer import Target, series
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -88,7 +86,6 @@ class RestructuringProblem:
             self.system,
             theta,
             self.omega,
-            self.response,
             admissible=self.is_stable,
             scaling=scaling,
         )
@@ -216,7 +213,6 @@ def problem_from_models(
     parts = (target.A, target.B, target.C, target.D)
     if system.weight is not None:
         parts = series(*parts, system.weight)
-    omega, margin = grid_and_margin(target)
     bound = 0.0
     if len(models) == 1 and filter_ is None and len(first.A) > structure.order:
         bound = float(first.hankel_singular_values()[structure.order])
@@ -224,8 +220,8 @@ def problem_from_models(
         structure,
         system,
         boxes[0],
-        omega,
-        margin,
+        system.grid,
+        natural_margin(target),
         hinf_norm(*parts, dt=dt).norm,
         first.D - boxes[0].D,
         bound,

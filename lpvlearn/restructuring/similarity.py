@@ -19,8 +19,7 @@ from scipy.optimize import least_squares
 
 from ..minimax.problem import MinimaxResult, Peaks
 from ..systems.least_squares import Residuals, levenberg_marquardt
-from .error_system import Structure
-from .transfer import Target
+from .error_system import Structure, Target
 
 Array = NDArray[Any]
 
@@ -32,7 +31,6 @@ _NULL_TOLERANCE = 1e-6
 # A start ends when its squared distance falls by less than _SLOW that often in a row:
 # far from the structure progress is slow and then fast again.
 _SLOW, _PATIENCE = 1e-4, 4
-
 _ROUNDING = 1e-24  # squared distance, relative to the structure: it is reached exactly
 
 
@@ -120,11 +118,8 @@ def similarity_starts(
 ) -> tuple[Array, Array]:
     """Parameter vectors from random similarities, all starts in one batch.
 
-    Returns
-    -------
-    theta : ndarray of shape (n_found, n_params)
-    mismatch : ndarray of shape (n_found,)
-        Remaining distance to the structure, ascending.
+    Returns them (n_found, n_params) and the distances to the structure that remain,
+    ascending.
     """
     n = len(problem.A)
     M, b = linear_equations(problem)
@@ -224,13 +219,8 @@ def bilinear_fit(
     takes the structured state to that of the black box. The cost is quadratic in T for
     given parameters, which starts T, and quadratic in the parameters for given T.
 
-    Returns
-    -------
-    theta : ndarray of shape (n_params,)
-    distance : float
-        Square root of the cost.
-    n_iter : int
-    converged : bool
+    Returns the parameters, the square root of the cost, iterations, and whether these
+    converged.
     """
     n = len(problem.A)
     eye = np.eye(n)
@@ -283,10 +273,7 @@ def minimise_bilinear(
 ) -> tuple[Array, MinimaxResult]:
     """Minimise Eq. (7) from given parameters, time and states scaled.
 
-    Raises
-    ------
-    ValueError
-        If the structure is not affine or of another order than the black box.
+    A ValueError where the structure is not affine or of another order than the box.
     """
     offset = getattr(structure, "offset", None)
     if offset is None or box is None or len(box.A) != structure.order:

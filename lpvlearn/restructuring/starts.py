@@ -20,11 +20,11 @@ from ..structures.mechanical import ImplicitMap
 from ..structures.structure import GrayBoxStructure, drawn_around
 from ..systems.balancing import balancing_transformation
 from .continuation import continued_fits
-from .least_squares import LeastSquaresResult, channel_scaling, frequency_grid
+from .error_system import Target, frequency_grid, model_derivatives
+from .least_squares import LeastSquaresResult, channel_scaling
 from .limits import growth
 from .problem import GOOD_FIT, RestructuringProblem
 from .similarity import scaled_problem, similarity_starts
-from .transfer import Target, model_derivatives
 
 Array = NDArray[np.float64]
 

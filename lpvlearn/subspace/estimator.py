@@ -11,13 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
-from ..data.columns import Table, roles_of
-from ..data.experiments import Experiment, read_experiments
+from ..data.experiments import Experiment, Table, read_experiments
 from ..data.preparation import split_at_gaps
 from ..models.innovation import InnovationModel
 from ..validation import one_of
-from .fit import LocalFit, fit_pairs, warn_about_horizon
-from .options import check_options, selection_table, selection_text, warn_about
+from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
+from .selection import selection_text
 from .stream import SampleStream, fit_as_stream
 
 Array = NDArray[np.float64]
@@ -226,7 +225,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             names = experiments[0].input_names
             fitted = fit_pairs(pairs, choices, set(), detrend=self.detrend, names=names)
         self._take(fitted, self._step_of(experiments))
-        warn_about(fitted.model, fitted.residual, fitted.stability_loss, set())
+        warn_about(fitted, set())
         if choices.order is not None and choices.horizon is not None:
             warn_about_horizon(fitted, choices)
         return self
@@ -330,8 +329,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.lti_ = fitted.evidence.state_space(fitted.model, step)
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
-        self.selection_ = selection_table(fitted.selection)
-        self.n_outputs_ = self.lti_.n_outputs
+        self.selection_ = fitted.selection.table()
+        self.n_outputs_ = len(fitted.output_offset)
         self.initial_states_ = fitted.model.initial_states
         self.singular_values_ = fitted.singular_values
         self.residual_ = fitted.residual
@@ -535,7 +534,6 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self,
             X,
             y,
-            **roles_of(self),
             sampling_time=self.sampling_time,
             reset=reset,
             allow_missing=gaps,

@@ -1,22 +1,28 @@
-"""From experiments to everything that `SubspaceLTI` keeps of a fit."""
+"""From experiments to everything that `SubspaceLTI` keeps of a fit.
+
+The options are checked (`check_options`), the records made regular, order and
+horizon chosen, the model identified (`fit_pairs`), and what is wrong with it told.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from typing import NamedTuple
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import (
+    DETRENDS,
     Pairs,
     check_excitation,
     independent_inputs,
     remove_trends,
 )
 from ..exceptions import RankWarning, warn
-from .identification import Identified, ScaledRecords, identify, scale_records
-from .options import Choices, check_size, feedthrough_mask, tell
+from ..validation import one_of, positive_time
+from .identification import ScaledRecords, Settings, identify, scale_records
+from .realization import METHODS
 from .selection import Candidate, Selection, better_horizon, select
 from .simulation_fit import Freedom, Realization
 from .statistics import Evidence, shorten
@@ -24,40 +30,110 @@ from .statistics import Evidence, shorten
 Array = NDArray[np.float64]
 
 
+class Choices(NamedTuple):
+    """Checked options that decide about a fit."""
+
+    order: int | None = None  # None is to be chosen
+    horizon: int | None = None
+    n_noise_states: int = 0
+    method: str = "po-moesp"
+    feedthrough: Any = True
+    refine: bool = True
+    enforce_stability: bool = False
+    initial_states: bool = True  # False starts every experiment from rest
+
+    def settings(self, n_outputs: int, n_inputs: int, basis: Array) -> Settings:
+        """How models of these channels are made.
+
+        `basis` (n_inputs, rank) are the original inputs in terms of the independent
+        ones, which the models have.
+        """
+        mask = _feedthrough_mask(self.feedthrough, n_outputs, n_inputs, basis.shape[1])
+        return Settings(
+            Freedom(mask, self.initial_states),
+            self.method,
+            self.refine,
+            self.enforce_stability,
+            self.n_noise_states,
+        )
+
+
+def check_options(options: Mapping[str, Any]) -> Choices:
+    """Refuse what is not an option of `SubspaceLTI`, naming those that are."""
+    one_of("method", options["method"], METHODS)
+    one_of("stability", options["stability"], ("warn", "enforce"))
+    one_of("initial_state", options["initial_state"], ("estimate", "rest"))
+    one_of("missing", options["missing"], ("raise", "split"))
+    one_of("detrend", options["detrend"], DETRENDS)
+    if options["sampling_time"] is not None:
+        positive_time("sampling_time", options["sampling_time"])
+    if options["initial_state"] == "rest" and options["missing"] == "split":
+        raise ValueError(
+            "`initial_state` must be 'estimate' with missing='split': what follows a "
+            "gap does not start from rest. Got 'rest'."
+        )
+    return Choices(
+        _integer_or_auto("order", options["order"], 0),
+        _integer_or_auto("horizon", options["horizon"], 1),
+        _integer_or_auto("n_noise_states", options["n_noise_states"], 0) or 0,
+        options["method"],
+        options["feedthrough"],
+        bool(options["refine"]),
+        options["stability"] == "enforce",
+        options["initial_state"] == "estimate",
+    )
+
+
+def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:
+    if isinstance(value, str) and value == "auto":
+        return None
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not is_integer or value < lowest:
+        raise ValueError(
+            f"`{name}` must be 'auto' or an integer of at least {lowest}. "
+            f"Got {value!r}."
+        )
+    return int(value)
+
+
+def _feedthrough_mask(
+    feedthrough: Any, n_outputs: int, n_inputs: int, rank: int
+) -> NDArray[np.bool_]:
+    """Free entries of D for the independent inputs, (n_outputs, rank)."""
+    mask = np.asarray(feedthrough)
+    if mask.ndim == 0:
+        return np.full((n_outputs, rank), bool(feedthrough))
+    if mask.shape != (n_outputs, n_inputs):
+        raise ValueError(
+            "`feedthrough` must be True, False or a table of shape (n_outputs, "
+            f"n_inputs) = ({n_outputs}, {n_inputs}). Got shape {mask.shape}."
+        )
+    mask = mask.astype(bool)
+    if rank == n_inputs or mask.all() or not mask.any():
+        return mask[:, :rank]
+    raise ValueError(
+        "`feedthrough` cannot fix single entries of D while inputs are collinear. "
+        "Leave all but one of the collinear inputs out."
+    )
+
+
 class TooFewSamples(ValueError):
     """The samples do not tell enough for a model; more of them may."""
 
 
 class LocalFit(NamedTuple):
-    """A fitted model and what is known of it.
+    """A fitted model and what is known of it."""
 
-    Attributes
-    ----------
-    model : Realization
-        Of the scaled samples.
-    singular_values : ndarray
-    residual, stability_loss : float
-        As the attributes of `SubspaceLTI`.
-    selection : Selection
-    evidence : Evidence
-    input_offset, output_offset : ndarray
-        What `detrend` subtracted.
-    found : Identified
-        From `scaled`, the samples that were fitted as one table: all of them, or the
-        first ones of a long table or a stream.
-    scaled : ScaledRecords
-    """
-
-    model: Realization
+    model: Realization  # of the scaled samples
     singular_values: Array
     residual: float
     stability_loss: float
     selection: Selection
     evidence: Evidence
-    input_offset: Array
+    input_offset: Array  # what `detrend` subtracted
     output_offset: Array
-    found: Identified
-    scaled: ScaledRecords
+    first_model: Realization  # of `scaled`, the samples that were fitted as one table:
+    scaled: ScaledRecords  # all of them, or the first ones of a long table or a stream
 
 
 def fit_pairs(
@@ -70,59 +146,42 @@ def fit_pairs(
 ) -> LocalFit:
     """Check, detrend, choose and identify.
 
-    Parameters
-    ----------
-    pairs : list of (u, y)
-        One per experiment.
-    choices : Choices
-    told : set of str
-        Kinds of warnings that were given and are not repeated.
-    detrend : {None, "constant", "linear"}, default=None
-    names : sequence, default=None
-        Of the inputs, for messages.
-
-    Returns
-    -------
-    LocalFit
-
-    Raises
-    ------
-    TooFewSamples
-        If an input is constant or the samples are too few.
+    `told` are the kinds of warnings that were given and are not repeated, `names` those
+    of the inputs, for messages. `TooFewSamples` where an input is constant or the
+    samples are too few.
     """
     n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
+    order, horizon = choices.order, choices.horizon
     try:
         check_excitation(pairs, names)
         pairs, u_offset, y_offset = remove_trends(pairs, detrend)
         pairs, basis = _with_independent_inputs(pairs, told)
-        mask = feedthrough_mask(choices.feedthrough, n_outputs, n_inputs, basis)
-        check_size([len(u) for u, _ in pairs], basis.shape[1], n_outputs, choices)
+        settings = choices.settings(n_outputs, n_inputs, basis)
+        settings.check_size([len(u) for u, _ in pairs], order, horizon)
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
     scaled = scale_records(pairs)
-    settings = choices._replace(feedthrough=mask)._asdict()
-    order, horizon = settings.pop("order"), settings.pop("horizon")
     chosen = None
     if order is None or horizon is None:
-        chosen = select(scaled.records, order, horizon, **settings)
+        chosen = select(scaled.records, order, horizon, settings)
         order, horizon = chosen.order, chosen.horizon
-    found = identify(pairs, order, horizon, scaled=scaled, **settings)
+    found = identify(scaled.records, order, horizon, settings)
     if chosen is None:
         only = Candidate(order, horizon, found.residual, np.nan)
         chosen = Selection(order, horizon, [only])
     records, share = shorten(scaled.records)
     evidence = Evidence(
-        model=found.scaled_model,
+        model=found.model,
         records=records,
         input_scale=scaled.input_scale,
         output_scale=scaled.output_scale,
         basis=basis,
-        free=Freedom(mask, choices.initial_states),
+        free=settings.free,
         refined=choices.refine and found.stability_loss == 0.0,
         share=share,
     )
     return LocalFit(
-        found.scaled_model,
+        found.model,
         found.singular_values,
         found.residual,
         found.stability_loss,
@@ -130,7 +189,7 @@ def fit_pairs(
         evidence,
         u_offset,
         y_offset,
-        found,
+        found.model,
         scaled,
     )
 
@@ -158,18 +217,115 @@ def _with_independent_inputs(pairs: Pairs, told: set[str]) -> tuple[Pairs, Array
 
 def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
     """Tell the user when another horizon fits clearly better than the one given."""
-    better = better_horizon(
-        fitted.found._replace(residual=fitted.residual),
-        fitted.scaled,
-        fitted.selection.horizon,
+    settings = Settings(
         fitted.evidence.free,
-        method=choices.method,
-        refine=choices.refine,
-        enforce_stability=choices.enforce_stability,
+        choices.method,
+        choices.refine,
+        choices.enforce_stability,
+    )
+    better = better_horizon(
+        fitted.first_model,
+        fitted.residual,
+        fitted.scaled.records,
+        fitted.selection.horizon,
+        settings,
     )
     if better is not None:
         warn(
             f"horizon={choices.horizon} ends in a poor model: its simulation error is "
             f"{100.0 * fitted.residual:.3g} % of the outputs, that of horizon "
             f"{better[0]} is {100.0 * better[1]:.3g} %. Use horizon='auto'."
+        )
+
+
+_USELESS = 0.9  # share of the outputs' size left unexplained that is reported
+_HALF = 0.5  # share of their energy that enforced stability must cost to be reported
+_ROUNDING = 1e-8  # an integrator's pole may lie this far outside the unit circle
+
+# A stream fits much worse than its first samples where its error exceeds theirs by
+# this factor, and this share of the outputs' size.
+_MUCH_WORSE, _POOR = 5.0, 0.2
+
+# What was poor from the start was told then; it is told again where it grows by this.
+_GROWN = 1.1
+
+
+def tell(
+    told: set[str], kind: str, message: str, category: type[Warning] = UserWarning
+) -> None:
+    """Warn of a kind of thing that was not told before; from now on it was."""
+    if kind not in told:
+        told.add(kind)
+        warn(message, category)
+
+
+def warn_about(fitted: LocalFit, told: set[str]) -> None:
+    """Tell the user what is wrong with a model that is returned all the same.
+
+    `told` are the kinds of warnings that are not repeated; it grows by these.
+    """
+    model, residual = fitted.model, fitted.residual
+    if model.rank_deficit:
+        tell(
+            told,
+            "rank",
+            f"The data leave {model.rank_deficit} directions of B and D "
+            "undetermined; the smallest solution was taken. Excite the inputs "
+            "more richly, or lower `order`.",
+            RankWarning,
+        )
+    warn_about_pole(model.A, told)
+    as_found = residual - fitted.stability_loss
+    if residual**2 - as_found**2 > _HALF:
+        tell(
+            told,
+            "enforced",
+            "No stable model explains these outputs: the simulation error is "
+            f"{100.0 * residual:.0f} % of their size with stability='enforce', "
+            f"{100.0 * as_found:.3g} % without. The system seems to be unstable: "
+            "identify it with stability='warn', or from a record of bounded outputs, "
+            "with the controller's reference as input.",
+        )
+    elif residual > _USELESS:
+        tell(
+            told,
+            "useless",
+            "The model explains next to nothing of the outputs: its simulation "
+            f"error is {100.0 * residual:.0f} % of their size. Try a longer "
+            "`horizon` or order='auto', and check that inputs and outputs belong "
+            "together and in the order of time.",
+        )
+
+
+def warn_about_pole(A: Array, told: set[str]) -> None:
+    """Tell the user that a model is unstable."""
+    radius = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
+    if radius > 1.0 + _ROUNDING:
+        tell(
+            told,
+            "pole",
+            f"The identified model is unstable: a pole has modulus {radius:.6g}. "
+            "Use stability='enforce' for a stable one, another `order`, or a "
+            "longer `horizon`.",
+        )
+
+
+def warn_about_drift(
+    error: float, first: float, n_samples: int, told: set[str]
+) -> None:
+    """Tell the user where a stream does not go on as its first samples began.
+
+    `error` and `first` are relative simulation errors, of the stream and of its first
+    `n_samples`.
+    """
+    poor = error > min(_USELESS, max(_POOR, _MUCH_WORSE * first))
+    if poor and error > _GROWN * first:
+        tell(
+            told,
+            "drift",
+            f"The simulation error of the stream is {100.0 * error:.3g} % of the "
+            f"outputs, after {100.0 * first:.3g} % over its first {n_samples:,} "
+            "samples: these excite the system too little to go on from their model, "
+            "or the system or its noise has changed. Begin a stream with samples that "
+            "excite what comes later, or `fit` the whole table.",
         )

@@ -16,7 +16,7 @@ batch by batch: its `HankelSum` grows by the columns that each batch completes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,8 +30,7 @@ Array = NDArray[np.float64]
 # that the rows before it do not contain.
 _MIN_PIVOT = 1e-10
 
-# Columns mirrored at a time: a square of that size (32 kB) stays in the cache.
-_MIRROR = 64
+_MIRROR = 64  # columns mirrored at a time: a square of that size stays in the cache
 
 # Samples transformed at a time: transforms this many times as long as the lags (and no
 # shorter than the second) spend little on the overlap of neighbouring blocks.
@@ -40,6 +39,22 @@ _LAG_BLOCKS, _LEAST_BLOCK = 8, 4096
 # Hankel columns factored at a time: this many for each row (at least the second), so
 # that the factor carried along adds little to each QR.
 _COLUMNS_PER_ROW, _LEAST_COLUMNS = 4, 1024
+
+
+def data_factors(
+    records: Sequence[Array],
+    n_inputs: int,
+    horizons: Collection[int],
+    *,
+    past_outputs: bool = True,
+) -> Iterator[Array]:
+    """`data_factor` of every horizon; one correlation sequence serves them all."""
+    longest = 2 * max(horizons)
+    shared = [correlation_sequence(z, min(longest, len(z))) for z in records]
+    for horizon in horizons:
+        yield data_factor(
+            records, n_inputs, horizon, past_outputs=past_outputs, correlations=shared
+        )
 
 
 def data_factor(
@@ -53,36 +68,13 @@ def data_factor(
 ) -> Array:
     """Lower triangular factor of ``[U_f; U_p; Y_p; Y_f]`` of pooled experiments.
 
-    Parameters
-    ----------
-    records : sequence of ndarray of shape (n_samples_i, n_inputs + n_outputs)
-        Experiments; a row is a sample ``[u, y]``.
-    n_inputs : int
-        Number of leading columns that are inputs.
-    horizon : int
-        Past and future horizon, in samples.
-    past_outputs : bool, default=True
-        Whether ``Y_p`` is among the rows.
-    engine : {"cholesky", "qr"}, default="cholesky"
-        "cholesky" builds the Gram matrix from correlations and falls back to "qr"
-        where that would lose accuracy; both give the same factor.
-    correlations : sequence of ndarray, default=None
-        A `correlation_sequence` for each record, of ``2 * horizon`` lags at least where
-        the record is long enough; one computation serves all horizons.
+    A row of a record is a sample ``[u, y]``; `past_outputs` tells whether ``Y_p`` is
+    among the rows of the factor (Verhaegen and Verdult, *Filtering and System
+    Identification*, 2007, Chapter 9). The engine "cholesky" builds the Gram matrix from
+    correlations and falls back to "qr" where that would lose accuracy; both give the
+    same factor. `correlations` are known `correlation_sequence`s of the records, of
+    ``2 * horizon`` lags at least where a record is long enough.
 
-    Returns
-    -------
-    ndarray of shape (r, r)
-        ``r = horizon * (2 n_inputs + (1 + past_outputs) n_outputs)``.
-
-    References
-    ----------
-    M. Verhaegen and V. Verdult, *Filtering and System Identification*, Cambridge
-    University Press, 2007, Chapter 9.
-
-    Examples
-    --------
-    >>> import numpy as np
     >>> z = np.random.default_rng(0).standard_normal((300, 3))
     >>> L = data_factor([z], n_inputs=2, horizon=4)
     >>> np.allclose(L, data_factor([z], n_inputs=2, horizon=4, engine="qr"))
@@ -144,27 +136,15 @@ def _past_future_rows(
 
 
 class HankelSum(NamedTuple):
-    """Compressed block-Hankel data of a stream.
-
-    Attributes
-    ----------
-    n_inputs, n_outputs, horizon : int
-    past_outputs : bool
-    gram : ndarray of shape (r, r) or None
-        Gram matrix of all windows; None where the data need the factor.
-    factor : ndarray of shape (r, r) or None
-        Triangular factor instead of the Gram matrix.
-    tail : ndarray of shape (at most 2 * horizon - 1, n_channels)
-        Last samples of the experiment that may continue.
-    """
+    """Compressed block-Hankel data of a stream."""
 
     n_inputs: int
     n_outputs: int
     horizon: int
     past_outputs: bool
-    gram: Array | None
-    factor: Array | None
-    tail: Array
+    gram: Array | None  # (r, r), of all windows; None where the data need the factor
+    factor: Array | None  # (r, r), triangular, instead of the Gram matrix
+    tail: Array  # at most 2 * horizon - 1 last samples of what may continue
 
     @property
     def rows(self) -> NDArray[np.intp]:
@@ -189,16 +169,8 @@ def start_hankel_sum(
 ) -> HankelSum:
     """Summary of the first experiments, of which the last may continue.
 
-    Parameters
-    ----------
-    samples : sequence of ndarray of shape (n_samples_i, n_channels)
-        Scaled samples ``[u, y]``, one array per experiment.
-    n_inputs, horizon : int
-    past_outputs : bool, default=True
+    `samples` are scaled, ``[u, y]``: one (n_samples_i, n_channels) per experiment.
 
-    Examples
-    --------
-    >>> import numpy as np
     >>> z = np.random.default_rng(0).standard_normal((300, 3))
     >>> parts = start_hankel_sum([z[:100]], n_inputs=2, horizon=4)
     >>> parts = extend_hankel_sum(parts, z[100:], starts=False)
@@ -218,15 +190,7 @@ def start_hankel_sum(
 
 
 def extend_hankel_sum(state: HankelSum, samples: Array, *, starts: bool) -> HankelSum:
-    """Add the next samples.
-
-    Parameters
-    ----------
-    state : HankelSum
-    samples : ndarray of shape (n_samples, n_channels)
-    starts : bool
-        Whether they begin a new experiment rather than continue the last one.
-    """
+    """Add the next samples; `starts` tells whether they begin a new experiment."""
     z = samples if starts else np.vstack([state.tail, samples])
     n_rows = 2 * state.horizon
     tail = z[-(n_rows - 1) :].copy()
@@ -240,24 +204,12 @@ def extend_hankel_sum(state: HankelSum, samples: Array, *, starts: bool) -> Hank
     return state._replace(factor=factor, tail=tail)
 
 
-def cholesky_factor(gram: Array, min_pivot: float = _MIN_PIVOT) -> Array | None:
+def cholesky_factor(gram: Array) -> Array | None:
     """Lower Cholesky factor, or None where it would not be trustworthy.
 
-    None is returned when the matrix is not numerically positive definite or when,
-    after scaling to a unit diagonal, a squared pivot is below `min_pivot`.
+    That is where the matrix is not numerically positive definite or, after scaling to a
+    unit diagonal, a squared pivot is below `_MIN_PIVOT`.
 
-    Parameters
-    ----------
-    gram : ndarray of shape (r, r)
-    min_pivot : float
-
-    Returns
-    -------
-    ndarray of shape (r, r) or None
-
-    Examples
-    --------
-    >>> import numpy as np
     >>> cholesky_factor(np.diag([4.0, 9.0])).diagonal()
     array([2., 3.])
     >>> cholesky_factor(np.ones((2, 2))) is None
@@ -272,7 +224,7 @@ def cholesky_factor(gram: Array, min_pivot: float = _MIN_PIVOT) -> Array | None:
     # LAPACK sees the transposed (Fortran) matrix: its upper factor is our lower one.
     # Called itself it takes 9 ms for 900 rows, linalg.cholesky 12 ms, numpy's 21 ms.
     upper, info = linalg.lapack.dpotrf(scaled.T, lower=0, clean=1, overwrite_a=1)
-    if info != 0 or not np.diagonal(upper).min() ** 2 > min_pivot:
+    if info != 0 or not np.diagonal(upper).min() ** 2 > _MIN_PIVOT:
         return None
     lower = upper.T
     lower *= scale[:, None]
@@ -280,23 +232,7 @@ def cholesky_factor(gram: Array, min_pivot: float = _MIN_PIVOT) -> Array | None:
 
 
 def triangularize(columns: Array) -> Array:
-    """Upper triangular QR factor of ``columns.T``.
-
-    Parameters
-    ----------
-    columns : ndarray of shape (n_signals, n_samples)
-        One row per signal; overwritten.
-
-    Returns
-    -------
-    ndarray of shape (min(n_signals, n_samples), n_signals)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> abs(triangularize(np.array([[3.0, 4.0]])))
-    array([[5.]])
-    """
+    """Upper triangular QR factor of ``columns.T``; one row per signal, overwritten."""
     # "raw" forms no Q and, unlike "r", no rows of zeros below the triangle.
     return linalg.qr(columns.T, mode="raw", overwrite_a=True, check_finite=False)[1]
 
@@ -305,21 +241,9 @@ def stack_factors(factors: Sequence[Array]) -> Array:
     """Triangular factor of several factors side by side.
 
     ``[L_1, L_2, ...] = L Q``: the factor of all columns from the factors of parts, the
-    one operation behind pooling, streaming and map-reduce (TSQR).
+    one operation behind pooling, streaming and map-reduce (TSQR). Square, lower
+    triangular, with a non-negative diagonal.
 
-    Parameters
-    ----------
-    factors : sequence of ndarray of shape (r, n_columns_i)
-        Factors or data, with the same rows.
-
-    Returns
-    -------
-    ndarray of shape (r, r)
-        Lower triangular with a non-negative diagonal.
-
-    Examples
-    --------
-    >>> import numpy as np
     >>> stack_factors([np.array([[3.0]]), np.array([[4.0]])])
     array([[5.]])
     """
@@ -351,9 +275,6 @@ def _hankel_gram(z: Array, n_rows: int, correlations: Array | None = None) -> Ar
     ``G[i+1, j+1] = G[i, j] - z[i] z[j].T + z[n_cols+i] z[n_cols+j].T``. With known
     `correlations` of `z` the cost does not depend on the number of samples.
 
-    Examples
-    --------
-    >>> import numpy as np
     >>> z = np.arange(12.0).reshape(6, 2)
     >>> H = _hankel_matrix(z, 3)
     >>> np.allclose(_hankel_gram(z, 3), H @ H.T)
@@ -398,22 +319,9 @@ def correlation_sequence(z: Array, n_lags: int) -> Array:
     """Sums of lagged products over the whole record.
 
     ``R[d] = sum_t z[t] z[t + d].T`` for ``d = 0 .. n_lags - 1``, by overlapping
-    Fourier transforms, so that the cost grows as ``N log(n_lags)``.
+    Fourier transforms, so that the cost grows as ``N log(n_lags)``; no more lags than
+    samples.
 
-    Parameters
-    ----------
-    z : ndarray of shape (n_samples, n_channels)
-        The record.
-    n_lags : int
-        Number of lags, at most ``n_samples``.
-
-    Returns
-    -------
-    ndarray of shape (n_lags, n_channels, n_channels)
-
-    Examples
-    --------
-    >>> import numpy as np
     >>> correlation_sequence(np.array([[1.0], [2.0], [3.0]]), 2).ravel()
     array([14.,  8.])
     """

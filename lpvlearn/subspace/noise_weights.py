@@ -25,8 +25,8 @@ from ..systems.simulation import estimate_initial_state, free_responses, lti_res
 from .identification import scale_records
 from .refinement import refine_simulation
 from .signals import Record
-from .simulation_fit import Freedom, Realization
-from .uncertainty import autoregression
+from .simulation_fit import Freedom, Realization, in_sections
+from .statistics import autoregression
 
 Array = NDArray[np.float64]
 
@@ -101,7 +101,8 @@ def _refined(
     start = Realization(
         lti.A, lti.B * su, lti.C / sy, lti.D * su / sy, np.array(states), loss
     )
-    model, _ = refine_simulation(start, records, Freedom(lti.D != 0.0))
+    free = Freedom(lti.D != 0.0)
+    model = refine_simulation(in_sections(start), records, free)
     return StateSpace(
         model.A, model.B / su, sy * model.C, sy * model.D / su, lti.sampling_time
     )

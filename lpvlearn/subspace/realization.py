@@ -8,6 +8,7 @@ matrix; the methods differ in how they weight it (Van Overschee and De Moor, 199
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -24,9 +25,7 @@ METHODS = ("po-moesp", "pi-moesp", "n4sid", "cva")
 # Singular values of the block of past data below this share of the largest are those of
 # unexcited directions in data without noise; so are eigenvalues of the future outputs'
 # covariance, their squares but for rounding, below the second.
-_UNEXCITED = 1e-10
-
-_UNEXCITED_POWER = 1e-12
+_UNEXCITED, _UNEXCITED_POWER = 1e-10, 1e-12
 
 # Squaring (eigenvectors of L32 L32.T) is exact enough above this ratio of the last
 # wanted to the first singular value; below it the SVD is used.
@@ -34,18 +33,32 @@ _MIN_RATIO = 1e-4
 
 
 class ObservabilitySubspace(NamedTuple):
-    """Column space of the extended observability matrix.
+    """Column space of the extended observability matrix."""
 
-    Attributes
-    ----------
-    basis : ndarray of shape (horizon * n_outputs, k)
-        Leading directions, most important first, weighting undone.
-    singular_values : ndarray of shape (horizon * n_outputs,)
-        All singular values, descending.
-    """
+    basis: Array  # (horizon * n_outputs, k): most important first, weighting undone
+    singular_values: Array  # (horizon * n_outputs,): all of them, descending
 
-    basis: Array
-    singular_values: Array
+    def state_pair(
+        self,
+        n_outputs: int,
+        order: int,
+        n_noise_states: int,
+        with_inputs: Callable[[Array, Array], tuple[Array, Array, Array] | None],
+    ) -> tuple[Array, Array]:
+        """``(A, C)`` of an order, with noise states of those the inputs reach most.
+
+        `with_inputs` makes A, B and C of the pair of the higher order, or None where
+        that has no model.
+        """
+        horizon = len(self.singular_values) // n_outputs
+        most = min(self.basis.shape[1], (horizon - 1) * n_outputs)
+        extended = min(order + n_noise_states, most)
+        if 0 < order < extended:
+            A, C = shift_invariant_pair(self.basis, n_outputs, extended)
+            model = with_inputs(reflect_unstable(A), C)
+            if model is not None:
+                return _dominant_pair(*model, order, horizon)
+        return shift_invariant_pair(self.basis, n_outputs, order)
 
 
 def observability_subspace(
@@ -54,23 +67,15 @@ def observability_subspace(
     n_outputs: int,
     horizon: int,
     max_order: int,
-    method: str = "po-moesp",
+    method: str,
 ) -> ObservabilitySubspace:
     """Extended observability matrix from the triangular factor of the data.
 
-    Parameters
-    ----------
-    factor : ndarray of shape (r, r)
-        Lower triangular, of ``[U_f; U_p; Y_p; Y_f]``, without ``Y_p`` for PI-MOESP.
-    n_inputs, n_outputs, horizon : int
-        Dimensions of the blocks.
-    max_order : int
-        Number of directions to return.
-    method : {"po-moesp", "pi-moesp", "n4sid", "cva"}, default="po-moesp"
-        "pi-moesp": instruments are past inputs only, consistent under coloured
-        measurement noise (Verhaegen, 1993). "po-moesp": past inputs and outputs
-        (Verhaegen, 1994). "n4sid", "cva": the same past, weighted by the oblique
-        projection or to canonical correlations (Van Overschee and De Moor, 1995).
+    `factor` is that of ``[U_f; U_p; Y_p; Y_f]``, without ``Y_p`` for PI-MOESP;
+    `max_order` directions are returned. "pi-moesp": instruments are past inputs only,
+    consistent under coloured measurement noise (Verhaegen, 1993). "po-moesp": past
+    inputs and outputs (Verhaegen, 1994). "n4sid", "cva": the same past, weighted by the
+    oblique projection or to canonical correlations (Van Overschee and De Moor, 1995).
     """
     n_future, n_last = horizon * n_inputs, horizon * n_outputs
     past = slice(n_future, factor.shape[0] - n_last)
@@ -122,25 +127,9 @@ def shift_invariant_pair(
     """``(A, C)`` from the shift invariance of the extended observability matrix.
 
     ``C`` is the first block row and ``A`` solves ``O[:-1] A = O[1:]`` in the least
-    squares sense.
+    squares sense; `basis` has at least `order` columns, `order` is at most
+    ``(horizon - 1) * n_outputs``.
 
-    Parameters
-    ----------
-    basis : ndarray of shape (horizon * n_outputs, >= order)
-        Basis of the subspace.
-    n_outputs : int
-        Height of a block row.
-    order : int
-        Number of states, at most ``(horizon - 1) * n_outputs``.
-
-    Returns
-    -------
-    A : ndarray of shape (order, order)
-    C : ndarray of shape (n_outputs, order)
-
-    Examples
-    --------
-    >>> import numpy as np
     >>> basis = 2.0 * 0.5 ** np.arange(4.0)[:, None]
     >>> A, C = shift_invariant_pair(basis, n_outputs=1, order=1)
     >>> round(A.item(), 12), C.item()
@@ -162,22 +151,8 @@ def reflect_unstable(A: Array, limit: float = 1.0) -> Array:
     """Reflect the poles outside a circle around the origin into it.
 
     Every pole ``z`` with ``|z| > limit`` becomes ``limit**2 / conj(z)``; the others
-    stay.
+    stay. ``A`` itself where nothing had to be reflected.
 
-    Parameters
-    ----------
-    A : ndarray of shape (order, order)
-    limit : float, default=1.0
-        Radius of the circle.
-
-    Returns
-    -------
-    ndarray of shape (order, order)
-        ``A`` itself when nothing had to be reflected.
-
-    Examples
-    --------
-    >>> import numpy as np
     >>> reflect_unstable(np.diag([2.0, 0.5]))
     array([[0.5, 0. ],
            [0. , 0.5]])
@@ -198,34 +173,17 @@ def reflect_unstable(A: Array, limit: float = 1.0) -> Array:
     return rotation @ triangular @ rotation.T
 
 
-def dominant_pair(
+def _dominant_pair(
     A: Array, B: Array, C: Array, order: int, length: int
 ) -> tuple[Array, Array]:
     """``(A, C)`` of the part of a model that dominates its first Markov parameters.
 
-    The model is reduced through the singular values of its Hankel matrix (Ho and
-    Kalman, 1966), which needs no stability. States that the inputs do not reach,
-    such as those of a noise model, drop out.
+    The model is reduced through the singular values of its Hankel matrix of `length`
+    block rows and columns (Ho and Kalman, 1966), which needs no stability. States that
+    the inputs do not reach, such as those of a noise model, drop out.
 
-    Parameters
-    ----------
-    A, B, C : ndarray
-        State-space matrices.
-    order : int
-        Number of states to keep.
-    length : int
-        Block rows and columns of the Hankel matrix.
-
-    Returns
-    -------
-    A : ndarray of shape (order, order)
-    C : ndarray of shape (n_outputs, order)
-
-    Examples
-    --------
-    >>> import numpy as np
     >>> A, B, C = np.diag([0.9, 0.2]), np.array([[1.0], [0.0]]), np.ones((1, 2))
-    >>> dominant_pair(A, B, C, 1, 8)[0].round(6)
+    >>> _dominant_pair(A, B, C, 1, 8)[0].round(6)
     array([[0.9]])
     """
     seen, reached = [C], [B]
@@ -247,21 +205,7 @@ def factor_input_matrices(
     Toeplitz matrix of the Markov parameters, ``Q.T L31 = Q.T T L11`` but for the
     noise, which is linear in B and D (Verhaegen and Verdult, 2007, Section 9.2.4).
     Consistent, but less accurate than the simulation least squares of
-    `simulation_fit`, which needs the samples.
-
-    Parameters
-    ----------
-    factor : ndarray of shape (r, r)
-        Lower triangular, of ``[U_f; ...; Y_f]``.
-    A : ndarray of shape (order, order)
-    C : ndarray of shape (n_outputs, order)
-    free : Freedom
-    horizon : int
-
-    Returns
-    -------
-    B : ndarray of shape (order, n_inputs)
-    D : ndarray of shape (n_outputs, n_inputs)
+    `simulation_fit`, which needs the samples. `factor` is that of ``[U_f; ...; Y_f]``.
     """
     (ny, n), m = C.shape, free.direct.shape[1]
     powers = [C]

@@ -22,28 +22,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..systems.least_squares import scaled_lstsq
-from .parameters import block_parts, change_between, moved_model
-from .refinement import experiment_regressions
-from .signals import Record, signal_factor, state_coefficients
+from ..systems.least_squares import column_scale, scaled_lstsq
+from .signals import Record, block_slices, signal_factor
 from .simulation_fit import (
     Freedom,
-    Point,
     Realization,
-    jacobian_regression,
+    change_between,
     linear_regression,
-    n_own,
-    project_out,
-    stack_regressions,
+    linearised,
+    moved_model,
+    parameter_slices,
 )
 
 Array = NDArray[np.float64]
 
-# Directions of the scaled parameters that the pilot data do not determine.
-_RCOND = 1e-9
-
-# Samples from which the initial state of a stretch is estimated first.
-_HEAD = 4_096
+_RCOND = 1e-9  # directions of the scaled parameters that the pilot data do not tell
+_HEAD = 4_096  # samples from which the initial state of a stretch is estimated first
 
 # A linearisation holds for changes of a pole of this share of its distance from the
 # unit circle, taken as no smaller than some 10,000 samples can tell.
@@ -63,31 +57,16 @@ _COUPLING, _DIVERGED = 1e-14, 1e6
 class Recursion(NamedTuple):
     """Accumulated linearised simulation errors around a pilot model.
 
-    Attributes
-    ----------
-    pilot : Realization
-        In section form.
-    free : Freedom
-    directions : ndarray of shape (n_parameters, k)
-        Local coordinates: parameters (B, D, A, C) are those of the pilot plus
-        ``directions @ position``.
-    coordinates : ndarray of shape (k, n_parameters)
-        The other way: position of a change of the parameters, but for what leaves the
-        response as it is.
-    restraint : ndarray of shape (k,)
-        Weight of the distance from the pilot, along every coordinate.
-    information : ndarray of shape (k + 1, k + 1)
-        Triangular factor of ``[J, J position - error]``, summed up.
-    position : ndarray of shape (k,)
+    The parameters (B, D, A, C) are those of the pilot plus ``directions @ position``.
     """
 
-    pilot: Realization
+    pilot: Realization  # in section form
     free: Freedom
-    directions: Array
-    coordinates: Array
-    restraint: Array
-    information: Array
-    position: Array
+    directions: Array  # (n_parameters, k)
+    coordinates: Array  # (k, n_parameters): back, but for what leaves the response
+    restraint: Array  # (k,): weight of the distance from the pilot
+    information: Array  # (k + 1, k + 1): factor of [J, J position - error], summed up
+    position: Array  # (k,)
 
 
 def start_recursion(
@@ -96,48 +75,35 @@ def start_recursion(
     """Local coordinates and first information, from the data of the pilot model.
 
     What these tell of the parameters no better than the linearisation is valid, such as
-    the poles of a superfluous mode, stays with the pilot until the data tell more.
-
-    Parameters
-    ----------
-    pilot : Realization
-    records : sequence of Record
-    free : Freedom
-
-    Returns
-    -------
-    Recursion or None
-        None where the pilot cannot be linearised at: it has no section form, or its
-        responses overflow.
+    the poles of a superfluous mode, stays with the pilot until the data tell more. None
+    where the pilot cannot be linearised at: it has no section form, or its responses
+    overflow.
     """
     if pilot.blocks is None or not np.isfinite(pilot.loss):
         return None
-    regressions = experiment_regressions(pilot, records, free)
-    if regressions is None:
+    stacked = linearised(pilot, records, free)
+    if stacked is None:
         return None
-    stacked = stack_regressions(regressions, n_own(len(pilot.A), free))
     jacobian = stacked[:, :-1]
-    scale = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian))
-    scale[scale == 0.0] = 1.0
+    scale = column_scale(jacobian)
     _, s, right = linalg.svd(jacobian / scale, full_matrices=False, check_finite=False)
     right = right[s > _RCOND * s.max(initial=0.0)]
     directions = right.T / scale[:, None]
     rows = np.column_stack([jacobian @ directions, stacked[:, -1]])
     information = _triangle(rows)
     variance = pilot.loss / sum(record.y.size for record in records)
-    restraint = np.sqrt(variance) / _ranges(pilot, directions)
+    restraint = np.sqrt(variance) / _ranges(pilot, directions, free)
     position = _solve(information, restraint)
     return Recursion(
         pilot, free, directions, right * scale, restraint, information, position
     )
 
 
-def _ranges(pilot: Realization, directions: Array) -> Array:
+def _ranges(pilot: Realization, directions: Array, free: Freedom) -> Array:
     """How far every coordinate may move before a pole leaves its neighbourhood."""
     assert pilot.blocks is not None
     speed = np.full(directions.shape[1], _SLOWEST)
-    parts = block_parts(pilot, len(directions))
-    for block, part in zip(pilot.blocks, parts, strict=True):
+    for block, part in zip(pilot.blocks, parameter_slices(pilot, free), strict=True):
         change = directions[part]
         margin = 1.0 - np.abs(np.linalg.eigvals(block)).max()
         size = np.sqrt(np.einsum("ij,ij->j", change, change))
@@ -160,13 +126,7 @@ def _solve(information: Array, restraint: Array) -> Array:
 
 
 def current_model(recursion: Recursion) -> Realization:
-    """Model at the present position.
-
-    Returns
-    -------
-    Realization
-        Its loss is the sum of squared errors of the linearised problem.
-    """
+    """Model at the present position; its loss is that of the linearised problem."""
     step = recursion.directions @ recursion.position
     return _pilot_after(recursion, step, recursion.position)
 
@@ -182,18 +142,8 @@ def _pilot_after(recursion: Recursion, step: Array, position: Array) -> Realizat
 def input_matrices(recursion: Recursion, A: Array, C: Array) -> Realization | None:
     """Model with given A and C: B and D that minimise the linearised error.
 
-    Parameters
-    ----------
-    recursion : Recursion
-    A : ndarray of shape (order, order)
-    C : ndarray of shape (n_outputs, order)
-        In any state basis; near the model of the recursion.
-
-    Returns
-    -------
-    Realization or None
-        In the basis of the pilot model. None where ``(A, C)`` has no form with the
-        pilot's blocks.
+    `A` and `C` may be in any state basis, near the model of the recursion; the model is
+    in that of the pilot. None where they have no form with the pilot's blocks.
     """
     pilot, free = recursion.pilot, recursion.free
     pair = _aligned_pair(A, C, pilot)
@@ -220,10 +170,8 @@ def _aligned_pair(
     n = len(A)
     if n == 0:
         return (), C
-    sizes = [len(block) for block in pilot.blocks]
-    stops = np.cumsum(sizes)
-    parts = [slice(k - size, k) for k, size in zip(stops, sizes, strict=True)]
-    coupled = linalg.block_diag(*(np.ones((size, size)) for size in sizes)) == 0.0
+    parts = block_slices(pilot.blocks)
+    coupled = linalg.block_diag(*map(np.ones_like, pilot.blocks)) == 0.0
     T = linalg.lstsq(_observability(A, C), _observability(pilot.A, pilot.C))[0]
     try:
         A, C = linalg.solve(T, A @ T), C @ T
@@ -257,24 +205,11 @@ def extend_recursion(
     starts: bool,
     point: Realization | None = None,
 ) -> tuple[Recursion, Array]:
-    """Add a stretch of data, linearised at the present model.
+    """Add a stretch of data, linearised at the present model; its initial state.
 
-    Parameters
-    ----------
-    recursion : Recursion
-    record : Record
-        Scaled as the pilot's data.
-    starts : bool
-        Whether an experiment begins with it.
-    point : Realization, default=None
-        Another model to linearise at, from `input_matrices`.
-
-    Returns
-    -------
-    recursion : Recursion
-        Unchanged where the responses overflow.
-    initial_state : ndarray of shape (order,)
-        Of the stretch.
+    `record` is scaled as the pilot's data; `starts` says whether an experiment begins
+    with it. `point` is another model to linearise at, from `input_matrices`. Where the
+    responses overflow the recursion stays as it is.
     """
     if point is None:
         model, position = current_model(recursion), recursion.position
@@ -282,21 +217,14 @@ def extend_recursion(
         model = point
         step = change_between(recursion.pilot, point, recursion.free)
         position = recursion.coordinates @ step
-    assert model.blocks is not None
-    free = freedom_of_stretch(recursion.free, starts)
     # A linearisation point for the initial state; the stretch corrects it.
-    head = Record(record.u[:, :_HEAD], record.y[:, :_HEAD])
-    loss, x0 = stretch_error(model, head, free)
+    loss, x0 = stretch_error(model, record.head(_HEAD), recursion.free, starts=starts)
     if not np.isfinite(loss):
         return recursion, x0
-    driven = np.column_stack([x0, model.B])
-    state_map = state_coefficients(model.blocks, driven)
-    R = signal_factor(model.blocks, record, state_map)
-    if R is None:
+    free = _freedom_of_stretch(recursion.free, starts)
+    M = linearised(model._replace(initial_states=x0[None]), [record], free)
+    if M is None:
         return recursion, x0
-    around = Point(model.C, model.D, driven)
-    M = jacobian_regression(R, model.blocks, around, free)
-    M = project_out(M, n_own(len(model.A), free))
     J = M[:, :-1] @ recursion.directions
     rows = np.column_stack([J, M[:, -1] + J @ position])
     information = _triangle(np.vstack([recursion.information, rows]))
@@ -304,31 +232,21 @@ def extend_recursion(
     return recursion._replace(information=information, position=position), x0
 
 
-def freedom_of_stretch(free: Freedom, starts: bool) -> Freedom:
+def _freedom_of_stretch(free: Freedom, starts: bool) -> Freedom:
     """What continues an experiment does not start from rest."""
     return free if starts else free._replace(initial_states=True)
 
 
 def stretch_error(
-    model: Realization, record: Record, free: Freedom
+    model: Realization, record: Record, free: Freedom, *, starts: bool
 ) -> tuple[float, Array]:
-    """Simulation error of a stretch with the best initial state.
+    """Sum of squared errors of a stretch, and its best initial state.
 
-    Parameters
-    ----------
-    model : Realization
-        In section form.
-    record : Record
-    free : Freedom
-
-    Returns
-    -------
-    loss : float
-        Sum of squares; infinite where the responses overflow.
-    initial_state : ndarray of shape (order,)
+    The model is in section form; the error is infinite where the responses overflow.
     """
     assert model.blocks is not None
-    n, own = len(model.A), n_own(len(model.A), free)
+    free, n = _freedom_of_stretch(free, starts), len(model.A)
+    own = free.n_own(n)
     R = signal_factor(model.blocks, record)
     if R is None:
         return np.inf, np.zeros(n)

@@ -17,59 +17,42 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from ..systems.simulation import lti_response
 from .hankel import correlation_sequence
-from .identification import (
-    Identified,
-    ScaledRecords,
-    Settings,
-    correlations_of,
-    estimate,
-    max_horizon,
-    realize,
-    subspace_of,
-)
+from .identification import Settings, estimate, realize, subspaces_of
 from .realization import ObservabilitySubspace
 from .refinement import refine_simulation
 from .signals import Record, output_energy
-from .simulation_fit import Freedom, Realization, freedom
+from .simulation_fit import Realization
 
 Array = NDArray[np.float64]
 
-# Samples that a choice is made from: it needs fewer than an estimate.
-_MAX_SAMPLES = 12_000
+_MAX_SAMPLES = 12_000  # that a choice is made from: it needs fewer than an estimate
 
 # Share of each experiment to identify on, and the length below which none is held out:
 # what is left would be two samples.
-_ESTIMATION_SHARE = 0.7
-
-_TOO_SHORT = 8
+_ESTIMATION_SHARE, _TOO_SHORT = 0.7, 8
 
 # Blocks of time of each held-out part: many enough for the spread of their errors to be
 # known, and long enough for these to be nearly independent.
 _N_BLOCKS = 20
 
-# Horizons tried differ by this factor: the error changes little within it.
-_HORIZON_RATIO = 1.5
+_HORIZON_RATIO = 1.5  # between horizons tried: the error changes little within it
 
 # Height of the Hankel matrix up to which horizons are tried: the cost of compression
 # grows with its third power.
 _MAX_ROWS = 1000
 
 # Highest order tried, and the values that the data must have for each parameter.
-_MAX_ORDER = 20
-
-_VALUES_PER_PARAMETER = 10
+_MAX_ORDER, _VALUES_PER_PARAMETER = 20, 10
 
 # Orders tried beyond the last one that made the loss this much smaller, one per cent.
-_PATIENCE = 3
+_PATIENCE, _NOTICEABLE = 3, 0.99
 
-_NOTICEABLE = 0.99
-
-# A loss below this share of the outputs' energy (a relative error of 1e-9) is rounding.
-_EXACT = 1e-18
+_EXACT = 1e-18  # share of the outputs' energy (an error of 1e-9) that is rounding
 
 # A start this close to the best one ends in the same minimum when it is refined; the
 # shorter horizon is then the cheaper one. Unrefined, a horizon must be as good.
@@ -78,29 +61,20 @@ _LOSS_SLACK = {True: 1.05, False: 1.005}
 # Held-out errors that are higher by less than this share, or by less than this many
 # standard errors (two: 95 %), are as good: one superfluous state costs more than the
 # first in a record of a few thousand samples.
-_NEGLIGIBLE_GAIN = 3e-3
-
-_STANDARD_ERRORS = 2.0
+_NEGLIGIBLE_GAIN, _STANDARD_ERRORS = 3e-3, 2.0
 
 # What rules an order out by the data it was estimated on: this many times the loss of a
 # higher one (twice the error), and an F statistic that does not come about by chance.
-_TWICE_THE_ERROR = 4.0
-
-_CERTAIN = 20.0
+_TWICE_THE_ERROR, _CERTAIN = 4.0, 20.0
 
 
 class Candidate(NamedTuple):
     """One row of the selection table.
 
-    Attributes
-    ----------
-    order, horizon : int
-    criterion : float
-        Simulation error of the subspace model on the estimation part, root mean
-        square relative to the outputs.
-    validation_bft : float
-        Best fit (percent) on the held-out part of the model that would be returned,
-        the mean over outputs; NaN for a horizon that lost within its order.
+    The criterion is the simulation error of the subspace model on the estimation part,
+    root mean square relative to the outputs; `validation_bft` the best fit (percent,
+    mean over outputs) on the held-out part of the model that would be returned, NaN for
+    a horizon that lost within its order.
     """
 
     order: int
@@ -110,37 +84,41 @@ class Candidate(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """Outcome of `select`.
-
-    Attributes
-    ----------
-    order, horizon : int
-        The choice.
-    candidates : list of Candidate
-        Everything that was tried.
-    """
+    """The order and the horizon chosen, and everything that was tried."""
 
     order: int
     horizon: int
     candidates: list[Candidate]
 
+    def table(self) -> pd.DataFrame:
+        """One row per candidate, and which of them was chosen."""
+        table = pd.DataFrame(self.candidates, columns=Candidate._fields)
+        chosen = (table["order"] == self.order) & (table["horizon"] == self.horizon)
+        return table.assign(chosen=chosen)
+
+
+def selection_text(table: pd.DataFrame) -> str:
+    """The selection table as text, the chosen row marked.
+
+    >>> print(selection_text(Selection(2, 9, [Candidate(2, 9, 0.031, 96.9)]).table()))
+    order  horizon  error [%]  validation BFT [%]
+        2        9     3.1000               96.90  <- chosen
+    """
+    lines = ["order  horizon  error [%]  validation BFT [%]"]
+    for order, horizon, criterion, validation_bft, chosen in table.to_numpy():
+        bft = "-" if np.isnan(validation_bft) else f"{validation_bft:.2f}"
+        mark = "  <- chosen" if chosen else ""
+        error = f"{100.0 * criterion:.4f}"
+        lines.append(f"{order:5.0f}  {horizon:7.0f}  {error:>9}  {bft:>18}{mark}")
+    return "\n".join(lines)
+
 
 class _Split(NamedTuple):
-    """Records of which the later parts are held out.
+    """Records of which the later parts are held out."""
 
-    Attributes
-    ----------
-    records : list of Record
-        Whole.
-    parts : list of Record
-        What models are estimated on.
-    cuts : list of int
-        Where the held-out part of each record begins; its length where none is.
-    """
-
-    records: list[Record]
-    parts: list[Record]
-    cuts: list[int]
+    records: list[Record]  # whole
+    parts: list[Record]  # what models are estimated on
+    cuts: list[int]  # where the held-out part begins; the length where there is none
 
     @property
     def energy(self) -> float:
@@ -149,54 +127,24 @@ class _Split(NamedTuple):
 
 
 class _Tried(NamedTuple):
-    """One order, at the horizon that suits it best.
-
-    Attributes
-    ----------
-    order, horizon : int
-    model : Realization
-        That would be returned, of the parts to estimate on.
-    held_out : ndarray of shape (n_blocks,)
-        Block sums of its squared errors on the parts held out.
-    candidates : list of Candidate
-        The horizons compared.
-    """
+    """One order, at the horizon that suits it best."""
 
     order: int
     horizon: int
-    model: Realization
-    held_out: Array
-    candidates: list[Candidate]
+    model: Realization  # that would be returned, of the parts to estimate on
+    held_out: Array  # (n_blocks,): sums of its squared errors on the parts held out
+    candidates: list[Candidate]  # the horizons compared
 
 
 def select(
     records: Sequence[Record],
     order: int | None,
     horizon: int | None,
-    *,
-    method: str = "po-moesp",
-    feedthrough: bool | NDArray[np.bool_] = True,
-    refine: bool = True,
-    enforce_stability: bool = False,
-    n_noise_states: int = 0,
-    initial_states: bool = True,
+    settings: Settings,
 ) -> Selection:
-    """Choose the order, the horizon or both.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Scaled.
-    order, horizon : int or None
-        None is to be chosen.
-    method, feedthrough, refine, enforce_stability, n_noise_states, initial_states
-        As in `identify`.
-    """
-    m, ny = len(records[0].u), len(records[0].y)
-    free = freedom(ny, m, feedthrough, initial_states)
-    settings = Settings(free, method, refine, enforce_stability, n_noise_states)
+    """Choose the order, the horizon or both (None) for scaled records."""
     records = _thin_records(records, _MAX_SAMPLES)
-    if order is not None or not enforce_stability:
+    if order is not None or not settings.enforce_stability:
         return _search(records, order, horizon, settings)
     # The order is that of the system, whatever a stable model can show of it.
     as_found = settings._replace(enforce_stability=False)
@@ -217,7 +165,7 @@ def _search(
     orders = range(0 if order is None else order, highest + 1)
     width = highest + settings.n_noise_states
     widths = {h: min(width, settings.max_order(h)) for h in horizons}
-    spaces = _subspaces(parts, widths, settings.method)
+    spaces = subspaces_of(parts, widths, settings.method)
     # Of a given order, the table tells what every horizon would return.
     tried = _try_orders(orders, spaces, split, settings, validate_all=order is not None)
     best = _choose(tried, split)
@@ -226,7 +174,7 @@ def _search(
         # Nothing corrects the horizon afterwards: compare on the whole records.
         width = best.order + settings.n_noise_states
         widths = {h: width for h in horizons if best.order <= settings.max_order(h)}
-        spaces = _subspaces(records, widths, settings.method)
+        spaces = subspaces_of(records, widths, settings.method)
         starts = _starts(best.order, spaces, records, settings)
         chosen = _best_horizon(starts, settings.refine)
     candidates = [row for one in tried for row in one.candidates]
@@ -238,9 +186,6 @@ def _thin_records(records: Sequence[Record], n_samples: int) -> list[Record]:
 
     Experiments beyond that length are cut to it.
 
-    Examples
-    --------
-    >>> import numpy as np
     >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
     >>> [run.u.shape[1] for run in _thin_records(runs, 120)]
     [50, 60]
@@ -248,13 +193,7 @@ def _thin_records(records: Sequence[Record], n_samples: int) -> list[Record]:
     lengths = [record.u.shape[1] for record in records]
     keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
     spread = [i * len(records) // keep for i in range(keep)]
-    return [
-        Record(
-            np.ascontiguousarray(records[i].u[:, :n_samples]),
-            np.ascontiguousarray(records[i].y[:, :n_samples]),
-        )
-        for i in spread
-    ]
+    return [records[i].head(n_samples) for i in spread]
 
 
 def _hold_out(records: list[Record], order: int | None, settings: Settings) -> _Split:
@@ -263,13 +202,9 @@ def _hold_out(records: list[Record], order: int | None, settings: Settings) -> _
     cuts = [
         n if n < _TOO_SHORT else int(np.ceil(_ESTIMATION_SHARE * n)) for n in lengths
     ]
-    n_outputs, n_inputs = settings.free.direct.shape
-    if order and settings.max_order(max_horizon(cuts, n_inputs, n_outputs)) < order:
+    if order and settings.max_order(settings.max_horizon(cuts)) < order:
         return _Split(records, records, lengths)
-    parts = [
-        Record(record.u[:, :cut].copy(), record.y[:, :cut].copy())
-        for record, cut in zip(records, cuts, strict=True)
-    ]
+    parts = [record.head(cut) for record, cut in zip(records, cuts, strict=True)]
     return _Split(records, parts, cuts)
 
 
@@ -287,14 +222,12 @@ def _highest_horizon(records: Sequence[Record], settings: Settings) -> int:
     ny, m = settings.free.direct.shape
     height = 2 * m + (1 if settings.method == "pi-moesp" else 2) * ny
     lengths = [record.u.shape[1] for record in records]
-    return min(max_horizon(lengths, m, ny), max(2, _MAX_ROWS // height))
+    return min(settings.max_horizon(lengths), max(2, _MAX_ROWS // height))
 
 
 def _horizon_grid(lowest: int, highest: int) -> list[int]:
     """Horizons to try, in a geometric progression that ends at the highest.
 
-    Examples
-    --------
     >>> _horizon_grid(4, 30)
     [4, 6, 9, 13, 20, 30]
     """
@@ -316,19 +249,6 @@ def _highest_order(
     affordable /= m + ny + len(parts)
     by_horizon = max(settings.max_order(h) for h in horizons)
     return int(np.clip(affordable, 0, min(_MAX_ORDER, by_horizon)))
-
-
-def _subspaces(
-    records: Sequence[Record], widths: Mapping[int, int], method: str
-) -> dict[int, ObservabilitySubspace]:
-    """Observability subspace of every horizon, of as many directions as given."""
-    shared = correlations_of(records, max(widths))
-    return {
-        horizon: subspace_of(
-            records, horizon, width, method=method, correlations=shared
-        )
-        for horizon, width in widths.items()
-    }
 
 
 def _try_orders(
@@ -370,7 +290,7 @@ def _validated(
     for horizon in starts if validate_all else [chosen]:
         model = starts[horizon]
         if settings.refine:
-            model, _ = refine_simulation(model, split.parts, settings.free)
+            model = refine_simulation(model, split.parts, settings.free)
         models[horizon] = model
         errors[horizon] = _held_out_error(model, split.records, split.cuts)
     candidates = [
@@ -406,18 +326,10 @@ def _best_horizon(starts: Mapping[int, Realization], refine: bool) -> int:
 
 
 class _HeldOutError(NamedTuple):
-    """Simulation error on the parts held out.
+    """Simulation error on the parts held out."""
 
-    Attributes
-    ----------
-    blocks : ndarray of shape (n_blocks,)
-        Sums of squares over consecutive blocks of time.
-    bft : float
-        Best fit, percent, the mean over outputs; NaN where nothing is held out.
-    """
-
-    blocks: Array
-    bft: float
+    blocks: Array  # (n_blocks,): sums of squares over consecutive blocks of time
+    bft: float  # best fit, percent, mean over outputs; NaN where nothing is held out
 
 
 def _held_out_error(
@@ -464,9 +376,6 @@ def _smallest_good_order(held_out: Mapping[int, Array]) -> int:
     differences, and by more than 0.3 % of the best error. `held_out` are the block sums
     of squared errors by order, ascending.
 
-    Examples
-    --------
-    >>> import numpy as np
     >>> errors = {1: np.full(10, 5.0), 2: np.full(10, 1.001), 3: np.full(10, 1.0)}
     >>> _smallest_good_order(errors)
     2
@@ -492,17 +401,9 @@ def _lowest_order(losses: Mapping[int, float], n_values: int, per_state: int) ->
     that has twice the error (root mean square) of a higher one, and many times more
     than its missing parameters would explain.
 
-    Parameters
-    ----------
-    losses : mapping of int to float
-        Sums of squared simulation errors on the estimation part by order, ascending.
-    n_values : int
-        Samples times outputs.
-    per_state : int
-        Parameters that a state adds.
+    `losses` are sums of squared simulation errors on the estimation part by order,
+    ascending, of `n_values` samples times outputs; a state adds `per_state` parameters.
 
-    Examples
-    --------
     >>> _lowest_order({0: 1.0, 1: 1e-3, 2: 0.9e-3}, n_values=500, per_state=2)
     1
     """
@@ -521,78 +422,48 @@ def _lowest_order(losses: Mapping[int, float], n_values: int, per_state: int) ->
 # What a model at its minimum under white noise does not show: correlation of the
 # simulation error with past inputs, in standard deviations (the largest of a hundred
 # chance values is near three), or with its predecessor.
-_SUSPICIOUS = 6.0
-
-_SMOOTH = 0.3
+_SUSPICIOUS, _SMOOTH = 6.0, 0.3
 
 # Where that is looked for: past inputs up to this many samples ago, in this many
 # samples of so many experiments.
-_N_LAGS = 40
-
-_MAX_SUSPECTED = 4_096
-
-_SUSPECTED_RECORDS = 4
+_N_LAGS, _MAX_SUSPECTED, _SUSPECTED_RECORDS = 40, 4_096, 4
 
 # Least variance of a correlation, relative to that of white signals: an estimated sum
 # of products over the lags may come out as low as zero.
 _LEAST_VARIANCE = 0.2
 
-# An error below this share of the present one is that of a clearly better model.
-_CLEARLY_BETTER = 0.9
-
-# Relative errors below this are rounding.
-_ROUNDING = 1e-6
+_CLEARLY_BETTER = 0.9  # of the present error: that of a clearly better model
+_ROUNDING = 1e-6  # relative errors below it are rounding
 
 
 def better_horizon(
-    found: Identified,
-    scaled: ScaledRecords,
+    model: Realization,
+    residual: float,
+    records: Sequence[Record],
     horizon: int,
-    free: Freedom,
-    *,
-    method: str,
-    refine: bool,
-    enforce_stability: bool,
+    settings: Settings,
 ) -> tuple[int, float] | None:
-    """Another horizon whose model fits clearly better, where there is one.
+    """Another horizon whose model fits clearly better, and its residual.
 
     Others are tried only if the simulation error has structure: coloured noise, a model
     of too low an order, or a poor minimum, which can be told apart by trying.
-
-    Parameters
-    ----------
-    found : Identified
-        Model of the given horizon.
-    scaled : ScaledRecords
-    horizon : int
-    free : Freedom
-    method, refine, enforce_stability
-        As in `identify`.
-
-    Returns
-    -------
-    horizon : int
-    residual : float
-        Its relative simulation error.
     """
-    records, model = scaled.records, found.scaled_model
-    if not _ROUNDING < found.residual < np.inf:
+    if not _ROUNDING < residual < np.inf:
         return None
     some = zip(records[:_SUSPECTED_RECORDS], model.initial_states, strict=False)
     structure = [_error_structure(model, record, x0) for record, x0 in some]
     if all(u < _SUSPICIOUS and v < _SMOOTH for u, v in structure):
         return None
     order, energy = len(model.A), output_energy(records)
-    settings = Settings(free, method, refine, enforce_stability)
     highest = _highest_horizon(records, settings)
     for other in (2 * horizon, 4 * horizon, horizon // 2):
         if not 2 <= other <= highest or settings.max_order(other) < order:
             continue
-        space = subspace_of(records, other, order, method=method)
-        trial, _ = estimate(space, records, order, settings)
-        residual = float(np.sqrt(trial.loss / energy))
-        if residual < _CLEARLY_BETTER * found.residual:
-            return other, residual
+        space = subspaces_of(records, {other: order}, settings.method)[other]
+        trial = estimate(space, records, order, settings)
+        error = float(np.sqrt(trial.loss / energy))
+        if error < _CLEARLY_BETTER * residual:
+            return other, error
     return None
 
 
@@ -612,7 +483,7 @@ def _error_structure(
     own = np.einsum("dii->di", lags)
     of_u, of_v = own[:, :m], own[:, m:]
     white = np.outer(of_u[0], of_v[0])
-    variance = np.maximum(2.0 * of_u.T @ of_v - white, 0.2 * white) / n
+    variance = np.maximum(2.0 * of_u.T @ of_v - white, _LEAST_VARIANCE * white) / n
     variance[variance == 0.0] = np.inf
     by_inputs = (np.abs(lags[:, :m, m:]) / np.sqrt(variance)).max()
     size = np.where(of_v[0] > 0.0, of_v[0], np.inf)

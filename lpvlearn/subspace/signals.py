@@ -26,30 +26,26 @@ from .hankel import cholesky_factor, stack_factors
 
 Array = NDArray[np.float64]
 
-# Beyond this condition number of T the sections would lose half of the digits.
-_MAX_CONDITION = 1e8
-
-# Cosine above which two eigenvectors do not define their plane accurately.
-_PARALLEL = 1.0 - 1e-8
-
-# Samples worked on at a time: their signals stay in the cache.
-_PIECE = 8192
-
-# Squares of responses beyond this would overflow.
-_LARGEST = 1e200
+_MAX_CONDITION = 1e8  # of T, beyond which the sections lose half of the digits
+_PARALLEL = 1.0 - 1e-8  # cosine of eigenvectors that leave their plane inaccurate
+_PIECE = 8192  # samples worked on at a time: their signals stay in the cache
+_LARGEST = 1e200  # squares of responses beyond it would overflow
 
 
 class Record(NamedTuple):
-    """Samples of one experiment, one row per channel.
+    """Samples of one experiment, one row per channel."""
 
-    Attributes
-    ----------
-    u : ndarray of shape (n_inputs, n_samples)
-    y : ndarray of shape (n_outputs, n_samples)
-    """
+    u: Array  # (n_inputs, n_samples)
+    y: Array  # (n_outputs, n_samples)
 
-    u: Array
-    y: Array
+    @classmethod
+    def of(cls, u: Array, y: Array) -> Record:
+        """The record of samples with one row per time instant, rows contiguous."""
+        return cls(np.ascontiguousarray(u.T), np.ascontiguousarray(y.T))
+
+    def head(self, n_samples: int) -> Record:
+        """The first samples."""
+        return Record(self.u[:, :n_samples].copy(), self.y[:, :n_samples].copy())
 
 
 def output_energy(records: Sequence[Record]) -> float:
@@ -58,36 +54,18 @@ def output_energy(records: Sequence[Record]) -> float:
 
 
 class Sections(NamedTuple):
-    """Block-diagonal form of a state matrix.
+    """Block-diagonal form: ``A @ transform = transform @ block_diag(*blocks)``."""
 
-    Attributes
-    ----------
-    blocks : tuple of ndarray of shape (1, 1) or (2, 2)
-        Diagonal blocks.
-    transform : ndarray of shape (order, order)
-        ``A @ transform = transform @ block_diag(*blocks)``.
-    """
-
-    blocks: tuple[Array, ...]
+    blocks: tuple[Array, ...]  # of shape (1, 1) or (2, 2)
     transform: Array
 
 
 def block_sections(A: Array) -> Sections | None:
     """Split a state matrix into sections of one or two states.
 
-    Parameters
-    ----------
-    A : ndarray of shape (order, order)
+    None where the transformation is too ill conditioned: a pole of multiplicity three
+    or more, or a repeated complex pair.
 
-    Returns
-    -------
-    Sections or None
-        None where the transformation is too ill conditioned (a pole of multiplicity
-        three or more, or a repeated complex pair).
-
-    Examples
-    --------
-    >>> import numpy as np
     >>> A = np.array([[0.9, 1.0, 0.0], [0.0, 0.9, 0.0], [0.3, 0.0, 0.2]])
     >>> sections = block_sections(A)
     >>> [block.shape[0] for block in sections.blocks]
@@ -140,31 +118,22 @@ def _invariant_basis(A: Array, poles: Array, vectors: Array) -> Array:
 
 
 def signal_pieces(
-    blocks: tuple[Array, ...], record: Record, state_map: Array | None = None
+    blocks: tuple[Array, ...], record: Record, driven: Array | None = None
 ) -> Iterator[Array]:
-    """Signals of consecutive stretches of a record.
+    """Signals of consecutive stretches of a record, (n_signals, n_samples_i).
 
-    Parameters
-    ----------
-    blocks : tuple of ndarray
-        Diagonal blocks of A.
-    record : Record
-    state_map : ndarray of shape (order, order * (1 + n_inputs)), default=None
-        `state_coefficients`. Given, second responses follow: what every block answers
-        to its own states, the last signal of it only, since ``d = N g + [x0, B] g_u``
-        for states driven by signals with answers ``g_u``.
-
-    Yields
-    ------
-    ndarray of shape (n_signals, n_samples_i)
-        Rows: section signals, inputs, outputs, and second responses block by block.
-        Section signals: for each block and each of its signals, the answer to an
-        impulse that sets the state at time 0, then those to each input. The memory is
-        used again for the next piece.
+    Rows: section signals, inputs, outputs, and second responses block by block.
+    Section signals: for each block and each of its signals, the answer to an impulse
+    that sets the state at time 0, then those to each input. Second responses come
+    where `driven` is given, ``[x0, B]`` of shape (order, 1 + n_inputs): what every
+    block answers to its own states, the last signal of it only, since
+    ``d = N g + [x0, B] g_u`` for states driven by signals with answers ``g_u``.
+    The memory is used again for the next piece.
     """
     (m, n_samples), ny = record.u.shape, len(record.y)
     order = sum(len(block) for block in blocks)
     base = order * (1 + m)
+    state_map = None if driven is None else state_coefficients(blocks, driven)
     second = 0 if state_map is None else order
     memory = np.empty((base + m + ny + second, min(n_samples, _PIECE)))
     first_bank = _SectionBank(blocks, [1 + m] * len(blocks))
@@ -194,23 +163,12 @@ def signal_pieces(
 
 
 def signal_factor(
-    blocks: tuple[Array, ...], record: Record, state_map: Array | None = None
+    blocks: tuple[Array, ...], record: Record, driven: Array | None = None
 ) -> Array | None:
-    """Upper triangular factor of the signals of a record.
-
-    Parameters
-    ----------
-    blocks, record, state_map
-        As in `signal_pieces`.
-
-    Returns
-    -------
-    ndarray of shape (n_signals, n_signals) or None
-        None where the responses overflow.
-    """
+    """Upper triangular factor of the `signal_pieces`; None where they overflow."""
     with np.errstate(over="ignore", invalid="ignore"):
         gram: Array | float = 0.0
-        for X in signal_pieces(blocks, record, state_map):
+        for X in signal_pieces(blocks, record, driven):
             gram = gram + X @ X.T
         gram = np.asarray(gram)
         if not np.abs(np.diagonal(gram)).max(initial=0.0) < _LARGEST:
@@ -218,7 +176,7 @@ def signal_factor(
         lower = cholesky_factor(gram)
     if lower is None:
         lower = np.zeros((len(gram), 0))
-        for X in signal_pieces(blocks, record, state_map):
+        for X in signal_pieces(blocks, record, driven):
             lower = stack_factors([lower, X])
     return lower.T
 
@@ -226,12 +184,7 @@ def signal_factor(
 class _SectionBank:
     """Filters of all blocks, with the memory that a record in pieces needs.
 
-    Parameters
-    ----------
-    blocks : tuple of ndarray of shape (k, k)
-        ``k`` is one or two.
-    widths : sequence of int
-        Number of signals that drive each block.
+    `widths` are the numbers of signals that drive each block.
     """
 
     def __init__(self, blocks: tuple[Array, ...], widths: Sequence[int]) -> None:
@@ -245,14 +198,9 @@ class _SectionBank:
     def run(self, late: Sequence[Array], out: Array, *, last_only: bool) -> None:
         """Filter the next piece.
 
-        Parameters
-        ----------
-        late : sequence of ndarray of shape (n_signals, n_samples)
-            What drives each block, one sample late.
-        out : ndarray of shape (n_rows, n_samples)
-            Receives, block after block, ``d`` and, of blocks of two states, ``g``.
-        last_only : bool
-            Only the last of them: ``d`` of one state, ``g`` of two.
+        `late` is what drives each block, one sample late, (n_signals, n_samples) each.
+        `out` receives, block after block, ``d`` and, of blocks of two states, ``g``;
+        with `last_only` only the last of them: ``d`` of one state, ``g`` of two.
         """
         row = 0
         for i, v in enumerate(late):
@@ -288,46 +236,10 @@ class _SectionBank:
         self._last[i] = ahead[:, -1].copy()
 
 
-def output_coefficients(blocks: tuple[Array, ...], C: Array) -> Array:
-    """Outputs of every section, in terms of its signals.
-
-    ``c x = sum_i coefficient[i, j] b[j] signal[i]`` for a state driven through ``b``:
-    rows ``c`` for ``d`` and ``c N`` for ``g``.
-
-    Parameters
-    ----------
-    blocks : tuple of ndarray
-        Blocks of `Sections`.
-    C : ndarray of shape (n_outputs, order)
-        In the coordinates of the blocks.
-
-    Returns
-    -------
-    ndarray of shape (n_outputs, order, order)
-        Block diagonal, one matrix per output.
-    """
-    ny, n = C.shape
-    out = np.zeros((ny, n, n))
-    for block, part in zip(blocks, block_slices(blocks), strict=True):
-        out[:, part.start, part] = C[:, part]
-        if len(block) == 2:
-            out[:, part.start + 1, part] = C[:, part] @ block_remainder(block)
-    return out
-
-
 def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
-    """States in terms of the section signals.
+    """States in terms of the section signals, (order, order * (1 + n_inputs)).
 
-    Parameters
-    ----------
-    blocks : tuple of ndarray
-        Blocks of `Sections`.
-    driven : ndarray of shape (order, 1 + n_inputs)
-        Initial state and input matrix.
-
-    Returns
-    -------
-    ndarray of shape (order, order * (1 + n_inputs))
+    `driven` is ``[x0, B]``.
     """
     n, width = driven.shape
     out = np.zeros((n, n, width))

@@ -8,6 +8,9 @@ are signals, for each output. The derivative of the simulation error with respec
 all parameters, which `refinement` takes its steps by, is a regression on the same
 signals and on second responses. The unknowns of an experiment (its initial state) are
 projected out before experiments are pooled.
+
+The parameters of a model in section form are one vector: B (state-major), the free
+entries of D, the blocks of A (row-major) and C, as in the columns of the Jacobian.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..systems.least_squares import RCOND, scaled_lstsq
+from ..systems.least_squares import RCOND, column_scale, scaled_lstsq
 from ..systems.simulation import lti_response
 from .hankel import triangularize
 from .signals import (
@@ -27,7 +30,6 @@ from .signals import (
     block_remainder,
     block_sections,
     block_slices,
-    output_coefficients,
     signal_factor,
     state_coefficients,
 )
@@ -36,84 +38,105 @@ Array = NDArray[np.float64]
 
 
 class Freedom(NamedTuple):
-    """Which parameters are free besides A, B and C.
+    """Which parameters are free besides A, B and C."""
 
-    Attributes
-    ----------
-    direct : ndarray of bool, shape (n_outputs, n_inputs)
-        Entries of D; the others are zero.
-    initial_states : bool
-        False starts every experiment from rest.
-    """
+    direct: NDArray[np.bool_]  # (n_outputs, n_inputs): entries of D; others are zero
+    initial_states: bool = True  # False starts every experiment from rest
 
-    direct: NDArray[np.bool_]
-    initial_states: bool = True
+    def n_own(self, order: int) -> int:
+        """Number of unknowns that belong to one experiment."""
+        return order if self.initial_states else 0
 
-
-def freedom(
-    n_outputs: int,
-    n_inputs: int,
-    feedthrough: bool | NDArray[np.bool_] = True,
-    initial_states: bool = True,
-) -> Freedom:
-    """Initial states free or zero, and D as `feedthrough` says: all, none or a mask."""
-    direct = np.broadcast_to(np.asarray(feedthrough, dtype=bool), (n_outputs, n_inputs))
-    return Freedom(np.array(direct), initial_states)
+    def n_linear(self, order: int) -> int:
+        """Number of unknowns that outputs are linear in: initial state, B and D."""
+        n_d, m = int(self.direct.sum()), self.direct.shape[1]
+        return self.n_own(order) + order * m + n_d
 
 
 class Realization(NamedTuple):
-    """A discrete-time model with the initial states of its experiments.
-
-    Attributes
-    ----------
-    A, B, C, D : ndarray
-        State-space matrices.
-    initial_states : ndarray of shape (n_experiments, order)
-    loss : float
-        Sum of squared simulation errors over all experiments; infinite where the
-        simulation overflows.
-    rank_deficit : int
-        Number of directions of B and D that the data leave undetermined.
-    blocks : tuple of ndarray or None
-        Diagonal blocks of A where it is in section form.
-    """
+    """A discrete-time model with the initial states of its experiments."""
 
     A: Array
     B: Array
     C: Array
     D: Array
-    initial_states: Array
-    loss: float
-    rank_deficit: int = 0
-    blocks: tuple[Array, ...] | None = None
+    initial_states: Array  # (n_experiments, order)
+    loss: float  # sum of squared simulation errors; infinite where they overflow
+    rank_deficit: int = 0  # directions of B and D that the data leave undetermined
+    blocks: tuple[Array, ...] | None = None  # of A, where it is in section form
+
+
+def in_sections(model: Realization) -> Realization:
+    """The same model in section form, or as it is where there is none."""
+    if model.blocks is not None:
+        return model
+    sections = block_sections(model.A)
+    if sections is None:
+        return model
+    blocks, T = sections
+    return model._replace(
+        A=linalg.block_diag(*blocks),
+        B=linalg.solve(T, model.B),
+        C=model.C @ T,
+        initial_states=linalg.solve(T, model.initial_states.T).T,
+        blocks=blocks,
+    )
+
+
+def parameter_slices(model: Realization, free: Freedom) -> list[slice]:
+    """Where the entries of every block of A stand among the parameters."""
+    assert model.blocks is not None
+    sizes = [block.size for block in model.blocks]
+    stops = model.B.size + int(free.direct.sum()) + np.cumsum(sizes, dtype=int)
+    return [slice(stop - size, stop) for stop, size in zip(stops, sizes, strict=True)]
+
+
+def moved_model(model: Realization, change: Array, free: Freedom) -> Realization:
+    """The model after a change of its parameters; what else it tells is not updated.
+
+    An initial state may stand before the parameters, as in `linearised`: it is ignored.
+    """
+    assert model.blocks is not None
+    n_b, n_d, n_c = model.B.size, int(free.direct.sum()), model.C.size
+    n_a = sum(block.size for block in model.blocks)
+    change = change[len(change) - (n_b + n_d + n_a + n_c) :]
+    D = model.D.copy()
+    D[free.direct] += change[n_b : n_b + n_d]
+    blocks = tuple(
+        block + change[part].reshape(block.shape)
+        for block, part in zip(model.blocks, parameter_slices(model, free), strict=True)
+    )
+    return model._replace(
+        A=linalg.block_diag(*blocks) if blocks else model.A,
+        B=model.B + change[:n_b].reshape(model.B.shape),
+        C=model.C + change[len(change) - n_c :].reshape(model.C.shape),
+        D=D,
+        blocks=blocks,
+    )
+
+
+def change_between(start: Realization, end: Realization, free: Freedom) -> Array:
+    """The change of the parameters that leads from one model to another."""
+    assert start.blocks is not None and end.blocks is not None
+    changes = [new - old for new, old in zip(end.blocks, start.blocks, strict=True)]
+    return np.concatenate(
+        [
+            (end.B - start.B).ravel(),
+            (end.D - start.D)[free.direct],
+            *(change.ravel() for change in changes),
+            (end.C - start.C).ravel(),
+        ]
+    )
 
 
 def simulation_fit(
-    A: Array, C: Array, records: Sequence[Record], free: Freedom | None = None
+    A: Array, C: Array, records: Sequence[Record], free: Freedom
 ) -> Realization:
     """B, D and initial states that minimise the simulation error.
 
-    Parameters
-    ----------
-    A : ndarray of shape (order, order)
-    C : ndarray of shape (n_outputs, order)
-    records : sequence of Record
-        Experiments, each with its own initial state.
-    free : Freedom, default=None
-        None frees all initial states and all of D.
-
-    Returns
-    -------
-    Realization
-        In the coordinates of `block_sections` where these exist, else in those given.
-
-    References
-    ----------
-    M. Verhaegen and V. Verdult, *Filtering and System Identification*, Cambridge
-    University Press, 2007, Section 9.2.4.
+    In section form where there is one, else in the coordinates given. Verhaegen and
+    Verdult, *Filtering and System Identification*, 2007, Section 9.2.4.
     """
-    if free is None:
-        free = freedom(len(C), len(records[0].u))
     sections = block_sections(A)
     if sections is not None:
         return block_fit(sections.blocks, C @ sections.transform, records, free)
@@ -145,7 +168,7 @@ def _general_regression(A: Array, C: Array, record: Record, free: Freedom) -> Ar
     ``(A.T, c)`` driven by ``u_j``. Slower, but free of any transformation.
     """
     (m, n_samples), (ny, n) = record.u.shape, C.shape
-    own = n_own(n, free)
+    own = free.n_own(n)
     where = np.argwhere(free.direct)
     eye, none = np.eye(n), np.zeros((n, 1))
     parts = []
@@ -174,8 +197,8 @@ def _realization(
     blocks: tuple[Array, ...] | None,
 ) -> Realization:
     n, m = len(A), free.direct.shape[1]
-    own = n_own(n, free)
-    common, states, loss, deficit = solve_regressions(factors, own)
+    own = free.n_own(n)
+    common, states, loss, deficit = _solve_regressions(factors, own)
     D = np.zeros(free.direct.shape)
     D[free.direct] = common[n * m :]
     if not own:
@@ -191,26 +214,13 @@ def _overflowing(A: Array, C: Array, records: Sequence[Record]) -> Realization:
     return Realization(A, zero[0], C, zero[1], zero[2], np.inf)
 
 
-def solve_regressions(
+def _solve_regressions(
     regressions: Sequence[Array], n: int
 ) -> tuple[Array, Array, float, int]:
-    """Common unknowns and the own ones of every experiment.
+    """Common unknowns, own ones (n_experiments, n), loss and rank deficit.
 
-    Parameters
-    ----------
-    regressions : sequence of ndarray
-        The first `n` columns belong to an experiment's own unknowns, the last is the
-        right-hand side.
-    n : int
-
-    Returns
-    -------
-    common : ndarray of shape (n_common,)
-    own : ndarray of shape (n_experiments, n)
-    loss : float
-        Residual sum of squares.
-    rank_deficit : int
-        Of the common unknowns.
+    The first `n` columns of a regression belong to the own unknowns of its experiment,
+    the last is the right-hand side. The deficit is that of the common unknowns.
     """
     if len(regressions) == 1:
         M, rhs = regressions[0][:, :-1], regressions[0][:, -1]
@@ -218,7 +228,7 @@ def solve_regressions(
         if rank == M.shape[1]:
             loss = float(np.sum((M @ solution - rhs) ** 2))
             return solution[n:], solution[None, :n], loss, 0
-    stacked = stack_regressions(regressions, n)
+    stacked = _stack_regressions(regressions, n)
     common, rank = scaled_lstsq(stacked[:, :-1], stacked[:, -1])
     loss = float(np.sum((stacked[:, :-1] @ common - stacked[:, -1]) ** 2))
     own = np.empty((len(regressions), n))
@@ -227,15 +237,15 @@ def solve_regressions(
     return common, own, loss, len(common) - rank
 
 
-def stack_regressions(regressions: Sequence[Array], n: int) -> Array:
+def _stack_regressions(regressions: Sequence[Array], n: int) -> Array:
     """One regression on the common unknowns, the first `n` of each projected out."""
-    reduced = [project_out(M, n) for M in regressions]
+    reduced = [_project_out(M, n) for M in regressions]
     if len(reduced) == 1:
         return reduced[0]
     return triangularize(np.vstack(reduced).T)
 
 
-def project_out(M: Array, n: int) -> Array:
+def _project_out(M: Array, n: int) -> Array:
     """The columns after the first `n`, without what the first `n` explain."""
     if n == 0:
         return M
@@ -243,50 +253,16 @@ def project_out(M: Array, n: int) -> Array:
     return M[:, n:] - explained @ (explained.T @ M[:, n:])
 
 
-def column_scale(M: Array) -> Array:
-    """Norm of every column; 1 for a column of zeros."""
-    scale = np.sqrt(np.einsum("ij,ij->j", M, M))
-    scale[scale == 0.0] = 1.0
-    return scale
-
-
-class Point(NamedTuple):
-    """A model in section form, around which the simulation error is linearised.
-
-    Attributes
-    ----------
-    C : ndarray of shape (n_outputs, order)
-    D : ndarray of shape (n_outputs, n_inputs)
-    driven : ndarray of shape (order, 1 + n_inputs)
-        Initial state and B.
-    """
-
-    C: Array
-    D: Array
-    driven: Array
-
-
 def linear_regression(
     R: Array, blocks: tuple[Array, ...], C: Array, free: Freedom
 ) -> Array:
     """Regression of the outputs on initial state, B and D, with A and C given.
 
-    Parameters
-    ----------
-    R : ndarray of shape (k, n_signals)
-        From `signal_factor`.
-    blocks : tuple of ndarray
-        Blocks of A.
-    C : ndarray of shape (n_outputs, order)
-    free : Freedom
-
-    Returns
-    -------
-    ndarray of shape (n_outputs * k, n_unknowns + 1)
-        Columns: initial state (if free), B (state-major), free entries of D, output.
+    `R` (k, n_signals) comes from `signal_factor`. Rows: outputs times k; columns:
+    initial state (if free), B (state-major), free entries of D, output.
     """
     (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
-    out = np.zeros((ny, k, _n_linear(n, free) + 1))
+    out = np.zeros((ny, k, free.n_linear(n) + 1))
     _fill_linear(out, R, blocks, C, free)
     base = n * (1 + m)
     out[:, :, -1] = R[:, base + m : base + m + ny].T
@@ -294,28 +270,18 @@ def linear_regression(
 
 
 def jacobian_regression(
-    R: Array, blocks: tuple[Array, ...], point: Point, free: Freedom
+    R: Array, model: Realization, driven: Array, free: Freedom
 ) -> Array:
     """Regression of the simulation error on changes of all parameters.
 
-    Parameters
-    ----------
-    R : ndarray of shape (k, n_signals)
-        From `signal_factor`, with second responses.
-    blocks : tuple of ndarray
-        Blocks of A.
-    point : Point
-    free : Freedom
-
-    Returns
-    -------
-    ndarray of shape (n_outputs * k, n_parameters + 1)
-        Columns: initial state (if free), B, free entries of D, A (blocks, row-major),
-        C, simulation error.
+    `R` (k, n_signals) comes from `signal_factor`, with second responses of the model,
+    in section form, with ``driven = [x0, B]``. Rows: outputs times k; columns: initial
+    state (if free), then the parameters, then the simulation error.
     """
-    C, D, driven = point
+    blocks, C, D = model.blocks, model.C, model.D
+    assert blocks is not None
     (ny, n), m, k = C.shape, D.shape[1], len(R)
-    column, base = _n_linear(n, free), n * (1 + m)
+    column, base = free.n_linear(n), n * (1 + m)
     size_a = sum(block.size for block in blocks)
     out = np.zeros((ny, k, column + size_a + ny * n + 1))
     _fill_linear(out, R, blocks, C, free)
@@ -341,9 +307,30 @@ def jacobian_regression(
     return out.reshape(ny * k, -1)
 
 
-def _n_linear(order: int, free: Freedom) -> int:
-    """Number of unknowns that an output is linear in: initial state, B and D."""
-    return n_own(order, free) + order * free.direct.shape[1] + int(free.direct.sum())
+def linearised(
+    model: Realization,
+    records: Sequence[Record],
+    free: Freedom,
+    *,
+    keep_one: bool = False,
+) -> Array | None:
+    """Simulation error of all experiments, linearised at a model in section form.
+
+    A regression as `jacobian_regression`, but without the initial states, which are
+    projected out; with `keep_one` that of a single experiment stays among the unknowns,
+    where it costs less. None where responses overflow.
+    """
+    assert model.blocks is not None
+    parts = []
+    for record, x0 in zip(records, model.initial_states, strict=True):
+        driven = np.column_stack([x0, model.B])
+        R = signal_factor(model.blocks, record, driven)
+        if R is None:
+            return None
+        parts.append(jacobian_regression(R, model, driven, free))
+    if keep_one and len(parts) == 1:
+        return parts[0]
+    return _stack_regressions(parts, free.n_own(len(model.A)))
 
 
 def _fill_linear(
@@ -351,9 +338,9 @@ def _fill_linear(
 ) -> None:
     """Fill in the effects of initial state (if free), B and the free entries of D."""
     (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
-    own, base = n_own(n, free), n * (1 + m)
+    own, base = free.n_own(n), n * (1 + m)
     signals = R[:, :base].reshape(k, n, 1 + m).transpose(0, 2, 1)
-    effect = signals[None] @ output_coefficients(blocks, C)[:, None]
+    effect = signals[None] @ _output_coefficients(blocks, C)[:, None]
     out[:, :, :own] = effect[:, :, 0, :own]
     by_state = effect[:, :, 1:].transpose(0, 1, 3, 2)
     out[:, :, own : own + n * m] = by_state.reshape(ny, k, n * m)
@@ -361,6 +348,16 @@ def _fill_linear(
         out[i, :, column] = R[:, base + j]
 
 
-def n_own(order: int, free: Freedom) -> int:
-    """Number of unknowns that belong to one experiment."""
-    return order if free.initial_states else 0
+def _output_coefficients(blocks: tuple[Array, ...], C: Array) -> Array:
+    """Outputs of every section, in terms of its signals: (n_outputs, order, order).
+
+    ``c x = sum_i coefficient[i, j] b[j] signal[i]`` for a state driven through ``b``:
+    rows ``c`` for ``d`` and ``c N`` for ``g``; block diagonal.
+    """
+    ny, n = C.shape
+    out = np.zeros((ny, n, n))
+    for block, part in zip(blocks, block_slices(blocks), strict=True):
+        out[:, part.start, part] = C[:, part]
+        if len(block) == 2:
+            out[:, part.start + 1, part] = C[:, part] @ block_remainder(block)
+    return out

@@ -18,8 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.columns import Column
-from ..data.experiments import Experiment
+from ..data.experiments import Column, Experiment
 from ..data.preparation import (
     Pairs,
     complete_runs,
@@ -29,11 +28,11 @@ from ..data.preparation import (
     remove_trends,
 )
 from ..data.timestamps import check_uniform_time, time_in_seconds
-from .fit import LocalFit, TooFewSamples, fit_pairs
-from .options import (
+from .fit import (
     Choices,
-    check_size,
-    feedthrough_mask,
+    LocalFit,
+    TooFewSamples,
+    fit_pairs,
     tell,
     warn_about,
     warn_about_drift,
@@ -58,15 +57,9 @@ _REMEMBERED = 256
 class StreamClock:
     """Guard on the times of consecutive batches.
 
-    Attributes
-    ----------
-    step : float or None
-        Mean step of the first experiment so far, seconds; None before its second
-        sample.
+    `step` is the mean step of the first experiment so far, seconds; None before its
+    second sample.
 
-    Examples
-    --------
-    >>> import numpy as np
     >>> clock = StreamClock()
     >>> clock.check(Column("t", np.array([0.0, 0.1, 0.2])), 0, continues=False)
     >>> clock.check(Column("t", np.array([0.3, 0.4])), 0, continues=True)
@@ -85,18 +78,8 @@ class StreamClock:
     def check(self, stamps: Column, label: Hashable, *, continues: bool) -> None:
         """Refuse a batch that repeats or leaves out time, or has another step.
 
-        Parameters
-        ----------
-        stamps : Column
-            Times of the batch's samples of one experiment, even among themselves.
-        label : hashable
-            Of the experiment, for the message.
-        continues : bool
-            Whether the experiment was the last one of the batch before.
-
-        Raises
-        ------
-        ValueError
+        `stamps` are those of one experiment, even among themselves; `continues` tells
+        whether it was the last one of the batch before.
         """
         times = pd.Series(stamps.values).reset_index(drop=True)
         joined = times
@@ -169,16 +152,8 @@ class StreamClock:
 class SampleBuffer:
     """The samples of a stream that are kept, at most `BUFFER` of them.
 
-    Parameters
-    ----------
-    gaps : bool
-        Whether experiments end at missing samples; single ones between two gaps are
-        then left out.
-
-    Attributes
-    ----------
-    n_samples : int
-        Kept, but for those left out.
+    With `gaps` experiments end at missing samples; single ones between two gaps are
+    then left out, and do not count in `n_samples`.
     """
 
     def __init__(self, gaps: bool) -> None:
@@ -239,20 +214,10 @@ class SampleBuffer:
 class SampleStream:
     """The batches of `SubspaceLTI.partial_fit`.
 
-    Parameters
-    ----------
-    choices : Choices
-    options : mapping
-        The parameters of the estimator, which must not change in mid-stream.
-    first : sequence of Experiment
-        Of the first batch.
-    step : float
-        Seconds between samples where no `time` column tells it.
-
-    Raises
-    ------
-    ValueError
-        If the options are such that no table of these channels can carry them.
+    Begins with the experiments of the first batch. `options` are the parameters of the
+    estimator, which must not change in mid-stream; `step` the seconds between samples
+    where no `time` column tells it. A ValueError where no table of these channels can
+    carry the options.
     """
 
     def __init__(
@@ -265,10 +230,8 @@ class SampleStream:
         self._choices, self._options = choices, deepcopy(options)
         self._given_step, self._names = step, first[0].input_names
         n_inputs, self._n_outputs = first[0].inputs.shape[1], _n_outputs(first)
-        feedthrough_mask(
-            choices.feedthrough, self._n_outputs, n_inputs, np.eye(n_inputs)
-        )
-        check_size([BUFFER], n_inputs, self._n_outputs, choices)
+        settings = choices.settings(self._n_outputs, n_inputs, np.eye(n_inputs))
+        settings.check_size([BUFFER], choices.order, choices.horizon)
         self._told: set[str] = set()
         self._clock = StreamClock()
         self._label: Hashable = None  # of the sample that came last
@@ -291,12 +254,7 @@ class SampleStream:
         return other
 
     def check_options(self, options: Mapping[str, Any]) -> None:
-        """Refuse options other than those the stream began with.
-
-        Raises
-        ------
-        ValueError
-        """
+        """Refuse options other than those the stream began with."""
         for name, value in options.items():
             began = self._options[name]
             if not _same(value, began):
@@ -309,27 +267,12 @@ class SampleStream:
     def add(
         self, experiments: Sequence[Experiment], times: Column | None
     ) -> LocalFit | None:
-        """Take up a batch.
+        """Take up a batch: its experiments by appearance, and the times of its rows.
 
-        Parameters
-        ----------
-        experiments : sequence of Experiment
-            In the order in which they appear in the batch.
-        times : Column or None
-            Times of the batch's rows.
-
-        Returns
-        -------
-        LocalFit or None
-            Of all samples. None where the batch adds nothing to what was found before,
-            or the samples are still too few for a model.
-
-        Raises
-        ------
-        ValueError
-            If the batch has other outputs than the first one, or an experiment that
-            continues does not do so evenly in time. This stream must then be left:
-            go on from the one that it branched off.
+        The model of all samples; None where the batch adds nothing to what was found
+        before, or the samples are still too few. After a ValueError (other outputs than
+        in the first batch, an experiment that does not go on evenly in time) this
+        stream must be left: go on from the one that it branched off.
         """
         n_outputs = _n_outputs(experiments)
         if n_outputs != self._n_outputs:
@@ -397,7 +340,7 @@ class SampleStream:
                     f"{error}",
                 )
                 left = buffer.slide(left)
-        warn_about(fitted.model, fitted.residual, fitted.stability_loss, self._told)
+        warn_about(fitted, self._told)
         if full:
             self._summary = StreamSummary(fitted, choices, buffer.n_samples)
             self._first_residual = fitted.residual
@@ -432,21 +375,9 @@ def _same(first: Any, other: Any) -> bool:
 def fit_as_stream(
     pairs: Pairs, choices: Choices, *, detrend: str | None, gaps: bool
 ) -> LocalFit | None:
-    """Fit a long table as a stream of its samples.
+    """Fit a long table as a stream of its samples; `gaps` as in `SampleBuffer`.
 
-    Parameters
-    ----------
-    pairs : list of (u, y)
-        One per experiment.
-    choices : Choices
-    detrend : {None, "constant", "linear"}
-    gaps : bool
-        As in `SampleBuffer`.
-
-    Returns
-    -------
-    LocalFit or None
-        None where that would not do: few samples, or first ones that say too little.
+    None where that would not do: few samples, or first ones that say too little.
     """
     if sum(len(u) for u, _ in pairs) <= BUFFER:
         return None

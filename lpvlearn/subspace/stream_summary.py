@@ -19,30 +19,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .fit import LocalFit
+from .fit import Choices, LocalFit
 from .hankel import HankelSum, extend_hankel_sum, start_hankel_sum
 from .identification import STABLE_LOSS, STABLE_MARGIN
-from .options import Choices
 from .realization import (
     ObservabilitySubspace,
-    dominant_pair,
     factor_input_matrices,
     observability_subspace,
     reflect_unstable,
-    shift_invariant_pair,
 )
 from .recursive_refinement import (
     Recursion,
     current_model,
     extend_recursion,
-    freedom_of_stretch,
     input_matrices,
     start_recursion,
     stretch_error,
 )
-from .refinement import in_sections
 from .signals import Record
-from .simulation_fit import Realization
+from .simulation_fit import Realization, in_sections
 
 Array = NDArray[np.float64]
 
@@ -64,77 +59,38 @@ _EXCESS, _EXCESS_UNREFINED, _ROUNDING = 0.25, 5e-4, 1e-16
 
 
 class Piece(NamedTuple):
-    """Consecutive samples of one experiment.
-
-    Attributes
-    ----------
-    u, y : ndarray
-    starts : bool
-        False where they continue the experiment that came last.
-    """
+    """Consecutive samples of one experiment."""
 
     u: Array
     y: Array
-    starts: bool
+    starts: bool  # False where they continue the experiment that came last
 
 
 class _Sums(NamedTuple):
-    """Sums over the samples taken up.
-
-    Attributes
-    ----------
-    hankel : HankelSum
-    recursion : Recursion or None
-        None where the model of the first samples cannot be linearised at.
-    initial_state : ndarray of shape (order,)
-        Of the last stretch.
-    energy : ndarray of shape (n_channels,)
-        Per channel: the subspace step weighs the outputs by their final size.
-    n_samples : int
-    point : Realization or None
-        Where to linearise if not at the minimum.
-    next_point : int
-        Number of samples from which to look for another such point.
-    """
+    """Sums over the samples taken up."""
 
     hankel: HankelSum
-    recursion: Recursion | None
-    initial_state: Array
-    energy: Array
+    recursion: Recursion | None  # None where the first model cannot be linearised at
+    initial_state: Array  # of the last stretch
+    energy: Array  # per channel: the subspace step weighs outputs by their final size
     n_samples: int
-    point: Realization | None = None
-    next_point: int = 0
+    point: Realization | None = None  # where to linearise if not at the minimum
+    next_point: int = 0  # number of samples from which to look for another such point
 
 
 class _SubspaceStep(NamedTuple):
-    """The subspace step on channels of unit size.
-
-    Attributes
-    ----------
-    subspace : ObservabilitySubspace
-    factor : ndarray
-        Triangular factor of the Hankel data.
-    input_size, output_size : ndarray
-        Of the channels, in our scale.
-    """
+    """The subspace step on channels of unit size."""
 
     subspace: ObservabilitySubspace
-    factor: Array
-    input_size: Array
+    factor: Array  # triangular, of the Hankel data
+    input_size: Array  # of the channels, in our scale
     output_size: Array
 
 
 class StreamSummary:
     """Compressed Hankel data and linearised simulation errors of a stream.
 
-    Parameters
-    ----------
-    fitted : LocalFit
-        Of the first samples.
-    choices : Choices
-        With which it was fitted.
-    n_samples : int
-        How many those were.
+    Begins with the model `fitted` to its first `n_samples`.
     """
 
     def __init__(self, fitted: LocalFit, choices: Choices, n_samples: int) -> None:
@@ -221,21 +177,15 @@ class StreamSummary:
     def latest_error(self, model: Realization) -> float:
         """Simulation error of the latest samples themselves, relative to the outputs.
 
-        Parameters
-        ----------
-        model : Realization
-            From `fit`.
-
-        Returns
-        -------
-        float
-            Root mean square, relative to that of all outputs or, where these are
-            larger, of the latest ones; NaN where it is not known.
+        That of a model of `fit`, root mean square, relative to that of all outputs or,
+        where these are larger, of the latest ones; NaN where it is not known.
         """
         n, m = len(self._latest), len(self._su)
         if model.blocks is None or n == 0:
             return np.nan
-        loss, _ = self._stretch_error(model, self._latest, starts=False)
+        loss, _ = stretch_error(
+            model, self._record(self._latest), self._free, starts=False
+        )
         power = self._sums.energy[m:].sum() / self._sums.n_samples
         power = max(power, (self._latest[:, m:] ** 2).sum() / n)
         return float(np.sqrt(loss / n / (power or 1.0)))
@@ -245,20 +195,9 @@ class StreamSummary:
     ) -> Array | None:
         """Initial states, where the samples themselves are still there.
 
-        Parameters
-        ----------
-        model : Realization
-            From `fit`.
-        first : sequence of Piece
-            Those that the summaries began with.
-        others : sequence of Piece
-            All that were added.
-
-        Returns
-        -------
-        ndarray of shape (n_experiments, order) or None
-            None where the simulation error of the samples is not what the summaries
-            make it: the model of the first samples was too far off to linearise at.
+        For a model of `fit`, the pieces that the summaries began with, and all that
+        were added. None where the simulation error of the samples is not what the
+        summaries make it: the model of the first ones was too far off to linearise at.
         """
         if self._sums.recursion is None or model.blocks is None:
             return None
@@ -266,7 +205,9 @@ class StreamSummary:
         for samples, starts in chain(
             ((self._scaled(u, y), True) for u, y, _ in first), self._stretches(others)
         ):
-            error, x0 = self._stretch_error(model, samples, starts)
+            error, x0 = stretch_error(
+                model, self._record(samples), self._free, starts=starts
+            )
             loss += error
             if starts:
                 states.append(x0)
@@ -286,12 +227,6 @@ class StreamSummary:
                 part = slice(start, start + STRETCH)
                 yield self._scaled(u[part], y[part]), starts and start == 0
 
-    def _stretch_error(
-        self, model: Realization, samples: Array, starts: bool
-    ) -> tuple[float, Array]:
-        free = freedom_of_stretch(self._free, starts)
-        return stretch_error(model, self._record(samples), free)
-
     def _scaled(self, inputs: Array, outputs: Array) -> Array:
         u = inputs @ self._basis
         if self._basis.shape[0] > self._basis.shape[1]:
@@ -305,8 +240,8 @@ class StreamSummary:
         return np.hstack([u / self._su, outputs / self._sy])
 
     def _record(self, samples: Array) -> Record:
-        u, y = np.split(samples.T, [len(self._su)])
-        return Record(np.ascontiguousarray(u), np.ascontiguousarray(y))
+        m = len(self._su)
+        return Record.of(samples[:, :m], samples[:, m:])
 
     def _with_waiting(self) -> _Sums:
         # A single sample tells nothing but its own initial state.
@@ -357,16 +292,15 @@ class StreamSummary:
 
     def _state_pair(self, step: _SubspaceStep) -> tuple[Array, Array]:
         """A and C of the subspace step, in our scale."""
-        basis, ny = step.subspace.basis, len(self._sy)
-        most = min(basis.shape[1], (self._horizon - 1) * ny)
-        extended = min(self._order + self._choices.n_noise_states, most)
-        if self._order == 0 or extended <= self._order:
-            A, C = shift_invariant_pair(basis, ny, self._order)
-        else:
-            A, C = shift_invariant_pair(basis, ny, extended)
-            A = reflect_unstable(A)
-            B, _ = factor_input_matrices(step.factor, A, C, self._free, self._horizon)
-            A, C = dominant_pair(A, B, C, self._order, self._horizon)
+
+        def with_inputs(A: Array, C: Array) -> tuple[Array, Array, Array]:
+            # The samples are gone: B by the factor alone.
+            factor, horizon = step.factor, self._horizon
+            return A, factor_input_matrices(factor, A, C, self._free, horizon)[0], C
+
+        A, C = step.subspace.state_pair(
+            len(self._sy), self._order, self._choices.n_noise_states, with_inputs
+        )
         return A, step.output_size[:, None] * C
 
     def _with_inputs(

@@ -29,14 +29,6 @@ def gramian_factor(A: Array, B: Array, discrete: bool) -> Array:
     ----------
     .. [1] S. J. Hammarling, "Numerical solution of the stable, non-negative definite
        Lyapunov equation", IMA Journal of Numerical Analysis 2, 1982.
-
-    Examples
-    --------
-    ``dx/dt = -2 x + 2 u`` has the Gramian 2^2 / (2 * 2) = 1:
-
-    >>> import numpy as np
-    >>> gramian_factor(np.array([[-2.0]]), np.array([[2.0]]), discrete=False) ** 2
-    array([[1.]])
     """
     n = len(A)
     if n == 0:
@@ -87,25 +79,9 @@ def balancing_transformation(
 ) -> tuple[Array, Array, Array]:
     """Hankel singular values and the balancing projections of a stable model.
 
-    Returns
-    -------
-    hankel : ndarray of shape (n,)
-        Hankel singular values, descending.
-    left : ndarray of shape (r, n)
-    right : ndarray of shape (n, r)
-        ``left @ right = I``; ``(left A right, left B, C right)`` is balanced. `r` is
-        less than `n` when the remaining singular values are rounding noise
-        (states that are not controllable or not observable).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> A, B = np.diag([-1.0, -3.0]), np.array([[1.0], [0.0]])
-    >>> hankel, left, right = balancing_transformation(A, B, np.ones((1, 2)), False)
-    >>> hankel
-    array([0.5, 0. ])
-    >>> right.shape
-    (2, 1)
+    Values (n,), descending; `left` (r, n) and `right` (n, r) with ``left @ right = I``:
+    ``(left A right, left B, C right)`` is balanced. `r` is less than `n` when the
+    remaining values are rounding noise (states not controllable or not observable).
     """
     n = len(A)
     controllable = gramian_factor(A, B, discrete)
@@ -124,13 +100,6 @@ def align_signs(B: Array, C: Array, B_ref: Array, C_ref: Array) -> Array:
     A balanced realisation with distinct Hankel singular values is unique up to the
     sign of every state; the sign chosen for state ``i`` maximises
     ``B_ref[i] B[i]^T + C_ref[:, i]^T C[:, i]``.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> B, C = np.array([[1.0], [2.0]]), np.array([[1.0, 2.0]])
-    >>> align_signs(-B, -C, B, C)
-    array([-1., -1.])
     """
     match = np.einsum("ij,ij->i", B_ref, B) + np.einsum("ji,ji->i", C_ref, C)
     return np.where(match < 0, -1.0, 1.0)

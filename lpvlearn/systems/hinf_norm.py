@@ -33,8 +33,8 @@ _EPS = float(np.finfo(float).eps)
 # times what rounding moves a simple pole, and far below any damping that is one.
 _POLE_ON_AXIS = 1e-13
 
-# Each level is a refined peak, so that two or three are the rule: only a guard.
-_MAX_LEVELS = 40
+_ACCURACY = 1e-10  # height above the bound found at which the level set must be empty
+_MAX_LEVELS = 40  # a guard: each is a refined peak, so that two or three are the rule
 
 # For the one highest peak, maxima whose samples are below this part of the highest
 # sample wait: the level set above the best shows those that matter.
@@ -60,22 +60,11 @@ _ROUNDING, _BESIDE, _COARSE = 1e-12, 1e-6, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PeakSet:
-    """Norm of a system and the frequencies where it is attained, or nearly.
+    """Norm of a system and the frequencies where it is attained, or nearly."""
 
-    Attributes
-    ----------
-    norm : float
-        Largest value of the largest singular value over frequency.
-    frequencies : ndarray of shape (n_peaks,)
-        Peak frequencies in rad/s, the highest peak first. May hold 0 and, in
-        continuous time, infinity; in discrete time pi/dt.
-    values : ndarray of shape (n_peaks,)
-        Largest singular value at these frequencies, descending.
-    """
-
-    norm: float
-    frequencies: NDArray
-    values: NDArray
+    norm: float  # the largest singular value over frequency
+    frequencies: NDArray  # rad/s; may hold 0, infinity (in discrete time pi/dt)
+    values: NDArray  # the largest singular values there, descending
 
 
 def linf_norm(
@@ -86,34 +75,16 @@ def linf_norm(
     *,
     dt: float | None = None,
     within: float | None = None,
-    rtol: float = 1e-10,
+    stable: bool = False,
 ) -> PeakSet:
     r"""L-infinity norm and peaks of the frequency response.
 
     .. math:: \|G\|_\infty = \sup_\omega \sigma_{\max}(G(j\omega))
 
-    Finite also for an unstable system, as long as no pole lies on the boundary
-    (imaginary axis or unit circle); infinite otherwise.
-
-    Parameters
-    ----------
-    A, B, C, D, dt
-        The system.
-    within : float or None, default None
-        None: one frequency where the norm is attained. A number in [0, 1):
-        every local maximum whose value is at least (1 - within) times the norm.
-    rtol : float, default 1e-10
-        Relative height above the bound found at which the level set must be
-        empty.
-
-    Returns
-    -------
-    peaks : PeakSet
-
-    Raises
-    ------
-    ValueError
-        If `within` is not in [0, 1).
+    Finite also for an unstable system (unless it must be `stable`), as long as no pole
+    lies on the boundary (imaginary axis or unit circle); infinite otherwise. `within`
+    None gives one frequency where the norm is attained, a number in [0, 1) every local
+    maximum of at least (1 - within) times the norm.
 
     References
     ----------
@@ -132,7 +103,20 @@ def linf_norm(
     >>> round(peaks.norm, 9), peaks.frequencies.round(9)
     (5.025189076, array([0.98994949]))
     """
-    return _norm((A, B, C, D), dt, within, rtol, stable=False)
+    if within is not None and not 0.0 <= within < 1.0:
+        raise ValueError(
+            "`within` must be None, for one peak, or a fraction of the norm in "
+            f"[0, 1). Got {within}."
+        )
+    if len(A) == 0:
+        return _constant(D)
+    search = _Search(FrequencyEngine(A, B, C, D, discrete=dt is not None))
+    if stable and (search.depth >= -search.on_boundary).any():
+        return PeakSet(np.inf, np.empty(0), np.empty(0))
+    found = search.run(within)
+    if dt is None:
+        return found
+    return PeakSet(found.norm, found.frequencies / dt, found.values)
 
 
 def hinf_norm(
@@ -143,47 +127,9 @@ def hinf_norm(
     *,
     dt: float | None = None,
     within: float | None = None,
-    rtol: float = 1e-10,
 ) -> PeakSet:
-    """H-infinity norm and peaks: `linf_norm` of a stable system, else infinity.
-
-    There are no frequencies if a pole lies in the closed right half plane, or not
-    inside the open unit disc.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> one = np.ones((1, 1))
-    >>> hinf_norm(-one, one, one, 0 * one).norm
-    1.0
-    >>> hinf_norm(one, one, one, 0 * one).norm
-    inf
-    """
-    return _norm((A, B, C, D), dt, within, rtol, stable=True)
-
-
-def _norm(
-    system: tuple[NDArray, NDArray, NDArray, NDArray],
-    dt: float | None,
-    within: float | None,
-    rtol: float,
-    stable: bool,
-) -> PeakSet:
-    """Norm and peaks; infinite for an unstable system if it must be stable."""
-    if within is not None and not 0.0 <= within < 1.0:
-        raise ValueError(
-            "`within` must be None, for one peak, or a fraction of the norm in "
-            f"[0, 1). Got {within}."
-        )
-    if len(system[0]) == 0:
-        return _constant(system[3])
-    search = _Search(FrequencyEngine(*system, discrete=dt is not None), rtol)
-    if stable and (search.depth >= -search.on_boundary).any():
-        return PeakSet(np.inf, np.empty(0), np.empty(0))
-    found = search.run(within)
-    if dt is None:
-        return found
-    return PeakSet(found.norm, found.frequencies / dt, found.values)
+    """H-infinity norm and peaks: `linf_norm` of a stable system, else inf and none."""
+    return linf_norm(A, B, C, D, dt=dt, within=within, stable=True)
 
 
 def _constant(D: NDArray) -> PeakSet:
@@ -194,8 +140,8 @@ def _constant(D: NDArray) -> PeakSet:
 class _Search:
     """The search on one system; frequencies are angles in discrete time."""
 
-    def __init__(self, engine: FrequencyEngine, rtol: float) -> None:
-        self.engine, self.rtol = engine, rtol
+    def __init__(self, engine: FrequencyEngine) -> None:
+        self.engine = engine
         self.refiner, self.levels = PeakRefiner(engine), _LevelSets(engine)
         p, size = engine.poles, np.abs(engine.poles)
         self.angles = np.angle(p + 1.0) if engine.discrete else p.imag
@@ -242,22 +188,19 @@ class _Search:
         return _falling(peaks)
 
     def _raised(self, peaks: list[Peak]) -> list[Peak]:
-        """Raise the bound by refined peaks until the level set above is empty.
-
-        Returns the peaks with those found on the way, the highest first.
-        """
+        """Peaks, raised until the level set above the highest, first one is empty."""
         peaks = _falling(peaks)
         for _ in range(_MAX_LEVELS):
             best = peaks[0].value
             if best == 0.0:
                 break
-            crossings = self.levels.crossings(best * (1.0 + 2.0 * self.rtol))
+            crossings = self.levels.crossings(best * (1.0 + 2.0 * _ACCURACY))
             # Just above a peak the level set is empty, but nearly tangent.
             if all(any(p.covers(w) for p in peaks) for w in crossings.tolist()):
                 break
             w, s = self.refiner.sampled(_between(crossings, self.refiner.end, 0.5))
             new = self.refiner.highest(w, s, best * (1.0 - _BESIDE), peaks)
-            if not any(peak.value > best * (1.0 + self.rtol) for peak in new):
+            if not any(peak.value > best * (1.0 + _ACCURACY) for peak in new):
                 break
             peaks = _falling(peaks + new)
         return peaks
@@ -318,13 +261,13 @@ def _between(crossings: NDArray, end: float, fractions: NDArray | float) -> NDAr
 
 
 class _Mapped(NamedTuple):
-    """A continuous-time system whose feedthrough is diagonal, with these gains."""
+    """A continuous-time system whose feedthrough is diagonal."""
 
     A: NDArray
     B: NDArray
     C: NDArray
-    gains: NDArray
-    scale: float
+    gains: NDArray  # of the feedthrough
+    scale: float  # of the map
 
 
 class _LevelSets:
@@ -342,20 +285,7 @@ class _LevelSets:
     (pi), the one is taken at which no gain is near the level: the Hamiltonian
     then stays well conditioned also just above a peak at the other end.
 
-    Parameters
-    ----------
-    engine : FrequencyEngine
-        No pole may lie on the boundary.
-
-    Examples
-    --------
-    The gain of 1 / (s + 1) is 0.5 at the square root of 3:
-
-    >>> import numpy as np
-    >>> one = np.ones((1, 1))
-    >>> engine = FrequencyEngine(-one, one, one, 0 * one)
-    >>> _LevelSets(engine).crossings(0.5).round(12)
-    array([1.73205081])
+    No pole may lie on the boundary.
     """
 
     def __init__(self, engine: FrequencyEngine) -> None:
@@ -363,11 +293,7 @@ class _LevelSets:
         self._maps: dict[float, _Mapped] = {}
 
     def crossings(self, level: float) -> NDArray:
-        """Return sorted frequencies, some of them false, none missing.
-
-        The test for the axis is loose on purpose, so every frequency is to be
-        evaluated, and the intervals between them too.
-        """
+        """Sorted frequencies, by a loose test: some of them false, none missing."""
         end = self._end(level)
         eta = _imaginary_eigenvalues(_hamiltonian(self._mapped(end), level))
         if end == np.inf:

@@ -28,26 +28,23 @@ _NOISE = 1e-14  # a promised relative decrease below it cannot be seen in sixtee
 def scaled_lstsq(M: Array, rhs: Array, rcond: float = RCOND) -> tuple[Array, int]:
     """Least squares with columns scaled to one, minimum norm where rank deficient.
 
-    Parameters
-    ----------
-    M : ndarray of shape (n_rows, n_unknowns)
-    rhs : ndarray of shape (n_rows,) or (n_rows, n_runs)
-    rcond : float
-        Relative singular value below which a direction counts as undetermined.
-
-    Returns
-    -------
-    solution : ndarray of shape (n_unknowns,) or (n_unknowns, n_runs)
-    rank : int
+    `rhs` may have one column per run; a direction whose relative singular value is
+    below `rcond` counts as undetermined. Also returns the rank.
     """
     if M.shape[1] == 0:
         return np.zeros((0, *rhs.shape[1:])), 0
-    scale = np.sqrt(np.einsum("ij,ij->j", M, M))
-    scale[scale == 0.0] = 1.0
+    scale = column_scale(M)
     solution, _, rank, _ = linalg.lstsq(
         M / scale, rhs, cond=rcond, lapack_driver="gelsy", check_finite=False
     )
     return (solution.T / scale).T, int(rank)
+
+
+def column_scale(M: Array) -> Array:
+    """Norm of every column; 1 for a column of zeros."""
+    scale = np.sqrt(np.einsum("ij,ij->j", M, M))
+    scale[scale == 0.0] = 1.0
+    return scale
 
 
 # Residuals (k, n_residuals) of some rows of the stack of starts, not finite where a
@@ -87,25 +84,10 @@ def levenberg_marquardt(
     the condition of J is not squared. Steps are projected on the bounds; a variable
     whose bound the gradient presses against is left out of the step.
 
-    Parameters
-    ----------
-    residuals : callable
-        ``(x, rows) -> (r, jacobian)`` for x of shape (k, n_unknowns), that belong to
-        these rows of `starts`; ``jacobian(kept)`` gives the Jacobians of some of the k.
-    starts : ndarray of shape (n_starts, n_unknowns)
-    lower, upper : ndarray of shape (n_unknowns,) or float
-    longest : float
-        Largest change of a variable in a step.
-    max_iter : int
-        Steps that are tried.
-    tol : float
-    patience : int
-        A start ends when its cost falls by less than `tol` (relative) that many times
-        in a row, or when no step lowers it.
-    exact : float
-        A start ends at a cost not above that.
-    enough : int, default=None
-        All end when that many costs are that low.
+    `longest` is the largest change of a variable in a step; `max_iter` counts the steps
+    that are tried. A start ends when its cost falls by less than `tol` (relative)
+    `patience` times in a row, when no step lowers it, or at a cost not above `exact`;
+    all end when `enough` of them are that low.
     """
     x = np.clip(starts, lower, upper)
     k, q = x.shape
@@ -155,12 +137,14 @@ def levenberg_marquardt(
         promised = np.sum(c[rows] ** 2 - left**2, axis=1)
         before = cost[rows]
         # a step that a bound cuts off may promise nothing where a shorter one does
-        hopeful = (promised > _NOISE * before) | (trial != x[rows] + d).any(1)
-        hopeful &= damping[rows] < _LARGEST_DAMPING
-        active[rows[~hopeful]] = False
+        hopeful = promised > _NOISE * before
+        cut = ~hopeful & (trial != x[rows] + d).any(1)
+        damping[rows[cut]] *= _MORE
+        active[rows] = (hopeful | cut) & (damping[rows] < _LARGEST_DAMPING)
+        hopeful &= active[rows]
         rows, before, promised = rows[hopeful], before[hopeful], promised[hopeful]
         if len(rows) == 0:
-            break
+            continue
         better = move(rows, trial[hopeful])
         fall = before - cost[rows]
         good = np.where(fall > _AS_PROMISED * np.abs(promised), _LESS, 1.0)

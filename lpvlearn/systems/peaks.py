@@ -17,8 +17,7 @@ from .response import FrequencyEngine
 
 _TINY = float(np.finfo(float).tiny)
 
-# Relative gap below which two singular values count as one: rounding of their squares.
-_TIE = 1e-14
+_TIE = 1e-14  # relative gap of two equal singular values: rounding of their squares
 
 # Two maxima are one unless the singular value dips by this much between them: above
 # the rounding of a modal sum, 1e-13 to 1e-12 of its size.
@@ -32,21 +31,15 @@ _SAME = 1e-6
 # few parts in 1e7.
 _COVERED = 1e-3
 
-# Modal values with a smaller bound on their relative error are not solved anew.
-_TRUSTED = 1e-9
+_TRUSTED = 1e-9  # bound on the error of modal values that are not solved anew
 
 # Rounds of subdivision, by four each, where samples leave the sign of the slope in
 # doubt: a thousandth of the distance of two samples.
 _MAX_SPLITS = 5
 
-# Newton's method needs three to six steps; the rest is for bisection of a bracket.
-_MAX_NEWTON = 40
-
-# Convergence is quadratic: a step that gains this part of the value is the last.
-_LAST_GAIN = 1e-9
-
-# Stands for an infinite frequency, where nothing but the feedthrough is left.
-_FAR = 1e200
+_MAX_NEWTON = 40  # three to six steps; the rest is for bisection of a bracket
+_LAST_GAIN = 1e-9  # a step that gains less is the last: convergence is quadratic
+_FAR = 1e200  # for an infinite frequency, where only the feedthrough is left
 
 # Places of the samples in an interval that may hold maxima: ten tell three apart.
 TENTHS = (np.arange(10) + 0.5) / 10
@@ -56,8 +49,7 @@ TENTHS = (np.arange(10) + 0.5) / 10
 _MAX_CANDIDATES = 6
 _SAMPLED = 0.02
 
-# How far a search may go from the last sample towards infinity, as a factor.
-_REACH = 1e3
+_REACH = 1e3  # factor by which a search may go beyond the last sample, to infinity
 
 
 class Peak(NamedTuple):
@@ -86,24 +78,7 @@ class _Bracket(NamedTuple):
 class PeakRefiner:
     """Finds the maxima of the largest singular value near given samples.
 
-    Parameters
-    ----------
-    engine : FrequencyEngine
-
-    Attributes
-    ----------
-    end : float
-        The end of the frequency axis: infinity, or pi in discrete time.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> A, B = np.array([[0.0, 1.0], [-1.0, -0.2]]), np.array([[0.0], [1.0]])
-    >>> C, D = np.array([[1.0, 0.0]]), np.zeros((1, 1))
-    >>> refiner = PeakRefiner(FrequencyEngine(A, B, C, D))
-    >>> w, s = refiner.sampled(np.array([np.inf, 0.0, 0.5, 1.0, 2.0]))
-    >>> [round(peak.frequency, 9) for peak in refiner.every(w, s, floor=1.0)]
-    [0.989949494]
+    `end` is that of the frequency axis: infinity, or pi in discrete time.
     """
 
     def __init__(self, engine: FrequencyEngine) -> None:
@@ -121,10 +96,10 @@ class PeakRefiner:
     def highest(
         self, w: NDArray, s: NDArray, floor: float, known: list[Peak] | None = None
     ) -> list[Peak]:
-        """Refine the highest local maxima of the samples, one after the other.
+        """Refine the highest local maxima of the samples that are not known.
 
-        The known ones are left out, and those that their samples put clearly
-        below the best: the level set above it shows whether that was wrong.
+        Those that their samples put clearly below the best are left out: the level set
+        above it shows whether that was wrong.
         """
         padded = np.concatenate(([-1.0], s, [-1.0]))
         tops = (s >= floor) & (s >= padded[:-2]) & (s >= padded[2:])
@@ -144,10 +119,7 @@ class PeakRefiner:
         return peaks
 
     def _bracket(self, w: NDArray, s: NDArray, k: int) -> _Bracket:
-        """A maximum of the samples, its neighbours and the vertex between them.
-
-        One mode alone makes 1 / s**2 a parabola, whose vertex is then the peak.
-        """
+        """Of one mode alone the vertex of the parabola 1 / s**2 is the peak."""
         at, top = float(w[k]), float(s[k])
         if k == 0 or at == self.end:
             return _Bracket(at, at, at, at, top, top)
@@ -188,8 +160,8 @@ class PeakRefiner:
     def _climb(self, w: float, lower: float, upper: float, quick: bool = False) -> Peak:
         """Safeguarded Newton steps on 1 / sigma**2, a parabola near one mode.
 
-        The values are those of factorisations; if `quick`, only the first step
-        is by modes. Rounding may have moved the bracket a little off the peak.
+        By factorisations; if `quick`, the first step is by modes. Rounding may have
+        moved the bracket a little off the peak.
         """
         margin = 3e-3 * (upper - lower)  # rounding is far below, another peak above
         lower, upper = max(lower - margin, 0.0), min(upper + margin, self.end)
@@ -370,8 +342,7 @@ def _stepped(aimed: NDArray) -> NDArray:
 def _aimed(left: NDArray, right: NDArray) -> NDArray:
     """Newton starts (jets) and brackets, for intervals with a maximum inside.
 
-    Both ends start if both aim into the interval: where two branches of the
-    singular value cross they find one maximum each.
+    Both ends start if both aim into it: two branches that cross have a maximum each.
     """
     turns = (left[2] >= 0) & (right[2] <= 0)
     left, right = left[:, turns], right[:, turns]
@@ -421,14 +392,7 @@ def _apart(index: NDArray, values: NDArray | list[float], s: NDArray) -> list[in
 
 
 def sigma_max(G: NDArray) -> NDArray:
-    """Largest singular value of every response.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> sigma_max(np.array([[[3.0], [0.0]], [[4.0], [1.0]]])).round(6)
-    array([5.064495])
-    """
+    """Largest singular value of every response."""
     smaller = min(G.shape[:2])
     if smaller == 1:
         return np.sqrt((G.real**2 + G.imag**2).sum((0, 1)))
@@ -447,18 +411,8 @@ def _square_derivatives(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Square of the largest singular value and its two derivatives.
 
-    From the response and its two derivatives in frequency. Where the largest singular
-    value is not simple and not smooth, the curvature is large and positive: such a
-    point is never a maximum.
-
-    Examples
-    --------
-    The gain of 1 / (j w + 1), squared, is 1 / (1 + w**2):
-
-    >>> import numpy as np
-    >>> g = np.array([[[1 / (1 + 1j)]]])
-    >>> [x[0].real.round(12) for x in _square_derivatives(g, -1j * g**2, -2 * g**3)]
-    [np.float64(0.5), np.float64(-0.5), np.float64(0.5)]
+    From G and its two derivatives. Where the value is not simple and not smooth, the
+    curvature is large and positive: such a point is never a maximum.
     """
     smaller = min(G.shape[:2])
     if smaller == 1:
@@ -490,11 +444,8 @@ def _derivatives_of_two(
     coordinates = np.array(
         ((k11 + k22).real, (k11 - k22).real, (k12 + k21).real, (k12 - k21).imag)
     ).reshape(4, 4, -1)
-    m, m1, m2 = (
-        0.5 * coordinates[:, 0],
-        coordinates[:, 1],
-        coordinates[:, 2] + coordinates[:, 3],
-    )
+    m, m1 = 0.5 * coordinates[:, 0], coordinates[:, 1]
+    m2 = coordinates[:, 2] + coordinates[:, 3]
     d, d1, d2 = m[1:], m1[1:], m2[1:]
     radius = np.sqrt((d * d).sum(0))
     safe = np.maximum(radius, _TIE * m[0]) + _TINY
@@ -525,12 +476,6 @@ def _square_jet(G: NDArray, G1: NDArray, G2: NDArray) -> tuple[float, float, flo
 
     In scalars where there are two channels, 7 us instead of 23: a norm takes four to
     eight of these steps one after the other, in 0.35 ms.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> _square_jet(*(np.diag([k, 1.0]) for k in (3.0, 2.0, 1.0)))
-    (9.0, 12.0, 14.0)
     """
     smaller = min(G.shape)
     if smaller > 2:

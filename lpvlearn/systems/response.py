@@ -16,15 +16,12 @@ _MODAL_CONDITION = 1e7
 # a tenth of the 1e-8 to which norms agree with extended precision (the stress test).
 _ACCURACY = 1e-9
 
-# Each refinement gains as many digits as the factorisation has right, seven or more:
-# three reach the extended precision of the residuals.
+# Each gains as many digits as the factorisation has right, seven or more: three reach
+# the extended precision of the residuals.
 _REFINEMENTS = 3
 
-# Entries of the matrices factored at once: 64 MB.
-_STACK_ENTRIES = 4_000_000
-
-# A pole of a sampled model at the origin (a delay) stands for a decay to this a sample.
-_DELAY = 1e-12
+_STACK_ENTRIES = 4_000_000  # of the matrices factored at once: 64 MB
+_DELAY = 1e-12  # decay a sample of a sampled model's pole at the origin (a delay)
 
 
 def frequency_response(
@@ -44,15 +41,6 @@ def frequency_response(
     give D (a ValueError in discrete time); at a pole on the axis every entry is
     infinite. Modal coordinates of the equilibrated system, checked for cancellation;
     the frequencies where digits would be lost are solved one by one.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> G = frequency_response(np.array([[-2.0]]), np.array([[2.0]]),
-    ...                        np.array([[1.0]]), np.array([[3.0]]),
-    ...                        [0.0, 2.0, np.inf])
-    >>> G[:, 0, 0]
-    array([4. +0.j , 3.5-0.5j, 3. +0.j ])
     """
     omega = np.atleast_1d(np.asarray(omega, float))
     finite = np.isfinite(omega)
@@ -79,29 +67,12 @@ class FrequencyEngine:
     :math:`x = e^{j\omega} - 1` and :math:`F = A - I`, the delta form, which
     keeps its relative accuracy where sampling is fast and all poles crowd at 1.
 
-    `response` and `derivatives` work in modal coordinates, where the
+    `response` and `derivatives` work in modal coordinates (`is_modal`), where the
     eigenvectors are well conditioned, and on the complex Schur form otherwise;
     `solved` factors :math:`xI - F` at each frequency and is the reference.
-    Frequencies stand on the last axis: results have shape
-    (n_outputs, n_inputs, n_frequencies). Infinity is not handled here.
-
-    If `discrete`, frequencies are angles on the unit circle (rad per sample).
-
-    Attributes
-    ----------
-    poles : ndarray of shape (n,)
-        Eigenvalues of F: poles, less one in discrete time.
-    is_modal : bool
-        Whether modal coordinates are in use.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> engine = FrequencyEngine(np.array([[-2.0]]), np.ones((1, 1)),
-    ...                          np.ones((1, 1)), np.zeros((1, 1)))
-    >>> G, slope, curvature = engine.derivatives(np.array([0.0]))
-    >>> G[0, 0], slope[0, 0]
-    (array([0.5+0.j]), array([0.-0.25j]))
+    Results have shape (n_outputs, n_inputs, n_frequencies). Infinity is not handled
+    here. If `discrete`, frequencies are angles on the unit circle (rad per sample).
+    `poles` are the eigenvalues of F: those of A, less one in discrete time.
     """
 
     def __init__(
@@ -156,14 +127,14 @@ class FrequencyEngine:
         self._schur = T, Q.conj().T @ self.B, self.C @ Q
 
     def points(self, omega: NDArray) -> NDArray:
-        """Return the values of x at the frequencies."""
+        """Values of x at the frequencies."""
         if not self.discrete:
             return 1j * omega
         # 1 - cos by the half angle: no cancellation near omega = 0.
         return -2.0 * np.sin(0.5 * omega) ** 2 + 1j * np.sin(omega)
 
     def response(self, omega: NDArray) -> NDArray:
-        """Return G at finite frequencies."""
+        """G at finite frequencies."""
         x = self.points(omega)
         shape = (*self.D.shape, len(omega))
         if self.is_modal:
@@ -175,7 +146,7 @@ class FrequencyEngine:
         return G
 
     def derivatives(self, omega: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Return G and its first and second derivative in frequency."""
+        """G and its first and second derivative in frequency."""
         x = self.points(omega)
         shape = (*self.D.shape, len(omega))
         if self.is_modal:
@@ -193,17 +164,16 @@ class FrequencyEngine:
         return G, *self._chain(x, -G1, 2.0 * G2)
 
     def _chain(self, x: NDArray, Gx: NDArray, Gxx: NDArray) -> tuple[NDArray, NDArray]:
-        """Turn derivatives in x into derivatives in frequency."""
+        """Derivatives in frequency from those in x."""
         if not self.discrete:
             return 1j * Gx, -Gxx
         z = x + 1.0
         return 1j * z * Gx, -z * (z * Gxx + Gx)
 
     def jet(self, omega: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Return G and its two derivatives at one frequency, as accurate as `solved`.
+        """G and its two derivatives at one frequency, as accurate as `solved`.
 
-        Shapes (n_outputs, n_inputs): where there is a single frequency, the
-        overhead of the stacked forms would cost more than the arithmetic.
+        Without a last axis, whose overhead would cost more than the arithmetic.
         """
         x = self.points(np.asarray(omega))
         M = np.array(-self.F, complex, order="F")
@@ -223,11 +193,10 @@ class FrequencyEngine:
         return G, *self._chain(x, -(left @ right), 2.0 * (left @ again))
 
     def solved(self, omega: NDArray) -> NDArray:
-        """Return G by one LU factorisation per frequency.
+        """G by one LU factorisation per frequency.
 
-        Where the resolvent is so large that G would lose digits, the solutions
-        are refined on residuals in extended precision (where the platform's
-        long double has it), so that G is that of the matrices as given.
+        Where the resolvent is so large that G would lose digits, the solutions are
+        refined on residuals in extended precision (if long double has it).
         """
         G = np.empty((*self.D.shape, len(omega)), complex)
         step = max(1, _STACK_ENTRIES // max(1, self.order**2))
@@ -298,7 +267,7 @@ class FrequencyEngine:
         return _EPS * self._condition * amplification * (terms @ X)
 
     def accurate(self, omega: NDArray) -> NDArray:
-        """Return G, solved where modes would lose digits; infinite at poles."""
+        """G, solved where modes would lose digits; infinite at poles."""
         G = np.full((*self.D.shape, len(omega)), np.inf, complex)
         regular = (self.points(omega) != self.poles[:, None]).all(0)
         omega = omega[regular]
@@ -323,15 +292,6 @@ def equilibrated(
 
     The transfer function is unchanged to the last bit, as only exponents move. Where
     nothing is to be scaled the same objects are returned.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> A, B, C = equilibrated(np.array([[-1.0, 4096.0], [0.0625, -2.0]]),
-    ...                        np.ones((2, 1)), np.ones((1, 2)))
-    >>> A
-    array([[-1., 16.],
-           [16., -2.]])
     """
     scaled, _, _, scale, _ = lapack.dgebal(A, scale=1, permute=0)
     if (scale == 1.0).all():
@@ -340,14 +300,7 @@ def equilibrated(
 
 
 def pole_rates(poles: NDArray, dt: float | None) -> NDArray[np.complex128]:
-    """Poles in rad/s: those of a sampled model by the logarithm.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> pole_rates(np.exp([-0.5 + 1j, -0.5 - 1j]), 0.5)
-    array([-1.+2.j, -1.-2.j])
-    """
+    """Poles in rad/s: those of a sampled model by the logarithm."""
     poles = np.asarray(poles, dtype=complex)
     if dt is None:
         return poles
@@ -362,12 +315,6 @@ def pole_grid(
     `n_points` are spread from `low` to `high`; `offsets` are places around the
     frequency of each pole (`rates`, in rad/s), in units of its decay. The points are
     sorted, and may reach beyond the ends around a pole.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> pole_grid(np.array([-1 + 5j]), 1.0, 100.0, 3, [-1.0, 0.0, 1.0])
-    array([  1.,   4.,   5.,   6.,  10., 100.])
     """
     around = np.abs(rates.imag) + np.multiply.outer(offsets, np.abs(rates.real))
     return np.unique(np.append(np.geomspace(low, high, n_points), around))

@@ -33,21 +33,11 @@ def _band(A: Array, n_samples: int) -> Array:
 
 
 def state_trajectory(A: Array, f: Array, x0: Array | None = None) -> Array:
-    """Solve ``x[k+1] = A[k] x[k] + f[k]`` from ``x[0] = x0``.
+    """States ``x[0], ..., x[n_samples - 1]`` of ``x[k+1] = A[k] x[k] + f[k]``.
 
-    Parameters
-    ----------
-    A : ndarray of shape (n, n) or (n_samples, n, n)
-        One matrix, or one for every sample.
-    f : ndarray of shape (n_samples, n) or (n_samples, n, n_runs)
-        Forcing; several runs share the matrices.
-    x0 : ndarray of shape (n,) or (n, n_runs), default=None
-        Initial state; None is the origin.
-
-    Returns
-    -------
-    ndarray, shape of `f`
-        The states ``x[0], ..., x[n_samples - 1]``.
+    `A` is one matrix (n, n) or one for every sample (n_samples, n, n); the forcing, and
+    the result, (n_samples, n) or (n_samples, n, n_runs): several runs share `A`. `x0`
+    is (n,) or (n, n_runs); None is the origin.
     """
     n_samples, n = f.shape[:2]
     if n == 0 or n_samples == 0:
@@ -79,21 +69,12 @@ def state_trajectory(A: Array, f: Array, x0: Array | None = None) -> Array:
 def lti_response(
     A: Array, B: Array, C: Array, D: Array, u: Array, x0: Array | None = None
 ) -> Array:
-    """Output of a discrete-time LTI model.
-
-    ``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``.
-
-    From inputs of shape (n_samples, n_inputs) and an initial state (None is rest) to
-    outputs of shape (n_samples, n_outputs).
-    """
+    """Outputs ``C x[k] + D u[k]`` of ``x[k+1] = A x[k] + B u[k]``, one row a sample."""
     return state_trajectory(A, u @ B.T, x0) @ C.T + u @ D.T
 
 
 def free_responses(A: Array, C: Array, n_samples: int) -> Array:
-    """Outputs ``C A^k`` of a discrete-time model from every unit initial state.
-
-    The result has shape (n_samples, n_outputs, n).
-    """
+    """Outputs ``C A^k`` from every unit initial state, (n_samples, n_outputs, n)."""
     # (C A^k)^T = (A^T)^k C^T takes one run per output instead of one per state.
     rest = np.zeros((n_samples, *C.T.shape))
     return state_trajectory(A.T, rest, C.T).swapaxes(1, 2)
@@ -103,26 +84,8 @@ def estimate_initial_state(responses: Array, error: Array) -> Array:
     """Least-squares initial state behind what a simulation from rest leaves.
 
     ``min || error - sum_i responses[:, :, i] x0[i] ||``, of minimum norm where the
-    responses do not determine it.
-
-    Parameters
-    ----------
-    responses : ndarray of shape (n_samples, n_outputs, n)
-        Outputs from every unit initial state.
-    error : ndarray of shape (n_samples, n_outputs) or (n_samples, n_outputs, n_runs)
-        Outputs minus the simulation from rest; several runs share the responses.
-
-    Returns
-    -------
-    ndarray of shape (n,) or (n, n_runs)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> A, C = np.array([[0.5]]), np.array([[2.0]])
-    >>> responses = free_responses(A, C, 3)
-    >>> estimate_initial_state(responses, np.array([[6.0], [3.0], [1.5]]))
-    array([3.])
+    responses (of every unit initial state) do not determine it. The error has shape
+    (n_samples, n_outputs), and one more axis for several runs.
     """
     n_rows = error.shape[0] * error.shape[1]
     columns = responses.reshape(n_rows, -1)

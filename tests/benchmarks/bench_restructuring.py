@@ -16,7 +16,7 @@ import pytest
 
 from lpvlearn import GrayBoxRestructurer
 from lpvlearn.restructuring.continuation import continued_fits
-from lpvlearn.restructuring.transfer import Target
+from lpvlearn.restructuring.error_system import Target
 
 sys.path.insert(0, str(Path(__file__).parent))
 

@@ -18,9 +18,10 @@ from unittest import mock
 import numpy as np
 from scipy.linalg import block_diag, expm
 
+from lpvlearn.subspace import identification
 from lpvlearn.subspace.hankel import _hankel_matrix, data_factor
-from lpvlearn.subspace.identification import identify, scale_records
 from lpvlearn.subspace.selection import select
+from lpvlearn.subspace.simulation_fit import Freedom
 from lpvlearn.systems.simulation import lti_response
 
 try:
@@ -74,9 +75,22 @@ def arm_system() -> System:
     return M[:6, :6], M[:6, 6:], C, np.zeros((2, 2))
 
 
+def identify(u: Array, y: Array, order: int, horizon: int, **options) -> System:
+    """The function core of `SubspaceLTI`."""
+    records, su, sy = identification.scale_records([(u, y)])
+    settings = _settings(u, y, **options)
+    model = identification.identify(records, order, horizon, settings).model
+    return model.A, model.B / su, sy[:, None] * model.C, sy[:, None] * model.D / su
+
+
+def _settings(u: Array, y: Array, **options) -> identification.Settings:
+    free = Freedom(np.ones((y.shape[1], u.shape[1]), dtype=bool))
+    return identification.Settings(free, **options)
+
+
 def ours(method: str, refine: bool) -> Callable[..., System]:
     def fit(u: Array, y: Array, order: int, horizon: int) -> System:
-        return identify([(u, y)], order, horizon, method=method, refine=refine)[:4]
+        return identify(u, y, order, horizon, method=method, refine=refine)
 
     return fit
 
@@ -237,13 +251,14 @@ def consistency() -> None:
                         e = lti_response(*pole, e)
                     y = y + 10**-0.5 * y.std(axis=0) * e / e.std(axis=0)
                     model = identify(
-                        [(u, y)],
+                        u,
+                        y,
                         6,
                         20 if method == "po-moesp" else 40,
                         method=method,
                         refine=refine,
                         n_noise_states=n_noise,
-                    )[:4]
+                    )
                     truth = response(system)
                     gap = np.linalg.norm(response(model) - truth)
                     errors.append(gap / np.linalg.norm(truth))
@@ -267,13 +282,14 @@ def monte_carlo(n_fits: int) -> None:
     for method in ("po-moesp", "pi-moesp"):
         y = clean + sigma * rng.standard_normal(clean.shape)
         start = time.process_time()
-        records = scale_records([(u, y)]).records
-        horizon = select(records, 6, None, method=method).horizon
+        records = identification.scale_records([(u, y)]).records
+        settings = _settings(u, y, method=method)
+        horizon = select(records, 6, None, settings).horizon
         chosen = time.process_time() - start
         start = time.process_time()
         for _ in range(n_fits):
             y = clean + sigma * rng.standard_normal(clean.shape)
-            identify([(u, y)], 6, horizon, method=method)
+            identify(u, y, 6, horizon, method=method)
         total = time.process_time() - start
         print(
             f"  {method}: horizon {horizon} chosen in {chosen:.2f} s, then "

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from lpvlearn import GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.least_squares import grid_and_margin
-from lpvlearn.restructuring.transfer import Target
+from lpvlearn.restructuring.error_system import Target
+from lpvlearn.restructuring.limits import natural_margin
 from lpvlearn.systems.hinf_norm import linf_norm
 
 UNSTABLE = 1e300
@@ -26,7 +26,7 @@ class Objective:
     ) -> None:
         self.structure, self.model = structure, model
         target = Target(model.A, model.B, model.C, model.D)
-        self.margin = grid_and_margin(target)[1]  # the library's set of models
+        self.margin = natural_margin(target)  # the library's set of models
         self.theta0, self.T = theta, np.eye(len(theta))
         omega = self.grid()
         _, L, R = self.error(theta, omega)

@@ -16,10 +16,9 @@ import time
 from collections.abc import Iterator
 
 import numpy as np
-from bench_subspace import resonant_system
+from bench_subspace import identify, resonant_system
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.subspace.identification import identify
 from lpvlearn.systems.simulation import state_trajectory
 
 Array = np.ndarray
@@ -57,7 +56,7 @@ def compare(n_samples: int, batch: int, refine: bool) -> None:
     middle = time.process_time()
     whole = SubspaceLTI(6, horizon=30, refine=refine).fit(u, y)
     stop = time.process_time()
-    at_once = StateSpace(*identify([(u, y)], 6, 30, refine=refine)[:4], 1.0)
+    at_once = StateSpace(*identify(u, y, 6, 30, refine=refine), 1.0)
     end = time.process_time()
     H = streamed.lti_.frequency_response(omega)
 

@@ -8,8 +8,7 @@ import pytest
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.datasets import FlexibleArm
-from lpvlearn.restructuring.error_system import ErrorSystem
-from lpvlearn.restructuring.transfer import Target
+from lpvlearn.restructuring.error_system import ErrorSystem, Target
 
 from ..conftest import spring_structure
 

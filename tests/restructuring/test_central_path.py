@@ -9,7 +9,6 @@ from lpvlearn.restructuring.central_path import (
     Barrier,
     central_path,
     level_of,
-    search_grid,
     trust_region_step,
 )
 from lpvlearn.restructuring.error_system import ErrorSystem
@@ -27,7 +26,7 @@ def test_the_quadratic_is_that_of_the_value_along_geodesics(case, mu, monkeypatc
     monkeypatch.setattr(barrier_module, "_BARRIER", 0.0)
     system, theta = system_of(**case)
     peaks = system.peaks(theta, 0.5)
-    omega = np.union1d(search_grid(system), peaks.frequencies)
+    omega = np.union1d(system.grid, peaks.frequencies)
     barrier = Barrier(system, Limits(system, 0.01), omega, 1e-2 * peaks.norm)
     model = barrier.quadratic(theta, mu)
     assert np.isclose(model.value, barrier.value(theta, mu), rtol=1e-12)
@@ -50,7 +49,7 @@ def test_the_quadratic_is_that_of_the_value_along_geodesics(case, mu, monkeypatc
 @pytest.mark.parametrize("case", SYSTEMS, ids=str)
 def test_drift_is_the_derivative_of_the_gradient_by_mu(case):
     system, theta = system_of(**case)
-    barrier = Barrier(system, Limits(system, 0.01), search_grid(system), 0.1)
+    barrier = Barrier(system, Limits(system, 0.01), system.grid, 0.1)
     mu, h = 1e-2, 1e-7
     up, down = (barrier.quadratic(theta, mu + s * h).gradient for s in (1, -1))
     drift = barrier.quadratic(theta, mu).drift
@@ -67,7 +66,7 @@ def test_level_solves_its_equation(mu):
 
 def test_for_a_large_mu_psi_is_the_sum_of_squares():
     system, theta = system_of((2, 2))
-    limits, omega, mu = Limits(system, 0.01), search_grid(system), 1e6
+    limits, omega, mu = Limits(system, 0.01), system.grid, 1e6
     E = system.response(theta, omega) - system.target_response(omega)
     c = limits.rows(theta)[0]
     logarithms = -1e-2 * mu * np.log(-c).sum()
@@ -88,7 +87,7 @@ def test_a_resonance_between_the_frequencies_is_not_passed_over():
     theta = np.array([{"k": 4.0, "c": 2e-4, "b": 1.0}[name] for name in names])
     assert barrier.value(theta, 1e-3) == np.inf
     assert np.allclose(barrier.missed, 2.0, rtol=1e-6)
-    barrier.watch(np.append(barrier.omega, barrier.missed))
+    barrier.omega = np.append(barrier.omega, barrier.missed)
     assert np.isfinite(barrier.value(theta, 1e-3))
     assert barrier.missed.size == 0
 
@@ -110,10 +109,8 @@ def test_the_path_of_a_gain_ends_at_its_chebyshev_approximation():
 
 def fitted(structure, model, theta):
     system = ErrorSystem(structure, target_of(model))
-    grid = search_grid(system)
-    fit = fit_frequency_response(
-        system, theta, grid, system.target_response(grid), admissible=lambda _: True
-    )
+    grid = system.grid
+    fit = fit_frequency_response(system, theta, grid, admissible=lambda _: True)
     return system, fit
 
 

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from lpvlearn import GrayBoxStructure
 from lpvlearn.restructuring.continuation import continued_fits
-from lpvlearn.restructuring.transfer import Target
+from lpvlearn.restructuring.error_system import Target
 
 
 def chain(masses):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.central_path import search_grid
 from lpvlearn.restructuring.coordinates import (
     CanonicalForm,
     LocalChart,
@@ -26,7 +25,7 @@ def weighted_response(system, theta, omega):
 @pytest.mark.parametrize("case", SYSTEMS, ids=str)
 def test_a_unit_step_changes_the_response_by_the_given_size(case):
     system, theta = system_of(**case)
-    omega = search_grid(system)
+    omega = system.grid
     geometry = ResponseGeometry(system, theta, omega, 1e-5)
     assert np.allclose(geometry.T @ geometry.inverse, np.eye(len(theta)), atol=1e-9)
     here = weighted_response(system, theta, omega)
@@ -41,7 +40,7 @@ def test_a_unit_step_changes_the_response_by_the_given_size(case):
 def test_the_response_turns_away_from_its_tangent_along_a_geodesic(case):
     """G'' along ``theta + T (h d + h^2 a / 2)`` has no tangential part."""
     system, theta = system_of(**case)
-    omega = search_grid(system)
+    omega = system.grid
     size = np.linalg.norm(weighted_response(system, theta, omega))
     geometry = ResponseGeometry(system, theta, omega, 0.1 * size)
     rng, h = np.random.default_rng(1), 1e-3

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.error_system import ErrorSystem
+from lpvlearn.restructuring.error_system import ErrorSystem, Target, resolvent
 from lpvlearn.restructuring.measured import MeasuredErrorSystem
-from lpvlearn.restructuring.transfer import Target, resolvent
 
 
 def stable_model(rng, order, n_inputs, n_outputs, sampling_time=None):

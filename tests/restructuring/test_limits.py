@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.error_system import ErrorSystem
+from lpvlearn.restructuring.error_system import ErrorSystem, Target
 from lpvlearn.restructuring.limits import Limits, growth
-from lpvlearn.restructuring.transfer import Target
 
 
 def system_of(dt=None):

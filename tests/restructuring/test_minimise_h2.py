@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.error_system import ErrorSystem
+from lpvlearn.restructuring.error_system import ErrorSystem, Target
 from lpvlearn.restructuring.minimise_h2 import squared_h2
-from lpvlearn.restructuring.transfer import Target
 
 from .test_error_system import error_system
 

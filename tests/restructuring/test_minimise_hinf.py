@@ -6,12 +6,10 @@ from sklearn.exceptions import ConvergenceWarning
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.minimax import problem as minimax_problem
-from lpvlearn.restructuring.central_path import search_grid
 from lpvlearn.restructuring.coordinates import ResponseGeometry
-from lpvlearn.restructuring.error_system import ErrorSystem
+from lpvlearn.restructuring.error_system import ErrorSystem, Target
 from lpvlearn.restructuring.limits import Limits
 from lpvlearn.restructuring.minimise_hinf import HinfObjective
-from lpvlearn.restructuring.transfer import Target
 
 TRUTH = {"k1": 20.0, "k2": 10.0, "c1": 0.4, "c2": 0.2, "m1": 2.0, "m2": 0.5}
 
@@ -32,16 +30,15 @@ def objective_of(bounds=None):
     if bounds:
         structure = structure.with_bounds(bounds)
     system = ErrorSystem(structure, Target(box.A, box.B, box.C, box.D))
-    grid = search_grid(system)
     size = system.peaks(theta).norm
-    T = ResponseGeometry(system, theta, grid, size).T
-    return HinfObjective(system, theta, T, Limits(system, 1e-4), grid), names
+    T = ResponseGeometry(system, theta, system.grid, size).T
+    return HinfObjective(system, theta, T, Limits(system, 1e-4)), names
 
 
 def test_hessians_along_the_curves_are_second_derivatives():
     objective, _ = objective_of()
     y = np.zeros(len(objective.theta0))
-    omega = objective.grid[[5, 30, 60]]
+    omega = objective.system.grid[[5, 30, 60]]
     curve = objective.curve(y)
     slopes = objective.samples(y, omega).gradients
     H = objective.hessians(y, omega, np.zeros(3, bool))

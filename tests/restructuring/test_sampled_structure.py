@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxStructure, StateSpace, SubspaceLTI
-from lpvlearn.restructuring.error_system import ErrorSystem
+from lpvlearn.restructuring.error_system import ErrorSystem, Target
 from lpvlearn.restructuring.minimise_covariance import (
     minimise_covariance,
     uncertain_response,
 )
 from lpvlearn.restructuring.sampled_structure import SampledStructure
-from lpvlearn.restructuring.transfer import Target
 from lpvlearn.subspace.statistics import deviated_models
 
 STEP = 0.1

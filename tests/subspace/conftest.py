@@ -1,8 +1,12 @@
 """Systems and records that the subspace rooms are tested with."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
+from lpvlearn.subspace import identification
+from lpvlearn.subspace.simulation_fit import Freedom
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
@@ -56,3 +60,31 @@ def record(system, n_samples, seed=0, noise=0.1):
     u = rng.standard_normal((n_samples, system[1].shape[1]))
     y = lti_response(*system, u)
     return u, y + noise * y.std(axis=0) * rng.standard_normal(y.shape)
+
+
+def freedom(n_outputs, n_inputs):
+    """All initial states and all of D."""
+    return Freedom(np.ones((n_outputs, n_inputs), dtype=bool))
+
+
+class Found(NamedTuple):
+    """A model in the units of the data, and what is known of it."""
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    initial_states: np.ndarray
+    singular_values: np.ndarray
+    residual: float
+
+
+def identify(pairs, order, horizon, *, feedthrough=True, **options):
+    """The function core of `SubspaceLTI`, on samples that are not scaled yet."""
+    records, su, sy = identification.scale_records(pairs)
+    free = Freedom(np.full((len(sy), len(su)), feedthrough))
+    settings = identification.Settings(free, **options)
+    found = identification.identify(records, order, horizon, settings)
+    A, B, C, D, x0 = found.model[:5]
+    C, D = sy[:, None] * C, sy[:, None] * D / su
+    return Found(A, B / su, C, D, x0, found.singular_values, found.residual)

@@ -10,18 +10,18 @@ from lpvlearn.subspace.recursive_refinement import (
     input_matrices,
     start_recursion,
 )
-from lpvlearn.subspace.refinement import in_sections
 from lpvlearn.subspace.signals import Record
-from lpvlearn.subspace.simulation_fit import freedom, simulation_fit
+from lpvlearn.subspace.simulation_fit import simulation_fit
 
-from .conftest import record
+from .conftest import freedom, record
 
 OMEGA = np.linspace(0.05, 3.0, 40)
 
 
 def test_a_pair_is_brought_to_the_blocks_of_another_model(system):
     u, y = record(system, 400, noise=0.0)
-    pilot = in_sections(simulation_fit(system[0], system[2], [Record(u.T, y.T)]))
+    free = freedom(2, 2)
+    pilot = simulation_fit(system[0], system[2], [Record(u.T, y.T)], free)
     T = np.random.default_rng(1).standard_normal((5, 5))
     A = system[0] + 0.01 * np.random.default_rng(2).standard_normal((5, 5))
     A, C = np.linalg.solve(T, A @ T), 1.02 * system[2] @ T
@@ -43,7 +43,7 @@ def test_input_matrices_of_a_given_pair_solve_the_linearised_problem(system):
     """With the pilot's own A and C it is the simulation least squares."""
     u, y = record(system, 3000)
     records, free = [Record(u.T, y.T)], freedom(2, 2)
-    pilot = in_sections(simulation_fit(system[0], system[2], records))
+    pilot = simulation_fit(system[0], system[2], records, free)
     recursion = start_recursion(pilot, records, free)
     T = np.random.default_rng(1).standard_normal((5, 5))
     A, C = np.linalg.solve(T, system[0] @ T), system[2] @ T

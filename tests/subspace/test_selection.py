@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lpvlearn.subspace.identification import Settings
 from lpvlearn.subspace.selection import (
     _held_out_error,
     _horizon_grid,
@@ -13,7 +14,7 @@ from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import Realization
 
 from ..conftest import modes
-from .conftest import POLES, example, experiment
+from .conftest import POLES, example, experiment, freedom
 
 
 def test_horizon_grid_is_increasing_and_holds_both_ends():
@@ -44,5 +45,6 @@ def test_held_out_error_is_measured_after_the_cut(rng):
 def test_selection_finds_the_order_of_noise_free_data(rng):
     system = example(rng, modes(*POLES))
     u, y = experiment(rng, system, 400)
-    chosen = select([Record(u.T.copy(), y.T.copy())], None, None)
+    settings = Settings(freedom(2, 2))
+    chosen = select([Record.of(u, y)], None, None, settings)
     assert chosen.order == 6

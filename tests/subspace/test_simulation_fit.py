@@ -5,10 +5,9 @@ import numpy as np
 from lpvlearn.subspace.signals import Record, block_sections, signal_factor
 from lpvlearn.subspace.simulation_fit import (
     _general_regression,
-    freedom,
+    _solve_regressions,
     linear_regression,
     simulation_fit,
-    solve_regressions,
 )
 from lpvlearn.systems.simulation import (
     estimate_initial_state,
@@ -17,7 +16,7 @@ from lpvlearn.systems.simulation import (
 )
 
 from ..conftest import modes
-from .conftest import POLES, example, experiment
+from .conftest import POLES, example, experiment, freedom
 
 
 def test_both_regressions_give_the_same_B_D_and_initial_state(rng):
@@ -29,8 +28,8 @@ def test_both_regressions_give_the_same_B_D_and_initial_state(rng):
     T = sections.transform
     free, blocks = freedom(2, 2), sections.blocks
     R = signal_factor(blocks, record)
-    fast = solve_regressions([linear_regression(R, blocks, C @ T, free)], 6)
-    slow = solve_regressions([_general_regression(A, C, record, free)], 6)
+    fast = _solve_regressions([linear_regression(R, blocks, C @ T, free)], 6)
+    slow = _solve_regressions([_general_regression(A, C, record, free)], 6)
     np.testing.assert_allclose(T @ fast[1][0], slow[1][0], atol=1e-9)
     np.testing.assert_allclose(
         T @ fast[0][:12].reshape(6, 2), slow[0][:12].reshape(6, 2), atol=1e-9
@@ -43,7 +42,7 @@ def test_simulation_least_squares_loss_is_the_simulation_error(rng):
     system = example(rng, modes(*POLES))
     runs = [experiment(rng, system, n, noise=0.2) for n in (100, 140)]
     records = [Record(u.T.copy(), y.T.copy()) for u, y in runs]
-    model = simulation_fit(system[0], system[2], records)
+    model = simulation_fit(system[0], system[2], records, freedom(2, 2))
     error = sum(
         ((y - lti_response(*model[:4], u, x0)) ** 2).sum()
         for (u, y), x0 in zip(runs, model.initial_states, strict=True)
@@ -53,7 +52,7 @@ def test_simulation_least_squares_loss_is_the_simulation_error(rng):
 
 def test_overflowing_simulation_has_infinite_loss(rng):
     record = Record(rng.standard_normal((1, 3000)), rng.standard_normal((1, 3000)))
-    model = simulation_fit(np.array([[2.0]]), np.ones((1, 1)), [record])
+    model = simulation_fit(np.array([[2.0]]), np.ones((1, 1)), [record], freedom(1, 1))
     assert np.isinf(model.loss)
 
 

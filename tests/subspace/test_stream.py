@@ -13,12 +13,10 @@ from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace import stream as stream_module
 from lpvlearn.subspace import stream_summary as summary_module
 from lpvlearn.subspace.hankel import data_factor, extend_hankel_sum, start_hankel_sum
-from lpvlearn.subspace.identification import identify
 from lpvlearn.subspace.realization import METHODS, factor_input_matrices
-from lpvlearn.subspace.simulation_fit import freedom
 from lpvlearn.systems.simulation import lti_response
 
-from .conftest import record
+from .conftest import freedom, identify, record
 
 OMEGA = np.linspace(0.05, 3.0, 40)
 
