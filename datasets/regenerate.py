@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lpvlearn import GrayBoxStructure
-from lpvlearn.datasets.reference import write_reference
+from lpvlearn.datasets.reference import spring_structure, write_reference
 
 SAMPLING_TIME = 0.02
 STIFFNESS = {0.0: 40.0, 0.5: 45.0, 1.0: 60.0, 1.5: 85.0}  # 40 + 20 kappa^2
@@ -18,9 +17,7 @@ STIFFNESS = {0.0: 40.0, 0.5: 45.0, 1.0: 60.0, 1.5: 85.0}  # 40 + 20 kappa^2
 
 def spring_table(seed: int = 0) -> pd.DataFrame:
     """Four experiments on a mass whose spring stiffens with kappa, with noise."""
-    spring = GrayBoxStructure.from_template(
-        A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]]
-    )
+    spring = spring_structure()
     rng = np.random.default_rng(seed)
     runs = []
     for number, (kappa, stiffness) in enumerate(STIFFNESS.items()):

@@ -187,6 +187,19 @@ restructurer.starts_
 # weighting model. And ``norm="h2"`` minimises the mean square over frequency instead of
 # the largest value.
 #
+# An identified black box is not known equally well everywhere. Let :math:`g` be its
+# distance from the structure at all frequencies, and :math:`\Sigma` the covariance of
+# its response. ``norm="covariance"``, and :class:`~lpvlearn.LocalLPVPipeline` by
+# default (``efficient=True``), goes on from the H-infinity optimum to
+#
+# .. math::
+#
+#    \min_{\vartheta}\ g(\vartheta)^{\mathsf T}\, \Sigma^{+} g(\vartheta),
+#
+# whose parameters are statistically efficient. If the structure is true, the minimum is
+# a chi-square: ``report_`` has it with its p-value; a warning tells where noise
+# does not explain the distance. ``efficient=False`` keeps the H-infinity optimum.
+#
 # The worked figure
 # -----------------
 # :class:`~lpvlearn.inspection.ErrorDisplay` draws :math:`\sigma_1(\Sigma(j\omega))`.

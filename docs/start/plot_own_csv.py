@@ -116,7 +116,9 @@ crane.parameters_.round(3)
 
 # %%
 # No starting value was needed, and the numbers have a meaning: ``k`` should be 9.81
-# divided by the rope length, ``b`` one divided by it.
+# divided by the rope length, ``b`` one divided by it. The warnings are right, too: a
+# real pendulum follows the sine of its angle, and at some points the noise is too small
+# to hide that.
 
 length = crane.parameters_.index
 truth = pd.DataFrame({"b": 1 / length, "k": GRAVITY / length}, index=length)

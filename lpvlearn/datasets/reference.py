@@ -82,6 +82,13 @@ def load_flexible_arm() -> Bunch:
     )
 
 
+def spring_structure() -> GrayBoxStructure:
+    """A mass on a spring with damping, driven by a force: parameters b, c, k."""
+    return GrayBoxStructure.from_template(
+        A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]]
+    )
+
+
 def load_varying_spring() -> Bunch:
     """Load four local experiments on a mass whose spring stiffens with `kappa`.
 
@@ -125,9 +132,7 @@ def load_varying_spring() -> Bunch:
     return Bunch(
         X=table.drop(columns="position"),
         y=table[["position"]],
-        structure=GrayBoxStructure.from_template(
-            A=[[0, 1], ["-k", "-c"]], B=[[0], ["b"]], C=[[1, 0]]
-        ),
+        structure=spring_structure(),
         sampling_time=0.02,
         true_parameters=pd.DataFrame(
             {"b": 30.0, "c": 1.2, "k": 40.0 + 20.0 * kappa.to_numpy() ** 2}, kappa

@@ -14,12 +14,12 @@ from ..subspace import SubspaceLTI
 from ..subspace.residuals import (
     Residuals,
     autocorrelations,
+    check_kind,
     cross_correlations,
     input_labels,
     residual_tests,
     with_windows,
 )
-from ..validation import one_of
 from .drawing import (
     ACCENT,
     INK,
@@ -198,7 +198,7 @@ class ResidualDisplay:
             If an option is unknown, the estimator is another, or the experiments are
             too short.
         """
-        one_of("errors", errors, ("simulation", "prediction"))
+        check_kind(errors)
         estimator, simulates = unwrapped(estimator), errors == "simulation"
         if isinstance(estimator, SubspaceLTI):
             residuals = estimator._residuals(X, y, errors)

@@ -519,6 +519,14 @@ class StateSpace:
         return cls(model.A, model.B, model.C, model.D, dt if dt > 0 else None)
 
 
+# The uncertainty of a model, told by models to either side of it along independent
+# directions, which every conversion carries along. Their distance from the estimate, in
+# standard deviations, is small enough for what follows from them to be linear, and
+# large against rounding.
+ModelPair = tuple[StateSpace, StateSpace]
+DEVIATION = 1e-2
+
+
 def with_signs_of(reference: StateSpace, model: StateSpace) -> StateSpace:
     """A balanced model with the signs of its states turned to those of another."""
     s = align_signs(model.B, model.C, reference.B, reference.C)[:, None]

@@ -107,6 +107,14 @@ list, default=None
         one by one and their balanced models averaged (the paper's Monte Carlo).
     discretization : {"zoh", "tustin"}, default="zoh"
         From discrete to continuous time; "zoh" is exact for inputs that are held.
+    efficient : bool, default=True
+        Weigh by the noise: the outputs in the local models, and in step 4 the response
+        by the covariance of the black box, begun at the H-infinity optimum, as
+        ``GrayBoxRestructurer(norm="covariance")`` does. The parameters are then
+        statistically efficient, those of gray-box maximum likelihood to first order.
+        False keeps the paper's H-infinity optimum; so does a point whose covariance is
+        not known, and a restructurer with another norm or a frequency weight what it
+        minimises.
     on_error : {"raise", "skip"}, default="raise"
         What a failure at one operating point does: raise an error that names it, or
         leave the point out with a warning.
@@ -129,13 +137,16 @@ list, default=None
     restructurers_ : list
         The fitted restructurers, empty after "passthrough".
     parameters_ : DataFrame of shape (n_points, n_params)
-        Gray-box parameters, one row per operating point.
+        Gray-box parameters, one row per operating point: the efficient ones, where
+        `efficient` applies.
+    hinf_parameters_ : DataFrame of shape (n_points, n_params)
+        Those of the H-infinity optimum; equal to `parameters_` where that is kept.
     parameters_std_ : DataFrame of shape (n_points, n_params)
         Their standard deviations, to first order: from the covariance of the pooled
-        black box, or from the spread of the realizations that ``combine="average"``
-        identifies. NaN where that is not known: a local model that does not minimise
-        the simulation error (``refine=False``, a stability that had to be enforced),
-        collinear inputs, or "passthrough".
+        black box, or with ``combine="average"`` and ``efficient=False`` from the spread
+        of the realizations. NaN where that is not known: a local model that does not
+        minimise the simulation error (``refine=False``, a stability that had to be
+        enforced), collinear inputs, or "passthrough".
     interpolator_ : fitted regressor
     lpv_ : LPVStateSpace
     report_ : DataFrame
@@ -143,7 +154,10 @@ list, default=None
         of the gray-box model on the estimation data (percent, mean over the outputs),
         restructuring error, its structural floor and what remains apart from that, all
         relative to the black box's norm, the active frequency (rad/s) of what
-        remains, stationarity; the distance from the gray-box
+        remains, stationarity; with `efficient`, the error of the H-infinity optimum
+        ("relative_hinf_error"; floor, remainder and stationarity are its own), and
+        "chi2", "degrees_of_freedom" and "p_value" of the gray-box model's distance in
+        standard deviations of the black box; the distance from the gray-box
         model to the interpolated one (H-infinity norm, relative), and the FIT (percent,
         Eq. (36)) of its parameters; the parameters ("param_"), and their standard
         deviations ("std_") where known.
@@ -205,6 +219,7 @@ list, default=None
         sampling_time: float | None = None,
         combine: str = "pool",
         discretization: str = "zoh",
+        efficient: bool = True,
         on_error: str = "raise",
         memory: Any = None,
         n_jobs: int | None = None,
@@ -222,6 +237,7 @@ list, default=None
         self.sampling_time = sampling_time
         self.combine = combine
         self.discretization = discretization
+        self.efficient = efficient
         self.on_error = on_error
         self.memory = memory
         self.n_jobs = n_jobs
@@ -261,6 +277,7 @@ list, default=None
         memory = _checked_memory(self.memory, steps)
         runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
         restructurer, watch = self._restructurer(), Stopwatch()
+        efficient = getattr(restructurer, "norm", None) == "covariance"
 
         with watch.step("reading of the table"):  # steps 1 and 2, and their groups
             experiments = self._read(X, y, reset=True)
@@ -280,6 +297,7 @@ list, default=None
                 sampling_time=self.sampling_time_,
                 combine=self.combine,
                 discretization=self.discretization,
+                efficient=self.efficient or efficient,
             )
 
         with watch.step("restructuring"):  # step 4: all of them in one structure
@@ -301,6 +319,11 @@ list, default=None
                 report.deviations,
             )
             self.report_, self.parameter_report_ = report.points, report.by_parameter
+            self.hinf_parameters_ = report.parameters.copy()
+            for row, fitted in enumerate(found.restructurers):
+                self.hinf_parameters_.iloc[row] = getattr(
+                    fitted, "hinf_params_", fitted.params_
+                )
         self.step_times_ = watch.seconds
         return self
 

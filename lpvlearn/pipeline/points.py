@@ -9,6 +9,7 @@ several points at a time, tells progress and failures, and keeps results in a me
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -24,16 +25,20 @@ from threadpoolctl import ThreadpoolController
 from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
 from ..exceptions import warn
-from ..models.statespace import StateSpace, with_signs_of
+from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
+from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..structures.structure import GrayBoxStructure
-from ..subspace.statistics import DEVIATION, ModelPair, deviated_models
+from ..subspace.noise_weights import noise_weighted
+from ..subspace.statistics import deviated_models
 
 Array = NDArray[np.float64]
 
 # Mean of an output in standard deviations, from which it looks like an offset (a record
 # that rises steadily from rest has a mean of 1.7).
 _OFFSET = 5.0
+
+_Task = tuple[StateSpace, list[StateSpace], list[Estimate]]
 
 _SWEEPS = 4  # passes over the points: help travels that far from a good one
 
@@ -55,6 +60,9 @@ class LocalModel:
     horizon: int | None  # of the subspace step, where the estimator tells it
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
     deviated: list[ModelPair] = field(default_factory=list)  # from `deviated_models`
+    # the model as identified (of every realization) with models to either side of it,
+    # where the covariance is known; with "zoh" in discrete time
+    estimates: list[Estimate] = field(default_factory=list)
 
 
 def identify_points(
@@ -98,27 +106,31 @@ def identify_point(
     sampling_time: float,
     combine: str,
     discretization: str,
+    efficient: bool = False,
 ) -> LocalModel:
     """Identify the local model of one operating point by a clone of `local`.
 
     Fitted, it has `lti_`, a discrete-time StateSpace. `combine` is "pool", one fit of
     all experiments, or "average": one model each, balanced, signs aligned, and the
     matrices averaged (the paper's Monte Carlo). Refuses outputs that do not vary, and
-    an unstable model, which cannot be balanced.
+    an unstable model, which cannot be balanced. `efficient` weighs the outputs by their
+    noise, and gives `estimates`.
     """
     advice = _look_at_outputs(experiments)
     labels = list(dict.fromkeys(e.label for e in experiments))
     if combine == "pool" or len(labels) == 1:
         fitted = _fit_local(local, experiments, sampling_time)
-        lti = _continuous(fitted.lti_, discretization, advice)
-        deviated = deviated_models(
-            fitted.lti_,
-            [(e.inputs, e.outputs) for e in experiments if e.outputs is not None],
-            lambda model: model.to_continuous(discretization),
-            detrend=getattr(fitted, "detrend", None),
-            refined=getattr(fitted, "refine", False) and not fitted.stability_loss_,
+        model, pairs = _estimate(fitted, experiments, efficient)
+        lti = _continuous(model, discretization, advice)
+        found = LocalModel(
+            lti,
+            fitted.lti_.order,
+            _horizon(fitted),
+            deviated=_all_continuous(pairs, discretization),
         )
-        return LocalModel(lti, fitted.lti_.order, _horizon(fitted), deviated=deviated)
+        if efficient and pairs:
+            found.estimates.append(_in_own_time(model, pairs, discretization))
+        return found
     # The first realisation chooses order and horizon, the others follow it.
     # A realisation with gaps is several experiments of one label.
     realisations = [[e for e in experiments if e.label == label] for label in labels]
@@ -128,10 +140,15 @@ def identify_point(
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
     models, failures = [], []
+    estimates: list[Estimate] = []
     for realisation in realisations:
-        model = _fit_local(chosen, realisation, sampling_time).lti_
+        refitted = _fit_local(chosen, realisation, sampling_time)
+        model, pairs = refitted.lti_, []
+        if efficient:
+            model, pairs = _estimate(refitted, realisation, efficient)
         try:
             models.append(_continuous(model, discretization, advice))
+            estimates.append(_in_own_time(model, pairs, discretization))
         except ValueError as error:
             failures.append((realisation[0].label, error))
     if not models:
@@ -141,8 +158,51 @@ def identify_point(
             f"{len(failures)} of {len(labels)} realisations were left out of the "
             f"average; the first, {failures[0][0]!r}: {failures[0][1]}"
         )
-    models = [model for model in models if model.order == models[0].order]
-    return LocalModel(_average(models), fitted.lti_.order, _horizon(fitted), models)
+    lowest = min(model.order for model in models)  # where none grew
+    models = [model for model in models if model.order == lowest]
+    known = all(pairs for _, pairs in estimates)
+    return LocalModel(
+        _average(models),
+        fitted.lti_.order,
+        _horizon(fitted),
+        models,
+        estimates=estimates if known else [],
+    )
+
+
+def _estimate(
+    fitted: Any, experiments: Sequence[Experiment], efficient: bool
+) -> tuple[StateSpace, list[ModelPair]]:
+    """The model, its outputs weighed by their noise if so wished, and its pairs."""
+    samples = [(e.inputs, e.outputs) for e in experiments if e.outputs is not None]
+    model, scale = fitted.lti_, None
+    detrend = getattr(fitted, "detrend", None)
+    refined = getattr(fitted, "refine", False) and not fitted.stability_loss_
+    if refined and efficient:
+        model, scale = noise_weighted(model, samples, detrend=detrend)
+    return model, deviated_models(
+        model,
+        samples,
+        lambda other: other,
+        detrend=detrend,
+        refined=refined,
+        output_scale=scale,
+    )
+
+
+def _in_own_time(
+    model: StateSpace, pairs: list[ModelPair], method: str
+) -> tuple[StateSpace, list[ModelPair]]:
+    """In discrete time where inputs are held, else as the continuous-time model."""
+    if method == "zoh":
+        return model, pairs
+    return model.to_continuous(method), _all_continuous(pairs, method)
+
+
+def _all_continuous(pairs: list[ModelPair], method: str) -> list[ModelPair]:
+    with warnings.catch_warnings():  # the estimate's own conversion says it once
+        warnings.simplefilter("ignore")
+        return [(a.to_continuous(method), b.to_continuous(method)) for a, b in pairs]
 
 
 def _fit_local(
@@ -215,13 +275,25 @@ def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
 
 
 def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpace:
-    lti = model.to_continuous(discretization)
+    with warnings.catch_warnings():  # said below, at this point
+        warnings.filterwarnings("ignore", ".*negative real axis", RuntimeWarning)
+        lti = model.to_continuous(discretization)
     if not lti.is_stable:
         worst = lti.poles()[np.argmax(lti.poles().real)]
         raise ValueError(
             f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
             "local=SubspaceLTI(stability='enforce'), another `order`, a longer "
             "`horizon` or more data, or leave the point out by on_error='skip'."
+        )
+    if lti.order > model.order:
+        poles = model.poles()
+        poles = poles[(poles.real < 0) & (poles.imag == 0)].real
+        warn(
+            f"the identified model of order {model.order} has "
+            f"{lti.order - model.order} pole(s) on the negative real axis "
+            f"({', '.join(f'{p:.3g}' for p in poles)}), as no continuous-time model of "
+            "that order has: what becomes of the point is the nearest one. A shorter "
+            "sampling time or a lower `order` avoids it."
         )
     return lti.balance()
 
@@ -257,13 +329,28 @@ def restructure_points(
     Without a restructurer (None), the entries of the balanced models are parameters.
     """
     if restructurer is None:
-        structure, theta = balanced_entries([model.lti for model in local])
+        # poles on the negative real axis make the order grow in continuous time
+        structure, theta = balanced_entries(
+            [model.lti.balance(min(model.order, model.lti.order)) for model in local]
+        )
         balanced = [structure.model(row) for row in theta]
         unknown = np.full(theta.shape, np.nan)
         return StructuredModels(points, local, structure, theta, unknown, balanced, [])
-    # What a fit is about: the model, and where they are known its realizations.
-    tasks = [
-        (_plain(model.lti), [_plain(other) for other in model.realizations])
+    restructurer = _with_structure(restructurer, local)
+    # What a fit is about: the model, and where they are known its realizations and
+    # estimates. Another norm or a weight is what the user wants minimised.
+    weighed = getattr(restructurer, "norm", None) in ("hinf", "covariance")
+    weighed = weighed and restructurer.frequency_weight is None
+    tasks: list[_Task] = [
+        (
+            _plain(model.lti),
+            [_plain(other) for other in model.realizations],
+            [
+                (_plain(one), [(_plain(a), _plain(b)) for a, b in pairs])
+                for one, pairs in model.estimates
+                if weighed
+            ],
+        )
         for model in local
     ]
     found = runner.run(
@@ -304,22 +391,56 @@ def restructure_points(
     )
 
 
+def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
+    """One canonical form for all points, of the identified order, where none is given.
+
+    Raises
+    ------
+    ValueError
+        If the models differ in order.
+    """
+    if getattr(restructurer, "structure", "its own") is not None:
+        return restructurer
+    orders = sorted({model.order for model in local})
+    if len(orders) > 1:
+        raise ValueError(
+            "`structure=None` interpolates the parameters of a canonical form and "
+            f"needs local models of one order. Got orders {orders}. Fix the order: "
+            "local=SubspaceLTI(order=...)."
+        )
+    first = local[0].lti
+    form = GrayBoxStructure.observable_canonical(
+        orders[0],
+        first.n_inputs,
+        first.n_outputs,
+        orders[0] == 0 or any(model.lti.D.any() for model in local),
+    )
+    return clone(restructurer).set_params(structure=form)
+
+
 def _restructure_point(
     model: StateSpace,
     realizations: Sequence[StateSpace],
+    estimates: Sequence[Estimate],
     *,
     restructurer: Any,
     **options: Any,
 ) -> Any:
     """A clone of the restructurer, fitted to one local model."""
+    restructurer = clone(restructurer)
     if len(realizations) > 1:
         options["realizations"] = realizations
-    return clone(restructurer).fit_model(model, **options)
+    if estimates:
+        restructurer.set_params(norm="covariance")
+        options["estimates"] = estimates
+    elif getattr(restructurer, "norm", None) == "covariance":  # it is not known
+        restructurer.set_params(norm="hinf")
+    return restructurer.fit_model(model, **options)
 
 
 def _help_neighbours(
     fitted: Sequence[Any],
-    tasks: Sequence[tuple[StateSpace, list[StateSpace]]],
+    tasks: Sequence[_Task],
     kappa: Array,
     restructurer: Any,
 ) -> list[Any]:

@@ -86,12 +86,21 @@ def _restructuring(fitted: GrayBoxRestructurer) -> dict[str, float]:
     size = np.inf
     if fitted.relative_error_ > 0:
         size = fitted.error_ / fitted.relative_error_
+    weighed = {}
+    if hasattr(fitted, "hinf_params_"):
+        weighed = {
+            "relative_hinf_error": fitted.hinf_error_ / size,
+            "chi2": fitted.chi2_,
+            "degrees_of_freedom": fitted.degrees_of_freedom_,
+            "p_value": fitted.p_value_,
+        }
     return {
         "relative_error": fitted.relative_error_,
         "relative_floor": fitted.structural_floor_ / size,
         "remaining_error": fitted.remaining_error_ / size,
         "active_frequency": np.max(fitted.active_frequencies_, initial=0.0),
         "stationarity": fitted.stationarity_,
+        **weighed,
     }
 
 
@@ -129,6 +138,7 @@ def summarise(
         f"Local models: {local}, simulation fit (BFT) {_span(report['local_BFT'])} %",
     ]
     hidden = ["param_", "std_", "n_", "stationarity", "horizon", "order"]
+    hidden += ["relative_hinf_error", "chi2", "degrees_of_freedom"]
     restructured = "structured_BFT" in report
     if restructured:
         error, floor = 100 * report["relative_error"], 100 * report["relative_floor"]
@@ -138,16 +148,25 @@ def summarise(
             f"the largest at {_label_of_largest(remaining)} near "
             f"{report['active_frequency'].iloc[_largest(remaining)]:.4g} rad/s"
         )
+        weighed, spot = "p_value" in report, "" if has_floor else f", {place}"
         lines += [
             f"Restructuring: {restructurer}, "
             f"simulation fit (BFT) {_span(report['structured_BFT'])} %",
             f"    H-infinity error {_span(error)} % of the black box's norm"
-            + ("" if has_floor else f", {place}"),
+            + ("" if weighed else spot),
         ]
         if has_floor:
             lines += [
                 f"    of which no parameter can change {_span(floor)} %",
                 f"    apart from that, {_span(remaining)} %, {place}",
+            ]
+        if weighed:
+            best = 100 * report["relative_hinf_error"]
+            misfit = report["chi2"] / report["degrees_of_freedom"].clip(lower=1)
+            lines += [
+                f"    that of the H-infinity optimum {_span(best)} %{spot}",
+                "    in the black box's standard deviations: chi-square per degree of "
+                f"freedom {_span(misfit)}",
             ]
         # Without a floor, all of the error remains.
         hidden += (

@@ -27,6 +27,7 @@ from ..structures.structure import GrayBoxStructure
 from ..validation import one_of, whole_number
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
+from .minimise_covariance import Estimate, efficient_parameters
 from .minimise_h2 import minimise_h2
 from .minimise_hinf import SOLVERS, minimise_hinf, promising
 from .problem import (
@@ -44,6 +45,20 @@ _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows 
 
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
 _PROVEN = 1e-8  # an error that much above its lower bound, its rounding, is optimal
+
+# A structure is doubted where chance explains it that rarely, and the parameters would
+# suffer: errors of twice the standard deviations that are told.
+_IMPLAUSIBLE, _MISFIT = 1e-3, 4.0
+
+_ABSENT_ELSEWHERE = (  # attributes that not every fit has
+    "params_covariance_",
+    "hinf_params_",
+    "hinf_error_",
+    "chi2_",
+    "degrees_of_freedom_",
+    "p_value_",
+)
+
 _ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
 
 
@@ -59,11 +74,14 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
     ----------
     structure : GrayBoxStructure, default=None
         None is the observable canonical form of the model's order (`fit_model` only).
-    norm : {"hinf", "h2", "similarity"}, default="hinf"
+    norm : {"hinf", "h2", "covariance", "similarity"}, default="hinf"
         What is minimised: the largest singular value of the error over frequency,
-        Eq. (6); its mean square over frequency and entries; or, for comparison, the
-        bilinear equations of a similarity transformation, Eq. (7), for affine
-        structures of the black box's order.
+        Eq. (6); its mean square over frequency and entries; the error g of the response
+        (real and imaginary parts of all frequencies and entries) in the standard
+        deviations of the identified black box, :math:`g^\mathsf{T} \Sigma^+ g` with
+        its covariance :math:`\Sigma`, begun at the H-infinity optimum: statistically
+        efficient; or, for comparison, the bilinear equations of a similarity
+        transformation, Eq. (7), for affine structures of the black box's order.
     solver : {"sqp", "bundle"}, default="sqp"
         What ends the search: minimax sequential quadratic programming with exact
         second derivatives, or the paper's proximity control with cutting planes,
@@ -102,6 +120,15 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         Hankel singular value that a model of the structure's order leaves.
     active_frequencies_ : ndarray
         Frequencies, rad/s, of the peaks that support the optimum.
+    hinf_params_, hinf_error_ : ndarray of shape (n_params,), float
+        With ``norm="covariance"``: the H-infinity optimum, and its error. The bounds,
+        peaks and certificates below and above are those of that optimum; `params_`,
+        `lti_`, `error_` and `relative_error_` those of the efficient parameters, which
+        are the same where the uncertainty is nil.
+    chi2_, degrees_of_freedom_, p_value_ : float
+        With ``norm="covariance"``: the minimum, which is a chi-square of that many
+        degrees of freedom if the structure is true, and the probability of such a value
+        or a higher one; NaN where the uncertainty is nil.
     structural_floor_ : float
         Highest peak of the error that no parameter changes (a gain fixed by the
         structure); 0 where there is none. It is set aside, and the remaining peaks are
@@ -122,8 +149,9 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
     fit_error_ : float
         Relative root-mean-square error over frequency of the best least-squares fit.
     params_covariance_ : ndarray of shape (n_params, n_params)
-        Covariance of the parameters from the spread of the `realizations` given to
-        `fit_model`; absent without them.
+        Covariance of the parameters from the spread of the `realizations`, or that of
+        the `estimates`, given to `fit_model`; absent without them. Infinite variances
+        where the estimates do not determine a parameter, none at its bound.
     start_params_ : ndarray of shape (n_params,)
         Least-squares fit that the search started from.
     starts_ : DataFrame
@@ -185,6 +213,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         *,
         starts: Sequence[ArrayLike] = (),
         realizations: Sequence[StateSpace] = (),
+        estimates: Sequence[Estimate] = (),
     ) -> GrayBoxRestructurer:
         """Restructure a black-box state-space model with the exact H-infinity norm.
 
@@ -199,15 +228,28 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         realizations : sequence of StateSpace, default=()
             Models from single realizations of the noise, of which `model` is the
             average; their spread gives `params_covariance_`.
+        estimates : sequence of (StateSpace, pairs), default=()
+            For ``norm="covariance"``: independent estimates of the system (`model`
+            itself, or one of each realization), each with its uncertainty: pairs of
+            models 0.01 standard deviations to either side of it, along independent
+            directions. In the time domain of `model`, or in discrete time with inputs
+            that are held.
 
         Raises
         ------
         ValueError
-            If a model is unstable, or the structure has other inputs or outputs.
+            If a model is unstable, the structure has other inputs or outputs, or
+            ``norm="covariance"`` has no estimates.
         """
+        if self.norm == "covariance" and not len(estimates):
+            raise ValueError(
+                "`norm='covariance'` needs `estimates`: an identified model with its "
+                "uncertainty, as LocalLPVPipeline gives it. Got none."
+            )
         problem = self._problem(model)
-        self._restructure(problem, [problem.structure.check_params(s) for s in starts])
-        if len(realizations):
+        given = [problem.structure.check_params(s) for s in starts]
+        self._restructure(problem, given, estimates)
+        if len(realizations) and not hasattr(self, "params_covariance_"):
             spread = problem.spread_covariance(self.params_, realizations)
             self.params_covariance_ = spread
         return self
@@ -288,16 +330,24 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "params_")
         rng = np.random.default_rng(0)
-        rows = []
+        rows, norm, params = [], self.norm, self.params_
+        if norm == "covariance":
+            norm, params = "hinf", self.hinf_params_
         for _ in range(n_restarts):
-            start = self.params_ * (1.0 + size * rng.normal(size=self.params_.shape))
-            again = clone(self).set_params(init=start, n_starts=1).fit_model(model)
-            rows.append([*(again.params_ / self.params_ - 1.0), again.error_])
+            start = params * (1.0 + size * rng.normal(size=params.shape))
+            again = clone(self).set_params(norm=norm, init=start, n_starts=1)
+            again.fit_model(model)
+            rows.append([*(again.params_ / params - 1.0), again.error_])
         names = [*self.structure_.parameter_names, "error_"]
         return pd.DataFrame(rows, columns=names)
 
     def _check_options(self) -> None:
-        one_of("norm", self.norm, ("hinf", "h2", "similarity"))
+        one_of("norm", self.norm, ("hinf", "h2", "covariance", "similarity"))
+        if self.norm == "covariance" and self.frequency_weight is not None:
+            raise ValueError(
+                "`frequency_weight` must be None with norm='covariance', which weighs "
+                f"the error by its uncertainty. Got {self.frequency_weight!r}."
+            )
         one_of("solver", self.solver, tuple(SOLVERS))
         if isinstance(self.init, str) and self.init != "similarity":
             raise ValueError(
@@ -320,9 +370,15 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         models = list(model) if isinstance(model, Sequence) and model else [model]
         return problem_from_models(self.structure, models, self.frequency_weight)
 
-    def _restructure(self, problem: RestructuringProblem, given: list[Array]) -> None:
+    def _restructure(
+        self,
+        problem: RestructuringProblem,
+        given: list[Array],
+        estimates: Sequence[Estimate] = (),
+    ) -> None:
         """Starts and their least-squares fits, minimisation, certificates, warnings."""
-        self.__dict__.pop("params_covariance_", None)  # of an earlier fit
+        for name in _ABSENT_ELSEWHERE:  # of an earlier fit
+            self.__dict__.pop(name, None)
         seed = check_random_state(self.random_state).randint(2**31)
         problem, fits = search(problem, self.init, self.n_starts, given, seed)
         errors = [fit.relative_error for fit in fits]
@@ -330,6 +386,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         self.fit_error_, self.start_params_ = errors[0], fits[0].x
         self.params_, result, floor = self._minimise(problem, fits)
         self._describe(problem, result, floor)
+        if self.norm == "covariance":
+            self._weigh(problem, estimates)
         self._warn(problem, result)
 
     def _minimise(
@@ -377,8 +435,9 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         self.second_order_ = result.second_order
         self.n_iter_ = result.n_iter
         self.history_ = pd.DataFrame(result.history)
-        self.objective_ = result.peaks.top if self.norm != "hinf" else self.error_
-        if self.norm == "hinf":
+        minimax = self.norm in ("hinf", "covariance")
+        self.objective_ = self.error_ if minimax else result.peaks.top
+        if minimax:
             found = result.peaks
             active = found.values >= found.top * (1.0 - ACTIVE_PEAK)
             self.active_frequencies_ = np.sort(found.frequencies[active])
@@ -387,6 +446,42 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             self.active_frequencies_ = np.sort(peaks.frequencies)
             self.remaining_error_ = self.error_
         self.identifiability_ = problem.identifiability(self.params_)
+
+    def _weigh(
+        self, problem: RestructuringProblem, estimates: Sequence[Estimate]
+    ) -> None:
+        """From the H-infinity optimum to the parameters weighed by the uncertainty."""
+        self.hinf_params_, self.hinf_error_ = self.params_, self.error_
+        self.chi2_ = self.degrees_of_freedom_ = self.p_value_ = np.nan
+        dt, size = problem.system.dt, problem.reference
+        found = efficient_parameters(
+            problem.structure, estimates, self.params_, sampling_time=dt
+        )
+        if found is None:
+            return
+        self.params_, self.params_covariance_ = found.theta, found.covariance
+        self.lti_ = self.structure_.model(self.params_, dt)
+        self.error_ = problem.system.peaks(self.params_).norm
+        self.relative_error_ = self.error_ / size if size > 0 else np.nan
+        self.chi2_, self.objective_ = found.cost, np.sqrt(found.cost)
+        self.degrees_of_freedom_ = found.degrees_of_freedom
+        self.p_value_ = found.p_value
+        if not found.converged:
+            warn(
+                "the search for the parameters weighed by the uncertainty of the black "
+                "box did not end: the data may not determine them all. Take a "
+                "structure of fewer parameters, or norm='hinf'.",
+                ConvergenceWarning,
+            )
+        if found.p_value < _IMPLAUSIBLE and found.misfit > _MISFIT:
+            warn(
+                f"the structure lies {np.sqrt(found.misfit):.1f} times as far from the "
+                "black box as its noise explains (`p_value_` "
+                f"{found.p_value:.1g}): the standard deviations are too small then, "
+                "and the parameters meet the frequencies best that the data tell most "
+                "of. Give the structure what it lacks, or keep the H-infinity optimum "
+                "by norm='hinf' (in a pipeline, efficient=False)."
+            )
 
     def _warn(self, problem: RestructuringProblem, result: MinimaxResult) -> None:
         """Warn of a search that did not converge, a poor fit, and open parameters."""
@@ -403,7 +498,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 ConvergenceWarning,
             )
         floor = self.structural_floor_ / max(problem.reference, 1e-300)
-        if self.fit_error_ - floor > _POOR_FIT:
+        explained = getattr(self, "p_value_", 0.0) > _IMPLAUSIBLE  # by the noise
+        if self.fit_error_ - floor > _POOR_FIT and not explained:
             costs = self.starts_["relative_error"].to_numpy()
             agreeing = int((costs <= costs.min() * (1.0 + _AGREE)).sum())
             warn(

@@ -22,7 +22,13 @@ from ..data.preparation import split_at_gaps
 from ..models.innovation import InnovationModel
 from ..validation import one_of
 from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
-from .residuals import Residuals, input_labels, model_residuals, residual_tests
+from .residuals import (
+    Residuals,
+    check_kind,
+    input_labels,
+    model_residuals,
+    residual_tests,
+)
 from .selection import selection_text
 from .stream import SampleStream, fit_as_stream
 
@@ -523,7 +529,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _residuals(self, X: Any, y: Any, errors: str) -> Residuals:
         """What is tested; `ResidualDisplay` draws it."""
         check_is_fitted(self, "lti_")
-        one_of("errors", errors, ("simulation", "prediction"))
+        check_kind(errors)
         experiments, _ = self._read(X, y, reset=False)
         names = [] if y is None else read_outputs(y)[1]
         if y is not None and len(names) != self.n_outputs_:

@@ -43,7 +43,7 @@ from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import StateSpace
 from ..systems.simulation import estimate_initial_state, free_responses
-from ..validation import whole_number
+from ..validation import one_of, whole_number
 from .hankel import cholesky_factor, correlation_sequence, stack_factors
 from .statistics import Evidence, autoregression
 
@@ -82,6 +82,11 @@ class Fitted(NamedTuple):
     direct: NDArray[np.bool_]  # (n_outputs, n_inputs), free entries of D
     filter: Array  # (n_terms, n_outputs, n_outputs), impulse response of W
     n_noise: int = 0  # lags of the noise model for each output
+
+
+def check_kind(errors: str) -> None:
+    """Refuse what are no errors of a model, naming those that are."""
+    one_of("errors", errors, ("simulation", "prediction"))
 
 
 class Residuals(NamedTuple):

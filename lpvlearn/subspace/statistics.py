@@ -28,7 +28,7 @@ from scipy import fft, linalg
 
 from ..data.preparation import independent_inputs, remove_trends
 from ..models.innovation import InnovationModel, NoiseModel
-from ..models.statespace import StateSpace
+from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..systems.balancing import balancing_transformation
 from ..systems.simulation import (
     estimate_initial_state,
@@ -36,6 +36,7 @@ from ..systems.simulation import (
     lti_response,
 )
 from .hankel import correlation_sequence
+from .identification import scale_records
 from .signals import Record, block_slices, signal_pieces
 from .simulation_fit import (
     Freedom,
@@ -51,10 +52,6 @@ Array = NDArray[np.float64]
 # Averages over the record are known to a percent or so from this many samples.
 _MAX_SAMPLES = 30_000
 
-# Distance of the models of a pair from the estimate, in standard deviations: small
-# enough for what follows from them to be linear, and large against rounding.
-DEVIATION = 1e-2
-
 _NEGLIGIBLE = 1e-12  # relative variance below which a direction is rounding
 
 # Lags that are allowed for by the number of samples: 10 log10(n), a customary limit.
@@ -63,8 +60,6 @@ _LAGS_PER_DECADE = 10.0
 _RCOND_LAGS = 1e-13  # directions of past errors that are their rounding
 _MAX_CONDITION = 1e8  # of eigenvectors, which would lose half of the spectrum's digits
 _RCOND = 1e-15  # the weakest direction of the information that is told from rounding
-
-ModelPair = tuple[StateSpace, StateSpace]
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +180,7 @@ def deviated_models(
     *,
     detrend: str | None = None,
     refined: bool = True,
+    output_scale: Array | None = None,
 ) -> list[ModelPair]:
     """Models to either side of an estimate, along its directions of uncertainty.
 
@@ -193,15 +189,20 @@ def deviated_models(
     `DEVIATION` standard deviations from the estimate; directions are independent. Empty
     where the covariance is not known: the model does not minimise the simulation error
     (`refined`), it has no states, its inputs are collinear, or poles coincide.
+    It weighed errors equally in units of `output_scale`, by default those of the fit.
     """
     A, B, C, D = lti.A, lti.B, lti.C, lti.D
-    (ny, n), m = C.shape, B.shape[1]
+    n, m = B.shape
     if not refined or n == 0:
         return []
     if independent_inputs([u for u, _ in pairs]) is not None:  # they are collinear
         return []
     centred = remove_trends(list(pairs), detrend)[0]
-    records, share = shorten([Record(u.T, y.T) for u, y in centred])
+    scale = output_scale
+    if scale is None:
+        scale = scale_records(centred).output_scale
+    records, share = shorten([Record(u.T, (y / scale).T) for u, y in centred])
+    C, D = C / scale[:, None], D / scale[:, None]
     states = [
         estimate_initial_state(
             free_responses(A, C, y.shape[1]), y.T - lti_response(A, B, C, D, u.T)
@@ -212,7 +213,7 @@ def deviated_models(
         model=Realization(A, B, C, D, np.array(states), np.nan),
         records=records,
         input_scale=np.ones(m),
-        output_scale=np.ones(ny),
+        output_scale=scale,
         basis=np.eye(m),
         free=Freedom(D != 0.0),
         refined=True,

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from joblib import Memory
+from scipy.optimize import least_squares
 
 from lpvlearn import (
     GrayBoxRestructurer,
@@ -20,9 +21,11 @@ from lpvlearn import (
 )
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.pipeline.points import (
+    LocalModel,
     PointRunner,
     covariance_of_parameters,
     identify_point,
+    restructure_points,
 )
 from lpvlearn.subspace.statistics import deviated_models
 
@@ -157,6 +160,154 @@ def test_memory_tells_the_same_deviations(tmp_path):
     ]
     for other in fits[1:]:
         pd.testing.assert_frame_equal(fits[0].parameters_std_, other.parameters_std_)
+
+
+@pytest.fixture(scope="module")
+def with_a_negative_pole():
+    """Three points; at the middle one a pole of the sampled system is -0.3."""
+    rng = np.random.default_rng(0)
+    points = []
+    for kappa, pole in zip((0.0, 1.0, 2.0), (0.3, -0.3, 0.3), strict=True):
+        A, B, C = np.diag([0.8, pole]), np.ones((2, 1)), np.array([[1.0, 0.7]])
+        u = rng.standard_normal((400, 1))
+        y = StateSpace(A, B, C, sampling_time=STEP).simulate(u)
+        points.append((u, kappa, y + 0.01 * rng.standard_normal(y.shape)))
+    return from_trajectories(points, sampling_time=STEP)
+
+
+TWO_LAGS = GrayBoxStructure.from_template(
+    [["-a", 0], [0, "-b"]], [["g"], ["h"]], [[1, 1]]
+)
+
+
+@pytest.mark.filterwarnings("ignore:the (structure|search for)")
+@pytest.mark.parametrize(
+    "restructurer", [None, "passthrough", GrayBoxRestructurer(TWO_LAGS)]
+)
+def test_an_order_that_grows_in_continuous_time_is_that_of_the_others(
+    with_a_negative_pole, restructurer
+):
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(order=2, horizon=8),
+        restructurer,
+        scheduling="kappa",
+        experiment="experiment",
+        time="time",
+    )
+    with pytest.warns(UserWarning, match=r"1 pole\(s\) on the negative real.*-0\.3"):
+        pipeline.fit(*with_a_negative_pole)
+    assert [model.order for model in pipeline.local_models_] == [2, 3, 2]
+    assert [model.order for model in pipeline.structured_models_] == [2, 2, 2]
+    if restructurer != "passthrough":
+        assert pipeline.report_["structured_BFT"].min() > 60
+
+
+def test_one_canonical_form_needs_one_order():
+    models = [
+        LocalModel(StateSpace(-np.eye(n), np.ones((n, 1)), np.ones((1, n))), n, None)
+        for n in (1, 2)
+    ]
+    with pytest.raises(ValueError, match=r"one order. Got orders \[1, 2\]"):
+        restructure_points(GrayBoxRestructurer(), models, None, None)
+
+
+SENSORS = GrayBoxStructure.from_template(
+    [[0, 1], ["-k", "-c"]], [[0], [1]], [[1, 0], [0, 1]]
+)
+
+
+def sensor_record(seed, n_samples=600, noise=(0.02, 1.0), method="zoh"):
+    """Position and speed of a mass, the latter by a poor sensor."""
+    rng = np.random.default_rng(seed)
+    u = rng.choice([-1.0, 1.0], (n_samples // 3, 1)).repeat(3, axis=0)
+    y = SENSORS.model({"c": 0.6, "k": 5.0}).to_discrete(STEP, method).simulate(u)
+    size = y.std(axis=0) * noise
+    return u, y + size * rng.standard_normal(y.shape), size
+
+
+def sensor_pipeline(**options):
+    free = options.get("discretization") == "tustin"
+    local = SubspaceLTI(2, horizon=8, feedthrough=free, sampling_time=STEP)
+    options.setdefault("restructurer", GrayBoxRestructurer(SENSORS))
+    return LocalLPVPipeline(local, **options)
+
+
+@pytest.mark.parametrize("discretization", ["zoh", "tustin"])
+def test_efficient_parameters_are_those_of_maximum_likelihood(discretization):
+    u, y, size = sensor_record(0, method=discretization)
+
+    def residuals(theta):
+        model = SENSORS.model(theta).to_discrete(STEP, discretization)
+        return ((y - model.simulate(u)) / size).ravel()
+
+    best = least_squares(residuals, [0.6, 5.0], x_scale="jac")
+    bound = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)))
+    pipeline = sensor_pipeline(discretization=discretization).fit(u, y)
+    assert (np.abs(pipeline.parameters_.iloc[0] - best.x) < 0.5 * bound).all()
+    np.testing.assert_allclose(pipeline.parameters_std_.iloc[0], bound, rtol=0.15)
+    row = pipeline.report_.iloc[0]
+    assert row["degrees_of_freedom"] == (4 if discretization == "zoh" else 6)
+    assert row["p_value"] > 1e-3
+    assert row["relative_hinf_error"] <= row["relative_error"]
+    hinf = pipeline.hinf_parameters_.iloc[0]
+    restructurer = pipeline.restructurers_[0]
+    np.testing.assert_array_equal(restructurer.hinf_params_, hinf)
+    np.testing.assert_array_equal(restructurer.params_, pipeline.parameters_.iloc[0])
+    if discretization == "zoh":  # no feedthrough is left out of the comparison
+        distance = (restructurer.lti_ - pipeline.local_models_[0]).hinf_norm()
+        assert np.isclose(restructurer.error_, distance, rtol=1e-6)
+    assert "chi-square per degree of freedom" in pipeline.summary()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"efficient": False},
+        {"restructurer": GrayBoxRestructurer(SENSORS, norm="h2")},
+        {"restructurer": GrayBoxRestructurer(SENSORS, frequency_weight=(None, 9.0))},
+    ],
+)
+def test_what_another_norm_asks_for_stays(options):
+    u, y, _ = sensor_record(1, noise=(0.1, 0.1))
+    pipeline = sensor_pipeline(**options).fit(u, y)
+    pd.testing.assert_frame_equal(pipeline.parameters_, pipeline.hinf_parameters_)
+    assert "p_value" not in pipeline.report_
+    assert pipeline.parameters_std_.notna().all(axis=None)
+
+
+@pytest.mark.filterwarnings("ignore:All experiments are at one operating point")
+def test_realizations_are_weighed_together():
+    records = [sensor_record(seed)[:2] for seed in range(3)]
+    X, Y = from_trajectories([(u, 0.0, y) for u, y in records], sampling_time=STEP)
+    roles = {"experiment": "experiment", "time": "time", "scheduling": "kappa"}
+    pooled, average = (
+        sensor_pipeline(combine=combine, **roles).fit(X, Y)
+        for combine in ("pool", "average")
+    )
+    assert average.report_["degrees_of_freedom"].iloc[0] == 3 * 6 - 2
+    gap = (average.parameters_ - pooled.parameters_) / pooled.parameters_std_
+    assert gap.abs().to_numpy().max() < 0.5
+    ratio = average.parameters_std_ / pooled.parameters_std_
+    assert ratio.stack().between(0.8, 1.25).all()
+
+
+@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
+def test_a_structure_that_the_noise_does_not_explain_is_told():
+    u, y, _ = sensor_record(2, noise=(0.01, 0.01))
+    wrong = SENSORS.fix({"c": 0.7})
+    with pytest.warns(UserWarning, match=r"times as far .* efficient=False"):
+        pipeline = sensor_pipeline(restructurer=GrayBoxRestructurer(wrong)).fit(u, y)
+    assert pipeline.report_["p_value"].iloc[0] < 1e-3
+
+
+def test_without_a_covariance_the_hinf_optimum_is_kept():
+    u, y, _ = sensor_record(3, noise=(0.01, 0.01))
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(2, horizon=8, refine=False, feedthrough=False, sampling_time=STEP),
+        GrayBoxRestructurer(SENSORS, norm="covariance"),
+    ).fit(u, y)
+    pd.testing.assert_frame_equal(pipeline.parameters_, pipeline.hinf_parameters_)
+    assert pipeline.parameters_std_.isna().all(axis=None)
 
 
 # -- the runner -----------------------------------------------------------------------

@@ -128,6 +128,7 @@ def test_the_summary_does_not_lay_the_floor_to_a_frequency_of_the_rest():
         scheduling="kappa",
         experiment="experiment",
         time="time",
+        efficient=False,  # the structure is wrong, as the noise would tell
     ).fit(X, y)
     report, text = pipeline.report_, pipeline.summary()
     assert (report["relative_floor"] > 1e-3).all()

@@ -385,6 +385,16 @@ ERRORS = [
         "needs an affine structure of the order",
     ),
     (
+        lambda: GrayBoxRestructurer(norm="covariance").fit_model(GOOD),
+        "needs `estimates`",
+    ),
+    (
+        lambda: GrayBoxRestructurer(
+            norm="covariance", frequency_weight=(None, 1.0)
+        ).fit_model(GOOD, estimates=[(GOOD, [])]),
+        "`frequency_weight` must be None",
+    ),
+    (
         lambda: GrayBoxRestructurer(spring_structure(), norm="h2").fit(
             [1.0], [[1.0, 0.0]]
         ),

@@ -331,3 +331,23 @@ def test_collinear_inputs_leave_the_deviations_open():
     with pytest.warns(UserWarning, match="collinear"):
         fitted = SubspaceLTI(1, horizon=5).fit(both, y)
     assert deviated_models(fitted.lti_, [(both, y)], lambda model: model) == []
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_pairs_tell_the_deviations_of_the_fit_in_any_unit_of_an_output(unit):
+    rng = np.random.default_rng(0)
+    truth = StateSpace(
+        [[0.8, 0.3], [-0.3, 0.7]], [[1.0], [0.5]], np.eye(2), sampling_time=1.0
+    )
+    u = rng.standard_normal((1000, 1))
+    y = truth.simulate(u)
+    y = (y + 0.1 * y.std(0) * rng.standard_normal(y.shape)) * [1.0, unit]
+    fitted = SubspaceLTI(2, horizon=8).fit(u, y)
+    omega = np.linspace(0.1, 3, 6)
+    changes = [
+        above.frequency_response(omega) - below.frequency_response(omega)
+        for above, below in deviated_models(fitted.lti_, [(u, y)], lambda model: model)
+    ]
+    expected = np.abs(fitted.frequency_response_std(omega))
+    actual = np.linalg.norm(changes, axis=0) / 0.02
+    np.testing.assert_allclose(actual, expected, rtol=1e-3)

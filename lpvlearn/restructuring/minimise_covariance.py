@@ -1,0 +1,274 @@
+r"""Minimisation of the distance to a black box in units of its own uncertainty.
+
+An identified black box of order n is uncertain in p = n (n_inputs + n_outputs)
+directions, and one more for every free entry of D. Its response g0 (all frequencies and
+entries, real parts, then imaginary parts: N numbers) moves along them by the columns of
+V, shape (N, p), when its parameters move by one standard deviation each. To first order
+g0 then has the covariance ``Sigma = V V^T``, of rank p, and the efficient parameters
+are those of generalised least squares (Gauss and Markov; Aitken),
+
+    min over theta of  (g(theta) - g0)^T Sigma^+ (g(theta) - g0) = |z(theta)|^2,
+    z(theta) = V^+ (g(theta) - g0),                                    shape (p,).
+
+z are local coordinates of the black box, with the covariance I: how many standard
+deviations away, in p independent directions, the structured model lies. They depend on
+transfer functions alone, so no similarity transformation is involved. The rows of V are
+divided by the standard deviations of the entries before it is inverted: any left
+inverse of V gives the same estimate to first order, and this one depends neither on
+the units of a channel nor on those of time.
+
+With J the derivative of z, the covariance of theta is ``(J^T J)^-1``. If the black box
+is efficient (white noise, simulation error minimised) this is the Cramer-Rao bound of
+the structure: the estimate has the asymptotic distribution of gray-box maximum
+likelihood (the indirect prediction error method of Soderstrom, Stoica and Friedlander,
+Automatica 27, 1991). If the structure is true, the minimum is a chi-square with p minus
+n_params degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ..models.statespace import DEVIATION, ModelPair, StateSpace
+from ..systems.least_squares import levenberg_marquardt
+from .error_system import ErrorSystem, Structure, Target, frequency_grid
+from .limits import Limits, natural_margin
+from .sampled_structure import SampledStructure
+
+Array = NDArray[np.float64]
+
+Complex = NDArray[np.complex128]
+
+Estimate = tuple[StateSpace, Sequence[ModelPair]]  # with models on either side of it
+
+# Standard deviations below this part of a channel's largest gain cannot be told from
+# rounding: the models of a pair differ by a fiftieth of it, their responses are exact
+# to some 1e-13.
+_EXACT = 1e-9
+
+# Relative singular value of the scaled V below which a direction is rounding. Well
+# excited models stay above 1e-3; in the differences of pairs 1e-6 is still exact.
+_FAINT = 1e-6
+
+_UNDETERMINED = 1e-9  # the same of the scaled J, as in the analysis of identifiability
+
+# A step that lowers |z|^2 by less moves no parameter by more than a thousandth of its
+# standard deviation (or of the greater one that the misfit of a wrong structure makes).
+_SETTLED = 1e-6
+
+# Relative decrease of |z|^2, twice in a row, that ends the iteration: it converges
+# quadratically near a true structure, where |z|^2 is about p, so that a last step to
+# rounding costs nothing.
+_DECREASE = 1e-10
+
+
+@dataclass(frozen=True)
+class UncertainResponse:
+    """The response of a black box, and the coordinates of its uncertainty."""
+
+    omega: Array  # (k,), rad/s
+    response: Complex  # g0: (k, n_outputs, n_inputs)
+    whitening: Array  # V^+: (p, 2 k n_outputs n_inputs)
+
+    def coordinates(self, response: Complex) -> Array:
+        """``z = V^+ (g - g0)``, shape (p,), of another response."""
+        return np.asarray(self.whitening @ _parts(response - self.response))
+
+    def derivatives(self, jacobian: Complex) -> Array:
+        """Those of the coordinates, (p, q), from the response's, (k, ..., q)."""
+        return np.asarray(self.whitening @ _parts(jacobian, jacobian.shape[-1]))
+
+
+def _parts(response: Complex, *columns: int) -> Array:
+    flat = response.reshape(-1, *columns)
+    return np.concatenate([flat.real, flat.imag])
+
+
+def uncertain_response(
+    model: StateSpace, pairs: Sequence[ModelPair], omega: Array
+) -> UncertainResponse | None:
+    """Response of a black box with its covariance, from models on either side of it.
+
+    `pairs` stand along independent directions as `deviated_models` has them, in any
+    state basis; `omega` must tell models of that order apart. None where no uncertainty
+    is known, or none is left beyond rounding.
+    """
+    if len(pairs) == 0:
+        return None
+    G = model.frequency_response(omega)
+    changes = [
+        above.frequency_response(omega) - below.frequency_response(omega)
+        for above, below in pairs
+    ]
+    V = np.column_stack([_parts(change) for change in changes]) / (2 * DEVIATION)
+    std = np.linalg.norm(V, axis=1)
+    largest = np.broadcast_to(np.abs(G).max(0), G.shape)
+    floor = _EXACT * np.concatenate([largest.ravel()] * 2)
+    if not np.isfinite(std).all() or not (std > floor).any():
+        return None
+    std = np.maximum(std, floor)
+    std = np.where(std > 0, std, 1.0)  # a channel without any gain
+    U, s, _ = np.linalg.svd(V / std[:, None], full_matrices=False)
+    kept = s > _FAINT * s[0]
+    return UncertainResponse(omega, G, (U[:, kept] / s[kept]).T / std)
+
+
+@dataclass(frozen=True)
+class CovarianceFit:
+    """Efficient parameters and what is known about them.
+
+    The covariance is zero for parameters held at a bound, and infinite on the diagonal
+    for those that the black box does not determine.
+    """
+
+    theta: Array  # (n_params,)
+    cost: float  # |z|^2
+    degrees_of_freedom: int  # known directions minus parameters that they determine
+    covariance: Array  # (n_params, n_params)
+    remaining: float  # decrease of the cost by a further Gauss-Newton step
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such a cost, or a higher one, if the structure is true."""
+        if self.degrees_of_freedom == 0:
+            return 1.0
+        return float(chi2.sf(self.cost, self.degrees_of_freedom))
+
+    @property
+    def misfit(self) -> float:
+        """Cost by degree of freedom: about 1 where the structure is true."""
+        return self.cost / max(self.degrees_of_freedom, 1)
+
+    @property
+    def converged(self) -> bool:
+        """Whether a further step would change the parameters by next to nothing."""
+        return self.remaining <= _SETTLED * max(1.0, self.misfit)
+
+
+def efficient_parameters(
+    structure: Structure,
+    estimates: Sequence[Estimate],
+    start: Array,
+    *,
+    sampling_time: float | None = None,
+) -> CovarianceFit | None:
+    """Parameters of a structure from independent estimates of one system.
+
+    The estimates are those of all experiments, or of each realization of the noise,
+    with their models on either side. Where these are in discrete time and the structure
+    (`sampling_time`) is not, it is sampled behind a hold. None where an uncertainty is
+    not known, or the start does not keep the stability margin.
+    """
+    first = estimates[0][0]
+    target = Target(first.A, first.B, first.C, first.D, first.sampling_time)
+    omega, margin = frequency_grid(first.poles(), target.dt), natural_margin(target)
+    found = [uncertain_response(model, pairs, omega) for model, pairs in estimates]
+    boxes = [box for box in found if box is not None]
+    if len(boxes) < len(found):
+        return None
+    if first.sampling_time is not None and sampling_time is None:
+        structure = SampledStructure(structure, first.sampling_time)
+    return minimise_covariance(ErrorSystem(structure, target), start, margin, boxes)
+
+
+def minimise_covariance(
+    system: ErrorSystem,
+    start: Array,
+    margin: float,
+    boxes: Sequence[UncertainResponse],
+    *,
+    max_iter: int = 100,
+) -> CovarianceFit | None:
+    """Parameters nearest to black boxes in the metric of their own uncertainty.
+
+    `system` is that of the structure (its black box and weight do not enter), `start`
+    in the basin of the optimum, e.g. where the H-infinity norm is least; the costs of
+    independent black boxes add up. A structure that can be any model of the black box's
+    order returns the black box, with ``cost = 0`` and
+    ``(dg/dtheta) covariance (dg/dtheta)^T = Sigma``.
+
+    Examples
+    --------
+    The gain of a lag that the black box knows to 0.1, its pole to 0.2:
+
+    >>> import numpy as np
+    >>> from lpvlearn import GrayBoxStructure, StateSpace
+    >>> from lpvlearn.restructuring.problem import problem_from_models
+    >>> lag = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+    >>> box = StateSpace(-2.0, 3.0, 1.0)
+    >>> pairs = [(StateSpace(-2.002, 3.0, 1.0), StateSpace(-1.998, 3.0, 1.0)),
+    ...          (StateSpace(-2.0, 3.001, 1.0), StateSpace(-2.0, 2.999, 1.0))]
+    >>> problem = problem_from_models(lag, [box], None)
+    >>> estimate = uncertain_response(box, pairs, problem.omega)
+    >>> found = minimise_covariance(
+    ...     problem.system, np.array([1.0, 1.0]), problem.margin, [estimate])
+    >>> found.theta.round(6)
+    array([2., 3.])
+    >>> np.sqrt(np.diag(found.covariance)).round(4)
+    array([0.2, 0.1])
+    """
+    admissible = Limits(system, margin).admissible
+
+    def coordinates(theta: Array) -> tuple[Array, Array]:
+        z, J = [], []
+        for box in boxes:
+            G, dG = system.response_jacobian(theta, box.omega)
+            z.append(box.coordinates(G))
+            J.append(box.derivatives(dG))
+        return np.concatenate(z), np.vstack(J)
+
+    def residuals(x: Array, _: Any) -> tuple[Array, Callable[..., Array]]:
+        if not admissible(x[0]):
+            return np.full((1, 1), np.nan), lambda _: np.zeros((1, 1, x.shape[1]))
+        z, J = coordinates(x[0])
+        return z[None], lambda _: J[None]
+
+    lower, upper = system.structure.lower, system.structure.upper
+    reached, costs = levenberg_marquardt(
+        residuals,
+        np.asarray(start, dtype=float)[None],
+        lower=lower,
+        upper=upper,
+        max_iter=max_iter,
+        tol=_DECREASE,
+    )
+    theta, cost = reached[0], float(costs[0])
+    if not np.isfinite(cost):
+        return None
+    z, J = coordinates(theta)
+    gradient = J.T @ z
+    held = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
+    covariance, explained = _linear_analysis(np.where(held, 0.0, J))
+    return CovarianceFit(
+        theta,
+        cost,
+        len(z) - explained.shape[1],
+        covariance,
+        float(np.sum((explained.T @ z) ** 2)),
+    )
+
+
+def _linear_analysis(J: Array) -> tuple[Array, Array]:
+    """``(J^T J)^-1``, and orthonormal columns that span the range of J.
+
+    A column of zeros has no variance; parameters of a combination that J does not
+    determine have an infinite one.
+    """
+    unit = np.linalg.norm(J, axis=0)
+    free = unit > 0
+    unit = np.where(free, unit, 1.0)
+    U, s, Vt = np.linalg.svd(J[:, free] / unit[free])
+    s = np.concatenate([s, np.zeros(len(Vt) - len(s))])
+    known = s > _UNDETERMINED * s.max(initial=0.0)
+    part = (Vt[known].T / s[known] ** 2) @ Vt[known]
+    open_ = np.abs(Vt[~known]).max(0, initial=0.0) > _UNDETERMINED
+    part[np.diag_indices(len(part))] += np.where(open_, np.inf, 0.0)
+    covariance = np.zeros((len(unit), len(unit)))
+    covariance[np.ix_(free, free)] = part
+    return covariance / unit[:, None] / unit, U[:, : int(known.sum())]
