@@ -29,8 +29,7 @@ from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..structures.structure import GrayBoxStructure
-from ..subspace.noise_weights import noise_weighted
-from ..subspace.statistics import deviated_models
+from ..subspace.statistics import deviated_models, noise_weighted
 
 Array = NDArray[np.float64]
 
@@ -183,7 +182,6 @@ def _estimate(
     return model, deviated_models(
         model,
         samples,
-        lambda other: other,
         detrend=detrend,
         refined=refined,
         output_scale=scale,

@@ -33,13 +33,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.stats import chi2
 
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..systems.least_squares import levenberg_marquardt
-from .error_system import ErrorSystem, Structure, Target, frequency_grid
-from .limits import Limits, natural_margin
-from .sampled_structure import SampledStructure
+from .error_system import ErrorSystem, Structure, Target, remembering
+from .limits import keeps_margin, natural_margin
 
 Array = NDArray[np.float64]
 
@@ -131,24 +131,9 @@ class CovarianceFit:
     cost: float  # |z|^2
     degrees_of_freedom: int  # known directions minus parameters that they determine
     covariance: Array  # (n_params, n_params)
-    remaining: float  # decrease of the cost by a further Gauss-Newton step
-
-    @property
-    def p_value(self) -> float:
-        """Probability of such a cost, or a higher one, if the structure is true."""
-        if self.degrees_of_freedom == 0:
-            return 1.0
-        return float(chi2.sf(self.cost, self.degrees_of_freedom))
-
-    @property
-    def misfit(self) -> float:
-        """Cost by degree of freedom: about 1 where the structure is true."""
-        return self.cost / max(self.degrees_of_freedom, 1)
-
-    @property
-    def converged(self) -> bool:
-        """Whether a further step would change the parameters by next to nothing."""
-        return self.remaining <= _SETTLED * max(1.0, self.misfit)
+    p_value: float  # of such a cost, or a higher one, if the structure is true
+    misfit: float  # cost by degree of freedom: about 1 where the structure is true
+    converged: bool  # a further step would change the parameters by next to nothing
 
 
 def efficient_parameters(
@@ -167,14 +152,14 @@ def efficient_parameters(
     """
     first = estimates[0][0]
     target = Target(first.A, first.B, first.C, first.D, first.sampling_time)
-    omega, margin = frequency_grid(first.poles(), target.dt), natural_margin(target)
-    found = [uncertain_response(model, pairs, omega) for model, pairs in estimates]
+    if first.sampling_time is not None and sampling_time is None:
+        structure = SampledStructure(structure, first.sampling_time)
+    system = ErrorSystem(structure, target)
+    found = [uncertain_response(box, pairs, system.grid) for box, pairs in estimates]
     boxes = [box for box in found if box is not None]
     if len(boxes) < len(found):
         return None
-    if first.sampling_time is not None and sampling_time is None:
-        structure = SampledStructure(structure, first.sampling_time)
-    return minimise_covariance(ErrorSystem(structure, target), start, margin, boxes)
+    return minimise_covariance(system, start, natural_margin(target), boxes)
 
 
 def minimise_covariance(
@@ -213,7 +198,6 @@ def minimise_covariance(
     >>> np.sqrt(np.diag(found.covariance)).round(4)
     array([0.2, 0.1])
     """
-    admissible = Limits(system, margin).admissible
 
     def coordinates(theta: Array) -> tuple[Array, Array]:
         z, J = [], []
@@ -224,7 +208,7 @@ def minimise_covariance(
         return np.concatenate(z), np.vstack(J)
 
     def residuals(x: Array, _: Any) -> tuple[Array, Callable[..., Array]]:
-        if not admissible(x[0]):
+        if not keeps_margin(system, x[0], margin):
             return np.full((1, 1), np.nan), lambda _: np.zeros((1, 1, x.shape[1]))
         z, J = coordinates(x[0])
         return z[None], lambda _: J[None]
@@ -245,12 +229,17 @@ def minimise_covariance(
     gradient = J.T @ z
     held = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
     covariance, explained = _linear_analysis(np.where(held, 0.0, J))
+    freedom = len(z) - explained.shape[1]
+    misfit = cost / max(freedom, 1)
+    remaining = float(np.sum((explained.T @ z) ** 2))  # gain of a Gauss-Newton step
     return CovarianceFit(
         theta,
         cost,
-        len(z) - explained.shape[1],
+        freedom,
         covariance,
-        float(np.sum((explained.T @ z) ** 2)),
+        p_value=float(chi2.sf(cost, freedom)) if freedom else 1.0,
+        misfit=misfit,
+        converged=remaining <= _SETTLED * max(1.0, misfit),
     )
 
 
@@ -272,3 +261,59 @@ def _linear_analysis(J: Array) -> tuple[Array, Array]:
     covariance = np.zeros((len(unit), len(unit)))
     covariance[np.ix_(free, free)] = part
     return covariance / unit[:, None] / unit, U[:, : int(known.sum())]
+
+
+class SampledStructure:
+    r"""The discrete-time models of a continuous-time structure, exact for held inputs.
+
+        exp(M dt) = [[Ad, Bd], [0, I]],   M = [[A, B], [0, 0]],
+
+    C and D as they are. The derivatives by theta_j are the blocks of
+
+        exp([[M, M_j], [0, M]] dt) = [[exp(M dt), d exp(M dt) / d theta_j],
+                                      [0, exp(M dt)]]
+
+    (Van Loan, 1978). A black box in discrete time is so matched where it was
+    identified: one with a pole on the negative real axis has no logarithm.
+
+    It takes the place of a structure in an `ErrorSystem` whose black box has the same
+    sampling time. Structures that differ by modes beyond the Nyquist frequency have
+    the same samples: begin near the parameters that are meant.
+    """
+
+    is_affine = False
+
+    def __init__(self, structure: Structure, sampling_time: float) -> None:
+        self.structure, self.sampling_time = structure, sampling_time
+        self.order, self.n_params = structure.order, structure.n_params
+        self.lower, self.upper = structure.lower, structure.upper
+        self._sampled = remembering(self._sample)
+
+    def system_matrix(self, theta: Array) -> Array:
+        """``[[Ad, Bd], [C, D]]``; not finite where the sampled model overflows."""
+        return np.asarray(self._sampled(theta)[0])
+
+    def jacobian(self, theta: Array) -> Array:
+        """Its derivatives, shape (n_params, order + n_outputs, order + n_inputs)."""
+        return np.asarray(self._sampled(theta)[1])
+
+    def curvature(self, theta: Array) -> Array | None:
+        """Not known: the structure serves least squares, not the minimax."""
+        return None
+
+    def _sample(self, theta: Array) -> tuple[Array, Array]:
+        n, dt = self.order, self.sampling_time
+        S, dS = self.structure.system_matrix(theta), self.structure.jacobian(theta)
+        size = S.shape[1]
+        # the units of a parameter must not enter the norm that expm scales by
+        unit = np.abs(dS[:, :n]).max((1, 2), initial=0.0, keepdims=True)
+        unit = np.where(unit > 0, unit, 1.0) / np.abs(S[:n]).max(initial=1e-300)
+        M = np.zeros((self.n_params, 2 * size, 2 * size))
+        M[:, :n, :size] = M[:, size : size + n, size:] = S[:n] * dt
+        M[:, :n, size:] = dS[:, :n] / unit * dt
+        with np.errstate(over="ignore", invalid="ignore"):
+            E = expm(M) if np.isfinite(M).all() else np.full_like(M, np.nan)
+        return (
+            np.vstack([E[0, :n, :size], S[n:]]),
+            np.concatenate([E[:, :n, size:] * unit, dS[:, n:]], axis=1),
+        )

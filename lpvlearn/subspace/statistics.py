@@ -17,10 +17,10 @@ on to what becomes of a model.
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ from ..systems.simulation import (
 )
 from .hankel import correlation_sequence
 from .identification import scale_records
+from .refinement import refine_simulation
 from .signals import Record, block_slices, signal_pieces
 from .simulation_fit import (
     Freedom,
@@ -176,7 +177,6 @@ def shorten(records: list[Record]) -> tuple[list[Record], float]:
 def deviated_models(
     lti: StateSpace,
     pairs: Sequence[tuple[Array, Array]],
-    convert: Callable[[StateSpace], StateSpace],
     *,
     detrend: str | None = None,
     refined: bool = True,
@@ -185,11 +185,11 @@ def deviated_models(
     """Models to either side of an estimate, along its directions of uncertainty.
 
     `lti` is a discrete-time model, fitted to the experiments `pairs` (u, y) after
-    `detrend`; `convert` makes of one what it becomes. The models of a pair are
-    `DEVIATION` standard deviations from the estimate; directions are independent. Empty
-    where the covariance is not known: the model does not minimise the simulation error
-    (`refined`), it has no states, its inputs are collinear, or poles coincide.
-    It weighed errors equally in units of `output_scale`, by default those of the fit.
+    `detrend`; so are the others. The models of a pair are `DEVIATION` standard
+    deviations from the estimate; directions are independent. Empty where the covariance
+    is not known: the model does not minimise the simulation error (`refined`), it has
+    no states, its inputs are collinear, or poles coincide. It weighed errors equally in
+    units of `output_scale`, by default those of the fit.
     """
     A, B, C, D = lti.A, lti.B, lti.C, lti.D
     n, m = B.shape
@@ -203,12 +203,7 @@ def deviated_models(
         scale = scale_records(centred).output_scale
     records, share = shorten([Record(u.T, (y / scale).T) for u, y in centred])
     C, D = C / scale[:, None], D / scale[:, None]
-    states = [
-        estimate_initial_state(
-            free_responses(A, C, y.shape[1]), y.T - lti_response(A, B, C, D, u.T)
-        )
-        for u, y in records
-    ]
+    states, _ = _scaled_errors(lti, [(u.T, scale * y.T) for u, y in records], scale)
     evidence = Evidence(
         model=Realization(A, B, C, D, np.array(states), np.nan),
         records=records,
@@ -225,12 +220,10 @@ def deviated_models(
 
     def deviated(change: Array) -> StateSpace:
         model = moved_model(evidence.sections, change, evidence.free)
-        return convert(evidence.state_space(model, lti.sampling_time))
+        return evidence.state_space(model, lti.sampling_time)
 
     changes = DEVIATION * _square_root(evidence.covariance).T
-    with warnings.catch_warnings():  # the estimate's own conversion says it once
-        warnings.simplefilter("ignore")
-        return [(deviated(change), deviated(-change)) for change in changes]
+    return [(deviated(change), deviated(-change)) for change in changes]
 
 
 def _square_root(covariance: Array) -> Array:
@@ -478,3 +471,88 @@ def _pole_jacobian(
             poles[row], jacobian[row, part] = value, np.outer(left, vector).ravel()
             row += 1
     return poles, jacobian
+
+
+_SETTLED = 1.05  # a ratio of weights that costs the square of it in efficiency
+
+_LARGEST_RATIO = 1e4  # of noise to signal: sixteen digits carry the square of no better
+
+_ROUNDS = 6  # each brings a clean output's noise nearer by ten: up to that ratio
+
+
+class NoiseWeighted(NamedTuple):
+    """A model, and the units in which it minimises the errors of its outputs."""
+
+    lti: StateSpace
+    output_scale: Array
+
+
+def noise_weighted(
+    lti: StateSpace,
+    pairs: Sequence[tuple[Array, Array]],
+    *,
+    detrend: str | None = None,
+) -> NoiseWeighted:
+    """Refine a discrete-time model with its outputs weighted by their noise.
+
+    A fit minimises the sum over t and i of ``(v_i[t] / s_i)^2`` in some units s of the
+    outputs. Under white noise it is efficient where s_i is the standard deviation of
+    the noise of output i (the diagonal of maximum likelihood), which a fit cannot know
+    before: in units of the outputs' own size, a poor sensor bends the dynamics that all
+    outputs share. The errors of a first fit tell them nearly, and those of the next
+    better: a clean output that is fitted badly looks noisier than it is.
+
+    It nearly minimises the simulation error over the experiments (u, y) in other units;
+    entries of D that are zero stay so. A single output, or noise in proportion to the
+    outputs, returns the model as it was; so does a search that ends unstable.
+    """
+    centred = remove_trends(list(pairs), detrend)[0]
+    size = scale_records(centred).output_scale
+    plain = NoiseWeighted(lti, size)
+    if len(size) == 1 or lti.order == 0:
+        return plain
+    unit, weighted = size, lti
+    for _ in range(_ROUNDS):
+        errors = _scaled_errors(weighted, centred, unit)[1]
+        innovation = np.diagonal(autoregression(errors).covariance)
+        noise = unit / size * np.sqrt(np.maximum(innovation, 0.0))
+        if not noise.any():
+            break
+        new = size * np.maximum(noise, noise.max() / _LARGEST_RATIO) / noise.max()
+        change = new / unit
+        if change.max() <= _SETTLED * change.min():
+            break
+        unit, weighted = new, _refined(weighted, centred, new)
+    return NoiseWeighted(weighted, unit) if weighted.is_stable else plain
+
+
+def _scaled_errors(
+    lti: StateSpace, pairs: Sequence[tuple[Array, Array]], unit: Array
+) -> tuple[list[Array], list[Array]]:
+    """Initial states, and what is left of the outputs, in their units."""
+    C, D = lti.C / unit[:, None], lti.D / unit[:, None]
+    states, errors = [], []
+    for u, y in pairs:
+        error = y / unit - lti_response(lti.A, lti.B, C, D, u)
+        responses = free_responses(lti.A, C, len(error))
+        states.append(estimate_initial_state(responses, error))
+        errors.append(error - responses @ states[-1])
+    return states, errors
+
+
+def _refined(
+    lti: StateSpace, pairs: Sequence[tuple[Array, Array]], unit: Array
+) -> StateSpace:
+    """The model at the least simulation error in these units of the outputs."""
+    su, sy = scale_records(pairs).input_scale, unit[:, None]
+    records = [Record((u / su).T.copy(), (y / unit).T.copy()) for u, y in pairs]
+    states, errors = _scaled_errors(lti, pairs, unit)
+    loss = sum(float(np.sum(error**2)) for error in errors)
+    start = Realization(
+        lti.A, lti.B * su, lti.C / sy, lti.D * su / sy, np.array(states), loss
+    )
+    free = Freedom(lti.D != 0.0)
+    model = refine_simulation(in_sections(start), records, free)
+    return StateSpace(
+        model.A, model.B / su, sy * model.C, sy * model.D / su, lti.sampling_time
+    )

@@ -34,8 +34,7 @@ from scipy.signal import lfilter
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace, SubspaceLTI
 from lpvlearn.pipeline.points import _average, covariance_of_parameters
 from lpvlearn.restructuring.minimise_covariance import efficient_parameters
-from lpvlearn.subspace.noise_weights import noise_weighted
-from lpvlearn.subspace.statistics import deviated_models
+from lpvlearn.subspace.statistics import deviated_models, noise_weighted
 
 STRUCTURE = GrayBoxStructure.mechanical(
     M=[["m1", 0], [0, "m2"]],
@@ -139,9 +138,7 @@ def weighted(
     """Parameters nearest to discrete-time models in their own uncertainty."""
     identified = []
     for model, record, scale in zip(models, records, scales, strict=True):
-        pairs = deviated_models(
-            model, [record[:2]], lambda model: model, output_scale=scale
-        )
+        pairs = deviated_models(model, [record[:2]], output_scale=scale)
         identified.append((model, pairs))
     found = efficient_parameters(STRUCTURE, identified, start)
     assert found is not None and found.converged
@@ -168,9 +165,10 @@ def estimates(records: Sequence[Record], case: Case) -> Iterator[tuple[str, Esti
         if realizations:
             covariance = found.params_covariance_
         else:
-            pairs = deviated_models(
-                models[0], [records[0][:2]], StateSpace.to_continuous
-            )
+            pairs = [
+                (above.to_continuous(), below.to_continuous())
+                for above, below in deviated_models(models[0], [records[0][:2]])
+            ]
             covariance = covariance_of_parameters(
                 STRUCTURE, found.params_, None, black_box, pairs
             )

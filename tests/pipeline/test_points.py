@@ -124,7 +124,10 @@ def test_nothing_is_claimed_where_the_covariance_is_not_known(options):
 def test_a_frequency_weight_enters_the_covariance():
     u, y = lag_record(3)
     fitted = SubspaceLTI(1, horizon=8, feedthrough=False, sampling_time=STEP).fit(u, y)
-    pairs = deviated_models(fitted.lti_, [(u, y)], StateSpace.to_continuous)
+    pairs = [
+        (above.to_continuous(), below.to_continuous())
+        for above, below in deviated_models(fitted.lti_, [(u, y)])
+    ]
     box = fitted.lti_.to_continuous()
     theta = GrayBoxRestructurer(LAG).fit_model(box).params_
     plain, weighted = (

@@ -16,6 +16,7 @@ from lpvlearn.subspace.statistics import (
     _spectrum,
     autoregression,
     deviated_models,
+    noise_weighted,
 )
 from lpvlearn.systems.simulation import lti_response, state_trajectory
 
@@ -312,7 +313,10 @@ def test_pairs_stand_on_both_sides_of_the_estimate(method):
     lag = StateSpace([[-0.8]], [[1.5]], [[1.0]])
     y = lag.simulate(u, sampling_time=0.1) + 0.05 * rng.standard_normal((300, 1))
     fitted = SubspaceLTI(1, horizon=8, sampling_time=0.1).fit(u, y)
-    pairs = deviated_models(fitted.lti_, [(u, y)], lambda m: m.to_continuous(method))
+    pairs = [
+        (above.to_continuous(method), below.to_continuous(method))
+        for above, below in deviated_models(fitted.lti_, [(u, y)])
+    ]
     assert len(pairs) == 3  # pole, gain and feedthrough
     omega = np.geomspace(0.01, 20, 20)
     here = fitted.lti_.to_continuous(method).frequency_response(omega)
@@ -330,7 +334,7 @@ def test_collinear_inputs_leave_the_deviations_open():
     both = np.hstack([u, 2 * u])
     with pytest.warns(UserWarning, match="collinear"):
         fitted = SubspaceLTI(1, horizon=5).fit(both, y)
-    assert deviated_models(fitted.lti_, [(both, y)], lambda model: model) == []
+    assert deviated_models(fitted.lti_, [(both, y)]) == []
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
@@ -346,8 +350,121 @@ def test_pairs_tell_the_deviations_of_the_fit_in_any_unit_of_an_output(unit):
     omega = np.linspace(0.1, 3, 6)
     changes = [
         above.frequency_response(omega) - below.frequency_response(omega)
-        for above, below in deviated_models(fitted.lti_, [(u, y)], lambda model: model)
+        for above, below in deviated_models(fitted.lti_, [(u, y)])
     ]
     expected = np.abs(fitted.frequency_response_std(omega))
     actual = np.linalg.norm(changes, axis=0) / 0.02
     np.testing.assert_allclose(actual, expected, rtol=1e-3)
+
+
+TRUTH = StateSpace(
+    [[0.8, 0.3], [-0.3, 0.7]], [[1.0], [0.5]], np.eye(2), sampling_time=1.0
+)
+GRID = np.linspace(0.05, 3, 20)
+
+
+def record(noise, seed=0, n_samples=1000):
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((n_samples, 1))
+    y = TRUTH.simulate(u)
+    return u, y + y.std(0) * noise * rng.standard_normal(y.shape)
+
+
+def fitted(u, y):
+    return SubspaceLTI(2, horizon=8, feedthrough=False).fit(u, y).lti_
+
+
+def errors(model, u, y):
+    return y - lti_response(model.A, model.B, model.C, model.D, u)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_units_become_those_of_the_noise(seed):
+    u, y = record([0.01, 1.0], seed)
+    found = noise_weighted(fitted(u, y), [(u, y)])
+    noise = TRUTH.simulate(u).std(0) * [0.01, 1.0]
+    ratio = found.output_scale / noise
+    assert np.isclose(ratio[0] / ratio[1], 1.0, rtol=0.15)
+    # White errors of that size, uncorrelated with the inputs, are all that is left.
+    left = errors(found.lti, u, y)[20:].std(0)
+    np.testing.assert_allclose(left, noise, rtol=0.1)
+
+
+def test_a_poor_sensor_no_longer_spoils_a_good_one():
+    def row_errors(model):
+        gap = model.frequency_response(GRID) - TRUTH.frequency_response(GRID)
+        return np.sqrt(np.mean(np.abs(gap) ** 2, axis=(0, 2)))
+
+    before, after = [], []
+    for seed in range(4):
+        u, y = record([0.01, 1.0], seed)
+        plain = fitted(u, y)
+        before.append(row_errors(plain))
+        after.append(row_errors(noise_weighted(plain, [(u, y)]).lti))
+    before, after = np.median(before, axis=0), np.median(after, axis=0)
+    assert after[0] < 0.1 * before[0] and after[1] < 1.1 * before[1]
+
+
+def test_the_weighted_error_is_least():
+    u, y = record([0.05, 1.0])
+    y = y[:, ::-1].copy()
+    found, unit = noise_weighted(fitted(u, y), [(u, y)])
+
+    def loss(model):
+        return np.sum((errors(model, u, y) / unit) ** 2)
+
+    least = loss(found)
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        changed = StateSpace(
+            found.A * (1 + 3e-2 * rng.normal(size=(2, 2))),
+            found.B,
+            found.C,
+            sampling_time=1.0,
+        )
+        assert loss(changed) > least
+
+
+def test_noise_in_proportion_leaves_the_model_as_it_is():
+    u, y = record([0.1, 0.1])
+    plain = fitted(u, y)
+    assert noise_weighted(plain, [(u, y)]).lti is plain
+    assert noise_weighted(plain, [(u[:500], y[:500]), (u[500:], y[500:])]).lti is plain
+
+
+def test_one_output_has_nothing_to_weigh():
+    u, y = record([0.1, 0.1])
+    plain = fitted(u, y[:, :1])
+    assert noise_weighted(plain, [(u, y[:, :1])]).lti is plain
+
+
+def test_units_of_the_outputs_do_not_matter():
+    u, y = record([0.02, 1.0])
+    one = noise_weighted(fitted(u, y), [(u, y)])
+    factor = np.array([1e-3, 1e4])
+    other = noise_weighted(fitted(u, y * factor), [(u, y * factor)])
+    np.testing.assert_allclose(other.output_scale, one.output_scale * factor, rtol=1e-3)
+    np.testing.assert_allclose(
+        other.lti.frequency_response(GRID),
+        factor[:, None] * one.lti.frequency_response(GRID),
+        rtol=1e-4,
+    )
+
+
+def test_an_offset_is_taken_off_as_in_the_fit():
+    u, y = record([0.01, 1.0])
+    shifted = y + [3.0, -2.0]
+    plain = noise_weighted(fitted(u, y), [(u, y)], detrend="constant")
+    moved = noise_weighted(fitted(u, y), [(u, shifted)], detrend="constant")
+    np.testing.assert_allclose(moved.lti.A, plain.lti.A, rtol=1e-8)
+
+
+def test_without_noise_the_model_stays():
+    u, y = record([0.0, 0.0])
+    plain = fitted(u, y)
+    found = noise_weighted(plain, [(u, y)]).lti
+    np.testing.assert_allclose(
+        found.frequency_response(GRID),
+        plain.frequency_response(GRID),
+        rtol=1e-9,
+    )
