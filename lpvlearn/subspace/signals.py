@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, signal
+from scipy import linalg
 
 from .hankel import cholesky_factor, stack_factors
 
@@ -225,7 +225,9 @@ class _SectionBank:
         if len(block) == 2:
             det = block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0]
             denominator = [1.0, -block[0, 0] - block[1, 1], det]
-        out, self._memory[i] = signal.lfilter(
+        from scipy.signal import lfilter  # slow to import
+
+        out, self._memory[i] = lfilter(
             [1.0], denominator, v, axis=1, zi=self._memory[i]
         )
         return out

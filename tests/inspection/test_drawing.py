@@ -22,7 +22,7 @@ from lpvlearn.inspection.drawing import line_style
 
 from .conftest import ONE, random_model, spring
 
-HEAVY = ("matplotlib", "tqdm", "sklearn.pipeline")
+HEAVY = ("matplotlib", "tqdm", "scipy.signal", "sklearn.pipeline")
 
 
 def test_importing_the_library_leaves_out_what_is_slow_to_import():
