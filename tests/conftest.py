@@ -37,22 +37,23 @@ def stable_model(
     sampling_time=None,
     feedthrough=False,
     decay=0.3,
+    rate=1.0,
 ):
     """A random stable model; `seed` may be a Generator that goes on.
 
-    The slowest mode of a continuous model decays at the rate `decay`; with a
-    `sampling_time` the spectral radius is 0.9.
+    The slowest mode of a continuous model decays at the rate `decay`, and all of it
+    goes `rate` times as fast; with a `sampling_time` the spectral radius is 0.9.
     """
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(order, order))
     poles = np.linalg.eigvals(A)
     if sampling_time is None:
-        A = A - (poles.real.max(initial=0.0) + decay) * np.eye(order)
+        A = A - (poles.real.max(initial=-np.inf) + decay) * np.eye(order)
     else:
         A = 0.9 * A / np.abs(poles).max(initial=1e-3)
     B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
     D = rng.normal(size=(n_outputs, n_inputs)) if feedthrough else None
-    return StateSpace(A, B, C, D, sampling_time)
+    return StateSpace(rate * A, rate * B, C, D, sampling_time)
 
 
 def spring_structure():

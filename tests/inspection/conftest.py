@@ -12,6 +12,8 @@ from lpvlearn import (
     SubspaceLTI,
 )
 
+from ..conftest import stable_model
+
 STEP = 0.05
 KAPPA = np.array([-1.0, 0.0, 1.0, 2.0])
 SPRING = GrayBoxStructure.from_template(
@@ -71,16 +73,6 @@ def pipeline(tables):
 
 
 def random_model(seed, order=4, n_outputs=2, n_inputs=3, sampling_time=None):
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((order, order))
-    if sampling_time is None:
-        A -= (np.abs(np.linalg.eigvals(A).real).max() + 0.1) * np.eye(order)
-    else:
-        A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
-    return StateSpace(
-        A,
-        rng.standard_normal((order, n_inputs)),
-        rng.standard_normal((n_outputs, order)),
-        rng.standard_normal((n_outputs, n_inputs)),
-        sampling_time,
+    return stable_model(
+        seed, order, n_inputs, n_outputs, sampling_time=sampling_time, feedthrough=True
     )

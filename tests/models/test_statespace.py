@@ -14,20 +14,13 @@ from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace
 
+from ..conftest import stable_model
+
 OMEGA = np.array([0.0, 0.1, 1.0, 7.0, 40.0])
 
 
-def random_model(seed, order=4, n_inputs=2, n_outputs=3, sampling_time=None):
-    """A stable model with feedthrough."""
-    rng = np.random.default_rng(seed)
-    A = rng.normal(size=(order, order))
-    poles = np.linalg.eigvals(A)
-    if sampling_time is None:
-        A = A - (poles.real.max(initial=0.0) + 0.2) * np.eye(order)
-    else:
-        A = A / (1.1 * np.abs(poles).max(initial=1.0))
-    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
-    return StateSpace(A, B, C, rng.normal(size=(n_outputs, n_inputs)), sampling_time)
+def random_model(seed, order=4, n_inputs=2, n_outputs=3, **options):
+    return stable_model(seed, order, n_inputs, n_outputs, feedthrough=True, **options)
 
 
 @pytest.mark.parametrize("sampling_time", [None, 0.05])

@@ -11,6 +11,7 @@ from lpvlearn.datasets import FlexibleArm
 from lpvlearn.restructuring.error_system import ErrorSystem, Target
 
 from ..conftest import spring_structure
+from ..conftest import stable_model as continuous_model
 
 
 def target_of(model):
@@ -98,11 +99,9 @@ def rough():
         yield
 
 
-def stable_model(rng, order, n_inputs, n_outputs, dt=None, rate=1.0):
-    A = rng.normal(size=(order, order))
-    A -= (np.linalg.eigvals(A).real.max() + 0.5) * np.eye(order)
-    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
-    model = StateSpace(rate * A, rate * B, C)
+def stable_model(rng, order, n_inputs, n_outputs, dt=None, decay=0.5, **options):
+    """The shared random model, sampled where `dt` says so."""
+    model = continuous_model(rng, order, n_inputs, n_outputs, decay=decay, **options)
     return model if dt is None else model.to_discrete(dt)
 
 

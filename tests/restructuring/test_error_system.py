@@ -3,19 +3,17 @@
 import numpy as np
 import pytest
 
-from lpvlearn import GrayBoxStructure, StateSpace
+from lpvlearn import GrayBoxStructure
 from lpvlearn.restructuring.error_system import ErrorSystem, Target, resolvent
 from lpvlearn.restructuring.measured import MeasuredErrorSystem
 
+from .conftest import stable_model as sampled_model
 
-def stable_model(rng, order, n_inputs, n_outputs, sampling_time=None):
-    A = rng.normal(size=(order, order))
-    A -= (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(order)
-    B = rng.normal(size=(order, n_inputs))
-    C = rng.normal(size=(n_outputs, order))
-    D = rng.normal(size=(n_outputs, n_inputs))
-    model = StateSpace(A, B, C, D)
-    return model if sampling_time is None else model.to_discrete(sampling_time)
+
+def stable_model(rng, order, n_inputs, n_outputs, dt=None):
+    return sampled_model(
+        rng, order, n_inputs, n_outputs, dt, decay=0.3, feedthrough=True
+    )
 
 
 def error_system(rng, shape, dt=None, structure=None):

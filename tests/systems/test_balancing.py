@@ -14,17 +14,11 @@ from lpvlearn.systems.balancing import (
     gramian_factor,
 )
 
+from ..conftest import stable_model
 
-def random_model(seed, order=4, n_inputs=2, n_outputs=2, discrete=False):
-    rng = np.random.default_rng(seed)
-    A = rng.normal(size=(order, order))
-    poles = np.linalg.eigvals(A)
-    if discrete:
-        A = A / (1.1 * np.abs(poles).max(initial=0.1))
-    else:
-        A = A - (poles.real.max(initial=0.0) + 0.2) * np.eye(order)
-    B, C = rng.normal(size=(order, n_inputs)), rng.normal(size=(n_outputs, order))
-    return StateSpace(A, B, C, None, 0.1 if discrete else None)
+
+def random_model(seed, *shape, discrete=False):
+    return stable_model(seed, *shape, sampling_time=0.1 if discrete else None)
 
 
 def gramians(model):
