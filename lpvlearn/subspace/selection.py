@@ -92,9 +92,10 @@ class Selection(NamedTuple):
 
     def table(self) -> pd.DataFrame:
         """One row per candidate, and which of them was chosen."""
-        table = pd.DataFrame(self.candidates, columns=Candidate._fields)
-        chosen = (table["order"] == self.order) & (table["horizon"] == self.horizon)
-        return table.assign(chosen=chosen)
+        columns = [np.array(column) for column in zip(*self.candidates, strict=True)]
+        chosen = (columns[0] == self.order) & (columns[1] == self.horizon)
+        names = (*Candidate._fields, "chosen")
+        return pd.DataFrame(dict(zip(names, [*columns, chosen], strict=True)))
 
 
 def selection_text(table: pd.DataFrame) -> str:
