@@ -27,6 +27,7 @@ from ..systems.simulation import lti_response
 from .hankel import triangularize
 from .signals import (
     Record,
+    block_diagonal,
     block_remainder,
     block_sections,
     block_slices,
@@ -75,7 +76,7 @@ def in_sections(model: Realization) -> Realization:
         return model
     blocks, T = sections
     return model._replace(
-        A=linalg.block_diag(*blocks),
+        A=block_diagonal(blocks),
         B=linalg.solve(T, model.B),
         C=model.C @ T,
         initial_states=linalg.solve(T, model.initial_states.T).T,
@@ -107,7 +108,7 @@ def moved_model(model: Realization, change: Array, free: Freedom) -> Realization
         for block, part in zip(model.blocks, parameter_slices(model, free), strict=True)
     )
     return model._replace(
-        A=linalg.block_diag(*blocks) if blocks else model.A,
+        A=block_diagonal(blocks),
         B=model.B + change[:n_b].reshape(model.B.shape),
         C=model.C + change[len(change) - n_c :].reshape(model.C.shape),
         D=D,
@@ -151,7 +152,7 @@ def block_fit(
     blocks: tuple[Array, ...], C: Array, records: Sequence[Record], free: Freedom
 ) -> Realization:
     """As `simulation_fit`, for a state matrix in section form."""
-    A = linalg.block_diag(*blocks) if blocks else np.zeros((0, 0))
+    A = block_diagonal(blocks)
     factors = []
     for record in records:
         R = signal_factor(blocks, record)
