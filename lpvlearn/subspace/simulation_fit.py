@@ -27,7 +27,6 @@ from ..systems.simulation import lti_response
 from .hankel import triangularize
 from .signals import (
     Record,
-    block_diagonal,
     block_remainder,
     block_sections,
     block_slices,
@@ -67,6 +66,19 @@ class Realization(NamedTuple):
     blocks: tuple[Array, ...] | None = None  # of A, where it is in section form
 
 
+def _block_diagonal(blocks: Sequence[Array]) -> Array:
+    """The state matrix of the blocks.
+
+    `scipy.linalg.block_diag` checks and promotes every block: 37 us instead of 6 for
+    three blocks, a twentieth of a fit that tries many orders.
+    """
+    n = sum(len(block) for block in blocks)
+    A = np.zeros((n, n))
+    for block, part in zip(blocks, block_slices(blocks), strict=True):
+        A[part, part] = block
+    return A
+
+
 def in_sections(model: Realization) -> Realization:
     """The same model in section form, or as it is where there is none."""
     if model.blocks is not None:
@@ -76,7 +88,7 @@ def in_sections(model: Realization) -> Realization:
         return model
     blocks, T = sections
     return model._replace(
-        A=block_diagonal(blocks),
+        A=_block_diagonal(blocks),
         B=linalg.solve(T, model.B),
         C=model.C @ T,
         initial_states=linalg.solve(T, model.initial_states.T).T,
@@ -108,7 +120,7 @@ def moved_model(model: Realization, change: Array, free: Freedom) -> Realization
         for block, part in zip(model.blocks, parameter_slices(model, free), strict=True)
     )
     return model._replace(
-        A=block_diagonal(blocks),
+        A=_block_diagonal(blocks),
         B=model.B + change[:n_b].reshape(model.B.shape),
         C=model.C + change[len(change) - n_c :].reshape(model.C.shape),
         D=D,
@@ -152,7 +164,7 @@ def block_fit(
     blocks: tuple[Array, ...], C: Array, records: Sequence[Record], free: Freedom
 ) -> Realization:
     """As `simulation_fit`, for a state matrix in section form."""
-    A = block_diagonal(blocks)
+    A = _block_diagonal(blocks)
     factors = []
     for record in records:
         R = signal_factor(blocks, record)
