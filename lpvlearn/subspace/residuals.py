@@ -35,6 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
@@ -301,15 +302,15 @@ def cross_correlations(
     Those of the signals as they are would spread over all lags, in a band so wide that
     little were to be seen. Causal filters leave past and future apart.
     """
-    from scipy.signal import lfilter  # slow to import
-
     ny = errors[0].shape[1]
     filters = _whitening_filters(errors) + _whitening_filters(inputs)
     start, n_samples = max(map(len, filters)) - 1, 0
     sums = np.zeros((n_lags + 1, len(filters), len(filters)))
     for pair in zip(errors, inputs, strict=True):
         signals = zip(filters, np.hstack(pair).T, strict=True)
-        z = np.column_stack([lfilter(a, [1.0], x)[start:] for a, x in signals])
+        z = np.column_stack(
+            [scipy.signal.lfilter(a, [1.0], x)[start:] for a, x in signals]
+        )
         known = min(len(z), n_lags + 1)
         if known:
             n_samples += len(z)
@@ -351,8 +352,6 @@ def input_tests(
     fitted: Fitted | None = None,
 ) -> InputTests:
     """Do errors depend on past, present and future inputs?"""
-    from scipy.signal import lfilter  # slow to import
-
     m, n_rows = inputs[0].shape[1], 2 * n_lags + 1
     tests = InputTests([], [], [])
     for i, a in enumerate(_whitening_filters(errors)):
@@ -362,7 +361,7 @@ def input_tests(
                 continue
             own = [] if fitted is None else _sensitivities(fitted, i, u)
             present = np.column_stack([*own, e[:, i]])
-            white = lfilter(a, [1.0], present, axis=0)
+            white = scipy.signal.lfilter(a, [1.0], present, axis=0)
             parts.append((white[start + n_lags : len(e) - n_lags].T, u[start:]))
         n = sum(white.shape[1] for white, _ in parts)
         columns = _factor(parts, n_rows)
@@ -383,21 +382,21 @@ def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:
     are orthogonal for a white input and close poles do no harm. Thrice would allow for
     curvature, but then a mode that is missing beside another one goes unseen.
     """
-    from scipy.signal import lfilter  # slow to import
-
     poles = np.asarray(fitted.poles, dtype=complex)
     outside = np.abs(poles) > 1.0  # reflected: their own answers would overflow
     poles = np.where(outside, 1.0 / np.where(outside, poles, 1.0).conj(), poles)
     spanned, signals = [np.zeros((len(u), 0))], u
     for pole in np.tile(poles[poles.imag >= 0.0], 2):
         late = signals.astype(complex)
-        answer = lfilter([0.0, 1.0], [1.0, -pole], late, axis=0)
+        answer = scipy.signal.lfilter([0.0, 1.0], [1.0, -pole], late, axis=0)
         spanned += [answer.real, answer.imag] if pole.imag else [answer.real]
         denominator = np.poly([pole, pole.conj()] if pole.imag else [pole]).real
-        signals = lfilter(denominator[::-1], denominator, signals, axis=0)
+        signals = scipy.signal.lfilter(denominator[::-1], denominator, signals, axis=0)
     states = np.hstack(spanned)
     return [
-        lfilter(h, [1.0], np.hstack([states, u[:, fitted.direct[k]]]), axis=0)
+        scipy.signal.lfilter(
+            h, [1.0], np.hstack([states, u[:, fitted.direct[k]]]), axis=0
+        )
         for k, h in enumerate(fitted.filter[:, output].T)
         if h.any()
     ]

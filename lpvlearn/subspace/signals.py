@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg
 
@@ -225,9 +226,7 @@ class _SectionBank:
         if len(block) == 2:
             det = block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0]
             denominator = [1.0, -block[0, 0] - block[1, 1], det]
-        from scipy.signal import lfilter  # slow to import
-
-        out, self._memory[i] = lfilter(
+        out, self._memory[i] = scipy.signal.lfilter(
             [1.0], denominator, v, axis=1, zi=self._memory[i]
         )
         return out
