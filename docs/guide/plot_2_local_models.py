@@ -33,8 +33,12 @@ any number of inputs and outputs.
 # value decomposition gives it; :math:`\mathfrak{C}` is its first block and
 # :math:`\mathfrak{A}` maps it on itself, shifted by one block. With these two the
 # simulated output is linear in :math:`\mathfrak{B}, \mathfrak{D}` and :math:`x_0`,
-# which follow by least squares; a few Gauss-Newton steps on the simulation error polish
-# everything (``refine=True``).
+# which follow by least squares; a few Gauss-Newton steps polish everything
+# (``refine="auto"``). What they minimise is the simulation error, filtered until it is
+# white and weighted until all outputs have the same: the most accurate thing to do
+# under coloured or unequal noise, and the simulation error itself where the noise is
+# white. The plain error (``refine="simulation"``) is taken where it predicts parts of
+# the record better that were held out, as it may where the system is not linear.
 #
 # ``method`` says what serves as past data: inputs and outputs (``"po-moesp"``, the
 # default; ``"n4sid"`` and ``"cva"`` weight them differently), or inputs alone
@@ -55,21 +59,23 @@ local.lti_
 # %%
 # Order and horizon
 # -----------------
-# Both are chosen by what validates: the last part of the record is held out, every
-# candidate simulates it, and the smallest order that is not significantly worse than
-# the best one wins. For each order, the horizon that did best and what it predicts of
-# the held-out samples:
+# Every order is fitted to the record, with its errors whitened, and Schwarz's criterion
+# weighs what a state gains against the parameters that it takes. The choice, and a few
+# lower orders, then simulate parts of the record that were held out; a lower one that
+# does so clearly better is taken instead. For each order the best horizon, the error
+# before the polishing steps, the criterion above the best one, and how well the parts
+# held out are predicted, where that was looked at:
 
-table = local.selection_.dropna(subset="validation_bft").set_index("order")
-table.round({"criterion": 4, "validation_bft": 2})
+table = local.selection_.dropna(subset="criterion").set_index("order")
+table.round({"error": 4, "criterion": 4, "validation_bft": 2})
 
 # %%
 # Up to order 5 a mode is missing, from 6 on nothing is gained. ``selection_`` holds all
 # candidates. The horizon
-# matters too (relative simulation error in percent, before the polishing steps):
+# matters too (relative error in percent, before the polishing steps):
 
 table = local.selection_.query("order == 6").set_index("horizon")
-100 * table[["criterion"]].round(4)
+100 * table[["error"]].round(4)
 
 # %%
 # The singular values tell the same story. A gap marks the order that the data support:

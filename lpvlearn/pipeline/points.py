@@ -29,7 +29,6 @@ from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..structures.structure import GrayBoxStructure
-from ..subspace.statistics import deviated_models, noise_weighted
 
 Array = NDArray[np.float64]
 
@@ -58,7 +57,7 @@ class LocalModel:
     order: int  # as identified, in discrete time
     horizon: int | None  # of the subspace step, where the estimator tells it
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
-    deviated: list[ModelPair] = field(default_factory=list)  # from `deviated_models`
+    deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
     # the model as identified (of every realization) with models to either side of it,
     # where the covariance is known; with "zoh" in discrete time
     estimates: list[Estimate] = field(default_factory=list)
@@ -112,15 +111,14 @@ def identify_point(
     Fitted, it has `lti_`, a discrete-time StateSpace. `combine` is "pool", one fit of
     all experiments, or "average": one model each, balanced, signs aligned, and the
     matrices averaged (the paper's Monte Carlo). Refuses outputs that do not vary, and
-    an unstable model, which cannot be balanced. `efficient` weighs the outputs by their
-    noise, and gives `estimates`.
+    an unstable model, which cannot be balanced. `efficient` gives `estimates`.
     """
     advice = _look_at_outputs(experiments)
     labels = list(dict.fromkeys(e.label for e in experiments))
     if combine == "pool" or len(labels) == 1:
         fitted = _fit_local(local, experiments, sampling_time)
-        model, pairs = _estimate(fitted, experiments, efficient)
-        lti = _continuous(model, discretization, advice)
+        pairs = _deviated(fitted)
+        lti = _continuous(fitted.lti_, discretization, advice)
         found = LocalModel(
             lti,
             fitted.lti_.order,
@@ -128,7 +126,7 @@ def identify_point(
             deviated=_all_continuous(pairs, discretization),
         )
         if efficient and pairs:
-            found.estimates.append(_in_own_time(model, pairs, discretization))
+            found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
         return found
     # The first realisation chooses order and horizon, the others follow it.
     # A realisation with gaps is several experiments of one label.
@@ -142,9 +140,7 @@ def identify_point(
     estimates: list[Estimate] = []
     for realisation in realisations:
         refitted = _fit_local(chosen, realisation, sampling_time)
-        model, pairs = refitted.lti_, []
-        if efficient:
-            model, pairs = _estimate(refitted, realisation, efficient)
+        model, pairs = refitted.lti_, _deviated(refitted) if efficient else []
         try:
             models.append(_continuous(model, discretization, advice))
             estimates.append(_in_own_time(model, pairs, discretization))
@@ -169,23 +165,10 @@ def identify_point(
     )
 
 
-def _estimate(
-    fitted: Any, experiments: Sequence[Experiment], efficient: bool
-) -> tuple[StateSpace, list[ModelPair]]:
-    """The model, its outputs weighed by their noise if so wished, and its pairs."""
-    samples = [(e.inputs, e.outputs) for e in experiments if e.outputs is not None]
-    model, scale = fitted.lti_, None
-    detrend = getattr(fitted, "detrend", None)
-    refined = getattr(fitted, "refine", False) and not fitted.stability_loss_
-    if refined and efficient:
-        model, scale = noise_weighted(model, samples, detrend=detrend)
-    return model, deviated_models(
-        model,
-        samples,
-        detrend=detrend,
-        refined=refined,
-        output_scale=scale,
-    )
+def _deviated(fitted: Any) -> list[ModelPair]:
+    """Models to either side of a fitted one, where the estimator knows them."""
+    pairs = getattr(fitted, "deviated_models", None)
+    return [] if pairs is None else pairs()
 
 
 def _in_own_time(

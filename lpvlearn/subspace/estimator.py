@@ -20,6 +20,7 @@ from ..data.experiments import (
 )
 from ..data.preparation import split_at_gaps
 from ..models.innovation import InnovationModel
+from ..models.statespace import ModelPair
 from ..validation import one_of
 from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
 from .residuals import (
@@ -41,13 +42,15 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     The observability matrix is estimated from compressed block-Hankel data by one of
     the MOESP family; B, D and the initial state of every experiment follow by least
     squares on the simulated outputs, and a few Gauss-Newton steps on the simulation
-    error polish the result. Order and horizon are chosen by what validates.
+    error, weighed by the noise that is found in it, polish the result. Order and
+    horizon are chosen by evidence.
 
     Parameters
     ----------
     order : int or "auto", default="auto"
-        Number of states. "auto" takes the smallest order whose simulation of held-out
-        samples is not significantly worse than the best. 0 is a pure gain.
+        Number of states. "auto" takes the order with the best value of Schwarz's
+        criterion, or a lower one that simulates parts held out clearly better. 0 is a
+        pure gain.
     method : {"po-moesp", "pi-moesp", "n4sid", "cva"}, default="po-moesp"
         "pi-moesp" uses past inputs only as instruments: consistent under coloured
         measurement noise, but it needs long horizons. The others use past inputs and
@@ -62,8 +65,12 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     feedthrough : bool or array-like of bool, default=True
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
         shape (n_outputs, n_inputs) single entries of D.
-    refine : bool, default=True
-        Whether to minimise the simulation error after the subspace step.
+    refine : {"auto", "simulation", "prediction", False}, default="auto"
+        What is minimised after the subspace step: "simulation" the simulation error,
+        "prediction" that error whitened by an autoregression of itself and weighted by
+        the inverse covariance of its innovations, which has the least variance
+        under coloured or unequal noise. "auto" is "prediction" unless the other one, or
+        none, simulates parts held out clearly better.
     stability : {"warn", "enforce"}, default="warn"
         "warn" keeps an unstable model, with a warning, where a stable one fits
         clearly worse; "enforce" returns a stable one and reports in
@@ -103,9 +110,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Initial state of every experiment, in the order of first appearance; after
         `partial_fit` of a long stream, of its last stretch only.
     selection_ : DataFrame
-        What was tried: columns order, horizon, criterion (relative simulation error
-        before refinement on the estimation part), validation_bft (percent, on
-        the held-out part; NaN for horizons that lost within their order), chosen.
+        What was tried: columns order, horizon, error (relative, whitened, before
+        refinement), criterion (Schwarz's per value, above the best; NaN for horizons
+        that lost within their order), validation_bft (percent, on parts held out; NaN
+        where that was not looked at), chosen.
     residual_ : float
         Simulation error on the data relative to the outputs, root mean square.
     stability_loss_ : float
@@ -128,13 +136,13 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     Without refinement, "po-moesp" with as many noise states as the noise has and
     "pi-moesp" at the order of the system are consistent under coloured noise, others
-    under white noise only. Their error falls as ``1 / sqrt(n_samples)`` once the
-    horizon resolves the modes, and faster before: at a signal-to-noise ratio of 10 dB
-    under strongly coloured noise some ten thousand samples may be needed. The refined
-    error does so from the start, under any noise.
+    under white noise only. Refined on the simulation error every method is, and
+    refined on the prediction error it has the least variance that the noise allows
+    (the bound of Cramer and Rao).
 
     Of a table of more than 131,072 samples the first ones choose order and horizon;
-    the others are added in one pass, as `partial_fit` does.
+    the others are added in one pass, as `partial_fit` does, which refines on the
+    simulation error.
 
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.
@@ -171,7 +179,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         horizon: int | str = "auto",
         sampling_time: float | None = None,
         feedthrough: Any = True,
-        refine: bool = True,
+        refine: str | bool = "auto",
         stability: str = "warn",
         n_noise_states: int | str = "auto",
         initial_state: str = "estimate",
@@ -566,6 +574,22 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             return self._evidence.poles_std()
         except ValueError as error:
             raise AttributeError(str(error)) from None
+
+    def deviated_models(self) -> list[ModelPair]:
+        """Models to either side of `lti_`, along its directions of uncertainty.
+
+        Returns
+        -------
+        list of pairs of StateSpace
+            Both models of a pair lie a hundredth of a standard deviation from `lti_`,
+            in directions that are independent: to first order the variance of anything
+            computed from the model is the sum over the pairs of
+            ``((above - below) / 0.02)**2``. Empty where that is not known: without
+            refinement, with enforced stability, collinear inputs, errors that are
+            rounding, or poles of multiplicity three.
+        """
+        check_is_fitted(self, "lti_")
+        return self._evidence.deviated_models(self.lti_)
 
     def frequency_response_covariance(self, omega: ArrayLike) -> Array:
         """Covariance of the frequency response at every frequency.

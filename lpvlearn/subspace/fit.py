@@ -23,11 +23,14 @@ from ..exceptions import RankWarning, warn
 from ..validation import one_of, positive_time
 from .identification import ScaledRecords, Settings, identify, scale_records
 from .realization import METHODS
-from .selection import Candidate, Selection, better_horizon, select
+from .selection import Row, Selection, better_horizon, select
 from .simulation_fit import Freedom, Realization
 from .statistics import Evidence, shorten
 
 Array = NDArray[np.float64]
+
+
+REFINEMENTS = ("auto", "simulation", "prediction")
 
 
 class Choices(NamedTuple):
@@ -38,7 +41,7 @@ class Choices(NamedTuple):
     n_noise_states: int = 0
     method: str = "po-moesp"
     feedthrough: Any = True
-    refine: bool = True
+    refine: str | bool = "auto"
     enforce_stability: bool = False
     initial_states: bool = True  # False starts every experiment from rest
 
@@ -52,9 +55,11 @@ class Choices(NamedTuple):
         return Settings(
             Freedom(mask, self.initial_states),
             self.method,
-            self.refine,
+            self.refine is not False,
             self.enforce_stability,
             self.n_noise_states,
+            weigh=self.refine in ("auto", "prediction"),
+            compare=self.refine == "auto",
         )
 
 
@@ -78,10 +83,21 @@ def check_options(options: Mapping[str, Any]) -> Choices:
         _integer_or_auto("n_noise_states", options["n_noise_states"], 0) or 0,
         options["method"],
         options["feedthrough"],
-        bool(options["refine"]),
+        _refinement(options["refine"]),
         options["stability"] == "enforce",
         options["initial_state"] == "estimate",
     )
+
+
+def _refinement(value: Any) -> str | bool:
+    if isinstance(value, (bool, np.bool_)):
+        return "auto" if value else False
+    if not isinstance(value, str) or value not in REFINEMENTS:
+        raise ValueError(
+            "`refine` must be 'auto', 'simulation', 'prediction' or False. "
+            f"Got {value!r}."
+        )
+    return value
 
 
 def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:
@@ -165,9 +181,10 @@ def fit_pairs(
     if order is None or horizon is None:
         chosen = select(scaled.records, order, horizon, settings)
         order, horizon = chosen.order, chosen.horizon
-    found = identify(scaled.records, order, horizon, settings)
+    known = None if chosen is None else chosen.candidate
+    found = identify(scaled.records, order, horizon, settings, known)
     if chosen is None:
-        only = Candidate(order, horizon, found.residual, np.nan)
+        only = Row(order, horizon, found.residual, 0.0, np.nan)
         chosen = Selection(order, horizon, [only])
     records, share = shorten(scaled.records)
     evidence = Evidence(
@@ -177,7 +194,8 @@ def fit_pairs(
         output_scale=scaled.output_scale,
         basis=basis,
         free=settings.free,
-        refined=choices.refine and found.stability_loss == 0.0,
+        whitening=found.whitening,
+        refined=found.refined and found.stability_loss == 0.0,
         share=share,
     )
     return LocalFit(
@@ -220,7 +238,7 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
     settings = Settings(
         fitted.evidence.free,
         choices.method,
-        choices.refine,
+        choices.refine is not False,
         choices.enforce_stability,
     )
     better = better_horizon(

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .hankel import data_factors
+from .held_out import HeldOut, held_out
+from .noise import Whitening
 from .realization import (
     ObservabilitySubspace,
     observability_subspace,
@@ -20,7 +22,13 @@ from .realization import (
 )
 from .refinement import refine_simulation
 from .signals import Record, output_energy
-from .simulation_fit import Freedom, Realization, simulation_fit
+from .simulation_fit import (
+    Freedom,
+    Realization,
+    simulation_errors,
+    simulation_fit,
+    with_initial_states,
+)
 
 Array = NDArray[np.float64]
 
@@ -50,6 +58,8 @@ class Settings(NamedTuple):
     refine: bool = True
     enforce_stability: bool = False
     n_noise_states: int = 0  # additional states of the subspace step
+    weigh: bool = True  # whether errors are weighed by their noise when refined
+    compare: bool = True  # whether parts held out may say that other models are better
 
     def max_horizon(self, lengths: Sequence[int]) -> int:
         """Largest horizon whose Hankel columns outnumber its rows (at least 1).
@@ -101,10 +111,21 @@ class Settings(NamedTuple):
             )
 
 
+class Candidate(NamedTuple):
+    """A model of scaled records, and how it came about."""
+
+    model: Realization
+    horizon: int
+    whitening: Whitening  # of the errors whose squares it minimises
+    refined: bool
+
+
 class Identified(NamedTuple):
     """Result of `identify`."""
 
     model: Realization  # of the scaled records
+    whitening: Whitening  # of the errors whose squares the model minimises
+    refined: bool  # whether it does
     singular_values: Array  # (horizon * n_outputs,): of the subspace
     residual: float  # rms of the simulation errors relative to that of all outputs
     stability_loss: float  # increase of the residual that enforced stability cost
@@ -186,23 +207,142 @@ def estimate(
     return refine_simulation(start, records, settings.free)
 
 
+class _Fitted(NamedTuple):
+    candidate: Candidate
+    singular_values: Array
+
+
+def _fit(
+    records: Sequence[Record],
+    order: int,
+    horizon: int,
+    settings: Settings,
+    whitening: Whitening,
+    start: Realization | None = None,
+) -> _Fitted:
+    """Model of whitened records, from their subspace or another model of them."""
+    white, free = whitening.records(records, settings.free), settings.free
+    width = {horizon: order + settings.n_noise_states}
+    subspace = subspaces_of(white, width, settings.method)[horizon]
+    model = realize(subspace, white, order, settings)
+    if settings.refine:
+        if start is not None:
+            other = _restarted(whitening.model(start), white, free)
+            if other.loss < model.loss and not settings.enforce_stability:
+                model = other
+        model = refine_simulation(model, white, free)
+    if not whitening.is_none:
+        model = with_initial_states(whitening.undone(model), records, free)
+    candidate = Candidate(model, horizon, whitening, settings.refine)
+    return _Fitted(candidate, subspace.singular_values)
+
+
+def _restarted(
+    model: Realization, records: Sequence[Record], free: Freedom
+) -> Realization:
+    """The dynamics of a model with other B, D and initial states."""
+    return simulation_fit(model.A, model.C, records, free)
+
+
+_REFITS = 4  # steps to the minimum without some samples, from that with them
+
+
+def _refitted(
+    candidate: Candidate, records: Sequence[Record], settings: Settings
+) -> Realization:
+    """The model that other records would have given, by few steps from this one."""
+    whitening, free = candidate.whitening, settings.free
+    white = whitening.records(records, free)
+    if not white:
+        return candidate.model
+    lengths, order = [r.u.shape[1] for r in white], len(candidate.model.A)
+    if candidate.refined or settings.max_horizon(lengths) < candidate.horizon:
+        model = _restarted(whitening.model(candidate.model), white, free)
+        model = refine_simulation(model, white, free, _REFITS)
+    else:
+        width = {candidate.horizon: order + settings.n_noise_states}
+        spaces = subspaces_of(white, width, settings.method)
+        model = realize(spaces[candidate.horizon], white, order, settings)
+    return whitening.undone(model)
+
+
+_ROUNDS = 2  # the second noise model is of errors that the first has freed of its bias
+
+
 def identify(
-    records: Sequence[Record], order: int, horizon: int, settings: Settings
+    records: Sequence[Record],
+    order: int,
+    horizon: int,
+    settings: Settings,
+    known: Candidate | None = None,
 ) -> Identified:
-    """Model of scaled records; every experiment has its own initial state."""
-    width = order + settings.n_noise_states
-    subspace = subspaces_of(records, {horizon: width}, settings.method)[horizon]
-    model = estimate(
-        subspace, records, order, settings._replace(enforce_stability=False)
-    )
+    """Model of scaled records; every experiment has its own initial state.
+
+    Refined on the simulation error, then on that error whitened by what noise there is
+    in it, or at once by the noise of a model that is `known`. With ``compare`` the
+    simpler one is kept where it simulates parts held out clearly better.
+    """
+    none = Whitening.none(len(records[0].y))
+    as_found = settings._replace(enforce_stability=False)
+    if known is None:
+        fitted = _fit(records, order, horizon, as_found, none)
+        chosen = plain = fitted.candidate
+        for _ in range(_ROUNDS if settings.refine and settings.weigh else 0):
+            errors = simulation_errors(chosen.model, records)
+            whitening = Whitening.of(errors, settings.free)
+            if whitening.is_close_to(chosen.whitening):
+                break
+            again = _fit(records, order, horizon, as_found, whitening, chosen.model)
+            chosen = again.candidate
+    else:
+        fitted = _fit(records, order, horizon, as_found, known.whitening, known.model)
+        chosen = plain = fitted.candidate
+        if not chosen.whitening.is_none and settings.compare:
+            plain = _fit(records, order, horizon, as_found, none, chosen.model)[0]
+    if settings.compare and not chosen.whitening.is_none:
+        rivals = [chosen, plain, plain._replace(refined=False)]
+        chosen = _best_held_out(rivals, records, as_found)
+        if not chosen.refined:
+            unrefined = as_found._replace(refine=False)
+            chosen = _fit(records, order, horizon, unrefined, none).candidate
     energy = output_energy(records) or 1.0
-    stability_loss, free_loss = 0.0, model.loss
+    model, stability_loss = chosen.model, 0.0
     if settings.enforce_stability and not _radius(model.A) < 1.0 - STABLE_MARGIN:
-        model = estimate(subspace, records, order, settings)
-        if 0.0 < free_loss < model.loss:
-            stability_loss = np.sqrt(model.loss / energy) - np.sqrt(free_loss / energy)
-    residual = float(np.sqrt(model.loss / energy))
-    return Identified(model, subspace.singular_values, residual, float(stability_loss))
+        model = _fit(records, order, horizon, settings, chosen.whitening)[0].model
+        if 0.0 < chosen.model.loss < model.loss:
+            stability_loss = np.sqrt(model.loss / energy)
+            stability_loss -= np.sqrt(chosen.model.loss / energy)
+    return Identified(
+        model,
+        chosen.whitening,
+        chosen.refined,
+        fitted.singular_values,
+        float(np.sqrt(model.loss / energy)),
+        float(stability_loss),
+    )
+
+
+def _best_held_out(
+    candidates: Sequence[Candidate], records: Sequence[Record], settings: Settings
+) -> Candidate:
+    """The first, unless a later one simulates parts held out clearly better."""
+    best = candidates[0]
+    error = validate(best, records, settings)
+    for candidate in candidates[1:]:
+        other = validate(candidate, records, settings)
+        if other.clearly_better_than(error):
+            best, error = candidate, other
+    return best
+
+
+def validate(
+    candidate: Candidate, records: Sequence[Record], settings: Settings
+) -> HeldOut:
+    """Errors of a candidate's like on parts of the records."""
+    at_rest = not settings.free.initial_states
+    return held_out(
+        lambda train: _refitted(candidate, train, settings), records, at_rest=at_rest
+    )
 
 
 def _radius(A: Array) -> float:

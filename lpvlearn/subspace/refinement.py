@@ -48,7 +48,10 @@ _DAMPINGS = (1e-4, 1e-2, 1e-1, 1.0)
 
 
 def refine_simulation(
-    model: Realization, records: Sequence[Record], free: Freedom
+    model: Realization,
+    records: Sequence[Record],
+    free: Freedom,
+    max_iter: int = _MAX_ITER,
 ) -> Realization:
     """Minimise the simulation error by Gauss-Newton steps with damping.
 
@@ -66,7 +69,7 @@ def refine_simulation(
         return model
     energy = output_energy(records)
     n_values = sum(record.y.size for record in records)
-    for _ in range(_MAX_ITER):
+    for _ in range(max_iter):
         if model.loss <= _ROUNDING * energy or model.blocks is None:
             return model
         regression = linearised(model, records, free, keep_one=True)

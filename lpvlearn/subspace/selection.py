@@ -1,12 +1,14 @@
-"""Choice of the order and of the horizon by what validates.
+"""Choice of the order and of the horizon by evidence.
 
-Every candidate is identified on the first part of each experiment. For a given order
-all horizons have the same number of parameters, so that the one with the smallest
-simulation error is simply the best; orders are compared by the simulation error on
-the part held out, and the smallest that is not significantly worse than the best is
-taken. The steps, one function each: hold out a part (`_hold_out`), list the horizons
-and orders worth trying (`_horizons`, `_highest_order`), try each order at the horizon
-that suits it (`_try_orders`), and choose among what was tried (`_choose`).
+Errors are whitened first by the noise in those of a pilot model (`noise`), so that
+their sum of squares is a likelihood. Each order is then fitted at the horizon whose
+start is best, or from the model of the order below with one state more for what that
+leaves, whichever gives less: more states never fit worse. Schwarz's criterion weighs
+the likelihood against the number of parameters. The noise is estimated again from the
+choice, and the orders are compared once more where it has changed.
+
+The criterion trusts that the system is what the models are. Simulation of parts held
+out does not (`held_out`): it may lower the order.
 
 A horizon that was given is not questioned but by `better_horizon`, after the fit.
 """
@@ -19,26 +21,31 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy import linalg
 
 from ..systems.simulation import lti_response
 from .hankel import correlation_sequence
-from .identification import Settings, estimate, realize, subspaces_of
+from .held_out import HeldOut, thinned
+from .identification import (
+    Candidate,
+    Settings,
+    estimate,
+    realize,
+    subspaces_of,
+    validate,
+)
+from .noise import Whitening
 from .realization import ObservabilitySubspace
 from .refinement import refine_simulation
 from .signals import Record, output_energy
-from .simulation_fit import Realization
+from .simulation_fit import (
+    Realization,
+    simulation_errors,
+    simulation_fit,
+    with_initial_states,
+)
 
 Array = NDArray[np.float64]
-
-_MAX_SAMPLES = 12_000  # that a choice is made from: it needs fewer than an estimate
-
-# Share of each experiment to identify on, and the length below which none is held out:
-# what is left would be two samples.
-_ESTIMATION_SHARE, _TOO_SHORT = 0.7, 8
-
-# Blocks of time of each held-out part: many enough for the spread of their errors to be
-# known, and long enough for these to be nearly independent.
-_N_BLOCKS = 20
 
 _HORIZON_RATIO = 1.5  # between horizons tried: the error changes little within it
 
@@ -46,11 +53,17 @@ _HORIZON_RATIO = 1.5  # between horizons tried: the error changes little within 
 # grows with its third power.
 _MAX_ROWS = 1000
 
-# Highest order tried, and the values that the data must have for each parameter.
-_MAX_ORDER, _VALUES_PER_PARAMETER = 20, 10
+# Highest order tried, and the values that the data must have for each parameter: fewer
+# and the criterion, which is one of many samples, would be trusted too far.
+_MAX_ORDER, _VALUES_PER_PARAMETER = 20, 3
 
-# Orders tried beyond the last one that made the loss this much smaller, one per cent.
-_PATIENCE, _NOTICEABLE = 3, 0.99
+# Order and refinement steps of the pilot, whose errors are to be noise and not lack of
+# states; it is not to fit the noise itself.
+_PILOT_ORDER, _PILOT_STEPS = 8, 3
+
+_MORE_ROUNDS = 1  # of all orders: with the noise of the first choice
+
+_PATIENCE = 3  # orders tried beyond the one with the best criterion so far
 
 _EXACT = 1e-18  # share of the outputs' energy (an error of 1e-9) that is rounding
 
@@ -58,27 +71,27 @@ _EXACT = 1e-18  # share of the outputs' energy (an error of 1e-9) that is roundi
 # shorter horizon is then the cheaper one. Unrefined, a horizon must be as good.
 _LOSS_SLACK = {True: 1.05, False: 1.005}
 
-# Held-out errors that are higher by less than this share, or by less than this many
-# standard errors (two: 95 %), are as good: one superfluous state costs more than the
-# first in a record of a few thousand samples.
-_NEGLIGIBLE_GAIN, _STANDARD_ERRORS = 3e-3, 2.0
+_AS_GOOD = 0.999  # share of the loss of the order below that more states must beat
 
-# What rules an order out by the data it was estimated on: this many times the loss of a
-# higher one (twice the error), and an F statistic that does not come about by chance.
-_TWICE_THE_ERROR, _CERTAIN = 4.0, 20.0
+# Horizon for the states that an order adds to the one below.
+_SHORT_HORIZON = 10
+
+# How far below the choice other orders are simulated on parts held out.
+_LOWER = (1, 2, 4, 8, 16)
 
 
-class Candidate(NamedTuple):
+class Row(NamedTuple):
     """One row of the selection table.
 
-    The criterion is the simulation error of the subspace model on the estimation part,
-    root mean square relative to the outputs; `validation_bft` the best fit (percent,
-    mean over outputs) on the held-out part of the model that would be returned, NaN for
-    a horizon that lost within its order.
+    The error is that of the subspace model, whitened, root mean square relative to the
+    outputs; the criterion Schwarz's of the refined model, per value and above the best,
+    NaN for a horizon that lost within its order; `validation_bft` the best fit (in
+    percent, mean over outputs) on parts held out, NaN where that was not looked at.
     """
 
     order: int
     horizon: int
+    error: float
     criterion: float
     validation_bft: float
 
@@ -88,43 +101,35 @@ class Selection(NamedTuple):
 
     order: int
     horizon: int
-    candidates: list[Candidate]
+    rows: list[Row]
+    candidate: Candidate | None = None  # the choice, of thinned records
+    held_out: HeldOut | None = None  # its errors
 
     def table(self) -> pd.DataFrame:
         """One row per candidate, and which of them was chosen."""
-        columns = [np.array(column) for column in zip(*self.candidates, strict=True)]
+        columns = [np.array(column) for column in zip(*self.rows, strict=True)]
         chosen = (columns[0] == self.order) & (columns[1] == self.horizon)
-        names = (*Candidate._fields, "chosen")
+        names = (*Row._fields, "chosen")
         return pd.DataFrame(dict(zip(names, [*columns, chosen], strict=True)))
 
 
 def selection_text(table: pd.DataFrame) -> str:
-    """The selection table as text, the chosen row marked.
+    """The best horizon of every order as text, the chosen row marked.
 
-    >>> print(selection_text(Selection(2, 9, [Candidate(2, 9, 0.031, 96.9)]).table()))
-    order  horizon  error [%]  validation BFT [%]
-        2        9     3.1000               96.90  <- chosen
+    >>> print(selection_text(Selection(2, 9, [Row(2, 9, 0.031, 0.0, 96.9)]).table()))
+    order  horizon  error [%]  criterion  validation BFT [%]
+        2        9     3.1000     0.0000               96.90  <- chosen
     """
-    lines = ["order  horizon  error [%]  validation BFT [%]"]
-    for order, horizon, criterion, validation_bft, chosen in table.to_numpy():
+    lines = ["order  horizon  error [%]  criterion  validation BFT [%]"]
+    best = table.dropna(subset="criterion")
+    for order, horizon, error, criterion, validation_bft, chosen in best.to_numpy():
         bft = "-" if np.isnan(validation_bft) else f"{validation_bft:.2f}"
         mark = "  <- chosen" if chosen else ""
-        error = f"{100.0 * criterion:.4f}"
-        lines.append(f"{order:5.0f}  {horizon:7.0f}  {error:>9}  {bft:>18}{mark}")
+        lines.append(
+            f"{order:5.0f}  {horizon:7.0f}  {100.0 * error:9.4f}  {criterion:9.4f}  "
+            f"{bft:>18}{mark}"
+        )
     return "\n".join(lines)
-
-
-class _Split(NamedTuple):
-    """Records of which the later parts are held out."""
-
-    records: list[Record]  # whole
-    parts: list[Record]  # what models are estimated on
-    cuts: list[int]  # where the held-out part begins; the length where there is none
-
-    @property
-    def energy(self) -> float:
-        """Of the outputs to estimate on."""
-        return output_energy(self.parts)
 
 
 class _Tried(NamedTuple):
@@ -132,9 +137,9 @@ class _Tried(NamedTuple):
 
     order: int
     horizon: int
-    model: Realization  # that would be returned, of the parts to estimate on
-    held_out: Array  # (n_blocks,): sums of its squared errors on the parts held out
-    candidates: list[Candidate]  # the horizons compared
+    model: Realization  # of whitened records
+    criterion: float  # Schwarz's
+    starts: dict[int, Realization]  # by horizon, before refinement
 
 
 def select(
@@ -144,74 +149,122 @@ def select(
     settings: Settings,
 ) -> Selection:
     """Choose the order, the horizon or both (None) for scaled records."""
-    records = _thin_records(records, _MAX_SAMPLES)
-    if order is not None or not settings.enforce_stability:
-        return _search(records, order, horizon, settings)
-    # The order is that of the system, whatever a stable model can show of it.
-    as_found = settings._replace(enforce_stability=False)
-    chosen = _search(records, None, horizon, as_found)
-    stable = _search(records, chosen.order, horizon, settings)
-    others = [row for row in chosen.candidates if row.order != chosen.order]
-    return stable._replace(candidates=sorted(others + stable.candidates))
+    records = thinned(records)
+    # The order is that of the system, whatever a stable or rough model can show of it.
+    as_found = settings._replace(enforce_stability=False, refine=True)
+    if settings.refine and not settings.enforce_stability:
+        return _search(records, order, horizon, as_found)
+    rows: list[Row] = []
+    if order is None:
+        chosen = _search(records, None, horizon, as_found)
+        order = chosen.order
+        rows = [row for row in chosen.rows if row.order != order]
+    spaces = _spaces(records, order, order, horizon, settings)
+    starts = _starts(order, spaces, records, settings)
+    best = _best_horizon(starts, settings.refine)
+    tried = _Tried(order, best, starts[best], 0.0, starts)
+    return Selection(order, best, sorted(rows + _rows([tried], records, {})))
 
 
 def _search(
     records: list[Record], order: int | None, horizon: int | None, settings: Settings
 ) -> Selection:
     """The choice for settings that suit all orders alike."""
-    split = _hold_out(records, order, settings)
-    parts = split.parts
-    horizons = _horizons(parts, order or 0, settings) if horizon is None else [horizon]
-    highest = _highest_order(parts, horizons, settings) if order is None else order
+    highest = order
+    if highest is None:
+        highest = _highest_order(records, _horizons(records, 0, settings), settings)
+    whitening = Whitening.none(len(records[0].y))
+
+    def try_orders(orders: Sequence[int], max_iter: int | None = None) -> list[_Tried]:
+        white = whitening.records(records, settings.free)
+        spaces = _spaces(white, orders[0], orders[-1], horizon, settings)
+        return _try_orders(orders, spaces, white, settings, whitening.colour, max_iter)
+
+    def noise_of(tried: _Tried) -> Whitening:
+        model = whitening.undone(tried.model)
+        model = with_initial_states(model, records, settings.free)
+        found = Whitening.of(simulation_errors(model, records), settings.free)
+        lengths = [r.u.shape[1] for r in found.records(records, settings.free)]
+        room = settings.max_horizon(lengths)  # the filter takes samples away
+        fits = room >= (horizon or 1) and settings.max_order(room) >= (order or 0)
+        return found if fits else Whitening.none(len(records[0].y))
+
+    if settings.weigh:
+        pilot = min(highest, _PILOT_ORDER) if order is None else order
+        whitening = noise_of(try_orders([pilot], _PILOT_STEPS)[0])
     orders = range(0 if order is None else order, highest + 1)
+    tried = try_orders(orders)
+    best = min(tried, key=lambda one: one.criterion)
+    for _ in range(_MORE_ROUNDS if settings.weigh else 0):
+        again = noise_of(best)
+        if again.is_close_to(whitening):
+            break
+        whitening = again
+        tried = try_orders(orders)
+        best = min(tried, key=lambda one: one.criterion)
+    candidates = {
+        one.order: Candidate(
+            whitening.undone(one.model), one.horizon, whitening, refined=True
+        )
+        for one in tried
+    }
+    held_out = {best.order: validate(candidates[best.order], records, settings)}
+    chosen = best.order
+    if settings.compare:
+        for step in _LOWER:
+            lower = best.order - step
+            if lower not in candidates:
+                continue
+            held_out[lower] = validate(candidates[lower], records, settings)
+            if held_out[lower].clearly_better_than(held_out[chosen]):
+                chosen = lower
+    white = whitening.records(records, settings.free)
+    rows = _rows(tried, white, held_out)
+    candidate = candidates[chosen]
+    return Selection(chosen, candidate.horizon, rows, candidate, held_out[chosen])
+
+
+def _rows(
+    tried: Sequence[_Tried], white: Sequence[Record], held_out: Mapping[int, HeldOut]
+) -> list[Row]:
+    """Of all horizons of every order, tried on whitened records."""
+    energy = output_energy(white) or 1.0
+    least = min(one.criterion for one in tried)
+    n_values = sum(record.y.size for record in white)
+    rows = []
+    for one in tried:
+        for horizon, start in one.starts.items():
+            is_best = horizon == one.horizon
+            known = is_best and one.order in held_out
+            rows.append(
+                Row(
+                    one.order,
+                    horizon,
+                    float(np.sqrt(start.loss / energy)),
+                    (one.criterion - least) / n_values if is_best else np.nan,
+                    held_out[one.order].bft if known else np.nan,
+                )
+            )
+    return rows
+
+
+def _spaces(
+    records: Sequence[Record],
+    lowest: int,
+    highest: int,
+    horizon: int | None,
+    settings: Settings,
+) -> dict[int, ObservabilitySubspace]:
+    """Subspaces of every horizon to try."""
+    horizons = [horizon] if horizon else _horizons(records, lowest, settings)
     width = highest + settings.n_noise_states
     widths = {h: min(width, settings.max_order(h)) for h in horizons}
-    spaces = subspaces_of(parts, widths, settings.method)
-    # Of a given order, the table tells what every horizon would return.
-    tried = _try_orders(orders, spaces, split, settings, validate_all=order is not None)
-    best = _choose(tried, split)
-    chosen = best.horizon
-    if not settings.refine and horizon is None:
-        # Nothing corrects the horizon afterwards: compare on the whole records.
-        width = best.order + settings.n_noise_states
-        widths = {h: width for h in horizons if best.order <= settings.max_order(h)}
-        spaces = subspaces_of(records, widths, settings.method)
-        starts = _starts(best.order, spaces, records, settings)
-        chosen = _best_horizon(starts, settings.refine)
-    candidates = [row for one in tried for row in one.candidates]
-    return Selection(best.order, chosen, candidates)
+    return subspaces_of(records, widths, settings.method)
 
 
-def _thin_records(records: Sequence[Record], n_samples: int) -> list[Record]:
-    """Evenly spread experiments of about `n_samples` in total, at least one.
-
-    Experiments beyond that length are cut to it.
-
-    >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
-    >>> [run.u.shape[1] for run in _thin_records(runs, 120)]
-    [50, 60]
-    """
-    lengths = [record.u.shape[1] for record in records]
-    keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
-    spread = [i * len(records) // keep for i in range(keep)]
-    return [records[i].head(n_samples) for i in spread]
-
-
-def _hold_out(records: list[Record], order: int | None, settings: Settings) -> _Split:
-    """Part the records, unless too few samples are left to estimate a given order."""
-    lengths = [record.u.shape[1] for record in records]
-    cuts = [
-        n if n < _TOO_SHORT else int(np.ceil(_ESTIMATION_SHARE * n)) for n in lengths
-    ]
-    if order and settings.max_order(settings.max_horizon(cuts)) < order:
-        return _Split(records, records, lengths)
-    parts = [record.head(cut) for record, cut in zip(records, cuts, strict=True)]
-    return _Split(records, parts, cuts)
-
-
-def _horizons(parts: Sequence[Record], order: int, settings: Settings) -> list[int]:
+def _horizons(records: Sequence[Record], order: int, settings: Settings) -> list[int]:
     """Horizons to try: those that show the order and that the data can fill."""
-    highest = _highest_horizon(parts, settings)
+    highest = _highest_horizon(records, settings)
     lowest = 2 if highest > 1 else 1
     while lowest < highest and settings.max_order(lowest) < order:
         lowest += 1
@@ -241,13 +294,13 @@ def _horizon_grid(lowest: int, highest: int) -> list[int]:
 
 
 def _highest_order(
-    parts: Sequence[Record], horizons: Sequence[int], settings: Settings
+    records: Sequence[Record], horizons: Sequence[int], settings: Settings
 ) -> int:
     """Highest order to try: one that leaves enough values for each parameter."""
     ny, m = settings.free.direct.shape
-    n_values = sum(part.y.size for part in parts)
+    n_values = sum(record.y.size for record in records)
     affordable = n_values / _VALUES_PER_PARAMETER - m * ny
-    affordable /= m + ny + len(parts)
+    affordable /= m + ny + len(records)
     by_horizon = max(settings.max_order(h) for h in horizons)
     return int(np.clip(affordable, 0, min(_MAX_ORDER, by_horizon)))
 
@@ -255,55 +308,73 @@ def _highest_order(
 def _try_orders(
     orders: Sequence[int],
     spaces: Mapping[int, ObservabilitySubspace],
-    split: _Split,
+    records: Sequence[Record],
     settings: Settings,
-    *,
-    validate_all: bool,
+    colour: float,
+    max_iter: int | None = None,
 ) -> list[_Tried]:
     """Every order in turn, until further states gain nothing.
 
-    Of the horizons of an order the best is validated, or each with `validate_all`.
+    `colour` is that of the errors: where it is above one, states that fit their peak
+    gain as much by chance.
     """
     tried: list[_Tried] = []
-    best_loss, stale = np.inf, 0
+    best, stale = np.inf, 0
+    energy = output_energy(records)
+    n_values = sum(record.y.size for record in records)
+    steps = {} if max_iter is None else {"max_iter": max_iter}
     for order in orders:
-        starts = _starts(order, spaces, split.parts, settings)
-        found = _validated(order, starts, split, settings, validate_all=validate_all)
-        tried.append(found)
-        stale = 0 if found.model.loss < _NOTICEABLE * best_loss else stale + 1
-        best_loss = min(best_loss, found.model.loss)
-        if stale > _PATIENCE or best_loss <= _EXACT * split.energy:
+        starts = _starts(order, spaces, records, settings)
+        if not starts:
+            break
+        horizon = _best_horizon(starts, refine=True)
+        model = refine_simulation(starts[horizon], records, settings.free, **steps)
+        if tried and model.loss > _AS_GOOD * tried[-1].model.loss:
+            other = _with_more_states(tried[-1].model, records, settings)
+            if other is not None and other.loss < model.loss:
+                model = other
+        criterion = _criterion(model, energy, n_values, settings, colour)
+        tried.append(_Tried(order, horizon, model, criterion, starts))
+        stale = 0 if criterion < best else stale + 1
+        best = min(best, criterion)
+        if stale > _PATIENCE or model.loss <= _EXACT * energy:
             break
     return tried
 
 
-def _validated(
-    order: int,
-    starts: Mapping[int, Realization],
-    split: _Split,
+def _criterion(
+    model: Realization,
+    energy: float,
+    n_values: int,
     settings: Settings,
-    *,
-    validate_all: bool,
-) -> _Tried:
-    """One order at the horizon whose start is best, and what the others came to."""
-    chosen = _best_horizon(starts, settings.refine)
-    models, errors = {}, {}
-    for horizon in starts if validate_all else [chosen]:
-        model = starts[horizon]
-        if settings.refine:
-            model = refine_simulation(model, split.parts, settings.free)
-        models[horizon] = model
-        errors[horizon] = _held_out_error(model, split.records, split.cuts)
-    candidates = [
-        Candidate(
-            order,
-            horizon,
-            float(np.sqrt(start.loss / (split.energy or 1.0))),
-            errors[horizon].bft if horizon in errors else np.nan,
-        )
-        for horizon, start in starts.items()
-    ]
-    return _Tried(order, chosen, models[chosen], errors[chosen].blocks, candidates)
+    colour: float,
+) -> float:
+    """Schwarz's criterion of a model of whitened records."""
+    n, (ny, m) = len(model.A), settings.free.direct.shape
+    own = len(model.initial_states) * settings.free.n_own(n)
+    n_parameters = n * (m + ny) + int(settings.free.direct.sum()) + own
+    loss = max(model.loss, _EXACT * energy) or 1.0
+    return float(n_values * np.log(loss) + colour * n_parameters * np.log(n_values))
+
+
+def _with_more_states(
+    model: Realization, records: Sequence[Record], settings: Settings
+) -> Realization | None:
+    """A model with one state more, for what a model leaves of the outputs."""
+    free = settings.free
+    errors = simulation_errors(model, records)
+    if not np.isfinite(model.loss):
+        return None
+    left = [Record.of(r.u.T, e) for r, e in zip(records, errors, strict=True)]
+    room = settings.max_horizon([r.u.shape[1] for r in records])
+    horizon = min(_SHORT_HORIZON, room)
+    if settings.max_order(horizon) < 1:
+        return None
+    space = subspaces_of(left, {horizon: 1}, settings.method)[horizon]
+    more = realize(space, left, 1, settings._replace(n_noise_states=0))
+    A = linalg.block_diag(model.A, more.A)
+    C = np.hstack([model.C, more.C])
+    return refine_simulation(simulation_fit(A, C, records, free), records, free)
 
 
 def _starts(
@@ -324,100 +395,6 @@ def _best_horizon(starts: Mapping[int, Realization], refine: bool) -> int:
     """Smallest horizon whose loss is near the best."""
     limit = min(model.loss for model in starts.values()) * _LOSS_SLACK[refine]
     return min(h for h, model in starts.items() if model.loss <= limit)
-
-
-class _HeldOutError(NamedTuple):
-    """Simulation error on the parts held out."""
-
-    blocks: Array  # (n_blocks,): sums of squares over consecutive blocks of time
-    bft: float  # best fit, percent, mean over outputs; NaN where nothing is held out
-
-
-def _held_out_error(
-    model: Realization, records: Sequence[Record], cuts: Sequence[int]
-) -> _HeldOutError:
-    """Error after the cuts of whole records, simulated from the model's states."""
-    blocks, errors, outputs = [], [], []
-    for record, cut, x0 in zip(records, cuts, model.initial_states, strict=True):
-        if cut == record.u.shape[1]:
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):
-            fitted = lti_response(model.A, model.B, model.C, model.D, record.u.T, x0)
-        error = record.y.T[cut:] - fitted[cut:]
-        errors.append(error)
-        outputs.append(record.y.T[cut:])
-        n_blocks = min(_N_BLOCKS, len(error))
-        blocks += [float((b**2).sum()) for b in np.array_split(error, n_blocks)]
-    if not errors:
-        return _HeldOutError(np.zeros(0), np.nan)
-    error, output = np.vstack(errors), np.vstack(outputs)
-    spread = np.sqrt(((output - output.mean(axis=0)) ** 2).sum(axis=0))
-    spread[spread == 0.0] = 1.0
-    miss = np.sqrt((error**2).sum(axis=0)) / spread
-    bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
-    return _HeldOutError(np.array(blocks), bft if np.isfinite(bft) else 0.0)
-
-
-def _choose(tried: Sequence[_Tried], split: _Split) -> _Tried:
-    """The smallest order that neither part of the data speaks against."""
-    parts = split.parts
-    n_values = sum(part.y.size for part in parts)
-    per_state = len(parts[0].u) + len(parts[0].y) + len(parts)
-    losses = {one.order: one.model.loss for one in tried}
-    lowest = _lowest_order(losses, n_values, per_state)
-    held_out = {one.order: one.held_out for one in tried if one.order >= lowest}
-    order = _smallest_good_order(held_out)
-    return next(one for one in tried if one.order == order)
-
-
-def _smallest_good_order(held_out: Mapping[int, Array]) -> int:
-    """Smallest order whose held-out error is not significantly above the best.
-
-    Significantly: by more than two standard errors of the sum of the blockwise
-    differences, and by more than 0.3 % of the best error. `held_out` are the block sums
-    of squared errors by order, ascending.
-
-    >>> errors = {1: np.full(10, 5.0), 2: np.full(10, 1.001), 3: np.full(10, 1.0)}
-    >>> _smallest_good_order(errors)
-    2
-    """
-    totals = {n: b.sum() if len(b) else np.inf for n, b in held_out.items()}
-    totals = {n: total if np.isfinite(total) else np.inf for n, total in totals.items()}
-    best = min(totals, key=totals.__getitem__)
-    for order, block in held_out.items():
-        if not np.isfinite(totals[order]):
-            continue
-        gap = block - held_out[best]
-        error = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
-        allowed = max(_STANDARD_ERRORS * error, _NEGLIGIBLE_GAIN * totals[best])
-        if totals[order] - totals[best] <= allowed:
-            return order
-    return best
-
-
-def _lowest_order(losses: Mapping[int, float], n_values: int, per_state: int) -> int:
-    """Lowest order that the data it was estimated on do not rule out.
-
-    Held-out parts may be silent, as after an impulse or a step. Ruled out is an order
-    that has twice the error (root mean square) of a higher one, and many times more
-    than its missing parameters would explain.
-
-    `losses` are sums of squared simulation errors on the estimation part by order,
-    ascending, of `n_values` samples times outputs; a state adds `per_state` parameters.
-
-    >>> _lowest_order({0: 1.0, 1: 1e-3, 2: 0.9e-3}, n_values=500, per_state=2)
-    1
-    """
-    orders = list(losses)
-    lowest = orders[0]
-    for i, low in enumerate(orders):
-        for high in orders[i + 1 :]:
-            loss = losses[high]
-            degrees = max(n_values - high * per_state, 1)
-            excess = _CERTAIN * (high - low) * per_state * loss / degrees
-            if losses[low] > max(_TWICE_THE_ERROR * loss, loss + excess):
-                lowest = max(lowest, orders[i + 1])
-    return lowest
 
 
 # What a model at its minimum under white noise does not show: correlation of the

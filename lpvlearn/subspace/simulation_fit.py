@@ -23,7 +23,11 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.least_squares import RCOND, column_scale, scaled_lstsq
-from ..systems.simulation import lti_response
+from ..systems.simulation import (
+    estimate_initial_state,
+    free_responses,
+    lti_response,
+)
 from .hankel import triangularize
 from .signals import (
     Record,
@@ -172,6 +176,34 @@ def block_fit(
             return _overflowing(A, C, records)
         factors.append(linear_regression(R, blocks, C, free))
     return _realization(A, C, factors, free, blocks)
+
+
+def simulation_errors(model: Realization, records: Sequence[Record]) -> list[Array]:
+    """What is left of the outputs of every experiment, (n_samples, n_outputs) each."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return [
+            record.y.T - lti_response(*model[:4], record.u.T, x0)
+            for record, x0 in zip(records, model.initial_states, strict=True)
+        ]
+
+
+def with_initial_states(
+    model: Realization, records: Sequence[Record], free: Freedom
+) -> Realization:
+    """The model with the initial states that fit records best, and its loss on them."""
+    at_rest = np.zeros((len(records), len(model.A)))
+    model = model._replace(initial_states=at_rest)
+    errors = simulation_errors(model, records)
+    if not all(np.isfinite(error).all() for error in errors):
+        return model._replace(loss=np.inf)
+    if free.initial_states and model.A.size:
+        states = []
+        for i, error in enumerate(errors):
+            responses = free_responses(model.A, model.C, len(error))
+            states.append(estimate_initial_state(responses, error))
+            errors[i] = error - responses @ states[-1]
+        model = model._replace(initial_states=np.array(states))
+    return model._replace(loss=sum(float((error**2).sum()) for error in errors))
 
 
 def _general_regression(A: Array, C: Array, record: Record, free: Freedom) -> Array:

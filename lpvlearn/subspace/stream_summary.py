@@ -144,7 +144,8 @@ class StreamSummary:
         """
         sums = self._with_waiting()
         step = self._subspace_step(sums)
-        enforce, refine = self._choices.enforce_stability, self._choices.refine
+        enforce = self._choices.enforce_stability
+        refine = self._choices.refine is not False
         if refine and sums.recursion is not None:
             best = current_model(sums.recursion)
             best = best._replace(initial_states=sums.initial_state[None])
@@ -169,6 +170,7 @@ class StreamSummary:
             stability_loss=lost,
             evidence=replace(
                 evidence,
+                model=model,
                 share=kept / self._n_samples,
                 refined=evidence.refined and lost == 0.0,
             ),
@@ -215,7 +217,7 @@ class StreamSummary:
         energy = float(sums.energy[len(self._su) :].sum())
         n_values = sums.n_samples * len(self._sy)
         share = _EXCESS * len(self._sums.recursion.position) / n_values
-        if not self._choices.refine:
+        if self._choices.refine is False:
             share = max(share, _EXCESS_UNREFINED)
         if not abs(loss - model.loss) <= share * model.loss + _ROUNDING * energy:
             return None
@@ -253,7 +255,7 @@ class StreamSummary:
         """The sums, continued by a stretch of samples."""
         recursion = sums.recursion
         if recursion is not None:
-            if not self._choices.refine and sums.n_samples >= sums.next_point:
+            if self._choices.refine is False and sums.n_samples >= sums.next_point:
                 # The subspace step, not the minimum, is where the model will be.
                 sums = sums._replace(
                     point=self._subspace_model(sums), next_point=2 * sums.n_samples

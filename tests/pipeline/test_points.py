@@ -27,7 +27,6 @@ from lpvlearn.pipeline.points import (
     identify_point,
     restructure_points,
 )
-from lpvlearn.subspace.statistics import deviated_models
 
 from ..conftest import spring_pipeline, spring_structure, spring_tables
 
@@ -126,7 +125,7 @@ def test_a_frequency_weight_enters_the_covariance():
     fitted = SubspaceLTI(1, horizon=8, feedthrough=False, sampling_time=STEP).fit(u, y)
     pairs = [
         (above.to_continuous(), below.to_continuous())
-        for above, below in deviated_models(fitted.lti_, [(u, y)])
+        for above, below in fitted.deviated_models()
     ]
     box = fitted.lti_.to_continuous()
     theta = GrayBoxRestructurer(LAG).fit_model(box).params_

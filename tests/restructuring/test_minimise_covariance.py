@@ -13,7 +13,6 @@ from lpvlearn.restructuring.minimise_covariance import (
     uncertain_response,
 )
 from lpvlearn.restructuring.problem import problem_from_models
-from lpvlearn.subspace.statistics import deviated_models
 
 from ..conftest import stable_model
 
@@ -312,7 +311,7 @@ def identified(structure, u, y, start, step, **options):
     fitted = SubspaceLTI(sampling_time=step, horizon=8, **options).fit(u, y)
     pairs = [
         (above.to_continuous(), below.to_continuous())
-        for above, below in deviated_models(fitted.lti_, [(u, y)])
+        for above, below in fitted.deviated_models()
     ]
     return fit(structure, fitted.lti_.to_continuous(), pairs, start)[0]
 
@@ -446,7 +445,7 @@ def test_time_domains_give_one_estimate():
     def found(structure, convert):
         pairs = [
             (convert(above), convert(below))
-            for above, below in deviated_models(fitted.lti_, [(u, y)])
+            for above, below in fitted.deviated_models()
         ]
         return estimate(structure, convert(fitted.lti_), pairs, omega, theta)
 
@@ -474,7 +473,7 @@ def test_a_pole_on_the_negative_axis_needs_no_logarithm():
         u, y = record(structure.model(truth).to_discrete(DT), seed, 300, noise=0.3)
         fitted = SubspaceLTI(1, horizon=5, sampling_time=DT).fit(u, y)
         negative += fitted.lti_.A.item() < 0
-        pairs = deviated_models(fitted.lti_, [(u, y)])
+        pairs = fitted.deviated_models()
         omega = np.linspace(0.5, 30, 30)
         found = estimate(
             SampledStructure(structure, DT), fitted.lti_, pairs, omega, truth

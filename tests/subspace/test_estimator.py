@@ -181,11 +181,12 @@ def test_selection_table_shows_what_was_tried(rng):
     u = rng.standard_normal((400, 1))
     y = noisy(lti_response(*(np.array([[v]]) for v in (0.9, 1, 1, 0)), u), 20, rng)
     table = SubspaceLTI().fit(u, y).selection_
-    assert list(table) == ["order", "horizon", "criterion", "validation_bft", "chosen"]
+    columns = ["order", "horizon", "error", "criterion", "validation_bft", "chosen"]
+    assert list(table) == columns
     row = table[table["chosen"]].iloc[0]
     assert row["order"] == 1 and row["validation_bft"] > 85
     # An order that is too low has a larger error.
-    assert table[table["order"] == 0]["criterion"].min() > row["criterion"]
+    assert table[table["order"] == 0]["error"].min() > row["error"]
 
 
 def test_pure_gain_and_pure_delay(rng):

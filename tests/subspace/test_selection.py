@@ -1,17 +1,14 @@
 """The choice of order and horizon, in its parts."""
 
 import numpy as np
-import pytest
+from scipy.signal import lfilter
 
 from lpvlearn.subspace.identification import Settings
 from lpvlearn.subspace.selection import (
-    _held_out_error,
     _horizon_grid,
-    _smallest_good_order,
     select,
 )
 from lpvlearn.subspace.signals import Record
-from lpvlearn.subspace.simulation_fit import Realization
 
 from ..conftest import modes
 from .conftest import POLES, example, experiment, freedom
@@ -24,27 +21,50 @@ def test_horizon_grid_is_increasing_and_holds_both_ends():
         assert (np.diff(grid) > 0).all()
 
 
-def test_order_rule_ignores_insignificant_gains(rng):
-    noise = 1.0 + 0.1 * rng.standard_normal(20)
-    blocks = [3.0 * noise, noise + 1e-6, noise - 1e-3 * rng.standard_normal(20)]
-    assert _smallest_good_order(dict(zip([1, 2, 3], blocks, strict=True))) == 2
-    assert _smallest_good_order({0: np.array([np.nan]), 1: np.ones(1)}) == 1
-
-
-def test_held_out_error_is_measured_after_the_cut(rng):
-    system = example(rng, modes(*POLES))
-    u, y = experiment(rng, system, 100)
-    y = y.copy()
-    y[:70] += 1.0
-    model = Realization(*system, np.zeros((1, 6)), 0.0)
-    blocks, bft = _held_out_error(model, [Record(u.T, y.T)], [70])
-    assert blocks.sum() < 1e-18
-    assert bft == pytest.approx(100.0)
-
-
 def test_selection_finds_the_order_of_noise_free_data(rng):
     system = example(rng, modes(*POLES))
     u, y = experiment(rng, system, 400)
     settings = Settings(freedom(2, 2))
     chosen = select([Record.of(u, y)], None, None, settings)
     assert chosen.order == 6
+
+
+def coloured(seed, n_samples, pole=0.9, level=0.3):
+    rng = np.random.default_rng(seed)
+    system = example(rng, modes(0.9 * np.exp(0.4j), 0.7), 1, 2)
+    u, y = experiment(rng, system, n_samples)
+    e = lfilter([1.0], [1.0, -pole], rng.standard_normal(y.shape), axis=0)
+    return Record.of(u, y + level * y.std(axis=0) * e / e.std(axis=0))
+
+
+def test_coloured_noise_is_not_taken_for_states():
+    orders = [
+        select([coloured(seed, 600)], None, None, Settings(freedom(2, 1))).order
+        for seed in range(6)
+    ]
+    assert sum(order == 3 for order in orders) >= 5 and max(orders) <= 4
+
+
+def test_losses_do_not_rise_with_the_order():
+    chosen = select([coloured(1, 300)], None, None, Settings(freedom(2, 1)))
+    table = chosen.table().dropna(subset="criterion").set_index("order")["criterion"]
+    n_values, per_state = 2 * (300 - 1), 1 + 2 + 1
+    # Without the price of the parameters only the logarithm of the loss is left.
+    loss = table - table.index * per_state * np.log(n_values) / n_values
+    assert (loss.diff().dropna() < 1e-3).all()
+
+
+def test_the_noise_of_the_choice_goes_with_it():
+    chosen = select([coloured(2, 2000)], None, None, Settings(freedom(2, 1)))
+    np.testing.assert_allclose(chosen.candidate.whitening.filter[1], -0.9, atol=0.05)
+    plain = Settings(freedom(2, 1), weigh=False)
+    chosen = select([coloured(2, 2000)], None, None, plain)
+    assert chosen.candidate.whitening.is_none
+
+
+def test_a_given_order_is_kept_and_its_horizon_found():
+    for order in (1, 3, 6):
+        settings = Settings(freedom(2, 1))
+        chosen = select([coloured(3, 400)], order, None, settings)
+        assert chosen.order == order == len(chosen.candidate.model.A)
+        assert set(chosen.table()["order"]) == {order}

@@ -1,0 +1,127 @@
+"""Simulation of parts of the samples that a model has not seen.
+
+Each experiment is cut into pieces of equal length, and every piece but the first is
+held out once: the model is fitted again without it, from where it was, and simulated
+through it from the state that the samples before tell. What a likelihood says rests on
+its noise model being right; this does not, and so has the last word where a system is
+not quite what the models can be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..systems.simulation import estimate_initial_state, free_responses, lti_response
+from .signals import Record
+from .simulation_fit import Realization
+
+Array = NDArray[np.float64]
+
+MAX_SAMPLES = 12_000  # that a choice is made from: it needs fewer than an estimate
+
+_N_PIECES = 3  # held out in turn: a whole number of refits, and most samples stay
+
+_N_BLOCKS = 5  # of a piece: sums over time whose spread tells that of their total
+
+_TOO_SHORT = 8  # samples of an experiment of which nothing is held out
+
+# A model is clearly better where its error is less by this many standard errors of the
+# difference, and by this share.
+_STANDARD_ERRORS, _SHARE = 1.5, 0.03
+
+
+class HeldOut(NamedTuple):
+    """Simulation errors on parts held out."""
+
+    blocks: Array  # (n_blocks,): sums of squares over consecutive blocks of time
+    bft: float  # best fit, percent, mean over outputs; NaN where nothing is held out
+
+    def clearly_better_than(self, other: HeldOut) -> bool:
+        """Whether errors are less, by more than chance and by enough to matter."""
+        total = other.blocks.sum()
+        if not np.isfinite(total):
+            return bool(np.isfinite(self.blocks.sum()))
+        gap = other.blocks - self.blocks
+        chance = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
+        return bool(gap.sum() > max(_STANDARD_ERRORS * chance, _SHARE * total))
+
+
+def held_out(
+    refitted: Callable[[list[Record]], Realization],
+    records: Sequence[Record],
+    *,
+    at_rest: bool = False,
+) -> HeldOut:
+    """Errors of a model on pieces of scaled records that it was not fitted to.
+
+    `refitted` makes the model of other records; `at_rest` says that all experiments
+    begin so.
+    """
+    blocks: list[float] = []
+    errors, outputs = [], []
+    records = thinned(records)
+    for k in range(1, _N_PIECES + 1):
+        cuts = [_cut(record.u.shape[1], k) for record in records]
+        train = [
+            Record(record.u[:, part].copy(), record.y[:, part].copy())
+            for record, (start, stop) in zip(records, cuts, strict=True)
+            for part in (slice(0, start), slice(stop, None))
+            if part == slice(0, start) or record.u.shape[1] - stop >= _TOO_SHORT
+        ]
+        model = refitted(train)
+        for record, (start, stop) in zip(records, cuts, strict=True):
+            if start == stop:
+                continue
+            u, y = record.u.T[:stop], record.y.T[:stop]
+            with np.errstate(over="ignore", invalid="ignore"):
+                error = y - lti_response(model.A, model.B, model.C, model.D, u)
+                if not at_rest:
+                    free = free_responses(model.A, model.C, stop)
+                    x0 = estimate_initial_state(free[:start], error[:start])
+                    error = error - free @ x0
+            error = error[start:]
+            errors.append(error)
+            outputs.append(y[start:])
+            with np.errstate(over="ignore", invalid="ignore"):
+                parts = np.array_split(error, min(_N_BLOCKS, len(error)))
+                blocks += [float((part**2).sum()) for part in parts]
+    if not errors:
+        return HeldOut(np.zeros(0), np.nan)
+    error, output = np.vstack(errors), np.vstack(outputs)
+    spread = np.sqrt(((output - output.mean(axis=0)) ** 2).sum(axis=0))
+    spread[spread == 0.0] = 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        miss = np.sqrt((error**2).sum(axis=0)) / spread
+    bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
+    return HeldOut(np.array(blocks), bft if np.isfinite(bft) else 0.0)
+
+
+def thinned(records: Sequence[Record], n_samples: int = MAX_SAMPLES) -> list[Record]:
+    """Evenly spread experiments of about `n_samples` in total, at least one.
+
+    Experiments beyond that length are cut to it.
+
+    >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
+    >>> [run.u.shape[1] for run in thinned(runs, 120)]
+    [50, 60]
+    """
+    lengths = [record.u.shape[1] for record in records]
+    keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
+    spread = [i * len(records) // keep for i in range(keep)]
+    return [records[i].head(n_samples) for i in spread]
+
+
+def _cut(n_samples: int, k: int) -> tuple[int, int]:
+    """Start and end of the k-th piece held out; the end twice for a short experiment.
+
+    >>> [_cut(100, k) for k in (1, 2, 3)], _cut(5, 1)
+    ([(25, 50), (50, 75), (75, 100)], (5, 5))
+    """
+    if n_samples < _TOO_SHORT:
+        return n_samples, n_samples
+    size = n_samples // (_N_PIECES + 1)
+    return size * k, n_samples if k == _N_PIECES else size * (k + 1)

@@ -1,0 +1,302 @@
+"""The noise in the simulation errors of a model, and how to weigh them by it.
+
+The errors v are described by an autoregression in innovation form, ``v = H e`` with
+white e (`autoregression`). Their sum of squares is the likelihood where they are white
+and equally large, which `Whitening` makes them: a filter f common to all channels and
+a weight W of the outputs,
+
+    ``u_w = f(q) u``, ``y_w = W f(q) y``,
+
+under which the dynamics stay the same, ``G_w = W G``, for a filter of all channels
+commutes with them. Colours that differ from output to output are evened out on the
+whole only, the correlation of the innovations completely.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # which loads its signal package when that is first used: slowly
+from numpy.typing import NDArray
+from scipy import linalg
+
+from ..models.innovation import NoiseModel
+from ..systems.balancing import balancing_transformation
+from .hankel import correlation_sequence
+from .signals import Record
+from .simulation_fit import Freedom, Realization
+
+Array = NDArray[np.float64]
+
+# Lags that are allowed for by the number of samples: 10 log10(n), a customary limit.
+_LAGS_PER_DECADE = 10.0
+
+_RCOND_LAGS = 1e-13  # directions of past errors that are their rounding
+_MAX_CONDITION = 1e8  # of eigenvectors, which would lose half of the spectrum's digits
+
+_ROUNDING = 1e-9  # size of an error, relative to the output, that is not noise
+
+# Samples of an experiment by those that a filter takes away from it at its start.
+_LEAST_LEFT = 8
+
+# Between the noise of two outputs: the weight of a clean one is known no better, for
+# its errors come from the dynamics that it shares with the others.
+_LARGEST_RATIO = 1e4
+
+# Filters and weights that differ by less cost the square of it in efficiency.
+_SAME_FILTER, _SAME_WEIGHT = 0.05, 1.05
+
+_N_FREQUENCIES = 100  # at which a density of some ten lags is looked at
+
+_LEAST_VARIANCE = 1e-6  # of a combination of outputs of unit variance, for its weight
+
+
+class Whitening(NamedTuple):
+    """A filter and a weight after which errors are white and equally large."""
+
+    filter: Array  # (n_lags + 1,), the first is 1
+    weight: Array  # (n_outputs, n_outputs), of determinant 1
+    colour: float = 1.0  # largest spectral density of what is left, by its mean
+
+    @classmethod
+    def none(cls, n_outputs: int) -> Whitening:
+        """The one that changes nothing."""
+        return cls(np.ones(1), np.eye(n_outputs))
+
+    @classmethod
+    def of(cls, errors: Sequence[Array], free: Freedom) -> Whitening:
+        """That of the simulation errors of scaled records, a row per sample.
+
+        Errors that are rounding are left as they are.
+
+        >>> e = np.random.default_rng(0).standard_normal((5000, 1))
+        >>> v = scipy.signal.lfilter([1.0], [1.0, -0.9], e, axis=0)
+        >>> Whitening.of([v], Freedom(np.ones((1, 1), bool))).filter.round(2)
+        array([ 1. , -0.9])
+        """
+        size = np.sqrt(np.mean(np.vstack(errors) ** 2, axis=0))
+        noisy = np.flatnonzero(size > _ROUNDING)
+        if len(noisy) == 0 or not np.isfinite(size).all():
+            return cls.none(len(size))
+        channels = [e[:, [i]] / size[i] for e in errors for i in noisy]
+        middle = int(np.median([len(e) for e in errors]))
+        model = autoregression(channels, highest=middle // _LEAST_LEFT)
+        coefficients = np.concatenate([[1.0], -model.C[0]])
+        whitened = cls(coefficients, np.eye(len(size)))._filtered(errors)
+        weight = _weight(np.vstack(whitened), free)
+        return cls(coefficients, weight, _colour([e @ weight.T for e in whitened]))
+
+    @property
+    def is_none(self) -> bool:
+        """Whether it changes nothing."""
+        return len(self.filter) == 1 and _is_identity(self.weight)
+
+    def is_close_to(self, other: Whitening) -> bool:
+        """Whether it would give much the same model as another one."""
+        if len(self.filter) != len(other.filter):
+            return False
+        ratio = linalg.svdvals(linalg.solve(other.weight, self.weight))
+        close = np.abs(self.filter - other.filter).max() <= _SAME_FILTER
+        return bool(close and ratio[0] <= _SAME_WEIGHT * ratio[-1])
+
+    def _filtered(self, samples: Sequence[Array]) -> list[Array]:
+        """Samples without those to which the filter would need others before them."""
+        lost = len(self.filter) - 1
+        return [
+            scipy.signal.lfilter(self.filter, [1.0], z, axis=0)[lost:]
+            for z in samples
+            if len(z) > 2 * lost
+        ]
+
+    def records(self, records: Sequence[Record], free: Freedom) -> list[Record]:
+        """Samples filtered and weighted.
+
+        The first samples, to which the filter would need others before them, are left
+        out, and experiments that are too short for it; where all begin at rest
+        there is nothing before.
+        """
+        lost = len(self.filter) - 1
+        first = lost if free.initial_states else 0
+        out = []
+        for u, y in records:
+            if u.shape[1] > 2 * lost:
+                if lost:
+                    u = scipy.signal.lfilter(self.filter, [1.0], u, axis=1)[:, first:]
+                    y = scipy.signal.lfilter(self.filter, [1.0], y, axis=1)[:, first:]
+                if not _is_identity(self.weight):
+                    y = self.weight @ y
+                out.append(Record(np.ascontiguousarray(u), np.ascontiguousarray(y)))
+        return out
+
+    def model(self, model: Realization) -> Realization:
+        """The model of whitened samples; states and loss are still those before."""
+        return model._replace(C=self.weight @ model.C, D=self.weight @ model.D)
+
+    def undone(self, model: Realization) -> Realization:
+        """The model of the samples before, by one of whitened samples."""
+        C, D = (linalg.solve(self.weight, M) for M in (model.C, model.D))
+        return model._replace(C=C, D=D)
+
+
+def _is_identity(weight: Array) -> bool:
+    return np.array_equal(weight, np.eye(len(weight)))
+
+
+def _colour(errors: Sequence[Array]) -> float:
+    """Largest spectral density of an output's errors by its mean, 1 for white ones."""
+    omega = np.linspace(0.0, np.pi, _N_FREQUENCIES)
+    largest = 1.0
+    for i in range(errors[0].shape[1]):
+        model = autoregression([e[:, [i]] for e in errors])
+        density = spectral_density(model, omega).real
+        if len(model.A) and density.mean() > 0.0:
+            largest = max(largest, float(density.max() / density.mean()))
+    return largest
+
+
+def _weight(errors: Array, free: Freedom) -> Array:
+    """Weight of white errors: their covariance to the power of minus one half.
+
+    Equal, unequal or correlated outputs, whichever has the least value of Schwarz's
+    criterion. Correlated ones are mixed, which single entries of D that are known to
+    be zero do not allow.
+    """
+    n, ny = errors.shape
+    size = np.sqrt(np.mean(errors**2, axis=0))
+    size = np.maximum(size, size.max() / _LARGEST_RATIO)
+    unit = errors / size
+    correlation = unit.T @ unit / n
+    np.fill_diagonal(correlation, 1.0)
+    values, vectors = np.linalg.eigh(correlation)
+    values = np.maximum(values, _LEAST_VARIANCE)
+    equal = ny * np.log(np.mean(size**2))
+    unequal = float(np.sum(np.log(size**2)))
+    correlated = unequal + float(np.sum(np.log(values)))
+    penalty = np.log(n) / n
+    criteria = [equal, unequal + (ny - 1) * penalty]
+    if (free.direct == free.direct[0]).all():
+        criteria.append(correlated + (ny * (ny + 1) / 2 - 1) * penalty)
+    best = int(np.argmin(criteria))
+    if best == 0:
+        return np.eye(ny)
+    root = (vectors / np.sqrt(values)) @ vectors.T if best == 2 else np.eye(ny)
+    weight = root / size
+    return weight / np.linalg.det(weight) ** (1.0 / ny)
+
+
+def autoregression(
+    errors: Sequence[Array], *, highest: int | None = None
+) -> NoiseModel:
+    """Vector autoregression of simulation errors, in innovation form.
+
+    One array (n_samples_i, n_outputs) per experiment. The number of lags is that with
+    the smallest value of Schwarz's criterion, up to ``10 log10(n_samples)``
+    or `highest`.
+
+    >>> from scipy.signal import lfilter
+    >>> e = np.random.default_rng(0).standard_normal((5000, 1))
+    >>> model = autoregression([lfilter([1.0], [1.0, -0.9], e, axis=0)])
+    >>> model.A.round(2)
+    array([[0.9]])
+    """
+    ny, n_samples = errors[0].shape[1], sum(len(v) for v in errors)
+    longest = max(len(v) for v in errors)
+    # Half as many coefficients of an output as the longest experiment has samples.
+    allowed = (longest - 1) // (2 * ny)
+    if highest is not None:
+        allowed = min(allowed, highest)
+    highest = max(0, min(int(_LAGS_PER_DECADE * np.log10(n_samples)), allowed))
+    lags = np.zeros((highest + 1, ny, ny))
+    for v in errors:
+        known = min(len(v), highest + 1)
+        lags[:known] += correlation_sequence(v, known)
+    lags /= n_samples
+    # Channels of very different size must not spoil the determinants.
+    scale = np.sqrt(np.maximum(np.diagonal(lags[0]), 0.0))
+    scale[scale == 0.0] = 1.0
+    lags = lags / scale[:, None] / scale
+    best, found = np.inf, (np.zeros((ny, 0)), lags[0])
+    for p in range(highest + 1):
+        coefficients, covariance = _yule_walker(lags, p)
+        sign, logdet = np.linalg.slogdet(covariance)
+        if not sign > 0.0:  # errors without noise
+            break
+        criterion = logdet + p * ny * ny * np.log(n_samples) / n_samples
+        if criterion < best:
+            best, found = criterion, (coefficients, covariance)
+    coefficients, covariance = found
+    n = coefficients.shape[1]
+    blocks = coefficients.reshape(ny, n // ny, ny) * scale[:, None, None] / scale
+    C = blocks.reshape(ny, n)
+    A = np.eye(n, k=-ny)  # the state holds the last errors
+    A[: min(n, ny)] = C[: min(n, ny)]
+    return NoiseModel(A, C, np.eye(n, ny), covariance * np.outer(scale, scale))
+
+
+def _yule_walker(lags: Array, order: int) -> tuple[Array, Array]:
+    """Coefficients ``[Phi_1, ..., Phi_p]`` and innovation covariance.
+
+    ``lags[d] = E v[t] v[t + d].T``, of more lags than the order.
+    """
+    ny = lags.shape[1]
+    if order == 0:
+        return np.zeros((ny, 0)), lags[0]
+    gram = np.empty((order * ny, order * ny))
+    for i in range(order):
+        for j in range(order):
+            block = lags[i - j] if i >= j else lags[j - i].T
+            gram[i * ny : (i + 1) * ny, j * ny : (j + 1) * ny] = block
+    right = lags[1 : order + 1].reshape(order * ny, ny)
+    solution = linalg.lstsq(gram, right, cond=_RCOND_LAGS, check_finite=False)[0]
+    covariance = lags[0] - right.T @ solution
+    return solution.T, 0.5 * (covariance + covariance.T)
+
+
+def reduced_noise_model(model: NoiseModel, order: int) -> NoiseModel:
+    """Noise model of fewer states by balanced truncation; itself where it has no more.
+
+    The gain is computed anew from the Riccati equation, so that the predictor of
+    the truncated model is stable.
+    """
+    if len(model.A) <= order:
+        return model
+    ny = len(model.C)
+    if order == 0:
+        P = linalg.solve_discrete_lyapunov(
+            model.A, model.K @ model.covariance @ model.K.T
+        )
+        spread = model.C @ P @ model.C.T + model.covariance
+        return NoiseModel(
+            np.zeros((0, 0)), np.zeros((ny, 0)), np.zeros((0, ny)), spread
+        )
+    root = linalg.cholesky(model.covariance, lower=True)
+    _, left, right = balancing_transformation(
+        model.A, model.K @ root, model.C, discrete=True
+    )
+    left, right = left[:order], right[:, :order]
+    A, C, K = left @ model.A @ right, model.C @ right, left @ model.K
+    Q, S = K @ model.covariance @ K.T, K @ model.covariance
+    P = linalg.solve_discrete_are(A.T, C.T, Q, model.covariance, s=S)
+    covariance = C @ P @ C.T + model.covariance
+    gain = linalg.solve(covariance, (A @ P @ C.T + S).T, assume_a="pos").T
+    return NoiseModel(A, C, gain, 0.5 * (covariance + covariance.T))
+
+
+def spectral_density(model: NoiseModel, omega: Array) -> NDArray[np.complex128]:
+    """Spectral density of v, ``H covariance H^*``, at radians per sample."""
+    ny, n = model.C.shape
+    H = np.broadcast_to(np.eye(ny, dtype=complex), (len(omega), ny, ny))
+    if n:
+        poles, vectors = np.linalg.eig(model.A)
+        left = linalg.lstsq(vectors, model.K + 0j)[0]
+        z = np.exp(1j * omega)
+        # A nearly defective A would lose accuracy in modal form.
+        if np.linalg.cond(vectors) < _MAX_CONDITION:
+            weights = 1.0 / (z[:, None] - poles)
+            H = H + np.einsum("oi,fi,ij->foj", model.C @ vectors, weights, left)
+        else:
+            resolvent = z[:, None, None] * np.eye(n) - model.A
+            H = H + model.C @ np.linalg.solve(resolvent, model.K + 0j)
+    return H @ model.covariance @ H.conj().transpose(0, 2, 1)

@@ -1,0 +1,51 @@
+"""Simulation of parts that a model has not seen."""
+
+import numpy as np
+import pytest
+
+from lpvlearn.subspace.held_out import HeldOut, held_out
+from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.simulation_fit import Realization
+
+from ..conftest import modes
+from .conftest import POLES, example, experiment
+
+
+def test_errors_are_those_of_the_pieces_alone(rng):
+    system = example(rng, modes(*POLES))
+    u, y = experiment(rng, system, 400, x0=rng.standard_normal(6))
+    model = Realization(*system, np.zeros((1, 6)), 0.0)
+    lengths = []
+
+    def refitted(train):
+        lengths.append([record.u.shape[1] for record in train])
+        return model
+
+    error = held_out(refitted, [Record.of(u, y)])
+    assert lengths == [[100, 200], [200, 100], [300]]
+    assert error.blocks.shape == (15,) and error.blocks.sum() < 1e-15
+    assert error.bft == pytest.approx(100.0)
+    y = y + np.where(np.arange(400) >= 300, 1.0, 0.0)[:, None]
+    error = held_out(refitted, [Record.of(u, y)])
+    np.testing.assert_allclose(error.blocks[-5:], 20 * 2, rtol=1e-6)
+    assert error.blocks[:-5].sum() < 1e-15
+
+
+def test_short_experiments_are_not_held_out(rng):
+    system = example(rng, modes(*POLES))
+    records = [Record.of(*experiment(rng, system, 7)) for _ in range(3)]
+    model = Realization(*system, np.zeros((3, 6)), 0.0)
+    error = held_out(lambda train: model, records)
+    assert len(error.blocks) == 0 and np.isnan(error.bft)
+
+
+def test_a_difference_counts_where_it_is_neither_chance_nor_small(rng):
+    noise = 1.0 + 0.1 * rng.standard_normal(15)
+    base = HeldOut(noise, 0.0)
+    assert HeldOut(0.9 * noise, 0.0).clearly_better_than(base)
+    assert not HeldOut(0.99 * noise, 0.0).clearly_better_than(base)
+    mixed = noise * np.where(np.arange(15) % 2, 0.2, 1.6)
+    assert not HeldOut(mixed, 0.0).clearly_better_than(base)
+    diverged = HeldOut(np.full(15, np.nan), 0.0)
+    assert base.clearly_better_than(diverged)
+    assert not diverged.clearly_better_than(base)
