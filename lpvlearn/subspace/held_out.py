@@ -54,13 +54,16 @@ def held_out(
     refitted: Callable[[list[Record]], Realization],
     records: Sequence[Record],
     *,
+    weight: Array | None = None,
     at_rest: bool = False,
 ) -> HeldOut:
     """Errors of a model on pieces of scaled records that it was not fitted to.
 
-    `refitted` makes the model of other records; `at_rest` says that all experiments
-    begin so.
+    `refitted` makes the model of other records; `weight` (n_outputs, n_outputs) is that
+    of the errors by which initial states are found; `at_rest` says that there are none
+    to find.
     """
+    W = np.eye(len(records[0].y)) if weight is None else weight
     blocks: list[float] = []
     errors, outputs = [], []
     records = thinned(records)
@@ -80,9 +83,9 @@ def held_out(
             with np.errstate(over="ignore", invalid="ignore"):
                 error = y - lti_response(model.A, model.B, model.C, model.D, u)
                 if not at_rest:
-                    free = free_responses(model.A, model.C, stop)
-                    x0 = estimate_initial_state(free[:start], error[:start])
-                    error = error - free @ x0
+                    free = free_responses(model.A, W @ model.C, stop)
+                    x0 = estimate_initial_state(free[:start], error[:start] @ W.T)
+                    error = error - np.linalg.solve(W, (free @ x0).T).T
             error = error[start:]
             errors.append(error)
             outputs.append(y[start:])

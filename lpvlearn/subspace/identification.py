@@ -232,7 +232,8 @@ def _fit(
                 model = other
         model = refine_simulation(model, white, free)
     if not whitening.is_none:
-        model = with_initial_states(whitening.undone(model), records, free)
+        model = whitening.undone(model)
+        model = with_initial_states(model, records, free, whitening.weight)
     candidate = Candidate(model, horizon, whitening, settings.refine)
     return _Fitted(candidate, subspace.singular_values)
 
@@ -266,7 +267,9 @@ def _refitted(
     return whitening.undone(model)
 
 
-_ROUNDS = 2  # the second noise model is of errors that the first has freed of its bias
+# Times that the noise is estimated again, of errors that the last estimate has freed of
+# some bias: each brings a clean output's noise nearer by ten.
+_ROUNDS = 6
 
 
 def identify(
@@ -284,22 +287,24 @@ def identify(
     """
     none = Whitening.none(len(records[0].y))
     as_found = settings._replace(enforce_stability=False)
-    if known is None:
-        fitted = _fit(records, order, horizon, as_found, none)
-        chosen = plain = fitted.candidate
-        for _ in range(_ROUNDS if settings.refine and settings.weigh else 0):
-            errors = simulation_errors(chosen.model, records)
-            whitening = Whitening.of(errors, settings.free)
-            if whitening.is_close_to(chosen.whitening):
-                break
+    first, start = (none, None) if known is None else (known.whitening, known.model)
+    fitted = _fit(records, order, horizon, as_found, first, start)
+    chosen = fitted.candidate
+    filtered = known is not None or len(records[0].y) == 1
+    for _ in range(_ROUNDS if settings.refine and settings.weigh else 0):
+        errors = simulation_errors(chosen.model, records)
+        whitening = Whitening.of(errors, settings.free, filtered=filtered)
+        if not whitening.is_close_to(chosen.whitening):
             again = _fit(records, order, horizon, as_found, whitening, chosen.model)
             chosen = again.candidate
-    else:
-        fitted = _fit(records, order, horizon, as_found, known.whitening, known.model)
-        chosen = plain = fitted.candidate
-        if not chosen.whitening.is_none and settings.compare:
-            plain = _fit(records, order, horizon, as_found, none, chosen.model)[0]
+        elif filtered:
+            break
+        else:  # the weights of the outputs are found
+            filtered = True
     if settings.compare and not chosen.whitening.is_none:
+        plain = fitted.candidate
+        if not plain.whitening.is_none:
+            plain = _fit(records, order, horizon, as_found, none, chosen.model)[0]
         rivals = [chosen, plain, plain._replace(refined=False)]
         chosen = _best_held_out(rivals, records, as_found)
         if not chosen.refined:
@@ -339,9 +344,11 @@ def validate(
     candidate: Candidate, records: Sequence[Record], settings: Settings
 ) -> HeldOut:
     """Errors of a candidate's like on parts of the records."""
-    at_rest = not settings.free.initial_states
     return held_out(
-        lambda train: _refitted(candidate, train, settings), records, at_rest=at_rest
+        lambda train: _refitted(candidate, train, settings),
+        records,
+        weight=candidate.whitening.weight,
+        at_rest=not settings.free.initial_states,
     )
 
 

@@ -66,8 +66,13 @@ class Whitening(NamedTuple):
         return cls(np.ones(1), np.eye(n_outputs))
 
     @classmethod
-    def of(cls, errors: Sequence[Array], free: Freedom) -> Whitening:
+    def of(
+        cls, errors: Sequence[Array], free: Freedom, *, filtered: bool = True
+    ) -> Whitening:
         """That of the simulation errors of scaled records, a row per sample.
+
+        Without a filter only the outputs are weighted: for a first model, in which the
+        errors of a clean output are those of the dynamics, and coloured by them.
 
         Errors that are rounding are left as they are.
 
@@ -80,10 +85,12 @@ class Whitening(NamedTuple):
         noisy = np.flatnonzero(size > _ROUNDING)
         if len(noisy) == 0 or not np.isfinite(size).all():
             return cls.none(len(size))
-        channels = [e[:, [i]] / size[i] for e in errors for i in noisy]
-        middle = int(np.median([len(e) for e in errors]))
-        model = autoregression(channels, highest=middle // _LEAST_LEFT)
-        coefficients = np.concatenate([[1.0], -model.C[0]])
+        coefficients = np.ones(1)
+        if filtered:
+            channels = [e[:, [i]] / size[i] for e in errors for i in noisy]
+            middle = int(np.median([len(e) for e in errors]))
+            model = autoregression(channels, highest=middle // _LEAST_LEFT)
+            coefficients = np.concatenate([coefficients, -model.C[0]])
         whitened = cls(coefficients, np.eye(len(size)))._filtered(errors)
         weight = _weight(np.vstack(whitened), free)
         return cls(coefficients, weight, _colour([e @ weight.T for e in whitened]))

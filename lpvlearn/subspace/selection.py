@@ -61,6 +61,8 @@ _MAX_ORDER, _VALUES_PER_PARAMETER = 20, 3
 # states; it is not to fit the noise itself.
 _PILOT_ORDER, _PILOT_STEPS = 8, 3
 
+_WEIGHINGS = 4  # of the outputs, with the pilot: each brings a clean one nearer by ten
+
 _MORE_ROUNDS = 1  # of all orders: with the noise of the first choice
 
 _PATIENCE = 3  # orders tried beyond the one with the best criterion so far
@@ -180,9 +182,11 @@ def _search(
         spaces = _spaces(white, orders[0], orders[-1], horizon, settings)
         return _try_orders(orders, spaces, white, settings, whitening.colour, max_iter)
 
-    def noise_of(tried: _Tried) -> Whitening:
+    def unwhitened(tried: _Tried) -> Realization:
         model = whitening.undone(tried.model)
-        model = with_initial_states(model, records, settings.free)
+        return with_initial_states(model, records, settings.free, whitening.weight)
+
+    def noise_of(model: Realization) -> Whitening:
         found = Whitening.of(simulation_errors(model, records), settings.free)
         lengths = [r.u.shape[1] for r in found.records(records, settings.free)]
         room = settings.max_horizon(lengths)  # the filter takes samples away
@@ -191,12 +195,25 @@ def _search(
 
     if settings.weigh:
         pilot = min(highest, _PILOT_ORDER) if order is None else order
-        whitening = noise_of(try_orders([pilot], _PILOT_STEPS)[0])
+        model = try_orders([pilot], _PILOT_STEPS)[0].model
+        for _ in range(_WEIGHINGS if len(records[0].y) > 1 else 0):
+            errors = simulation_errors(model, records)
+            again = Whitening.of(errors, settings.free, filtered=False)
+            if again.is_close_to(whitening):
+                break
+            whitening, white = again, again.records(records, settings.free)
+            weighted = whitening.model(model)
+            start = simulation_fit(weighted.A, weighted.C, white, settings.free)
+            weighted = refine_simulation(start, white, settings.free, _PILOT_STEPS)
+            model = with_initial_states(
+                whitening.undone(weighted), records, settings.free, whitening.weight
+            )
+        whitening = noise_of(model)
     orders = range(0 if order is None else order, highest + 1)
     tried = try_orders(orders)
     best = min(tried, key=lambda one: one.criterion)
     for _ in range(_MORE_ROUNDS if settings.weigh else 0):
-        again = noise_of(best)
+        again = noise_of(unwhitened(best))
         if again.is_close_to(whitening):
             break
         whitening = again

@@ -188,9 +188,17 @@ def simulation_errors(model: Realization, records: Sequence[Record]) -> list[Arr
 
 
 def with_initial_states(
-    model: Realization, records: Sequence[Record], free: Freedom
+    model: Realization,
+    records: Sequence[Record],
+    free: Freedom,
+    weight: Array | None = None,
 ) -> Realization:
-    """The model with the initial states that fit records best, and its loss on them."""
+    """The model with the initial states that fit records best, and its loss on them.
+
+    `weight` (n_outputs, n_outputs) is that of the errors of which the states make the
+    least, not of the loss.
+    """
+    W = np.eye(len(model.C)) if weight is None else weight
     at_rest = np.zeros((len(records), len(model.A)))
     model = model._replace(initial_states=at_rest)
     errors = simulation_errors(model, records)
@@ -199,9 +207,9 @@ def with_initial_states(
     if free.initial_states and model.A.size:
         states = []
         for i, error in enumerate(errors):
-            responses = free_responses(model.A, model.C, len(error))
-            states.append(estimate_initial_state(responses, error))
-            errors[i] = error - responses @ states[-1]
+            responses = free_responses(model.A, W @ model.C, len(error))
+            states.append(estimate_initial_state(responses, error @ W.T))
+            errors[i] = error - np.linalg.solve(W, (responses @ states[-1]).T).T
         model = model._replace(initial_states=np.array(states))
     return model._replace(loss=sum(float((error**2).sum()) for error in errors))
 

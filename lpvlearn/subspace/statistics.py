@@ -71,7 +71,8 @@ class Evidence:
     @cached_property
     def noise(self) -> NoiseModel:
         """Autoregression of the simulation errors, in the scale of the records."""
-        model = with_initial_states(self.model, self.records, self.free)
+        weight = self.whitening.weight
+        model = with_initial_states(self.model, self.records, self.free, weight)
         return autoregression(simulation_errors(model, self.records))
 
     @cached_property
