@@ -118,8 +118,11 @@ def _trial_steps(step: Array, jacobian: Array, residual: Array) -> Iterator[Arra
     """The whole step, then damped ones."""
     yield step
     scale = column_scale(jacobian)
-    left, s, right = linalg.svd(
-        jacobian / scale, full_matrices=False, check_finite=False
+    left, s, right = linalg.svd(  # by the driver that always converges
+        jacobian / scale,
+        full_matrices=False,
+        check_finite=False,
+        lapack_driver="gesvd",
     )
     kept = s > _RCOND * s[0]
     left, s, right = left[:, kept], s[kept], right[kept]
