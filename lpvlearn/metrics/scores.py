@@ -156,7 +156,8 @@ def _read_pair(
     y_true: Any, y_pred: Any, names: tuple[str, str] = ("y_true", "y_pred")
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return two matrices of equal shape, (n_samples, n_outputs)."""
-    true, pred = read_outputs(y_true)[0], read_outputs(y_pred)[0]
+    pair = zip((y_true, y_pred), names, strict=True)
+    true, pred = (read_outputs(values, name)[0] for values, name in pair)
     if true.shape != pred.shape or len(true) == 0:
         raise ValueError(
             f"`{names[0]}` and `{names[1]}` must have the same shape, with at least 1 "
