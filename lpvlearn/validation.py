@@ -87,6 +87,17 @@ def one_of(name: str, value: Any, allowed: Sequence[Any]) -> None:
     raise ValueError(f"`{name}` must be {last}{listed[-1]}. Got {value!r}.")
 
 
+def frequencies(omega: ArrayLike) -> Array:
+    """`omega`, (n_freq,) or a number, as a vector without NaN; it may hold infinity."""
+    omega = np.atleast_1d(real_array("omega", omega))
+    if omega.ndim != 1 or np.isnan(omega).any():
+        raise ValueError(
+            "`omega` must have shape (n_freq,) and hold no NaN. Got "
+            f"shape {omega.shape} with {np.isnan(omega).sum()} NaN."
+        )
+    return omega
+
+
 def finite_samples(name: str, value: ArrayLike, width: int) -> Array:
     """Inputs `u` or outputs `y` as a finite array of shape (n_samples, width)."""
     array = real_array(name, value)

@@ -214,7 +214,7 @@ TABLES = {
         ["operating point 1 (scheduling 0.5): Every input must vary", "'force'"],
     ),
     "an input of an array that does not move": (
-        lambda: LocalLPVPipeline(scheduling=2, experiment=3).fit(
+        lambda: LocalLPVPipeline(scheduling=2, experiment=3, sampling_time=1).fit(
             X[["force", "time", "kappa", "run"]].assign(time=0.0).to_numpy(), Y
         ),
         ["Every input must vary", "'1' constant at 0"],

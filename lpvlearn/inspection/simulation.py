@@ -316,4 +316,6 @@ def _time_of(estimator: Any, table: Table) -> tuple[Array, str]:
     step = getattr(estimator, "sampling_time_", None)
     if step is None and hasattr(estimator, "lti_"):
         step = estimator.lti_.sampling_time
-    return (number, "Sample") if step is None else (float(step) * number, "Time (s)")
+    if step is None or step is True:
+        return number, "Sample"
+    return float(step) * number, "Time (s)"

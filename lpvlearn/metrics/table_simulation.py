@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.experiments import Experiment, read_experiments
+from ..data.experiments import NO_TIME, Experiment, read_experiments
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..systems.simulation import (
@@ -53,14 +53,15 @@ def fit_of(
 def simulate_experiments(
     model: StateSpace | LPVStateSpace,
     experiments: Sequence[Experiment],
-    sampling_time: float,
+    sampling_time: float | None,
     *,
     estimate: bool,
 ) -> Array:
     """Outputs (n_samples, n_outputs) of a model along the experiments of a table.
 
     Rows stand where they do in the table; `sampling_time` is that of experiments that
-    do not tell it. From rest, or from initial states estimated on the outputs.
+    do not tell it, None where it is not known. From rest, or from initial states
+    estimated on the outputs.
     """
     table = np.empty((sum(len(e.rows) for e in experiments), model.n_outputs))
     for e in experiments:
@@ -70,20 +71,23 @@ def simulate_experiments(
 
 
 def _simulate(
-    model: StateSpace | LPVStateSpace, e: Experiment, dt: float, estimate: bool
+    model: StateSpace | LPVStateSpace, e: Experiment, dt: float | None, estimate: bool
 ) -> Array:
     x0 = None
+    if isinstance(model, StateSpace) and not model.is_continuous:
+        if estimate:
+            y = _outputs(e, model.n_outputs)
+            x0 = model.estimate_initial_state(e.inputs, y)
+        return model.simulate(e.inputs, initial_state=x0)
+    if dt is None:
+        raise ValueError(NO_TIME.format("the model is"))
     if isinstance(model, LPVStateSpace):
         kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
         if estimate:
             error = _outputs(e, model.n_outputs) - model.simulate(e.inputs, kappa, dt)
             x0 = estimate_initial_state(model.free_responses(kappa, dt), error)
         return model.simulate(e.inputs, kappa, dt, x0)
-    sampled = model.to_discrete(dt) if model.is_continuous else model
-    if estimate:
-        y = _outputs(e, model.n_outputs)
-        x0 = sampled.estimate_initial_state(e.inputs, y)
-    return sampled.simulate(e.inputs, initial_state=x0)
+    return _simulate(model.to_discrete(dt), e, dt, estimate)
 
 
 def _outputs(experiment: Experiment, n_outputs: int) -> Array:
@@ -138,5 +142,6 @@ class TableSimulator(BaseEstimator):
         return read_experiments(self, X, y, sampling_time=self.sampling_time)
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
-        step = self.sampling_time or 1.0  # where the table does not tell it
-        return simulate_experiments(self.model, experiments, step, estimate=estimate)
+        return simulate_experiments(
+            self.model, experiments, self.sampling_time, estimate=estimate
+        )

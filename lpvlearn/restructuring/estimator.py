@@ -512,7 +512,13 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                     else "Either it cannot represent the model, or the search ended in "
                     "a wrong basin."
                 )
-                + " Give `init`, or raise `n_starts`, to search elsewhere.",
+                + " Give `init`, or raise `n_starts`, to search elsewhere."
+                + (
+                    ""
+                    if self.structure is None or self.lti_.is_continuous
+                    else " The black box is in discrete time: convert it by "
+                    "to_continuous() if the structure is in continuous time."
+                ),
                 ConvergenceWarning,
             )
         if self.identifiability_.rank < self.structure_.n_params:

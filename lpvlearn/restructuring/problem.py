@@ -187,14 +187,22 @@ def problem_from_models(
     for model in models:
         _check_model(model)
     first = models[0]
+    if structure is not None:
+        _check_time(structure, first.sampling_time)
     structure = _structure_for(structure, first)
     p, dt = structure.n_outputs, first.sampling_time
     for model in models:
-        own = (*model.D.shape, model.sampling_time)
-        if own != (p, structure.n_inputs, dt):
+        if model.D.shape != (p, structure.n_inputs):
             raise ValueError(
                 f"`structure` has {p} outputs and {structure.n_inputs} inputs, `model` "
-                f"has {own[0]} and {own[1]} (sampling time {own[2]}). They must agree."
+                f"has {model.n_outputs} and {model.n_inputs}. They must agree; an "
+                "input too many is often a column whose role was forgotten (`time=`, "
+                "`scheduling=`, `experiment=`)."
+            )
+        if model.sampling_time != dt:
+            raise ValueError(
+                "models to be matched together must have one sampling time. Got "
+                f"{dt} and {model.sampling_time}."
             )
     boxes = [
         Target(m.A, m.B, m.C, structure.feedthrough_of(m.D), m.sampling_time)
@@ -236,6 +244,22 @@ def _check_model(model: Any) -> None:
         raise ValueError(
             "`model` must be stable: its distance to a gray-box model is infinite "
             f"otherwise. Got a pole at {worst:.4g}."
+        )
+
+
+def _check_time(structure: Any, sampling_time: float | None) -> None:
+    """Refuse a discrete-time model where the structure is not, or cannot be told."""
+    if sampling_time is True:
+        raise ValueError(
+            "`model` must have a known sampling time beside a `structure`. Got one "
+            "that counts time in samples. Identify it with `time=` or `sampling_time=` "
+            "in seconds, and convert it by to_continuous() for a structure in "
+            "continuous time; sampling_time=1 stands for samples."
+        )
+    if sampling_time is not None and getattr(structure, "is_mechanical", False):
+        raise ValueError(
+            "`model` must be in continuous time for equations of motion. Got sampling "
+            f"time {sampling_time} s. Convert it by to_continuous()."
         )
 
 

@@ -21,7 +21,7 @@ from ..data.experiments import (
 from ..data.preparation import split_at_gaps
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair
-from ..validation import one_of
+from ..validation import frequencies, one_of
 from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
 from .residuals import (
     Residuals,
@@ -61,7 +61,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         samples "auto" looks at that many, spread over the experiments.
     sampling_time : float, default=None
         Seconds between samples, which must agree with the `time` column. None: the
-        step of that column; without one, 1 s.
+        step of that column; without one the model counts time in samples, and is
+        refused where continuous time is asked of it.
     feedthrough : bool or array-like of bool, default=True
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
         shape (n_outputs, n_inputs) single entries of D.
@@ -361,11 +362,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._evidence = fitted.evidence
 
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
-        """Seconds between the samples of a table."""
+        """Seconds between the samples of a table; True where nothing tells them."""
         for e in experiments:
             if e.sampling_time:
                 return e.sampling_time
-        return 1.0 if self.sampling_time is None else float(self.sampling_time)
+        return True if self.sampling_time is None else float(self.sampling_time)
 
     def predict(self, X: Any) -> Array:
         """Simulate the outputs of every experiment from rest.
@@ -647,7 +648,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _per_sample(self, omega: ArrayLike) -> Array:
         """Angular frequencies in radians per sample."""
         step = self.lti_.sampling_time or 1.0
-        return np.atleast_1d(np.asarray(omega, dtype=float)) * step
+        return frequencies(omega) * step
 
     def selection_text(self) -> str:
         """`selection_` as a text table, the choice marked."""

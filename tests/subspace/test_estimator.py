@@ -309,6 +309,17 @@ def test_a_sampling_time_beside_a_time_column_must_agree_with_it(given):
         assert model.fit(X, np.roll(u, 1)).lti_.sampling_time == pytest.approx(0.1)
 
 
-def test_without_any_sampling_time_a_sample_lasts_a_second():
+def test_without_any_sampling_time_time_is_counted_in_samples():
     u = np.random.default_rng(0).standard_normal((100, 1))
-    assert SubspaceLTI(1).fit(u, np.roll(u, 1)).lti_.sampling_time == 1.0
+    model = SubspaceLTI(1, horizon=5).fit(u, np.roll(u, 1))
+    assert model.lti_.sampling_time is True
+    known = SubspaceLTI(1, horizon=5, sampling_time=1).fit(u, np.roll(u, 1))
+    np.testing.assert_array_equal(model.predict(u), known.predict(u))
+    omega = np.linspace(0.1, 3.0, 4)
+    np.testing.assert_array_equal(
+        model.frequency_response_std(omega), known.frequency_response_std(omega)
+    )
+    with pytest.raises(ValueError, match="`time=`.*or `sampling_time=`"):
+        model.lti_.to_continuous()
+    stream = SubspaceLTI(1, horizon=5).partial_fit(u, np.roll(u, 1))
+    assert stream.partial_fit(u, np.roll(u, 1)).lti_.sampling_time is True
