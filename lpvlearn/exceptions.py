@@ -1,15 +1,18 @@
-"""Warnings that this library gives, and the one way to give them."""
+"""Errors and warnings of this library, and the one way to give a warning."""
 
 from __future__ import annotations
 
 import os
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 _HERE = str(Path(__file__).parent) + os.sep
 
@@ -20,6 +23,25 @@ class ExtrapolationWarning(UserWarning):
 
 class RankWarning(UserWarning):
     """The data do not determine the model: a minimum-norm solution was taken."""
+
+
+class DivergenceError(ValueError):
+    """A simulation left the range of the floating-point numbers."""
+
+
+def finite_simulation(
+    outputs: NDArray[np.float64], cause: Callable[[], str]
+) -> NDArray[np.float64]:
+    """Simulated outputs, or a DivergenceError that tells where they end, and why."""
+    finite = np.isfinite(outputs)
+    if finite.all():
+        return outputs
+    sample, channel = (int(i) for i in np.argwhere(~finite)[0])
+    before = f"{outputs[sample - 1, channel]:.4g} at sample {sample - 1}, and "
+    raise DivergenceError(
+        f"the simulation diverges: output {channel} is {before if sample else ''}"
+        f"beyond all numbers at sample {sample}. {cause()}"
+    )
 
 
 class Told(NamedTuple):

@@ -8,7 +8,8 @@ else by a level of the index, else by its position.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from numbers import Integral
@@ -19,7 +20,8 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_array, check_consistent_length, validate_data
 
-from .forgotten_roles import warn_of_forgotten_roles
+from ..exceptions import DivergenceError
+from .forgotten_roles import warn_of_disorder, warn_of_forgotten_roles
 from .timestamps import check_uniform_time, time_in_seconds
 
 Array = NDArray[np.float64]
@@ -131,6 +133,11 @@ class Table:
 
     def __init__(self, X: Any, argument: str = "X") -> None:
         X = X if is_table(X) or hasattr(X, "dtype") else np.asarray(X, object)
+        if len(X.shape) != 2:
+            raise ValueError(
+                f"{argument} must have shape (n_samples, n_features). Got {X.shape}; "
+                "reshape(-1, 1) makes a column."
+            )
         self.X = X
         self.n_rows: int = X.shape[0]
         self.named = is_table(X)
@@ -222,6 +229,15 @@ class Experiment:
     input_names: tuple[Hashable, ...] = ()  # of the columns, or their positions
 
 
+@contextmanager
+def naming(experiment: Experiment) -> Iterator[None]:
+    """Name the experiment in which a simulation diverges."""
+    try:
+        yield
+    except DivergenceError as error:
+        raise DivergenceError(f"Experiment {experiment.label!r}: {error}") from error
+
+
 def read_experiments(
     estimator: Any,
     X: Any,
@@ -274,6 +290,8 @@ def read_experiments(
     if Y is not None:
         _check_finite(Y, y_names, "y", labels, groups, allow_missing)
     steps = _sampling_times(by_time, labels, groups, sampling_time)
+    if by_time is None:
+        warn_of_disorder(X, groups)
     if reset and roles["inputs"] is None:
         warn_of_forgotten_roles(U, names, groups, roles)
     return [
@@ -321,25 +339,49 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
     if text or not array:
         shown = type(values).__name__ if isinstance(values, dict) else repr(values)
         raise ValueError(
-            f"`{argument}` must be a table or an array with a row for each sample, as "
-            f"a pandas.DataFrame is. Got {shown}."
+            f"`{argument}` must be a table (a pandas.DataFrame) or an array of "
+            f"numbers. Got {shown}."
         )
+    if np.ma.isMaskedArray(values):
+        values = np.ma.filled(values.astype(float), np.nan)  # masked ones are missing
     try:
         return check_array(
             values, ensure_all_finite=False, input_name=argument, **options
         )
     except (TypeError, ValueError) as error:
-        entries = np.asarray(values)
-        if entries.dtype.kind in "OSU" and entries.ndim:
-            k = _first_not_a_number(entries.ravel())
-            if k is not None:
-                place = [int(i) for i in np.unravel_index(k, entries.shape)]
-                raise type(error)(
-                    f"`{argument}` must hold numbers. Got {entries.ravel()[k]!r} at "
-                    f"{', '.join(map('{} {}'.format, ('row', 'column'), place))}: "
-                    f"{error}."
-                ) from error
+        try:
+            entries = np.asarray(values)
+        except ValueError:
+            raise ValueError(
+                f"`{argument}` must have rows of one length. Got rows that differ."
+            ) from error
+        flat = entries.ravel()
+        k = _first_not_a_number(flat) if entries.dtype.kind in "OSU" else None
+        if k is not None and entries.ndim:  # a sparse matrix has none
+            at = zip(
+                ("row", "column"), np.unravel_index(k, entries.shape), strict=False
+            )
+            raise type(error)(
+                f"`{argument}` must hold numbers. Got {as_scalar(flat[k])!r} at "
+                f"{', '.join(f'{axis} {i}' for axis, i in at)}: {error}."
+            ) from error
         raise
+
+
+def as_numbers(argument: str, values: Any) -> Array:
+    """Numbers in an array of any shape, a single one in a vector.
+
+    Raises a ValueError about the `argument` where one is not a real number.
+    """
+    many = hasattr(values, "__len__") and np.shape(values) != ()
+    return _checked(
+        argument,
+        values if many or isinstance(values, str) else [values],
+        dtype=np.float64,
+        ensure_2d=False,
+        allow_nd=True,
+        ensure_min_samples=0,
+    )
 
 
 def _numbers(columns: Sequence[Column], n_rows: int, argument: str) -> Array:
@@ -488,6 +530,16 @@ def from_trajectories(
     0  1.0    0.3           0   0.0
     1  0.0    0.3           0   0.1
     """
+    if not isinstance(trajectories, Sequence) or isinstance(trajectories, str):
+        raise ValueError(
+            "`trajectories` must be a list of tuples (u, kappa, y) or (u, y). Got "
+            f"{type(trajectories).__name__}."
+        )
+    if sampling_time is not None and not as_numbers("sampling_time", sampling_time) > 0:
+        raise ValueError(
+            "`sampling_time` must be a positive number of seconds. Got "
+            f"{sampling_time}."
+        )
     if len(trajectories) == 0:
         raise ValueError("`trajectories` must hold at least one tuple. Got 0.")
     parts = [_trajectory(k, item) for k, item in enumerate(trajectories)]
@@ -523,8 +575,12 @@ def _trajectory(
             "`trajectories` must be a list of tuples (u, kappa, y) or (u, y). Got "
             f"{got} instead of 2 or 3 arrays in trajectory {k}."
         )
-    u, y = _as_columns(item[0]), _as_columns(item[-1])
-    kappa = _as_columns(item[1]) if len(item) == 3 else None
+    names = ("u", "y") if len(item) == 2 else ("u", "kappa", "y")
+    arrays = {
+        name: _as_columns(f"trajectories[{k}]: {name}", values)
+        for name, values in zip(names, item, strict=True)
+    }
+    u, y, kappa = arrays["u"], arrays["y"], arrays.get("kappa")
     if kappa is not None and len(kappa) == 1:
         kappa = np.repeat(kappa, len(u), axis=0)
     lengths = [len(a) for a in (u, kappa, y) if a is not None]
@@ -536,6 +592,10 @@ def _trajectory(
     return u, kappa, y
 
 
-def _as_columns(values: ArrayLike) -> Array:
-    array = np.asarray(values, dtype=np.float64)
+def _as_columns(name: str, values: ArrayLike) -> Array:
+    array = as_numbers(name, values)
+    if array.ndim > 2:
+        raise ValueError(
+            f"`{name}` must have shape (n_samples, n_channels). Got {array.shape}."
+        )
     return array if array.ndim == 2 else array.reshape(-1, 1)

@@ -1,7 +1,8 @@
-"""Columns that were taken for inputs and look as if they had another role.
+"""Tables that look as if a role was forgotten, or their rows shuffled.
 
 A column without a role is an input. The time, the number of the experiment or the
-scheduling variable makes a poor one: the fit goes on and its numbers mean nothing.
+scheduling variable makes a poor one: the fit goes on and its numbers mean nothing. So
+it does with shuffled rows, which no time column gives away where it is forgotten.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from ..exceptions import warn
@@ -19,9 +21,11 @@ Indices = NDArray[np.intp]
 
 # Steps that differ by no more than that part of them are even: stamps are rounded, and
 # no other signal but a ramp comes near.
-_EVEN = 0.02
+_EVEN = 0.05
 _FEWEST = 10  # steps below which a few even ones are chance
 _RESTARTS = 0.05  # share of the steps that may go back, from experiment to experiment
+
+_ORDERED = ("integer", "datetime64", "timedelta64")  # index types that tell an order
 
 _HOLDS = 10.0  # samples that a number of an experiment stands for, at least, on average
 _LEVELS = 3  # that make a count; two are a step, the commonest input of all
@@ -61,6 +65,29 @@ def warn_of_forgotten_roles(
                 f"operating_point={name!r}; if the system got it as an input, list the "
                 "inputs in `inputs`."
             )
+
+
+def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
+    """Warn of rows that are not in the order of their numbers or dates, the index.
+
+    Labels that stand twice (tables below each other) tell nothing.
+    """
+    index = getattr(X, "index", None)
+    if not isinstance(index, pd.Index) or index.inferred_type not in _ORDERED:
+        return
+    for rows in groups:
+        labels = index[rows]
+        if labels.is_unique and not labels.is_monotonic_increasing:
+            later = int(np.argmin(labels[1:] > labels[:-1])) + 1
+            warn(
+                "The rows of X are not in the order of its index: "
+                f"{labels[later]!s} comes after {labels[later - 1]!s}. A dynamic model "
+                "needs the samples in the order of time. If they were shuffled, sort "
+                "them (sort_index of pandas) and split by experiment with "
+                "ExperimentSplit or in time with BlockedTimeSeriesSplit; if the index "
+                "means nothing, drop it (reset_index)."
+            )
+            return
 
 
 def _typical_step(column: Array) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..data.experiments import as_numbers
 from ..models.statespace import StateSpace
 from ..systems.response import pole_grid, pole_rates
 
@@ -80,7 +81,7 @@ def response_up_to_nyquist(model: StateSpace, omega: Array) -> NDArray[np.comple
 
 def check_frequencies(omega: ArrayLike) -> Array:
     """`omega` as increasing positive frequencies, or a ValueError."""
-    grid = np.asarray(omega, dtype=float)
+    grid = as_numbers("omega", omega)
     if grid.ndim != 1 or len(grid) < 2:
         raise ValueError(
             "`omega` must hold at least 2 angular frequencies in rad/s, shape "

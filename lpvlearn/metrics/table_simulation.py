@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.experiments import NO_TIME, Experiment, read_experiments
+from ..data.experiments import NO_TIME, Experiment, naming, read_experiments
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..systems.simulation import (
@@ -66,7 +66,8 @@ def simulate_experiments(
     table = np.empty((sum(len(e.rows) for e in experiments), model.n_outputs))
     for e in experiments:
         dt = e.sampling_time or sampling_time
-        table[e.rows] = _simulate(model, e, dt, estimate)
+        with naming(e):
+            table[e.rows] = _simulate(model, e, dt, estimate)
     return table
 
 
@@ -139,7 +140,13 @@ class TableSimulator(BaseEstimator):
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
                 "that the LPV model follows. Got None."
             )
-        return read_experiments(self, X, y, sampling_time=self.sampling_time)
+        found = read_experiments(self, X, y, sampling_time=self.sampling_time)
+        if len(found[0].input_names) != self.model.n_inputs:
+            raise ValueError(
+                f"`inputs` must name the {self.model.n_inputs} input(s) of the model "
+                f"among the columns of X. Got {list(found[0].input_names)}."
+            )
+        return found
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
         return simulate_experiments(

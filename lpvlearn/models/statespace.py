@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import warn
+from ..exceptions import finite_simulation, warn
 from ..systems.balancing import align_signs, balancing_transformation
 from ..systems.hinf_norm import hinf_norm
 from ..systems.response import frequency_response
@@ -250,6 +250,8 @@ class StateSpace:
         ValueError
             If a shape does not fit, a value is not finite, or `sampling_time` is
             missing or not that of the discrete-time model.
+        DivergenceError
+            If the outputs overflow; the first sample and value are told.
 
         Examples
         --------
@@ -268,7 +270,19 @@ class StateSpace:
                     f"`sampling_time` must be {dt} s, the model's own. "
                     f"Got {sampling_time}. Convert with to_continuous() first."
                 )
-        return lti_response(A, B, self.C, self.D, u, x0)
+        with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
+            y = lti_response(A, B, self.C, self.D, u, x0)
+        return finite_simulation(y, self._why_it_diverges)
+
+    def _why_it_diverges(self) -> str:
+        if self.is_stable:
+            return "The model is stable: scale `u` or `initial_state` down."
+        poles = self.poles()
+        worst = poles[self._growth(poles).argmax()]
+        return (
+            f"The model is unstable (a pole at {worst:.6g}): use stability='enforce' "
+            "of SubspaceLTI, or a shorter record."
+        )
 
     def estimate_initial_state(self, u: ArrayLike, y: ArrayLike) -> Array:
         """Initial state of a discrete-time model with which it fits a record best.

@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from numbers import Integral
 from time import perf_counter
 from typing import Any
 
@@ -31,7 +32,7 @@ from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
-from ..validation import one_of, positive_time
+from ..validation import one_of, positive_time, whole_number
 from .points import PointRunner, identify_points, restructure_points
 from .reports import Tables, summarise, tables
 
@@ -448,6 +449,16 @@ list, default=None
         one_of("combine", self.combine, ("pool", "average"))
         one_of("discretization", self.discretization, ("zoh", "tustin"))
         one_of("on_error", self.on_error, ("raise", "skip"))
+        one_of("efficient", self.efficient, (True, False))
+        if not isinstance(self.verbose, bool):
+            whole_number("verbose", self.verbose, 0)
+        if self.n_jobs is not None and (
+            not isinstance(self.n_jobs, Integral) or self.n_jobs == 0
+        ):
+            raise ValueError(
+                "`n_jobs` must be None or an integer, -1 for all processors, not 0. "
+                f"Got {self.n_jobs!r}."
+            )
         for name in _STEPS:
             _check_step(name, getattr(self, name))
 

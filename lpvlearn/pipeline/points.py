@@ -238,20 +238,27 @@ def _bare(experiment: Experiment) -> Experiment:
 
 
 def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
-    """What to try first if the model turns out unstable."""
+    """What to try first if the model turns out unstable: offsets make it so."""
     outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
-    spread = outputs.std(axis=0)
     if len(outputs) > len(experiments) and not np.ptp(outputs, axis=0).any():
         raise ValueError(
             f"An output must vary. Got {outputs[0].tolist()} throughout: no dynamics "
             "can be identified from it."
         )
-    if (np.abs(outputs.mean(axis=0)) > _OFFSET * spread).any():
-        return (
-            "The outputs stand far from zero: subtract their value at rest from y (a "
-            "simulation begins there). Else try "
-        )
-    return "Try "
+    inputs = np.vstack([e.inputs for e in experiments])
+    far = [
+        (name, place)
+        for name, place, values in (("outputs", "y", outputs), ("inputs", "X", inputs))
+        if (np.abs(values.mean(axis=0)) > _OFFSET * values.std(axis=0)).any()
+    ]
+    if not far:
+        return "Try "
+    names, places = (" and ".join(words) for words in zip(*far, strict=True))
+    return (
+        f"The {names} stand far from zero: subtract their value at rest from {places} "
+        "(a simulation begins there), or let the local models find a constant: "
+        "local=SubspaceLTI(offset='auto'). Else try "
+    )
 
 
 def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpace:

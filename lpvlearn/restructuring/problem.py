@@ -20,6 +20,7 @@ from scipy.linalg import block_diag, qr
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
+from ..validation import real_array
 from .error_system import ErrorSystem, Target, series
 from .least_squares import (
     LeastSquaresResult,
@@ -156,10 +157,11 @@ class RestructuringProblem:
         Every realization's response is carried to the parameters to first order; the
         covariance of their mean is that of one divided by their number.
         """
-        if len(models) < 2:
+        if len(models) < 2 or not all(isinstance(m, StateSpace) for m in models):
             raise ValueError(
-                "`realizations` must be at least 2 models to have a spread. Got "
-                f"{len(models)}."
+                "`realizations` must be at least 2 models, each a StateSpace, to have "
+                f"a spread. Got {len(models)} of "
+                f"{', '.join(sorted({type(m).__name__ for m in models}))}."
             )
         G = np.array([model.frequency_response(self.omega) for model in models])
         changes = self.parameter_changes(theta, G - G.mean(0))
@@ -308,11 +310,13 @@ def problem_from_response(
         own = filter_.frequency_response(grid)
         W = own if own.shape == W.shape else own * W  # one for all outputs
     if sample_weight is not None:
-        scale = np.asarray(sample_weight, dtype=float).reshape(-1)
-        if scale.shape != grid.shape or not np.isfinite(scale).all() or scale.min() < 0:
+        scale = real_array("sample_weight", sample_weight).reshape(-1)
+        known = scale.shape == grid.shape and np.isfinite(scale).all()
+        if not known or scale.min() < 0 or scale.max() == 0:
             raise ValueError(
-                f"`sample_weight` must hold {len(grid)} finite weights, not negative, "
-                f"one for each frequency. Got shape {np.shape(sample_weight)}."
+                f"`sample_weight` must hold {len(grid)} finite weights, one for each "
+                "frequency, not negative and not all zero. Got shape "
+                f"{np.shape(sample_weight)}."
             )
         W = W * scale[:, None, None]
     system = MeasuredErrorSystem(structure, grid, G, W)

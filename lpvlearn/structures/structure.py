@@ -213,10 +213,12 @@ class GrayBoxStructure:
         np.float64(2.4525)
         """
         start, names = named_values("initial", initial, parameter_names)
-        given = function(start)
-        if len(given) not in (3, 4):
+        given = function(start) if callable(function) else function
+        if not isinstance(given, tuple | list) or len(given) not in (3, 4):
+            many = f"{len(given)} of them" if isinstance(given, tuple | list) else ""
             raise ValueError(
-                f"`function` must return (A, B, C) or (A, B, C, D). Got {len(given)}."
+                "`function` must be a function of the parameters that returns "
+                f"(A, B, C) or (A, B, C, D). Got {many or type(given).__name__}."
             )
         A, B, C = given[:3]
         model = StateSpace(A, B, C, given[3] if len(given) == 4 else None)

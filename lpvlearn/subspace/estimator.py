@@ -15,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted
 from ..data.experiments import (
     Experiment,
     Table,
+    naming,
     read_experiments,
     read_outputs,
 )
@@ -713,7 +714,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Outputs in the rows of their samples, NaN elsewhere."""
         out = np.full((n_samples, self.n_outputs_), np.nan)
         for e in experiments:
-            out[e.rows] = outputs(e) + self.output_offset_
+            with naming(e):
+                out[e.rows] = outputs(e) + self.output_offset_
         return out[:, 0] if self._single_output else out
 
 
