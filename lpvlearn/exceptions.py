@@ -36,10 +36,10 @@ def finite_simulation(
     finite = np.isfinite(outputs)
     if finite.all():
         return outputs
-    sample, channel = (int(i) for i in np.argwhere(~finite)[0])
-    before = f"{outputs[sample - 1, channel]:.4g} at sample {sample - 1}, and "
+    sample, *place = (int(i) for i in np.argwhere(~finite)[0])
+    before = f"{outputs[sample - 1, *place]:.4g} at sample {sample - 1}, and "
     raise DivergenceError(
-        f"the simulation diverges: output {channel} is {before if sample else ''}"
+        f"the simulation diverges: output {place[0]} is {before if sample else ''}"
         f"beyond all numbers at sample {sample}. {cause()}"
     )
 

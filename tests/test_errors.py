@@ -528,7 +528,7 @@ STEPS |= {
     ),
     "a word for a function": (
         lambda: GrayBoxStructure.from_function("pendulum", [1.0]),
-        ["`function` must be a function", "Got str"],
+        ["`function` must return (A, B, C)", "Got str"],
     ),
     "a function of two matrices": (
         lambda: GrayBoxStructure.from_function(lambda p: (1, 2), [1.0]),

@@ -292,8 +292,7 @@ class LPVStateSpace:
                 states = state_trajectory(A, forcing, x)
                 y[rows] = C @ states + D @ u[rows]
                 x = A[-1] @ states[-1] + forcing[-1]
-        finite_simulation(y.reshape(len(y), -1), lambda: model._why_it_diverges(kappa))
-        return y
+        return finite_simulation(y, lambda: model._why_it_diverges(kappa))
 
     def _why_it_diverges(self, kappa: Array) -> str:
         """The worst of the frozen models along a trajectory, and what may be wrong."""

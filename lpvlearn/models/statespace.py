@@ -325,10 +325,11 @@ class StateSpace:
                 "`u` and `y` must have one row for each of the same samples, at least "
                 f"one. Got {len(u)} and {len(y)}."
             )
-        free = free_responses(self.A, self.C, len(y))
-        return estimate_initial_state(
-            free, y - lti_response(self.A, self.B, self.C, self.D, u)
-        )
+        error = y - self.simulate(u)
+        with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
+            free = free_responses(self.A, self.C, len(y))
+        finite_simulation(free, self._why_it_diverges)
+        return estimate_initial_state(free, error)
 
     def transform(self, T: ArrayLike) -> StateSpace:
         """Change the state basis: ``(T A T^-1, T B, C T^-1, D)``.

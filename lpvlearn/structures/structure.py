@@ -217,8 +217,8 @@ class GrayBoxStructure:
         if not isinstance(given, tuple | list) or len(given) not in (3, 4):
             many = f"{len(given)} of them" if isinstance(given, tuple | list) else ""
             raise ValueError(
-                "`function` must be a function of the parameters that returns "
-                f"(A, B, C) or (A, B, C, D). Got {many or type(given).__name__}."
+                "`function` must return (A, B, C) or (A, B, C, D) for a vector of "
+                f"parameters. Got {many or type(given).__name__}."
             )
         A, B, C = given[:3]
         model = StateSpace(A, B, C, given[3] if len(given) == 4 else None)

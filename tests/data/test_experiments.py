@@ -142,11 +142,8 @@ def test_interleaved_experiments_are_taken_apart_in_order():
 
 
 def test_experiments_come_in_the_order_of_first_appearance():
-    X, y = make_table()
-    labels = [
-        run.label
-        for run in read(X[::-1], y[::-1], experiment="run", time=None, inputs="u1")
-    ]
+    X, y = (table[::-1].reset_index(drop=True) for table in make_table())
+    labels = [run.label for run in read(X, y, experiment="run", time=None, inputs="u1")]
     assert labels == ["run 2", "run 1", "run 0"]
 
 

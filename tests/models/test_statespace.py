@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace
+from lpvlearn.exceptions import DivergenceError
 
 from ..conftest import stable_model
 
@@ -341,6 +342,32 @@ def test_control_models_of_unknown_time_or_kind_are_refused():
         StateSpace.from_control(types.SimpleNamespace(**known, dt=None))
     with pytest.raises(ValueError, match="must be a control.StateSpace.*int"):
         StateSpace.from_control(3)
+
+
+# -- divergence ------------------------------------------------------------------
+
+
+def test_an_unstable_model_grows_until_its_numbers_end():
+    model = StateSpace(10.0, 1, 1, sampling_time=1.0)
+    y = model.simulate(np.ones(309))  # 1.1e307 at last
+    assert_allclose(y[:4, 0], [0, 1, 11, 111])
+    assert np.isfinite(y).all()
+    with pytest.raises(DivergenceError, match=r"0 is 1\.111e\+308 at sample 309"):
+        model.simulate(np.ones(311))
+    with pytest.raises(DivergenceError, match=r"sample 310\. .*\(a pole at 10"):
+        model.simulate(np.ones(2000))
+    with pytest.raises(DivergenceError, match=r"\(a pole at 10"):
+        model.estimate_initial_state(np.zeros(2000), np.ones(2000))
+
+
+def test_a_continuous_model_diverges_as_its_samples_do():
+    with pytest.raises(DivergenceError, match=r"a pole at 2\+0j"):
+        StateSpace(2.0, 1, 1).simulate(np.ones(9000), sampling_time=0.1)
+
+
+def test_a_stable_model_is_not_blamed():
+    with pytest.raises(DivergenceError, match="is stable: scale `u`"):
+        StateSpace(0.5, 1e10, 1, sampling_time=1.0).simulate([1e300, 1e300, 1.0])
 
 
 # -- time in samples -------------------------------------------------------------

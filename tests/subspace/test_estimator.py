@@ -5,12 +5,13 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.signal import lfilter
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.exceptions import RankWarning
+from lpvlearn.exceptions import DivergenceError, RankWarning
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
@@ -323,3 +324,21 @@ def test_without_any_sampling_time_time_is_counted_in_samples():
         model.lti_.to_continuous()
     stream = SubspaceLTI(1, horizon=5).partial_fit(u, np.roll(u, 1))
     assert stream.partial_fit(u, np.roll(u, 1)).lti_.sampling_time is True
+
+
+@pytest.mark.filterwarnings("ignore:The identified model is unstable")
+def test_predictions_that_diverge_name_experiment_and_sample():
+    rng = np.random.default_rng(0)
+    X = pd.DataFrame({"u": rng.normal(size=60), "run": "short"})
+    y = lfilter([0.0, 1.0], [1.0, -1.5], X["u"])
+    model = SubspaceLTI(1, horizon=4, experiment="run").fit(X, y)
+    assert np.isfinite(model.predict(X)).all()
+    long = pd.DataFrame({"u": rng.normal(size=3000), "run": "long"})
+    both = pd.concat([X, long], ignore_index=True)
+    for use in (
+        model.predict,
+        lambda both: model.score(both, both["u"]),
+        lambda both: model.predict_with_initial_state(both, both["u"]),
+    ):
+        with pytest.raises(DivergenceError, match="Experiment 'long': .*pole at 1.5"):
+            use(both)
