@@ -333,6 +333,11 @@ TABLES |= {
         ["`X` must be a table (a pandas.DataFrame)", "'data.csv'"],
     ),
     "nothing for the table": (lambda: fit(None), ["`X` must be a table", "None"]),
+    "a set for the table": (lambda: fit({1, 2}), ["`X` must be a table", "set"]),
+    "dates for the inputs": (
+        lambda: SubspaceLTI(1).fit(np.zeros((4, 1), "datetime64[s]"), np.ones(4)),
+        ["`X` must hold numbers", "dates", "`time`"],
+    ),
     "a dict for the table": (lambda: fit({"a": 1}), ["`X` must be a table", "dict"]),
     "a series of words for the outputs": (
         lambda: fit(y=put("off", 3, "position", Y)["position"]),
@@ -346,7 +351,7 @@ TABLES |= {
         lambda: fit(y=["off"] * len(X)),
         ["`y` must hold numbers", "'off' at row 0"],
     ),
-    "a number for the outputs": (lambda: fit(y=3.0), ["`y` must be a table", "3.0"]),
+    "a number for the outputs": (lambda: fit(y=3.0), ["`y` must be a table", "float"]),
     "words in an array of inputs": (
         lambda: SubspaceLTI(1).fit([["1.0"], ["off"]], [1.0, 2.0]),
         ["`X` must hold numbers", "'off' at row 1, column 0"],
@@ -676,7 +681,7 @@ SPLITS = {
         lambda: bft_score(["a"], [1.0]),
         ["`y_true` must hold numbers", "'a' at row 0"],
     ),
-    "a score of numbers": (lambda: bft_score(1.0, 1.0), ["`y_true` must be", "1.0"]),
+    "a score of numbers": (lambda: bft_score(1.0, 1.0), ["`y_true` must", "float"]),
     "weights of words for outputs": (
         lambda: bft_score([1.0, 2.0], [1.0, 2.0], multioutput=["a"]),
         ["`multioutput` must hold real numbers", "'a'"],

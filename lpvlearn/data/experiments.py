@@ -335,12 +335,20 @@ def _as_matrix(estimator: Any, X: Any, *, numeric: bool) -> NDArray[Any]:
 def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
     """An array by `check_array`; values that are no numbers are named."""
     array = any(hasattr(values, name) for name in ("__len__", "__array__"))
-    text = isinstance(values, str | bytes | dict) and not hasattr(values, "shape")
-    if text or not array:
-        shown = type(values).__name__ if isinstance(values, dict) else repr(values)
+    other = isinstance(values, str | bytes | dict | set) and not hasattr(
+        values, "shape"
+    )
+    if other or not array:
+        shown = repr(values) if isinstance(values, str) else type(values).__name__
         raise ValueError(
             f"`{argument}` must be a table (a pandas.DataFrame) or an array of "
             f"numbers. Got {shown}."
+        )
+    kind = getattr(getattr(values, "dtype", None), "kind", "")
+    if kind in ("m", "M") and options.get("dtype") is not None:
+        raise ValueError(
+            f"`{argument}` must hold numbers. Got dates or time differences, which are "
+            "a `time` column beside inputs at best."
         )
     if np.ma.isMaskedArray(values):
         values = np.ma.filled(values.astype(float), np.nan)  # masked ones are missing
