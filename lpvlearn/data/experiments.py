@@ -543,7 +543,8 @@ def from_trajectories(
             "`trajectories` must be a list of tuples (u, kappa, y) or (u, y). Got "
             f"{type(trajectories).__name__}."
         )
-    if sampling_time is not None and not as_numbers("sampling_time", sampling_time) > 0:
+    step = 1.0 if sampling_time is None else sampling_time
+    if not 0 < as_numbers("sampling_time", step).min() < np.inf:
         raise ValueError(
             "`sampling_time` must be a positive number of seconds. Got "
             f"{sampling_time}."

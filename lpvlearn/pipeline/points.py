@@ -347,19 +347,19 @@ def restructure_points(
         restructurer=restructurer,
     )
     kept = [k for k, done in enumerate(found) if done is not None]
-    alone = [done for done in found if done is not None]
     better = runner.call(
         _help_neighbours,
-        [done.result for done in alone],
+        [done.result for done in found if done is not None],
         [tasks[k] for k in kept],
         points.kappa[kept],
         restructurer,
         ignore=["fitted"],
     )
-    done = [other or own for own, other in zip(alone, better, strict=True)]
+    for k, other in zip(kept, better, strict=True):
+        found[k] = other or found[k]
+    _tell(found, points.kappa)
+    helped = [done.result for done in found if done is not None]
     points, local = points.keep(kept), [local[k] for k in kept]
-    _tell(done, points.kappa)
-    helped = [one.result for one in done]
     theta = np.array([fitted.params_ for fitted in helped])
     std = np.full(theta.shape, np.nan)
     for row, fitted, model in zip(std, helped, local, strict=True):
@@ -567,6 +567,8 @@ class PointRunner:
             found.extend(results)
         except _Stopped as stopped:
             k, error, told = stopped.args
+            if self.verbose:
+                results.close()  # or the warnings would stand in the bar's line
             _tell([*_done(found[:k]), Done(None, told)], kappa)
             # The point, or an option? A neighbour (the last for the first) tells.
             other = _attempt(kept, arguments[k - 1], shared, None)

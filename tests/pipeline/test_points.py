@@ -507,3 +507,11 @@ def test_a_progress_bar_stays_whole(capsys):
     assert len(set(texts)) == len(texts)
     assert all("(At operating point" in text for text in texts)
     assert {w.filename for w in caught} == {__file__}
+
+
+def test_a_bar_that_a_failure_ends_is_closed(capsys):
+    with pytest.warns(UserWarning, match="A shared cause"):
+        with pytest.raises(ValueError, match="It fails"):
+            run(4, verbose=1)
+    shown = capsys.readouterr().err
+    assert "3/4" in shown and shown.endswith("\n")
