@@ -348,6 +348,11 @@ list, default=None
         -------
         ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
 
+        Raises
+        ------
+        DivergenceError
+            If the outputs overflow, for the model is unstable along an experiment.
+
         Warns
         -----
         ExtrapolationWarning

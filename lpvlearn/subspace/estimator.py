@@ -379,6 +379,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         ndarray of shape (n_samples,) or (n_samples, n_outputs)
+
+        Raises
+        ------
+        DivergenceError
+            If the outputs of an unstable model overflow.
         """
         check_is_fitted(self, "lti_")
         experiments, n_samples = self._read(X, None, reset=False)
