@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.experiments import Experiment, read_experiments
+from ..data.experiments import NO_TIME, Experiment, naming, read_experiments
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..systems.simulation import (
@@ -53,37 +53,42 @@ def fit_of(
 def simulate_experiments(
     model: StateSpace | LPVStateSpace,
     experiments: Sequence[Experiment],
-    sampling_time: float,
+    sampling_time: float | None,
     *,
     estimate: bool,
 ) -> Array:
     """Outputs (n_samples, n_outputs) of a model along the experiments of a table.
 
     Rows stand where they do in the table; `sampling_time` is that of experiments that
-    do not tell it. From rest, or from initial states estimated on the outputs.
+    do not tell it, None where it is not known. From rest, or from initial states
+    estimated on the outputs.
     """
     table = np.empty((sum(len(e.rows) for e in experiments), model.n_outputs))
     for e in experiments:
         dt = e.sampling_time or sampling_time
-        table[e.rows] = _simulate(model, e, dt, estimate)
+        with naming(e):
+            table[e.rows] = _simulate(model, e, dt, estimate)
     return table
 
 
 def _simulate(
-    model: StateSpace | LPVStateSpace, e: Experiment, dt: float, estimate: bool
+    model: StateSpace | LPVStateSpace, e: Experiment, dt: float | None, estimate: bool
 ) -> Array:
     x0 = None
+    if isinstance(model, StateSpace) and not model.is_continuous:
+        if estimate:
+            y = _outputs(e, model.n_outputs)
+            x0 = model.estimate_initial_state(e.inputs, y)
+        return model.simulate(e.inputs, initial_state=x0)
+    if dt is None:
+        raise ValueError(NO_TIME.format("the model is"))
     if isinstance(model, LPVStateSpace):
         kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
         if estimate:
             error = _outputs(e, model.n_outputs) - model.simulate(e.inputs, kappa, dt)
             x0 = estimate_initial_state(model.free_responses(kappa, dt), error)
         return model.simulate(e.inputs, kappa, dt, x0)
-    sampled = model.to_discrete(dt) if model.is_continuous else model
-    if estimate:
-        y = _outputs(e, model.n_outputs)
-        x0 = sampled.estimate_initial_state(e.inputs, y)
-    return sampled.simulate(e.inputs, initial_state=x0)
+    return _simulate(model.to_discrete(dt), e, dt, estimate)
 
 
 def _outputs(experiment: Experiment, n_outputs: int) -> Array:
@@ -135,8 +140,15 @@ class TableSimulator(BaseEstimator):
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
                 "that the LPV model follows. Got None."
             )
-        return read_experiments(self, X, y, sampling_time=self.sampling_time)
+        found = read_experiments(self, X, y, sampling_time=self.sampling_time)
+        if len(found[0].input_names) != self.model.n_inputs:
+            raise ValueError(
+                f"`inputs` must name the {self.model.n_inputs} input(s) of the model "
+                f"among the columns of X. Got {list(found[0].input_names)}."
+            )
+        return found
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
-        step = self.sampling_time or 1.0  # where the table does not tell it
-        return simulate_experiments(self.model, experiments, step, estimate=estimate)
+        return simulate_experiments(
+            self.model, experiments, self.sampling_time, estimate=estimate
+        )
