@@ -59,8 +59,8 @@ local.lti_
 # %%
 # Order and horizon
 # -----------------
-# Every order is fitted to the record, with its errors whitened, and Schwarz's criterion
-# weighs what a state gains against the parameters that it takes. The choice, and a few
+# Every order is fitted to the record, with its errors whitened, and a criterion like
+# Akaike's weighs what a state gains against the parameters that it takes. The choice, and a few
 # lower orders, then simulate parts of the record that were held out; a lower one that
 # does so clearly better is taken instead. For each order the best horizon, the error
 # before the polishing steps, the criterion above the best one, and how well the parts

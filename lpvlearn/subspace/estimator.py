@@ -49,9 +49,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Parameters
     ----------
     order : int or "auto", default="auto"
-        Number of states. "auto" takes the order with the best value of Schwarz's
-        criterion, or a lower one that simulates parts held out clearly better. 0 is a
-        pure gain.
+        Number of states. "auto" takes the order with the best criterion (minus
+        twice the logarithm of the likelihood, and 4 for each parameter), or a lower one
+        that simulates parts held out clearly better. 0 is a pure gain.
     method : {"po-moesp", "pi-moesp", "n4sid", "cva"}, default="po-moesp"
         "pi-moesp" uses past inputs only as instruments: consistent under coloured
         measurement noise, but it needs long horizons. The others use past inputs and
@@ -113,8 +113,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         `partial_fit` of a long stream, of its last stretch only.
     selection_ : DataFrame
         What was tried: columns order, horizon, error (relative, whitened, before
-        refinement), criterion (Schwarz's per value, above the best; NaN for horizons
-        that lost within their order), validation_bft (percent, on parts held out; NaN
+        refinement), criterion (per value, above the best; NaN for horizons that
+        lost within their order), validation_bft (percent, on parts held out; NaN
         where that was not looked at), chosen.
     residual_ : float
         Simulation error on the data relative to the outputs, root mean square.

@@ -29,9 +29,9 @@ _N_BLOCKS = 5  # of a piece: sums over time whose spread tells that of their tot
 
 _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 
-# A model is clearly better where its error is less by this many standard errors of the
-# difference, and by this share.
-_STANDARD_ERRORS, _SHARE = 1.5, 0.03
+# A model is clearly better where its error is less by more than the standard error of
+# the difference, and by this share: it is asked only where there is reason to doubt.
+_SHARE = 0.03
 
 
 class HeldOut(NamedTuple):
@@ -47,7 +47,7 @@ class HeldOut(NamedTuple):
             return bool(np.isfinite(self.blocks.sum()))
         gap = other.blocks - self.blocks
         chance = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
-        return bool(gap.sum() > max(_STANDARD_ERRORS * chance, _SHARE * total))
+        return bool(gap.sum() > max(chance, _SHARE * total))
 
 
 def held_out(
