@@ -29,9 +29,7 @@ _N_BLOCKS = 5  # of a piece: sums over time whose spread tells that of their tot
 
 _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 
-# A model is clearly better where its error is less by more than the standard error of
-# the difference, and by this share: it is asked only where there is reason to doubt.
-_SHARE = 0.03
+_SHARE = 0.03  # by which an error must be less to matter
 
 
 class HeldOut(NamedTuple):
@@ -40,14 +38,17 @@ class HeldOut(NamedTuple):
     blocks: Array  # (n_blocks,): sums of squares over consecutive blocks of time
     bft: float  # best fit, percent, mean over outputs; NaN where nothing is held out
 
-    def clearly_better_than(self, other: HeldOut) -> bool:
-        """Whether errors are less, by more than chance and by enough to matter."""
+    def clearly_better_than(self, other: HeldOut, standard_errors: float) -> bool:
+        """Whether errors are less, by more than chance and by enough to matter.
+
+        Chance is so many standard errors of the difference.
+        """
         total = other.blocks.sum()
         if not np.isfinite(total):
             return bool(np.isfinite(self.blocks.sum()))
         gap = other.blocks - self.blocks
         chance = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
-        return bool(gap.sum() > max(chance, _SHARE * total))
+        return bool(gap.sum() > max(standard_errors * chance, _SHARE * total))
 
 
 def held_out(

@@ -327,6 +327,11 @@ def identify(
     )
 
 
+# Standard errors by which another way to the model must be better: errors that are not
+# whitened, or no refinement, lose to whitened ones unless the system is not linear.
+_DOUBT = 2.0
+
+
 def _best_held_out(
     candidates: Sequence[Candidate], records: Sequence[Record], settings: Settings
 ) -> Candidate:
@@ -335,7 +340,7 @@ def _best_held_out(
     error = validate(best, records, settings)
     for candidate in candidates[1:]:
         other = validate(candidate, records, settings)
-        if other.clearly_better_than(error):
+        if other.clearly_better_than(error, _DOUBT):
             best, error = candidate, other
     return best
 

@@ -83,6 +83,8 @@ _AS_GOOD = 0.999  # share of the loss of the order below that more states must b
 # Horizon for the states that an order adds to the one below.
 _SHORT_HORIZON = 10
 
+_DOUBT = 1.0  # standard errors by which a lower order must be better
+
 # How far below the choice other orders are simulated on parts held out.
 _LOWER = (1, 2, 4, 8, 16)
 
@@ -237,8 +239,8 @@ def _search(
             lower = best.order - step
             if lower not in candidates:
                 continue
-            held_out[lower] = validate(candidates[lower], records, settings)
-            if held_out[lower].clearly_better_than(held_out[chosen]):
+            error = held_out[lower] = validate(candidates[lower], records, settings)
+            if error.clearly_better_than(held_out[chosen], _DOUBT):
                 chosen = lower
     white = whitening.records(records, settings.free)
     rows = _rows(tried, white, held_out)
