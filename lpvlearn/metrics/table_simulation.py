@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.experiments import Experiment, read_experiments
+from ..data.experiments import Experiment, n_rows_of, read_experiments
+from ..data.preparation import read_runs
+from ..data.timestamps import TIME_TOL
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..systems.simulation import (
@@ -54,15 +56,17 @@ def simulate_experiments(
     model: StateSpace | LPVStateSpace,
     experiments: Sequence[Experiment],
     sampling_time: float,
+    n_samples: int,
     *,
     estimate: bool,
 ) -> Array:
     """Outputs (n_samples, n_outputs) of a model along the experiments of a table.
 
-    Rows stand where they do in the table; `sampling_time` is that of experiments that
-    do not tell it. From rest, or from initial states estimated on the outputs.
+    Rows stand where they do in the table, NaN in those of no experiment;
+    `sampling_time` is that of experiments that do not tell it. From rest, or from
+    initial states estimated on the outputs.
     """
-    table = np.empty((sum(len(e.rows) for e in experiments), model.n_outputs))
+    table = np.full((n_samples, model.n_outputs), np.nan)
     for e in experiments:
         dt = e.sampling_time or sampling_time
         table[e.rows] = _simulate(model, e, dt, estimate)
@@ -81,8 +85,7 @@ def _simulate(
         return model.simulate(e.inputs, kappa, dt, x0)
     sampled = model.to_discrete(dt) if model.is_continuous else model
     if estimate:
-        y = _outputs(e, model.n_outputs)
-        x0 = sampled.estimate_initial_state(e.inputs, y)
+        x0 = sampled.estimate_initial_state(e.inputs, _outputs(e, model.n_outputs))
     return sampled.simulate(e.inputs, initial_state=x0)
 
 
@@ -107,6 +110,7 @@ class TableSimulator(BaseEstimator):
         experiment: Any = None,
         time: Any = None,
         operating_point: Any = None,
+        time_tol: float = TIME_TOL,
     ) -> None:
         self.model = model
         self.sampling_time = sampling_time
@@ -115,28 +119,36 @@ class TableSimulator(BaseEstimator):
         self.experiment = experiment
         self.time = time
         self.operating_point = operating_point
+        self.time_tol = time_tol
 
     def predict(self, X: Any) -> Array:
         """Simulate from rest."""
-        return self._simulate(self._read(X, None), estimate=False)
+        return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate from initial states estimated on the outputs."""
-        return self._simulate(self._read(X, y), estimate=True)
+        return self._simulate(
+            self._read(X, y, outputs=False), n_rows_of(X), estimate=True
+        )
 
     def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
         """Rows of every experiment."""
-        return [e.rows for e in self._read(X, None)]
+        return [e.rows for e in read_experiments(self, X, allow_missing="Xy")]
 
-    def _read(self, X: Any, y: Any) -> list[Experiment]:
+    def _read(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
         is_lpv = isinstance(self.model, LPVStateSpace)
         if is_lpv and self.scheduling is None and self.model.scheduling_range.any():
             raise ValueError(
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
                 "that the LPV model follows. Got None."
             )
-        return read_experiments(self, X, y, sampling_time=self.sampling_time)
+        step = self.sampling_time
+        return read_runs(self, X, y, split=True, sampling_time=step, **options)
 
-    def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
+    def _simulate(
+        self, experiments: list[Experiment], n_samples: int, *, estimate: bool
+    ) -> Array:
         step = self.sampling_time or 1.0  # where the table does not tell it
-        return simulate_experiments(self.model, experiments, step, estimate=estimate)
+        return simulate_experiments(
+            self.model, experiments, step, n_samples, estimate=estimate
+        )

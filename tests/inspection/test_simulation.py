@@ -65,6 +65,7 @@ def test_simulation_of_an_experiment_is_the_prediction_there(pipeline, tables):
     assert display.axes_[-1].get_xlabel() == "Time (s)"
 
 
+@pytest.mark.filterwarnings("ignore:The scored table starts in mid-motion")
 def test_simulation_from_an_estimated_state_fits_a_record_cut_in_the_middle(
     pipeline, tables
 ):

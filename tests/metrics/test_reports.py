@@ -26,7 +26,7 @@ from ..conftest import (
     spring_tables,
     spring_truth,
 )
-from .conftest import RNG
+from .conftest import IN_MOTION, RNG
 
 
 @pytest.fixture(scope="module")
@@ -43,11 +43,13 @@ def balanced(spring):
 # -- one model -------------------------------------------------------------------------
 
 
+@IN_MOTION
 def test_the_report_has_a_row_for_each_experiment_and_output(data):
     model, X, y = data
     report = fit_report(model, X, y)
     assert list(report) == [
         "experiment", "operating_point", "output", "BFT", "VAF", "RMSE", "R2",
+        "n_missing",
     ]  # fmt: skip
     assert report["experiment"].tolist() == ["a", "a", "b", "b", "c", "c"]
     assert report["output"].tolist() == 3 * ["vx", "vy"]
@@ -63,6 +65,7 @@ def test_the_report_has_a_row_for_each_experiment_and_output(data):
         assert row["R2"] == pytest.approx(r2_score(true, pred))
 
 
+@IN_MOTION
 def test_the_report_takes_the_scorers_options(data):
     model, X, y = data
     assert (fit_report(model, X, y, initial_state="estimate")["BFT"] == 100).all()
@@ -123,6 +126,7 @@ def test_models_without_an_estimator_take_roles(spring):
     assert bare["BFT"].item() > 100 - 1e-6
 
 
+@IN_MOTION
 def test_the_start_of_a_record_in_the_middle_is_estimated(spring):
     X, y = (table.iloc[400:900] for table in spring[2:])
     models = {"lpv": spring_lpv(), "lti": spring_lpv().at(0.75)}

@@ -25,7 +25,10 @@ from lpvlearn import (
     vaf_scorer,
 )
 
-from .conftest import RNG
+from .conftest import IN_MOTION, RNG
+
+# The table `data` does: warnings of it have a test of their own.
+pytestmark = IN_MOTION
 
 
 def test_scorers_from_rest_score_predict():
