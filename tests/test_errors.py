@@ -167,7 +167,7 @@ TABLES = {
         lambda: fit(X.assign(time=X["time"].mask(X.index == 7, 0.1414))),
         [
             "evenly spaced",
-            "at sample 7, 0.07 of the step",
+            "at sample 7, 0.068 of the step",
             "`time_tol`",
             "lpvlearn.resample",
         ],

@@ -458,7 +458,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs.
+            Measured outputs. Missing ones (NaN) correct nothing.
         steps : int, default=1
             Prediction horizon in samples.
         initial_state : {"estimate", "rest"}, default="estimate"
@@ -472,7 +472,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "lti_")
         one_of("initial_state", initial_state, ("estimate", "rest"))
-        experiments, predictor = self._read(X, y), self.predictor_
+        experiments, predictor = self._read(X, y, outputs=False), self.predictor_
 
         def predicted(e: Experiment) -> Array:
             return predictor.predict(
