@@ -13,7 +13,8 @@ role                         the column holds
 ``inputs``                   :math:`u`; by default every column without another role
 ``scheduling``               :math:`\kappa`, what the dynamics depend on; default: none
 ``experiment``               a label; rows with one label are one record in time
-``time``                     seconds or dates; checked, then left alone
+``time``                     seconds, dates or time differences; checked, and read for
+                             the step
 ``operating_point``          a label of the operating point; by default experiments are
                              grouped by their mean scheduling value
 ============================ ==========================================================
@@ -95,6 +96,9 @@ except ValueError as error:
     print(error)
 
 # %%
+# Clocks that jitter, lost rows, missing values and other units of time have a :ref:`page
+# of their own <guide_logs>`.
+#
 # Columns that are not numbers
 # ----------------------------
 # Labels may be text, times may be dates; inputs and scheduling variables are numbers. A
