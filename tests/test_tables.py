@@ -133,6 +133,14 @@ def test_shuffled_rows_are_refused_and_shuffled_labels_put_right(kind, fitted):
     pd.testing.assert_frame_equal(report, fit_report(other, X, Y))
 
 
+@pytest.mark.parametrize("kind", MODELS)
+def test_labels_of_operating_points_may_be_categories(kind, fitted):
+    point = pd.Categorical(X["kappa"].map("point {}".format))
+    model = make(kind, operating_point="point").fit(X.assign(point=point), Y)
+    assert_allclose(model_of(model), model_of(fitted[kind]), rtol=1e-9)
+    assert_allclose(model.predict(X), fitted[kind].predict(X), atol=1e-9)
+
+
 # ------------------------------------------------------------------ after the fit
 
 

@@ -96,8 +96,8 @@ except ValueError as error:
     print(error)
 
 # %%
-# Clocks that jitter, lost rows, missing values and other units of time have a :ref:`page
-# of their own <guide_logs>`.
+# Clocks that jitter, lost rows, missing values and other units of time have a
+# :ref:`page of their own <guide_logs>`.
 #
 # Columns that are not numbers
 # ----------------------------

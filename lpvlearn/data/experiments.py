@@ -319,8 +319,14 @@ def read_experiments(
         time_tol=check_time_tol(getattr(estimator, "time_tol", TIME_TOL)),
         allow_missing=gaps,
         expected=[
-            (sampling_time, "`sampling_time` must be the step of the time column"),
-            (fitted_step, "X must have the time step of the fit"),
+            (
+                UNTIMED._replace(step=sampling_time),
+                "`sampling_time` must be the step of the time column",
+            ),
+            (
+                UNTIMED._replace(step=fitted_step),
+                "X must have the time step of the fit",
+            ),
         ],
     )
     return [
@@ -427,7 +433,7 @@ def _clocks(
     labels: Sequence[Hashable],
     groups: Sequence[Indices],
     *,
-    expected: Sequence[tuple[float | None, str]],
+    expected: Sequence[tuple[Clock, str]],
     **options: Any,
 ) -> list[Clock]:
     """Read the time column in every experiment; options as in `read_clock`."""
@@ -437,7 +443,7 @@ def _clocks(
     clocks: list[Clock] = []
     rule = "All experiments must have the same time step"
     for label, rows in zip(labels, groups, strict=True):
-        common = next((c.step for c in clocks if c.step is not None), None)
+        common = next((c for c in clocks if c.step is not None), UNTIMED)
         clock = read_clock(
             seconds[rows],
             column=column.name,

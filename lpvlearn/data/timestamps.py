@@ -45,8 +45,8 @@ _RESTARTS = (
     "tells them apart. "
 )
 
-# Share of the steps that go back in time, up to which a table looks like experiments
-# one after the other rather than shuffled.
+# Share of the steps up to which a table does not look shuffled: those that go back in
+# time, where experiments follow each other, or leave rows out, as a logger does.
 _FEW = 0.05
 
 
@@ -87,6 +87,7 @@ class Clock(NamedTuple):
     step: float | None  # seconds; None for a single sample
     jitter: float  # largest deviation from the even grid, relative to the step
     breaks: Indices  # samples before which others are missing
+    slack: float = 0.0  # seconds, by which the step may be wrong
 
 
 UNTIMED = Clock(None, 0.0, np.empty(0, dtype=np.intp))  # a table without stamps
@@ -110,7 +111,7 @@ def read_clock(
     experiment: Hashable,
     time_tol: float = 0.0,
     allow_missing: bool = False,
-    expected: Sequence[tuple[float | None, str]] = (),
+    expected: Sequence[tuple[Clock, str]] = (),
 ) -> Clock:
     """Read the stamps of an experiment, which must increase on an even grid.
 
@@ -118,8 +119,8 @@ def read_clock(
     number of decimals or to single precision: by one unit of the last place, as long
     as that is less than half the step). With `allow_missing` samples may be missing;
     the grid after them need not be that before. Raises a ValueError where time is
-    otherwise, or its step not the one `expected`: pairs of a step (None: any) and of
-    the rule that the message begins with.
+    otherwise, or its step not the one `expected`: pairs of a clock and of the rule that
+    the message begins with.
 
     >>> clock = read_clock(np.array([0, 1, 2, 5, 6, 7]), column="t", experiment=0,
     ...                    allow_missing=True)
@@ -169,22 +170,28 @@ def read_clock(
         )
     if missing.any() and not allow_missing:
         k = int(np.argmax(missing))
+        remedy = _CUT_THERE
+        if missing.sum() > _FEW * len(t):
+            remedy = (
+                f"{_USE_INSTEAD} If a logger lost them: {remedy[0].lower()}{remedy[1:]}"
+            )
         n_missing = np.maximum(1, np.rint(steps[missing] / step) - 1).sum()
         raise ValueError(
             f"{where} must be evenly spaced. Got a step of {steps[k]:.9g} s after its "
             f"sample {k}, against {step:.9g} s elsewhere: about {n_missing:.0f} row(s) "
-            f"are missing, at {missing.sum()} place(s). {_CUT_THERE} {_USE_INSTEAD}"
+            f"are missing, at {missing.sum()} place(s). {remedy}"
         )
     slack = 2 * (rounding + time_tol * step) / (len(t) - 1 - missing.sum())
-    for known, rule in expected:
-        if known is None or abs(step - known) <= _SAMPLING_TIME_RTOL * known + slack:
+    for clock, rule in expected:
+        known = step if clock.step is None else clock.step
+        if abs(step - known) <= _SAMPLING_TIME_RTOL * known + slack + clock.slack:
             continue
         raise ValueError(
             f"{rule}. Got {known:.9g} s, and {step:.9g} s in column {column!r} of "
             f"experiment {experiment!r}; {_about_units(step / known)}."
         )
     jitter = float(np.abs(off).max()) / step
-    return Clock(step, jitter, np.flatnonzero(missing) + 1)
+    return Clock(step, jitter, np.flatnonzero(missing) + 1, slack)
 
 
 def missing_after(steps: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -138,9 +138,9 @@ class StreamClock:
             return
         # Rounded stamps tell the step the better the more there are.
         short, long = sorted((self._reference, times), key=len)
-        step = self._read(long, name, label).step
+        longer = self._read(long, name, label)
         try:
-            self._read(short, name, label, expected=[(step, "")])
+            self._read(short, name, label, expected=[(longer, "")])
         except ValueError as error:
             first, other = (
                 self._read(t, name, label).step for t in (self._reference, times)

@@ -1,10 +1,17 @@
 """Time stamps: even however they are stored, or refused."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from lpvlearn.data.timestamps import check_time_tol, read_clock, time_in_seconds
+from lpvlearn.data.timestamps import (
+    UNTIMED,
+    check_time_tol,
+    read_clock,
+    time_in_seconds,
+)
 
 
 @pytest.mark.parametrize(
@@ -56,8 +63,16 @@ def test_even_time_passes_however_it_is_stored(stamps):
     ids=["gap", "jitter", "repeat", "reversed", "two paces", "two rounded paces"],
 )
 def test_uneven_time_raises_and_says_what_to_use(stamps, remedy):
-    with pytest.raises(ValueError, match=f"{remedy}.*GroupKFold.*TimeSeriesSplit"):
+    with pytest.raises(ValueError, match="GroupKFold.*TimeSeriesSplit") as raised:
         read_clock(np.asarray(stamps, float), column="t", experiment=0)
+    assert re.search(remedy, str(raised.value))
+
+
+def test_a_few_lost_rows_do_not_look_shuffled():
+    t = np.delete(np.arange(200.0), [50, 120])
+    with pytest.raises(ValueError, match="missing='split'.*resample") as raised:
+        read_clock(t, column="t", experiment=0)
+    assert "shuffle" not in str(raised.value)
 
 
 # ------------------------------------------------------------------- jitter and gaps
@@ -105,10 +120,22 @@ def test_gaps_are_found_whatever_the_phase_after_them(share, shift):
 @pytest.mark.parametrize("power", [-2, -1, 1, 2, 3])
 def test_another_unit_of_time_is_recognised(power):
     t = np.arange(20) * 0.05 * 1000.0**power
-    with pytest.raises(ValueError, match="the rule. Got 0.05 s.*milliseconds by 1000"):
-        read_clock(t, column="t", experiment=0, expected=[(0.05, "the rule")])
-    with pytest.raises(ValueError, match="the rule. Got 0.02 s.*times are in seconds"):
-        read_clock(t, column="t", experiment=0, expected=[(0.02, "the rule")])
+    for step, words in ((0.05, "milliseconds by 1000"), (0.02, "times are in seconds")):
+        expected = [(UNTIMED._replace(step=step), "the rule")]
+        with pytest.raises(ValueError, match=f"the rule. Got {step} s.*{words}"):
+            read_clock(t, column="t", experiment=0, expected=expected)
+
+
+def test_steps_agree_as_far_as_jitter_lets_them_be_known():
+    off = 0.009 * np.random.default_rng(2).uniform(-1, 1, 500)
+    options = {"column": "t", "experiment": 0, "time_tol": 0.01}
+    long = read_clock(np.arange(500) + off, **options)
+    for n in (2, 3, 10, 100):
+        short = read_clock(np.arange(n) + off[:n], **options)
+        read_clock(np.arange(n) + off[:n], expected=[(long, "rule")], **options)
+        read_clock(np.arange(500) + off, expected=[(short, "rule")], **options)
+    with pytest.raises(ValueError, match="rule. Got"):
+        read_clock(1.01 * np.arange(100), expected=[(long, "rule")], **options)
 
 
 @pytest.mark.parametrize("tol", [-0.1, 0.25, np.nan, "1 %", True])
