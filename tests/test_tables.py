@@ -1,5 +1,6 @@
 """The doors of the estimators: one table in many dresses is one table."""
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -36,6 +37,12 @@ def make(kind, **options):
         inputs="force",
         **options,
     )
+
+
+@pytest.fixture(autouse=True)
+def closed_figures():
+    yield
+    plt.close("all")
 
 
 @pytest.fixture(scope="module")

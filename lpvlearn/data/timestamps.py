@@ -37,7 +37,9 @@ _USE_INSTEAD = (
 _CUT_THERE = (
     "Identify with missing='split' (of SubspaceLTI), which cuts the record there, or "
     "fill short gaps with lpvlearn.resample. Predictions past a gap need an initial "
-    "state: predict_with_initial_state, or a scorer with initial_state='estimate'."
+    "state: predict_with_initial_state, or a scorer with initial_state='estimate'. In "
+    "cross-validation split by experiment with ExperimentSplit, or in time with "
+    "BlockedTimeSeriesSplit: blocks of rows leave others with a hole."
 )
 
 _RESTARTS = (
