@@ -108,3 +108,17 @@ def test_bad_calls_raise_and_name_the_cause(call, words):
         call()
     for word in words:
         assert word in str(raised.value)
+
+
+@pytest.mark.parametrize("score", [bft_score, vaf_score, r2_ratio])
+def test_missing_samples_of_an_output_are_left_out_of_its_score(score):
+    lost = np.random.default_rng(4).random(Y_TRUE.shape) < 0.3
+    options = {} if score is r2_ratio else {"multioutput": "raw_values"}
+    found = score(np.where(lost, np.nan, Y_TRUE), Y_PRED, **options)
+    for k in (0, 1):
+        known = ~lost[:, k]
+        alone = score(Y_TRUE[known, k], Y_PRED[known, k], **options)
+        np.testing.assert_allclose(found[k], alone, rtol=1e-12)
+    # A simulation need not be known where nothing was measured.
+    both = np.where(lost, np.nan, Y_TRUE), np.where(lost, np.nan, Y_PRED)
+    np.testing.assert_array_equal(score(*both, **options), found)
