@@ -1,11 +1,18 @@
-"""Warnings that this library gives, and the one way to give them."""
+"""Errors and warnings of this library, and the one way to give a warning."""
 
 from __future__ import annotations
 
 import os
 import sys
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 _HERE = str(Path(__file__).parent) + os.sep
 
@@ -18,12 +25,59 @@ class RankWarning(UserWarning):
     """The data do not determine the model: a minimum-norm solution was taken."""
 
 
+class DivergenceError(ValueError):
+    """A simulation left the range of the floating-point numbers."""
+
+
+def finite_simulation(
+    outputs: NDArray[np.float64], cause: Callable[[], str]
+) -> NDArray[np.float64]:
+    """Simulated outputs, or a DivergenceError that tells where they end, and why."""
+    finite = np.isfinite(outputs)
+    if finite.all():
+        return outputs
+    sample, *place = (int(i) for i in np.argwhere(~finite)[0])
+    before = f"{outputs[sample - 1, *place]:.4g} at sample {sample - 1}, and "
+    raise DivergenceError(
+        f"the simulation diverges: output {place[0]} is {before if sample else ''}"
+        f"beyond all numbers at sample {sample}. {cause()}"
+    )
+
+
+class Told(NamedTuple):
+    """A warning that was not given yet."""
+
+    message: str
+    category: type[Warning]
+
+
+_COLLECTING: ContextVar[list[Told] | None] = ContextVar("collecting", default=None)
+
+
+@contextmanager
+def collected() -> Iterator[list[Told]]:
+    """Collect what the block warns of by `warn`, instead of giving the warnings.
+
+    In this thread alone, where the filters of `warnings` are those of all threads.
+    """
+    told: list[Told] = []
+    token = _COLLECTING.set(told)
+    try:
+        yield told
+    finally:
+        _COLLECTING.reset(token)
+
+
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Give a warning that points to the user's line, however deep it arises.
 
     That line is the one which called the outermost function of this library: what
     lies between (joblib, a pipeline of scikit-learn) is passed over.
     """
+    collecting = _COLLECTING.get()
+    if collecting is not None:
+        collecting.append(Told(message, category))
+        return
     level, frame = 1, sys._getframe(1)
     outermost = 1
     while frame.f_back is not None:

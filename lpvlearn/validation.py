@@ -24,9 +24,13 @@ def real_array(name: str, value: Any) -> Array:
             return np.array(array, dtype=np.float64)
     except (TypeError, ValueError):
         pass
-    shown = repr(value)
-    shown = shown if len(shown) <= 80 else shown[:77] + "..."
-    raise ValueError(f"`{name}` must hold real numbers only. Got {shown}.")
+    raise ValueError(f"`{name}` must hold real numbers only. Got {shown(value)}.")
+
+
+def shown(value: Any) -> str:
+    """A value in a message, of which a table shows its beginning only."""
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def matrix(name: str, value: ArrayLike) -> Array:
@@ -56,7 +60,7 @@ def positive_time(name: str, value: Any) -> float:
         time = np.nan
     if not 0.0 < time < np.inf:
         raise ValueError(
-            f"`{name}` must be a positive number of seconds. Got {value!r}."
+            f"`{name}` must be a positive number of seconds. Got {shown(value)}."
         )
     return time
 
@@ -66,7 +70,7 @@ def whole_number(name: str, value: Any, low: int, high: int | None = None) -> in
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not whole or value < low or (high is not None and value > high):
         limits = f"at least {low}" if high is None else f"{low} to {high}"
-        raise ValueError(f"`{name}` must be an integer, {limits}. Got {value!r}.")
+        raise ValueError(f"`{name}` must be an integer, {limits}. Got {shown(value)}.")
     return int(value)
 
 
@@ -84,7 +88,18 @@ def one_of(name: str, value: Any, allowed: Sequence[Any]) -> None:
         return
     listed = [repr(option) for option in allowed]
     last = f"{', '.join(listed[:-1])} or " if len(listed) > 1 else ""
-    raise ValueError(f"`{name}` must be {last}{listed[-1]}. Got {value!r}.")
+    raise ValueError(f"`{name}` must be {last}{listed[-1]}. Got {shown(value)}.")
+
+
+def frequencies(omega: ArrayLike) -> Array:
+    """`omega`, (n_freq,) or a number, as a vector without NaN; it may hold infinity."""
+    omega = np.atleast_1d(real_array("omega", omega))
+    if omega.ndim != 1 or np.isnan(omega).any():
+        raise ValueError(
+            "`omega` must have shape (n_freq,) and hold no NaN. Got "
+            f"shape {omega.shape} with {np.isnan(omega).sum()} NaN."
+        )
+    return omega
 
 
 def finite_samples(name: str, value: ArrayLike, width: int) -> Array:

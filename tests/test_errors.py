@@ -16,6 +16,7 @@ from lpvlearn import (
     GrayBoxRestructurer,
     GrayBoxStructure,
     LocalLPVPipeline,
+    LPVStateSpace,
     PolynomialLPV,
     StateSpace,
     SubspaceLTI,
@@ -25,20 +26,28 @@ from lpvlearn import (
     fit_report,
     from_trajectories,
     make_bft_scorer,
+    parameter_fit,
+    peak_gains,
+    readable_report,
 )
-from lpvlearn.datasets import make_flexible_arm
+from lpvlearn.datasets import FlexibleArm, make_flexible_arm
+from lpvlearn.inspection import BodeDisplay, SimulationDisplay
 
 from .conftest import (
     ROLES,
+    spring_lpv,
     spring_pipeline,
     spring_structure,
     spring_sweep,
     spring_tables,
+    stable_model,
 )
 
 X, Y = spring_tables(n_samples=150)
 X_SWEEP, Y_SWEEP = spring_sweep(300)
 FIVE_POINTS = spring_tables(n_samples=20, kappas=np.linspace(0, 2, 5))
+U = np.random.default_rng(3).standard_normal((80, 1))
+SPRING = spring_lpv().at(0.0)
 SHUFFLED = np.random.default_rng(0).permutation(len(X))
 TWO_INPUTS = GrayBoxStructure.from_template(
     [[0, 1], ["-k", "-c"]], [[0, 0], ["b", "d"]], [[1, 0]]
@@ -53,6 +62,10 @@ def fit(X=X, y=Y, **options):
     """Fit a pipeline with one thing wrong."""
     options = {"restructurer": GrayBoxRestructurer(spring_structure()), **options}
     return LocalLPVPipeline(**{**ROLES, **options}).fit(X, y)
+
+
+def spring_restructurer(**options):
+    return GrayBoxRestructurer(spring_structure(), **options)
 
 
 def put(value, row, column, table=X):
@@ -152,7 +165,7 @@ TABLES = {
     ),
     "an output far from zero": (
         lambda: fit(y=Y + 1000.0),
-        ["must be stable", "subtract their value at rest from y"],
+        ["must be stable", "subtract their value at rest from y", "offset='auto'"],
     ),
     "a missing sample": (
         lambda: fit(X.drop(index=50), Y.drop(index=50)),
@@ -236,7 +249,7 @@ TABLES = {
         ["operating point 1 (scheduling 0.5): Every input must vary", "'force'"],
     ),
     "an input of an array that does not move": (
-        lambda: LocalLPVPipeline(scheduling=2, experiment=3).fit(
+        lambda: LocalLPVPipeline(scheduling=2, experiment=3, sampling_time=1).fit(
             X[["force", "time", "kappa", "run"]].assign(time=0.0).to_numpy(), Y
         ),
         ["Every input must vary", "'1' constant at 0"],
@@ -300,6 +313,82 @@ TABLES = {
     "a negative tolerance": (
         lambda: fit(scheduling_tol=-1),
         ["`scheduling_tol` must be a non-negative number", "Got -1"],
+    ),
+}
+
+TABLES |= {
+    "no time for a structure": (
+        lambda: fit(X.drop(columns="time"), time=None),
+        ["`time` or `sampling_time`", "structure", "continuous time", "Got neither"],
+    ),
+    "no time for an LPV model": (
+        lambda: fit(X.drop(columns="time"), time=None, restructurer="passthrough"),
+        ["`time` or `sampling_time`", "LPV model", "`time=`", "sampling_time=1"],
+    ),
+    "a column too many among the inputs": (
+        lambda: fit(X.assign(torque=X["force"] ** 2 + X["time"] % 0.1)),
+        ["`structure` has", "1 inputs", "2 input column(s), 'force', 'torque'"],
+    ),
+    "inputs named that the structure lacks": (
+        lambda: fit(X.assign(torque=1 - X["force"]), inputs=["force", "torque"]),
+        ["'force', 'torque'", "as named in `inputs`"],
+    ),
+    "an output that the structure lacks": (
+        lambda: fit(y=Y.assign(speed=Y["position"].diff().fillna(0.0))),
+        ["1 outputs", "`y` has 2 column(s), 'position', 'speed'", "in its order"],
+    ),
+    "the time among the inputs": (
+        lambda: fit(inputs=["force", "time"]),
+        ["`inputs` must not name", "the `time` column already", "'time'"],
+    ),
+    "the time to tell experiments": (
+        lambda: fit(experiment="time"),
+        ["`time` must not name", "the `experiment` column already", "'time'"],
+    ),
+    "a scheduling variable of words": (
+        lambda: fit(scheduling="run", experiment=None, inputs="force"),
+        ["Column 'run' of X must hold numbers", "'p0r0'"],
+    ),
+    "X and y swapped": (lambda: fit(Y, X), ["name a column", "('position')", "'run'"]),
+    "a file for the table": (
+        lambda: fit("data.csv"),
+        ["`X` must be a table (a pandas.DataFrame)", "'data.csv'"],
+    ),
+    "nothing for the table": (lambda: fit(None), ["`X` must be a table", "None"]),
+    "a set for the table": (lambda: fit({1, 2}), ["`X` must be a table", "set"]),
+    "dates for the inputs": (
+        lambda: SubspaceLTI(1).fit(np.zeros((4, 1), "datetime64[s]"), np.ones(4)),
+        ["`X` must hold numbers", "dates", "`time`"],
+    ),
+    "a dict for the table": (lambda: fit({"a": 1}), ["`X` must be a table", "dict"]),
+    "a series of words for the outputs": (
+        lambda: fit(y=put("off", 3, "position", Y)["position"]),
+        ["Column 'position' of y must hold numbers", "'off' at row 3", "Mend"],
+    ),
+    "an array of words for the outputs": (
+        lambda: fit(y=put("off", 3, "position", Y).to_numpy()),
+        ["`y` must hold numbers", "'off' at row 3, column 0"],
+    ),
+    "a list of words for the outputs": (
+        lambda: fit(y=["off"] * len(X)),
+        ["`y` must hold numbers", "'off' at row 0"],
+    ),
+    "a number for the outputs": (lambda: fit(y=3.0), ["`y` must be a table", "float"]),
+    "words in an array of inputs": (
+        lambda: SubspaceLTI(1).fit([["1.0"], ["off"]], [1.0, 2.0]),
+        ["`X` must hold numbers", "'off' at row 1, column 0"],
+    ),
+    "rows of several lengths": (
+        lambda: SubspaceLTI(1).fit([[1.0], [1.0, 2.0]], [1.0, 2.0]),
+        ["`X` must have rows of one length"],
+    ),
+    "masked samples": (
+        lambda: SubspaceLTI(1).fit(U, np.ma.masked_array(U[:, 0], U[:, 0] > 1)),
+        ["y contains NaN", "'y1'"],
+    ),
+    "a tolerance of words": (
+        lambda: fit(scheduling_tol="small"),
+        ["`scheduling_tol` must", "'small'"],
     ),
 }
 
@@ -401,6 +490,120 @@ STEPS = {
     ),
 }
 
+STEPS |= {
+    "a word for the feedthrough": (
+        lambda: fit(local=SubspaceLTI(2, feedthrough="no")),
+        ["`feedthrough` must be True, False or a table", "Got 'no'"],
+    ),
+    "a word for the jobs": (lambda: fit(n_jobs="all"), ["`n_jobs`", "-1", "'all'"]),
+    "no job": (lambda: fit(n_jobs=0), ["`n_jobs`", "not 0"]),
+    "a word for the progress": (
+        lambda: fit(verbose="yes"),
+        ["`verbose` must be an integer", "'yes'"],
+    ),
+    "a word for the efficiency": (
+        lambda: fit(efficient="yes"),
+        ["`efficient` must be True or False", "'yes'"],
+    ),
+    "time in samples for a structure": (
+        lambda: spring_restructurer().fit_model(SubspaceLTI(2).fit(U, U * 1.0).lti_),
+        ["`model` must have a known sampling time", "`time=`", "sampling_time=1"],
+    ),
+    "time in samples in continuous time": (
+        lambda: SubspaceLTI(1, horizon=5).fit(U, np.roll(U, 1)).lti_.to_continuous(),
+        ["`sampling_time` must be known", "`time=`", "`sampling_time=`"],
+    ),
+    "discrete time for equations of motion": (
+        lambda: GrayBoxRestructurer(
+            GrayBoxStructure.mechanical([["m"]], [["c"]], [["k"]], [[1]])
+        ).fit_model(SPRING.to_discrete(0.02)),
+        ["`model` must be in continuous time", "0.02 s", "to_continuous()"],
+    ),
+    "models of several clocks": (
+        lambda: spring_restructurer().fit_model([SPRING, SPRING.to_discrete(0.02)]),
+        ["one sampling time", "None and 0.02"],
+    ),
+    "a model of more inputs": (
+        lambda: spring_restructurer().fit_model(stable_model(0, 2, 2, 1)),
+        ["1 inputs, `model` has 1 and 2", "role was forgotten"],
+    ),
+    "a number for the starts": (
+        lambda: spring_restructurer().fit_model(SPRING, starts=3),
+        ["`starts` must be a list", "Got int", "brackets"],
+    ),
+    "a model for the realizations": (
+        lambda: spring_restructurer().fit_model(SPRING, realizations=SPRING),
+        ["`realizations` must be a list", "StateSpace"],
+    ),
+    "numbers for the realizations": (
+        lambda: spring_restructurer().fit_model(SPRING, realizations=[1, 2]),
+        ["`realizations` must be at least 2 models", "2 of int"],
+    ),
+    "a model without its uncertainty": (
+        lambda: spring_restructurer(norm="covariance").fit_model(
+            SPRING, estimates=[SPRING]
+        ),
+        ["`estimates` must hold pairs", "StateSpace"],
+    ),
+    "weights of words": (
+        lambda: spring_restructurer().fit([1, 2], [[1, 2]] * 2, ["a", "b"]),
+        ["`sample_weight` must hold real numbers", "'a'"],
+    ),
+    "weights of zero": (
+        lambda: spring_restructurer().fit([1, 2], [[1, 2]] * 2, [0, 0]),
+        ["`sample_weight`", "not all zero"],
+    ),
+    "a word for a function": (
+        lambda: GrayBoxStructure.from_function("pendulum", [1.0]),
+        ["`function` must return (A, B, C)", "Got str"],
+    ),
+    "a function of two matrices": (
+        lambda: GrayBoxStructure.from_function(lambda p: (1, 2), [1.0]),
+        ["`function`", "(A, B, C)", "Got 2"],
+    ),
+    "a word for the structure of a model": (
+        lambda: LPVStateSpace("spring", PolynomialLPV(), [[0], [1]]),
+        ["`structure` must be a GrayBoxStructure", "Got str"],
+    ),
+    "nothing for the interpolator of a model": (
+        lambda: LPVStateSpace(spring_structure(), None, [[0], [1]]),
+        ["`interpolator` must be a fitted regressor", "NoneType"],
+    ),
+    "an interpolator of other parameters": (
+        lambda: LPVStateSpace(
+            spring_structure(), PolynomialLPV(1).fit([[0], [1]], [0, 1]), [[0], [1]]
+        ).at(0.5),
+        ["`interpolator` must predict the 3 parameters", "(1,)"],
+    ),
+    "arguments in another order": (
+        lambda: spring_lpv().simulate(np.ones(99), 0.02, np.ones(99)),
+        ["`sampling_time` must be a positive number", "array([1., 1.", "..."],
+    ),
+    "a word for a model": (lambda: peak_gains("G"), ["`model`", "StateSpace", "str"]),
+    "models of samples and of seconds in one picture": (
+        lambda: BodeDisplay.from_models(
+            {"a": StateSpace(0.5, 1, 1, sampling_time=True), "b": StateSpace(-1, 1, 1)}
+        ),
+        ["count time alike", "True, None", "`time=`"],
+    ),
+    "words for frequencies": (
+        lambda: BodeDisplay.from_models({"a": SPRING}, omega="low"),
+        ["`omega`", "'low'"],
+    ),
+    "a word for axes": (
+        lambda: BodeDisplay.from_models({"a": SPRING}, ax="left"),
+        ["`ax` must be None", "1 of str"],
+    ),
+    "a word for the time of a picture": (
+        lambda: SimulationDisplay.from_predictions("t", U, U),
+        ["`time`", "'t'"],
+    ),
+    "a number for a zoom": (
+        lambda: SimulationDisplay.from_predictions(np.arange(80), U, U, zoom=3),
+        ["`zoom` must be (t_start, t_stop)", "Got 3"],
+    ),
+}
+
 SPLITS = {
     "more folds than experiments": (
         lambda: list(ExperimentSplit(9, experiment="run").split(X)),
@@ -468,6 +671,60 @@ SPLITS = {
         lambda: from_trajectories([([1, 2], [1, 2, 3])]),
         ["`trajectories` must hold arrays of equal length", "[2, 3] in trajectory 0"],
     ),
+    "trajectories of words": (
+        lambda: from_trajectories([("a", "b")]),
+        ["`trajectories[0]: u` must", "'a'"],
+    ),
+    "no list of trajectories": (
+        lambda: from_trajectories(None),
+        ["`trajectories` must be a list of tuples", "NoneType"],
+    ),
+    "trajectories in three dimensions": (
+        lambda: from_trajectories([(np.zeros((2, 2, 2)), np.zeros(8))]),
+        ["`trajectories[0]: u` must have shape", "(2, 2, 2)"],
+    ),
+    "trajectories back in time": (
+        lambda: from_trajectories([([1, 2], [1, 2])], sampling_time=-1),
+        ["`sampling_time` must be a positive number", "-1"],
+    ),
+    "folds of nothing": (
+        lambda: list(ExperimentSplit(2).split(None)),
+        ["X must have shape (n_samples, n_features)"],
+    ),
+    "folds of a vector": (
+        lambda: list(BlockedTimeSeriesSplit(2).split(U[:, 0])),
+        ["X must have shape", "(80,)", "reshape(-1, 1)"],
+    ),
+    "a score of a model": (
+        lambda: bft_scorer(SPRING, X, Y),
+        ["`estimator` must be a fitted estimator", "StateSpace", "compare_models"],
+    ),
+    "a score of words": (
+        lambda: bft_score(["a"], [1.0]),
+        ["`y_true` must hold numbers", "'a' at row 0"],
+    ),
+    "a score of numbers": (lambda: bft_score(1.0, 1.0), ["`y_true` must", "float"]),
+    "weights of words for outputs": (
+        lambda: bft_score([1.0, 2.0], [1.0, 2.0], multioutput=["a"]),
+        ["`multioutput` must hold real numbers", "'a'"],
+    ),
+    "a fit of words": (
+        lambda: parameter_fit(["a"], [1]),
+        ["`params_true` must hold real numbers", "'a'"],
+    ),
+    "a report of numbers": (
+        lambda: readable_report([1, 2]),
+        ["`report` must be a DataFrame", "list"],
+    ),
+    "a comparison on too many inputs": (
+        lambda: compare_models({"a": SPRING}, np.hstack([U, -U]), U[:, 0]),
+        ["model 'a': `inputs` must name the 1 input(s)", "[0, 1]"],
+    ),
+    "an arm of words": (
+        lambda: make_flexible_arm(n_operating_points="seven"),
+        ["`n_operating_points` must be an integer of at least 1", "'seven'"],
+    ),
+    "a link of words": (lambda: FlexibleArm(l1="long"), ["`l1` must be", "'long'"]),
     "an arm without operating points": (
         lambda: make_flexible_arm(n_operating_points=0),
         ["`n_operating_points` must be an integer of at least 1", "Got 0"],

@@ -32,6 +32,7 @@ def test_what_lies_between_is_passed_over():
             PolynomialLPV(1),
             scheduling="kappa",
             experiment="kappa",
+            sampling_time=0.1,
         ).fit(table, y)
     assert {w.filename for w in caught} == {__file__}
 

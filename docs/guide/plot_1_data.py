@@ -96,6 +96,30 @@ except ValueError as error:
     print(error)
 
 # %%
+# Forgotten roles
+# ---------------
+# A column without a role is an input, and a model with one input too many may fit well
+# and mean nothing. What looks like something else is named in a warning: a column that
+# rises evenly (the time), one that counts in blocks (the experiment), one that no
+# experiment changes (the scheduling variable). Whoever lists the ``inputs`` is not
+# doubted.
+
+import warnings
+
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    SubspaceLTI(6, horizon=20, experiment="experiment", scheduling="kappa").fit(
+        X[part], y[part]
+    )
+print(caught[0].message)
+
+# %%
+# Without a time column and without ``sampling_time``, a model counts time in samples:
+# enough to simulate tables, and all that a discrete-time model needs. Where seconds are
+# meant, for a structure, an LPV model, or ``to_continuous()``, that is an error rather
+# than a second per sample; ``sampling_time=1`` says that samples are meant. A structure
+# with fewer inputs than the table names the columns that were taken for inputs.
+#
 # Clocks that jitter, lost rows, missing values and other units of time have a
 # :ref:`page of their own <guide_logs>`.
 #

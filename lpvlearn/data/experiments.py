@@ -8,7 +8,8 @@ else by a level of the index, else by its position.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from numbers import Integral
@@ -19,7 +20,9 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_array, check_consistent_length, validate_data
 
+from ..exceptions import DivergenceError
 from .alignment import align_outputs
+from .forgotten_roles import warn_of_disorder, warn_of_forgotten_roles
 from .timestamps import (
     TIME_TOL,
     UNTIMED,
@@ -39,6 +42,11 @@ ROLES = ("inputs", "scheduling", "experiment", "time", "operating_point")
 OPTIONAL_ROLES = ("time", "operating_point")  # not needed after a fit
 
 _SEVERAL = ("inputs", "scheduling")  # roles of more than one column
+NO_TIME = (  # what a message says where seconds are needed and nothing tells them
+    "`time` or `sampling_time` must tell the seconds between samples: {} in continuous "
+    "time. Got neither. Name the column of times by `time=`, or give `sampling_time=`; "
+    "sampling_time=1 counts time in samples."
+)
 
 _ALIKE = 0.6  # likeness (difflib's, its default) from which a name may have been meant
 _N_SHOWN = 10  # names in an error message, lest a wide table fills the screen
@@ -85,11 +93,16 @@ class Column:
                 return series.to_numpy(dtype=np.float64, na_value=np.nan)
             except (TypeError, ValueError):
                 pass
-        first = 0 if kind in "mM" else _first_not_a_number(series)
+        first = 0 if kind in "mM" else _first_not_a_number(series) or 0
+        remedy = "Mend the value, or leave the column out."
+        if argument == "X":
+            remedy = (
+                "Give a column of labels or times its role, or list the numeric "
+                "columns in `inputs`."
+            )
         raise ValueError(
             f"Column {self.name!r} of {argument} must hold numbers. Got "
-            f"{series.iloc[first]!r} at row {first}. Give a column of labels or times "
-            "its role, or list the numeric columns in `inputs`."
+            f"{series.iloc[first]!r} at row {first}. {remedy}"
         )
 
     def labels(self, rows: Sequence[int]) -> list[Hashable]:
@@ -114,14 +127,14 @@ def _shown(names: Sequence[Any]) -> str:
     return ", ".join(map(repr, names[:_N_SHOWN])) + ", ..." * (len(names) > _N_SHOWN)
 
 
-def _first_not_a_number(series: pd.Series) -> int:
-    for row, value in enumerate(series):
+def _first_not_a_number(values: Iterable[Any]) -> int | None:
+    for row, value in enumerate(values):
         try:
             float(value)
         except (TypeError, ValueError):
             if value is not pd.NA and value is not None:
                 return row
-    return 0
+    return None
 
 
 def _keys(role: str, value: Any) -> list[Any]:
@@ -156,6 +169,11 @@ class Table:
 
     def __init__(self, X: Any, argument: str = "X") -> None:
         X = X if is_table(X) or hasattr(X, "dtype") else np.asarray(X, object)
+        if len(X.shape) != 2:
+            raise ValueError(
+                f"{argument} must have shape (n_samples, n_features). Got {X.shape}; "
+                "reshape(-1, 1) makes a column."
+            )
         self.X = X
         self.n_rows: int = X.shape[0]
         self.named = is_table(X)
@@ -248,6 +266,15 @@ class Experiment:
     jitter: float = 0.0  # largest deviation from even time, relative to the step
 
 
+@contextmanager
+def naming(experiment: Experiment) -> Iterator[None]:
+    """Name the experiment in which a simulation diverges."""
+    try:
+        yield
+    except DivergenceError as error:
+        raise DivergenceError(f"Experiment {experiment.label!r}: {error}") from error
+
+
 def read_experiments(
     estimator: Any,
     X: Any,
@@ -296,6 +323,7 @@ def read_experiments(
     by_label, by_time, by_point = (table.one(roles[name], name) for name in single)
     kappa = table.several(roles["scheduling"], "scheduling")
     u = table.inputs(roles["inputs"], [by_label, by_time, by_point, *kappa])
+    _check_apart({"experiment": by_label, "time": by_time}, u)
     U = _numbers(u, table.n_rows, "X")
     check_array(U, ensure_all_finite=False, estimator=estimator, input_name="X")
     K = _numbers(kappa, table.n_rows, "X") if kappa else None
@@ -303,15 +331,16 @@ def read_experiments(
     if Y is not None:
         check_consistent_length(U, Y)
     labels, groups = group_rows(by_label, table.n_rows)
+    names = [c.name for c in u]
     gaps, remedy = "X" in allow_missing, _SIMULATED if Y is None else _IDENTIFIED
-    for values, names, argument in (
-        (U, [c.name for c in u], "X"),
+    for values, columns, argument in (
+        (U, names, "X"),
         (K, [c.name for c in kappa], "X"),
         (Y, y_names, "y"),
     ):
         if values is not None:
             allow = argument in allow_missing
-            _check_finite(values, names, argument, labels, groups, allow, remedy)
+            _check_finite(values, columns, argument, labels, groups, allow, remedy)
     clocks = _clocks(
         by_time,
         labels,
@@ -329,6 +358,10 @@ def read_experiments(
             ),
         ],
     )
+    if by_time is None:
+        warn_of_disorder(X, groups)
+    if reset and roles["inputs"] is None:
+        warn_of_forgotten_roles(U, names, groups, roles)
     return [
         Experiment(
             label=label,
@@ -338,12 +371,28 @@ def read_experiments(
             scheduling=None if K is None else K[rows],
             operating_point=operating_point_of(by_point, rows, label),
             sampling_time=clock.step,
-            input_names=tuple(column.name for column in u),
+            input_names=tuple(names),
             breaks=tuple(clock.breaks.tolist()),
             jitter=clock.jitter,
         )
         for label, rows, clock in zip(labels, groups, clocks, strict=True)
     ]
+
+
+def _check_apart(single: Mapping[str, Column | None], inputs: Sequence[Column]) -> None:
+    """Refuse a column that tells time or experiments and something else besides."""
+    taken: dict[Hashable, str] = {}
+    for role, columns in [
+        *((role, [column]) for role, column in single.items() if column is not None),
+        ("inputs", inputs),
+    ]:
+        for column in columns:
+            if column.name in taken:
+                raise ValueError(
+                    f"`{role}` must not name a column that is the "
+                    f"`{taken[column.name]}` column already. Got {column.name!r}."
+                )
+        taken |= {column.name: role for column in columns}
 
 
 def fitted_roles(
@@ -391,8 +440,66 @@ def _as_matrix(estimator: Any, X: Any, *, numeric: bool) -> NDArray[Any]:
     """Check an array; with labels among its columns, their type is kept."""
     # A list is read as objects, lest numpy turns its numbers into text.
     dtype = np.float64 if numeric else None if hasattr(X, "dtype") else object
-    return check_array(
-        X, dtype=dtype, ensure_all_finite=False, estimator=estimator, input_name="X"
+    return _checked("X", X, dtype=dtype, estimator=estimator)
+
+
+def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
+    """An array by `check_array`; values that are no numbers are named."""
+    array = any(hasattr(values, name) for name in ("__len__", "__array__"))
+    other = isinstance(values, str | bytes | dict | set) and not hasattr(
+        values, "shape"
+    )
+    if other or not array:
+        shown = repr(values) if isinstance(values, str) else type(values).__name__
+        raise ValueError(
+            f"`{argument}` must be a table (a pandas.DataFrame) or an array of "
+            f"numbers. Got {shown}."
+        )
+    kind = getattr(getattr(values, "dtype", None), "kind", "")
+    if kind in ("m", "M") and options.get("dtype") is not None:
+        raise ValueError(
+            f"`{argument}` must hold numbers. Got dates or time differences, which are "
+            "a `time` column beside inputs at best."
+        )
+    if np.ma.isMaskedArray(values):
+        values = np.ma.filled(values.astype(float), np.nan)  # masked ones are missing
+    try:
+        return check_array(
+            values, ensure_all_finite=False, input_name=argument, **options
+        )
+    except (TypeError, ValueError) as error:
+        try:
+            entries = np.asarray(values)
+        except ValueError:
+            raise ValueError(
+                f"`{argument}` must have rows of one length. Got rows that differ."
+            ) from error
+        flat = entries.ravel()
+        k = _first_not_a_number(flat) if entries.dtype.kind in "OSU" else None
+        if k is not None and entries.ndim:  # a sparse matrix has none
+            at = zip(
+                ("row", "column"), np.unravel_index(k, entries.shape), strict=False
+            )
+            raise type(error)(
+                f"`{argument}` must hold numbers. Got {as_scalar(flat[k])!r} at "
+                f"{', '.join(f'{axis} {i}' for axis, i in at)}: {error}."
+            ) from error
+        raise
+
+
+def as_numbers(argument: str, values: Any) -> Array:
+    """Numbers in an array of any shape, a single one in a vector.
+
+    Raises a ValueError about the `argument` where one is not a real number.
+    """
+    many = hasattr(values, "__len__") and np.shape(values) != ()
+    return _checked(
+        argument,
+        values if many or isinstance(values, str) else [values],
+        dtype=np.float64,
+        ensure_2d=False,
+        allow_nd=True,
+        ensure_min_samples=0,
     )
 
 
@@ -489,20 +596,20 @@ def operating_point_of(
     return as_scalar(values[0])
 
 
-def read_outputs(y: Any) -> tuple[Array, list[Hashable]]:
+def read_outputs(y: Any, argument: str = "y") -> tuple[Array, list[Hashable]]:
     """Outputs as a matrix (n_samples, n_outputs), and their names (y1, y2, ...).
 
     From a DataFrame, a Series or an array-like, not checked for missing values. Raises
-    a ValueError when a column does not hold real numbers.
+    a ValueError about the `argument` when a column does not hold real numbers.
     """
+    if isinstance(y, pd.Series):
+        y = y.to_frame("y1" if y.name is None or y.name == "" else y.name)
     if is_table(y):
-        table = Table(y, "y")
+        table = Table(y, argument)
         columns = [table.at(position) for position in range(len(table.names))]
-        return _numbers(columns, table.n_rows, "y"), table.names
+        return _numbers(columns, table.n_rows, argument), table.names
     name = getattr(y, "name", None)
-    Y = check_array(
-        y, dtype=np.float64, ensure_2d=False, ensure_all_finite=False, input_name="y"
-    )
+    Y = _checked(argument, y, dtype=np.float64, ensure_2d=False)
     if Y.ndim == 1:
         return Y[:, None], ["y1" if name is None or name == "" else name]
     return Y, [f"y{k + 1}" for k in range(Y.shape[1])]
@@ -545,6 +652,17 @@ def from_trajectories(
     0  1.0    0.3           0   0.0
     1  0.0    0.3           0   0.1
     """
+    if not isinstance(trajectories, Sequence) or isinstance(trajectories, str):
+        raise ValueError(
+            "`trajectories` must be a list of tuples (u, kappa, y) or (u, y). Got "
+            f"{type(trajectories).__name__}."
+        )
+    step = 1.0 if sampling_time is None else sampling_time
+    if not 0 < as_numbers("sampling_time", step).min() < np.inf:
+        raise ValueError(
+            "`sampling_time` must be a positive number of seconds. Got "
+            f"{sampling_time}."
+        )
     if len(trajectories) == 0:
         raise ValueError("`trajectories` must hold at least one tuple. Got 0.")
     parts = [_trajectory(k, item) for k, item in enumerate(trajectories)]
@@ -580,8 +698,12 @@ def _trajectory(
             "`trajectories` must be a list of tuples (u, kappa, y) or (u, y). Got "
             f"{got} instead of 2 or 3 arrays in trajectory {k}."
         )
-    u, y = _as_columns(item[0]), _as_columns(item[-1])
-    kappa = _as_columns(item[1]) if len(item) == 3 else None
+    names = ("u", "y") if len(item) == 2 else ("u", "kappa", "y")
+    arrays = {
+        name: _as_columns(f"trajectories[{k}]: {name}", values)
+        for name, values in zip(names, item, strict=True)
+    }
+    u, y, kappa = arrays["u"], arrays["y"], arrays.get("kappa")
     if kappa is not None and len(kappa) == 1:
         kappa = np.repeat(kappa, len(u), axis=0)
     lengths = [len(a) for a in (u, kappa, y) if a is not None]
@@ -593,6 +715,10 @@ def _trajectory(
     return u, kappa, y
 
 
-def _as_columns(values: ArrayLike) -> Array:
-    array = np.asarray(values, dtype=np.float64)
+def _as_columns(name: str, values: ArrayLike) -> Array:
+    array = as_numbers(name, values)
+    if array.ndim > 2:
+        raise ValueError(
+            f"`{name}` must have shape (n_samples, n_channels). Got {array.shape}."
+        )
     return array if array.ndim == 2 else array.reshape(-1, 1)

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ..exceptions import ExtrapolationWarning, warn
-from .experiments import Experiment
+from .experiments import Experiment, as_numbers
 
 Array = NDArray[np.float64]
 
@@ -179,8 +179,8 @@ def _tolerance(signals: Sequence[Array], means: Array, tol: ArrayLike | None) ->
     if tol is None:
         spreads = [np.ptp(signal, axis=0) for signal in signals]
         return np.maximum(_CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0))
-    given = np.asarray(tol, dtype=np.float64)
-    if given.shape not in ((), (means.shape[1],)) or not (given >= 0).all():
+    given = as_numbers("scheduling_tol", tol)
+    if given.shape not in ((1,), (means.shape[1],)) or not (given >= 0).all():
         raise ValueError(
             "`scheduling_tol` must be a non-negative number, or one per scheduling "
             f"variable ({means.shape[1]}). Got {tol!r}."

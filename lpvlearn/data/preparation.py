@@ -198,6 +198,7 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
         raise ValueError(
             f"Every input must vary. Got input {k if names is None else names[k]!r} "
             f"constant at {inputs[0][0, k]:g}: "
-            "its effect cannot be told from the initial state. Leave it out of "
-            "`inputs` or excite it."
+            "its effect cannot be told from the initial state. Excite it, or leave it "
+            "out of `inputs`; a column that is no input needs its role (`scheduling=`, "
+            "`operating_point=`, `experiment=`)."
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Real
+
 import numpy as np
 from numpy.random import Generator, RandomState
 from numpy.typing import NDArray
@@ -104,12 +106,14 @@ def spawn_generators(
 
 def check_count(name: str, value: float) -> None:
     """Refuse what is no whole number of at least 1."""
-    if value != int(value) or value < 1:
-        raise ValueError(f"`{name}` must be an integer of at least 1. Got {value}.")
+    whole = isinstance(value, Real) and value == np.rint(value)
+    if not whole or value < 1 or not np.isfinite(value):
+        raise ValueError(f"`{name}` must be an integer of at least 1. Got {value!r}.")
 
 
 def check_size(name: str, value: float, may_be_zero: bool = False) -> None:
     """Refuse what is not finite and positive (or zero, where that may be)."""
-    if not (np.isfinite(value) and (value > 0 or (may_be_zero and value == 0))):
+    finite = isinstance(value, Real) and np.isfinite(value)
+    if not finite or not (value > 0 or (may_be_zero and value == 0)):
         rule = "non-negative" if may_be_zero else "positive"
-        raise ValueError(f"`{name}` must be finite and {rule}. Got {value}.")
+        raise ValueError(f"`{name}` must be finite and {rule}. Got {value!r}.")

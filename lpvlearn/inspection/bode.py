@@ -11,7 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..models.statespace import StateSpace
 from .drawing import axes_grid, figure_legend, line_style, named, names_of, tidy
 from .fitted import check_model, models_of, unwrapped, with_others
-from .frequency import check_frequencies, frequency_axis, response_up_to_nyquist
+from .frequency import (
+    check_frequencies,
+    frequency_axis,
+    frequency_label,
+    response_up_to_nyquist,
+)
 
 Array = NDArray[np.float64]
 
@@ -40,6 +45,7 @@ class BodeDisplay:
         square.
     output_names, input_names : sequence of str, default=None
         None is y1, y2, ... and u1, u2, ...
+    frequency_label : str, default="Frequency (rad/s)"
 
     Attributes
     ----------
@@ -70,7 +76,9 @@ class BodeDisplay:
         std: Mapping[str, ArrayLike] | None = None,
         output_names: Sequence[Hashable] | None = None,
         input_names: Sequence[Hashable] | None = None,
+        frequency_label: str = "Frequency (rad/s)",
     ) -> None:
+        self.frequency_label = frequency_label
         self.omega = check_frequencies(omega)
         self.responses = {
             name: np.asarray(response, dtype=complex)
@@ -176,7 +184,11 @@ class BodeDisplay:
         responses = {
             name: response_up_to_nyquist(model, grid) for name, model in models.items()
         }
-        names = {"output_names": output_names, "input_names": input_names}
+        names: dict[str, Any] = {
+            "output_names": output_names,
+            "input_names": input_names,
+            "frequency_label": frequency_label(list(models.values())),
+        }
         return cls(grid, responses, std=std, **names).plot(ax, phase=phase)
 
     @classmethod
@@ -304,7 +316,7 @@ class BodeDisplay:
         for j, name in enumerate(self.input_names):
             if len(self.input_names) > 1:
                 axes[0, j].set_title(f"from {name}", fontsize=9)
-            axes[-1, j].set_xlabel("Frequency (rad/s)")
+            axes[-1, j].set_xlabel(self.frequency_label)
         for i, name in enumerate(self.output_names):
             several = len(self.output_names) > 1 or len(self.input_names) > 1
             prefix = f"to {name}\n" if several else ""

@@ -90,10 +90,11 @@ def axes_grid(
         cells = spec.subgridspec(n_rows, n_columns, height_ratios=height_ratios)
         return ax.figure, cells.subplots(**share)
     axes = np.atleast_1d(np.asarray(ax, dtype=object))
-    if axes.size != n_axes:
+    if axes.size != n_axes or not all(isinstance(one, Axes) for one in axes.flat):
+        kinds = ", ".join(sorted({type(one).__name__ for one in axes.flat}))
         raise ValueError(
             f"`ax` must be None, one subplot or an array of {n_axes} Axes "
-            f"({n_rows} x {n_columns}). Got {axes.size}."
+            f"({n_rows} x {n_columns}). Got {axes.size} of {kinds}."
         )
     return axes.flat[0].figure, axes.reshape(n_rows, n_columns)
 

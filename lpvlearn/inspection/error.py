@@ -14,6 +14,7 @@ from .fitted import check_model
 from .frequency import (
     check_frequencies,
     frequency_axis,
+    frequency_label,
     nyquist_frequency,
     response_up_to_nyquist,
 )
@@ -76,7 +77,9 @@ class ErrorDisplay:
         active_values: ArrayLike | None = None,
         floor: float = 0.0,
         norms: Mapping[str, float] | None = None,
+        frequency_label: str = "Frequency (rad/s)",
     ) -> None:
+        self.frequency_label = frequency_label
         self.omega = check_frequencies(omega)
         self.error = self._curve("error", error)
         self.start = None if start is None else self._curve("start", start)
@@ -164,6 +167,7 @@ class ErrorDisplay:
             active_values=_sigma(difference, marked),
             floor=floor,
             norms=norms,
+            frequency_label=frequency_label([gray_box, black_box]),
         )
         return display.plot(ax)
 
@@ -283,7 +287,7 @@ class ErrorDisplay:
         one.set_xlim(self.omega[0], self.omega[-1])
         self._limit(one)
         tidy(one)
-        one.set_xlabel("Frequency (rad/s)")
+        one.set_xlabel(self.frequency_label)
         one.set_ylabel("Largest singular value of the error")
         handles = [*self.lines_.values(), *self.active_points_[:1]]
         legend_above(one, handles, n_columns=4 if len(handles) < 4 else 2)

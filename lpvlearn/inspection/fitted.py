@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..data.experiments import as_numbers
 from ..models.statespace import StateSpace
 
 
@@ -36,7 +37,7 @@ def models_of(
             "`kappa` must tell at which scheduling value to draw the pipeline's "
             f"models. Got None; its operating points are {shown}."
         )
-    place = np.reshape(np.asarray(kappa, dtype=float), -1)
+    place = as_numbers("kappa", kappa).reshape(-1)
     if place.shape != points.shape[1:]:
         raise ValueError(
             f"`kappa` must hold {points.shape[1]} scheduling value(s). Got {kappa!r}."
@@ -69,6 +70,11 @@ def check_model(name: str, model: Any, hint: str = "") -> None:
 
 def with_others(own: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
     """An estimator's things and further ones to compare with, by name."""
+    if not isinstance(others, Mapping):
+        raise ValueError(
+            "`others` must be a dict from names to models. Got "
+            f"{type(others).__name__}."
+        )
     for name in others:
         if name in own:
             raise ValueError(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..data.experiments import as_numbers
 from ..models.statespace import StateSpace
 from ..systems.response import pole_grid, pole_rates
 
@@ -48,6 +49,20 @@ def frequency_axis(models: Sequence[StateSpace], n_points: int = 400) -> Array:
     return grid[(grid >= low) & (grid <= high)]
 
 
+def frequency_label(models: Sequence[StateSpace]) -> str:
+    """Of the axis; a ValueError where some models count time in samples, others not."""
+    times = [model.sampling_time for model in models]
+    if not any(time is True for time in times):
+        return "Frequency (rad/s)"
+    if any(time != 1 for time in times):
+        raise ValueError(
+            "models to draw together must count time alike. Got sampling times "
+            f"{', '.join(map(str, times))}, where True counts samples: identify that "
+            "model with `time=` or `sampling_time=`."
+        )
+    return "Frequency (rad/sample)"
+
+
 def nyquist_frequency(model: StateSpace) -> float:
     """Highest frequency (rad/s) of a sampled model; infinity in continuous time."""
     return np.inf if model.sampling_time is None else np.pi / model.sampling_time
@@ -66,7 +81,7 @@ def response_up_to_nyquist(model: StateSpace, omega: Array) -> NDArray[np.comple
 
 def check_frequencies(omega: ArrayLike) -> Array:
     """`omega` as increasing positive frequencies, or a ValueError."""
-    grid = np.asarray(omega, dtype=float)
+    grid = as_numbers("omega", omega)
     if grid.ndim != 1 or len(grid) < 2:
         raise ValueError(
             "`omega` must hold at least 2 angular frequencies in rad/s, shape "

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..data.experiments import as_numbers
 from .drawing import LABEL_SIZE, MUTED, TEXT_SIZE, legend_above, single_axes, tidy
 from .fitted import (
     check_one_scheduling,
@@ -261,7 +262,7 @@ def _draw_damping(ax: Any) -> None:
 def _grid(model: Any, kappa: ArrayLike | None) -> Array:
     check_one_scheduling(model.n_scheduling, "PoleDisplay")
     if kappa is not None:
-        return np.asarray(kappa, dtype=float).reshape(-1)
+        return as_numbers("kappa", kappa).reshape(-1)
     low, high = model.scheduling_range[:, 0]
     return np.linspace(low, high, _N_POINTS)
 

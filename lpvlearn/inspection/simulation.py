@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.alignment import align_outputs
-from ..data.experiments import ROLES, Table, fitted_roles, is_table, read_outputs
+from ..data.experiments import (
+    ROLES,
+    Table,
+    as_numbers,
+    fitted_roles,
+    is_table,
+    read_outputs,
+)
 from ..data.timestamps import time_in_seconds
 from ..metrics.scorers import check_options, simulate
 from ..metrics.scores import bft_score
@@ -87,7 +94,7 @@ class SimulationDisplay:
     ) -> None:
         self.y_true, names = read_outputs(y_true)
         n_outputs = self.y_true.shape[1]
-        self.time = np.asarray(time, dtype=float)
+        self.time = as_numbers("time", time)
         if self.time.shape != (len(self.y_true),):
             raise ValueError(
                 f"`time` must have shape ({len(self.y_true)},), a value for each row "
@@ -275,8 +282,9 @@ class SimulationDisplay:
     def _window(self, zoom: tuple[float, float] | None) -> NDArray[np.bool_]:
         if zoom is None:
             return np.ones(len(self.time), dtype=bool)
-        shown = (self.time >= zoom[0]) & (self.time <= zoom[1])
-        if shown.sum() < 2:
+        edges = as_numbers("zoom", zoom).ravel()
+        shown = (self.time >= edges[0]) & (self.time <= edges[-1])
+        if len(edges) != 2 or shown.sum() < 2:
             raise ValueError(
                 "`zoom` must be (t_start, t_stop) with at least 2 samples between, "
                 f"within {self.time[0]:g} to {self.time[-1]:g}. Got {zoom}."
@@ -323,4 +331,6 @@ def _time_of(estimator: Any, table: Table) -> tuple[Array, str]:
     step = getattr(estimator, "sampling_time_", None)
     if step is None and hasattr(estimator, "lti_"):
         step = estimator.lti_.sampling_time
-    return (number, "Sample") if step is None else (float(step) * number, "Time (s)")
+    if step is None or step is True:
+        return number, "Sample"
+    return float(step) * number, "Time (s)"

@@ -9,13 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..exceptions import DivergenceError, finite_simulation
 from ..models.statespace import StateSpace, sorted_poles
 from ..models.system_matrix import blocks
 from ..structures.structure import GrayBoxStructure
 from ..systems.sampling import sample_zoh
 from ..systems.simulation import state_trajectory
 from ..systems.tabulation import tabulate
-from ..validation import finite_samples, positive_time, real_array, state_vector
+from ..validation import (
+    finite_samples,
+    positive_time,
+    real_array,
+    state_vector,
+)
 
 Array = NDArray[np.float64]
 
@@ -90,6 +96,16 @@ class LPVStateSpace:
     n_scheduling: int = field(init=False)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.structure, GrayBoxStructure):
+            raise ValueError(
+                "`structure` must be a GrayBoxStructure. Got "
+                f"{type(self.structure).__name__}."
+            )
+        if not hasattr(self.interpolator, "predict"):
+            raise ValueError(
+                "`interpolator` must be a fitted regressor, such as PolynomialLPV. Got "
+                f"{type(self.interpolator).__name__}."
+            )
         bounds = real_array("scheduling_range", self.scheduling_range)
         if bounds.ndim != 2 or len(bounds) != 2 or not (bounds[0] <= bounds[1]).all():
             raise ValueError(
@@ -127,7 +143,13 @@ class LPVStateSpace:
         """
         kappa = self._scheduling(kappa)
         values = np.asarray(self.interpolator.predict(kappa), dtype=float)
-        return values.reshape(len(kappa), self.structure.n_params)
+        n_params = self.structure.n_params
+        if values.size != len(kappa) * n_params:
+            raise ValueError(
+                f"`interpolator` must predict the {n_params} parameters of the "
+                f"structure. Got shape {values.shape} for {len(kappa)} point(s)."
+            )
+        return values.reshape(len(kappa), n_params)
 
     def at(self, kappa: ArrayLike) -> StateSpace:
         """The frozen model at one scheduling value, Eq. (2).
@@ -197,6 +219,8 @@ class LPVStateSpace:
         ValueError
             If shapes do not fit, a value is not finite, or the structure gives no
             finite matrices at a scheduling value.
+        DivergenceError
+            If the outputs overflow; the first sample and value are told.
         """
         u = finite_samples("u", u, self.n_inputs)
         x = np.zeros(self.order)
@@ -264,10 +288,32 @@ class LPVStateSpace:
             S = model._held_matrices(kappa[rows], dt)
             A, B, C, D = blocks(S[:, :, : self.order + u.shape[1]], self.order)
             forcing = B @ u[rows]
-            states = state_trajectory(A, forcing, x)
-            y[rows] = C @ states + D @ u[rows]
-            x = A[-1] @ states[-1] + forcing[-1]
-        return y
+            with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
+                states = state_trajectory(A, forcing, x)
+                y[rows] = C @ states + D @ u[rows]
+                x = A[-1] @ states[-1] + forcing[-1]
+        return finite_simulation(y, lambda: model._why_it_diverges(kappa))
+
+    def _why_it_diverges(self, kappa: Array) -> str:
+        """The worst of the frozen models along a trajectory, and what may be wrong."""
+        poles = self.frozen_poles(kappa).real.max(axis=1, initial=-np.inf)
+        worst = int(poles.argmax())
+        if poles[worst] < 0:
+            return "All frozen models along `scheduling` are stable: look at the input."
+        low, high = self.scheduling_range
+        beyond = ((kappa[worst] < low) | (kappa[worst] > high)).any()
+        cause = (
+            "It is outside of the identified range: identify a model there too, or "
+            "hold the border's by PolynomialLPV(extrapolation='clip')."
+            if beyond
+            else "Look at the parameters of the local models: inputs or outputs about "
+            "an offset, shuffled rows, or times in another unit spoil them. If they "
+            "are right, lower the degree of the polynomial."
+        )
+        return (
+            f"The frozen model at scheduling {kappa[worst].round(6).tolist()} is "
+            f"unstable: a pole has real part {poles[worst]:.4g} 1/s. {cause}"
+        )
 
     def _held_matrices(self, kappa: Array, dt: float) -> Array:
         """``[[Ad, Bd], [C, D]]`` at every row of `kappa`."""
@@ -281,7 +327,13 @@ class LPVStateSpace:
                     "`structure` must give finite matrices along `scheduling`. Got a "
                     f"NaN or infinity at {points[~finite][0]}."
                 )
-            Ad, Bd = sample_zoh(A, B, dt)
+            try:
+                Ad, Bd = sample_zoh(A, B, dt)
+            except ValueError:  # it overflows within a sample
+                raise DivergenceError(
+                    f"the simulation diverges within one sample of {dt:g} s. "
+                    f"{self._why_it_diverges(points)}"
+                ) from None
             upper, lower = np.concatenate([Ad, Bd], 2), np.concatenate([C, D], 2)
             return np.concatenate([upper, lower], 1)
 

@@ -210,6 +210,11 @@ def readable_report(report: pd.DataFrame) -> pd.DataFrame:
       local BFT  k
     0     96.83  3
     """
+    if not isinstance(report, pd.DataFrame):
+        raise ValueError(
+            "`report` must be a DataFrame, such as fit_report returns. Got "
+            f"{type(report).__name__}."
+        )
     headings, columns = [], []
     for name, column in report.items():
         heading, style = _READABLE.get(str(name), (str(name), _DIGITS))

@@ -189,6 +189,11 @@ def unwrap(estimator: Any, X: Any) -> tuple[Any, Any]:
     """The simulating estimator within a search or pipeline, and its input."""
     from sklearn.pipeline import Pipeline  # slow to import
 
+    if not hasattr(estimator, "predict"):
+        raise ValueError(
+            "`estimator` must be a fitted estimator with the method predict(X). Got "
+            f"{type(estimator).__name__}; compare_models takes state-space models."
+        )
     while True:
         if hasattr(estimator, "best_estimator_"):
             estimator = estimator.best_estimator_

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import read_outputs
+from ..validation import real_array
 
 Multioutput = Literal["raw_values", "uniform_average"] | ArrayLike
 
@@ -138,9 +139,8 @@ def parameter_fit(params_true: ArrayLike, params_pred: ArrayLike) -> float:
     >>> parameter_fit([[1.0, 2.0], [3.0, 4.0]], [[1.0, 2.0], [3.0, 4.0]])
     100.0
     """
-    eta = np.asarray(params_true, dtype=np.float64)
-    eta_hat = np.asarray(params_pred, dtype=np.float64)
     names = ("params_true", "params_pred")
+    eta, eta_hat = real_array(names[0], params_true), real_array(names[1], params_pred)
     if eta.shape != eta_hat.shape or eta.size == 0:
         raise ValueError(
             f"`{names[0]}` and `{names[1]}` must have the same shape, not empty. Got "
@@ -172,7 +172,8 @@ def _read_pair(
 
     Unless refused, `missing` values of the first are NaN in both.
     """
-    true, pred = read_outputs(y_true)[0], read_outputs(y_pred)[0]
+    pair = zip((y_true, y_pred), names, strict=True)
+    true, pred = (read_outputs(values, name)[0] for values, name in pair)
     if true.shape != pred.shape or len(true) == 0:
         raise ValueError(
             f"`{names[0]}` and `{names[1]}` must have the same shape, with at least 1 "
@@ -240,7 +241,7 @@ def _percent(
             "`multioutput` must be 'raw_values', 'uniform_average' or one weight per "
             f"output. Got {multioutput!r}."
         )
-    weights = np.asarray(multioutput, dtype=np.float64)
+    weights = real_array("multioutput", multioutput)
     if weights.shape != scores.shape or weights.min() < 0 or weights.sum() == 0:
         raise ValueError(
             "`multioutput` must hold one non-negative weight for each of "

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.experiments import Experiment, n_rows_of, read_experiments
+from ..data.experiments import (
+    NO_TIME,
+    Experiment,
+    n_rows_of,
+    naming,
+    read_experiments,
+)
 from ..data.preparation import read_runs
 from ..data.timestamps import TIME_TOL
 from ..lpv.model import LPVStateSpace
@@ -55,7 +61,7 @@ def fit_of(
 def simulate_experiments(
     model: StateSpace | LPVStateSpace,
     experiments: Sequence[Experiment],
-    sampling_time: float,
+    sampling_time: float | None,
     n_samples: int,
     *,
     estimate: bool,
@@ -63,30 +69,35 @@ def simulate_experiments(
     """Outputs (n_samples, n_outputs) of a model along the experiments of a table.
 
     Rows stand where they do in the table, NaN in those of no experiment;
-    `sampling_time` is that of experiments that do not tell it. From rest, or from
-    initial states estimated on the outputs.
+    `sampling_time` is that of experiments that do not tell it, None where it is not
+    known. From rest, or from initial states estimated on the outputs.
     """
     table = np.full((n_samples, model.n_outputs), np.nan)
     for e in experiments:
         dt = e.sampling_time or sampling_time
-        table[e.rows] = _simulate(model, e, dt, estimate)
+        with naming(e):
+            table[e.rows] = _simulate(model, e, dt, estimate)
     return table
 
 
 def _simulate(
-    model: StateSpace | LPVStateSpace, e: Experiment, dt: float, estimate: bool
+    model: StateSpace | LPVStateSpace, e: Experiment, dt: float | None, estimate: bool
 ) -> Array:
     x0 = None
+    if isinstance(model, StateSpace) and not model.is_continuous:
+        if estimate:
+            y = _outputs(e, model.n_outputs)
+            x0 = model.estimate_initial_state(e.inputs, y)
+        return model.simulate(e.inputs, initial_state=x0)
+    if dt is None:
+        raise ValueError(NO_TIME.format("the model is"))
     if isinstance(model, LPVStateSpace):
         kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
         if estimate:
             error = _outputs(e, model.n_outputs) - model.simulate(e.inputs, kappa, dt)
             x0 = estimate_initial_state(model.free_responses(kappa, dt), error)
         return model.simulate(e.inputs, kappa, dt, x0)
-    sampled = model.to_discrete(dt) if model.is_continuous else model
-    if estimate:
-        x0 = sampled.estimate_initial_state(e.inputs, _outputs(e, model.n_outputs))
-    return sampled.simulate(e.inputs, initial_state=x0)
+    return _simulate(model.to_discrete(dt), e, dt, estimate)
 
 
 def _outputs(experiment: Experiment, n_outputs: int) -> Array:
@@ -142,13 +153,18 @@ class TableSimulator(BaseEstimator):
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
                 "that the LPV model follows. Got None."
             )
-        step = self.sampling_time
-        return read_runs(self, X, y, split=True, sampling_time=step, **options)
+        options |= {"split": True, "sampling_time": self.sampling_time}
+        found = read_runs(self, X, y, **options)
+        if len(found[0].input_names) != self.model.n_inputs:
+            raise ValueError(
+                f"`inputs` must name the {self.model.n_inputs} input(s) of the model "
+                f"among the columns of X. Got {list(found[0].input_names)}."
+            )
+        return found
 
     def _simulate(
         self, experiments: list[Experiment], n_samples: int, *, estimate: bool
     ) -> Array:
-        step = self.sampling_time or 1.0  # where the table does not tell it
         return simulate_experiments(
-            self.model, experiments, step, n_samples, estimate=estimate
+            self.model, experiments, self.sampling_time, n_samples, estimate=estimate
         )

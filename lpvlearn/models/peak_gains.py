@@ -73,6 +73,8 @@ def peak_gains(
     (5.025189, array([1.979899]))
     """
     one_of("norm", norm, ("hinf", "linf"))
+    if not isinstance(model, StateSpace):
+        raise ValueError(f"`model` must be a StateSpace. Got {type(model).__name__}.")
     if not 0 < within < 1:
         raise ValueError(f"`within` must be between 0 and 1. Got {within}.")
     compute = hinf_norm if norm == "hinf" else linf_norm

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import warn
+from ..exceptions import finite_simulation, warn
 from ..systems.balancing import align_signs, balancing_transformation
 from ..systems.hinf_norm import hinf_norm
 from ..systems.response import frequency_response
@@ -20,6 +20,7 @@ from ..systems.simulation import (
 )
 from ..validation import (
     finite_samples,
+    frequencies,
     matrix,
     one_of,
     positive_time,
@@ -53,8 +54,10 @@ class StateSpace:
     C : array-like of shape (n_outputs, order)
     D : array-like of shape (n_outputs, n_inputs), default=None
         None is no feedthrough.
-    sampling_time : float, default=None
-        Seconds between samples; None is continuous time.
+    sampling_time : float or True, default=None
+        Seconds between samples; None is continuous time. True is discrete time with a
+        step that is not known: time is counted in samples, frequencies in radians per
+        sample, and there is no way to continuous time.
 
     Attributes
     ----------
@@ -127,7 +130,8 @@ class StateSpace:
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         dt = sampling_time
-        dt = None if dt is None else positive_time("sampling_time", dt)
+        if dt is not None and dt is not True:
+            dt = positive_time("sampling_time", dt)
         names = ("sampling_time", "order", "n_outputs", "n_inputs")
         for name, number in zip(names, (dt, n, *shape), strict=True):
             object.__setattr__(self, name, number)
@@ -138,7 +142,8 @@ class StateSpace:
 
     def __repr__(self) -> str:
         dt = self.sampling_time
-        time = "continuous time" if dt is None else f"sampling_time={dt:g}"
+        named = {None: "continuous time", True: "time in samples"}
+        time = f"sampling_time={dt:g}" if isinstance(dt, float) else named[dt]
         return (
             f"{type(self).__name__}(order={self.order}, n_inputs={self.n_inputs}, "
             f"n_outputs={self.n_outputs}, {time})"
@@ -192,13 +197,7 @@ class StateSpace:
         >>> StateSpace(-2, 2, 1).frequency_response([0.0, 2.0])[:, 0, 0]
         array([1. +0.j , 0.5-0.5j])
         """
-        omega = np.atleast_1d(real_array("omega", omega))
-        if omega.ndim != 1 or np.isnan(omega).any():
-            raise ValueError(
-                "`omega` must have shape (n_freq,) and hold no NaN. Got "
-                f"shape {omega.shape} with {np.isnan(omega).sum()} NaN."
-            )
-        dt = self.sampling_time
+        omega, dt = frequencies(omega), self.sampling_time
         return frequency_response(self.A, self.B, self.C, self.D, omega, dt=dt)
 
     def dc_gain(self) -> Array:
@@ -252,6 +251,8 @@ class StateSpace:
         ValueError
             If a shape does not fit, a value is not finite, or `sampling_time` is
             missing or not that of the discrete-time model.
+        DivergenceError
+            If the outputs overflow; the first sample and value are told.
 
         Examples
         --------
@@ -270,7 +271,19 @@ class StateSpace:
                     f"`sampling_time` must be {dt} s, the model's own. "
                     f"Got {sampling_time}. Convert with to_continuous() first."
                 )
-        return lti_response(A, B, self.C, self.D, u, x0)
+        with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
+            y = lti_response(A, B, self.C, self.D, u, x0)
+        return finite_simulation(y, self._why_it_diverges)
+
+    def _why_it_diverges(self) -> str:
+        if self.is_stable:
+            return "The model is stable: scale `u` or `initial_state` down."
+        poles = self.poles()
+        worst = poles[self._growth(poles).argmax()]
+        return (
+            f"The model is unstable (a pole at {worst:.6g}): use stability='enforce' "
+            "of SubspaceLTI, or a shorter record."
+        )
 
     def estimate_initial_state(self, u: ArrayLike, y: ArrayLike) -> Array:
         """Initial state of a discrete-time model with which it fits a record best.
@@ -317,10 +330,11 @@ class StateSpace:
                 "`u` and `y` must have one row for each of the same samples, at least "
                 f"one. Got {len(u)} and {len(y)}."
             )
-        free = free_responses(self.A, self.C, len(y))
-        return estimate_initial_state(
-            free, y - lti_response(self.A, self.B, self.C, self.D, u)
-        )
+        error = y - self.simulate(u)
+        with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
+            free = free_responses(self.A, self.C, len(y))
+        finite_simulation(free, self._why_it_diverges)
+        return estimate_initial_state(free, error)
 
     def transform(self, T: ArrayLike) -> StateSpace:
         """Change the state basis: ``(T A T^-1, T B, C T^-1, D)``.
@@ -362,11 +376,12 @@ class StateSpace:
                 "models to subtract must have the same inputs, outputs and sampling "
                 f"time. Got {self} and {other}."
             )
+        dt = other.sampling_time if self.sampling_time is True else self.sampling_time
         n, k = self.order, other.order
         A = np.zeros((n + k, n + k))
         A[:n, :n], A[n:, n:] = self.A, other.A
         B, C = np.vstack([self.B, other.B]), np.hstack([self.C, -other.C])
-        return StateSpace(A, B, C, self.D - other.D, self.sampling_time)
+        return StateSpace(A, B, C, self.D - other.D, dt)
 
     def hankel_singular_values(self) -> Array:
         """Hankel singular values of a stable model, descending, shape (order,).
@@ -465,7 +480,8 @@ class StateSpace:
         Raises
         ------
         ValueError
-            If a pole has no continuous equivalent (at 0 for "zoh", at -1 for "tustin").
+            If a pole has no continuous equivalent (at 0 for "zoh", at -1 for "tustin"),
+            or the sampling time is not known.
 
         Warns
         -----
@@ -481,6 +497,12 @@ class StateSpace:
         if self.sampling_time is None:
             return self
         dt = self.sampling_time
+        if dt is True:
+            raise ValueError(
+                "`sampling_time` must be known for continuous time. Got a model that "
+                "counts time in samples. Identify it with `time=` (a column of X) or "
+                "`sampling_time=` (seconds; 1 where a sample is the unit of time)."
+            )
         if method == "tustin":
             return StateSpace(*d2c_tustin(self.A, self.B, self.C, self.D, dt))
         A, B, C, doubled = d2c_zoh(self.A, self.B, self.C, dt)
@@ -516,9 +538,10 @@ class StateSpace:
                 f"{type(model).__name__}."
             )
         dt = model.dt
-        if dt is True or dt is None:
+        if dt is None:
             raise ValueError(
-                f"`model.dt` must be 0 or a sampling time in seconds. Got {dt}."
+                "`model.dt` must be 0 (continuous time), a sampling time in seconds or "
+                "True (discrete time, in samples). Got None."
             )
         return cls(model.A, model.B, model.C, model.D, dt if dt > 0 else None)
 
@@ -545,7 +568,9 @@ def sorted_poles(A: Array) -> NDArray[np.complex128]:
 
 
 def _same_time(one: float | None, other: float | None) -> bool:
-    """Whether two sampling times agree; None is continuous time."""
+    """Whether two sampling times agree; None is continuous time, True any step."""
     if one is None or other is None:
         return one is other
+    if one is True or other is True:
+        return True
     return abs(one - other) <= _SAME_TIME * other

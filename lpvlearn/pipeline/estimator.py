@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from numbers import Integral
 from time import perf_counter
 from typing import Any
 
@@ -17,6 +18,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
 from sklearn.utils.validation import check_is_fitted, check_memory
 
 from ..data.experiments import (
+    NO_TIME,
     Experiment,
     as_list,
     n_rows_of,
@@ -31,8 +33,9 @@ from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
+from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
-from ..validation import one_of, positive_time
+from ..validation import one_of, positive_time, whole_number
 from .points import PointRunner, identify_points, restructure_points
 from .reports import Tables, summarise, tables
 
@@ -104,7 +107,8 @@ list, default=None
         from the data.
     sampling_time : float, default=None
         Seconds between samples. None reads it from the time column, else takes that of
-        `local`.
+        `local`. One of them must tell it where there is a structure or a scheduling
+        variable, for the model is in continuous time; 1 counts time in samples.
     time_tol : float, default=0.01
         Largest deviation of a time stamp from an even grid, relative to the step. For
         more, see `resample`. Where samples are missing, ``local=SubspaceLTI(
@@ -296,16 +300,20 @@ list, default=None
             self.n_outputs_ = len(self.output_names_)
             self._single_output = np.asarray(y).ndim == 1
             check_outputs(experiments, self.output_names_)
-            self.sampling_time_ = self._sampling_time(experiments)
             self.time_jitter_ = max(e.jitter for e in experiments)
+            structure = getattr(restructurer, "structure", None)
+            _check_channels(
+                structure, experiments[0].input_names, self.output_names_, self.inputs
+            )
             points = local_experiments(experiments, self.scheduling_tol)
+            self.sampling_time_ = self._sampling_time(experiments, structure)
 
         with watch.step("local models"):  # step 3: a black box at every point
             local, points = identify_points(
                 SubspaceLTI() if self.local is None else self.local,
                 points,
                 runner,
-                structure=getattr(restructurer, "structure", None),
+                structure=structure,
                 sampling_time=self.sampling_time_,
                 combine=self.combine,
                 discretization=self.discretization,
@@ -351,6 +359,11 @@ list, default=None
         Returns
         -------
         ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+
+        Raises
+        ------
+        DivergenceError
+            If the outputs overflow, for the model is unstable along an experiment.
 
         Warns
         -----
@@ -460,13 +473,20 @@ list, default=None
                 check_unit(e.sampling_time, self.sampling_time_, self.time)
         return experiments
 
-    def _sampling_time(self, experiments: list[Experiment]) -> float:
+    def _sampling_time(self, experiments: list[Experiment], structure: Any) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]
         if steps:
             return float(np.median(steps))
-        if self.sampling_time is not None:
-            return positive_time("sampling_time", self.sampling_time)
-        return float(getattr(self.local, "sampling_time", None) or 1.0)
+        for owner in (self, self.local):
+            given = getattr(owner, "sampling_time", None)
+            if given is not None:
+                return positive_time("sampling_time", given)
+        if self.time is not None or (structure is None and self.scheduling is None):
+            # Single samples, which are refused later; or a black box of one operating
+            # point, whose time is in samples.
+            return 1.0
+        needed = "an LPV model is" if structure is None else "the structure is"
+        raise ValueError(NO_TIME.format(needed))
 
     def _restructurer(self) -> Any:
         """The restructurer to clone, or None for "passthrough"."""
@@ -485,6 +505,16 @@ list, default=None
         one_of("combine", self.combine, ("pool", "average"))
         one_of("discretization", self.discretization, ("zoh", "tustin"))
         one_of("on_error", self.on_error, ("raise", "skip"))
+        one_of("efficient", self.efficient, (True, False))
+        if not isinstance(self.verbose, bool):
+            whole_number("verbose", self.verbose, 0)
+        if self.n_jobs is not None and (
+            not isinstance(self.n_jobs, Integral) or self.n_jobs == 0
+        ):
+            raise ValueError(
+                "`n_jobs` must be None or an integer, -1 for all processors, not 0. "
+                f"Got {self.n_jobs!r}."
+            )
         for name in _STEPS:
             _check_step(name, getattr(self, name))
 
@@ -516,6 +546,36 @@ def _checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
                 "top of a module, or leave `memory` out."
             ) from error
     return memory
+
+
+def _check_channels(
+    structure: Any, inputs: Sequence[Any], outputs: Sequence[Any], named: Any
+) -> None:
+    """Refuse columns that a structure has no inputs or outputs for, naming them."""
+    if not isinstance(structure, GrayBoxStructure):
+        return
+    has = f"`structure` has {structure.n_outputs} outputs and {structure.n_inputs} "
+    if structure.n_inputs != len(inputs):
+        shown = ", ".join(map(repr, inputs))
+        how = (
+            "as named in `inputs`"
+            if named is not None
+            else (
+                "all without another role. Is one of them the time, the scheduling "
+                "variable or the experiment? Name it by `time=`, `scheduling=` or "
+                "`experiment=`"
+            )
+        )
+        raise ValueError(
+            f"{has}inputs; `X` has {len(inputs)} input column(s), {shown}, {how}. They "
+            "must agree: list the inputs of the structure in `inputs`."
+        )
+    if structure.n_outputs != len(outputs):
+        shown = ", ".join(map(repr, outputs))
+        raise ValueError(
+            f"{has}inputs; `y` has {len(outputs)} column(s), {shown}. They must agree: "
+            "give the outputs of the structure alone, in its order."
+        )
 
 
 def _name_of_step(step: Any, name: str) -> str:

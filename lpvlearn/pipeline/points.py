@@ -9,7 +9,6 @@ several points at a time, tells progress and failures, and keeps results in a me
 from __future__ import annotations
 
 import inspect
-import warnings
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -24,7 +23,7 @@ from threadpoolctl import ThreadpoolController
 
 from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
-from ..exceptions import warn
+from ..exceptions import Told, collected, warn
 from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
@@ -83,18 +82,19 @@ def identify_points(
     # Where a record stood in the table does not matter: splits share their results.
     groups = [[_bare(e) for e in group] for group in points.experiments]
 
-    def identify(estimator: Any) -> list[LocalModel | None]:
+    def identify(estimator: Any) -> list[Done | None]:
         arguments = [(estimator, group) for group in groups]
         return runner.run(
             "local models", identify_point, arguments, points.kappa, **options
         )
 
     found = identify(local)
-    orders = {model.order for model in found if model is not None}
+    orders = {done.result.order for done in found if done is not None}
     if chooses and structure is None and len(orders) > 1:
         found = identify(clone(local).set_params(order=max(orders)))
-    kept = [k for k, model in enumerate(found) if model is not None]
-    return [model for model in found if model is not None], points.keep(kept)
+    _tell(found, points.kappa)
+    kept = [k for k, done in enumerate(found) if done is not None]
+    return [done.result for done in found if done is not None], points.keep(kept)
 
 
 def identify_point(
@@ -181,8 +181,7 @@ def _in_own_time(
 
 
 def _all_continuous(pairs: list[ModelPair], method: str) -> list[ModelPair]:
-    with warnings.catch_warnings():  # the estimate's own conversion says it once
-        warnings.simplefilter("ignore")
+    with collected():  # the estimate's own conversion says it once
         return [(a.to_continuous(method), b.to_continuous(method)) for a, b in pairs]
 
 
@@ -239,25 +238,31 @@ def _bare(experiment: Experiment) -> Experiment:
 
 
 def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
-    """What to try first if the model turns out unstable."""
+    """What to try first if the model turns out unstable: offsets make it so."""
     outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
-    spread = outputs.std(axis=0)
     if len(outputs) > len(experiments) and not np.ptp(outputs, axis=0).any():
         raise ValueError(
             f"An output must vary. Got {outputs[0].tolist()} throughout: no dynamics "
             "can be identified from it."
         )
-    if (np.abs(outputs.mean(axis=0)) > _OFFSET * spread).any():
-        return (
-            "The outputs stand far from zero: subtract their value at rest from y (a "
-            "simulation begins there). Else try "
-        )
-    return "Try "
+    inputs = np.vstack([e.inputs for e in experiments])
+    far = [
+        (name, place)
+        for name, place, values in (("outputs", "y", outputs), ("inputs", "X", inputs))
+        if (np.abs(values.mean(axis=0)) > _OFFSET * values.std(axis=0)).any()
+    ]
+    if not far:
+        return "Try "
+    names, places = (" and ".join(words) for words in zip(*far, strict=True))
+    return (
+        f"The {names} stand far from zero: subtract their value at rest from {places} "
+        "(a simulation begins there), or let the local models find a constant: "
+        "local=SubspaceLTI(offset='auto'). Else try "
+    )
 
 
 def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpace:
-    with warnings.catch_warnings():  # said below, at this point
-        warnings.filterwarnings("ignore", ".*negative real axis", RuntimeWarning)
+    with collected():  # said below
         lti = model.to_continuous(discretization)
     if not lti.is_stable:
         worst = lti.poles()[np.argmax(lti.poles().real)]
@@ -341,16 +346,20 @@ def restructure_points(
         points.kappa,
         restructurer=restructurer,
     )
-    kept = [k for k, result in enumerate(found) if result is not None]
-    points, local = points.keep(kept), [local[k] for k in kept]
-    helped = runner.call(
+    kept = [k for k, done in enumerate(found) if done is not None]
+    better = runner.call(
         _help_neighbours,
-        [found[k] for k in kept],
+        [done.result for done in found if done is not None],
         [tasks[k] for k in kept],
-        points.kappa,
+        points.kappa[kept],
         restructurer,
         ignore=["fitted"],
     )
+    for k, other in zip(kept, better, strict=True):
+        found[k] = other or found[k]
+    _tell(found, points.kappa)
+    helped = [done.result for done in found if done is not None]
+    points, local = points.keep(kept), [local[k] for k in kept]
     theta = np.array([fitted.params_ for fitted in helped])
     std = np.full(theta.shape, np.nan)
     for row, fitted, model in zip(std, helped, local, strict=True):
@@ -424,13 +433,15 @@ def _help_neighbours(
     tasks: Sequence[_Task],
     kappa: Array,
     restructurer: Any,
-) -> list[Any]:
+) -> list[Done | None]:
     """Try the parameters of neighbouring points as starts, until nothing improves.
 
     A point in a wrong basin is one that its neighbours' parameters lead out of. Points
-    that fit well need no help. `fitted` follows from the other arguments.
+    that fit well need no help. `fitted` follows from the other arguments. Returns the
+    better fits, None where there is none.
     """
     fitted = list(fitted)
+    better: list[Done | None] = [None] * len(fitted)
     span = np.ptp(kappa, axis=0)
     scaled = kappa / np.where(span > 0, span, 1.0)
     distance = np.linalg.norm(scaled[:, None] - scaled[None], axis=2)
@@ -448,13 +459,15 @@ def _help_neighbours(
                 tried.add(key)
                 own = fitted[i].fit_error_
                 if fitted[i].start_error(task[0], start) < _BETTER * own:
-                    fitted[i] = _restructure_point(
-                        *task, restructurer=restructurer, starts=[start]
-                    )
+                    with collected() as told:
+                        fitted[i] = _restructure_point(
+                            *task, restructurer=restructurer, starts=[start]
+                        )
+                    better[i] = Done(fitted[i], told)
                     improved = True
         if not improved:
             break
-    return fitted
+    return better
 
 
 def covariance_of_parameters(
@@ -527,8 +540,11 @@ class PointRunner:
         arguments: Sequence[tuple[Any, ...]],
         kappa: Array,
         **shared: Any,
-    ) -> list[Any]:
+    ) -> list[Done | None]:
         """Results of a step at every operating point; None where it failed and may.
+
+        What the points warn of comes with them: given at once, warnings would tear
+        the progress bar, name no point, and be lost in other processes.
 
         The function takes the arguments of a point and the shared keywords; the memory
         knows its results by the values of all of them. `what` labels the progress bar.
@@ -546,10 +562,14 @@ class PointRunner:
             from tqdm import tqdm  # slow to import
 
             results = tqdm(results, desc=what, total=len(arguments))
+        found: list[Done | _Failure] = []
         try:
-            found = list(results)
+            found.extend(results)
         except _Stopped as stopped:
-            k, error = stopped.args
+            k, error, told = stopped.args
+            if self.verbose:
+                results.close()  # or the warnings would stand in the bar's line
+            _tell([*_done(found[:k]), Done(None, told)], kappa)
             # The point, or an option? A neighbour (the last for the first) tells.
             other = _attempt(kept, arguments[k - 1], shared, None)
             if isinstance(other, _Failure) and other.text == str(error):
@@ -558,7 +578,7 @@ class PointRunner:
             raise ValueError(f"{_place(k, kappa)}: {error}{skip}") from error
         failures = {k: r for k, r in enumerate(found) if isinstance(r, _Failure)}
         if len(failures) == len(found):
-            first = found[0]
+            first = failures[0]
             if all(failure.text == first.text for failure in failures.values()):
                 raise ValueError(first.text) from first.error
             raise ValueError(
@@ -567,7 +587,7 @@ class PointRunner:
             ) from first.error
         for k, failure in failures.items():
             warn(f"left out {_place(k, kappa)}: {failure.text}")
-        return [None if isinstance(r, _Failure) else r for r in found]
+        return _done(found)
 
     def call(
         self, function: Callable[..., Any], *args: Any, ignore: Sequence[str] = ()
@@ -623,6 +643,13 @@ class _Remembered:
         return [folder, hash((source, told), coerce_mmap=True)]
 
 
+class Done(NamedTuple):
+    """The result of a step at a point, and what was told on the way."""
+
+    result: Any
+    told: list[Told]
+
+
 @dataclass(frozen=True)
 class _Failure:
     """Why a point failed."""
@@ -635,7 +662,7 @@ class _Failure:
 
 
 class _Stopped(Exception):
-    """A failure that ends the step: number of the point, and error."""
+    """A failure that ends the step: number of the point, error, what was told."""
 
 
 def _attempt(
@@ -645,12 +672,13 @@ def _attempt(
     stop_as: int | None,
 ) -> Any:
     """Run a step at one operating point; `stop_as` is its number if it must succeed."""
+    told: list[Told] = []
     try:
-        with _blas().limit(limits=1, user_api="blas"):
-            return function(*args, **shared)
+        with _blas().limit(limits=1, user_api="blas"), collected() as told:
+            return Done(function(*args, **shared), told)
     except (ValueError, np.linalg.LinAlgError) as error:
         if stop_as is not None:
-            raise _Stopped(stop_as, error) from error
+            raise _Stopped(stop_as, error, told) from error
         return _Failure(error)  # told by the runner, who knows the other points
 
 
@@ -658,6 +686,23 @@ def _attempt(
 def _blas() -> ThreadpoolController:
     """Found once in every process: the search takes longer than a small step."""
     return ThreadpoolController()
+
+
+def _done(found: Sequence[Done | _Failure]) -> list[Done | None]:
+    return [result if isinstance(result, Done) else None for result in found]
+
+
+def _tell(found: Sequence[Done | None], kappa: Array) -> None:
+    """Give the warnings of all points: each once, with the points that it came from."""
+    where: dict[Told, list[int]] = {}
+    for k, done in enumerate(found):
+        for told in dict.fromkeys(done.told if done is not None else ()):
+            where.setdefault(told, []).append(k)
+    for (message, category), points in where.items():
+        place = "all operating points"
+        if len(points) < len(kappa):
+            place = ", ".join(_place(k, kappa) for k in points)
+        warn(message if len(kappa) == 1 else f"{message} (At {place}.)", category)
 
 
 def _place(number: int, kappa: Array) -> str:

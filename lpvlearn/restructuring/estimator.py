@@ -24,7 +24,7 @@ from ..exceptions import RankWarning, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..validation import one_of, whole_number
+from ..validation import one_of, real_array, whole_number
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
 from .minimise_covariance import Estimate, efficient_parameters
@@ -246,6 +246,20 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 "`norm='covariance'` needs `estimates`: an identified model with its "
                 "uncertainty, as LocalLPVPipeline gives it. Got none."
             )
+        lists = {"starts": starts, "realizations": realizations, "estimates": estimates}
+        for name, value in lists.items():
+            if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str):
+                raise ValueError(
+                    f"`{name}` must be a list. Got {type(value).__name__}; put a "
+                    "single one in brackets."
+                )
+        for estimate in estimates:
+            pair = isinstance(estimate, tuple | list) and len(estimate) == 2
+            if not pair or not isinstance(estimate[0], StateSpace):
+                raise ValueError(
+                    "`estimates` must hold pairs of a StateSpace and a list of models "
+                    f"to either side of it. Got {type(estimate).__name__}."
+                )
         problem = self._problem(model)
         given = [problem.structure.check_params(s) for s in starts]
         self._restructure(problem, given, estimates)
@@ -329,6 +343,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             Relative deviation of every parameter from `params_`, and `error_`.
         """
         check_is_fitted(self, "params_")
+        whole_number("n_restarts", n_restarts, 1)
+        size = float(real_array("size", size))
         rng = np.random.default_rng(0)
         rows, norm, params = [], self.norm, self.params_
         if norm == "covariance":
@@ -512,7 +528,13 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                     else "Either it cannot represent the model, or the search ended in "
                     "a wrong basin."
                 )
-                + " Give `init`, or raise `n_starts`, to search elsewhere.",
+                + " Give `init`, or raise `n_starts`, to search elsewhere."
+                + (
+                    ""
+                    if self.structure is None or self.lti_.is_continuous
+                    else " The black box is in discrete time: convert it by "
+                    "to_continuous() if the structure is in continuous time."
+                ),
                 ConvergenceWarning,
             )
         if self.identifiability_.rank < self.structure_.n_params:
@@ -534,7 +556,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             Real parts of the entries, row by row, then the imaginary parts.
         """
         check_is_fitted(self, "lti_")
-        grid = np.asarray(omega, dtype=float).reshape(-1)
+        grid = real_array("omega", omega).reshape(-1)
         return stack_response(self.lti_.frequency_response(grid))
 
     def __sklearn_tags__(self) -> Any:

@@ -20,6 +20,7 @@ from scipy.linalg import block_diag, qr
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
+from ..validation import real_array
 from .error_system import ErrorSystem, Target, series
 from .least_squares import (
     LeastSquaresResult,
@@ -156,10 +157,11 @@ class RestructuringProblem:
         Every realization's response is carried to the parameters to first order; the
         covariance of their mean is that of one divided by their number.
         """
-        if len(models) < 2:
+        if len(models) < 2 or not all(isinstance(m, StateSpace) for m in models):
             raise ValueError(
-                "`realizations` must be at least 2 models to have a spread. Got "
-                f"{len(models)}."
+                "`realizations` must be at least 2 models, each a StateSpace, to have "
+                f"a spread. Got {len(models)} of "
+                f"{', '.join(sorted({type(m).__name__ for m in models}))}."
             )
         G = np.array([model.frequency_response(self.omega) for model in models])
         changes = self.parameter_changes(theta, G - G.mean(0))
@@ -187,14 +189,22 @@ def problem_from_models(
     for model in models:
         _check_model(model)
     first = models[0]
+    if structure is not None:
+        _check_time(structure, first.sampling_time)
     structure = _structure_for(structure, first)
     p, dt = structure.n_outputs, first.sampling_time
     for model in models:
-        own = (*model.D.shape, model.sampling_time)
-        if own != (p, structure.n_inputs, dt):
+        if model.D.shape != (p, structure.n_inputs):
             raise ValueError(
                 f"`structure` has {p} outputs and {structure.n_inputs} inputs, `model` "
-                f"has {own[0]} and {own[1]} (sampling time {own[2]}). They must agree."
+                f"has {model.n_outputs} and {model.n_inputs}. They must agree; an "
+                "input too many is often a column whose role was forgotten (`time=`, "
+                "`scheduling=`, `experiment=`)."
+            )
+        if model.sampling_time != dt:
+            raise ValueError(
+                "models to be matched together must have one sampling time. Got "
+                f"{dt} and {model.sampling_time}."
             )
     boxes = [
         Target(m.A, m.B, m.C, structure.feedthrough_of(m.D), m.sampling_time)
@@ -236,6 +246,22 @@ def _check_model(model: Any) -> None:
         raise ValueError(
             "`model` must be stable: its distance to a gray-box model is infinite "
             f"otherwise. Got a pole at {worst:.4g}."
+        )
+
+
+def _check_time(structure: Any, sampling_time: float | None) -> None:
+    """Refuse a discrete-time model where the structure is not, or cannot be told."""
+    if sampling_time is True:
+        raise ValueError(
+            "`model` must have a known sampling time beside a `structure`. Got one "
+            "that counts time in samples. Identify it with `time=` or `sampling_time=` "
+            "in seconds, and convert it by to_continuous() for a structure in "
+            "continuous time; sampling_time=1 stands for samples."
+        )
+    if sampling_time is not None and getattr(structure, "is_mechanical", False):
+        raise ValueError(
+            "`model` must be in continuous time for equations of motion. Got sampling "
+            f"time {sampling_time} s. Convert it by to_continuous()."
         )
 
 
@@ -284,11 +310,13 @@ def problem_from_response(
         own = filter_.frequency_response(grid)
         W = own if own.shape == W.shape else own * W  # one for all outputs
     if sample_weight is not None:
-        scale = np.asarray(sample_weight, dtype=float).reshape(-1)
-        if scale.shape != grid.shape or not np.isfinite(scale).all() or scale.min() < 0:
+        scale = real_array("sample_weight", sample_weight).reshape(-1)
+        known = scale.shape == grid.shape and np.isfinite(scale).all()
+        if not known or scale.min() < 0 or scale.max() == 0:
             raise ValueError(
-                f"`sample_weight` must hold {len(grid)} finite weights, not negative, "
-                f"one for each frequency. Got shape {np.shape(sample_weight)}."
+                f"`sample_weight` must hold {len(grid)} finite weights, one for each "
+                "frequency, not negative and not all zero. Got shape "
+                f"{np.shape(sample_weight)}."
             )
         W = W * scale[:, None, None]
     system = MeasuredErrorSystem(structure, grid, G, W)

@@ -62,6 +62,8 @@ class GrayBoxStructure:
     is_bounded : bool
     ranges : ndarray of shape (2, n_params)
         Where a parameter is expected; NaN where that is not known.
+    is_mechanical : bool
+        Whether it comes from equations of motion, which are in continuous time.
 
     Examples
     --------
@@ -87,12 +89,13 @@ class GrayBoxStructure:
         lower: Array | None = None,
         upper: Array | None = None,
         ranges: Array | None = None,
+        is_mechanical: bool = False,
     ) -> None:
         q = len(parameter_names)
         self.order, self.map = order, map
         self.parameter_names, self.n_params = tuple(parameter_names), q
         self.n_outputs, self.n_inputs = (int(k) - order for k in map.shape)
-        self.initial = initial
+        self.initial, self.is_mechanical = initial, is_mechanical
         self.lower = np.full(q, -np.inf) if lower is None else lower
         self.upper = np.full(q, np.inf) if upper is None else upper
         self.ranges = np.full((2, q), np.nan) if ranges is None else ranges
@@ -112,7 +115,7 @@ class GrayBoxStructure:
     def _changed(self, **changes: Any) -> GrayBoxStructure:
         """Another one, which differs in some of the constructor's arguments."""
         names = ("order", "map", "parameter_names")
-        known = ("initial", "lower", "upper", "ranges")
+        known = ("initial", "lower", "upper", "ranges", "is_mechanical")
         own = {name: getattr(self, name) for name in (*names, *known)}
         return type(self)(**own | changes)
 
@@ -210,10 +213,12 @@ class GrayBoxStructure:
         np.float64(2.4525)
         """
         start, names = named_values("initial", initial, parameter_names)
-        given = function(start)
-        if len(given) not in (3, 4):
+        given = function(start) if callable(function) else function
+        if not isinstance(given, tuple | list) or len(given) not in (3, 4):
+            many = f"{len(given)} of them" if isinstance(given, tuple | list) else ""
             raise ValueError(
-                f"`function` must return (A, B, C) or (A, B, C, D). Got {len(given)}."
+                "`function` must return (A, B, C) or (A, B, C, D) for a vector of "
+                f"parameters. Got {many or type(given).__name__}."
             )
         A, B, C = given[:3]
         model = StateSpace(A, B, C, given[3] if len(given) == 4 else None)
@@ -381,7 +386,8 @@ class GrayBoxStructure:
         """
         equations, names = mechanical_map(M, D, K, F, outputs, sensors, parameter_names)
         guess = None if initial is None else named_values("initial", initial, names)[0]
-        return cls(equations.order, equations.simplest(), names, initial=guess)
+        simplest = equations.simplest()
+        return cls(equations.order, simplest, names, initial=guess, is_mechanical=True)
 
     # -- what is known of the parameters -------------------------------------------
 

@@ -17,6 +17,7 @@ from ..data.experiments import (
     Experiment,
     Table,
     n_rows_of,
+    naming,
     read_experiments,
     read_outputs,
 )
@@ -25,7 +26,7 @@ from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair
-from ..validation import one_of
+from ..validation import frequencies, one_of
 from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
 from .residuals import (
     Residuals,
@@ -65,7 +66,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         samples "auto" looks at that many, spread over the experiments.
     sampling_time : float, default=None
         Seconds between samples, which must agree with the `time` column. None: the
-        step of that column; without one, 1 s.
+        step of that column; without one the model counts time in samples, and is
+        refused where continuous time is asked of it.
     feedthrough : bool or array-like of bool, default=True
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
         shape (n_outputs, n_inputs) single entries of D.
@@ -384,11 +386,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._evidence = fitted.evidence
 
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
-        """Seconds between the samples of a table."""
+        """Seconds between the samples of a table; True where nothing tells them."""
         for e in experiments:
             if e.sampling_time:
                 return e.sampling_time
-        return 1.0 if self.sampling_time is None else float(self.sampling_time)
+        return True if self.sampling_time is None else float(self.sampling_time)
 
     def predict(self, X: Any) -> Array:
         """Simulate the outputs of every experiment from rest.
@@ -400,6 +402,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         ndarray of shape (n_samples,) or (n_samples, n_outputs)
+
+        Raises
+        ------
+        DivergenceError
+            If the outputs of an unstable model overflow.
         """
         check_is_fitted(self, "lti_")
         return self._in_table(self._read(X, None), n_rows_of(X), self._simulated)
@@ -691,7 +698,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _per_sample(self, omega: ArrayLike) -> Array:
         """Angular frequencies in radians per sample."""
         step = self.lti_.sampling_time or 1.0
-        return np.atleast_1d(np.asarray(omega, dtype=float)) * step
+        return frequencies(omega) * step
 
     def selection_text(self) -> str:
         """`selection_` as a text table, the choice marked."""
@@ -756,7 +763,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Outputs in the rows of their samples, NaN elsewhere."""
         out = np.full((n_samples, self.n_outputs_), np.nan)
         for e in experiments:
-            out[e.rows] = outputs(e) + self.output_offset_
+            with naming(e):
+                out[e.rows] = outputs(e) + self.output_offset_
         return out[:, 0] if self._single_output else out
 
 

@@ -70,6 +70,12 @@ def check_options(options: Mapping[str, Any]) -> Choices:
     one_of("initial_state", options["initial_state"], ("estimate", "rest"))
     one_of("missing", options["missing"], ("raise", "split"))
     one_of("detrend", options["detrend"], DETRENDS)
+    feedthrough = options["feedthrough"]
+    if np.ndim(feedthrough) == 0 and feedthrough not in (True, False):
+        raise ValueError(
+            "`feedthrough` must be True, False or a table of them, shape (n_outputs, "
+            f"n_inputs). Got {feedthrough!r}."
+        )
     if options["sampling_time"] is not None:
         positive_time("sampling_time", options["sampling_time"])
     if options["initial_state"] == "rest" and options["missing"] == "split":

@@ -142,11 +142,8 @@ def test_interleaved_experiments_are_taken_apart_in_order():
 
 
 def test_experiments_come_in_the_order_of_first_appearance():
-    X, y = make_table()
-    labels = [
-        run.label
-        for run in read(X[::-1], y[::-1], experiment="run", time=None, inputs="u1")
-    ]
+    X, y = (table[::-1].reset_index(drop=True) for table in make_table())
+    labels = [run.label for run in read(X, y, experiment="run", time=None, inputs="u1")]
     assert labels == ["run 2", "run 1", "run 0"]
 
 
@@ -276,10 +273,17 @@ BAD_CALLS = [
     (make_table, {"inputs": []}, ["`inputs`", "at least one"]),
     (make_table, {"inputs": ["u1", 0]}, ["`inputs`", "each once"]),
     (make_table, {"inputs": None, "scheduling": ["u1", "u2", "kappa"]}, ["`inputs`"]),
-    (make_table, {"inputs": ["u1", "run"]}, ["'run'", "must hold numbers", "'run 0'"]),
+    (make_table, {"inputs": ["u1", "run"]}, ["`inputs`", "`experiment`", "'run'"]),
+    (make_table, {"inputs": ["t", "u1"]}, ["`inputs`", "`time` column", "'t'"]),
+    (make_table, {"time": "run"}, ["`time`", "`experiment` column", "'run'"]),
+    (make_table, {"scheduling": ["run"]}, ["'run'", "must hold numbers", "'run 0'"]),
     (make_table, {"operating_point": "u1"}, ["`operating_point`", "'u1'", "'run 0'"]),
     (make_table, {"sampling_time": 0.2}, ["`sampling_time`", "0.2 s", "0.1 s"]),
-    (make_table, {"time": "run"}, ["'run'", "to_datetime", "'run 0'"]),
+    (
+        make_table,
+        {"time": "run", "experiment": None},
+        ["'run'", "to_datetime", "'run 0'"],
+    ),
     (_slow, {}, ["same time step", "0.1 s", "0.2 s", "'run 2'"]),
     (lambda: _with("u1", 7, np.nan), {}, ["NaN", "'u1'", "'run 1'", "row 7"]),
     (lambda: _with("u2", 12, pd.NA), {}, ["NaN", "'u2'", "'run 2'", "row 12"]),

@@ -16,7 +16,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV, StateSpace
-from lpvlearn.exceptions import ExtrapolationWarning
+from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
 from lpvlearn.lpv import model as model_module
 
 DT = 0.05
@@ -308,3 +308,26 @@ def test_matrices_that_are_not_finite_are_located():
     model = LPVStateSpace(structure, PolynomialLPV(1).fit(kappa, kappa), kappa)
     with pytest.raises(ValueError, match="finite matrices along `scheduling`.*at"):
         model.simulate(np.ones((10, 1)), np.linspace(1, -1, 10), DT)
+
+
+def stiffening():
+    """Unstable where kappa is negative."""
+    structure = GrayBoxStructure.from_template([["-a"]], [[1]], [[1]])
+    line = PolynomialLPV(1).fit([[0.0], [1.0]], [[0.0], [1.0]])
+    return structure, line
+
+
+def test_a_diverging_simulation_names_the_frozen_model():
+    structure, line = stiffening()
+    kappa = np.r_[np.full(100, 0.5), np.full(9000, -2.0)]
+    outside = LPVStateSpace(structure, line, [[0.0], [1.0]])
+    with pytest.raises(DivergenceError) as raised:
+        outside.simulate(np.ones(9100), kappa, 0.1)
+    for words in ("beyond all numbers at sample", "[-2.0]", "real part 2 1/s", "clip"):
+        assert words in str(raised.value)
+    inside = LPVStateSpace(structure, line, [[-2.0], [1.0]])
+    with pytest.raises(DivergenceError, match="offset, shuffled rows, or times in"):
+        inside.simulate(np.ones(9100), kappa, 0.1)
+    with pytest.raises(DivergenceError, match="diverges within one sample of 1000 s"):
+        inside.simulate(np.ones(3), np.full(3, -2.0), 1000.0)
+    assert np.isfinite(inside.simulate(np.ones(300), kappa[:300], 0.1)).all()

@@ -158,8 +158,18 @@ def test_a_discrete_model_is_compared_as_it_is(spring):
         ),
         (
             {"a": StateSpace(-np.eye(2), np.eye(2), np.eye(2))},
-            {"inputs": "force"},
+            {"inputs": "force", "sampling_time": 0.02},
             "model 'a': .*2",
+        ),
+        (
+            {"a": StateSpace(-np.eye(1), np.eye(1), np.eye(1))},
+            {"inputs": "force"},
+            "model 'a': `time` or `sampling_time` must tell the seconds",
+        ),
+        (
+            {"a": spring_lpv()},
+            {"inputs": "force", "scheduling": "kappa"},
+            "model 'a': `time` or `sampling_time` must tell the seconds",
         ),
     ],
 )

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace
+from lpvlearn.exceptions import DivergenceError
 
 from ..conftest import stable_model
 
@@ -244,7 +245,7 @@ SQUARE = [[-1.0, 0.0], [0.0, -2.0]]
         ((ONE, ONE, ONE, None, np.nan), "`sampling_time` must be a positive"),
         ((ONE, ONE, ONE, None, np.inf), "`sampling_time` must be a positive"),
         ((ONE, ONE, ONE, None, "1"), "`sampling_time` must be a positive"),
-        ((ONE, ONE, ONE, None, True), "`sampling_time` must be a positive"),
+        ((ONE, ONE, ONE, None, False), "`sampling_time` must be a positive"),
         ((ONE, ONE, ONE, None, [1, 2]), "`sampling_time` must be a positive"),
         (([], [], []), "a pure gain takes them from `D`"),
         ((ONE, np.zeros((1, 0)), ONE), "at least one input and one output"),
@@ -337,11 +338,72 @@ def test_control_gets_zero_for_continuous_time(monkeypatch):
 
 def test_control_models_of_unknown_time_or_kind_are_refused():
     known = dict(A=ONE, B=ONE, C=ONE, D=ONE)
-    for dt in (None, True):
-        with pytest.raises(ValueError, match="`model.dt`"):
-            StateSpace.from_control(types.SimpleNamespace(**known, dt=dt))
+    with pytest.raises(ValueError, match="`model.dt`"):
+        StateSpace.from_control(types.SimpleNamespace(**known, dt=None))
     with pytest.raises(ValueError, match="must be a control.StateSpace.*int"):
         StateSpace.from_control(3)
+
+
+# -- divergence ------------------------------------------------------------------
+
+
+def test_an_unstable_model_grows_until_its_numbers_end():
+    model = StateSpace(10.0, 1, 1, sampling_time=1.0)
+    y = model.simulate(np.ones(309))  # 1.1e307 at last
+    assert_allclose(y[:4, 0], [0, 1, 11, 111])
+    assert np.isfinite(y).all()
+    with pytest.raises(DivergenceError, match=r"0 is 1\.111e\+308 at sample 309"):
+        model.simulate(np.ones(311))
+    with pytest.raises(DivergenceError, match=r"sample 310\. .*\(a pole at 10"):
+        model.simulate(np.ones(2000))
+    with pytest.raises(DivergenceError, match=r"\(a pole at 10"):
+        model.estimate_initial_state(np.zeros(2000), np.ones(2000))
+
+
+def test_a_continuous_model_diverges_as_its_samples_do():
+    with pytest.raises(DivergenceError, match=r"a pole at 2\+0j"):
+        StateSpace(2.0, 1, 1).simulate(np.ones(9000), sampling_time=0.1)
+
+
+def test_a_stable_model_is_not_blamed():
+    with pytest.raises(DivergenceError, match="is stable: scale `u`"):
+        StateSpace(0.5, 1e10, 1, sampling_time=1.0).simulate([1e300, 1e300, 1.0])
+
+
+# -- time in samples -------------------------------------------------------------
+
+
+def test_time_in_samples_is_that_of_one_second_samples():
+    blocks = random_model(3, sampling_time=1.0)
+    samples = StateSpace(blocks.A, blocks.B, blocks.C, blocks.D, True)
+    omega, u = np.linspace(0.0, np.pi, 7), np.random.default_rng(0).normal(size=(9, 2))
+    np.testing.assert_array_equal(
+        samples.frequency_response(omega), blocks.frequency_response(omega)
+    )
+    assert samples.hinf_norm() == blocks.hinf_norm()
+    assert (samples.is_stable, samples.is_continuous) == (blocks.is_stable, False)
+    for step in (None, 0.1, 3.0):  # any step is as good
+        np.testing.assert_array_equal(
+            samples.simulate(u, sampling_time=step), blocks.simulate(u)
+        )
+    for copied in (samples.balance(), samples.transform(np.eye(samples.order))):
+        assert copied.sampling_time is True
+    assert pickle.loads(pickle.dumps(samples)).sampling_time is True
+    assert "time in samples" in repr(samples)
+
+
+def test_time_in_samples_agrees_with_any_step_but_not_with_continuous_time():
+    samples = StateSpace(0.5, 1, 1, sampling_time=True)
+    for dt in (0.1, 1.0):
+        known = StateSpace(0.5, 1, 1, sampling_time=dt)
+        for difference in (samples - known, known - samples):
+            assert difference.sampling_time == dt and difference.hinf_norm() < 1e-12
+    assert (samples - samples).sampling_time is True
+    with pytest.raises(ValueError, match="same inputs, outputs and sampling time"):
+        samples - StateSpace(-0.5, 1, 1)
+    for method in ("zoh", "tustin"):
+        with pytest.raises(ValueError, match="`sampling_time` must be known.*`time=`"):
+            samples.to_continuous(method)
 
 
 # -- initial states --------------------------------------------------------------

@@ -17,7 +17,7 @@ from lpvlearn import (
     bft_score,
     fit_report,
 )
-from lpvlearn.exceptions import ExtrapolationWarning
+from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
 from lpvlearn.pipeline.estimator import Stopwatch
 
 from ..conftest import (
@@ -483,3 +483,27 @@ def test_a_stopwatch_adds_up_the_times_of_the_steps():
     assert table["step"].tolist() == ["a", "b", "total"]
     assert watch.seconds["a"] > 1.0 and watch.seconds["b"] > 0.0
     assert table["seconds"].tolist()[-1] == sum(watch.seconds.values())
+
+
+@pytest.mark.filterwarnings("ignore:Scheduling variable 'kappa' must be within")
+def test_a_prediction_that_diverges_names_the_experiment(spring):
+    X, y, _, _ = spring
+    model = spring_pipeline().fit(X, y)
+    far = X.assign(kappa=X["kappa"].where(X["run"] != "p2r0", 1e9))
+    with pytest.raises(DivergenceError, match="Experiment 'p2r0': .*at scheduling"):
+        model.predict(far)
+
+
+def test_time_may_come_from_the_local_estimator_or_be_counted_in_samples(spring):
+    X, y, _, _ = spring
+    bare = X.drop(columns="time")
+    told = spring_pipeline().fit(X, y).parameters_
+    for options in (
+        {"local": SubspaceLTI(2, sampling_time=0.02)},
+        {"sampling_time": 0.02},
+    ):
+        model = spring_pipeline(**options).set_params(time=None).fit(bare, y)
+        pd.testing.assert_frame_equal(model.parameters_, told, rtol=1e-6)
+    u = X.loc[X["run"] == "p0r0", ["force"]]
+    lti = LocalLPVPipeline(SubspaceLTI(2, horizon=8)).fit(u, y.loc[u.index])
+    assert lti.sampling_time_ == 1.0  # one black box: nothing means seconds

@@ -5,12 +5,13 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.signal import lfilter
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.exceptions import RankWarning
+from lpvlearn.exceptions import DivergenceError, RankWarning
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
@@ -310,6 +311,35 @@ def test_a_sampling_time_beside_a_time_column_must_agree_with_it(given):
         assert model.fit(X, np.roll(u, 1)).lti_.sampling_time == pytest.approx(0.1)
 
 
-def test_without_any_sampling_time_a_sample_lasts_a_second():
+def test_without_any_sampling_time_time_is_counted_in_samples():
     u = np.random.default_rng(0).standard_normal((100, 1))
-    assert SubspaceLTI(1).fit(u, np.roll(u, 1)).lti_.sampling_time == 1.0
+    model = SubspaceLTI(1, horizon=5).fit(u, np.roll(u, 1))
+    assert model.lti_.sampling_time is True
+    known = SubspaceLTI(1, horizon=5, sampling_time=1).fit(u, np.roll(u, 1))
+    np.testing.assert_array_equal(model.predict(u), known.predict(u))
+    omega = np.linspace(0.1, 3.0, 4)
+    np.testing.assert_array_equal(
+        model.frequency_response_std(omega), known.frequency_response_std(omega)
+    )
+    with pytest.raises(ValueError, match="`time=`.*or `sampling_time=`"):
+        model.lti_.to_continuous()
+    stream = SubspaceLTI(1, horizon=5).partial_fit(u, np.roll(u, 1))
+    assert stream.partial_fit(u, np.roll(u, 1)).lti_.sampling_time is True
+
+
+@pytest.mark.filterwarnings("ignore:The identified model is unstable")
+def test_predictions_that_diverge_name_experiment_and_sample():
+    rng = np.random.default_rng(0)
+    X = pd.DataFrame({"u": rng.normal(size=60), "run": "short"})
+    y = lfilter([0.0, 1.0], [1.0, -1.5], X["u"])
+    model = SubspaceLTI(1, horizon=4, experiment="run").fit(X, y)
+    assert np.isfinite(model.predict(X)).all()
+    long = pd.DataFrame({"u": rng.normal(size=3000), "run": "long"})
+    both = pd.concat([X, long], ignore_index=True)
+    for use in (
+        model.predict,
+        lambda both: model.score(both, both["u"]),
+        lambda both: model.predict_with_initial_state(both, both["u"]),
+    ):
+        with pytest.raises(DivergenceError, match="Experiment 'long': .*pole at 1.5"):
+            use(both)

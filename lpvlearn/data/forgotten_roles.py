@@ -1,0 +1,127 @@
+"""Tables that look as if a role was forgotten, or their rows shuffled.
+
+A column without a role is an input. The time, the number of the experiment or the
+scheduling variable makes a poor one: the fit goes on and its numbers mean nothing. So
+it does with shuffled rows, which no time column gives away where it is forgotten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..exceptions import warn
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+# Steps that differ by no more than that part of them are even: stamps are rounded, and
+# no other signal but a ramp comes near.
+_EVEN = 0.05
+_FEWEST = 10  # steps below which a few even ones are chance
+_RESTARTS = 0.05  # share of the steps that may go back, from experiment to experiment
+
+_ORDERED = ("integer", "datetime64", "timedelta64")  # index types that tell an order
+
+_HOLDS = 10.0  # samples that a number of an experiment stands for, at least, on average
+_LEVELS = 3  # that make a count; two are a step, the commonest input of all
+
+
+def warn_of_forgotten_roles(
+    inputs: Array,
+    names: Sequence[Hashable],
+    groups: Sequence[Indices],
+    roles: Mapping[str, Any],
+) -> None:
+    """Warn of inputs (n_samples, n_inputs) that nobody named and that look like none.
+
+    `groups` are the rows of every experiment.
+    """
+    for k, name in enumerate(names):
+        column = inputs[:, k]
+        if roles["time"] is None and _is_clock(column, groups):
+            warn(
+                f"Input column {name!r} rises by the same {_typical_step(column):.6g} "
+                "from row to row, as times and row numbers do. If it is the time, name "
+                f"it: time={name!r}; if it numbers the rows, drop it; if it is a ramp "
+                "that the system got, list the inputs in `inputs`."
+            )
+        elif roles["experiment"] is None and _is_count(column):
+            warn(
+                f"Input column {name!r} counts from {column[0]:g} to {column[-1]:g} in "
+                "blocks of rows, as numbers of experiments do. If it is one, name it: "
+                f"experiment={name!r}; if it is a staircase that the system got, list "
+                "the inputs in `inputs`."
+            )
+        elif _is_setting(column, groups) and _others_move(inputs, k, groups):
+            warn(
+                f"Input column {name!r} does not change within any of the "
+                f"{len(groups)} experiments, as scheduling variables and operating "
+                f"points do. If it is one, name it: scheduling={name!r} or "
+                f"operating_point={name!r}; if the system got it as an input, list the "
+                "inputs in `inputs`."
+            )
+
+
+def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
+    """Warn of rows that are not in the order of their numbers or dates, the index.
+
+    Labels that stand twice (tables below each other) tell nothing.
+    """
+    index = getattr(X, "index", None)
+    if not isinstance(index, pd.Index) or index.inferred_type not in _ORDERED:
+        return
+    for rows in groups:
+        labels = index[rows]
+        if labels.is_unique and not labels.is_monotonic_increasing:
+            later = int(np.argmin(labels[1:] > labels[:-1])) + 1
+            warn(
+                "The rows of X are not in the order of its index: "
+                f"{labels[later]!s} comes after {labels[later - 1]!s}. A dynamic model "
+                "needs the samples in the order of time. If they were shuffled, sort "
+                "them (sort_index of pandas) and split by experiment with "
+                "ExperimentSplit or in time with BlockedTimeSeriesSplit; if the index "
+                "means nothing, drop it (reset_index)."
+            )
+            return
+
+
+def _typical_step(column: Array) -> float:
+    return float(np.median(np.diff(column)))
+
+
+def _is_clock(column: Array, groups: Sequence[Indices]) -> bool:
+    """Whether a column rises evenly, from anew where another experiment begins."""
+    steps = np.concatenate([np.diff(column[rows]) for rows in groups])
+    if len(steps) < _FEWEST or not np.isfinite(steps).all():
+        return False
+    typical = float(np.median(steps))
+    uneven = steps[np.abs(steps - typical) > _EVEN * typical]
+    back = (uneven < 0).all() and len(uneven) <= _RESTARTS * len(steps)
+    return typical > 0 and bool(back if len(groups) == 1 else not len(uneven))
+
+
+def _is_count(column: Array) -> bool:
+    """Whether a column counts up by one, in blocks of many rows."""
+    steps = np.diff(column)
+    rises = int((steps == 1).sum())
+    counts = bool(
+        ((steps == 0) | (steps == 1)).all() and column[:1] == np.rint(column[:1])
+    )
+    return counts and rises >= _LEVELS - 1 and len(column) >= _HOLDS * (rises + 1)
+
+
+def _is_setting(column: Array, groups: Sequence[Indices]) -> bool:
+    """Whether a column has one value in every experiment, and several in all."""
+    still = all((column[rows] == column[rows[0]]).all() for rows in groups)
+    return still and len(groups) > 1 and bool((column != column[0]).any())
+
+
+def _others_move(inputs: Array, k: int, groups: Sequence[Indices]) -> bool:
+    """Whether another input moves within experiments: else they may be step tests."""
+    rest = np.delete(inputs, k, axis=1)
+    return any((rest[rows] != rest[rows[0]]).any() for rows in groups)

@@ -1,0 +1,141 @@
+"""Columns that look as if their role was forgotten, and rows out of order."""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.base import BaseEstimator, RegressorMixin
+
+from lpvlearn import SubspaceLTI
+from lpvlearn.data.experiments import read_experiments
+
+
+class Reader(RegressorMixin, BaseEstimator):
+    """A stand-in for the estimators that call `read_experiments`."""
+
+
+N, RUNS = 40, 3
+
+
+def table(**columns):
+    """Three experiments of an input, and further columns."""
+    rng = np.random.default_rng(0)
+    X = pd.DataFrame({"u": rng.normal(size=N * RUNS)})
+    return X.assign(run=np.repeat([f"r{k}" for k in range(RUNS)], N), **columns)
+
+
+def warned(X, **roles):
+    """Messages of the warnings that reading a table for a fit gives."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        read_experiments(Reader(), X, np.ones(len(X)), **roles)
+    return [str(w.message) for w in caught]
+
+
+TIME = 0.01 * np.arange(N)
+RNG = np.random.default_rng(1)
+
+# A column, and what makes it suspicious within three experiments.
+CLOCKS = {
+    "time": np.tile(TIME, RUNS),
+    "time that goes on": 0.01 * np.arange(N * RUNS),
+    "rounded time": np.tile(TIME / 3, RUNS).round(4),
+    "late time": 1.7e9 + np.tile(TIME, RUNS),
+    "row number": np.arange(N * RUNS),
+    "single precision": np.tile(TIME, RUNS).astype(np.float32),
+}
+
+INPUTS = {
+    "noise": RNG.normal(size=N * RUNS),
+    "random walk upwards": np.cumsum(RNG.uniform(0.5, 1.5, N * RUNS)),
+    "binary noise": RNG.choice([-1.0, 1.0], N * RUNS),
+    "falling": -np.arange(N * RUNS),
+    "a step": np.tile(np.arange(N) >= N // 2, RUNS).astype(float),
+    "stair": np.tile(np.arange(N) // 4, RUNS),
+    "sawtooth": np.arange(N * RUNS) % 8,
+    "sine": np.sin(np.arange(N * RUNS)),
+}
+
+
+@pytest.mark.parametrize("name", CLOCKS)
+def test_an_evenly_rising_input_may_be_the_time(name):
+    X = table(clock=CLOCKS[name])
+    (message,) = warned(X, experiment="run")
+    assert message.startswith("Input column 'clock' rises by the same 0.0") or (
+        name == "row number" and "rises by the same 1 " in message
+    )
+    assert "time='clock'" in message and "`inputs`" in message
+    # as one experiment, where the clock restarts now and then, too
+    assert any("time='clock'" in m for m in warned(X.drop(columns="run")))
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_other_inputs_are_not_suspected(name):
+    assert warned(table(v=INPUTS[name]), experiment="run") == []
+    assert warned(table(v=INPUTS[name]).drop(columns="run")) == []
+
+
+def test_who_names_the_inputs_is_not_doubted():
+    X = table(clock=CLOCKS["time"])
+    assert warned(X, experiment="run", inputs=["u", "clock"]) == []
+    assert warned(X, experiment="run", time="clock") == []
+
+
+def test_a_few_rows_prove_nothing():
+    X = pd.DataFrame({"u": [0.0, 2.0, 1.0, 4.0], "v": [1.0, 2.0, 3.0, 4.0]})
+    assert warned(X) == []
+
+
+def test_a_column_that_no_experiment_changes_may_be_the_operating_point():
+    X = table(kappa=np.repeat([0.0, 0.3, 0.4], N))
+    (message,) = warned(X, experiment="run")
+    for word in ("'kappa' does not change", "scheduling='kappa'", "`inputs`"):
+        assert word in message
+    assert warned(X, experiment="run", scheduling="kappa") == []
+    # step tests of several heights: nothing else moves
+    assert warned(X.drop(columns="u"), experiment="run") == []
+
+
+def test_a_count_in_blocks_may_be_the_number_of_the_experiment():
+    X = table(number=np.repeat(np.arange(RUNS) + 5, N)).drop(columns="run")
+    (message,) = warned(X)
+    assert "counts from 5 to 7" in message and "experiment='number'" in message
+    assert warned(X[X["number"] < 7]) == []  # a step
+
+
+def test_columns_of_arrays_are_named_by_position():
+    X = table(clock=CLOCKS["time"]).drop(columns="run").to_numpy()
+    (message,) = warned(X)
+    assert "Input column 1" in message and "time=1" in message
+
+
+@pytest.mark.parametrize(
+    "index",
+    [
+        np.arange(N * RUNS),
+        pd.date_range("2024-01-01", periods=N * RUNS, freq="s"),
+        pd.to_timedelta(np.arange(N * RUNS), unit="s"),
+    ],
+)
+def test_shuffled_rows_are_told_by_the_index(index):
+    X = table().set_index(pd.Index(index))
+    assert warned(X, experiment="run") == []
+    (message,) = warned(X.sample(frac=1, random_state=0), experiment="run")
+    for word in ("not in the order of its index", "comes after", "ExperimentSplit"):
+        assert word in message
+    # whole experiments may come in any order, their labels may stand twice or be words
+    parts = [part for _, part in X.groupby("run")]
+    assert warned(pd.concat(parts[::-1]), experiment="run") == []
+    again = pd.concat([X.iloc[:N], X.iloc[:N]])
+    assert warned(again.drop(columns="run")) == []
+    words = X.set_index(np.array([f"row {k % 7}, {k}" for k in range(len(X))]))
+    assert warned(words, experiment="run") == []
+
+
+def test_shuffled_rows_are_told_in_predictions_too():
+    X = table().drop(columns="run")
+    y = np.convolve(X["u"], [0.0, 1.0, 0.5])[: len(X)]
+    model = SubspaceLTI(2, horizon=5).fit(X, y)
+    with pytest.warns(UserWarning, match="not in the order of its index"):
+        model.predict(X.sample(frac=1, random_state=0))
