@@ -26,8 +26,8 @@ def align_outputs(X: Any, y: Any) -> Any:
     >>> align_outputs(X, y) is y
     True
     """
-    if y is None:
-        return None
+    if y is None or not hasattr(y, "__len__"):
+        return y  # where outputs are read, it is said what they must be
     check_consistent_length(X, y)
     own, given = getattr(X, "index", None), getattr(y, "index", None)
     if not isinstance(own, pd.Index) or not isinstance(given, pd.Index):

@@ -307,11 +307,11 @@ def read_experiments(
     within an experiment.
     """
     roles = roles_of(estimator) | roles
-    y = align_outputs(X, y)
     if not is_table(X):
         numeric = all(role is None for role in roles.values())
         X = _as_matrix(estimator, X, numeric=numeric)
     table = Table(X)
+    y = align_outputs(X, y)
     if not reset and table.named and hasattr(estimator, "feature_names_in_"):
         roles = fitted_roles(estimator, table, roles, optional)
     elif y is None and not reset:
