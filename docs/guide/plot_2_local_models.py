@@ -148,11 +148,12 @@ pd.DataFrame(
 # --------------------------
 # * ``partial_fit`` takes a record batch by batch, in memory that does not grow with it.
 #   The model is the one that ``fit`` finds from the whole record, however it is cut;
-#   with a ``time`` column a batch that repeats or leaves out samples is refused.
+#   with a ``time`` column a batch that repeats or leaves out samples is refused (with
+#   ``missing="split"``, one that repeats them).
 # * ``initial_state="rest"`` says that experiments start at rest, instead of estimating
 #   where each starts: worth it for many short ones.
-# * ``missing="split"`` ends an experiment before a sample with NaN and starts another
-#   one after it.
+# * ``missing="split"`` ends an experiment before a sample with NaN, or a row that the
+#   ``time`` column misses, and starts another one after it: :ref:`guide_logs`.
 # * ``detrend="constant"`` or ``"linear"`` subtracts what an experiment drifts about.
 # * ``stability="enforce"`` returns a stable model and says in ``stability_loss_`` what
 #   that cost.

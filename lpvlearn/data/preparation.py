@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .experiments import Experiment
+from .experiments import Experiment, read_experiments
 
 Array = NDArray[np.float64]
 
@@ -27,14 +29,39 @@ DETRENDS = (None, "constant", "linear")
 _COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 
 
+def read_runs(
+    estimator: Any, X: Any, y: Any, *, split: bool, outputs: bool = True, **options: Any
+) -> list[Experiment]:
+    """Experiments of a table, as `read_experiments` reads them with these options.
+
+    With `split` they are cut where samples are missing, if there is a `y`: a simulation
+    alone needs all inputs. Without `outputs` these may be missing, and cut nothing.
+    """
+    split = split and y is not None
+    allowed = "Xy" if split else "" if outputs else "y"
+    found = read_experiments(estimator, X, y, allow_missing=allowed, **options)
+    if split and outputs:
+        return split_at_gaps(found)
+    if not split:
+        return found
+    return [run for e in found for run in complete_runs(e, 1, outputs=False)]
+
+
 def has_gaps(experiment: Experiment) -> bool:
-    """Whether an input or an output of an experiment is missing."""
-    signals = (experiment.inputs, experiment.outputs)
-    return any(np.isnan(values).any() for values in signals if values is not None)
+    """Whether a sample of an experiment is missing, or a part of one."""
+    return bool(experiment.breaks) or not _is_complete(experiment).all()
+
+
+def _is_complete(experiment: Experiment, outputs: bool = True) -> NDArray[np.bool_]:
+    """Samples of which no value is missing, of outputs only where asked."""
+    signals = [experiment.inputs, experiment.scheduling]
+    signals += [experiment.outputs] if outputs else []
+    known = [np.isfinite(x).all(axis=1) for x in signals if x is not None]
+    return np.logical_and.reduce(known)
 
 
 def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Cut experiments where an input or an output is missing (NaN).
+    """Cut experiments where a value is missing (NaN), or time has a hole.
 
     Every run of at least two complete samples keeps its label, and starts from an
     initial state of its own. Raises a ValueError if there is none.
@@ -56,16 +83,20 @@ def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
     return parts
 
 
-def complete_runs(experiment: Experiment, shortest: int = 2) -> list[Experiment]:
-    """Runs of at least `shortest` consecutive samples of which nothing is missing."""
-    complete = np.isfinite(experiment.inputs).all(axis=1)
-    if experiment.outputs is not None:
-        complete &= np.isfinite(experiment.outputs).all(axis=1)
-    edges = np.flatnonzero(np.diff(complete, prepend=False, append=False))
+def complete_runs(
+    experiment: Experiment, shortest: int = 2, *, outputs: bool = True
+) -> list[Experiment]:
+    """Runs of at least `shortest` consecutive samples of which nothing is missing.
+
+    Without `outputs`, these may be missing.
+    """
+    complete = _is_complete(experiment, outputs)
+    edges = np.flatnonzero(np.diff(complete)) + 1
+    cuts = np.unique([0, *edges, *experiment.breaks, len(complete)])
     return [
         _rows(experiment, slice(start, stop))
-        for start, stop in edges.reshape(-1, 2)
-        if stop - start >= shortest
+        for start, stop in pairwise(cuts)
+        if complete[start] and stop - start >= shortest
     ]
 
 
@@ -79,6 +110,7 @@ def _rows(experiment: Experiment, part: slice) -> Experiment:
         inputs=experiment.inputs[part],
         outputs=cut(experiment.outputs),
         scheduling=cut(experiment.scheduling),
+        breaks=(),
     )
 
 

@@ -13,13 +13,17 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.experiments import (
+    OPTIONAL_ROLES,
     Experiment,
     Table,
+    n_rows_of,
     naming,
     read_experiments,
     read_outputs,
 )
-from ..data.preparation import split_at_gaps
+from ..data.preparation import read_runs
+from ..data.scoring import score_from_rest
+from ..data.timestamps import TIME_TOL
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair
 from ..validation import frequencies, one_of
@@ -89,14 +93,18 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Subtract its mean or straight line from every channel of every experiment.
         Predictions are then about the means of all training samples.
     missing : {"raise", "split"}, default="raise"
-        "split" ends an experiment before a sample with NaN and starts another after
-        it, with an initial state of its own.
+        "split" ends an experiment before a sample with NaN, or a row that the `time`
+        column misses, and starts another after it, with an initial state of its own.
+    time_tol : float, default=0.01
+        Largest deviation of a time stamp from an even grid, relative to the step. For
+        more, see `resample`.
     inputs : str, int or list of them, default=None
         Input columns of X. None: all columns without another role.
     experiment : str or int, default=None
         Column that tells experiments apart. None: the table is one experiment.
     time : str or int, default=None
-        Column of sample times, checked for even steps.
+        Column of sample times (seconds, dates or time differences), checked for even
+        steps.
     scheduling, operating_point : str, int or list of them, default=None
         Columns with these roles are read and left alone: the model is time-invariant.
 
@@ -126,6 +134,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Standard deviations of the real and imaginary parts of ``lti_.poles()``.
     input_offset_, output_offset_ : ndarray
         Means subtracted with `detrend`, else zero.
+    time_jitter_ : float
+        Largest deviation of a time stamp of `fit` from an even grid, relative to the
+        step; 0 without a `time` column.
     n_outputs_ : int
     n_features_in_ : int
     feature_names_in_ : ndarray of str
@@ -187,6 +198,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         initial_state: str = "estimate",
         detrend: str | None = None,
         missing: str = "raise",
+        time_tol: float = TIME_TOL,
         inputs: Any = None,
         experiment: Any = None,
         time: Any = None,
@@ -204,6 +216,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.initial_state = initial_state
         self.detrend = detrend
         self.missing = missing
+        self.time_tol = time_tol
         self.inputs = inputs
         self.experiment = experiment
         self.time = time
@@ -238,7 +251,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             If the model is unstable or explains next to nothing of the outputs.
         """
         choices = check_options(self.get_params(deep=False))
-        experiments, _ = self._read(X, y, reset=True)
+        experiments = self._read(X, y, reset=True)
+        self.time_jitter_ = max(e.jitter for e in experiments)
         self._stream: SampleStream | None = None
         self._single_output = np.asarray(y).ndim == 1
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
@@ -324,7 +338,16 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if before is not None:
             before.check_options(options)
         with self._unchanged_where_refused():
-            experiments, _ = self._read(X, y, reset=before is None, split=False)
+            experiments = read_experiments(
+                self,
+                X,
+                y,
+                sampling_time=self.sampling_time,
+                reset=before is None,
+                allow_missing="Xy" if self.missing == "split" else "",
+            )
+            jitter = 0.0 if before is None else self.time_jitter_
+            self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
             if before is None:
                 step = self._step_of(experiments)
                 stream = SampleStream(choices, options, experiments, step)
@@ -386,8 +409,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             If the outputs of an unstable model overflow.
         """
         check_is_fitted(self, "lti_")
-        experiments, n_samples = self._read(X, None, reset=False)
-        return self._in_table(experiments, n_samples, self._simulated)
+        return self._in_table(self._read(X, None), n_rows_of(X), self._simulated)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate the outputs from initial states estimated on measured outputs.
@@ -397,19 +419,42 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Measured outputs, used for the initial state of every experiment only
-            (least squares over the whole experiment).
+            (least squares over the whole experiment). Missing ones (NaN) are left out.
 
         Returns
         -------
         ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            With ``missing="split"`` NaN where an input is missing; the simulation
+            begins anew after that.
         """
         check_is_fitted(self, "lti_")
-        experiments, n_samples = self._read(X, y, reset=False)
 
         def simulated(e: Experiment) -> Array:
             return self._simulated(e, self._initial_state(e))
 
-        return self._in_table(experiments, n_samples, simulated)
+        return self._in_table(self._read(X, y, outputs=False), n_rows_of(X), simulated)
+
+    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
+        """Coefficient of determination of the simulation from rest.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Measured outputs. Samples of which one is missing (NaN) are left out.
+        sample_weight : array-like of shape (n_samples,), default=None
+
+        Returns
+        -------
+        float
+            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
+
+        Warns
+        -----
+        UserWarning
+            If an experiment starts in mid-motion, which a simulation from rest misses.
+        """
+        return score_from_rest(self, X, y, sample_weight)
 
     def predict_ahead(
         self, X: Any, y: Any, steps: int = 1, *, initial_state: str = "estimate"
@@ -420,7 +465,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs.
+            Measured outputs. Missing ones (NaN) correct nothing.
         steps : int, default=1
             Prediction horizon in samples.
         initial_state : {"estimate", "rest"}, default="estimate"
@@ -434,8 +479,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "lti_")
         one_of("initial_state", initial_state, ("estimate", "rest"))
-        experiments, n_samples = self._read(X, y, reset=False)
-        predictor = self.predictor_
+        experiments, predictor = self._read(X, y, outputs=False), self.predictor_
 
         def predicted(e: Experiment) -> Array:
             return predictor.predict(
@@ -447,7 +491,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 ),
             )
 
-        return self._in_table(experiments, n_samples, predicted)
+        return self._in_table(experiments, n_rows_of(X), predicted)
 
     def residual_tests(
         self,
@@ -464,8 +508,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs. Initial states are estimated from them, `detrend` and
-            `missing` act as in `fit`.
+            Measured outputs. Initial states are estimated from them, and `detrend`
+            acts as in `fit`. Records are cut where samples are missing.
         errors : {"simulation", "prediction"}, default="simulation"
             Of `predict_with_initial_state`, or of `predict_ahead`. Only the latter
             should be white: they test the noise model too.
@@ -545,7 +589,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """What is tested; `ResidualDisplay` draws it."""
         check_is_fitted(self, "lti_")
         check_kind(errors)
-        experiments, _ = self._read(X, y, reset=False)
+        experiments = self._read(X, y, split=True)
         names = [] if y is None else read_outputs(y)[1]
         if y is not None and len(names) != self.n_outputs_:
             raise ValueError(
@@ -673,7 +717,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         list of ndarray of int
         """
         check_is_fitted(self, "lti_")
-        return [e.rows for e in self._read(X, None, reset=False)[0]]
+        gaps = "Xy" if self.missing == "split" else ""
+        optional = (*OPTIONAL_ROLES, "scheduling")
+        options: dict[str, Any] = {"reset": False, "optional": optional}
+        found = read_experiments(self, X, allow_missing=gaps, **options)
+        return [e.rows for e in found]
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
@@ -682,23 +730,19 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tags.input_tags.allow_nan = self.missing == "split"
         return tags
 
-    def _read(
-        self, X: Any, y: Any, *, reset: bool, split: bool = True
-    ) -> tuple[list[Experiment], int]:
-        # A simulation needs every input; gaps are for what has outputs beside them.
-        gaps = self.missing == "split" and y is not None
-        experiments = read_experiments(
+    def _read(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
+        """Experiments of a table; options as in `read_runs`."""
+        options = {"split": self.missing == "split", "reset": False} | options
+        known = options["reset"] or self.time is None
+        return read_runs(
             self,
             X,
             y,
             sampling_time=self.sampling_time,
-            reset=reset,
-            allow_missing=gaps,
+            fitted_step=None if known else self.lti_.sampling_time,
+            optional=(*OPTIONAL_ROLES, "scheduling"),
+            **options,
         )
-        n_samples = sum(len(e.rows) for e in experiments)
-        if gaps and split:
-            experiments = split_at_gaps(experiments)
-        return experiments, n_samples
 
     def _simulated(self, experiment: Experiment, x0: Array | None = None) -> Array:
         """Outputs about their offset."""

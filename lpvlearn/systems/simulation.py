@@ -85,8 +85,12 @@ def estimate_initial_state(responses: Array, error: Array) -> Array:
 
     ``min || error - sum_i responses[:, :, i] x0[i] ||``, of minimum norm where the
     responses (of every unit initial state) do not determine it. The error has shape
-    (n_samples, n_outputs), and one more axis for several runs.
+    (n_samples, n_outputs), and one more axis for several runs. Of one run, entries may
+    be missing (NaN).
     """
     n_rows = error.shape[0] * error.shape[1]
     columns = responses.reshape(n_rows, -1)
+    if error.ndim == 2 and np.isnan(error).any():
+        known = ~np.isnan(error.reshape(n_rows))
+        return scaled_lstsq(columns[known], error.reshape(n_rows)[known])[0]
     return scaled_lstsq(columns, error.reshape(n_rows, *error.shape[2:]))[0]

@@ -393,7 +393,7 @@ def test_names_of_columns_are_kept_and_checked(fitted, spring):
     assert fitted.n_features_in_ == 4
     assert fitted.output_names_ == ["position"]
     assert fitted.scheduling_names_ == ["kappa"]
-    with pytest.raises(ValueError, match="feature names should match"):
+    with pytest.raises(ValueError, match=r"none of name 'force' \(inputs\)"):
         fitted.predict(X.rename(columns={"force": "u"}))
 
 

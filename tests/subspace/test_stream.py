@@ -585,3 +585,25 @@ def test_experiments_of_a_stream_have_one_time_step(timed):
     model.partial_fit(X[:200], y[:200])
     with pytest.raises(ValueError, match="same time step. Got 0.1 s first, and 0.2 s"):
         model.partial_fit(X[200:], y[200:])
+
+
+@pytest.mark.parametrize("dates", [False, True])
+def test_dropped_rows_and_jitter_of_a_stream_are_those_of_its_table(timed, dates):
+    """Rows are missing within batches and between them; stamps are off by 0.8 %."""
+    rng = np.random.default_rng(1)
+    t = 0.1 * (np.arange(400) + 0.008 * rng.uniform(-1, 1, 400))
+    if dates:
+        t = pd.Timestamp("2024-02-28 23:59:50") + pd.to_timedelta(t, unit="s")
+    kept = ~np.isin(np.arange(400), [70, 71, 150, 201, 202, 300])
+    X, y = timed[0].assign(t=t)[kept], timed[1][kept]
+    options = {"order": 1, "horizon": 5, "time": "t", "missing": "split"}
+    whole, stream = SubspaceLTI(**options).fit(X, y), SubspaceLTI(**options)
+    assert len(whole.initial_states_) == 5
+    for start, stop in [(0, 60), (60, 148), (148, 149), (149, 250), (250, 394)]:
+        stream.partial_fit(X[start:stop], y[start:stop])
+    assert stream.lti_.sampling_time == pytest.approx(whole.lti_.sampling_time)
+    assert 0.006 < stream.time_jitter_ < 0.01
+    np.testing.assert_allclose(response(stream), response(whole), rtol=1e-9)
+    with pytest.raises(ValueError, match=r"row\(s\) are missing|does not continue"):
+        strict = SubspaceLTI(**{**options, "missing": "raise"})
+        strict.partial_fit(X[:60], y[:60]).partial_fit(X[60:148], y[60:148])
