@@ -26,6 +26,7 @@ from ..data.experiments import (
 )
 from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
 from ..data.preparation import split_at_gaps
+from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..metrics.table_simulation import simulate_experiments
@@ -311,6 +312,7 @@ list, default=None
         with watch.step("restructuring"):  # step 4: all of them in one structure
             found = restructure_points(restructurer, local, points, runner)
             self.local_models_ = [model.lti for model in found.local]
+            self._n_with_offset = sum(model.n_trend > 0 for model in found.local)
             self.structured_models_ = found.models
             self.restructurers_ = found.restructurers
 
@@ -357,6 +359,9 @@ list, default=None
         -----
         ExtrapolationWarning
             Where a scheduling variable leaves `scheduling_range_`.
+        UserWarning
+            Where local models have constants (`SubspaceLTI.offset_`), which the LPV
+            model leaves out.
         """
         check_is_fitted(self, "lpv_")
         return self._simulate(self._read(X, None, reset=False), estimate=False)
@@ -402,6 +407,15 @@ list, default=None
         )
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
+        if self._n_with_offset:
+            warn(
+                f"The experiments at {self._n_with_offset} of "
+                f"{len(self.local_models_)} operating point(s) have constants in their "
+                "outputs, which local models allow for. The LPV model has none: its "
+                "outputs are about zero. Subtract from y what it is at rest at input "
+                "zero, at every operating point, or say that it is zero: "
+                "local=SubspaceLTI(offset=None)."
+            )
         if getattr(self.interpolator_, "extrapolation", None) != "clip":
             warn_extrapolation(
                 experiments, self.scheduling_range_, self.scheduling_names_
