@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 Pairs = list[tuple[Array, Array]]
 
-DETRENDS = (None, "constant", "linear")
+DETRENDS = (None, "constant", "linear")  # by the number of signals in a trend
 
 # Relative singular value below which inputs count as collinear, and the ratio of the
 # eigenvalues of their Gram matrix below which that is looked into: its rounding hides
@@ -117,8 +117,8 @@ def _rows(experiment: Experiment, part: slice) -> Experiment:
 def remove_trends(pairs: Pairs, detrend: str | None) -> tuple[Pairs, Array, Array]:
     """Subtract its mean or its straight line from every channel of every experiment.
 
-    The pairs come back with the offsets of the inputs and of the outputs: means over
-    all samples, zero with ``detrend=None``.
+    The pairs come back with the offsets of inputs and outputs, a row per experiment:
+    means over its samples, zero with ``detrend=None``.
 
     Examples
     --------
@@ -126,17 +126,14 @@ def remove_trends(pairs: Pairs, detrend: str | None) -> tuple[Pairs, Array, Arra
     >>> t = np.arange(4.0)[:, None]
     >>> pairs, u0, y0 = remove_trends([(t, 2.0 * t + 1.0)], "linear")
     >>> u0, y0, np.abs(pairs[0][1]).max() < 1e-12
-    (array([1.5]), array([4.]), np.True_)
+    (array([[1.5]]), array([[4.]]), np.True_)
     """
+    means = [np.array([pair[k].mean(axis=0) for pair in pairs]) for k in (0, 1)]
     if detrend is None:
-        return pairs, np.zeros(pairs[0][0].shape[1]), np.zeros(pairs[0][1].shape[1])
+        return pairs, np.zeros_like(means[0]), np.zeros_like(means[1])
     degree = 0 if detrend == "constant" else 1
     cleaned = [(u - _trend(u, degree), y - _trend(y, degree)) for u, y in pairs]
-    total = sum(len(u) for u, _ in pairs)
-    offsets = [
-        np.asarray(sum(pair[k].sum(axis=0) for pair in pairs)) / total for k in (0, 1)
-    ]
-    return cleaned, offsets[0], offsets[1]
+    return cleaned, means[0], means[1]
 
 
 def _trend(values: Array, degree: int) -> Array:

@@ -24,6 +24,7 @@ from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
     state_trajectory,
+    trend_signals,
 )
 from .scores import bft_score
 
@@ -31,11 +32,15 @@ Array = NDArray[np.float64]
 
 
 def fit_of(
-    model: StateSpace, group: Sequence[Experiment], sampling_time: float
+    model: StateSpace,
+    group: Sequence[Experiment],
+    sampling_time: float,
+    n_trend: int = 0,
 ) -> float:
     """BFT (percent, mean over the outputs) of a continuous model on experiments.
 
-    The initial state of every experiment is estimated by least squares. Experiments of
+    The initial state of every experiment is estimated by least squares, and with
+    `n_trend` a constant (1), a constant and a drift (2) of every output. Experiments of
     one length are simulated together; realizations of one input, once.
     """
     sampled = model.to_discrete(sampling_time)
@@ -51,7 +56,9 @@ def fit_of(
             sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
         )
         forced = sampled.C @ x + sampled.D @ u
-        free = free_responses(sampled.A, sampled.C, length)
+        free = free_responses(
+            sampled.A, sampled.C, length, trend_signals(length, n_trend)
+        )
         found = forced + free @ estimate_initial_state(free, y - forced)
         true.append(np.moveaxis(y, -1, 0).reshape(-1, model.n_outputs))
         simulated.append(np.moveaxis(found, -1, 0).reshape(-1, model.n_outputs))

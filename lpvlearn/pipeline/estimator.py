@@ -29,6 +29,7 @@ from ..data.operating_points import check_outputs, local_experiments, warn_extra
 from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
+from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..metrics.table_simulation import simulate_experiments
@@ -323,6 +324,7 @@ list, default=None
         with watch.step("restructuring"):  # step 4: all of them in one structure
             found = restructure_points(restructurer, local, points, runner)
             self.local_models_ = [model.lti for model in found.local]
+            self._n_with_offset = sum(model.n_trend > 0 for model in found.local)
             self.structured_models_ = found.models
             self.restructurers_ = found.restructurers
 
@@ -369,6 +371,9 @@ list, default=None
         -----
         ExtrapolationWarning
             Where a scheduling variable leaves `scheduling_range_`.
+        UserWarning
+            Where local models have constants (`SubspaceLTI.offset_`), which the LPV
+            model leaves out.
         """
         check_is_fitted(self, "lpv_")
         return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
@@ -445,6 +450,15 @@ list, default=None
     def _simulate(
         self, experiments: list[Experiment], n_samples: int, *, estimate: bool
     ) -> Array:
+        if self._n_with_offset:
+            warn(
+                f"The experiments at {self._n_with_offset} of "
+                f"{len(self.local_models_)} operating point(s) have constants in their "
+                "outputs, which local models allow for. The LPV model has none: its "
+                "outputs are about zero. Subtract from y what it is at rest at input "
+                "zero, at every operating point, or say that it is zero: "
+                "local=SubspaceLTI(offset=None)."
+            )
         if getattr(self.interpolator_, "extrapolation", None) != "clip":
             warn_extrapolation(
                 experiments, self.scheduling_range_, self.scheduling_names_

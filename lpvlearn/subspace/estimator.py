@@ -21,11 +21,17 @@ from ..data.experiments import (
     read_experiments,
     read_outputs,
 )
-from ..data.preparation import read_runs
+from ..data.preparation import DETRENDS, read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL
+from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair
+from ..systems.simulation import (
+    estimate_initial_state,
+    free_responses,
+    trend_signals,
+)
 from ..validation import frequencies, one_of
 from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
 from .residuals import (
@@ -90,8 +96,15 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         State in which every experiment of `fit` starts: estimated along with B and D,
         or zero, which is worth knowing of short experiments that start at rest.
     detrend : {None, "constant", "linear"}, default=None
-        Subtract its mean or straight line from every channel of every experiment.
-        Predictions are then about the means of all training samples.
+        Subtract its mean or straight line from every channel of every experiment
+        beforehand. A mean is not where a system rests: what transients add to it stays
+        as an error, which `offset` does not have.
+    offset : {"auto", None, "constant", "linear"}, default="auto"
+        Unknowns of every output and experiment, estimated with B, D and the initial
+        state: a constant, as signals have that are not measured from a point of rest,
+        or a constant and a drift. None: the outputs are zero at rest at input zero.
+        "auto" takes constants of all experiments where they are significant, else (and
+        with `detrend`, which has dealt with them) none.
     missing : {"raise", "split"}, default="raise"
         "split" ends an experiment before a sample with NaN, or a row that the `time`
         column misses, and starts another after it, with an initial state of its own.
@@ -132,8 +145,20 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         `lti_` with a noise model, Kalman gain and innovation covariance.
     poles_std_ : ndarray of complex, shape (order_,)
         Standard deviations of the real and imaginary parts of ``lti_.poles()``.
-    input_offset_, output_offset_ : ndarray
-        Means subtracted with `detrend`, else zero.
+    offset_ : {None, "constant", "linear"}
+        What was estimated.
+    input_offset_ : ndarray of shape (n_experiments, n_inputs)
+        Mean of the inputs of every experiment (a run between two gaps is one); zero
+        without `offset_` and `detrend`, with ``initial_state="rest"``, and where the
+        static gain is infinite: a mode slower than the longest experiment.
+    output_offset_ : ndarray of shape (n_experiments, n_outputs)
+        Where the outputs rest at these inputs: but for transients and drifts
+        ``y - output_offset_ = G (u - input_offset_)``. With `detrend` their means, to
+        which `offset` adds. After `partial_fit` of a long stream there is one row, the
+        mean of all.
+    output_drift_ : ndarray of shape (n_experiments, n_outputs)
+        Change per second (per sample where no time is known), about the middle of
+        the experiment; zero without ``offset="linear"``.
     time_jitter_ : float
         Largest deviation of a time stamp of `fit` from an even grid, relative to the
         step; 0 without a `time` column.
@@ -146,6 +171,17 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     `predict` simulates from rest; `predict_with_initial_state` estimates the
     initial state from outputs first, as a split in the middle of an experiment
     needs. Models of different fits do not share a state basis.
+
+    Signals about a point (u0, y0) are ``y = G u + c`` with ``c = y0 - G(1) u0``, but
+    for a transient that the initial state takes. So one unknown for each output stands
+    for all offsets. Of a system that integrates, an offset of the input makes a
+    straight line: ``offset="linear"``. `predict` then begins at rest at the mean of
+    `input_offset_`, the outputs at that of `output_offset_` (of drifts it knows
+    nothing); where the constants of the experiments differ by more than their
+    uncertainty it warns, as inputs alone cannot tell which one it will be. What is
+    given outputs estimates constant (and drift) of every experiment anew:
+    `predict_with_initial_state`, `residual_tests` and, from estimated initial states,
+    `predict_ahead`.
 
     Without refinement, "po-moesp" with as many noise states as the noise has and
     "pi-moesp" at the order of the system are consistent under coloured noise, others
@@ -197,6 +233,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         n_noise_states: int | str = "auto",
         initial_state: str = "estimate",
         detrend: str | None = None,
+        offset: str | None = "auto",
         missing: str = "raise",
         time_tol: float = TIME_TOL,
         inputs: Any = None,
@@ -215,6 +252,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.n_noise_states = n_noise_states
         self.initial_state = initial_state
         self.detrend = detrend
+        self.offset = offset
         self.missing = missing
         self.time_tol = time_tol
         self.inputs = inputs
@@ -312,6 +350,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         to be poor: the first 131,072 samples hardly excite what comes later, outputs
         drift, or (``refine=False``) the order is higher than the data support.
 
+        ``offset="auto"`` decides from the samples that are kept. From then on every
+        16,384 samples have constants (and drifts) of their own, so that a level that
+        wanders slowly does no harm.
+
         Examples
         --------
         >>> import numpy as np
@@ -332,7 +374,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.detrend is not None:
             raise ValueError(
                 "`detrend` must be None in partial_fit, which never sees a whole "
-                f"experiment. Got {self.detrend!r}."
+                f"experiment. Got {self.detrend!r}. Use offset={self.detrend!r}."
             )
         before = getattr(self, "_stream", None)
         if before is not None:
@@ -376,14 +418,16 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
         self.selection_ = fitted.selection.table()
-        self.n_outputs_ = len(fitted.output_offset)
+        self.n_outputs_ = len(fitted.evidence.output_scale)
         self.initial_states_ = fitted.model.initial_states
         self.singular_values_ = fitted.singular_values
         self.residual_ = fitted.residual
         self.stability_loss_ = fitted.stability_loss
-        self.input_offset_ = fitted.input_offset
-        self.output_offset_ = fitted.output_offset
-        self._evidence = fitted.evidence
+        self._evidence, self._offsets = fitted.evidence, fitted.offsets
+        self.offset_ = DETRENDS[fitted.evidence.free.n_trend]
+        self.input_offset_ = fitted.offsets.inputs
+        self.output_offset_ = fitted.offsets.outputs
+        self.output_drift_ = fitted.offsets.drifts / step
 
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
         """Seconds between the samples of a table; True where nothing tells them."""
@@ -407,8 +451,21 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ------
         DivergenceError
             If the outputs of an unstable model overflow.
+
+        Warns
+        -----
+        UserWarning
+            If the constants of the experiments of `fit` differ: the outputs are about
+            their mean.
         """
         check_is_fitted(self, "lti_")
+        if self._offsets.differ:
+            warn(
+                "The experiments of `fit` have different constants in their outputs "
+                "(`output_offset_`): predictions are about their mean. Where outputs "
+                "are known, predict_with_initial_state(X, y) and "
+                "initial_state='estimate' of scores estimate those of every experiment."
+            )
         return self._in_table(self._read(X, None), n_rows_of(X), self._simulated)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
@@ -418,8 +475,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs, used for the initial state of every experiment only
-            (least squares over the whole experiment). Missing ones (NaN) are left out.
+            Measured outputs, used for the initial state of every experiment (and of a
+            model with `offset_` for the constant and drift) only: least squares over
+            the whole experiment. Missing ones (NaN) are left out.
 
         Returns
         -------
@@ -430,7 +488,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self, "lti_")
 
         def simulated(e: Experiment) -> Array:
-            return self._simulated(e, self._initial_state(e))
+            x0, level = self._own_part(e)
+            u0, _ = self._rest()
+            return level + self.lti_.simulate(e.inputs - u0, initial_state=x0)
 
         return self._in_table(self._read(X, y, outputs=False), n_rows_of(X), simulated)
 
@@ -482,14 +542,12 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         experiments, predictor = self._read(X, y, outputs=False), self.predictor_
 
         def predicted(e: Experiment) -> Array:
-            return predictor.predict(
-                e.inputs - self.input_offset_,
-                _outputs_of(e) - self.output_offset_,
-                steps=steps,
-                initial_state=(
-                    self._initial_state(e) if initial_state == "estimate" else None
-                ),
-            )
+            u0, level = self._rest()
+            x0 = None
+            if initial_state == "estimate":
+                x0, level = self._own_part(e)
+            u, y = e.inputs - u0, _outputs_of(e) - level
+            return level + predictor.predict(u, y, steps=steps, initial_state=x0)
 
         return self._in_table(experiments, n_rows_of(X), predicted)
 
@@ -508,8 +566,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs. Initial states are estimated from them, and `detrend`
-            acts as in `fit`. Records are cut where samples are missing.
+            Measured outputs. Initial states and trends of `offset_` are estimated from
+            them, `detrend` acts as in `fit`. Records are cut where samples are missing.
         errors : {"simulation", "prediction"}, default="simulation"
             Of `predict_with_initial_state`, or of `predict_ahead`. Only the latter
             should be white: they test the noise model too.
@@ -744,15 +802,24 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             **options,
         )
 
-    def _simulated(self, experiment: Experiment, x0: Array | None = None) -> Array:
-        """Outputs about their offset."""
-        u = experiment.inputs - self.input_offset_
-        return self.lti_.simulate(u, initial_state=x0)
+    def _rest(self) -> tuple[Array, Array]:
+        """Inputs and outputs of an experiment at rest: the means of all."""
+        pooled = self._offsets.pooled()
+        return pooled.inputs[0], pooled.outputs[0]
 
-    def _initial_state(self, experiment: Experiment) -> Array:
-        u = experiment.inputs - self.input_offset_
-        y = _outputs_of(experiment) - self.output_offset_
-        return self.lti_.estimate_initial_state(u, y)
+    def _simulated(self, experiment: Experiment) -> Array:
+        """Outputs from rest at the mean offsets."""
+        u0, y0 = self._rest()
+        return y0 + self.lti_.simulate(experiment.inputs - u0)
+
+    def _own_part(self, experiment: Experiment) -> tuple[Array, Array]:
+        """Initial state, and the outputs that the answer to the inputs adds to."""
+        y, n_trend = _outputs_of(experiment), self._evidence.free.n_trend
+        trend = trend_signals(len(y), n_trend)
+        responses = free_responses(self.lti_.A, self.lti_.C, len(y), trend)
+        own = estimate_initial_state(responses, y - self._simulated(experiment))
+        n = self.lti_.order
+        return own[:n], self._rest()[1] + responses[:, :, n:] @ own[n:]
 
     def _in_table(
         self,
@@ -764,7 +831,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         out = np.full((n_samples, self.n_outputs_), np.nan)
         for e in experiments:
             with naming(e):
-                out[e.rows] = outputs(e) + self.output_offset_
+                out[e.rows] = outputs(e)
         return out[:, 0] if self._single_output else out
 
 

@@ -2,9 +2,9 @@
 
 Each experiment is cut into pieces of equal length, and every piece but the first is
 held out once: the model is fitted again without it, from where it was, and simulated
-through it from the state that the samples before tell. What a likelihood says rests on
-its noise model being right; this does not, and so has the last word where a system is
-not quite what the models can be.
+through it from the state (and the constant) that the samples before tell. What a
+likelihood says rests on its noise model being right; this does not, and so has the last
+word where a system is not quite what the models can be.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def held_out(
     for k in range(1, _N_PIECES + 1):
         cuts = [_cut(record.u.shape[1], k) for record in records]
         train = [
-            Record(record.u[:, part].copy(), record.y[:, part].copy())
+            Record(*(signals[:, part].copy() for signals in record))
             for record, (start, stop) in zip(records, cuts, strict=True)
             for part in (slice(0, start), slice(stop, None))
             if part == slice(0, start) or record.u.shape[1] - stop >= _TOO_SHORT
@@ -83,10 +83,12 @@ def held_out(
             u, y = record.u.T[:stop], record.y.T[:stop]
             with np.errstate(over="ignore", invalid="ignore"):
                 error = y - lti_response(model.A, model.B, model.C, model.D, u)
-                if not at_rest:
-                    free = free_responses(model.A, W @ model.C, stop)
-                    x0 = estimate_initial_state(free[:start], error[:start] @ W.T)
-                    error = error - np.linalg.solve(W, (free @ x0).T).T
+                if len(record.trend) or not at_rest:
+                    trend = record.trend[:, :stop]
+                    free = free_responses(model.A, W @ model.C, stop, trend)
+                    free = free[:, :, len(model.A) * at_rest :]
+                    own = estimate_initial_state(free[:start], error[:start] @ W.T)
+                    error = error - np.linalg.solve(W, (free @ own).T).T
             error = error[start:]
             errors.append(error)
             outputs.append(y[start:])

@@ -387,7 +387,7 @@ def fit_as_stream(
     """
     if sum(len(u) for u, _ in pairs) <= BUFFER:
         return None
-    pairs, u_offset, y_offset = remove_trends(pairs, detrend)
+    pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     buffer = SampleBuffer(gaps)
     left = buffer.add([Piece(u, y, True) for u, y in pairs])
     first = buffer.pairs
@@ -403,13 +403,13 @@ def fit_as_stream(
     except ValueError:
         return None
     kept = [Piece(u, y, True) for u, y in first]
-    states = summary.initial_states(fitted.model, kept, left)
-    if states is None:
+    own = summary.own_unknowns(fitted.model, kept, left)
+    if own is None:
         return None
+    states, offsets = own
     return fitted._replace(
         model=fitted.model._replace(initial_states=states),
-        input_offset=u_offset,
-        output_offset=y_offset,
+        offsets=offsets.shifted(u_mean, y_mean),
     )
 
 
