@@ -15,7 +15,11 @@ import pandas as pd
 from joblib import Memory, hash
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
-from sklearn.utils.validation import check_is_fitted, check_memory
+from sklearn.utils.validation import (
+    check_is_fitted,
+    check_memory,
+    has_fit_parameter,
+)
 
 from ..data.experiments import (
     NO_TIME,
@@ -26,6 +30,7 @@ from ..data.experiments import (
 )
 from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
 from ..data.preparation import split_at_gaps
+from ..lpv.auto import AutoLPV
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..metrics.table_simulation import simulate_experiments
@@ -41,14 +46,14 @@ Array = NDArray[np.float64]
 _DEFAULTS = {
     "local": SubspaceLTI,
     "restructurer": GrayBoxRestructurer,
-    "interpolator": PolynomialLPV,
+    "interpolator": AutoLPV,
 }
 
 # Methods that the steps need, an example, and what else is allowed.
 _STEPS = {
     "local": (("fit",), "SubspaceLTI()", None),
     "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", "passthrough"),
-    "interpolator": (("fit", "predict"), "PolynomialLPV()", None),
+    "interpolator": (("fit", "predict"), "AutoLPV() or PolynomialLPV()", None),
 }
 
 
@@ -90,8 +95,9 @@ class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
         baseline without structure.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
-        (n_points, n_params); None is ``PolynomialLPV()``, a parabola (a line through
-        two points). Any scikit-learn regressor with several outputs serves. One
+        (n_points, n_params); None is ``AutoLPV()``, which chooses by the covariances
+        of the parameters. Any scikit-learn regressor with several outputs serves; one
+        whose `fit` takes a `covariance` gets these (n_points, n_params, n_params). One
         operating point makes a constant, whatever the interpolator.
     inputs, scheduling, experiment, time, operating_point : column name, position or \
 list, default=None
@@ -180,7 +186,7 @@ list, default=None
 
     See Also
     --------
-    SubspaceLTI, GrayBoxRestructurer, PolynomialLPV : The three steps.
+    SubspaceLTI, GrayBoxRestructurer, AutoLPV : The three steps.
 
     Examples
     --------
@@ -316,7 +322,10 @@ list, default=None
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
             kappa = self.operating_points_ = found.points.kappa
-            self.interpolator_ = self._interpolator(len(kappa)).fit(kappa, found.theta)
+            interpolator, known = self._interpolator(len(kappa)), {}
+            if has_fit_parameter(interpolator, "covariance"):
+                known["covariance"] = found.covariance
+            self.interpolator_ = interpolator.fit(kappa, found.theta, **known)
             span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
             self.lpv_ = LPVStateSpace(found.structure, self.interpolator_, span)
             self.scheduling_range_ = found.points.identified_range
@@ -446,9 +455,7 @@ list, default=None
     def _interpolator(self, n_points: int) -> Any:
         if n_points == 1:
             return PolynomialLPV(degree=0)
-        if self.interpolator is None:
-            return PolynomialLPV(degree=min(2, n_points - 1))
-        return clone(self.interpolator)
+        return AutoLPV() if self.interpolator is None else clone(self.interpolator)
 
     def _check_options(self) -> None:
         one_of("combine", self.combine, ("pool", "average"))

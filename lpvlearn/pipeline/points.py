@@ -299,7 +299,7 @@ class StructuredModels(NamedTuple):
     local: list[LocalModel]  # the black boxes
     structure: GrayBoxStructure
     theta: Array  # (n_points, n_params), parameters
-    std: Array  # (n_points, n_params), their standard deviations: NaN where not known
+    covariance: Array  # (n_points, n_params, n_params): NaN where not known
     models: list[StateSpace]
     restructurers: list[Any]  # fitted; empty without that step
 
@@ -320,7 +320,7 @@ def restructure_points(
             [model.lti.balance(min(model.order, model.lti.order)) for model in local]
         )
         balanced = [structure.model(row) for row in theta]
-        unknown = np.full(theta.shape, np.nan)
+        unknown = _unknown_covariance(theta)
         return StructuredModels(points, local, structure, theta, unknown, balanced, [])
     restructurer = _with_structure(restructurer, local)
     # What a fit is about: the model, and where they are known its realizations and
@@ -361,8 +361,8 @@ def restructure_points(
     helped = [done.result for done in found if done is not None]
     points, local = points.keep(kept), [local[k] for k in kept]
     theta = np.array([fitted.params_ for fitted in helped])
-    std = np.full(theta.shape, np.nan)
-    for row, fitted, model in zip(std, helped, local, strict=True):
+    covariance = _unknown_covariance(theta)
+    for P, fitted, model in zip(covariance, helped, local, strict=True):
         known = getattr(fitted, "params_covariance_", None)  # where it tells its own
         if known is None and model.deviated:
             known = runner.call(
@@ -374,11 +374,15 @@ def restructure_points(
                 model.deviated,
             )
         if known is not None:
-            row[:] = np.sqrt(np.diag(known))
+            P[:] = known
     models = [fitted.lti_ for fitted in helped]
     return StructuredModels(
-        points, local, helped[0].structure_, theta, std, models, helped
+        points, local, helped[0].structure_, theta, covariance, models, helped
     )
+
+
+def _unknown_covariance(theta: Array) -> Array:
+    return np.full((*theta.shape, theta.shape[1]), np.nan)
 
 
 def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:

@@ -10,6 +10,7 @@ from sklearn.ensemble import RandomForestRegressor
 from sklearn.linear_model import LinearRegression
 
 from lpvlearn import (
+    AutoLPV,
     GrayBoxRestructurer,
     LocalLPVPipeline,
     PolynomialLPV,
@@ -117,6 +118,35 @@ def test_any_regressor_interpolates(spring, memory):
     forest = RandomForestRegressor(5, random_state=0)
     steps = spring_pipeline(interpolator=forest, memory=memory).fit(X, y)
     assert bft_score(y_sweep, steps.predict(X_sweep)) > 50
+
+
+@pytest.mark.slow
+def test_points_of_few_samples_count_by_their_covariances():
+    """Two operating points of 100 samples among five of 3000."""
+    kappas = np.linspace(0, 1.5, 7)
+    parts = [
+        spring_tables(
+            0.1, 100 if k in (1, 4) else 3000, seed=20 + k, kappas=kappas[k : k + 1]
+        )
+        for k in range(7)
+    ]
+    X = pd.concat([X.assign(run=k) for k, (X, _) in enumerate(parts)])
+    y = pd.concat([y for _, y in parts])
+    pipeline = spring_pipeline(local=SubspaceLTI(2, feedthrough=False)).fit(X, y)
+    assert pipeline.interpolator_.form_ == "polynomial 2"
+    assert pipeline.interpolator_.best_estimator_.weighted_
+    assert "(polynomial 2)" in pipeline.summary()
+    unweighted = PolynomialLPV().fit(kappas[:, None], pipeline.parameters_)
+    fine = np.linspace(0, 1.5, 50)
+    truth = spring_truth(fine)
+    errors = [
+        np.sqrt(np.mean(((found - truth) / truth) ** 2))
+        for found in (
+            pipeline.lpv_.parameters(fine),
+            unweighted.predict(fine[:, None]),
+        )
+    ]
+    assert errors[0] < errors[1] / 1.5
 
 
 def test_sub_estimators_are_cloned(spring):
@@ -267,9 +297,9 @@ def test_nested_parameters_reach_the_steps():
 
 def test_parameters_of_a_default_step_can_be_set():
     pipeline = LocalLPVPipeline(**ROLES)
-    pipeline.set_params(local__horizon=12, interpolator__degree=1)
+    pipeline.set_params(local__horizon=12, interpolator__criterion="bic")
     assert pipeline.local.get_params() == SubspaceLTI(horizon=12).get_params()
-    assert pipeline.interpolator.degree == 1
+    assert pipeline.interpolator.get_params() == AutoLPV("bic").get_params()
     assert pipeline.restructurer is None
     with pytest.raises(ValueError, match="Invalid parameter 'horizn'"):
         pipeline.set_params(local__horizn=3)
@@ -350,7 +380,7 @@ def test_two_points_carry_a_line_by_default(spring, memory):
     X, y, _, _ = spring
     two = X["kappa"].isin([0.0, 0.5])
     pipeline = spring_pipeline(memory=memory).fit(X[two], y[two])
-    assert pipeline.interpolator_.degree == 1
+    assert pipeline.interpolator_.form_ == "polynomial 1"
 
 
 # -------------------------------------------------------------------- tables and arrays
