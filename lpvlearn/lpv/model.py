@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,18 +13,22 @@ from numpy.typing import ArrayLike, NDArray
 from ..exceptions import DivergenceError, finite_simulation
 from ..models.statespace import StateSpace, sorted_poles
 from ..models.system_matrix import blocks
+from ..structures.map import numerical_jacobian
 from ..structures.structure import GrayBoxStructure
 from ..systems.sampling import sample_zoh
 from ..systems.simulation import state_trajectory
 from ..systems.tabulation import tabulate
 from ..validation import (
     finite_samples,
+    matrix,
     positive_time,
     real_array,
     state_vector,
 )
 
 Array = NDArray[np.float64]
+
+_Basis = Callable[[Array], ArrayLike] | ArrayLike
 
 # Samples whose matrices are held at once: for 6 states, 2 inputs and outputs 17 MB.
 _BLOCK = 32_768
@@ -45,6 +50,8 @@ class LPVStateSpace:
         n_params). Says itself what it makes of values outside of the range.
     scheduling_range : array-like of shape (2, n_scheduling)
         Smallest and largest scheduling values that the model was identified on.
+    bases : tuple of callables or arrays of shape (order, order), default=()
+        Changes of the structure's state basis, see :meth:`change_basis`.
 
     Attributes
     ----------
@@ -85,11 +92,20 @@ class LPVStateSpace:
     >>> free = lpv.free_responses(trajectory, sampling_time=0.1)
     >>> np.allclose(moved - y, free @ [1, 0])
     True
+
+    The momentum of a mass 1 + kappa in place of the rate: the same system.
+
+    >>> momentum = lpv.change_basis(lambda kappa: np.diag([1, 1 + kappa[0]]))
+    >>> momentum.at(0.5).A[0].round(9), momentum.at(0.5, rate=3.0).A[1].round(9)
+    (array([0.        , 0.66666667]), array([-9.75,  1.5 ]))
+    >>> np.allclose(momentum.simulate(np.ones(500), trajectory, 0.1), y)
+    True
     """
 
     structure: GrayBoxStructure
     interpolator: Any
     scheduling_range: Array
+    bases: tuple[_Basis, ...] = ()
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -151,12 +167,15 @@ class LPVStateSpace:
             )
         return values.reshape(len(kappa), n_params)
 
-    def at(self, kappa: ArrayLike) -> StateSpace:
+    def at(self, kappa: ArrayLike, rate: ArrayLike | None = None) -> StateSpace:
         """The frozen model at one scheduling value, Eq. (2).
 
         Parameters
         ----------
         kappa : float or array-like of shape (n_scheduling,)
+        rate : float or array-like of shape (n_scheduling,), default=None
+            Rate of change of `kappa` (1/s), which A depends on after a change of basis
+            that follows kappa; None is rest.
 
         Returns
         -------
@@ -168,8 +187,56 @@ class LPVStateSpace:
         ValueError
             If `kappa` is not one finite value of every scheduling variable.
         """
-        theta = self.parameters(np.reshape(kappa, (1, -1)))[0]
-        return self.structure.model(theta)
+        place = self._scheduling(np.reshape(kappa, (1, -1)))[0]
+        model = self.structure.model(self.parameters(place[None])[0])
+        if not self.bases:
+            return model
+        T = self._basis_at(place)
+        model = model.transform(T)
+        if rate is None:
+            return model
+        speed = self._scheduling(np.reshape(rate, (1, -1)))[0]
+        slopes = numerical_jacobian(self._basis_at, place, self.scheduling_range[1])
+        term = np.tensordot(speed, slopes, 1) @ np.linalg.inv(T)
+        return StateSpace(model.A + term, model.B, model.C, model.D)
+
+    def change_basis(self, T: _Basis) -> LPVStateSpace:
+        """The same system in the state ``z = T(kappa) x``.
+
+        Parameters
+        ----------
+        T : callable or array-like of shape (order, order)
+            Invertible; a function gets the scheduling values, shape (n_scheduling,).
+
+        Returns
+        -------
+        LPVStateSpace
+            Of the same outputs along any trajectory. Its states, and the frozen models
+            of :meth:`at`, are those of the new basis.
+
+        Raises
+        ------
+        ValueError
+            If T has another shape or is singular in the middle of the range.
+
+        Notes
+        -----
+        While kappa moves, T does:
+        ``z' = (T A T^-1 + T' T^-1) z + T B u``, ``T' = sum_j dT/dkappa_j kappa_j'``.
+        The term ``T' T^-1`` is that of `at` with a `rate`. Models that are interpolated
+        in the new basis leave it out and are another system: that choice is the
+        structure's, see :ref:`guide_state_basis`.
+        """
+        changed = replace(self, bases=(*self.bases, T))
+        changed.at(self.scheduling_range.mean(axis=0))  # refuses what is no basis
+        return changed
+
+    def _basis_at(self, kappa: Array) -> Array:
+        """T from the structure's state to this one's."""
+        T = np.eye(self.order)
+        for basis in self.bases:
+            T = matrix("T", basis(kappa) if callable(basis) else basis) @ T
+        return T
 
     def frozen_poles(self, kappa: ArrayLike) -> NDArray[np.complex128]:
         """Poles (rad/s) of the frozen models, each row by modulus.
@@ -227,6 +294,8 @@ class LPVStateSpace:
         if initial_state is not None:
             x = state_vector(initial_state, self.order)
         kappa = self._scheduling(scheduling)
+        if self.bases and len(kappa):
+            x[:] = np.linalg.solve(self._basis_at(kappa[0]), x)
         return self._response(u[:, :, None], kappa, sampling_time, x[:, None])[:, :, 0]
 
     def free_responses(self, scheduling: ArrayLike, sampling_time: float) -> Array:
@@ -249,8 +318,10 @@ class LPVStateSpace:
             As `simulate`.
         """
         kappa = self._scheduling(scheduling)
-        none = np.zeros((len(kappa), 0, self.order))
-        return self._response(none, kappa, sampling_time, np.eye(self.order))
+        none, x = np.zeros((len(kappa), 0, self.order)), np.eye(self.order)
+        if self.bases and len(kappa):
+            x[:] = np.linalg.inv(self._basis_at(kappa[0]))
+        return self._response(none, kappa, sampling_time, x)
 
     def silenced(self) -> LPVStateSpace:
         """The model whose interpolator extrapolates without a warning."""

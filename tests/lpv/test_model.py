@@ -331,3 +331,79 @@ def test_a_diverging_simulation_names_the_frozen_model():
     with pytest.raises(DivergenceError, match="diverges within one sample of 1000 s"):
         inside.simulate(np.ones(3), np.full(3, -2.0), 1000.0)
     assert np.isfinite(inside.simulate(np.ones(300), kappa[:300], 0.1)).all()
+
+
+# ---------------------------------------------------------------- changes of the basis
+
+
+def growing(kappa):
+    """An invertible T that follows the scheduling variable."""
+    return np.array([[1.0, 0.3 * kappa[0]], [np.sin(kappa[0]), 2.0 + kappa[0]]])
+
+
+def test_a_change_of_basis_changes_no_output():
+    model, u, kappa = spring(), inputs(200), sweep(200)
+    x0 = np.array([0.3, -1.0])
+    changed = model.change_basis(growing)
+    y = model.simulate(u, kappa, DT, x0)
+    assert_allclose(changed.simulate(u, kappa, DT, growing(kappa[:1]) @ x0), y)
+    free = changed.free_responses(kappa, DT)
+    expected = model.free_responses(kappa, DT)
+    assert_allclose(free @ growing(kappa[:1]), expected, atol=1e-12)
+    assert_allclose(changed.frozen_poles(kappa), model.frozen_poles(kappa))
+
+
+def test_the_model_in_the_new_basis_is_that_of_the_moving_state():
+    """``z = T x`` along a trajectory, from the matrices of `at` with a rate."""
+    model = spring()
+    changed = model.change_basis(growing)
+    t, dt = 0.7, 1e-6
+
+    def kappa(t):
+        return np.array([1 + np.sin(t)])
+
+    x, u = np.array([0.5, -0.2]), np.array([1.0, 0.4])
+    local = model.at(kappa(t))
+    ahead, behind = (
+        growing(kappa(t + h)) @ (x + h * (local.A @ x + local.B @ u)) for h in (dt, -dt)
+    )
+    new = changed.at(kappa(t), rate=np.cos(t))
+    z = growing(kappa(t)) @ x
+    assert_allclose(new.A @ z + new.B @ u, (ahead - behind) / (2 * dt), atol=1e-8)
+    assert_allclose(new.C @ z + new.D @ u, local.C @ x + local.D @ u, atol=1e-12)
+    at_rest = changed.at(kappa(t))
+    assert_allclose(
+        at_rest.A, growing(kappa(t)) @ local.A @ np.linalg.inv(growing(kappa(t)))
+    )
+
+
+def test_changes_of_basis_follow_one_another_and_back():
+    model = spring()
+    T = np.array([[2.0, 1.0], [0.0, 1.0]])
+    there = model.change_basis(T).change_basis(growing)
+    back = there.change_basis(lambda k: np.linalg.inv(growing(k) @ T))
+    assert_allclose(back.at(0.7, rate=2.0).A, model.at(0.7).A, atol=1e-8)
+    assert_allclose(
+        model.change_basis(T).at(0.7, rate=2.0).A,
+        T @ model.at(0.7).A @ np.linalg.inv(T),
+    )
+    assert pickle.loads(pickle.dumps(model.change_basis(growing))).bases == (growing,)
+
+
+def test_a_change_of_basis_over_two_variables():
+    model = two_variables()
+
+    def T(kappa):
+        return np.diag([1.0 + kappa[0], 2.0 + kappa[1] * kappa[0]])
+
+    kappa, rate = np.array([0.5, 0.2]), np.array([3.0, -1.0])
+    changed = model.change_basis(T).at(kappa, rate=rate)
+    slope = np.diag([rate[0], rate[1] * kappa[0] + kappa[1] * rate[0]])
+    expected = (T(kappa) @ model.at(kappa).A + slope) @ np.linalg.inv(T(kappa))
+    assert_allclose(changed.A, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("T", [np.eye(3), np.ones((2, 2)), lambda k: np.zeros((2, 2))])
+def test_what_is_no_basis_is_refused(T):
+    with pytest.raises(ValueError):
+        spring().change_basis(T)
