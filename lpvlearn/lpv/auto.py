@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from .interpolator import Interpolator
 from .polynomial import PolynomialLPV, chebyshev_terms, resolvable_powers
 from .rational import RationalLPV
 from .spline import SplineLPV
-from .weighting import WeightedPoints, is_plausible
+from .weighting import WeightedPoints, is_chance
 
 Array = NDArray[np.float64]
 
@@ -70,10 +71,15 @@ class AutoLPV(Interpolator):
     -----
     If a form is true, its chi-square is about its degrees of freedom. A form whose
     chi-square is more than four times that (and no chance, for few degrees of freedom)
-    is not true, however precise: no criterion makes it so. Rational forms have one
-    denominator: the entries of ``M(kappa)^-1 K(kappa)``, of any equation of motion,
-    are such functions. With several scheduling variables polynomials and rational
-    forms of a total degree compete with those of a degree in each variable ("tensor").
+    is not taken, unless what it leaves of the variation over the points is next to
+    nothing (1e-4 of the variance): very precise points show deviations of any form. If
+    only such forms are left, the lowest of their chi-squares per degree of freedom
+    divides all chi-squares in the criterion, as errors larger than known do.
+
+    Rational forms have one denominator: the entries of ``M(kappa)^-1 K(kappa)``, of any
+    equation of motion, are such functions. With several scheduling variables
+    polynomials and rational forms of a total degree compete with those of a degree in
+    each variable ("tensor").
 
     References
     ----------
@@ -107,28 +113,39 @@ class AutoLPV(Interpolator):
         self.extrapolation = extrapolation
 
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
-        n = points.theta.size
-        price = 2.0 if self.criterion == "aic" else math.log(n)
-        rows, fitted = [], []
+        found: list[tuple[str, Any]] = []
         for name, form in _forms(kappa) if points.whitening is not None else ():
             form.fit(kappa, points.theta, covariance=points.covariance)
-            chi2, dof = form.chi2_, form.degrees_of_freedom_
-            if dof > 0 or isinstance(form, PolynomialLPV):  # else it meets any points
-                rows.append((name, chi2, dof, chi2 + price * (n - dof)))
-                fitted.append(form)
-        costs = [row[3] if is_plausible(*row[1:3]) else np.inf for row in rows]
-        if np.isfinite(costs).any():
-            limit = min(costs) + _SUPPORT
-            supported = [k for k, cost in enumerate(costs) if cost <= limit]
-            chosen = max(supported, key=lambda k: (rows[k][2], -costs[k]))
+            saturated = form.degrees_of_freedom_ <= 0  # it meets any points
+            if isinstance(form, PolynomialLPV) or not saturated:
+                found.append((name, form))
+        chi2 = np.array([form.chi2_ for _, form in found])
+        dof = np.array([form.degrees_of_freedom_ for _, form in found], dtype=int)
+        good = np.array([form.weighted_ for _, form in found], dtype=bool)
+        excess = 1.0
+        if not any(map(is_chance, chi2, dof)) and good.any():
+            excess = np.min(chi2[good] / dof[good])
+        n = points.theta.size
+        price = 2.0 if self.criterion == "aic" else math.log(n)
+        cost = chi2 / excess + price * (n - dof)
+        if good.any():
+            supported = np.flatnonzero(good & (cost <= cost[good].min() + _SUPPORT))
+            chosen = int(min(supported, key=lambda k: (-dof[k], cost[k])))
         else:
-            chosen = len(rows)
-            rows.append((_INTERPOLATION, np.nan, 0, np.nan))
-            fitted.append(SplineLPV(_INTERPOLATION).fit(kappa, points.theta))
-        names = ["form", "chi2", "dof", self.criterion]
-        self.selection_ = pd.DataFrame(rows, columns=names)
-        self.selection_["chosen"] = np.arange(len(rows)) == chosen
-        self.form_, self.best_estimator_ = rows[chosen][0], fitted[chosen]
+            spline = SplineLPV(_INTERPOLATION).fit(kappa, points.theta)
+            chosen = len(found)
+            found.append((_INTERPOLATION, spline))
+            chi2, dof, cost = np.r_[chi2, np.nan], np.r_[dof, 0], np.r_[cost, np.nan]
+        self.form_, self.best_estimator_ = found[chosen]
+        self.selection_ = pd.DataFrame(
+            {
+                "form": [name for name, _ in found],
+                "chi2": chi2,
+                "dof": dof,
+                self.criterion: cost,
+                "chosen": np.arange(len(found)) == chosen,
+            }
+        )
 
     def _evaluate(self, kappa: Array) -> Array:
         return self.best_estimator_._evaluate(kappa)

@@ -17,7 +17,7 @@ from sklearn.utils.validation import (
 
 from ..exceptions import ExtrapolationWarning, warn
 from ..validation import one_of
-from .weighting import WeightedPoints, is_plausible, weighted_points
+from .weighting import WeightedPoints, weighted_points
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,9 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         known = points.whitening is not None
         self.degrees_of_freedom_ = points.theta.size - n_coefficients
         self.chi2_ = points.misfit(values) if known else np.nan
-        self.weighted_ = known and is_plausible(self.chi2_, self.degrees_of_freedom_)
+        self.weighted_ = known and points.is_plausible(
+            self.chi2_, self.degrees_of_freedom_
+        )
 
 
 def _check_weight(sample_weight: ArrayLike | None, X: Array) -> Array:

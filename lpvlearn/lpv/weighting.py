@@ -28,6 +28,13 @@ _SINGULAR = 1e-12  # eigenvalue of a correlation matrix that is zero up to round
 # Per degree of freedom: the covariances are those of local models to first order. (The
 # arm at 30 dB, 7 and 4 points, 10 seeds: its form 0.4 to 1.8, others above 1000.)
 _PLAUSIBLE = 4.0
+
+# Share of the values' variance over the points (per degree of freedom) that is no
+# matter, however precise they are: 1 % of their spread. (The arm averaged over 20
+# realizations: its form 1e-5, for the local models are of a non-linear system; a
+# polynomial of degree 4 2e-3.)
+_NEGLIGIBLE = 1e-4
+
 _SURPRISE = 1e-3  # probability of a chi-square, of few degrees of freedom, that is one
 
 
@@ -77,6 +84,15 @@ class WeightedPoints:
         """Weighted sum of squares of what `values` leave; with covariances, chi^2."""
         return float(np.sum(self.errors(self.theta - values) ** 2))
 
+    def is_plausible(self, chi2: float, degrees_of_freedom: int) -> bool:
+        """Whether a form that leaves `chi2` may be taken for true, or as good as it."""
+        if is_chance(chi2, degrees_of_freedom):
+            return True
+        one = np.ones((len(self.theta), 1))
+        constant = self.misfit(one @ self.coefficients(one)[0])
+        spread = constant / max(self.theta.size - self.theta.shape[1], 1)
+        return bool(chi2 <= _NEGLIGIBLE * spread * degrees_of_freedom)
+
 
 def weighted_points(
     theta: Array, weight: Array, covariance: ArrayLike | None
@@ -123,7 +139,7 @@ def _whitening(P: Array, size: Array) -> Array | None:
     return np.linalg.inv(np.linalg.cholesky(correlation)) / deviation[:, None, :]
 
 
-def is_plausible(chi2: float, degrees_of_freedom: int) -> bool:
+def is_chance(chi2: float, degrees_of_freedom: int) -> bool:
     """Whether errors may be those of the values, not of the form through them."""
     if degrees_of_freedom == 0:  # the form meets the points, whatever they are
         return True

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
 from .. import (
+    AutoLPV,
     GrayBoxRestructurer,
     LocalLPVPipeline,
     LPVStateSpace,
@@ -28,6 +29,7 @@ from .tables import (
     ParameterSet,
     interpolation_table,
     local_table,
+    momentum_table,
     restructuring_table,
     validation_table,
 )
@@ -50,7 +52,7 @@ class PaperExperiment:
     lpv : dict of str to LPVStateSpace
         Interpolated with the requested degree.
     tables : dict of str to DataFrame
-        "table1", "table1_other", "table2", "table3", "table4", "timing".
+        "table1", "table1_other", "table2", "table3", "table4", "momentum", "timing".
     degree, n_realizations : int
         Of the interpolation; of the noise at each operating point.
     method, other_method : str
@@ -147,6 +149,7 @@ def run_paper_experiment(
             "table2": restructuring_table(pipeline, data),
             "table3": interpolation_table(parameters, kappa),
             "table4": validation_table(lpv, data),
+            "momentum": momentum_table(_of_momenta(pipeline, data), data),
         }
     tables["timing"] = watch.table()
     return PaperExperiment(
@@ -169,4 +172,18 @@ def _interpolated(found: ParameterSet, kappa: Array, degree: int) -> LPVStateSpa
     interpolator = PolynomialLPV(degree).fit(kappa, found.theta)
     return LPVStateSpace(
         found.structure, interpolator, np.array([kappa.min(0), kappa.max(0)])
+    )
+
+
+def _of_momenta(pipeline: LocalLPVPipeline, data: Bunch) -> LPVStateSpace:
+    """The same local models, interpolated in the momenta and by the form they choose.
+
+    Parameters of the arm are those of either state.
+    """
+    kappa = pipeline.operating_points_
+    form = AutoLPV().fit(
+        kappa, pipeline.parameters_, covariance=pipeline.parameters_covariance_
+    )
+    return LPVStateSpace(
+        data.arm.structure("momentum"), form, np.array([kappa.min(0), kappa.max(0)])
     )

@@ -151,6 +151,8 @@ list, default=None
         `efficient` applies.
     hinf_parameters_ : DataFrame of shape (n_points, n_params)
         Those of the H-infinity optimum; equal to `parameters_` where that is kept.
+    parameters_covariance_ : ndarray of shape (n_points, n_params, n_params)
+        Their covariances, of use to the interpolator.
     parameters_std_ : DataFrame of shape (n_points, n_params)
         Their standard deviations, to first order: from the covariance of the pooled
         black box, or with ``combine="average"`` and ``efficient=False`` from the spread
@@ -330,6 +332,7 @@ list, default=None
             self.lpv_ = LPVStateSpace(found.structure, self.interpolator_, span)
             self.scheduling_range_ = found.points.identified_range
             self.scheduling_names_ = as_list(self.scheduling)
+            self.parameters_covariance_ = found.covariance
             report = tables(found, self.lpv_, self.sampling_time_)
             self.parameters_, self.parameters_std_ = (
                 report.parameters,

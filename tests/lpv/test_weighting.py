@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from lpvlearn import PolynomialLPV
-from lpvlearn.lpv.weighting import is_plausible, weighted_points
+from lpvlearn.lpv.weighting import is_chance, weighted_points
 
 KAPPA = np.linspace(0, 1, 6)
 TERMS = KAPPA[:, None] ** np.arange(3)
@@ -59,15 +59,15 @@ def test_the_misfit_of_the_true_form_is_a_chi_square():
         misfits.append(points.misfit(TERMS @ points.coefficients(TERMS)[0]))
     # mean 9 and variance 18 of a chi-square with 9 degrees of freedom
     assert abs(np.mean(misfits) - 9) < 4 * np.sqrt(18 / 400)
-    assert np.mean([is_plausible(value, 9) for value in misfits]) == 1.0
+    assert np.mean([is_chance(value, 9) for value in misfits]) == 1.0
 
 
-def test_a_form_is_plausible_by_its_misfit_per_degree_of_freedom():
-    assert is_plausible(1e9, 0)
-    assert is_plausible(10.0, 1)  # once in 600
-    assert not is_plausible(11.0, 1)
-    assert is_plausible(239.0, 60)
-    assert not is_plausible(241.0, 60)
+def test_a_form_is_chance_by_its_misfit_per_degree_of_freedom():
+    assert is_chance(1e9, 0)
+    assert is_chance(10.0, 1)  # once in 600
+    assert not is_chance(11.0, 1)
+    assert is_chance(239.0, 60)
+    assert not is_chance(241.0, 60)
 
 
 def test_precise_points_count_more_where_the_polynomial_is_true():
