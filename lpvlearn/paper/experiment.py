@@ -29,8 +29,8 @@ from .tables import (
     ParameterSet,
     interpolation_table,
     local_table,
-    momentum_table,
     restructuring_table,
+    sweeps_table,
     validation_table,
 )
 
@@ -128,6 +128,7 @@ def run_paper_experiment(
         comparison = LocalLPVPipeline(
             SubspaceLTI(data.structure.order, method=other, feedthrough=False),
             "passthrough",
+            PolynomialLPV(degree),
             **roles,
         ).fit(data.X, data.y)
     with watch.step("validation"):
@@ -149,7 +150,7 @@ def run_paper_experiment(
             "table2": restructuring_table(pipeline, data),
             "table3": interpolation_table(parameters, kappa),
             "table4": validation_table(lpv, data),
-            "momentum": momentum_table(_of_momenta(pipeline, data), data),
+            "momentum": sweeps_table(_of_momenta(pipeline, data), data),
         }
     tables["timing"] = watch.table()
     return PaperExperiment(

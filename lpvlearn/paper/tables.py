@@ -151,7 +151,7 @@ def validation_table(lpv: dict[str, LPVStateSpace], data: Bunch) -> pd.DataFrame
     return pd.DataFrame(rows, columns=["model", "output", "metric", "ours", "paper"])
 
 
-def momentum_table(model: LPVStateSpace, data: Bunch) -> pd.DataFrame:
+def sweeps_table(model: LPVStateSpace, data: Bunch) -> pd.DataFrame:
     """Fit of an LPV model on the sweep, and on one the other way, both from rest.
 
     The other one begins where the first is mirrored to, by the mirrored reference of

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import make_pipeline
@@ -407,3 +408,29 @@ def test_a_change_of_basis_over_two_variables():
 def test_what_is_no_basis_is_refused(T):
     with pytest.raises(ValueError):
         spring().change_basis(T)
+
+
+def test_a_model_of_momenta_follows_newtons_law_while_the_mass_moves():
+    """``(m q')' = u - c q' - k q`` integrated; the frozen models do not tell it."""
+    kappa = np.array([[0.0], [1.0]])
+    mass = PolynomialLPV(1).fit(kappa, 3.0 - 2.0 * kappa)
+    t = 0.01 * np.arange(1000)
+
+    def moves(time):
+        return 0.5 - 0.5 * np.cos(2.0 * time)
+
+    def law(time, state):
+        rate = state[1] / (3.0 - 2.0 * moves(time))
+        return [rate, 1.0 - 0.1 * rate - state[0]]
+
+    true = solve_ivp(law, (0, t[-1]), [0, 0], t_eval=t, max_step=0.01, rtol=1e-9).y[0]
+    errors = []
+    for state in ("rate", "momentum"):
+        structure = GrayBoxStructure.mechanical(
+            [["m"]], [[0.1]], [[1]], [[1]], state=state
+        )
+        y = LPVStateSpace(structure, mass, kappa).simulate(
+            np.ones(1000), moves(t), 0.01
+        )
+        errors.append(np.abs(y[:, 0] - true).max() / np.ptp(true))
+    assert errors[1] < 0.02 < 0.3 < errors[0]
