@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..validation import one_of
 from .excitation import check_size
 from .mechanics import (
     arm_tables,
@@ -237,7 +236,8 @@ class FlexibleArm:
         >>> bool((momentum - arm.linearize(1.0)).hinf_norm() < 1e-9)
         True
         """
-        one_of("form", form, ("rate", "momentum"))
+        if form not in ("rate", "momentum"):
+            raise ValueError(f"`form` must be 'rate' or 'momentum'. Got {form!r}.")
         p = np.array([f"p{i}" for i in range(1, 17)]).reshape(4, 4).T
         A: list[list[float | str]]
         B: list[list[float | str]]

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import DivergenceError, finite_simulation
+from ..exceptions import (
+    DivergenceError,
+    ExtrapolationWarning,
+    finite_simulation,
+    warn,
+)
 from ..models.statespace import StateSpace, sorted_poles
 from ..models.system_matrix import blocks
 from ..structures.map import numerical_jacobian
@@ -29,6 +34,8 @@ from ..validation import (
 Array = NDArray[np.float64]
 
 _Basis = Callable[[Array], ArrayLike] | ArrayLike
+
+_DIGITS = 3  # of a range that a message shows
 
 # Samples whose matrices are held at once: for 6 states, 2 inputs and outputs 17 MB.
 _BLOCK = 32_768
@@ -50,6 +57,13 @@ class LPVStateSpace:
         n_params). Says itself what it makes of values outside of the range.
     scheduling_range : array-like of shape (2, n_scheduling)
         Smallest and largest scheduling values that the model was identified on.
+    scheduling_names : sequence, default=None
+        Names of the scheduling variables, to give their values by; None is numbers.
+    identified_range : array-like of shape (2, n_scheduling), default=None
+        Beyond which `at` and `simulate` warn, whatever the interpolator does but for
+        holding the border's value. A pipeline's is `scheduling_range`, widened by how
+        far the variables moved within an experiment. None leaves it to the
+        interpolator.
     bases : tuple of callables or arrays of shape (order, order), default=()
         Changes of the structure's state basis, see :meth:`change_basis`.
 
@@ -105,6 +119,8 @@ class LPVStateSpace:
     structure: GrayBoxStructure
     interpolator: Any
     scheduling_range: Array
+    scheduling_names: Sequence[Hashable] | None = None
+    identified_range: ArrayLike | None = None
     bases: tuple[_Basis, ...] = ()
     order: int = field(init=False)
     n_inputs: int = field(init=False)
@@ -131,6 +147,12 @@ class LPVStateSpace:
         bounds.setflags(write=False)
         object.__setattr__(self, "scheduling_range", bounds)
         object.__setattr__(self, "n_scheduling", bounds.shape[1])
+        names = self.scheduling_names
+        if names is not None and len(names) != bounds.shape[1]:
+            raise ValueError(
+                f"`scheduling_names` must name the {bounds.shape[1]} scheduling "
+                f"variables. Got {list(names)}."
+            )
         for name in ("order", "n_inputs", "n_outputs"):
             object.__setattr__(self, name, getattr(self.structure, name))
 
@@ -167,13 +189,19 @@ class LPVStateSpace:
             )
         return values.reshape(len(kappa), n_params)
 
-    def at(self, kappa: ArrayLike, rate: ArrayLike | None = None) -> StateSpace:
+    def at(
+        self,
+        kappa: ArrayLike | Mapping[Any, float],
+        rate: ArrayLike | Mapping[Any, float] | None = None,
+    ) -> StateSpace:
         """The frozen model at one scheduling value, Eq. (2).
 
         Parameters
         ----------
-        kappa : float or array-like of shape (n_scheduling,)
-        rate : float or array-like of shape (n_scheduling,), default=None
+        kappa : float, array-like of shape (n_scheduling,) or mapping
+            By position, or by the names of the variables:
+            ``{"mass": 150, "speed": 25}``.
+        rate : float, array-like of shape (n_scheduling,) or mapping, default=None
             Rate of change of `kappa` (1/s), which A depends on after a change of basis
             that follows kappa; None is rest.
 
@@ -186,8 +214,17 @@ class LPVStateSpace:
         ------
         ValueError
             If `kappa` is not one finite value of every scheduling variable.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Outside of `identified_range`.
         """
-        place = self._scheduling(np.reshape(kappa, (1, -1)))[0]
+        place = self._place(kappa)
+        self._tell_extrapolation(place[None])
+        return self.silenced()._at(place, rate)
+
+    def _at(self, place: Array, rate: Any = None) -> StateSpace:
         model = self.structure.model(self.parameters(place[None])[0])
         if not self.bases:
             return model
@@ -195,7 +232,7 @@ class LPVStateSpace:
         model = model.transform(T)
         if rate is None:
             return model
-        speed = self._scheduling(np.reshape(rate, (1, -1)))[0]
+        speed = self._place(rate)
         slopes = numerical_jacobian(self._basis_at, place, self.scheduling_range[1])
         term = np.tensordot(speed, slopes, 1) @ np.linalg.inv(T)
         return StateSpace(model.A + term, model.B, model.C, model.D)
@@ -228,7 +265,7 @@ class LPVStateSpace:
         structure's, see :ref:`guide_state_basis`.
         """
         changed = replace(self, bases=(*self.bases, T))
-        changed.at(self.scheduling_range.mean(axis=0))  # refuses what is no basis
+        changed._at(self.scheduling_range.mean(axis=0))  # refuses what is no basis
         return changed
 
     def _basis_at(self, kappa: Array) -> Array:
@@ -259,7 +296,7 @@ class LPVStateSpace:
     def simulate(
         self,
         u: ArrayLike,
-        scheduling: ArrayLike,
+        scheduling: ArrayLike | Mapping[Any, ArrayLike],
         sampling_time: float,
         initial_state: ArrayLike | None = None,
     ) -> Array:
@@ -272,6 +309,8 @@ class LPVStateSpace:
         ----------
         u : array-like of shape (n_samples, n_inputs)
         scheduling : array-like of shape (n_samples, n_scheduling) or (n_samples,)
+            Or a mapping from the names of the variables to (n_samples,), or a table
+            with such columns.
         sampling_time : float
             Seconds.
         initial_state : array-like of shape (order,), default=None
@@ -288,6 +327,11 @@ class LPVStateSpace:
             finite matrices at a scheduling value.
         DivergenceError
             If the outputs overflow; the first sample and value are told.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Outside of `identified_range`.
         """
         u = finite_samples("u", u, self.n_inputs)
         x = np.zeros(self.order)
@@ -324,7 +368,7 @@ class LPVStateSpace:
         return self._response(none, kappa, sampling_time, x)
 
     def silenced(self) -> LPVStateSpace:
-        """The model whose interpolator extrapolates without a warning."""
+        """The model that extrapolates without a warning."""
         known: dict[str, Any] = getattr(self.interpolator, "get_params", dict)()
         loud = [
             name
@@ -334,7 +378,18 @@ class LPVStateSpace:
         quiet = copy.deepcopy(self.interpolator) if loud else self.interpolator
         for name in loud:
             quiet.set_params(**{name: "ignore"})
-        return replace(self, interpolator=quiet)
+        return replace(self, interpolator=quiet, identified_range=None)
+
+    def _tell_extrapolation(self, kappa: Array) -> None:
+        """Warn of values out of the range, or have the interpolator tell of them."""
+        extrapolation = getattr(self.interpolator, "extrapolation", None)
+        if self.identified_range is None or extrapolation == "error":
+            low, high = self.scheduling_range
+            if ((kappa < low) | (kappa > high)).any():
+                self.interpolator.predict(kappa)
+        elif extrapolation != "clip":
+            names = self.scheduling_names or range(1, self.n_scheduling + 1)
+            warn_extrapolation(kappa, np.asarray(self.identified_range), list(names))
 
     def _response(self, u: Array, kappa: Array, dt: float, x: Array) -> Array:
         """Outputs of runs along one trajectory: inputs (n_samples, n_inputs, n_runs).
@@ -348,11 +403,8 @@ class LPVStateSpace:
                 f"`scheduling` must have one row for each of the {len(u)} samples of "
                 f"`u`. Got {len(kappa)}."
             )
-        low, high = self.scheduling_range
-        model = self
-        if ((kappa < low) | (kappa > high)).any():
-            self.interpolator.predict(kappa)  # which says how far out the samples are
-            model = self.silenced()  # not once more, of the nodes of the table
+        self._tell_extrapolation(kappa)
+        model = self.silenced()  # not once more, of the nodes of the table
         y = np.empty((len(u), self.n_outputs, u.shape[2]))
         for start in range(0, len(u), _BLOCK):
             rows = slice(start, start + _BLOCK)
@@ -375,7 +427,7 @@ class LPVStateSpace:
         beyond = ((kappa[worst] < low) | (kappa[worst] > high)).any()
         cause = (
             "It is outside of the identified range: identify a model there too, or "
-            "hold the border's by PolynomialLPV(extrapolation='clip')."
+            "hold the border's by AutoLPV(extrapolation='clip')."
             if beyond
             else "Look at the parameters of the local models: inputs or outputs about "
             "an offset, shuffled rows, or times in another unit spoil them. If they "
@@ -415,7 +467,35 @@ class LPVStateSpace:
             return np.broadcast_to(S[0], (len(kappa), *S.shape[1:]))
         return held(kappa)
 
-    def _scheduling(self, kappa: ArrayLike) -> Array:
+    def _place(self, kappa: Any) -> Array:
+        """One value of every scheduling variable."""
+        by_name = isinstance(kappa, Mapping)
+        values = self._scheduling(kappa if by_name else np.reshape(kappa, (1, -1)))
+        if len(values) != 1:
+            raise ValueError(
+                "`kappa` must be one value of every scheduling variable. Got "
+                f"{len(values)}."
+            )
+        return values[0]
+
+    def _scheduling(self, kappa: Any) -> Array:
+        names = self.scheduling_names
+        if isinstance(kappa, Mapping):
+            if names is None or set(kappa) != set(names):
+                known = "no names" if names is None else list(names)
+                raise ValueError(
+                    "`scheduling` by name must have a value for each scheduling "
+                    f"variable; the model knows {known}. Got {list(kappa)}."
+                )
+            columns = [np.ravel(kappa[name]) for name in names]
+            if len({len(column) for column in columns}) > 1:
+                raise ValueError(
+                    "`scheduling` must have as many values of each variable. Got "
+                    f"{[len(column) for column in columns]}."
+                )
+            kappa = np.column_stack(columns)
+        elif names is not None and set(names) <= set(getattr(kappa, "columns", ())):
+            kappa = kappa[list(names)]
         values = real_array("scheduling", kappa)
         if values.ndim < 2:
             values = values.reshape(-1, 1)
@@ -430,3 +510,32 @@ class LPVStateSpace:
                 f"`scheduling` must be finite. Got {values[k]} in row {k}."
             )
         return values
+
+
+def warn_extrapolation(
+    kappa: Array, identified_range: Array, names: Sequence[Hashable]
+) -> None:
+    """Warn, once, of scheduling values outside the (2, n_scheduling) range identified.
+
+    The message names every such variable, its range and the farthest value.
+    """
+    low, high = identified_range
+    width = np.where(high > low, high - low, 1.0)
+    excess = np.maximum(low - kappa, kappa - high) / width
+    said = []
+    for j in np.flatnonzero((excess > 0).any(axis=0)):
+        digits = _DIGITS - int(np.floor(np.log10(width[j])))
+        shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
+        farthest = kappa[np.argmax(excess[:, j]), j]
+        said.append(
+            f"Scheduling variable {names[int(j)]!r} must be within the identified "
+            f"range, {shown[0]} to {shown[1]}. Got {int((excess[:, j] > 0).sum())} of "
+            f"{len(kappa)} samples outside, the farthest at {farthest:.4g}"
+        )
+    if said:
+        warn(
+            f"{'. '.join(said)}: the model is extrapolated. Identify a model there "
+            "too, or hold the border's with "
+            "interpolator=AutoLPV(extrapolation='clip').",
+            ExtrapolationWarning,
+        )

@@ -28,10 +28,10 @@ from ..data.experiments import (
     read_experiments,
     read_outputs,
 )
-from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
+from ..data.operating_points import check_outputs, local_experiments
 from ..data.preparation import split_at_gaps
 from ..lpv.auto import AutoLPV
-from ..lpv.model import LPVStateSpace
+from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
@@ -161,6 +161,7 @@ list, default=None
         enforced), collinear inputs, or "passthrough".
     interpolator_ : fitted regressor
     lpv_ : LPVStateSpace
+        Knows the names of the scheduling variables: ``lpv_.at({"kappa": 0.5})``.
     report_ : DataFrame
         One row per operating point: experiments, samples, order, BFT of the local and
         of the gray-box model on the estimation data (percent, mean over the outputs),
@@ -329,9 +330,15 @@ list, default=None
                 known["covariance"] = found.covariance
             self.interpolator_ = interpolator.fit(kappa, found.theta, **known)
             span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
-            self.lpv_ = LPVStateSpace(found.structure, self.interpolator_, span)
             self.scheduling_range_ = found.points.identified_range
             self.scheduling_names_ = as_list(self.scheduling)
+            self.lpv_ = LPVStateSpace(
+                found.structure,
+                self.interpolator_,
+                span,
+                scheduling_names=self.scheduling_names_ or None,
+                identified_range=self.scheduling_range_,
+            )
             self.parameters_covariance_ = found.covariance
             report = tables(found, self.lpv_, self.sampling_time_)
             self.parameters_, self.parameters_std_ = (
@@ -414,9 +421,10 @@ list, default=None
         )
 
     def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
-        if getattr(self.interpolator_, "extrapolation", None) != "clip":
+        signals = [e.scheduling for e in experiments if e.scheduling is not None]
+        if signals and getattr(self.interpolator_, "extrapolation", None) != "clip":
             warn_extrapolation(
-                experiments, self.scheduling_range_, self.scheduling_names_
+                np.vstack(signals), self.scheduling_range_, self.scheduling_names_
             )
         model = self.lpv_.silenced()  # said above, of all experiments at once
         out = simulate_experiments(

@@ -6,12 +6,14 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from sklearn.base import clone
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -434,3 +436,84 @@ def test_a_model_of_momenta_follows_newtons_law_while_the_mass_moves():
         )
         errors.append(np.abs(y[:, 0] - true).max() / np.ptp(true))
     assert errors[1] < 0.02 < 0.3 < errors[0]
+
+
+# ------------------------------------------------------------------ names and ranges
+
+
+def of_mass_and_speed(extrapolation="ignore"):
+    """Two named variables, 0 to 2 and -1 to 1, identified a little beyond."""
+    model = two_variables()
+    quiet = clone(model.interpolator).set_params(extrapolation=extrapolation)
+    points = np.array([[i, j] for i in (0.0, 1.0, 2.0) for j in (-1.0, 0.0, 1.0)])
+    return replace(
+        model,
+        interpolator=quiet.fit(points, model.parameters(points)),
+        scheduling_names=["mass", "speed"],
+        identified_range=[[-0.1, -1.1], [2.1, 1.1]],
+    )
+
+
+def test_values_go_by_name_in_any_order():
+    model, u, t = of_mass_and_speed(), inputs(50), np.linspace(0, 1, 50)
+    by_name, by_place = model.at({"speed": 0.5, "mass": 1.5}), model.at([1.5, 0.5])
+    assert_array_equal(by_name.A, by_place.A)
+    expected = model.simulate(u, np.column_stack([t, -t]), DT)
+    named = {"speed": -t, "mass": t}
+    assert_array_equal(model.simulate(u, named, DT), expected)
+    table = pd.DataFrame(named).assign(other=0.0)
+    assert_array_equal(model.simulate(u, table, DT), expected)
+    held = model.change_basis(lambda kappa: np.diag([1, 2 + kappa[1]]))
+    A = held.at({"speed": 0.5, "mass": 1.5}, rate={"mass": 0.0, "speed": 1.0}).A
+    assert_allclose(A, held.at([1.5, 0.5], rate=[0.0, 1.0]).A)
+
+
+@pytest.mark.parametrize(
+    "kappa, words",
+    [
+        ({"mass": 1.0}, r"the model knows \['mass', 'speed'\]. Got \['mass'\]"),
+        ({"mass": 1.0, "sped": 2.0}, r"Got \['mass', 'sped'\]"),
+        ({"mass": [1.0, 2.0], "speed": 0.0}, r"as many values .* Got \[2, 1\]"),
+        ({"mass": [1.0, 2.0], "speed": [0.0, 1.0]}, "one value of every"),
+        ({"mass": np.nan, "speed": 0.0}, "must be finite"),
+    ],
+)
+def test_names_that_do_not_fit_are_refused(kappa, words):
+    with pytest.raises(ValueError, match=words):
+        of_mass_and_speed().at(kappa)
+
+
+def test_a_model_without_names_says_so():
+    with pytest.raises(ValueError, match="knows no names"):
+        spring().at({"kappa": 1.0})
+    with pytest.raises(ValueError, match="`scheduling_names` must name the 1"):
+        replace(spring(), scheduling_names=["mass", "speed"])
+
+
+@pytest.mark.parametrize("extrapolation", ["ignore", "warn"])
+def test_values_out_of_range_are_named_with_their_range(extrapolation):
+    model, u = of_mass_and_speed(extrapolation), inputs(50)
+    with pytest.warns(ExtrapolationWarning) as caught:
+        model.at({"mass": 3.0, "speed": 0.5})
+    text = str(caught[0].message)
+    assert "'mass' must be within the identified range, -0.1 to 2.1." in text
+    assert "farthest at 3:" in text and "'speed'" not in text
+    kappa = {"mass": np.linspace(0, 2.5, 50), "speed": np.linspace(-2, 1, 50)}
+    with pytest.warns(ExtrapolationWarning) as caught:
+        model.simulate(u, kappa, DT)
+    assert len(caught) == 1
+    text = str(caught[0].message)
+    assert "'mass' must be" in text and "8 of 50 samples outside, the farthest" in text
+    assert "'speed' must be" in text and "farthest at -2:" in text
+
+
+def test_what_is_within_the_range_or_held_at_its_border_is_not_told():
+    u = inputs(50)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        of_mass_and_speed("warn").at([2.05, -1.05])
+        of_mass_and_speed("clip").at([3.0, 0.0])
+        of_mass_and_speed().silenced().at([3.0, 0.0])
+        of_mass_and_speed().simulate(u, np.tile([2.05, 0.0], (50, 1)), DT)
+    with pytest.raises(ValueError, match="identified range"):
+        of_mass_and_speed("error").at([3.0, 0.0])

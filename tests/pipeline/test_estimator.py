@@ -326,6 +326,21 @@ def test_leaving_the_identified_range_warns_once_for_all_experiments(fitted, spr
     assert warning.filename == __file__
 
 
+def test_the_model_tells_of_extrapolation_as_predict_does(fitted, spring):
+    _, _, X_sweep, _ = spring
+    u, kappa = X_sweep[["force"]], X_sweep["kappa"] + 0.2
+    for use in (
+        lambda: fitted.predict(X_sweep.assign(kappa=kappa)),
+        lambda: fitted.lpv_.simulate(u, {"kappa": kappa}, 0.02),
+        lambda: fitted.lpv_.at({"kappa": 1.7}),
+    ):
+        with pytest.warns(ExtrapolationWarning, match="'kappa' must be within the ide"):
+            use()
+    np.testing.assert_array_equal(
+        fitted.lpv_.at({"kappa": 0.7}).A, fitted.lpv_.at(0.7).A
+    )
+
+
 def test_holding_the_border_is_no_extrapolation(spring, memory):
     X, y, X_sweep, _ = spring
     clipped = PolynomialLPV(extrapolation="clip")
