@@ -49,11 +49,13 @@ _DEFAULTS = {
     "interpolator": AutoLPV,
 }
 
+_WITHOUT = ("aligned", "passthrough")  # what restructures without a structure
+
 # Methods that the steps need, an example, and what else is allowed.
 _STEPS = {
-    "local": (("fit",), "SubspaceLTI()", None),
-    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", "passthrough"),
-    "interpolator": (("fit", "predict"), "AutoLPV() or PolynomialLPV()", None),
+    "local": (("fit",), "SubspaceLTI()", ()),
+    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", _WITHOUT),
+    "interpolator": (("fit", "predict"), "AutoLPV() or PolynomialLPV()", ()),
 }
 
 
@@ -89,10 +91,11 @@ class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Step 3, a black-box model per operating point; None is ``SubspaceLTI()``. Its
         column roles are set by the pipeline. ``order="auto"`` becomes the order of the
         restructurer's structure where it has one.
-    restructurer : GrayBoxRestructurer, "passthrough" or None, default=None
-        Step 4; None is ``GrayBoxRestructurer()``, the observable canonical form.
-        "passthrough" interpolates the entries of the balanced local models: the
-        baseline without structure.
+    restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
+        Step 4. Without a structure, "aligned" (None) interpolates the entries of
+        the balanced local models, each turned to its neighbour by the rotation that
+        brings their states nearest; "passthrough" those whose signs alone agree, the
+        paper's baseline. ``GrayBoxRestructurer()`` is the observable canonical form.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
         (n_points, n_params); None is ``AutoLPV()``, which chooses by the covariances
@@ -143,9 +146,9 @@ list, default=None
     local_models_ : list of StateSpace
         Black-box models, continuous time, balanced.
     structured_models_ : list of StateSpace
-        Gray-box models (the balanced ones after "passthrough").
+        Gray-box models (without a structure, the balanced ones).
     restructurers_ : list
-        The fitted restructurers, empty after "passthrough".
+        The fitted restructurers, empty without a structure.
     parameters_ : DataFrame of shape (n_points, n_params)
         Gray-box parameters, one row per operating point: the efficient ones, where
         `efficient` applies.
@@ -158,7 +161,7 @@ list, default=None
         black box, or with ``combine="average"`` and ``efficient=False`` from the spread
         of the realizations. NaN where that is not known: a local model that does not
         minimise the simulation error (``refine=False``, a stability that had to be
-        enforced), collinear inputs, or "passthrough".
+        enforced), collinear inputs, or no structure.
     interpolator_ : fitted regressor
     lpv_ : LPVStateSpace
         Knows the names of the scheduling variables: ``lpv_.at({"kappa": 0.5})``.
@@ -458,10 +461,8 @@ list, default=None
         raise ValueError(NO_TIME.format(needed))
 
     def _restructurer(self) -> Any:
-        """The restructurer to clone, or None for "passthrough"."""
-        if self.restructurer is None:
-            return GrayBoxRestructurer()
-        return None if isinstance(self.restructurer, str) else self.restructurer
+        """The restructurer to clone, or the way without one."""
+        return _WITHOUT[0] if self.restructurer is None else self.restructurer
 
     def _interpolator(self, n_points: int) -> Any:
         if n_points == 1:
@@ -546,20 +547,22 @@ def _check_channels(
 
 
 def _name_of_step(step: Any, name: str) -> str:
+    if name == "restructurer" and (step is None or isinstance(step, str)):
+        return step or _WITHOUT[0]
     return (_DEFAULTS[name] if step is None else type(step)).__name__
 
 
 def _check_step(name: str, step: Any) -> None:
     """Refuse what cannot be a step of the method, and say what can."""
     methods, example, other = _STEPS[name]
-    if step is None or (other and isinstance(step, str) and step == other):
+    if step is None or (isinstance(step, str) and step in other):
         return
     got = f"{step!r}" if isinstance(step, str) else type(step).__name__
     if isinstance(step, type):
         got = f"the class {step.__name__}, not an instance"
     elif all(hasattr(step, method) for method in (*methods, "get_params")):
         return
-    choice = f"an estimator, {other!r} or None" if other else "an estimator or None"
+    choice = ", ".join(["an estimator", *map(repr, other)]) + " or None"
     raise ValueError(
         f"`{name}` must be {choice}. Got {got}. Give an instance with the "
         f"method(s) {', '.join(methods)}, such as {example}."

@@ -180,9 +180,14 @@ def summarise(
                 "point(s): see `parameters_std_`"
             )
     else:
+        basis = (
+            "each turned to its neighbour"
+            if restructurer == "aligned"
+            else "which have no common state basis"
+        )
         lines.append(
             "Restructuring: none; the entries of balanced models are interpolated, "
-            "which have no common state basis"
+            + basis
         )
     distance = 100 * report["interpolation_error"]
     form = getattr(lpv.interpolator, "form_", "")

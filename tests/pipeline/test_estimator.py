@@ -101,9 +101,28 @@ def test_baseline_without_structure_is_worse(fitted, spring, memory):
     assert score < bft_score(y_sweep, fitted.predict(X_sweep)) - 1
 
 
-def test_default_restructurer_is_the_canonical_form(spring):
+def test_without_a_structure_black_boxes_are_aligned(fitted, spring):
     X, y, X_sweep, y_sweep = spring
-    pipeline = LocalLPVPipeline(SubspaceLTI(feedthrough=False), **ROLES).fit(X, y)
+    pipeline = LocalLPVPipeline(SubspaceLTI(2, feedthrough=False), **ROLES).fit(X, y)
+    assert pipeline.restructurers_ == []
+    assert pipeline.parameters_.shape == (4, 4 + 2 + 2 + 1)
+    for turned, true in zip(
+        pipeline.structured_models_, fitted.structured_models_, strict=True
+    ):
+        assert (turned - true).hinf_norm() < 1e-6 * true.hinf_norm()
+    assert "each turned to its neighbour" in pipeline.summary()
+    signs = spring_pipeline(restructurer="passthrough").fit(X, y)
+    aligned, baseline = (
+        bft_score(y_sweep, model.predict(X_sweep)) for model in (pipeline, signs)
+    )
+    assert aligned > baseline - 0.1
+
+
+def test_a_restructurer_without_structure_takes_the_canonical_form(spring):
+    X, y, X_sweep, y_sweep = spring
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(feedthrough=False), GrayBoxRestructurer(), **ROLES
+    ).fit(X, y)
     assert pipeline.parameters_.shape == (4, 4)  # two poles, two entries of B
     assert bft_score(y_sweep, pipeline.predict(X_sweep)) > 99.9
 
