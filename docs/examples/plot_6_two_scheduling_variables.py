@@ -47,7 +47,8 @@ X.groupby("experiment").first().head(4)
 
 # %%
 # Total degree 2: six terms (1, load, charge, load\ :sup:`2`, load x charge,
-# charge\ :sup:`2`) for twelve points.
+# charge\ :sup:`2`) for twelve points. (Left out, the interpolator is ``AutoLPV()``, which
+# tries rational functions and degrees in each variable, too.)
 
 from lpvlearn import GrayBoxRestructurer, LocalLPVPipeline, PolynomialLPV, SubspaceLTI
 
@@ -89,6 +90,11 @@ ax.plot(*model.operating_points_.T, "o", color="white", markeredgecolor="black")
 ax.set_xlabel("Load (kg)")
 ax.set_ylabel("Charge")
 bar = fig.colorbar(mesh, label="gain (m/s²)")
+
+# %%
+# The frozen model anywhere in between, by name:
+
+model.lpv_.at({"load": 0.3, "charge": 0.5}).poles()
 
 # %%
 # A flight in which a load is picked up and the battery runs down, both between the

@@ -27,6 +27,7 @@ from ..pipeline.estimator import Stopwatch
 from ..pipeline.points import balanced_entries
 from .tables import (
     ParameterSet,
+    both_sweeps,
     interpolation_table,
     local_table,
     restructuring_table,
@@ -150,7 +151,7 @@ def run_paper_experiment(
             "table2": restructuring_table(pipeline, data),
             "table3": interpolation_table(parameters, kappa),
             "table4": validation_table(lpv, data),
-            "momentum": sweeps_table(_of_momenta(pipeline, data), data),
+            "momentum": sweeps_table(_of_momenta(pipeline, data), both_sweeps(data)),
         }
     tables["timing"] = watch.table()
     return PaperExperiment(

@@ -31,7 +31,7 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.datasets import make_flexible_arm
-from lpvlearn.paper.tables import sweeps_table
+from lpvlearn.paper.tables import both_sweeps, sweeps_table
 
 INTERPOLATORS = {
     "AutoLPV": AutoLPV(),
@@ -61,6 +61,7 @@ def bench_arm(n_points: int, seeds: range) -> None:
         ).fit(data.X, data.y)
         forms[pipeline.interpolator_.form_] += 1
         kappa, P = pipeline.operating_points_, pipeline.parameters_covariance_
+        sweeps = both_sweeps(data)
         for name, interpolator in INTERPOLATORS.items():
             known = {} if "pchip" in name or "spline" in name else {"covariance": P}
             interpolator.fit(kappa, pipeline.parameters_.to_numpy(), **known)
@@ -68,7 +69,7 @@ def bench_arm(n_points: int, seeds: range) -> None:
                 model = LPVStateSpace(
                     data.arm.structure(state), interpolator, kappa[[0, -1]]
                 )
-                table = sweeps_table(model, data)
+                table = sweeps_table(model, sweeps)
                 bft = table[table["metric"] == "BFT"]["ours"].to_numpy()
                 fits[state, name].append(bft)
     print(f"\nFlexible arm, {n_points} points: BFT up (y1, y2), down (y1, y2)")
