@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..exceptions import DivergenceError, finite_simulation
-from ..models.statespace import StateSpace, sorted_poles
+from ..models.statespace import StateSpace, sorted_poles, split_delay
 from ..models.system_matrix import blocks
 from ..structures.structure import GrayBoxStructure
 from ..systems.sampling import sample_zoh
-from ..systems.simulation import state_trajectory
+from ..systems.simulation import delayed, state_trajectory
 from ..systems.tabulation import tabulate
 from ..validation import (
     finite_samples,
+    input_delays,
     positive_time,
     real_array,
     state_vector,
@@ -34,7 +35,8 @@ class LPVStateSpace:
     """A continuous-time state-space model scheduled by measured variables, Eq. (1).
 
     ``dx/dt = A(kappa) x + B(kappa) u``, ``y = C(kappa) x + D(kappa) u`` with static
-    dependence on the scheduling variables kappa.
+    dependence on the scheduling variables kappa, which act at once; an input may act
+    late, ``u_j(t - input_delay[j])`` in the place of ``u_j(t)``.
 
     Parameters
     ----------
@@ -45,6 +47,8 @@ class LPVStateSpace:
         n_params). Says itself what it makes of values outside of the range.
     scheduling_range : array-like of shape (2, n_scheduling)
         Smallest and largest scheduling values that the model was identified on.
+    input_delay : float or array-like of shape (n_inputs,), default=0
+        Seconds, whole samples of every simulation. As attribute, an array.
 
     Attributes
     ----------
@@ -55,7 +59,7 @@ class LPVStateSpace:
     ------
     ValueError
         If `scheduling_range` is not two rows of finite numbers, the first not above
-        the second.
+        the second, or a delay is negative.
 
     Examples
     --------
@@ -90,6 +94,7 @@ class LPVStateSpace:
     structure: GrayBoxStructure
     interpolator: Any
     scheduling_range: Array
+    input_delay: Any = 0
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -117,11 +122,15 @@ class LPVStateSpace:
         object.__setattr__(self, "n_scheduling", bounds.shape[1])
         for name in ("order", "n_inputs", "n_outputs"):
             object.__setattr__(self, name, getattr(self.structure, name))
+        delay = input_delays(self.input_delay, self.n_inputs, samples=False)
+        object.__setattr__(self, "input_delay", delay)
 
     def __repr__(self) -> str:
+        each = ", ".join(f"{d:g}" for d in self.input_delay)
         return (
             f"LPVStateSpace(order={self.order}, n_inputs={self.n_inputs}, "
-            f"n_outputs={self.n_outputs}, n_scheduling={self.n_scheduling})"
+            f"n_outputs={self.n_outputs}, n_scheduling={self.n_scheduling}"
+            f"{f', input_delay=[{each}] s' if self.input_delay.any() else ''})"
         )
 
     def parameters(self, kappa: ArrayLike) -> Array:
@@ -169,7 +178,7 @@ class LPVStateSpace:
             If `kappa` is not one finite value of every scheduling variable.
         """
         theta = self.parameters(np.reshape(kappa, (1, -1)))[0]
-        return self.structure.model(theta)
+        return self.structure.model(theta).with_input_delay(self.input_delay)
 
     def frozen_poles(self, kappa: ArrayLike) -> NDArray[np.complex128]:
         """Poles (rad/s) of the frozen models, each row by modulus.
@@ -208,7 +217,8 @@ class LPVStateSpace:
         sampling_time : float
             Seconds.
         initial_state : array-like of shape (order,), default=None
-            None is rest.
+            None is rest. The inputs before the first sample are zero; those in transit
+            may follow the state, as `StateSpace.estimate_initial_state` has them.
 
         Returns
         -------
@@ -217,20 +227,21 @@ class LPVStateSpace:
         Raises
         ------
         ValueError
-            If shapes do not fit, a value is not finite, or the structure gives no
-            finite matrices at a scheduling value.
+            If shapes do not fit, a value is not finite, a delay is no whole number of
+            samples, or the structure gives no finite matrices at a scheduling value.
         DivergenceError
             If the outputs overflow; the first sample and value are told.
         """
         u = finite_samples("u", u, self.n_inputs)
-        x = np.zeros(self.order)
-        if initial_state is not None:
-            x = state_vector(initial_state, self.order)
+        delay, n = self._samples_of_delay(sampling_time), self.order
+        x = np.zeros(n) if initial_state is None else initial_state
+        x, before = np.split(state_vector(x, n, int(delay.sum())), [n])
+        late = delayed(u, delay, before)[:, :, None]
         kappa = self._scheduling(scheduling)
-        return self._response(u[:, :, None], kappa, sampling_time, x[:, None])[:, :, 0]
+        return self._response(late, kappa, sampling_time, x[:, None])[:, :, 0]
 
     def free_responses(self, scheduling: ArrayLike, sampling_time: float) -> Array:
-        """Outputs that each unit initial state causes without input.
+        """Outputs that each unit initial state, and input in transit, causes.
 
         Parameters
         ----------
@@ -240,17 +251,37 @@ class LPVStateSpace:
 
         Returns
         -------
-        ndarray of shape (n_samples, n_outputs, order)
-            ``y = free_responses @ x0`` for ``u = 0``: regressors of an initial state.
+        ndarray of shape (n_samples, n_outputs, order + n_in_transit)
+            ``y = free_responses @ x0`` for ``u = 0``: regressors of an initial state,
+            with one entry for each sample of delay after it.
 
         Raises
         ------
         ValueError
             As `simulate`.
         """
-        kappa = self._scheduling(scheduling)
-        none = np.zeros((len(kappa), 0, self.order))
-        return self._response(none, kappa, sampling_time, np.eye(self.order))
+        kappa, n = self._scheduling(scheduling), self.order
+        delay = self._samples_of_delay(sampling_time)
+        unit = np.eye(n + delay.sum())
+        if not delay.any():  # which spares the inputs
+            return self._response(
+                np.zeros((len(kappa), 0, n)), kappa, sampling_time, unit
+            )
+        none = np.zeros((len(kappa), self.n_inputs, len(unit)))
+        late = delayed(none, delay, unit[n:])
+        return self._response(late, kappa, sampling_time, unit[:n])
+
+    def _samples_of_delay(self, sampling_time: float) -> NDArray[np.intp]:
+        """Delays in samples, which they must be a whole number of."""
+        dt = positive_time("sampling_time", sampling_time)
+        whole, rest = split_delay(self.input_delay, dt)
+        if rest.any():
+            raise ValueError(
+                "`sampling_time` must divide the input delay of "
+                f"{self.input_delay.tolist()} s. Got {dt:g} s. Resample the record, or "
+                "round the delay: dataclasses.replace(model, input_delay=...)."
+            )
+        return whole
 
     def silenced(self) -> LPVStateSpace:
         """The model whose interpolator extrapolates without a warning."""
