@@ -28,6 +28,8 @@ from ..data.preparation import (
     remove_trends,
 )
 from ..data.timestamps import check_uniform_time, time_in_seconds
+from ..validation import input_delays
+from .delay import late_inputs
 from .fit import (
     Choices,
     LocalFit,
@@ -236,7 +238,11 @@ class SampleStream:
         self._clock = StreamClock()
         self._label: Hashable = None  # of the sample that came last
         self._open = False  # whether nothing of that experiment is missing since
-        self._buffer = SampleBuffer(options["missing"] == "split")
+        self.delay = input_delays(options["input_delay"], n_inputs, samples=True)
+        self._rest = not choices.initial_states
+        self._in_transit: Array | None = None  # inputs of that experiment
+        unknown = bool(self.delay.any()) and not self._rest
+        self._buffer = SampleBuffer(options["missing"] == "split" or unknown)
         self._summary: StreamSummary | None = None
         self._first_residual = np.nan
 
@@ -305,6 +311,8 @@ class SampleStream:
             if times is not None:
                 stamps = Column(times.name, pd.Series(times.values).iloc[e.rows])
                 self._clock.check(stamps, e.label, continues=continues)
+            before = self._in_transit if continues else None
+            e, sent = late_inputs(e, self.delay, rest=self._rest, before=before)
             parts = complete_runs(e, shortest=1) if has_gaps(e) else [e]
             for part in parts:
                 assert part.outputs is not None
@@ -313,7 +321,7 @@ class SampleStream:
                 if len(part.rows) > 1 or joins or goes_on:
                     out.append(Piece(part.inputs, part.outputs, not joins))
             unbroken = bool(parts) and parts[-1].rows[-1] == e.rows[-1]
-        self._label, self._open = ordered[-1].label, unbroken
+        self._label, self._open, self._in_transit = ordered[-1].label, unbroken, sent
         return out
 
     def _fit_kept(self, pieces: Sequence[Piece]) -> tuple[LocalFit | None, list[Piece]]:

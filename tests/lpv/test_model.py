@@ -19,6 +19,8 @@ from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV, StateSpace
 from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
 from lpvlearn.lpv import model as model_module
 
+from ..conftest import spring_lpv
+
 DT = 0.05
 
 
@@ -331,3 +333,26 @@ def test_a_diverging_simulation_names_the_frozen_model():
     with pytest.raises(DivergenceError, match="diverges within one sample of 1000 s"):
         inside.simulate(np.ones(3), np.full(3, -2.0), 1000.0)
     assert np.isfinite(inside.simulate(np.ones(300), kappa[:300], 0.1)).all()
+
+
+def test_delayed_inputs_are_shifted_inputs():
+    rng, plain = np.random.default_rng(0), spring_lpv()
+    lpv = replace(plain, input_delay=0.06)
+    u, kappa = rng.normal(size=(80, 1)), np.linspace(0, 1.5, 80)
+    late = np.vstack([np.zeros((3, 1)), u[:-3]])
+    np.testing.assert_array_equal(
+        lpv.simulate(u, kappa, 0.02), plain.simulate(late, kappa, 0.02)
+    )
+    x0 = rng.normal(size=5)  # two states, three inputs in transit
+    y = lpv.simulate(u, kappa, 0.02, initial_state=x0)
+    free = lpv.free_responses(kappa, 0.02)
+    np.testing.assert_allclose(lpv.simulate(u, kappa, 0.02) + free @ x0, y, atol=1e-12)
+    frozen = lpv.at(1.0)
+    np.testing.assert_array_equal(frozen.input_delay, [0.06])
+    constant = lpv.simulate(u, np.ones(80), 0.02)
+    np.testing.assert_allclose(
+        frozen.simulate(u, sampling_time=0.02), constant, atol=1e-12
+    )
+    assert "input_delay=[0.06] s" in repr(lpv)
+    with pytest.raises(ValueError, match="must divide the input delay"):
+        lpv.simulate(u, kappa, 0.025)

@@ -1,0 +1,367 @@
+"""Input delays: inputs as they arrive, and the delays that the records show.
+
+A model with a delay is identified from late inputs, ``u[t - d]`` in the place of
+``u[t]``: all other rooms see these only (`with_late_inputs`).
+
+Which delay (`find_delays`)? A regression on past outputs and on inputs from ``u[t]`` on
+tells how many of the latest inputs can be left out, one after the other: the delay is
+not longer. It may be shorter, as smooth systems begin to answer below the noise. But a
+model with a delay that is k samples too short needs k states more, one with a delay
+that is longer as far as the answer is faint needs none. So models of several orders and
+delays are compared by their likelihood, in samples whose noise is whitened: the fewest
+states that are not significantly worse than the best, and of these the shortest delay.
+It is certain only where a model without delay has not done as well with a state more,
+nor at the same order on samples held out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # which loads its signal package when that is first used: slowly
+from numpy.typing import NDArray
+from scipy import stats
+
+from ..data.experiments import Experiment
+from ..data.preparation import Pairs, split_at_gaps
+from ..systems.simulation import delayed, lti_response
+from .identification import Settings, identify
+from .selection import select
+from .signals import Record
+from .statistics import autoregression
+
+Array = NDArray[np.float64]
+
+Delay = NDArray[np.intp]
+
+LONGEST = 30  # samples that a delay is looked for, of each input
+
+_SHARE = 10  # and no longer than this part of the longest experiment, a tenth
+
+_MAX_SAMPLES = 12_000  # that are looked at: as many as for the choice of an order
+
+# Past outputs and, after the longest delay, inputs in the regression: enough for its
+# error to be nearly white, and for the answers of systems of usual orders.
+_PAST = 12
+
+_CHANCE = 1e-4  # probability by chance of an answer, or of states, that are certain
+
+# Twice the logarithm of a likelihood by which a delay is better than a shorter one at
+# the same order: by chance that happens to one in a hundred.
+_BETTER = 6.0
+
+_CLEARLY = 1.1  # factor of the mean square error that one sample of delay must be worth
+
+_STATES = range(-1, 3)  # about the order chosen at the longest delay, that are tried
+
+_GIVEN_UP = 2  # delays in turn without any good model: shorter ones have none either
+
+_SHORTEST_HORIZON = 8  # of the models compared, which the refinement makes equal
+
+_ROUNDING = 1e-14  # share of an output's energy that is rounding
+
+_LARGEST_RATIO = 1e4  # of an output's size to its noise by which outputs are weighed
+
+_ESTIMATED = 0.7  # part of the samples to estimate on where others are held out
+
+
+def late_inputs(
+    experiment: Experiment, delay: Delay, *, rest: bool, before: Array | None = None
+) -> tuple[Experiment, Array]:
+    """An experiment with its inputs as they arrive, and the inputs still in transit.
+
+    What arrives in the first samples was sent `before` (the inputs in transit where an
+    experiment goes on), or else is unknown: NaN, or zero from `rest`.
+    """
+    sent, longest = experiment.inputs, int(delay.max())
+    if before is None:
+        before = np.full((longest, sent.shape[1]), 0.0 if rest else np.nan)
+    sent, n_samples = np.vstack([before, sent]), len(sent)
+    late = [
+        column[longest - d : longest - d + n_samples]
+        for column, d in zip(sent.T, delay, strict=True)
+    ]
+    return replace(experiment, inputs=np.column_stack(late)), sent[n_samples:]
+
+
+def with_late_inputs(
+    experiments: Sequence[Experiment], delay: Delay, *, rest: bool, gaps: bool
+) -> list[Experiment]:
+    """Experiments with inputs as they arrive, cut at gaps where there may be some.
+
+    Without `rest` the first samples, to which unknown inputs arrive, are left out. A
+    ValueError where that leaves no two samples of any experiment.
+    """
+    if not delay.any():
+        return split_at_gaps(experiments) if gaps else list(experiments)
+    late = [late_inputs(e, delay, rest=rest)[0] for e in experiments]
+    if rest:
+        return late
+    longest = max(len(e.rows) for e in experiments)
+    if longest < delay.max() + 2:
+        raise ValueError(
+            f"`input_delay` of {delay.max()} samples needs an experiment of at least "
+            f"{delay.max() + 2} samples: what arrives before is not known. Got "
+            f"{longest}. initial_state='rest' takes it as zero."
+        )
+    return split_at_gaps(late)
+
+
+def find_delays(
+    pairs: Pairs, settings: Settings, order: int | None, horizon: int | None
+) -> Delay:
+    """Delay of every input, in samples, as far as it is certain; else 0.
+
+    `order` and `horizon` as of `select`.
+    """
+    pairs = _head(pairs)
+    longest = min(LONGEST, max(len(u) for u, _ in pairs) // _SHARE)
+    answers = first_answers(pairs, longest)
+    direct = settings.free.direct.any(axis=0)
+    delay = np.where(answers < 0, 0, np.maximum(answers - ~direct, 0))
+    if not delay.any():
+        return delay
+    settings = settings._replace(
+        free=settings.free._replace(initial_states=True),
+        refine=True,
+        enforce_stability=False,
+    )
+    trial = _Trial.of(pairs, settings, int(delay.max()))
+    chosen = order
+    if chosen is None:
+        chosen = select(trial.records(delay), None, horizon, settings).order
+    trial = trial.whitened(delay, chosen)
+    orders = [chosen]
+    if order is None:
+        orders = [chosen + more for more in _STATES if chosen + more >= 0]
+    for j in np.flatnonzero(delay):
+        delay[j] = trial.delay_of(int(j), delay, orders)
+    return delay
+
+
+def _head(pairs: Pairs) -> Pairs:
+    """The first experiments, some thousand samples of them."""
+    out, left = [], _MAX_SAMPLES
+    for u, y in pairs:
+        if left > 0:
+            out.append((u[:left], y[:left]))
+            left -= len(u)
+    return out
+
+
+def first_answers(pairs: Pairs, longest: int) -> Delay:
+    """Latest input that certainly shows in an output, counted back from the present.
+
+    For every input 0 to `longest`, or -1 where none of these is certain.
+
+    >>> u, e = np.random.default_rng(0).standard_normal((2, 500, 1))
+    >>> first_answers([(u[3:], u[:-3] + 0.1 * e[3:])], 10)
+    array([3])
+    """
+    m, ny = pairs[0][0].shape[1], pairs[0][1].shape[1]
+    n_samples = sum(len(u) for u, _ in pairs)
+    # No more unknowns than a quarter of the samples
+    past = int(np.clip((n_samples / 4 - m * longest) / (m + ny), 1, _PAST))
+    span = longest + past
+    long = [(u, y) for u, y in pairs if len(u) > span]
+    found = np.full(m, -1)
+    if not long:
+        return found
+    window = np.lib.stride_tricks.sliding_window_view
+    inputs = np.concatenate([window(u, span + 1, axis=0) for u, _ in long])
+    outputs = [window(y[span - past : -1], past, axis=0) for _, y in long]
+    earlier = np.concatenate(outputs).reshape(len(inputs), -1)
+    y = np.concatenate([y[span:] for _, y in long])
+    for j in range(m):
+        rest = np.delete(inputs, j, axis=1).reshape(len(inputs), -1)
+        own = inputs[:, j]  # the present last
+        X = np.column_stack([np.ones(len(y)), earlier, rest, own])
+        k = X.shape[1]
+        error = len(X) - k
+        if error < 1:
+            return found
+        R = np.asarray(np.linalg.qr(np.column_stack([X, y]), mode="r"))
+        explained = R[k - longest - 1 : k, k:][::-1] ** 2
+        left = (R[k:, k:] ** 2).sum(axis=0)
+        left = np.maximum(left, _ROUNDING * (y**2).sum(axis=0)) / error
+        count = np.arange(1, longest + 2)[:, None]
+        F = np.cumsum(explained, axis=0) / count / left
+        certain = (stats.f.sf(F, count, error) < _CHANCE / (longest + 1)).any(axis=1)
+        if certain.any():
+            found[j] = np.argmax(certain)
+    return found
+
+
+class _Size(NamedTuple):
+    """How many parameters a model has: sizes are in their order."""
+
+    order: int
+    direct: bool  # whether the input whose delay is looked for acts at once
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Samples to try delays on; from row `longest` on all inputs are known."""
+
+    pairs: Pairs
+    settings: Settings
+    longest: int
+    known: dict[tuple[int, ...], float] = field(default_factory=dict)  # losses
+
+    @classmethod
+    def of(
+        cls,
+        pairs: Pairs,
+        settings: Settings,
+        longest: int,
+        noise: Array | float = np.inf,
+    ) -> _Trial:
+        """The trial of inputs of unit size, and outputs in units of their noise.
+
+        Where that is not known, or very small, their own size counts.
+        """
+        unit = [
+            np.sqrt(np.mean(np.vstack([pair[k] for pair in pairs]) ** 2, axis=0))
+            for k in (0, 1)
+        ]
+        su, sy = (np.where(size > 0.0, size, 1.0) for size in unit)
+        sy = np.where(np.isfinite(noise), np.maximum(noise, sy / _LARGEST_RATIO), sy)
+        # the largest output has unit size
+        sy = sy * max(float((unit[1] / sy).max()), np.finfo(float).tiny)
+        kept = [(u / su, y / sy) for u, y in pairs if len(u) > longest + 1]
+        return cls(kept, settings, longest)
+
+    def records(self, delay: Delay) -> list[Record]:
+        cut = slice(self.longest, None)
+        return [Record.of(delayed(u, delay)[cut], y[cut]) for u, y in self.pairs]
+
+    def errors(
+        self, delay: Delay, size: _Size, j: int, part: float = 1.0
+    ) -> list[Array]:
+        """Simulation errors of a model of these; with `part` those of the rest."""
+        order, direct = size
+        settings = self.settings
+        if not direct:
+            mask = settings.free.direct.copy()
+            mask[:, j] = False
+            settings = settings._replace(free=settings.free._replace(direct=mask))
+        records = self.records(delay)
+        cuts = [int(np.ceil(part * r.u.shape[1])) for r in records]
+        heads = [r.head(cut) for r, cut in zip(records, cuts, strict=True)]
+        horizon = max(_SHORTEST_HORIZON, 2 * (order + 1))
+        horizon = min(horizon, self.settings.max_horizon(cuts))
+        if self.settings.max_order(horizon) < order:
+            return [np.full_like(r.y.T, np.inf) for r in records]
+        A, B, C, D, states = identify(heads, order, horizon, settings).model[:5]
+        if part == 1.0:
+            cuts = [0] * len(cuts)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return [
+                (r.y.T - lti_response(A, B, C, D, r.u.T, x0))[cut:]
+                for r, x0, cut in zip(records, states, cuts, strict=True)
+            ]
+
+    def loss(self, delay: Delay, size: _Size, j: int) -> float:
+        """Mean square of the simulation errors; at least that of rounding."""
+        key = (*delay.tolist(), *size, j)
+        if key not in self.known:
+            mean = float(np.mean(np.concatenate(self.errors(delay, size, j)) ** 2))
+            self.known[key] = (mean if np.isfinite(mean) else np.inf) + _ROUNDING
+        return self.known[key]
+
+    def whitened(self, delay: Delay, order: int) -> _Trial:
+        """The trial of samples filtered alike, so that noise becomes nearly white.
+
+        One filter for all inputs and outputs leaves the system as it is.
+        """
+        errors = self.errors(delay, _Size(order, True), 0)
+        size = np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0))
+        size[size == 0.0] = 1.0
+        model = autoregression(
+            [e[:, [i]] / size[i] for e in errors for i in range(len(size))]
+        )
+        a = np.concatenate([[1.0], -model.C[0]])
+
+        def white(signal: Array) -> Array:
+            return scipy.signal.lfilter(a, [1.0], signal, axis=0)[len(a) - 1 :]
+
+        filtered = [(white(u), white(y)) for u, y in self.pairs]
+        return self.of(filtered, self.settings, self.longest, size)
+
+    def delay_of(self, j: int, longest: Delay, orders: Sequence[int]) -> int:
+        """Delay of one input, up to the `longest`; those of the others stay."""
+
+        def at(d: int) -> Delay:
+            return np.where(np.arange(len(longest)) == j, d, longest)
+
+        may_be_direct = bool(self.settings.free.direct[:, j].any())
+        sizes = [
+            _Size(n, D) for n in orders for D in (False, True)[: 1 + may_be_direct]
+        ]
+        found: dict[_Size, dict[int, float]] = {size: {} for size in sizes}
+        tried_in_vain = 0
+        for d in range(longest[j], -1, -1):
+            for size in sizes:
+                found[size][d] = self.loss(at(d), size, j)
+            good = self._as_good_as_best(found)
+            tried_in_vain = (
+                0
+                if any(
+                    d in found[size]
+                    and self._evidence(found[size][d], min(found[size].values()))
+                    < _BETTER
+                    for size in good
+                )
+                else tried_in_vain + 1
+            )
+            if tried_in_vain == _GIVEN_UP:
+                break
+        size = min(self._as_good_as_best(found))
+        d = min(found[size], key=found[size].__getitem__)
+        if d == 0:
+            return 0
+        loss, n = found[size][d], size.order
+        if d == 1:  # which a state more is as good as
+            certain = self.loss(at(0), _Size(n, may_be_direct), j) > _CLEARLY * loss
+        else:
+            none = self.loss(at(0), _Size(n + 1, may_be_direct), j)
+            certain = self._evidence(none, loss) > _BETTER
+        if not certain:
+            return 0
+        late, present = (
+            np.sum(
+                np.concatenate(
+                    self.errors(at(one), _Size(n, may_be_direct), j, _ESTIMATED)
+                )
+                ** 2
+            )
+            for one in (d, 0)
+        )
+        return 0 if late > present else d
+
+    def _as_good_as_best(self, found: dict[_Size, dict[int, float]]) -> list[_Size]:
+        """Sizes whose lack of parameters is not significant."""
+        (u, y), losses = self.pairs[0], {k: min(v.values()) for k, v in found.items()}
+        best = min(losses, key=losses.__getitem__)
+
+        def n_parameters(size: _Size) -> int:
+            return size.order * (u.shape[1] + y.shape[1]) + size.direct * y.shape[1]
+
+        good = []
+        for size, loss in losses.items():
+            dof = max(1, n_parameters(best) - n_parameters(size))
+            allowed = max(stats.chi2.isf(_CHANCE, dof), dof * np.log(self.n_values))
+            if self._evidence(loss, losses[best]) <= allowed:
+                good.append(size)
+        return good
+
+    @property
+    def n_values(self) -> int:
+        return sum(y[self.longest :].size for _, y in self.pairs)
+
+    def _evidence(self, loss: float, best: float) -> float:
+        """Twice the logarithm of the ratio of two likelihoods."""
+        return self.n_values * float(np.log(loss / best))
