@@ -47,13 +47,12 @@ _MAX_SAMPLES = 12_000  # that are looked at: as many as for the choice of an ord
 # error to be nearly white, and for the answers of systems of usual orders.
 _PAST = 12
 
-_CHANCE = 1e-4  # probability by chance of an answer, or of states, that are certain
+_CHANCE = 1e-4  # probability by chance of an answer that is certain
 
-# Twice the logarithm of a likelihood by which a delay is better than a shorter one at
-# the same order: by chance that happens to one in a hundred.
-_BETTER = 6.0
-
-_CLEARLY = 1.1  # factor of the mean square error that one sample of delay must be worth
+# Twice the logarithm of the likelihood by which no delay, with a state more, must be
+# worse than several samples of delay; and no better than one sample, which that state
+# can take the place of. One sample must make this factor of the mean square error.
+_WORSE, _BETTER, _CLEARLY = 6.0, 3.0, 1.05
 
 _STATES = range(-1, 3)  # about the order chosen at the longest delay, that are tried
 
@@ -129,14 +128,14 @@ def find_delays(
         refine=True,
         enforce_stability=False,
     )
-    trial = _Trial.of(pairs, settings, int(delay.max()))
-    chosen = order
-    if chosen is None:
-        chosen = select(trial.records(delay), None, horizon, settings).order
-    trial = trial.whitened(delay, chosen)
-    orders = [chosen]
-    if order is None:
-        orders = [chosen + more for more in _STATES if chosen + more >= 0]
+    trial = _Trial.of(pairs, settings, int(delay.max()), horizon or 1)
+    orders = [] if order is None else [order]
+    if order is None or horizon is None:
+        chosen = select(trial.records(delay), order, horizon, settings)
+        trial = replace(trial, horizon=chosen.horizon)
+        about = [chosen.order + more for more in _STATES if chosen.order + more >= 0]
+        orders = orders or about
+    trial = trial.whitened(delay, orders[-1])
     for j in np.flatnonzero(delay):
         delay[j] = trial.delay_of(int(j), delay, orders)
     return delay
@@ -209,6 +208,7 @@ class _Trial:
     pairs: Pairs
     settings: Settings
     longest: int
+    horizon: int  # of the models compared, at least
     known: dict[tuple[int, ...], float] = field(default_factory=dict)  # losses
 
     @classmethod
@@ -217,6 +217,7 @@ class _Trial:
         pairs: Pairs,
         settings: Settings,
         longest: int,
+        horizon: int,
         noise: Array | float = np.inf,
     ) -> _Trial:
         """The trial of inputs of unit size, and outputs in units of their noise.
@@ -232,7 +233,7 @@ class _Trial:
         # the largest output has unit size
         sy = sy * max(float((unit[1] / sy).max()), np.finfo(float).tiny)
         kept = [(u / su, y / sy) for u, y in pairs if len(u) > longest + 1]
-        return cls(kept, settings, longest)
+        return cls(kept, settings, longest, horizon)
 
     def records(self, delay: Delay) -> list[Record]:
         cut = slice(self.longest, None)
@@ -251,7 +252,7 @@ class _Trial:
         records = self.records(delay)
         cuts = [int(np.ceil(part * r.u.shape[1])) for r in records]
         heads = [r.head(cut) for r, cut in zip(records, cuts, strict=True)]
-        horizon = max(_SHORTEST_HORIZON, 2 * (order + 1))
+        horizon = max(self.horizon, _SHORTEST_HORIZON, 2 * (order + 1))
         horizon = min(horizon, self.settings.max_horizon(cuts))
         if self.settings.max_order(horizon) < order:
             return [np.full_like(r.y.T, np.inf) for r in records]
@@ -289,7 +290,7 @@ class _Trial:
             return scipy.signal.lfilter(a, [1.0], signal, axis=0)[len(a) - 1 :]
 
         filtered = [(white(u), white(y)) for u, y in self.pairs]
-        return self.of(filtered, self.settings, self.longest, size)
+        return self.of(filtered, self.settings, self.longest, self.horizon, size)
 
     def delay_of(self, j: int, longest: Delay, orders: Sequence[int]) -> int:
         """Delay of one input, up to the `longest`; those of the others stay."""
@@ -297,38 +298,39 @@ class _Trial:
         def at(d: int) -> Delay:
             return np.where(np.arange(len(longest)) == j, d, longest)
 
+        m, ny = self.pairs[0][0].shape[1], self.pairs[0][1].shape[1]
         may_be_direct = bool(self.settings.free.direct[:, j].any())
-        sizes = [
-            _Size(n, D) for n in orders for D in (False, True)[: 1 + may_be_direct]
+        families = [
+            [_Size(n, direct) for n in sorted(orders, reverse=True)]
+            for direct in (False, True)[: 1 + may_be_direct]
         ]
-        found: dict[_Size, dict[int, float]] = {size: {} for size in sizes}
-        tried_in_vain = 0
+
+        def penalty(size: _Size) -> float:
+            n_parameters = size.order * (m + ny) + size.direct * ny
+            return float(np.log(self.n_values)) * n_parameters
+
+        least, best, tried_in_vain = np.inf, (families[0][0], 0), 0
         for d in range(longest[j], -1, -1):
-            for size in sizes:
-                found[size][d] = self.loss(at(d), size, j)
-            good = self._as_good_as_best(found)
-            tried_in_vain = (
-                0
-                if any(
-                    d in found[size]
-                    and self._evidence(found[size][d], min(found[size].values()))
-                    < _BETTER
-                    for size in good
-                )
-                else tried_in_vain + 1
-            )
+            tried_in_vain += 1
+            for sizes in families:
+                for size in sizes:
+                    misfit = self.n_values * np.log(self.loss(at(d), size, j))
+                    if misfit + penalty(size) < least:
+                        least, best = misfit + penalty(size), (size, d)
+                    if misfit + penalty(sizes[-1]) > least:
+                        break  # smaller models fit no better
+                    tried_in_vain = 0
             if tried_in_vain == _GIVEN_UP:
                 break
-        size = min(self._as_good_as_best(found))
-        d = min(found[size], key=found[size].__getitem__)
+        (n, direct), d = best
         if d == 0:
             return 0
-        loss, n = found[size][d], size.order
+        loss = self.loss(at(d), best[0], j)
+        gain = self._evidence(self.loss(at(0), _Size(n + 1, may_be_direct), j), loss)
+        certain = gain > _WORSE
         if d == 1:  # which a state more is as good as
-            certain = self.loss(at(0), _Size(n, may_be_direct), j) > _CLEARLY * loss
-        else:
-            none = self.loss(at(0), _Size(n + 1, may_be_direct), j)
-            certain = self._evidence(none, loss) > _BETTER
+            none = self.loss(at(0), _Size(n, may_be_direct), j)
+            certain = gain > -_BETTER and none > _CLEARLY * loss
         if not certain:
             return 0
         late, present = (
@@ -341,22 +343,6 @@ class _Trial:
             for one in (d, 0)
         )
         return 0 if late > present else d
-
-    def _as_good_as_best(self, found: dict[_Size, dict[int, float]]) -> list[_Size]:
-        """Sizes whose lack of parameters is not significant."""
-        (u, y), losses = self.pairs[0], {k: min(v.values()) for k, v in found.items()}
-        best = min(losses, key=losses.__getitem__)
-
-        def n_parameters(size: _Size) -> int:
-            return size.order * (u.shape[1] + y.shape[1]) + size.direct * y.shape[1]
-
-        good = []
-        for size, loss in losses.items():
-            dof = max(1, n_parameters(best) - n_parameters(size))
-            allowed = max(stats.chi2.isf(_CHANCE, dof), dof * np.log(self.n_values))
-            if self._evidence(loss, losses[best]) <= allowed:
-                good.append(size)
-        return good
 
     @property
     def n_values(self) -> int:
