@@ -49,10 +49,11 @@ _PAST = 12
 
 _CHANCE = 1e-4  # probability by chance of an answer that is certain
 
-# Twice the logarithm of the likelihood by which no delay, with a state more, must be
-# worse than several samples of delay; and no better than one sample, which that state
-# can take the place of. One sample must make this factor of the mean square error.
-_WORSE, _BETTER, _CLEARLY = 6.0, 3.0, 1.05
+# No delay, with a state more, must be worse than several samples of delay by this, in
+# twice the logarithm of the likelihood. One sample that state can take the place of:
+# there it must gain no more than by chance, and the sample be worth this factor of the
+# mean square error.
+_WORSE, _BY_CHANCE, _CLEARLY = 6.0, 0.05, 1.05
 
 _STATES = range(-1, 3)  # about the order chosen at the longest delay, that are tried
 
@@ -305,41 +306,38 @@ class _Trial:
             for direct in (False, True)[: 1 + may_be_direct]
         ]
 
-        def penalty(size: _Size) -> float:
-            n_parameters = size.order * (m + ny) + size.direct * ny
-            return float(np.log(self.n_values)) * n_parameters
+        def n_parameters(size: _Size) -> int:
+            return size.order * (m + ny) + size.direct * ny
 
+        each = np.log(self.n_values)  # parameter's price, by Schwarz's criterion
         least, best, tried_in_vain = np.inf, (families[0][0], 0), 0
         for d in range(longest[j], -1, -1):
             tried_in_vain += 1
             for sizes in families:
                 for size in sizes:
                     misfit = self.n_values * np.log(self.loss(at(d), size, j))
-                    if misfit + penalty(size) < least:
-                        least, best = misfit + penalty(size), (size, d)
-                    if misfit + penalty(sizes[-1]) > least:
+                    if misfit + each * n_parameters(size) < least:
+                        least, best = misfit + each * n_parameters(size), (size, d)
+                    if misfit + each * n_parameters(sizes[-1]) > least:
                         break  # smaller models fit no better
                     tried_in_vain = 0
             if tried_in_vain == _GIVEN_UP:
                 break
-        (n, direct), d = best
+        size, d = best
         if d == 0:
             return 0
-        loss = self.loss(at(d), best[0], j)
-        gain = self._evidence(self.loss(at(0), _Size(n + 1, may_be_direct), j), loss)
-        certain = gain > _WORSE
-        if d == 1:  # which a state more is as good as
-            none = self.loss(at(0), _Size(n, may_be_direct), j)
-            certain = gain > -_BETTER and none > _CLEARLY * loss
+        loss = self.loss(at(d), size, j)
+        same, more = (_Size(size.order + k, may_be_direct) for k in (0, 1))
+        gain = self._evidence(loss, self.loss(at(0), more, j))
+        certain = gain < -_WORSE
+        if d == 1:
+            dof = n_parameters(more) - n_parameters(size)
+            certain = gain < stats.chi2.isf(_BY_CHANCE, dof)
+            certain &= self.loss(at(0), same, j) > _CLEARLY * loss
         if not certain:
             return 0
         late, present = (
-            np.sum(
-                np.concatenate(
-                    self.errors(at(one), _Size(n, may_be_direct), j, _ESTIMATED)
-                )
-                ** 2
-            )
+            np.sum(np.concatenate(self.errors(at(one), same, j, _ESTIMATED)) ** 2)
             for one in (d, 0)
         )
         return 0 if late > present else d
