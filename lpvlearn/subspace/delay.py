@@ -55,7 +55,11 @@ _CHANCE = 1e-4  # probability by chance of an answer that is certain
 # mean square error.
 _WORSE, _BY_CHANCE, _CLEARLY = 6.0, 0.05, 1.05
 
-_STATES = range(-1, 3)  # about the order chosen at the longest delay, that are tried
+# Parameters that a feedthrough counts for: with it goes one sample of delay more, which
+# a state without that would do as well.
+_DIRECT = 1.5
+
+_STATES = range(-2, 3)  # about the order chosen at the longest delay, that are tried
 
 _GIVEN_UP = 2  # delays in turn without any good model: shorter ones have none either
 
@@ -309,16 +313,19 @@ class _Trial:
         def n_parameters(size: _Size) -> int:
             return size.order * (m + ny) + size.direct * ny
 
-        each = np.log(self.n_values)  # parameter's price, by Schwarz's criterion
+        def price(size: _Size) -> float:  # Schwarz's criterion
+            counted = n_parameters(size) + (_DIRECT - 1.0) * size.direct * ny
+            return float(np.log(self.n_values)) * counted
+
         least, best, tried_in_vain = np.inf, (families[0][0], 0), 0
         for d in range(longest[j], -1, -1):
             tried_in_vain += 1
             for sizes in families:
                 for size in sizes:
                     misfit = self.n_values * np.log(self.loss(at(d), size, j))
-                    if misfit + each * n_parameters(size) < least:
-                        least, best = misfit + each * n_parameters(size), (size, d)
-                    if misfit + each * n_parameters(sizes[-1]) > least:
+                    if misfit + price(size) < least:
+                        least, best = misfit + price(size), (size, d)
+                    if misfit + price(sizes[-1]) > least:
                         break  # smaller models fit no better
                     tried_in_vain = 0
             if tried_in_vain == _GIVEN_UP:
