@@ -29,9 +29,9 @@ from ..data.experiments import Experiment
 from ..data.preparation import Pairs, split_at_gaps
 from ..systems.simulation import delayed, lti_response
 from .identification import Settings, identify
+from .noise import autoregression
 from .selection import select
 from .signals import Record
-from .statistics import autoregression
 
 Array = NDArray[np.float64]
 
@@ -133,7 +133,8 @@ def find_delays(
         refine=True,
         enforce_stability=False,
     )
-    trial = _Trial.of(pairs, settings, int(delay.max()), horizon or 1)
+    plain = settings._replace(weigh=False, compare=False)
+    trial = _Trial.of(pairs, plain, int(delay.max()), horizon or 1)
     orders = [] if order is None else [order]
     if order is None or horizon is None:
         chosen = select(trial.records(delay), order, horizon, settings)
