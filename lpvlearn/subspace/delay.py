@@ -55,10 +55,6 @@ _CHANCE = 1e-4  # probability by chance of an answer that is certain
 # mean square error.
 _WORSE, _BY_CHANCE, _CLEARLY = 6.0, 0.05, 1.05
 
-# Parameters that a feedthrough counts for: with it goes one sample of delay more, which
-# a state without that would do as well.
-_DIRECT = 1.5
-
 _STATES = range(-2, 3)  # about the order chosen at the longest delay, that are tried
 
 _GIVEN_UP = 2  # delays in turn without any good model: shorter ones have none either
@@ -315,8 +311,7 @@ class _Trial:
             return size.order * (m + ny) + size.direct * ny
 
         def price(size: _Size) -> float:  # Schwarz's criterion
-            counted = n_parameters(size) + (_DIRECT - 1.0) * size.direct * ny
-            return float(np.log(self.n_values)) * counted
+            return float(np.log(self.n_values)) * n_parameters(size)
 
         least, best, tried_in_vain = np.inf, (families[0][0], 0), 0
         for d in range(longest[j], -1, -1):
