@@ -3,15 +3,14 @@
 A model with a delay is identified from late inputs, ``u[t - d]`` in the place of
 ``u[t]``: all other rooms see these only (`with_late_inputs`).
 
-Which delay (`find_delays`)? A regression on past outputs and on inputs from ``u[t]`` on
-tells how many of the latest inputs can be left out, one after the other: the delay is
-not longer. It may be shorter, as smooth systems begin to answer below the noise. But a
-model with a delay that is k samples too short needs k states more, one with a delay
-that is longer as far as the answer is faint needs none. So models of several orders and
-delays are compared by their likelihood, in samples whose noise is whitened: the fewest
-states that are not significantly worse than the best, and of these the shortest delay.
-It is certain only where a model without delay has not done as well with a state more,
-nor at the same order on samples held out.
+Which delay (`find_delays`)? A regression on past outputs and on inputs from ``u[t]``
+back tells how many of the latest inputs can be left out: the delay is not longer. It
+may be shorter, as smooth systems begin to answer below the noise. But a model with a
+delay that is k samples too short needs k states more, and a delay of one sample more
+can stand for a first answer that is a feedthrough then. So models of several orders and
+delays, with feedthrough and without, are compared by Schwarz's criterion, in samples
+whose noise is whitened. The best one's delay is certain only where a model without
+delay has not done as well with a state more, nor at the same order on samples held out.
 """
 
 from __future__ import annotations

@@ -169,9 +169,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     began. These samples are left out of the fit, unless ``initial_state="rest"`` takes
     those inputs as zero, which is what `predict` does. `predict_with_initial_state`
     estimates them beside the state. ``input_delay="auto"`` compares models of several
-    orders and delays by their likelihood, with the noise whitened. It takes the fewest
-    states that explain the data, the shortest delay at that order, and none where a
-    model without delay does as well with a state more, or on held-out samples.
+    orders and delays, with feedthrough and without, by Schwarz's criterion, with the
+    noise whitened; a delay is none where a model without it does as well with a state
+    more, or on samples held out. Where the first answers of a system are fainter than
+    the noise, its delay may come out a sample off.
 
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.
@@ -564,12 +565,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Notes
         -----
-        Of inputs with a delay it is their arrival that counts: as present input, what
-        acts at once. Errors that depend on *past* inputs tell of a model that lacks
-        states, a delay
+        Errors that depend on *past* inputs tell of a model that lacks states, a delay
         or a nonlinearity; on the *present* input, of a lacking feedthrough; on *future*
-        inputs, of feedback. The errors are whitened by an autoregression before
-        they are regressed on the inputs, so that coloured noise raises no alarm.
+        inputs, of feedback. An input with a delay is present when it arrives. The
+        errors are whitened by an autoregression before they are regressed on the
+        inputs, so that coloured noise raises no alarm.
 
         On the samples of the fit, the errors have lost what the parameters could
         explain: sensitivities of the errors to the parameters join the regressions, and

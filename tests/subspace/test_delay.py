@@ -153,6 +153,7 @@ def test_every_input_has_its_own_delay():
     np.testing.assert_array_equal(found.lti_.input_delay, DELAY)
 
 
+@pytest.mark.slow
 def test_experiments_are_looked_at_together_and_units_do_not_matter():
     _, u, y = late_record(400, noise=0.02)
     v, z = late_record(200, seed=5, noise=0.02)[1:]
