@@ -1,6 +1,6 @@
 """Local linear parameter-varying (LPV) identification."""
 
-from .data import from_trajectories
+from .data import from_trajectories, resample
 from .lpv import LPVStateSpace, PolynomialLPV
 from .metrics import (
     bft_score,
@@ -42,6 +42,7 @@ __all__ = [
     "parameter_fit",
     "peak_gains",
     "readable_report",
+    "resample",
     "vaf_score",
     "vaf_scorer",
 ]

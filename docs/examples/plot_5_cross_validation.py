@@ -199,7 +199,8 @@ except ValueError as error:
 # In the middle of an experiment
 # ------------------------------
 # Test parts that start in mid-motion need an initial state; the scorer can estimate it
-# from the outputs, or leave the first samples out.
+# from the outputs, or leave the first samples out. From rest the score is wrong, as the
+# library says.
 
 from lpvlearn import BlockedTimeSeriesSplit
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
+from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import state_trajectory
 from ..validation import whole_number
 from .statespace import StateSpace
@@ -117,6 +118,8 @@ class InnovationModel:
         ----------
         u : array-like of shape (n_samples, n_inputs)
         y : array-like of shape (n_samples, n_outputs)
+            Missing values (NaN) are predicted from those beside them, and correct
+            nothing.
         steps : int, default=1
             Prediction horizon in samples.
         initial_state : array-like of shape (order,), default=None
@@ -133,7 +136,24 @@ class InnovationModel:
             return simulated
         A, C, K, _ = self.noise
         error = np.asarray(y, dtype=float).reshape(simulated.shape) - simulated
-        ahead = state_trajectory(A - K @ C, error @ K.T)
+        known = ~np.isnan(error)
+        if known.all():
+            ahead = state_trajectory(A - K @ C, error @ K.T)
+        else:
+            gains = self._gains(known)
+            forcing = np.einsum("tij,tj->ti", gains, np.where(known, error, 0.0))
+            ahead = state_trajectory(A - gains @ C, forcing)
         decay = C @ np.linalg.matrix_power(A, delay)
         simulated[delay:] += ahead[: max(len(error) - delay, 0)] @ decay.T
         return simulated
+
+    def _gains(self, known: NDArray[np.bool_]) -> Array:
+        """K for the outputs that are known: of the others the expected innovation."""
+        K, covariance = self.noise.K, self.noise.covariance
+        gains = np.zeros((len(known), *K.shape))
+        for pattern in np.unique(known, axis=0):
+            own = np.flatnonzero(pattern)
+            others, _ = scaled_lstsq(covariance[np.ix_(own, own)], covariance[own])
+            rows = np.flatnonzero((known == pattern).all(axis=1))
+            gains[np.ix_(rows, np.arange(len(K)), own)] = K @ others.T
+        return gains

@@ -21,11 +21,15 @@ from ..data.experiments import (
     NO_TIME,
     Experiment,
     as_list,
+    n_rows_of,
     read_experiments,
     read_outputs,
 )
 from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
-from ..data.preparation import split_at_gaps
+from ..data.preparation import read_runs
+from ..data.scoring import score_from_rest
+from ..data.timestamps import TIME_TOL, check_unit
+from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..metrics.table_simulation import simulate_experiments
@@ -106,6 +110,10 @@ list, default=None
         Seconds between samples. None reads it from the time column, else takes that of
         `local`. One of them must tell it where there is a structure or a scheduling
         variable, for the model is in continuous time; 1 counts time in samples.
+    time_tol : float, default=0.01
+        Largest deviation of a time stamp from an even grid, relative to the step. For
+        more, see `resample`. Where samples are missing, ``local=SubspaceLTI(
+        missing="split")`` cuts the records.
     combine : {"pool", "average"}, default="pool"
         Several experiments at one operating point enter one fit, or are identified
         one by one and their balanced models averaged (the paper's Monte Carlo).
@@ -175,6 +183,8 @@ list, default=None
         Beyond which `predict` warns: the operating points, widened by how far the
         scheduling variables moved within an experiment.
     sampling_time_ : float
+    time_jitter_ : float
+        Largest deviation of a time stamp from an even grid, relative to the step.
     output_names_, scheduling_names_ : list
     n_outputs_, n_features_in_ : int
     feature_names_in_ : ndarray of str
@@ -222,6 +232,7 @@ list, default=None
         operating_point: Any = None,
         scheduling_tol: float | None = None,
         sampling_time: float | None = None,
+        time_tol: float = TIME_TOL,
         combine: str = "pool",
         discretization: str = "zoh",
         efficient: bool = True,
@@ -240,6 +251,7 @@ list, default=None
         self.operating_point = operating_point
         self.scheduling_tol = scheduling_tol
         self.sampling_time = sampling_time
+        self.time_tol = time_tol
         self.combine = combine
         self.discretization = discretization
         self.efficient = efficient
@@ -297,6 +309,7 @@ list, default=None
             self.n_outputs_ = len(self.output_names_)
             self._single_output = np.asarray(y).ndim == 1
             check_outputs(experiments, self.output_names_)
+            self.time_jitter_ = max(e.jitter for e in experiments)
             structure = getattr(restructurer, "structure", None)
             _check_channels(
                 structure, experiments[0].input_names, self.output_names_, self.inputs
@@ -319,6 +332,7 @@ list, default=None
         with watch.step("restructuring"):  # step 4: all of them in one structure
             found = restructure_points(restructurer, local, points, runner)
             self.local_models_ = [model.lti for model in found.local]
+            self._n_with_offset = sum(model.n_trend > 0 for model in found.local)
             self.structured_models_ = found.models
             self.restructurers_ = found.restructurers
 
@@ -366,9 +380,12 @@ list, default=None
         -----
         ExtrapolationWarning
             Where a scheduling variable leaves `scheduling_range_`.
+        UserWarning
+            Where local models have constants (`SubspaceLTI.offset_`), which the LPV
+            model leaves out.
         """
         check_is_fitted(self, "lpv_")
-        return self._simulate(self._read(X, None, reset=False), estimate=False)
+        return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate from initial states estimated on the measured outputs.
@@ -380,18 +397,47 @@ list, default=None
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+            Missing outputs (NaN) are left out.
 
         Returns
         -------
         ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+            Where `local` has ``missing="split"``, NaN at missing inputs or scheduling
+            values; the simulation begins anew after them.
         """
         check_is_fitted(self, "lpv_")
-        return self._simulate(self._read(X, y, reset=False), estimate=True)
+        return self._simulate(
+            self._read(X, y, outputs=False), n_rows_of(X), estimate=True
+        )
+
+    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
+        """Coefficient of determination of the simulation from rest.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+            Samples of which an output is missing (NaN) are left out.
+        sample_weight : array-like of shape (n_samples,), default=None
+
+        Returns
+        -------
+        float
+            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
+
+        Warns
+        -----
+        UserWarning
+            If an experiment starts in mid-motion, which a simulation from rest misses.
+        """
+        return score_from_rest(self, X, y, sample_weight)
 
     def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
         """Rows of every experiment of a table, in the order of time."""
         check_is_fitted(self, "lpv_")
-        return [e.rows for e in self._read(X, None, reset=False)]
+        gaps = "Xy" if self._splits else ""
+        found = read_experiments(self, X, reset=False, allow_missing=gaps)
+        return [e.rows for e in found]
 
     def summary(self) -> str:
         """What was identified and how well, as text: ``print(pipeline.summary())``."""
@@ -410,26 +456,45 @@ list, default=None
             restructurer=_name_of_step(self.restructurer, "restructurer"),
         )
 
-    def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
+    def _simulate(
+        self, experiments: list[Experiment], n_samples: int, *, estimate: bool
+    ) -> Array:
+        if self._n_with_offset:
+            warn(
+                f"The experiments at {self._n_with_offset} of "
+                f"{len(self.local_models_)} operating point(s) have constants in their "
+                "outputs, which local models allow for. The LPV model has none: its "
+                "outputs are about zero. Subtract from y what it is at rest at input "
+                "zero, at every operating point, or say that it is zero: "
+                "local=SubspaceLTI(offset=None)."
+            )
         if getattr(self.interpolator_, "extrapolation", None) != "clip":
             warn_extrapolation(
                 experiments, self.scheduling_range_, self.scheduling_names_
             )
         model = self.lpv_.silenced()  # said above, of all experiments at once
         out = simulate_experiments(
-            model, experiments, self.sampling_time_, estimate=estimate
+            model, experiments, self.sampling_time_, n_samples, estimate=estimate
         )
         return out[:, 0] if self._single_output else out
 
     # -- helpers -------------------------------------------------------------------
 
-    def _read(self, X: Any, y: Any, *, reset: bool) -> list[Experiment]:
-        gaps = reset and getattr(self.local, "missing", None) == "split"
-        options: dict[str, Any] = {"reset": reset, "allow_missing": gaps}
-        if reset:
-            options["sampling_time"] = self.sampling_time
-        experiments = read_experiments(self, X, y, **options)
-        return split_at_gaps(experiments) if gaps else experiments
+    @property
+    def _splits(self) -> bool:
+        return getattr(self.local, "missing", None) == "split"
+
+    def _read(
+        self, X: Any, y: Any, *, reset: bool = False, **options: Any
+    ) -> list[Experiment]:
+        """Experiments of a table; options as in `read_runs`."""
+        declared = self.sampling_time if reset else None
+        options |= {"split": self._splits, "reset": reset, "sampling_time": declared}
+        experiments = read_runs(self, X, y, **options)
+        if not reset:  # another step will do, but hardly another unit
+            for e in experiments:
+                check_unit(e.sampling_time, self.sampling_time_, self.time)
+        return experiments
 
     def _sampling_time(self, experiments: list[Experiment], structure: Any) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]

@@ -23,6 +23,7 @@ from threadpoolctl import ThreadpoolController
 
 from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
+from ..data.preparation import DETRENDS
 from ..exceptions import Told, collected, warn
 from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.minimise_covariance import Estimate
@@ -57,6 +58,7 @@ class LocalModel:
     horizon: int | None  # of the subspace step, where the estimator tells it
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
     deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
+    n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
     # the model as identified (of every realization) with models to either side of it,
     # where the covariance is known; with "zoh" in discrete time
     estimates: list[Estimate] = field(default_factory=list)
@@ -124,6 +126,7 @@ def identify_point(
             fitted.lti_.order,
             _horizon(fitted),
             deviated=_all_continuous(pairs, discretization),
+            n_trend=_n_trend(fitted),
         )
         if efficient and pairs:
             found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
@@ -136,10 +139,11 @@ def identify_point(
     for name in ("order", "horizon", "input_delay"):
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
-    models, failures = [], []
+    models, failures, n_trend = [], [], 0
     estimates: list[Estimate] = []
     for realisation in realisations:
         refitted = _fit_local(chosen, realisation, sampling_time)
+        n_trend = max(n_trend, _n_trend(refitted))
         model, pairs = refitted.lti_, _deviated(refitted) if efficient else []
         try:
             models.append(_continuous(model, discretization, advice))
@@ -162,6 +166,7 @@ def identify_point(
         _horizon(fitted),
         models,
         estimates=estimates if known else [],
+        n_trend=n_trend,
     )
 
 
@@ -169,6 +174,11 @@ def _deviated(fitted: Any) -> list[ModelPair]:
     """Models to either side of a fitted one, where the estimator knows them."""
     pairs = getattr(fitted, "deviated_models", None)
     return [] if pairs is None else pairs()
+
+
+def _n_trend(fitted: Any) -> int:
+    """Trends of every output and experiment in a model, as `LocalModel` has them."""
+    return DETRENDS.index(getattr(fitted, "offset_", None))
 
 
 def _in_own_time(

@@ -49,10 +49,11 @@ def tables(found: StructuredModels, lpv: LPVStateSpace, sampling_time: float) ->
             "n_samples": sum(len(e.rows) for e in group),
             "order": model.order,
             "horizon": model.horizon,
-            "local_BFT": fit_of(model.lti, group, sampling_time),
+            "local_BFT": fit_of(model.lti, group, sampling_time, model.n_trend),
         }
         if found.restructurers:
-            row["structured_BFT"] = fit_of(gray_box, group, sampling_time)
+            structured = fit_of(gray_box, group, sampling_time, model.n_trend)
+            row["structured_BFT"] = structured
             row |= _restructuring(found.restructurers[k])
         if delayed:
             samples = np.round(model.lti.input_delay / sampling_time).astype(int)

@@ -25,8 +25,14 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from ..data.experiments import Experiment
-from ..data.preparation import Pairs, split_at_gaps
-from ..systems.simulation import delayed, lti_response
+from ..data.preparation import (
+    DETRENDS,
+    Pairs,
+    remove_trends,
+    split_at_gaps,
+    unbroken_runs,
+)
+from ..systems.simulation import delayed
 from .identification import Settings, identify
 from .noise import autoregression
 from .selection import select
@@ -96,8 +102,12 @@ def with_late_inputs(
     """
     if not delay.any():
         return split_at_gaps(experiments) if gaps else list(experiments)
-    late = [late_inputs(e, delay, rest=rest)[0] for e in experiments]
-    if rest:
+    late = [
+        late_inputs(run, delay, rest=rest and i == 0)[0]
+        for e in experiments
+        for i, run in enumerate(unbroken_runs(e))
+    ]
+    if rest and not gaps:
         return late
     longest = max(len(e.rows) for e in experiments)
     if longest < delay.max() + 2:
@@ -114,9 +124,10 @@ def find_delays(
 ) -> Delay:
     """Delay of every input, in samples, as far as it is certain; else 0.
 
-    `order` and `horizon` as of `select`.
+    `order` and `horizon` as of `select`. Experiments have the trends of `settings`,
+    whose removal here leaves little for the models to tell.
     """
-    pairs = _head(pairs)
+    pairs = remove_trends(_head(pairs), DETRENDS[settings.free.n_trend])[0]
     longest = min(LONGEST, max(len(u) for u, _ in pairs) // _SHARE)
     answers = first_answers(pairs, longest)
     direct = settings.free.direct.any(axis=0)
@@ -237,8 +248,9 @@ class _Trial:
         return cls(kept, settings, longest, horizon)
 
     def records(self, delay: Delay) -> list[Record]:
-        cut = slice(self.longest, None)
-        return [Record.of(delayed(u, delay)[cut], y[cut]) for u, y in self.pairs]
+        cut, n_trend = slice(self.longest, None), self.settings.free.n_trend
+        late = [(delayed(u, delay)[cut], y[cut]) for u, y in self.pairs]
+        return [Record.of(u, y, n_trend) for u, y in late]
 
     def errors(
         self, delay: Delay, size: _Size, j: int, part: float = 1.0
@@ -257,13 +269,13 @@ class _Trial:
         horizon = min(horizon, self.settings.max_horizon(cuts))
         if self.settings.max_order(horizon) < order:
             return [np.full_like(r.y.T, np.inf) for r in records]
-        A, B, C, D, states = identify(heads, order, horizon, settings).model[:5]
+        model = identify(heads, order, horizon, settings).model
         if part == 1.0:
             cuts = [0] * len(cuts)
         with np.errstate(over="ignore", invalid="ignore"):
             return [
-                (r.y.T - lti_response(A, B, C, D, r.u.T, x0))[cut:]
-                for r, x0, cut in zip(records, states, cuts, strict=True)
+                (r.y.T - model.outputs(r, k))[cut:]
+                for k, (r, cut) in enumerate(zip(records, cuts, strict=True))
             ]
 
     def loss(self, delay: Delay, size: _Size, j: int) -> float:

@@ -14,15 +14,26 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.experiments import (
+    OPTIONAL_ROLES,
     Experiment,
     Table,
+    n_rows_of,
     naming,
     read_experiments,
     read_outputs,
 )
-from ..data.preparation import remove_trends, split_at_gaps
+from ..data.preparation import DETRENDS, read_runs, remove_trends, split_at_gaps
+from ..data.scoring import score_from_rest
+from ..data.timestamps import TIME_TOL
+from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
+from ..systems.simulation import (
+    estimate_initial_state,
+    free_responses,
+    trend_signals,
+    with_transit,
+)
 from ..validation import frequencies, input_delays, one_of
 from .delay import Delay, find_delays, with_late_inputs
 from .fit import (
@@ -33,6 +44,7 @@ from .fit import (
     warn_about,
     warn_about_horizon,
 )
+from .offsets import N_TRENDS
 from .residuals import (
     Residuals,
     check_kind,
@@ -101,17 +113,28 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         State in which every experiment of `fit` starts: estimated along with B and D,
         or zero, which is worth knowing of short experiments that start at rest.
     detrend : {None, "constant", "linear"}, default=None
-        Subtract its mean or straight line from every channel of every experiment.
-        Predictions are then about the means of all training samples.
+        Subtract its mean or straight line from every channel of every experiment
+        beforehand. A mean is not where a system rests: what transients add to it stays
+        as an error, which `offset` does not have.
+    offset : {"auto", None, "constant", "linear"}, default="auto"
+        Unknowns of every output and experiment, estimated with B, D and the initial
+        state: a constant, as signals have that are not measured from a point of rest,
+        or a constant and a drift. None: the outputs are zero at rest at input zero.
+        "auto" takes constants of all experiments where they are significant, else (and
+        with `detrend`, which has dealt with them) none.
     missing : {"raise", "split"}, default="raise"
-        "split" ends an experiment before a sample with NaN and starts another after
-        it, with an initial state of its own.
+        "split" ends an experiment before a sample with NaN, or a row that the `time`
+        column misses, and starts another after it, with an initial state of its own.
+    time_tol : float, default=0.01
+        Largest deviation of a time stamp from an even grid, relative to the step. For
+        more, see `resample`.
     inputs : str, int or list of them, default=None
         Input columns of X. None: all columns without another role.
     experiment : str or int, default=None
         Column that tells experiments apart. None: the table is one experiment.
     time : str or int, default=None
-        Column of sample times, checked for even steps.
+        Column of sample times (seconds, dates or time differences), checked for even
+        steps.
     scheduling, operating_point : str, int or list of them, default=None
         Columns with these roles are read and left alone: the model is time-invariant.
 
@@ -143,8 +166,23 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         `lti_` with a noise model, Kalman gain and innovation covariance.
     poles_std_ : ndarray of complex, shape (order_,)
         Standard deviations of the real and imaginary parts of ``lti_.poles()``.
-    input_offset_, output_offset_ : ndarray
-        Means subtracted with `detrend`, else zero.
+    offset_ : {None, "constant", "linear"}
+        What was estimated.
+    input_offset_ : ndarray of shape (n_experiments, n_inputs)
+        Mean of the inputs of every experiment (a run between two gaps is one); zero
+        without `offset_` and `detrend`, with ``initial_state="rest"``, and where the
+        static gain is infinite: a mode slower than the longest experiment.
+    output_offset_ : ndarray of shape (n_experiments, n_outputs)
+        Where the outputs rest at these inputs: but for transients and drifts
+        ``y - output_offset_ = G (u - input_offset_)``. With `detrend` their means, to
+        which `offset` adds. After `partial_fit` of a long stream there is one row, the
+        mean of all.
+    output_drift_ : ndarray of shape (n_experiments, n_outputs)
+        Change per second (per sample where no time is known), about the middle of
+        the experiment; zero without ``offset="linear"``.
+    time_jitter_ : float
+        Largest deviation of a time stamp of `fit` from an even grid, relative to the
+        step; 0 without a `time` column.
     n_outputs_ : int
     n_features_in_ : int
     feature_names_in_ : ndarray of str
@@ -154,6 +192,17 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     `predict` simulates from rest; `predict_with_initial_state` estimates the
     initial state from outputs first, as a split in the middle of an experiment
     needs. Models of different fits do not share a state basis.
+
+    Signals about a point (u0, y0) are ``y = G u + c`` with ``c = y0 - G(1) u0``, but
+    for a transient that the initial state takes. So one unknown for each output stands
+    for all offsets. Of a system that integrates, an offset of the input makes a
+    straight line: ``offset="linear"``. `predict` then begins at rest at the mean of
+    `input_offset_`, the outputs at that of `output_offset_` (of drifts it knows
+    nothing); where the constants of the experiments differ by more than their
+    uncertainty it warns, as inputs alone cannot tell which one it will be. What is
+    given outputs estimates constant (and drift) of every experiment anew:
+    `predict_with_initial_state`, `residual_tests` and, from estimated initial states,
+    `predict_ahead`.
 
     Without refinement, "po-moesp" with as many noise states as the noise has and
     "pi-moesp" at the order of the system are consistent under coloured noise, others
@@ -215,7 +264,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         n_noise_states: int | str = "auto",
         initial_state: str = "estimate",
         detrend: str | None = None,
+        offset: str | None = "auto",
         missing: str = "raise",
+        time_tol: float = TIME_TOL,
         inputs: Any = None,
         experiment: Any = None,
         time: Any = None,
@@ -233,7 +284,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.n_noise_states = n_noise_states
         self.initial_state = initial_state
         self.detrend = detrend
+        self.offset = offset
         self.missing = missing
+        self.time_tol = time_tol
         self.inputs = inputs
         self.experiment = experiment
         self.time = time
@@ -268,13 +321,15 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             If the model is unstable or explains next to nothing of the outputs.
         """
         choices = check_options(self.get_params(deep=False))
-        experiments, _ = self._read(X, y, reset=True, split=False)
+        experiments = self._read(X, y, reset=True, cut=False)
+        self.time_jitter_ = max(e.jitter for e in experiments)
         delay = self._delay_of(experiments, choices)
-        experiments = self._with_late_inputs(experiments, delay)
+        gaps, rest = self.missing == "split", not choices.initial_states
+        experiments = with_late_inputs(experiments, delay, rest=rest, gaps=gaps)
         self._stream: SampleStream | None = None
         self._single_output = np.asarray(y).ndim == 1
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
-        gaps = self.missing == "split" or (choices.initial_states and bool(delay.any()))
+        gaps |= bool(delay.any()) and not rest
         fitted = fit_as_stream(pairs, choices, detrend=self.detrend, gaps=gaps)
         if fitted is None:
             names = experiments[0].input_names
@@ -330,6 +385,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         to be poor: the first 131,072 samples hardly excite what comes later, outputs
         drift, or (``refine=False``) the order is higher than the data support.
 
+        ``offset="auto"`` decides from the samples that are kept. From then on every
+        16,384 samples have constants (and drifts) of their own, so that a level that
+        wanders slowly does no harm.
+
         Examples
         --------
         >>> import numpy as np
@@ -350,7 +409,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.detrend is not None:
             raise ValueError(
                 "`detrend` must be None in partial_fit, which never sees a whole "
-                f"experiment. Got {self.detrend!r}."
+                f"experiment. Got {self.detrend!r}. Use offset={self.detrend!r}."
             )
         if isinstance(self.input_delay, str):
             raise ValueError(
@@ -362,7 +421,16 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if before is not None:
             before.check_options(options)
         with self._unchanged_where_refused():
-            experiments, _ = self._read(X, y, reset=before is None, split=False)
+            experiments = read_experiments(
+                self,
+                X,
+                y,
+                sampling_time=self.sampling_time,
+                reset=before is None,
+                allow_missing="Xy" if self.missing == "split" else "",
+            )
+            jitter = 0.0 if before is None else self.time_jitter_
+            self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
             if before is None:
                 step = self._step_of(experiments)
                 stream = SampleStream(choices, options, experiments, step)
@@ -401,14 +469,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
         pairs = remove_trends(pairs, self.detrend)[0]
         n_outputs = pairs[0][1].shape[1]
-        settings = choices.settings(n_outputs, n_inputs, np.eye(n_inputs))
+        # A constant more than there is costs little, one less is taken for a mode.
+        n_trend = 1 if choices.offset == "auto" else N_TRENDS[choices.offset]
+        settings = choices.settings(n_outputs, n_inputs, np.eye(n_inputs), n_trend)
         return find_delays(pairs, settings, choices.order, choices.horizon)
-
-    def _with_late_inputs(
-        self, experiments: list[Experiment], delay: Delay
-    ) -> list[Experiment]:
-        rest, gaps = self.initial_state == "rest", self.missing == "split"
-        return with_late_inputs(experiments, delay, rest=rest, gaps=gaps)
 
     def _take(self, fitted: LocalFit, step: float, delay: Delay) -> None:
         """Set the fitted attributes."""
@@ -418,13 +482,16 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
         self.selection_ = fitted.selection.table()
-        self.n_outputs_ = len(fitted.output_offset)
+        self.n_outputs_ = len(fitted.evidence.output_scale)
         self.initial_states_ = fitted.model.initial_states
         self.singular_values_ = fitted.singular_values
         self.residual_ = fitted.residual
         self.stability_loss_ = fitted.stability_loss
-        self.input_offset_ = fitted.input_offset
-        self.output_offset_ = fitted.output_offset
+        self._offsets = fitted.offsets
+        self.offset_ = DETRENDS[fitted.evidence.free.n_trend]
+        self.input_offset_ = fitted.offsets.inputs
+        self.output_offset_ = fitted.offsets.outputs
+        self.output_drift_ = fitted.offsets.drifts / step
 
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
         """Seconds between the samples of a table; True where nothing tells them."""
@@ -448,10 +515,22 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ------
         DivergenceError
             If the outputs of an unstable model overflow.
+
+        Warns
+        -----
+        UserWarning
+            If the constants of the experiments of `fit` differ: the outputs are about
+            their mean.
         """
         check_is_fitted(self, "lti_")
-        experiments, n_samples = self._read(X, None, reset=False)
-        return self._in_table(experiments, n_samples, self._simulated)
+        if self._offsets.differ:
+            warn(
+                "The experiments of `fit` have different constants in their outputs "
+                "(`output_offset_`): predictions are about their mean. Where outputs "
+                "are known, predict_with_initial_state(X, y) and "
+                "initial_state='estimate' of scores estimate those of every experiment."
+            )
+        return self._in_table(self._read(X, None), n_rows_of(X), self._simulated)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate the outputs from initial states estimated on measured outputs.
@@ -460,21 +539,48 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs, used for the initial state of every experiment only
-            (least squares over the whole experiment), and for the inputs in transit
-            where they act late: its first samples are then met more or less exactly.
+            Measured outputs, used for the initial state of every experiment (and of a
+            model with `offset_` for the constant and drift) only: least squares over
+            the whole experiment. Missing ones (NaN) are left out. Where inputs act
+            late, those in transit are estimated too: the first samples are then met
+            more or less exactly.
 
         Returns
         -------
         ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            With ``missing="split"`` NaN where an input is missing; the simulation
+            begins anew after that.
         """
         check_is_fitted(self, "lti_")
-        experiments, n_samples = self._read(X, y, reset=False)
 
         def simulated(e: Experiment) -> Array:
-            return self._simulated(e, self._initial_state(e))
+            x0, level = self._own_part(e)
+            u0, _ = self._rest()
+            return level + self.lti_.simulate(e.inputs - u0, initial_state=x0)
 
-        return self._in_table(experiments, n_samples, simulated)
+        return self._in_table(self._read(X, y, outputs=False), n_rows_of(X), simulated)
+
+    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
+        """Coefficient of determination of the simulation from rest.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Measured outputs. Samples of which one is missing (NaN) are left out.
+        sample_weight : array-like of shape (n_samples,), default=None
+
+        Returns
+        -------
+        float
+            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
+
+        Warns
+        -----
+        UserWarning
+            If an experiment starts in mid-motion, which a simulation from rest misses.
+        """
+        return score_from_rest(self, X, y, sample_weight)
 
     def predict_ahead(
         self, X: Any, y: Any, steps: int = 1, *, initial_state: str = "estimate"
@@ -485,7 +591,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs.
+            Measured outputs. Missing ones (NaN) correct nothing.
         steps : int, default=1
             Prediction horizon in samples.
         initial_state : {"estimate", "rest"}, default="estimate"
@@ -499,20 +605,17 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "lti_")
         one_of("initial_state", initial_state, ("estimate", "rest"))
-        experiments, n_samples = self._read(X, y, reset=False)
-        predictor = self.predictor_
+        experiments, predictor = self._read(X, y, outputs=False), self.predictor_
 
         def predicted(e: Experiment) -> Array:
-            return predictor.predict(
-                e.inputs - self.input_offset_,
-                _outputs_of(e) - self.output_offset_,
-                steps=steps,
-                initial_state=(
-                    self._initial_state(e) if initial_state == "estimate" else None
-                ),
-            )
+            u0, level = self._rest()
+            x0 = None
+            if initial_state == "estimate":
+                x0, level = self._own_part(e)
+            u, y = e.inputs - u0, _outputs_of(e) - level
+            return level + predictor.predict(u, y, steps=steps, initial_state=x0)
 
-        return self._in_table(experiments, n_samples, predicted)
+        return self._in_table(experiments, n_rows_of(X), predicted)
 
     def residual_tests(
         self,
@@ -529,8 +632,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs. Initial states are estimated from them, `detrend` and
-            `missing` act as in `fit`.
+            Measured outputs. Initial states and trends of `offset_` are estimated from
+            them, `detrend` acts as in `fit`. Records are cut where samples are missing.
         errors : {"simulation", "prediction"}, default="simulation"
             Of `predict_with_initial_state`, or of `predict_ahead`. Only the latter
             should be white: they test the noise model too.
@@ -611,14 +714,17 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """What is tested; `ResidualDisplay` draws it."""
         check_is_fitted(self, "lti_")
         check_kind(errors)
-        experiments, _ = self._read(X, y, reset=False, split=False)
+        experiments = self._read(X, y, split=True, cut=False)
         names = [] if y is None else read_outputs(y)[1]
         if y is not None and len(names) != self.n_outputs_:
             raise ValueError(
                 f"`y` must hold the {self.n_outputs_} output(s) of the model. Got "
                 f"{len(names)}."
             )
-        experiments = self._with_late_inputs(experiments, self.input_delay_)
+        rest = self.initial_state == "rest"
+        experiments = with_late_inputs(
+            experiments, self.input_delay_, rest=rest, gaps=True
+        )
         undelayed = self.lti_.with_input_delay(0)
         return model_residuals(
             undelayed,
@@ -744,7 +850,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         list of ndarray of int
         """
         check_is_fitted(self, "lti_")
-        return [e.rows for e in self._read(X, None, reset=False)[0]]
+        gaps = "Xy" if self.missing == "split" else ""
+        optional = (*OPTIONAL_ROLES, "scheduling")
+        options: dict[str, Any] = {"reset": False, "optional": optional}
+        found = read_experiments(self, X, allow_missing=gaps, **options)
+        return [e.rows for e in found]
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
@@ -753,33 +863,40 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tags.input_tags.allow_nan = self.missing == "split"
         return tags
 
-    def _read(
-        self, X: Any, y: Any, *, reset: bool, split: bool = True
-    ) -> tuple[list[Experiment], int]:
-        # A simulation needs every input; gaps are for what has outputs beside them.
-        gaps = self.missing == "split" and y is not None
-        experiments = read_experiments(
+    def _read(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
+        """Experiments of a table; options as in `read_runs`."""
+        options = {"split": self.missing == "split", "reset": False} | options
+        known = options["reset"] or self.time is None
+        return read_runs(
             self,
             X,
             y,
             sampling_time=self.sampling_time,
-            reset=reset,
-            allow_missing=gaps,
+            fitted_step=None if known else self.lti_.sampling_time,
+            optional=(*OPTIONAL_ROLES, "scheduling"),
+            **options,
         )
-        n_samples = sum(len(e.rows) for e in experiments)
-        if gaps and split:
-            experiments = split_at_gaps(experiments)
-        return experiments, n_samples
 
-    def _simulated(self, experiment: Experiment, x0: Array | None = None) -> Array:
-        """Outputs about their offset."""
-        u = experiment.inputs - self.input_offset_
-        return self.lti_.simulate(u, initial_state=x0)
+    def _rest(self) -> tuple[Array, Array]:
+        """Inputs and outputs of an experiment at rest: the means of all."""
+        pooled = self._offsets.pooled()
+        return pooled.inputs[0], pooled.outputs[0]
 
-    def _initial_state(self, experiment: Experiment) -> Array:
-        u = experiment.inputs - self.input_offset_
-        y = _outputs_of(experiment) - self.output_offset_
-        return self.lti_.estimate_initial_state(u, y)
+    def _simulated(self, experiment: Experiment) -> Array:
+        """Outputs from rest at the mean offsets."""
+        u0, y0 = self._rest()
+        return y0 + self.lti_.simulate(experiment.inputs - u0)
+
+    def _own_part(self, experiment: Experiment) -> tuple[Array, Array]:
+        """Initial state, inputs in transit; and the outputs their answers add to."""
+        y, n_trend = _outputs_of(experiment), self._evidence.free.n_trend
+        trend = trend_signals(len(y), n_trend)
+        lti = self.lti_
+        responses = free_responses(lti.A, lti.C, len(y), trend)
+        responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
+        own = estimate_initial_state(responses, y - self._simulated(experiment))
+        n = lti.order + int(lti.input_delay.sum())
+        return own[:n], self._rest()[1] + responses[:, :, n:] @ own[n:]
 
     def _in_table(
         self,
@@ -791,7 +908,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         out = np.full((n_samples, self.n_outputs_), np.nan)
         for e in experiments:
             with naming(e):
-                out[e.rows] = outputs(e) + self.output_offset_
+                out[e.rows] = outputs(e)
         return out[:, 0] if self._single_output else out
 
 

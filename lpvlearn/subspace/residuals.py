@@ -39,13 +39,18 @@ import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-from ..data.preparation import remove_trends
+from ..data.preparation import DETRENDS, remove_trends
 from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import StateSpace
-from ..systems.simulation import estimate_initial_state, free_responses
+from ..systems.simulation import (
+    estimate_initial_state,
+    free_responses,
+    trend_signals,
+)
 from ..validation import one_of, whole_number
 from .hankel import cholesky_factor, correlation_sequence, stack_factors
+from .identification import centred
 from .statistics import Evidence, autoregression
 
 Array = NDArray[np.float64]
@@ -147,25 +152,30 @@ def model_residuals(
     the outputs of one of theirs. Where only a part was fitted that costs some power,
     and no test becomes wrong.
     """
-    pairs, errors = remove_trends(list(pairs), detrend)[0], []
+    n, n_trend = lti.order, evidence.free.n_trend
+    pairs = remove_trends(list(pairs), detrend)[0]
+    pairs, errors = centred(pairs, n_trend, True)[0], []
     with np.errstate(over="ignore", invalid="ignore"):  # refused below
         for u, y in pairs:
-            free = free_responses(lti.A, lti.C, len(y))
+            free = free_responses(lti.A, lti.C, len(y), trend_signals(len(y), n_trend))
             error = y - lti.simulate(u)
-            x0 = estimate_initial_state(free, error)
+            own = estimate_initial_state(free, error)
             if predictor is None:
-                errors.append(error - free @ x0)
+                errors.append(error - free @ own)
             else:
-                errors.append(y - predictor.predict(u, y, initial_state=x0))
+                y = y - free[:, :, n:] @ own[n:]
+                errors.append(y - predictor.predict(u, y, initial_state=own[:n]))
     if not all(np.isfinite(e).all() for e in errors):
         raise ValueError(
             "residual tests need a simulation that stays finite. The model is unstable "
             "and diverges over these samples: use stability='enforce'."
         )
     inputs = [u for u, _ in pairs]
-    # The trend of an answer is not quite the answer to the trend of an input.
-    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), detrend)[0]
-    errors = [e for _, e in cleaned]
+    # The trend of an answer is not quite the answer to the trend of an input. Inputs
+    # are compared with what trends have left of the errors.
+    trend = DETRENDS[n_trend] or detrend
+    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), trend)[0]
+    inputs, errors = [u for u, _ in cleaned], [e for _, e in cleaned]
     y, e = np.vstack([y for _, y in pairs]), np.vstack(errors)
     size, largest = np.sqrt(np.mean(e**2, axis=0)), np.abs(y).max(axis=0)
     rounding = size <= _ROUNDING * y.std(axis=0)

@@ -4,8 +4,8 @@ Errors are whitened first by the noise in those of a pilot model (`noise`), so t
 their sum of squares is a likelihood. Each order is then fitted at the horizon whose
 start is best, or from the model of the order below with one state more for what that
 leaves, whichever gives less: more states never fit worse. A criterion like Akaike's
-weighs the likelihood against the number of parameters. The noise is estimated again from the
-choice, and the orders are compared once more where it has changed.
+weighs the likelihood against the number of parameters. The noise is estimated again
+from the choice, and the orders are compared once more where it has changed.
 
 The criterion trusts that the system is what the models are. Simulation of parts held
 out does not (`held_out`): it may lower the order.
@@ -23,7 +23,6 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..systems.simulation import lti_response
 from .hankel import correlation_sequence
 from .held_out import HeldOut, thinned
 from .identification import (
@@ -82,6 +81,8 @@ _AS_GOOD = 0.999  # share of the loss of the order below that more states must b
 
 # Horizon for the states that an order adds to the one below.
 _SHORT_HORIZON = 10
+
+_DOUBT = 1.0  # standard errors by which a lower order must be better
 
 # How far below the choice other orders are simulated on parts held out.
 _LOWER = (1, 2, 4, 8, 16)
@@ -237,8 +238,8 @@ def _search(
             lower = best.order - step
             if lower not in candidates:
                 continue
-            held_out[lower] = validate(candidates[lower], records, settings)
-            if held_out[lower].clearly_better_than(held_out[chosen]):
+            error = held_out[lower] = validate(candidates[lower], records, settings)
+            if error.clearly_better_than(held_out[chosen], _DOUBT):
                 chosen = lower
     white = whitening.records(records, settings.free)
     rows = _rows(tried, white, held_out)
@@ -455,8 +456,8 @@ def better_horizon(
     """
     if not _ROUNDING < residual < np.inf:
         return None
-    some = zip(records[:_SUSPECTED_RECORDS], model.initial_states, strict=False)
-    structure = [_error_structure(model, record, x0) for record, x0 in some]
+    some = enumerate(records[:_SUSPECTED_RECORDS])
+    structure = [_error_structure(model, record, k) for k, record in some]
     if all(u < _SUSPICIOUS and v < _SMOOTH for u, v in structure):
         return None
     order, energy = len(model.A), output_energy(records)
@@ -473,7 +474,7 @@ def better_horizon(
 
 
 def _error_structure(
-    model: Realization, record: Record, x0: Array
+    model: Realization, record: Record, experiment: int
 ) -> tuple[float, float]:
     """How much the simulation error depends on past inputs and on its own past.
 
@@ -482,8 +483,8 @@ def _error_structure(
     the largest of an output's error with that one sample before.
     """
     n = min(record.u.shape[1], _MAX_SUSPECTED)
-    u, m = record.u[:, :n].T, len(record.u)
-    error = record.y[:, :n].T - lti_response(*model[:4], u, x0)
+    record, m = record.head(n), len(record.u)
+    u, error = record.u.T, record.y.T - model.outputs(record, experiment)
     lags = correlation_sequence(np.hstack([u, error]), min(_N_LAGS, n))
     own = np.einsum("dii->di", lags)
     of_u, of_v = own[:, :m], own[:, m:]

@@ -393,7 +393,7 @@ def test_names_of_columns_are_kept_and_checked(fitted, spring):
     assert fitted.n_features_in_ == 4
     assert fitted.output_names_ == ["position"]
     assert fitted.scheduling_names_ == ["kappa"]
-    with pytest.raises(ValueError, match="feature names should match"):
+    with pytest.raises(ValueError, match=r"none of name 'force' \(inputs\)"):
         fitted.predict(X.rename(columns={"force": "u"}))
 
 
@@ -507,6 +507,36 @@ def test_time_may_come_from_the_local_estimator_or_be_counted_in_samples(spring)
     u = X.loc[X["run"] == "p0r0", ["force"]]
     lti = LocalLPVPipeline(SubspaceLTI(2, horizon=8)).fit(u, y.loc[u.index])
     assert lti.sampling_time_ == 1.0  # one black box: nothing means seconds
+
+
+@pytest.mark.slow
+def test_local_models_have_constants_of_their_experiments():
+    """Different at every experiment; the LPV model, which has none, says so."""
+    X, y = spring_tables(noise=0.02, n_repeats=2, seed=3)
+    level = X["run"].astype("category").cat.codes.to_numpy() % 3 - 1.0
+    moved = y + 0.2 * level[:, None]
+    plain, fitted = (
+        spring_pipeline(local=SubspaceLTI(offset=offset)).fit(X, outputs)
+        for offset, outputs in ((None, y), ("auto", moved))
+    )
+    np.testing.assert_allclose(fitted.parameters_, plain.parameters_, rtol=0.02)
+    np.testing.assert_allclose(fitted.parameters_std_, plain.parameters_std_, rtol=0.3)
+    for column in ("local_BFT", "structured_BFT"):
+        np.testing.assert_allclose(
+            fitted.report_[column], plain.report_[column], atol=10.0
+        )
+        assert fitted.report_[column].min() > 95.0
+    with pytest.warns(UserWarning, match="at 4 of 4 operating point.* have constants"):
+        fitted.predict(X)
+    plain.predict(X)  # is silent
+
+
+def test_averaged_realizations_have_constants_of_their_own():
+    X, y = spring_tables(noise=0.02, n_repeats=2, seed=3, kappas=KAPPA[:2])
+    level = X["run"].astype("category").cat.codes.to_numpy() % 3 - 1.0
+    fitted = spring_pipeline(combine="average").fit(X, y + 0.2 * level[:, None])
+    np.testing.assert_allclose(fitted.parameters_, spring_truth(KAPPA[:2]), rtol=0.05)
+    assert fitted.report_["local_BFT"].min() > 95.0
 
 
 # -- input delays ----------------------------------------------------------------

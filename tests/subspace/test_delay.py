@@ -113,6 +113,98 @@ def test_residuals_tell_of_a_delay_that_is_missing():
     assert not tests.loc["past inputs", "passed"].all()
 
 
+# -- with offsets, trends and gaps -----------------------------------------------
+
+
+def offset_tables(noise=0.02, holes=True):
+    """Two experiments about points of their own, each at rest there before it."""
+    rng = np.random.default_rng(8)
+    model = stable_model(3, 3, sampling_time=1.0, feedthrough=True)
+    late, u0 = model.with_input_delay(DELAY), [[3.0, -2.0], [-1.0, 40.0]]
+    constants = np.array([[50.0, -8.0], [-20.0, 3.0]])
+    du = rng.normal(size=(2, 300, 2))
+    y = np.array([late.simulate(v) for v in du])
+    y += noise * y.std(axis=(0, 1)) * rng.normal(size=y.shape)
+    y += (u0 @ model.dc_gain().T + constants)[:, None]
+    u = du + np.array(u0)[:, None]
+    if holes:
+        y[0, 150:152] = y[1, 200, 0] = np.nan
+    table = np.column_stack([u.reshape(600, 2), np.repeat([0, 1], 300)])
+    return late, table, y.reshape(600, 2), constants
+
+
+@pytest.mark.parametrize("input_delay", [DELAY, "auto"])
+def test_late_inputs_offsets_and_gaps_together(input_delay):
+    late, X, y, constants = offset_tables()
+    found = SubspaceLTI(
+        3, horizon=6, input_delay=input_delay, missing="split", experiment=2
+    ).fit(X, y)
+    np.testing.assert_array_equal(found.input_delay_, DELAY)
+    assert found.offset_ == "constant"
+    omega, exact = np.linspace(0.0, np.pi, 20), late.frequency_response
+    error = found.lti_.frequency_response(omega) - exact(omega)
+    assert (np.abs(error) < 5.0 * np.abs(found.frequency_response_std(omega))).all()
+    # at the mean inputs the outputs are known as well as a mean of 96 samples is
+    rest = constants[[0, 0, 1, 1]] + found.input_offset_ @ late.dc_gain().T
+    noise = 0.02 * np.nanstd(y[:300], axis=0)
+    bound = 5.0 * noise / np.sqrt(96.0)
+    np.testing.assert_array_less(np.abs(found.output_offset_ - rest), bound + 0 * rest)
+    assert found.residual_tests(X, y, n_lags=10)["passed"].all()
+    known = ~np.isnan(y)
+    for predict in (found.predict_with_initial_state, found.predict_ahead):
+        z = predict(X, y)
+        assert np.isfinite(z).all()  # missing outputs cut nothing there
+        error = (z - y)[known.all(axis=1)]
+        np.testing.assert_array_less(error.std(axis=0), 1.2 * noise)
+
+
+def test_without_noise_all_own_unknowns_are_exact():
+    """States, inputs in transit and constants; y does not depend on the others."""
+    late, X, y, _ = offset_tables(noise=0.0)
+    found = SubspaceLTI(
+        3, horizon=6, input_delay=DELAY, missing="split", experiment=2
+    ).fit(X, y)
+    omega = np.linspace(0.0, np.pi, 20)
+    np.testing.assert_allclose(
+        found.lti_.frequency_response(omega),
+        late.frequency_response(omega),
+        atol=1e-8,
+    )
+    known = ~np.isnan(y)
+    for start in (0, 37):  # in mid-motion, with inputs in transit
+        rows = slice(start, None)
+        for predict in (found.predict_with_initial_state, found.predict_ahead):
+            z = predict(X[rows], y[rows])
+            np.testing.assert_allclose(z[known[rows]], y[rows][known[rows]], atol=1e-7)
+
+
+def test_from_rest_the_input_before_is_the_offset():
+    _, X, y, _ = offset_tables(noise=0.0, holes=False)
+    found = SubspaceLTI(3, horizon=6, input_delay=DELAY).fit(X[:300, :2], y[:300])
+    still = np.broadcast_to(found.input_offset_[0], (10, 2))
+    rest = np.broadcast_to(found.output_offset_[0], (10, 2))
+    np.testing.assert_allclose(found.predict(still), rest, atol=1e-7)
+
+
+def test_holes_in_time_end_what_is_known_of_the_inputs():
+    _, u, y = late_record()
+    rows = np.r_[0:120, 123:300]
+    table = np.column_stack([u, np.arange(300.0)])[rows]
+    options = {"missing": "split", "time": 2, "offset": None}
+    found = estimator(**options).fit(table, y[rows])
+    assert found.residual_ < 1e-9
+    # 4 samples are lost at the start, and after the hole
+    assert sum(record.u.shape[1] for record in found._evidence.records) == 297 - 8
+    np.testing.assert_allclose(
+        found.predict_with_initial_state(table, y[rows]), y[rows], atol=1e-9
+    )
+    for first in (60, 120, 200):  # before, at and after the hole
+        stream = estimator(**options)
+        for start, stop in ((0, first), (first, 297)):
+            stream.partial_fit(table[start:stop], y[rows][start:stop])
+        np.testing.assert_array_equal(stream.lti_.A, found.lti_.A)
+
+
 # -- found -----------------------------------------------------------------------
 
 
