@@ -404,7 +404,7 @@ STEPS = {
     "a structure as restructurer": (
         lambda: fit(restructurer=spring_structure()),
         [
-            "`restructurer` must be an estimator, 'passthrough' or None",
+            "`restructurer` must be an estimator, 'aligned', 'passthrough' or None",
             "Got GrayBoxStructure",
             "GrayBoxRestructurer(structure)",
         ],

@@ -15,7 +15,11 @@ import pandas as pd
 from joblib import Memory, hash
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
-from sklearn.utils.validation import check_is_fitted, check_memory
+from sklearn.utils.validation import (
+    check_is_fitted,
+    check_memory,
+    has_fit_parameter,
+)
 
 from ..data.experiments import (
     NO_TIME,
@@ -25,12 +29,13 @@ from ..data.experiments import (
     read_experiments,
     read_outputs,
 )
-from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
+from ..data.operating_points import check_outputs, local_experiments
 from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
 from ..exceptions import warn
-from ..lpv.model import LPVStateSpace
+from ..lpv.auto import AutoLPV
+from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
@@ -45,14 +50,16 @@ Array = NDArray[np.float64]
 _DEFAULTS = {
     "local": SubspaceLTI,
     "restructurer": GrayBoxRestructurer,
-    "interpolator": PolynomialLPV,
+    "interpolator": AutoLPV,
 }
+
+_WITHOUT = ("aligned", "passthrough")  # what restructures without a structure
 
 # Methods that the steps need, an example, and what else is allowed.
 _STEPS = {
-    "local": (("fit",), "SubspaceLTI()", None),
-    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", "passthrough"),
-    "interpolator": (("fit", "predict"), "PolynomialLPV()", None),
+    "local": (("fit",), "SubspaceLTI()", ()),
+    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", _WITHOUT),
+    "interpolator": (("fit", "predict"), "AutoLPV() or PolynomialLPV()", ()),
 }
 
 
@@ -88,14 +95,16 @@ class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Step 3, a black-box model per operating point; None is ``SubspaceLTI()``. Its
         column roles are set by the pipeline. ``order="auto"`` becomes the order of the
         restructurer's structure where it has one.
-    restructurer : GrayBoxRestructurer, "passthrough" or None, default=None
-        Step 4; None is ``GrayBoxRestructurer()``, the observable canonical form.
-        "passthrough" interpolates the entries of the balanced local models: the
-        baseline without structure.
+    restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
+        Step 4. Without a structure, "aligned" (None) interpolates the entries of
+        the balanced local models, each turned to its neighbour by the rotation that
+        brings their states nearest; "passthrough" those whose signs alone agree, the
+        paper's baseline. ``GrayBoxRestructurer()`` is the observable canonical form.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
-        (n_points, n_params); None is ``PolynomialLPV()``, a parabola (a line through
-        two points). Any scikit-learn regressor with several outputs serves. One
+        (n_points, n_params); None is ``AutoLPV()``, which chooses by the covariances
+        of the parameters. Any scikit-learn regressor with several outputs serves; one
+        whose `fit` takes a `covariance` gets these (n_points, n_params, n_params). One
         operating point makes a constant, whatever the interpolator.
     inputs, scheduling, experiment, time, operating_point : column name, position or \
 list, default=None
@@ -145,22 +154,25 @@ list, default=None
     local_models_ : list of StateSpace
         Black-box models, continuous time, balanced.
     structured_models_ : list of StateSpace
-        Gray-box models (the balanced ones after "passthrough").
+        Gray-box models (without a structure, the balanced ones).
     restructurers_ : list
-        The fitted restructurers, empty after "passthrough".
+        The fitted restructurers, empty without a structure.
     parameters_ : DataFrame of shape (n_points, n_params)
         Gray-box parameters, one row per operating point: the efficient ones, where
         `efficient` applies.
     hinf_parameters_ : DataFrame of shape (n_points, n_params)
         Those of the H-infinity optimum; equal to `parameters_` where that is kept.
+    parameters_covariance_ : ndarray of shape (n_points, n_params, n_params)
+        Their covariances, of use to the interpolator.
     parameters_std_ : DataFrame of shape (n_points, n_params)
         Their standard deviations, to first order: from the covariance of the pooled
         black box, or with ``combine="average"`` and ``efficient=False`` from the spread
         of the realizations. NaN where that is not known: a local model that does not
         minimise the simulation error (``refine=False``, a stability that had to be
-        enforced), collinear inputs, or "passthrough".
+        enforced), collinear inputs, or no structure.
     interpolator_ : fitted regressor
     lpv_ : LPVStateSpace
+        Knows the names of the scheduling variables: ``lpv_.at({"kappa": 0.5})``.
     report_ : DataFrame
         One row per operating point: experiments, samples, order, BFT of the local and
         of the gray-box model on the estimation data (percent, mean over the outputs),
@@ -191,7 +203,7 @@ list, default=None
 
     See Also
     --------
-    SubspaceLTI, GrayBoxRestructurer, PolynomialLPV : The three steps.
+    SubspaceLTI, GrayBoxRestructurer, AutoLPV : The three steps.
 
     Examples
     --------
@@ -338,12 +350,22 @@ list, default=None
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
             kappa = self.operating_points_ = found.points.kappa
-            self.interpolator_ = self._interpolator(len(kappa)).fit(kappa, found.theta)
+            interpolator, known = self._interpolator(len(kappa)), {}
+            if has_fit_parameter(interpolator, "covariance"):
+                known["covariance"] = found.covariance
+            self.interpolator_ = interpolator.fit(kappa, found.theta, **known)
             span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
-            delay = common_delay(found.local, kappa, self.sampling_time_)
-            self.lpv_ = LPVStateSpace(found.structure, self.interpolator_, span, delay)
             self.scheduling_range_ = found.points.identified_range
             self.scheduling_names_ = as_list(self.scheduling)
+            self.lpv_ = LPVStateSpace(
+                found.structure,
+                self.interpolator_,
+                span,
+                scheduling_names=self.scheduling_names_ or None,
+                identified_range=self.scheduling_range_,
+                input_delay=common_delay(found.local, kappa, self.sampling_time_),
+            )
+            self.parameters_covariance_ = found.covariance
             report = tables(found, self.lpv_, self.sampling_time_)
             self.parameters_, self.parameters_std_ = (
                 report.parameters,
@@ -468,9 +490,10 @@ list, default=None
                 "zero, at every operating point, or say that it is zero: "
                 "local=SubspaceLTI(offset=None)."
             )
-        if getattr(self.interpolator_, "extrapolation", None) != "clip":
+        signals = [e.scheduling for e in experiments if e.scheduling is not None]
+        if signals and getattr(self.interpolator_, "extrapolation", None) != "clip":
             warn_extrapolation(
-                experiments, self.scheduling_range_, self.scheduling_names_
+                np.vstack(signals), self.scheduling_range_, self.scheduling_names_
             )
         model = self.lpv_.silenced()  # said above, of all experiments at once
         out = simulate_experiments(
@@ -512,17 +535,13 @@ list, default=None
         raise ValueError(NO_TIME.format(needed))
 
     def _restructurer(self) -> Any:
-        """The restructurer to clone, or None for "passthrough"."""
-        if self.restructurer is None:
-            return GrayBoxRestructurer()
-        return None if isinstance(self.restructurer, str) else self.restructurer
+        """The restructurer to clone, or the way without one."""
+        return _WITHOUT[0] if self.restructurer is None else self.restructurer
 
     def _interpolator(self, n_points: int) -> Any:
         if n_points == 1:
             return PolynomialLPV(degree=0)
-        if self.interpolator is None:
-            return PolynomialLPV(degree=min(2, n_points - 1))
-        return clone(self.interpolator)
+        return AutoLPV() if self.interpolator is None else clone(self.interpolator)
 
     def _check_options(self) -> None:
         one_of("combine", self.combine, ("pool", "average"))
@@ -602,20 +621,22 @@ def _check_channels(
 
 
 def _name_of_step(step: Any, name: str) -> str:
+    if name == "restructurer" and (step is None or isinstance(step, str)):
+        return step or _WITHOUT[0]
     return (_DEFAULTS[name] if step is None else type(step)).__name__
 
 
 def _check_step(name: str, step: Any) -> None:
     """Refuse what cannot be a step of the method, and say what can."""
     methods, example, other = _STEPS[name]
-    if step is None or (other and isinstance(step, str) and step == other):
+    if step is None or (isinstance(step, str) and step in other):
         return
     got = f"{step!r}" if isinstance(step, str) else type(step).__name__
     if isinstance(step, type):
         got = f"the class {step.__name__}, not an instance"
     elif all(hasattr(step, method) for method in (*methods, "get_params")):
         return
-    choice = f"an estimator, {other!r} or None" if other else "an estimator or None"
+    choice = ", ".join(["an estimator", *map(repr, other)]) + " or None"
     raise ValueError(
         f"`{name}` must be {choice}. Got {got}. Give an instance with the "
         f"method(s) {', '.join(methods)}, such as {example}."

@@ -12,6 +12,7 @@ import inspect
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
 from ..data.preparation import DETRENDS
 from ..exceptions import Told, collected, warn
+from ..lpv.alignment import aligned_models
 from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
@@ -335,7 +337,7 @@ class StructuredModels(NamedTuple):
     local: list[LocalModel]  # the black boxes
     structure: GrayBoxStructure
     theta: Array  # (n_points, n_params), parameters
-    std: Array  # (n_points, n_params), their standard deviations: NaN where not known
+    covariance: Array  # (n_points, n_params, n_params): NaN where not known
     models: list[StateSpace]
     restructurers: list[Any]  # fitted; empty without that step
 
@@ -348,18 +350,20 @@ def restructure_points(
 ) -> StructuredModels:
     """Bring the local models of all operating points into one structure.
 
-    Without a restructurer (None), the entries of the balanced models are parameters.
+    "aligned" or "passthrough": the entries of the balanced models are parameters.
     """
-    if restructurer is None:
+    if isinstance(restructurer, str):
         # poles on the negative real axis make the order grow in continuous time
-        structure, theta = balanced_entries(
-            [model.lti.balance(min(model.order, model.lti.order)) for model in local]
-        )
-        balanced = [
-            structure.model(row).with_input_delay(model.lti.input_delay)
-            for row, model in zip(theta, local, strict=True)
+        models = [
+            model.lti.balance(min(model.order, model.lti.order)) for model in local
         ]
-        unknown = np.full(theta.shape, np.nan)
+        kappa = points.kappa if restructurer == "aligned" else None
+        structure, theta = balanced_entries(models, kappa)
+        balanced = [
+            structure.model(row).with_input_delay(model.input_delay)
+            for row, model in zip(theta, models, strict=True)
+        ]
+        unknown = _unknown_covariance(theta)
         return StructuredModels(points, local, structure, theta, unknown, balanced, [])
     restructurer = _with_structure(restructurer, local)
     # What a fit is about: the model, and where they are known its realizations and
@@ -400,8 +404,8 @@ def restructure_points(
     helped = [done.result for done in found if done is not None]
     points, local = points.keep(kept), [local[k] for k in kept]
     theta = np.array([fitted.params_ for fitted in helped])
-    std = np.full(theta.shape, np.nan)
-    for row, fitted, model in zip(std, helped, local, strict=True):
+    covariance = _unknown_covariance(theta)
+    for P, fitted, model in zip(covariance, helped, local, strict=True):
         known = getattr(fitted, "params_covariance_", None)  # where it tells its own
         if known is None and model.deviated:
             known = runner.call(
@@ -413,11 +417,15 @@ def restructure_points(
                 model.deviated,
             )
         if known is not None:
-            row[:] = np.sqrt(np.diag(known))
+            P[:] = known
     models = [fitted.lti_ for fitted in helped]
     return StructuredModels(
-        points, local, helped[0].structure_, theta, std, models, helped
+        points, local, helped[0].structure_, theta, covariance, models, helped
     )
+
+
+def _unknown_covariance(theta: Array) -> Array:
+    return np.full((*theta.shape, theta.shape[1]), np.nan)
 
 
 def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
@@ -538,25 +546,28 @@ def _plain(model: StateSpace) -> StateSpace:
     return StateSpace(A, B, C, D, model.sampling_time, model.input_delay.copy())
 
 
-def balanced_entries(models: Sequence[StateSpace]) -> tuple[GrayBoxStructure, Array]:
-    """The entries of balanced models as parameters, signs aligned along the points.
+def balanced_entries(
+    models: Sequence[StateSpace], kappa: Array | None = None
+) -> tuple[GrayBoxStructure, Array]:
+    """The entries of balanced models as parameters. Orders must agree.
 
-    The baseline of the paper: no common state basis is guaranteed. Orders must agree.
+    Aligned with one another over `kappa`; without it their signs only, along the
+    points: the baseline of the paper, of no common state basis.
     """
     orders = sorted({model.order for model in models})
     if len(orders) > 1:
         raise ValueError(
-            "`restructurer='passthrough'` interpolates matrices and needs local models "
-            f"of one order. Got orders {orders}. Fix the order: "
+            "Without a structure the matrices are interpolated, which needs local "
+            f"models of one order. Got orders {orders}. Fix the order: "
             "local=SubspaceLTI(order=...)."
         )
+    if kappa is not None:
+        models = aligned_models(models, kappa)
+    else:
+        models = list(accumulate(models, with_signs_of))
     first = models[0]
     structure = GrayBoxStructure.full(orders[0], first.n_inputs, first.n_outputs)
-    rows = []
-    previous = first
-    for model in models:
-        previous = with_signs_of(previous, model)
-        rows.append(np.concatenate([getattr(previous, M).ravel() for M in "ABCD"]))
+    rows = [np.concatenate([getattr(m, M).ravel() for M in "ABCD"]) for m in models]
     return structure, np.array(rows)
 
 
