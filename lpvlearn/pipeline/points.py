@@ -43,6 +43,11 @@ _NEIGHBOURS = 2  # points that help one: those to either side along one variable
 
 _BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
 
+_HELD = (
+    "If only its controller holds the plant, identify the closed loop, with the "
+    "controller's reference as input and the controller in the structure. "
+)
+
 _SKIP = " (Mend the experiments there, or leave the point out by on_error='skip'.)"
 
 # -- step 3: a black box at every point ------------------------------------------------
@@ -118,6 +123,8 @@ def identify_point(
     if combine == "pool" or len(labels) == 1:
         fitted = _fit_local(local, experiments, sampling_time)
         pairs = _deviated(fitted)
+        if _from_closed_loop(fitted):
+            advice = _HELD + advice
         lti = _continuous(fitted.lti_, discretization, advice)
         found = LocalModel(
             lti,
@@ -132,6 +139,8 @@ def identify_point(
     # A realisation with gaps is several experiments of one label.
     realisations = [[e for e in experiments if e.label == label] for label in labels]
     fitted = _fit_local(local, realisations[0], sampling_time)
+    if _from_closed_loop(fitted):
+        advice = _HELD + advice
     chosen = clone(local)
     for name in ("order", "horizon"):
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
@@ -169,6 +178,10 @@ def _deviated(fitted: Any) -> list[ModelPair]:
     """Models to either side of a fitted one, where the estimator knows them."""
     pairs = getattr(fitted, "deviated_models", None)
     return [] if pairs is None else pairs()
+
+
+def _from_closed_loop(fitted: Any) -> bool:
+    return getattr(fitted, "method_", None) == "pbsid"
 
 
 def _in_own_time(

@@ -21,7 +21,7 @@ from ..data.experiments import (
 )
 from ..data.preparation import split_at_gaps
 from ..models.innovation import InnovationModel
-from ..models.statespace import ModelPair
+from ..models.statespace import ModelPair, StateSpace
 from ..validation import frequencies, one_of
 from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
 from .residuals import (
@@ -52,12 +52,16 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Number of states. "auto" takes the order with the best value of Schwarz's
         criterion, or a lower one that simulates parts held out clearly better. 0 is a
         pure gain.
-    method : {"po-moesp", "pi-moesp", "n4sid", "cva"}, default="po-moesp"
-        "pi-moesp" uses past inputs only as instruments: consistent under coloured
-        measurement noise, but it needs long horizons. The others use past inputs and
-        outputs and differ in the weighting.
+    method : {"auto", "po-moesp", "pi-moesp", "n4sid", "cva", "pbsid"}, default="auto"
+        "auto" is "po-moesp", or "pbsid" where the data come from a closed loop, with a
+        warning. "pi-moesp" uses past inputs only as instruments: consistent under
+        coloured measurement noise, but it needs long horizons. "n4sid" and "cva" use
+        past inputs and outputs, as "po-moesp", and differ in the weighting. "pbsid"
+        minimises the error of prediction instead of simulation: feedback does not
+        bias it, and the plant may be unstable.
     horizon : int or "auto", default="auto"
-        Past and future horizon in samples. "auto" tries a geometric grid and takes
+        Past and future horizon in samples; for "pbsid" the past that its first
+        regression needs, by Akaike's criterion. "auto" tries a geometric grid and takes
         one whose model simulates the data as well as any. Of more than 12,000
         samples "auto" looks at that many, spread over the experiments.
     sampling_time : float, default=None
@@ -66,22 +70,27 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         refused where continuous time is asked of it.
     feedthrough : bool or array-like of bool, default=True
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
-        shape (n_outputs, n_inputs) single entries of D.
+        shape (n_outputs, n_inputs) single entries of D. A feedthrough in a closed loop
+        can be told only where the controller needs a sample to answer: method="auto"
+        takes ``D = 0`` instead of True where something acts within the sample.
     refine : {"auto", "simulation", "prediction", False}, default="auto"
         What is minimised after the subspace step: "simulation" the simulation error,
         "prediction" that error whitened by an autoregression of itself and weighted by
         the inverse covariance of its innovations, which has the least variance
         under coloured or unequal noise. "auto" is "prediction" unless the other one, or
-        none, simulates parts held out clearly better.
+        none, simulates parts held out clearly better. "pbsid" minimises the error of
+        prediction whatever is said, but for False.
     stability : {"warn", "enforce"}, default="warn"
         "warn" keeps an unstable model, with a warning, where a stable one fits
         clearly worse; "enforce" returns a stable one and reports in
-        `stability_loss_` what that cost.
+        `stability_loss_` what that cost. "pbsid" keeps what it finds, or, enforced,
+        reflects poles into the unit circle and fits B and D to the simulation error.
     n_noise_states : int or "auto", default="auto"
         States of the noise model in `predictor_`. A number also raises the order of
         the subspace step by that much, which makes "po-moesp" consistent under
         coloured noise without refinement; only states that the inputs reach are
-        kept in `lti_`.
+        kept in `lti_`. "pbsid" has plant and noise share their states; what only the
+        noise drives is told from that, or a number of states besides `order`.
     initial_state : {"estimate", "rest"}, default="estimate"
         State in which every experiment of `fit` starts: estimated along with B and D,
         or zero, which is worth knowing of short experiments that start at rest.
@@ -104,6 +113,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ----------
     lti_ : StateSpace
         Discrete-time model.
+    method_ : str
+        As chosen or given.
     order_, horizon_ : int
         As chosen or given.
     singular_values_ : ndarray of shape (horizon_ * n_outputs,)
@@ -115,13 +126,17 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         What was tried: columns order, horizon, error (relative, whitened, before
         refinement), criterion (Schwarz's per value, above the best; NaN for horizons
         that lost within their order), validation_bft (percent, on parts held out; NaN
-        where that was not looked at), chosen.
+        where that was not looked at), chosen. Of
+        "pbsid" orders are those of plant and noise together, error that of the
+        regression on their states.
     residual_ : float
-        Simulation error on the data relative to the outputs, root mean square.
+        Simulation error on the data relative to the outputs, root mean square; of
+        "pbsid" the error of one-step prediction.
     stability_loss_ : float
         Increase of `residual_` that enforced stability cost; 0 where it cost nothing.
     predictor_ : InnovationModel
-        `lti_` with a noise model, Kalman gain and innovation covariance.
+        `lti_` with a noise model, Kalman gain and innovation covariance. That of
+        "pbsid" predicts unstable plants, too.
     poles_std_ : ndarray of complex, shape (order_,)
         Standard deviations of the real and imaginary parts of ``lti_.poles()``.
     input_offset_, output_offset_ : ndarray
@@ -146,6 +161,13 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     the others are added in one pass, as `partial_fit` does, which refines on the
     simulation error.
 
+    Data are taken for those of a closed loop where future inputs tell of the errors
+    of a long regression of the outputs on the past, with a p-value below 1e-4, and
+    nonlinear terms of the past do not tell more. What minimises the simulation error
+    has then a bias that no number of samples removes. A loop through which nothing but
+    white noise of the sensors goes does not show; it does no harm with
+    ``feedthrough=False``.
+
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.
 
@@ -156,6 +178,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     M. Verhaegen and V. Verdult, *Filtering and System Identification*, Cambridge
     University Press, 2007.
+
+    A. Chiuso, "The role of vector autoregressive modeling in predictor-based subspace
+    identification", Automatica 43, 2007.
 
     Examples
     --------
@@ -177,7 +202,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         order: int | str = "auto",
         *,
-        method: str = "po-moesp",
+        method: str = "auto",
         horizon: int | str = "auto",
         sampling_time: float | None = None,
         feedthrough: Any = True,
@@ -235,7 +260,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         RankWarning
             If inputs are collinear or do not excite the system sufficiently.
         UserWarning
-            If the model is unstable or explains next to nothing of the outputs.
+            If the model is unstable or explains next to nothing of the outputs, if
+            the data come from a closed loop, and if more than a tenth of the errors
+            depends on past inputs (beyond chance, and 1 % of the outputs): the model
+            lacks states, a delay or a nonlinearity.
         """
         choices = check_options(self.get_params(deep=False))
         experiments, _ = self._read(X, y, reset=True)
@@ -243,12 +271,13 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._single_output = np.asarray(y).ndim == 1
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
         gaps = self.missing == "split"
-        fitted = fit_as_stream(pairs, choices, detrend=self.detrend, gaps=gaps)
+        told: set[str] = set()
+        fitted = fit_as_stream(pairs, choices, told, detrend=self.detrend, gaps=gaps)
         if fitted is None:
             names = experiments[0].input_names
-            fitted = fit_pairs(pairs, choices, set(), detrend=self.detrend, names=names)
+            fitted = fit_pairs(pairs, choices, told, detrend=self.detrend, names=names)
         self._take(fitted, self._step_of(experiments))
-        warn_about(fitted, set())
+        warn_about(fitted, told)
         if choices.order is not None and choices.horizon is not None:
             warn_about_horizon(fitted, choices)
         return self
@@ -273,10 +302,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            If an option is unknown or not the one that the stream began with, or
-            `detrend` is set: a trend needs the whole experiment. If the `time` column
-            repeats or leaves out samples between two batches of an experiment, or
-            its step changes. If a batch has other columns than the first one.
+            If an option is unknown or not the one that the stream began with, the
+            method is "pbsid", or `detrend` is set: a trend needs the whole experiment.
+            If the `time` column repeats or leaves out samples between two batches of
+            an experiment, or its step changes. If a batch has other columns than the
+            first one.
             Everything is then as before the batch, and the right one may follow.
 
         Warns
@@ -320,6 +350,14 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 "`detrend` must be None in partial_fit, which never sees a whole "
                 f"experiment. Got {self.detrend!r}."
             )
+        if choices.method == "pbsid":
+            raise ValueError(
+                "`method` must not be 'pbsid' in partial_fit: of a stream, what it "
+                "needs is not kept. `fit` the table as a whole, or, if the plant "
+                "stands in no feedback loop, leave method='auto'."
+            )
+        if choices.method == "auto":
+            choices = choices._replace(method="po-moesp")
         before = getattr(self, "_stream", None)
         if before is not None:
             before.check_options(options)
@@ -352,6 +390,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.lti_ = fitted.evidence.state_space(fitted.model, step)
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
+        self.method_ = fitted.method
         self.selection_ = fitted.selection.table()
         self.n_outputs_ = len(fitted.output_offset)
         self.initial_states_ = fitted.model.initial_states
@@ -407,7 +446,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         experiments, n_samples = self._read(X, y, reset=False)
 
         def simulated(e: Experiment) -> Array:
-            return self._simulated(e, self._initial_state(e))
+            return self._simulated(e, self._initial_state(e, self.lti_))
 
         return self._in_table(experiments, n_samples, simulated)
 
@@ -425,7 +464,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Prediction horizon in samples.
         initial_state : {"estimate", "rest"}, default="estimate"
             "estimate" takes the deterministic initial state from the whole experiment,
-            as `predict_with_initial_state` does; "rest" uses no later output.
+            as `predict_with_initial_state` does (with "pbsid" that of plant and noise,
+            from the errors of prediction); "rest" uses no later output.
 
         Returns
         -------
@@ -443,7 +483,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 _outputs_of(e) - self.output_offset_,
                 steps=steps,
                 initial_state=(
-                    self._initial_state(e) if initial_state == "estimate" else None
+                    self._initial_state(e, predictor)
+                    if initial_state == "estimate"
+                    else None
                 ),
             )
 
@@ -502,7 +544,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         -----
         Errors that depend on *past* inputs tell of a model that lacks states, a delay
         or a nonlinearity; on the *present* input, of a lacking feedthrough; on *future*
-        inputs, of feedback. The errors are whitened by an autoregression before
+        inputs, of feedback, where errors of prediction are the ones to look at. The
+        errors are whitened by an autoregression before
         they are regressed on the inputs, so that coloured noise raises no alarm.
 
         On the samples of the fit, the errors have lost what the parameters could
@@ -531,12 +574,13 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         >>> from lpvlearn import SubspaceLTI
         >>> u, e = np.random.default_rng(0).standard_normal((2, 600))
         >>> y = lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.8], u) + 0.1 * e
-        >>> for order in (1, 2):
-        ...     model = SubspaceLTI(order, horizon=10).fit(u[:, None], y)
-        ...     tests = model.residual_tests(u[:, None], y).set_index("test")
-        ...     print(order, tests["passed"].to_dict())
-        1 {'whiteness': False, 'past inputs': False, ...}
-        2 {'whiteness': True, 'past inputs': True, ...}
+        >>> model = SubspaceLTI(2, horizon=10).fit(u[:, None], y)
+        >>> model.residual_tests(u[:, None], y)[["test", "passed"]]
+                    test  passed
+        0      whiteness    True
+        1    past inputs    True
+        2  present input    True
+        3  future inputs    True
         """
         residuals = self._residuals(X, y, errors)
         return residual_tests(residuals, n_lags=n_lags, level=level)
@@ -619,7 +663,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            If the model does not minimise the simulation error (``refine=False``).
+            If the model does not minimise the simulation error, with "pbsid" the
+            prediction error (``refine=False``).
         """
         check_is_fitted(self, "lti_")
         return self._evidence.frequency_response_covariance(self._per_sample(omega))
@@ -705,10 +750,12 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         u = experiment.inputs - self.input_offset_
         return self.lti_.simulate(u, initial_state=x0)
 
-    def _initial_state(self, experiment: Experiment) -> Array:
+    def _initial_state(
+        self, experiment: Experiment, model: StateSpace | InnovationModel
+    ) -> Array:
         u = experiment.inputs - self.input_offset_
         y = _outputs_of(experiment) - self.output_offset_
-        return self.lti_.estimate_initial_state(u, y)
+        return model.estimate_initial_state(u, y)
 
     def _in_table(
         self,

@@ -21,11 +21,14 @@ from ..data.preparation import (
 )
 from ..exceptions import RankWarning, warn
 from ..validation import one_of, positive_time
+from .closed_loop import identify_closed_loop
 from .identification import ScaledRecords, Settings, identify, scale_records
 from .realization import METHODS
+from .residuals import find_lack
 from .selection import Row, Selection, better_horizon, select
 from .simulation_fit import Freedom, Realization
 from .statistics import Evidence, shorten
+from .varx import Feedback, find_feedback
 
 Array = NDArray[np.float64]
 
@@ -34,12 +37,15 @@ REFINEMENTS = ("auto", "simulation", "prediction")
 
 
 class Choices(NamedTuple):
-    """Checked options that decide about a fit."""
+    """Checked options that decide about a fit.
+
+    The method "auto" is "pbsid" where there is feedback, else "po-moesp".
+    """
 
     order: int | None = None  # None is to be chosen
     horizon: int | None = None
     n_noise_states: int = 0
-    method: str = "po-moesp"
+    method: str = "auto"
     feedthrough: Any = True
     refine: str | bool = "auto"
     enforce_stability: bool = False
@@ -65,7 +71,7 @@ class Choices(NamedTuple):
 
 def check_options(options: Mapping[str, Any]) -> Choices:
     """Refuse what is not an option of `SubspaceLTI`, naming those that are."""
-    one_of("method", options["method"], METHODS)
+    one_of("method", options["method"], ("auto", *METHODS, "pbsid"))
     one_of("stability", options["stability"], ("warn", "enforce"))
     one_of("initial_state", options["initial_state"], ("estimate", "rest"))
     one_of("missing", options["missing"], ("raise", "split"))
@@ -152,6 +158,8 @@ class LocalFit(NamedTuple):
     stability_loss: float
     selection: Selection
     evidence: Evidence
+    method: str  # that made the model
+    innovations: Array | None  # least variances of the errors, where known and sought
     input_offset: Array  # what `detrend` subtracted
     output_offset: Array
     first_model: Realization  # of `scaled`, the samples that were fitted as one table:
@@ -179,10 +187,32 @@ def fit_pairs(
         pairs, u_offset, y_offset = remove_trends(pairs, detrend)
         pairs, basis = _with_independent_inputs(pairs, told)
         settings = choices.settings(n_outputs, n_inputs, basis)
-        settings.check_size([len(u) for u, _ in pairs], order, horizon)
+        if settings.method != "pbsid":
+            settings.check_size([len(u) for u, _ in pairs], order, horizon)
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
     scaled = scale_records(pairs)
+    feedback = find_feedback(scaled.records)
+    settings = _heed(feedback, settings, choices.feedthrough is True, told)
+    if settings.method == "pbsid":
+        try:
+            closed = identify_closed_loop(scaled, basis, order, horizon, settings)
+        except ValueError as error:
+            raise TooFewSamples(str(error)) from None
+        return LocalFit(
+            closed.evidence.model,
+            closed.singular_values,
+            closed.residual,
+            closed.stability_loss,
+            closed.selection,
+            closed.evidence,
+            settings.method,
+            None,
+            u_offset,
+            y_offset,
+            closed.evidence.model,
+            scaled,
+        )
     chosen = None
     if order is None or horizon is None:
         chosen = select(scaled.records, order, horizon, settings)
@@ -211,11 +241,58 @@ def fit_pairs(
         found.stability_loss,
         chosen,
         evidence,
+        settings.method,
+        None if feedback is None else feedback.innovations,
         u_offset,
         y_offset,
         found.model,
         scaled,
     )
+
+
+def _heed(
+    feedback: Feedback | None, settings: Settings, by_default: bool, told: set[str]
+) -> Settings:
+    """The settings with their method chosen, and the user told of feedback.
+
+    `by_default` tells that D is free because nobody said otherwise.
+    """
+    chooses, direct = settings.method == "auto", settings.free.direct
+    if feedback is None or not feedback.found:
+        return settings._replace(method="po-moesp") if chooses else settings
+    what = (
+        "The inputs know the noise of the outputs (future inputs explain "
+        f"{100.0 * feedback.share:.2g} % of the innovations, p = "
+        f"{feedback.p_value:.1g}): the data come from a closed loop. "
+    )
+    loop = direct.any() and feedback.instantaneous
+    if not chooses and settings.method != "pbsid":
+        what += (
+            f"That biases method={settings.method!r} however many samples there are. "
+            "Use method='pbsid', or identify with the controller's reference as input."
+        )
+    elif not chooses and loop:
+        what += (
+            "Inputs and outputs also depend on each other within the sample, and the "
+            "data do not tell a feedthrough from a controller that answers at once. "
+            "Use feedthrough=False unless the controller needs a sample to answer."
+        )
+    elif not chooses:
+        return settings
+    else:
+        what += "method='pbsid' was taken, which that does not bias."
+        settings = settings._replace(method="pbsid")
+        if loop and by_default:
+            what += (
+                " Inputs and outputs also depend on each other within the sample, and "
+                "the data do not tell a feedthrough from a controller that answers at "
+                "once: D = 0 was taken. If the controller needs a sample to answer, "
+                "use method='pbsid', which leaves D free."
+            )
+            none = np.zeros_like(direct)
+            settings = settings._replace(free=settings.free._replace(direct=none))
+    tell(told, "feedback", what)
+    return settings
 
 
 def _with_independent_inputs(pairs: Pairs, told: set[str]) -> tuple[Pairs, Array]:
@@ -241,9 +318,11 @@ def _with_independent_inputs(pairs: Pairs, told: set[str]) -> tuple[Pairs, Array
 
 def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
     """Tell the user when another horizon fits clearly better than the one given."""
+    if fitted.method == "pbsid":
+        return
     settings = Settings(
         fitted.evidence.free,
-        choices.method,
+        fitted.method,
         choices.refine is not False,
         choices.enforce_stability,
     )
@@ -298,7 +377,7 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "more richly, or lower `order`.",
             RankWarning,
         )
-    warn_about_pole(model.A, told)
+    warn_about_pole(model.A, told, fitted.method)
     as_found = residual - fitted.stability_loss
     if residual**2 - as_found**2 > _HALF:
         tell(
@@ -319,18 +398,41 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
         )
+    if fitted.innovations is not None and "lack" not in told:
+        lack = find_lack(fitted.evidence, fitted.innovations)
+        if lack is not None:
+            tried = {row.order for row in fitted.selection.rows}
+            remedy = "a higher `order`" if len(tried) > 1 else "order='auto'"
+            tell(
+                told,
+                "lack",
+                "The simulation error depends on past inputs, which explain "
+                f"{100.0 * lack.share:.0f} % of it (p = {lack.p_value:.1g}): the model "
+                f"of order {len(model.A)} lacks states, a delay or a nonlinearity. Try "
+                f"{remedy}, `input_delay`, or, if the system is nonlinear, smaller "
+                "inputs; `residual_tests` tells which input it is.",
+            )
 
 
-def warn_about_pole(A: Array, told: set[str]) -> None:
+def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
     """Tell the user that a model is unstable."""
     radius = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
     if radius > 1.0 + _ROUNDING:
+        remedy = (
+            "Use stability='enforce' for a stable one, another `order`, or a longer "
+            "`horizon`."
+        )
+        if method == "pbsid":
+            remedy = (
+                "Such a plant can be predicted (`predict_ahead`), but not simulated "
+                "for long nor brought into a structure: for that, identify the closed "
+                "loop, with the controller's reference as input."
+            )
         tell(
             told,
             "pole",
             f"The identified model is unstable: a pole has modulus {radius:.6g}. "
-            "Use stability='enforce' for a stable one, another `order`, or a "
-            "longer `horizon`.",
+            + remedy,
         )
 
 

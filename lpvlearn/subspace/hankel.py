@@ -83,11 +83,19 @@ def data_factor(
     n_outputs = records[0].shape[1] - n_inputs
     rows = _past_future_rows(n_inputs, n_outputs, horizon, past_outputs=past_outputs)
     if engine == "cholesky":
-        gram = _pooled_gram(records, 2 * horizon, rows, correlations)
-        lower = cholesky_factor(gram)
-        if lower is not None:
-            return lower
+        return hankel_factor(records, 2 * horizon, rows, correlations)
     return _qr_factor(records, 2 * horizon, rows)
+
+
+def hankel_factor(
+    records: Sequence[Array],
+    n_rows: int,
+    rows: NDArray[np.intp],
+    correlations: Sequence[Array] | None = None,
+) -> Array:
+    """Lower triangular factor of some `rows` of `n_rows` block rows, in that order."""
+    lower = cholesky_factor(_pooled_gram(records, n_rows, rows, correlations))
+    return _qr_factor(records, n_rows, rows) if lower is None else lower
 
 
 def _qr_factor(records: Sequence[Array], n_rows: int, rows: NDArray[np.intp]) -> Array:

@@ -46,7 +46,9 @@ from ..models.statespace import StateSpace
 from ..systems.simulation import estimate_initial_state, free_responses
 from ..validation import one_of, whole_number
 from .hankel import cholesky_factor, correlation_sequence, stack_factors
-from .statistics import Evidence, autoregression
+from .noise import autoregression
+from .simulation_fit import simulation_errors, with_initial_states
+from .statistics import Evidence
 
 Array = NDArray[np.float64]
 
@@ -69,6 +71,13 @@ _ROUNDING, _ROUNDING_OF_LARGEST = 1e-8, 1e-13
 _HEAD = 50  # outputs by which an experiment is recognised: measured, hardly the same
 
 _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligible
+
+# A lack is told that explains this share of the errors, is larger than this share of
+# the output, and so improbable by chance; it is looked for in so many samples.
+_MUCH, _MUCH_OF_OUTPUT, _CERTAIN, _MAX_SAMPLES = 0.1, 0.01, 1e-8, 4_096
+
+# Lags by which it is seen at little cost that errors are no larger than need be.
+_N_SCREEN = 10
 
 _PIECE = 8192  # windows worked on at a time: they stay in memory
 
@@ -150,17 +159,18 @@ def model_residuals(
     pairs, errors = remove_trends(list(pairs), detrend)[0], []
     with np.errstate(over="ignore", invalid="ignore"):  # refused below
         for u, y in pairs:
+            if predictor is not None:
+                x0 = predictor.estimate_initial_state(u, y)
+                errors.append(y - predictor.predict(u, y, initial_state=x0))
+                continue
             free = free_responses(lti.A, lti.C, len(y))
             error = y - lti.simulate(u)
-            x0 = estimate_initial_state(free, error)
-            if predictor is None:
-                errors.append(error - free @ x0)
-            else:
-                errors.append(y - predictor.predict(u, y, initial_state=x0))
+            errors.append(error - free @ estimate_initial_state(free, error))
     if not all(np.isfinite(e).all() for e in errors):
         raise ValueError(
             "residual tests need a simulation that stays finite. The model is unstable "
-            "and diverges over these samples: use stability='enforce'."
+            "and diverges over these samples: use stability='enforce', or "
+            "errors='prediction' with method='pbsid'."
         )
     inputs = [u for u, _ in pairs]
     # The trend of an answer is not quite the answer to the trend of an input.
@@ -187,11 +197,11 @@ def model_residuals(
     if any((y[:head] / scale).T.tobytes() in known for _, y in pairs):
         response, n_noise = [np.eye(lti.n_outputs)], 0
         if predictor is not None:
-            n_noise = -(-predictor.n_noise_states // lti.n_outputs)
-            noise = predictor.noise
-            state, A = noise.K, noise.A - noise.K @ noise.C
+            K, C = predictor.K, predictor.C
+            n_noise = -(-int(K.any(axis=1).sum()) // lti.n_outputs)
+            state, A = K, predictor.A - K @ C
             while len(response) < _LONGEST_RESPONSE and state.any():
-                response.append(-noise.C @ state)
+                response.append(-C @ state)
                 state = A @ state
         fitted = Fitted(lti.poles(), lti.D != 0.0, np.array(response), n_noise)
     return Residuals(errors, inputs, output_names, input_names, fitted)
@@ -371,6 +381,74 @@ def input_tests(
             added = [np.arange(first + j, stop, m) for j in range(m)]
             found.append([_f_test(columns, first, part, n) for part in added])
     return tests
+
+
+class Lack(NamedTuple):
+    """What past inputs explain of simulation errors."""
+
+    share: float  # beyond chance
+    p_value: float
+
+
+def find_lack(evidence: Evidence, innovations: Array) -> Lack | None:
+    """Errors of a fit that clearly depend on past inputs, and not just by a little.
+
+    `innovations` are variances of the errors of a long regression on the past, in the
+    scale of the records: a model whose errors are as small is not looked at.
+    """
+    records, left = [], _MAX_SAMPLES
+    for record in evidence.records:
+        if left > 0:
+            records.append(record.head(left))
+        left -= record.u.shape[1]
+    if not np.isfinite(evidence.model.loss):
+        return None
+    inputs, weight = [record.u.T for record in records], evidence.whitening.weight
+    model = with_initial_states(evidence.model, records, evidence.free, weight)
+    errors = simulation_errors(model, records)
+    outputs = np.hstack([record.y for record in records])
+    size = np.mean(outputs**2, axis=1)
+    variances = np.mean(np.vstack(errors) ** 2, axis=0)
+
+    def much(variance: Array) -> NDArray[np.bool_]:
+        lacking = variance - innovations
+        return (lacking > _MUCH * variance) & (lacking > _MUCH_OF_OUTPUT**2 * size)
+
+    if not much(variances).any():
+        return None
+    suspects = np.flatnonzero(much(_predicted_variances(errors)))
+    if not len(suspects):
+        return None
+    poles = np.linalg.eigvals(model.A).astype(complex)
+    fitted = Fitted(poles, evidence.free.direct, np.eye(len(size))[None])
+    names = list(range(len(size))), list(range(inputs[0].shape[1]))
+    try:
+        residuals, n_lags = with_windows(
+            Residuals(errors, inputs, *names, fitted), None
+        )
+    except ValueError:  # too few samples
+        return None
+    tests = input_tests(residuals.errors, residuals.inputs, n_lags, fitted).past
+    n = sum(map(len, residuals.errors))
+    found = [
+        Lack((test.statistic - test.dof) / (test.statistic + n), test.p_value)
+        for i in suspects
+        for test in tests[i]
+        if test.p_value < _CERTAIN
+    ]
+    found = [lack for lack in found if lack.share > _MUCH]
+    return max(found, default=None)
+
+
+def _predicted_variances(errors: Sequence[Array]) -> Array:
+    """Variances of the errors of every output, given some of its last ones."""
+    r = autocorrelations(errors, _N_SCREEN)
+    r[0] *= 1.0 + _DEPENDENT**2
+    explained = [
+        one[1:] @ linalg.solve_toeplitz(one[:-1], one[1:]) if one[0] else 0.0
+        for one in r.T
+    ]
+    return np.mean(np.vstack(errors) ** 2, axis=0) * (1.0 - np.array(explained))
 
 
 def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:

@@ -263,7 +263,7 @@ def test_unrelated_outputs_warn(rng):
         ({"horizon": 0}, "`horizon` must be 'auto' or an integer of at least 1"),
         (
             {"method": "arx"},
-            "`method` must be 'po-moesp', 'pi-moesp', 'n4sid' or 'cva'",
+            "`method` must be 'auto', 'po-moesp', .* or 'pbsid'. Got 'arx'",
         ),
         ({"stability": "maybe"}, "`stability` must be 'warn' or 'enforce'"),
         ({"sampling_time": 0.0}, "`sampling_time` must be a positive"),

@@ -497,7 +497,7 @@ def test_options_must_stay_within_a_stream(system, short_buffer, n_first, change
     model.set_params(**changed)
     (name,) = changed
     refused(model, u[n_first:], y[n_first:], f"`{name}` must stay as it was")
-    model.set_params(order=5, method="po-moesp", feedthrough=free.copy())
+    model.set_params(order=5, method="auto", feedthrough=free.copy())
     model.partial_fit(u[n_first:], y[n_first:])
     model.set_params(**changed).fit(u, y).partial_fit(u, y)
 
