@@ -24,7 +24,7 @@ from ..validation import one_of, positive_time
 from .closed_loop import identify_closed_loop
 from .identification import ScaledRecords, Settings, identify, scale_records
 from .realization import METHODS
-from .residuals import find_lack
+from .residuals import lacks
 from .selection import Row, Selection, better_horizon, select
 from .simulation_fit import Freedom, Realization
 from .statistics import Evidence, shorten
@@ -398,20 +398,20 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
         )
-    if fitted.innovations is not None and "lack" not in told:
-        lack = find_lack(fitted.evidence, fitted.innovations)
-        if lack is not None:
-            tried = {row.order for row in fitted.selection.rows}
-            remedy = "a higher `order`" if len(tried) > 1 else "order='auto'"
-            tell(
-                told,
-                "lack",
-                "The simulation error depends on past inputs, which explain "
-                f"{100.0 * lack.share:.0f} % of it (p = {lack.p_value:.1g}): the model "
-                f"of order {len(model.A)} lacks states, a delay or a nonlinearity. Try "
-                f"{remedy}, `input_delay`, or, if the system is nonlinear, smaller "
-                "inputs; `residual_tests` tells which input it is.",
-            )
+    if fitted.innovations is None or fitted.stability_loss or "lack" in told:
+        return
+    if lacks(fitted.evidence, fitted.innovations):
+        tried = {row.order for row in fitted.selection.rows}
+        remedy = "a higher `order`" if len(tried) > 1 else "order='auto'"
+        # Without figures, so that a search over orders says it once of each.
+        tell(
+            told,
+            "lack",
+            "The simulation error depends on past inputs, which explain more than a "
+            f"tenth of it: the model of order {len(model.A)} lacks states, a delay or "
+            f"a nonlinearity. Try {remedy}, `input_delay`, or, if the system is "
+            "nonlinear, smaller inputs; `residual_tests` tells which input it is.",
+        )
 
 
 def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:

@@ -383,15 +383,8 @@ def input_tests(
     return tests
 
 
-class Lack(NamedTuple):
-    """What past inputs explain of simulation errors."""
-
-    share: float  # beyond chance
-    p_value: float
-
-
-def find_lack(evidence: Evidence, innovations: Array) -> Lack | None:
-    """Errors of a fit that clearly depend on past inputs, and not just by a little.
+def lacks(evidence: Evidence, innovations: Array) -> bool:
+    """Whether errors of a fit clearly depend on past inputs, and not just by a little.
 
     `innovations` are variances of the errors of a long regression on the past, in the
     scale of the records: a model whose errors are as small is not looked at.
@@ -402,7 +395,7 @@ def find_lack(evidence: Evidence, innovations: Array) -> Lack | None:
             records.append(record.head(left))
         left -= record.u.shape[1]
     if not np.isfinite(evidence.model.loss):
-        return None
+        return False
     inputs, weight = [record.u.T for record in records], evidence.whitening.weight
     model = with_initial_states(evidence.model, records, evidence.free, weight)
     errors = simulation_errors(model, records)
@@ -415,10 +408,10 @@ def find_lack(evidence: Evidence, innovations: Array) -> Lack | None:
         return (lacking > _MUCH * variance) & (lacking > _MUCH_OF_OUTPUT**2 * size)
 
     if not much(variances).any():
-        return None
+        return False
     suspects = np.flatnonzero(much(_predicted_variances(errors)))
     if not len(suspects):
-        return None
+        return False
     poles = np.linalg.eigvals(model.A).astype(complex)
     fitted = Fitted(poles, evidence.free.direct, np.eye(len(size))[None])
     names = list(range(len(size))), list(range(inputs[0].shape[1]))
@@ -427,17 +420,15 @@ def find_lack(evidence: Evidence, innovations: Array) -> Lack | None:
             Residuals(errors, inputs, *names, fitted), None
         )
     except ValueError:  # too few samples
-        return None
+        return False
     tests = input_tests(residuals.errors, residuals.inputs, n_lags, fitted).past
     n = sum(map(len, residuals.errors))
-    found = [
-        Lack((test.statistic - test.dof) / (test.statistic + n), test.p_value)
+    return any(
+        test.p_value < _CERTAIN
+        and test.statistic - test.dof > _MUCH * (test.statistic + n)
         for i in suspects
         for test in tests[i]
-        if test.p_value < _CERTAIN
-    ]
-    found = [lack for lack in found if lack.share > _MUCH]
-    return max(found, default=None)
+    )
 
 
 def _predicted_variances(errors: Sequence[Array]) -> Array:
