@@ -135,14 +135,14 @@ def identify_point(
         if efficient and pairs:
             found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
         return found
-    # The first realisation chooses order and horizon, the others follow it.
+    # The first realisation chooses order, horizon and method, the others follow it.
     # A realisation with gaps is several experiments of one label.
     realisations = [[e for e in experiments if e.label == label] for label in labels]
     fitted = _fit_local(local, realisations[0], sampling_time)
     if _from_closed_loop(fitted):
         advice = _HELD + advice
     chosen = clone(local)
-    for name in ("order", "horizon"):
+    for name in ("order", "horizon", "method"):
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
     models, failures = [], []
