@@ -183,6 +183,7 @@ class _Predictor(NamedTuple):
     records: list[Record]
     free: Freedom
     root: Array  # lower triangular: outputs are ``root`` times those of the model
+    share: float  # samples in `records` by all samples that were used
 
     def innovation(self, model: Realization, covariance: Array) -> _Innovation:
         """The innovation form of this predictor, or of one that was moved."""
@@ -196,7 +197,8 @@ class _Predictor(NamedTuple):
         half = linalg.solve_triangular(self.root, covariance, lower=True)
         white = linalg.solve_triangular(self.root, half.T, lower=True)
         noise = NoiseModel(*_no_states(len(white)), white)
-        return parameter_covariance(self.model, self.records, self.free, noise)
+        known = parameter_covariance(self.model, self.records, self.free, noise)
+        return known * self.share
 
     def jacobian(self, n_parameters: int) -> _Changes:
         """Changes of the innovation form with the parameters.
@@ -286,7 +288,7 @@ class ClosedLoopEvidence(Evidence):
             )
         direct = self.free.direct
         known = _knowledge(self.fitted, self.joint, self.transform, self.kept, direct)
-        return known.plant * self.share
+        return known.plant
 
     def predictor(self, lti: StateSpace, n_noise_states: int | None) -> InnovationModel:
         """Innovation model of `lti`; the fit has chosen the states of the noise."""
@@ -320,12 +322,67 @@ def identify_closed_loop(
     subspace = _predictor_subspace(records, wanted, free.direct, horizon)
     errors = _errors_by_order(subspace, max(wanted, _MAX_ORDER))
     criteria = _criteria(errors, subspace)
-    n_joint = wanted
-    if settings.n_noise_states == 0 or order is None:
-        if settings.refine or order is None:
-            n_joint = max(wanted, int(np.argmin(criteria)))
+    free_order = order is None or (settings.refine and settings.n_noise_states == 0)
+    n_joint = max(wanted, int(np.argmin(criteria))) if free_order else wanted
+    fitted, joint, states, transform, kept = _fit_together(
+        subspace, records, order, n_joint, settings
+    )
+    loss = sum(
+        float(np.sum(_predicted(joint, r, free, x0)[1] ** 2))
+        for r, x0 in zip(records, states, strict=True)
+    )
+    A, B, C = joint.A[kept][:, kept], joint.B[kept], joint.C[:, kept]
+    plant = Realization(A, B, C, joint.D, states[:, kept], loss)
+    energy, stability_loss = output_energy(records) or 1.0, 0.0
+    residual = float(np.sqrt(loss / energy))
+    heads, share = shorten(records)
+    none = Whitening.none(len(free.direct))
+    known = heads, scaled.input_scale, scaled.output_scale, basis, free, none
+    evidence: Evidence
+    limit = 1.0 - STABLE_MARGIN if settings.enforce_stability else np.inf
+    stable_A = reflect_unstable(A, limit)
+    if stable_A is A:
+        evidence = ClosedLoopEvidence(
+            plant, *known, fitted is not None, share, joint, transform, kept, fitted
+        )
+    else:
+        plant = simulation_fit(stable_A, C, records, free)
+        stability_loss = float(np.sqrt(plant.loss / energy)) - residual
+        residual += stability_loss
+        evidence = Evidence(plant, *known, False, share)
+    sizes = [float(np.linalg.norm(e)) / np.sqrt(len(e)) for e in errors]
+    excess = (criteria - criteria.min()).tolist()
+    tried = [
+        Row(n, subspace.past, size, value, np.nan)
+        for n, (size, value) in enumerate(zip(sizes, excess, strict=True))
+        if order in (None, n)
+    ]
+    chosen = Selection(len(A), subspace.past, tried)
+    return ClosedLoopFit(
+        evidence, chosen, subspace.singular_values, residual, stability_loss
+    )
+
+
+class _Together(NamedTuple):
+    """Plant and noise."""
+
+    fitted: _Predictor | None  # None where it is not at a minimum
+    joint: _Innovation  # block diagonal
+    states: Array  # (n_experiments, order), initial
+    transform: Array  # from the states of `fitted` to these
+    kept: NDArray[np.bool_]  # which states are the plant's
+
+
+def _fit_together(
+    subspace: _Subspace,
+    records: Sequence[Record],
+    order: int | None,
+    n_joint: int,
+    settings: Settings,
+) -> _Together:
+    """Plant and noise of `n_joint` states, told apart; `order` is that of the plant."""
+    free, fitted, states = settings.free, None, None
     joint = _innovation_form(subspace, n_joint)
-    fitted, states = None, None
     if settings.refine:
         fitted, joint, states = _refined(joint, records, free)
         if fitted.model.blocks is None:  # it could not be refined
@@ -337,56 +394,11 @@ def identify_closed_loop(
         split = _Split(np.eye(order), np.ones(order, dtype=bool))
     if states is None:
         states = np.array([_predicted(joint, r, free)[0] for r in records])
-    transform, kept = split
-    joint, states = joint.transformed(transform), linalg.solve(transform, states.T).T
+    T, kept = split
+    joint, states = joint.transformed(T), linalg.solve(T, states.T).T
     if fitted is not None and not kept.all():
-        joint = _without_reached_noise(joint, fitted, transform, kept, free.direct)
-    energy = output_energy(records) or 1.0
-    loss = sum(
-        float(np.sum(_predicted(joint, r, free, x0)[1] ** 2))
-        for r, x0 in zip(records, states, strict=True)
-    )
-    plant = Realization(
-        joint.A[kept][:, kept],
-        joint.B[kept],
-        joint.C[:, kept],
-        joint.D,
-        states[:, kept],
-        loss,
-    )
-    residual, stability_loss = float(np.sqrt(loss / energy)), 0.0
-    heads, share = shorten(records)
-    none = Whitening.none(len(free.direct))
-    known = heads, scaled.input_scale, scaled.output_scale, basis, free, none
-    evidence: Evidence
-    limit = 1.0 - STABLE_MARGIN
-    stable_A = reflect_unstable(
-        plant.A, limit if settings.enforce_stability else np.inf
-    )
-    if stable_A is plant.A:
-        if fitted is not None:
-            fitted = fitted._replace(records=shorten(fitted.records)[0])
-        evidence = ClosedLoopEvidence(
-            plant, *known, fitted is not None, share, joint, transform, kept, fitted
-        )
-    else:
-        plant = simulation_fit(stable_A, plant.C, records, free)
-        stability_loss = float(np.sqrt(plant.loss / energy)) - residual
-        residual += stability_loss
-        evidence = Evidence(plant, *known, False, share)
-    scale = float(np.sqrt(len(free.direct)))
-    excess = (criteria - criteria.min()).tolist()
-    tried = [
-        Row(n, subspace.past, float(np.linalg.norm(e)) / scale, value, np.nan)
-        for n, (e, value) in enumerate(zip(errors, excess, strict=True))
-    ]
-    n_plant = int(kept.sum())
-    if order is not None:
-        tried = tried[n_plant : n_plant + 1]
-    chosen = Selection(n_plant, subspace.past, tried)
-    return ClosedLoopFit(
-        evidence, chosen, subspace.singular_values, residual, stability_loss
-    )
+        joint = _without_reached_noise(joint, fitted, T, kept, free.direct)
+    return _Together(fitted, joint, states, T, kept)
 
 
 def _predictor_subspace(
@@ -534,7 +546,8 @@ def _refined(model: _Innovation, records: Sequence[Record], free: Freedom) -> _R
     weighted = linalg.solve_triangular(root, C, lower=True)
     start = simulation_fit(A - K @ C, weighted, driven, predictor)
     found = refine_simulation(start, driven, predictor)
-    fitted = _Predictor(found, driven, predictor, root)
+    heads, share = shorten(driven)
+    fitted = _Predictor(found, heads, predictor, root, share)
     joint = fitted.innovation(found, covariance)
     errors = [
         _predicted(joint, record, free, x0)[1]
