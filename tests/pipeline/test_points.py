@@ -109,6 +109,7 @@ def test_deviations_follow_the_units(short_springs):
 
 
 @pytest.mark.filterwarnings("ignore:The model explains next to nothing")
+@pytest.mark.filterwarnings("ignore:The simulation error depends on past")
 @pytest.mark.parametrize("options", [{"refine": False}, {"order": 0}])
 def test_nothing_is_claimed_where_the_covariance_is_not_known(options):
     u, y = lag_record(2)

@@ -103,7 +103,7 @@ def test_a_plant_may_be_unstable():
         "present input": True,
         "future inputs": False,
     }
-    with pytest.raises(ValueError, match="errors='prediction'"):
+    with pytest.raises(ValueError, match="diverges"):
         model.residual_tests(np.tile(u, (9, 1)), np.tile(y, (9, 1)))
 
 
