@@ -462,12 +462,11 @@ def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:
         denominator = np.poly([pole, pole.conj()] if pole.imag else [pole]).real
         signals = scipy.signal.lfilter(denominator[::-1], denominator, signals, axis=0)
     states = np.hstack(spanned)
+    driven = [np.hstack([states, u[:, free]]) for free in fitted.direct]
     return [
-        scipy.signal.lfilter(
-            h, [1.0], np.hstack([states, u[:, fitted.direct[k]]]), axis=0
-        )
-        for k, h in enumerate(fitted.filter[:, output].T)
-        if h.any()
+        scipy.signal.lfilter(h, [1.0], signals, axis=0)
+        for h, signals in zip(fitted.filter[:, output].T, driven, strict=True)
+        if h.any() and signals.size
     ]
 
 

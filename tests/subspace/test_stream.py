@@ -485,6 +485,7 @@ def test_stream_warns_once_where_its_linearisation_fails(system, short_buffer, s
     assert len(found) == (true > 0.5) == (size < 1.0)
 
 
+@pytest.mark.filterwarnings("ignore:The simulation error depends on past")
 @pytest.mark.parametrize("n_first", [600, 3000])
 @pytest.mark.parametrize(
     "changed", [{"order": 4}, {"method": "cva"}, {"feedthrough": [[True, False]] * 2}]
