@@ -1,7 +1,7 @@
 """Local linear parameter-varying (LPV) identification."""
 
-from .data import from_trajectories
-from .lpv import LPVStateSpace, PolynomialLPV
+from .data import from_trajectories, resample
+from .lpv import AutoLPV, LPVStateSpace, PolynomialLPV, RationalLPV, SplineLPV
 from .metrics import (
     bft_score,
     bft_scorer,
@@ -22,6 +22,7 @@ from .structures import GrayBoxStructure
 from .subspace import SubspaceLTI
 
 __all__ = [
+    "AutoLPV",
     "BlockedTimeSeriesSplit",
     "ExperimentSplit",
     "GrayBoxRestructurer",
@@ -30,6 +31,8 @@ __all__ = [
     "LPVStateSpace",
     "LocalLPVPipeline",
     "PolynomialLPV",
+    "RationalLPV",
+    "SplineLPV",
     "StateSpace",
     "SubspaceLTI",
     "bft_score",
@@ -42,6 +45,7 @@ __all__ = [
     "parameter_fit",
     "peak_gains",
     "readable_report",
+    "resample",
     "vaf_score",
     "vaf_scorer",
 ]

@@ -164,12 +164,34 @@ TABLES = {
         ["operating point 1", "An output must vary. Got [0.5]", "on_error='skip'"],
     ),
     "an output far from zero": (
-        lambda: fit(y=Y + 1000.0),
+        lambda: fit(y=Y + 1000.0, local=SubspaceLTI(offset=None, refine=False)),
         ["must be stable", "subtract their value at rest from y", "offset='auto'"],
     ),
     "a missing sample": (
         lambda: fit(X.drop(index=50), Y.drop(index=50)),
-        ["Time column 'time' of experiment 'p0r0' must be evenly spaced", "0.04 s"],
+        [
+            "Time column 'time' of experiment 'p0r0' must be evenly spaced",
+            "0.04 s",
+            "1 row(s) are missing, at 1 place(s)",
+            "missing='split'",
+        ],
+    ),
+    "a clock that jitters": (
+        lambda: fit(X.assign(time=X["time"].mask(X.index == 7, 0.1414))),
+        [
+            "evenly spaced",
+            "at sample 7, 0.068 of the step",
+            "`time_tol`",
+            "lpvlearn.resample",
+        ],
+    ),
+    "outputs of other rows of one table": (
+        lambda: fit(X.iloc[:300], Y.iloc[1:301]),
+        ["`y` must have the row labels of X", "1 label(s)", "the first 300"],
+    ),
+    "a tolerance of a whole step": (
+        lambda: fit(time_tol=1),
+        ["`time_tol` must be a share of the time step", "Got 1"],
     ),
     "a sweep among local experiments": (
         lambda: fit(pd.concat([X, X_SWEEP]), pd.concat([Y, Y_SWEEP])),
@@ -193,7 +215,7 @@ TABLES = {
     ),
     "NaN in an output": (
         lambda: fit(y=put(np.nan, 7, "position", Y)),
-        ["y contains NaN", "'position' of experiment 'p0r0', at row 7"],
+        ["y contains NaN", "'position' of experiment 'p0r0', at row 7", "'split'"],
     ),
     "a start at rest after a gap": (
         lambda: fit(
@@ -382,7 +404,7 @@ STEPS = {
     "a structure as restructurer": (
         lambda: fit(restructurer=spring_structure()),
         [
-            "`restructurer` must be an estimator, 'passthrough' or None",
+            "`restructurer` must be an estimator, 'aligned', 'passthrough' or None",
             "Got GrayBoxStructure",
             "GrayBoxRestructurer(structure)",
         ],
@@ -712,11 +734,41 @@ SPLITS = {
 USES = {
     "other columns than at fit": (
         lambda model: model.predict(X.rename(columns={"force": "u"})),
-        ["feature names should match", "u", "missing", "force"],
+        ["the columns that the fit read", "'force' (inputs) among 'u', 'kappa'"],
     ),
     "a column less than at fit": (
-        lambda model: model.predict(X.drop(columns="time")),
-        ["feature names should match", "missing", "time"],
+        lambda model: model.predict(X.drop(columns=["kappa", "run"])),
+        ["the columns that the fit read", "'kappa' (scheduling), 'run' (experiment)"],
+    ),
+    "milliseconds after seconds": (
+        lambda model: model.predict(X.assign(time=1000 * X["time"])),
+        [
+            "unit of time of the fit",
+            "20 s",
+            "0.02 s in the fit",
+            "milliseconds by 1000",
+        ],
+    ),
+    "fewer outputs than rows": (
+        lambda model: bft_scorer(model, X, Y[:-1]),
+        ["inconsistent numbers of samples", "[600, 599]"],
+    ),
+    "a report of fewer outputs than rows": (
+        lambda model: fit_report(model, X, Y[:-1]),
+        ["inconsistent numbers of samples", "[600, 599]"],
+    ),
+    "outputs of other rows": (
+        lambda model: model.score(X.iloc[50:150], Y.iloc[60:160]),
+        [
+            "`y` must have the row labels of X",
+            "10 label(s)",
+            "the first 150",
+            "to_numpy",
+        ],
+    ),
+    "an input that is missing in a simulation": (
+        lambda model: model.predict(put(np.nan, 5, "force")),
+        ["X contains NaN", "row 5", "predict_with_initial_state"],
     ),
     "an array of the inputs alone": (
         lambda model: model.predict(X[["force"]].to_numpy()),

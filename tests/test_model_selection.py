@@ -414,6 +414,7 @@ def test_blocks_without_experiments_are_one_record():
         np.testing.assert_array_equal(test, own)
 
 
+@pytest.mark.filterwarnings("ignore:The scored table starts in mid-motion")
 def test_later_parts_of_experiments_are_predicted_from_estimated_states(few, pipeline):
     X, y = few
     cv = BlockedTimeSeriesSplit(2, gap=10, experiment="run")

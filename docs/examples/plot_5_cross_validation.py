@@ -169,13 +169,13 @@ curve.round(2)
 # ---------------------
 # Roles may also be levels of the index. Then only inputs are columns of ``X``, and
 # ``permutation_importance`` shuffles nothing else. A second input
-# that does nothing, and a structure that allows for it (the canonical form):
+# that does nothing, and black boxes, which allow for it:
 
 from sklearn.inspection import permutation_importance
 
 X_wide = X.assign(idle=rng.choice([-1.0, 1.0], len(X)))
 X_wide = X_wide.set_index(["experiment", "time", "load"])
-wide = search.best_estimator_.set_params(restructurer=None).fit(X_wide, y)
+wide = search.best_estimator_.set_params(restructurer="aligned").fit(X_wide, y)
 importance = permutation_importance(
     wide, X_wide, y, scoring=bft_scorer, n_repeats=2, random_state=0
 )
@@ -199,7 +199,8 @@ except ValueError as error:
 # In the middle of an experiment
 # ------------------------------
 # Test parts that start in mid-motion need an initial state; the scorer can estimate it
-# from the outputs, or leave the first samples out.
+# from the outputs, or leave the first samples out. From rest the score is wrong, as the
+# library says.
 
 from lpvlearn import BlockedTimeSeriesSplit
 

@@ -91,6 +91,11 @@ ax.set_ylabel("Charge")
 bar = fig.colorbar(mesh, label="gain (m/s²)")
 
 # %%
+# The frozen model anywhere in between, by name:
+
+model.lpv_.at({"load": 0.3, "charge": 0.5}).poles()
+
+# %%
 # A flight in which a load is picked up and the battery runs down, both between the
 # operating points. The truth is simulated with frozen coefficients at every sample.
 
@@ -131,4 +136,15 @@ table = pd.DataFrame(
         "time": t,
     }
 )
+round(bft_score(truth, model.predict(table)), 2)
+
+# %%
+# Left out, the interpolator is ``AutoLPV()``. It finds what the parameters are here:
+# products of straight lines in load and charge over a mass that both share.
+
+model.set_params(interpolator=None).fit(X, y)
+table_of_forms = model.interpolator_.selection_
+table_of_forms[table_of_forms["aic"] < 300].round(1)
+
+# %%
 round(bft_score(truth, model.predict(table)), 2)

@@ -13,7 +13,8 @@ role                         the column holds
 ``inputs``                   :math:`u`; by default every column without another role
 ``scheduling``               :math:`\kappa`, what the dynamics depend on; default: none
 ``experiment``               a label; rows with one label are one record in time
-``time``                     seconds or dates; checked, then left alone
+``time``                     seconds, dates or time differences; checked, and read for
+                             the step
 ``operating_point``          a label of the operating point; by default experiments are
                              grouped by their mean scheduling value
 ============================ ==========================================================
@@ -118,6 +119,9 @@ print(caught[0].message)
 # meant, for a structure, an LPV model, or ``to_continuous()``, that is an error rather
 # than a second per sample; ``sampling_time=1`` says that samples are meant. A structure
 # with fewer inputs than the table names the columns that were taken for inputs.
+#
+# Clocks that jitter, lost rows, missing values and other units of time have a
+# :ref:`page of their own <guide_logs>`.
 #
 # Columns that are not numbers
 # ----------------------------

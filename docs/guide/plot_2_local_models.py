@@ -61,12 +61,12 @@ local.lti_
 # %%
 # Order and horizon
 # -----------------
-# Every order is fitted to the record, with its errors whitened, and Schwarz's criterion
-# weighs what a state gains against the parameters that it takes. The choice, and a few
-# lower orders, then simulate parts of the record that were held out; a lower one that
-# does so clearly better is taken instead. For each order the best horizon, the error
-# before the polishing steps, the criterion above the best one, and how well the parts
-# held out are predicted, where that was looked at:
+# Every order is fitted to the record, with its errors whitened, and a criterion like
+# Akaike's weighs what a state gains against the parameters that it takes. The choice,
+# and a few lower orders, then simulate parts of the record that were held out; a lower
+# one that does so clearly better is taken instead. For each order the best horizon, the
+# error before the polishing steps, the criterion above the best one, and how well the
+# parts held out are predicted, where that was looked at:
 
 table = local.selection_.dropna(subset="criterion").set_index("order")
 table.round({"error": 4, "criterion": 4, "validation_bft": 2})
@@ -146,6 +146,56 @@ pd.DataFrame(
 )
 
 # %%
+# .. _guide_offsets:
+#
+# Offsets and drifts
+# ------------------
+# Measured signals stand about a point of work: a temperature of 80 degrees under a
+# valve that is half open. About the point :math:`(u_0, y_0)` the model is
+#
+# .. math::
+#
+#    y - y_0 = G\,(u - u_0) \quad\Longleftrightarrow\quad y = G\,u + c,
+#    \qquad c = y_0 - G(1)\,u_0,
+#
+# but for a transient that the initial state takes. So one unknown number for each
+# output stands for all offsets, and it belongs to the experiment, as the initial state
+# does. ``offset="constant"`` estimates it together with :math:`\mathfrak{B},
+# \mathfrak{D}` and :math:`x_0`, in every step of the refinement too, and projects a row
+# of ones out of the subspace step. The default, ``"auto"``, does so where the constants
+# are significant, given the colour of the noise, and is the model without them
+# elsewhere. Two experiments with different offsets:
+
+two = X.iloc[:2000].copy()
+two["experiment"] = np.repeat(["morning", "evening"], 1000)
+moved = y.iloc[:2000] + np.where(two[["experiment"]] == "morning", 0.3, -0.2)
+
+settings = {"horizon": 40, "feedthrough": False, **roles}
+offset = SubspaceLTI(6, **settings).fit(two, moved)
+print("offset_:", offset.offset_)
+pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round(3)
+
+# %%
+# ``output_offset_`` is where the outputs rest at the mean inputs, ``input_offset_``.
+# ``predict`` begins at rest there. A table of inputs does not tell which offset it will
+# have, so where those of the experiments differ, ``predict`` takes their mean and
+# warns; with outputs at hand, ``predict_with_initial_state``, scores with
+# ``initial_state="estimate"`` and ``residual_tests`` estimate each experiment's own.
+#
+# * ``offset="linear"`` adds a drift (``output_drift_``, per second). It is also what a
+#   system that *integrates* needs: its answer to an offset of the input is a straight
+#   line. A constant of its output is a matter of the initial state.
+# * ``offset=None`` says that outputs are zero at rest at input zero, and that every
+#   constant tells something of the static gain.
+# * ``detrend="constant"`` or ``"linear"`` subtracts means or straight lines from inputs
+#   and outputs before anything else. A mean is not where the system rests: what the
+#   transients at both ends add to it remains as an error, which ``offset`` does not
+#   have (with ``detrend`` set, "auto" means None; ``offset="constant"`` may follow it).
+# * In a :class:`~lpvlearn.LocalLPVPipeline` constants of the local experiments are
+#   allowed for in local models and scores. The LPV model has none, and its ``predict``
+#   says so.
+
+# %%
 # .. _guide_closed_loop:
 #
 # Data from a closed loop
@@ -210,20 +260,20 @@ in_loop.predictor_.K.round(2)
 local.residual_tests(X, y)
 
 # %%
-# Long records, gaps, drifts
-# --------------------------
+# Long records and gaps
+# ---------------------
 # * ``partial_fit`` takes a record batch by batch, in memory that does not grow with it.
 #   The model is the one that ``fit`` finds from the whole record, however it is cut;
-#   with a ``time`` column a batch that repeats or leaves out samples is refused.
+#   with a ``time`` column a batch that repeats or leaves out samples is refused (with
+#   ``missing="split"``, one that repeats them).
 # * ``initial_state="rest"`` says that experiments start at rest, instead of estimating
 #   where each starts: worth it for many short ones.
-# * ``missing="split"`` ends an experiment before a sample with NaN and starts another
-#   one after it.
-# * ``detrend="constant"`` or ``"linear"`` subtracts what an experiment drifts about.
+# * ``missing="split"`` ends an experiment before a sample with NaN, or a row that the
+#   ``time`` column misses, and starts another one after it, with an initial state and a
+#   constant of its own: :ref:`guide_logs`.
 # * ``stability="enforce"`` returns a stable model and says in ``stability_loss_`` what
 #   that cost.
 
-settings = {"horizon": 40, "feedthrough": False, **roles}
 streamed = SubspaceLTI(6, **settings)
 for batch in range(3):
     rows = slice(1000 * batch, 1000 * (batch + 1))

@@ -5,12 +5,17 @@ Interpolation
 =============
 
 Step 5. Every operating point :math:`\kappa_i` has its parameter vector
-:math:`\vartheta_i`, all in one common state basis. A polynomial of the scheduling
-variables carries each parameter from point to point, Eq. (35) of the paper:
+:math:`\vartheta_i`, all in one common state basis. A function of the scheduling
+variables carries each parameter from point to point: a polynomial, Eq. (35) of the
+paper,
 
 .. math::
 
-   \vartheta(\kappa) = \vartheta_0 + \vartheta_1 \kappa + \dots + \vartheta_d \kappa^d .
+   \vartheta(\kappa) = \vartheta_0 + \vartheta_1 \kappa + \dots + \vartheta_d \kappa^d ,
+
+or a rational function with one denominator for all parameters, as equations of motion
+:math:`M(\kappa)\, \ddot q = \dots` give it. The parameters know their covariances, and
+these tell which form may be true.
 """
 
 # %%
@@ -86,14 +91,34 @@ for degree in range(1, 5):
 pd.DataFrame(rows).T.rename_axis("degree").round(1)
 
 # %%
-# FIT rises with the degree, always: it is measured on the points themselves. To
-# *choose*, leave points out (:ref:`guide_validation`).
+# FIT rises with the degree, always: it is measured on the points themselves. What tells
+# a true form is the distance from the points in units of their standard deviations: its
+# square is about the number of degrees of freedom. By default the pipeline's
+# interpolator is :class:`~lpvlearn.AutoLPV`, which tries polynomials and rational
+# functions and takes the simplest one that the data support.
+
+pipeline.set_params(interpolator=None).fit(data.X, data.y)
+pipeline.interpolator_.selection_.round(1)
+
+# %%
+# No polynomial comes near: the arm's parameters are entries of
+# :math:`M(\kappa)^{-1} K`, and so rational functions. The pipeline says which form it
+# took; where no form can be true, or the covariances are not known, the interpolation
+# goes through the points and keeps their shape (:class:`~lpvlearn.SplineLPV`).
+
+pipeline.interpolator_.form_
+
+# %%
+# Where points differ in quality, the covariances weigh them, in
+# :class:`~lpvlearn.PolynomialLPV` and :class:`~lpvlearn.RationalLPV` alike. At a degree
+# that is too low they are not used (``weighted_``): the errors are then those of the
+# form, and precise points would bend it.
 #
 # Other interpolators
 # -------------------
 # Any regressor of scikit-learn with several outputs will do; it also says itself what
-# it makes of scheduling values outside the identified range. ``PolynomialLPV`` can warn
-# about them or hold the border's value (``extrapolation="clip"``).
+# it makes of scheduling values outside the identified range. Those of this library can
+# warn about them or hold the border's value (``extrapolation="clip"``).
 
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
@@ -101,9 +126,11 @@ from sklearn.preprocessing import SplineTransformer
 
 spline = make_pipeline(SplineTransformer(n_knots=3, degree=3), LinearRegression())
 spline.fit(kappa, pipeline.parameters_)
+parabola = PolynomialLPV(degree=2).fit(kappa, pipeline.parameters_)
 comparison = pd.DataFrame(
     {
-        "parabola": pipeline.interpolator_.predict([[0.5]])[0],
+        "rational": pipeline.interpolator_.predict([[0.5]])[0],
+        "parabola": parabola.predict([[0.5]])[0],
         "cubic spline": spline.predict([[0.5]])[0],
         "truth": data.arm.parameters(np.arccos(0.5)),
     },

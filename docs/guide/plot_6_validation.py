@@ -198,8 +198,8 @@ by_degree.round(1)
 # :class:`~lpvlearn.BlockedTimeSeriesSplit` cuts every experiment at the same places
 # (scikit-learn's ``TimeSeriesSplit`` cuts the *table*, whose later rows are other
 # experiments). The test part then starts in the middle of a motion, and a simulation
-# from rest is wrong there. Let the scorer estimate the initial state, and say so when
-# you report the result:
+# from rest is wrong there, as a warning says. Let the scorer estimate the initial
+# state, and say so when you report the result:
 
 from lpvlearn import BlockedTimeSeriesSplit
 

@@ -196,7 +196,7 @@ pd.Series(test.mean(axis=1).round(2), pd.Index(sizes, name="rows"), name="BFT (%
 # -------
 # **permutation_importance by roles**: roles may be levels of the index, too. Then only
 # inputs are columns, and only they are shuffled. (An input more needs a structure that
-# has one more: the canonical form, which is the default.)
+# has one more, or none: black boxes that are aligned, the default.)
 
 from sklearn.inspection import permutation_importance
 
@@ -238,7 +238,9 @@ round(bft_scorer(whole, X, y), 2)
 # %%
 # Wrong splits
 # ------------
-# Whatever tears an experiment apart is refused, with what to use instead:
+# With a ``time`` column, shuffled rows are refused, with what to use instead; so are
+# training sets that lack a part of an experiment, unless the local models have
+# ``missing="split"``. Without one, nothing tells that rows were shuffled.
 
 from sklearn.model_selection import KFold
 
@@ -246,3 +248,16 @@ try:
     cross_val_score(model, X, y, cv=KFold(shuffle=True), error_score="raise")
 except ValueError as error:
     print(error)
+
+# %%
+# Blocks of successive rows are in the order of time, and pass. A block that begins in
+# the middle of an experiment is scored from rest all the same: the score is too low
+# (sometimes far), and the library warns. Keep experiments whole, or estimate the
+# initial state. What ``predict`` returns there is wrong in silence: it sees no output.
+
+one = X["experiment"] == 0
+local = SubspaceLTI(2, horizon=10, inputs="u1", feedthrough=False)
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    torn = cross_val_score(local, X[one], y[one], cv=KFold(4), scoring=bft_scorer)
+print(torn.round(1), caught[0].message, sep="\n")

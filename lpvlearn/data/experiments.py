@@ -21,8 +21,16 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_array, check_consistent_length, validate_data
 
 from ..exceptions import DivergenceError
+from .alignment import align_outputs
 from .forgotten_roles import warn_of_disorder, warn_of_forgotten_roles
-from .timestamps import check_uniform_time, time_in_seconds
+from .timestamps import (
+    TIME_TOL,
+    UNTIMED,
+    Clock,
+    check_time_tol,
+    read_clock,
+    time_in_seconds,
+)
 
 Array = NDArray[np.float64]
 
@@ -31,6 +39,9 @@ Indices = NDArray[np.intp]
 # The arguments of the estimators that give columns a role.
 ROLES = ("inputs", "scheduling", "experiment", "time", "operating_point")
 
+OPTIONAL_ROLES = ("time", "operating_point")  # not needed after a fit
+
+_SEVERAL = ("inputs", "scheduling")  # roles of more than one column
 NO_TIME = (  # what a message says where seconds are needed and nothing tells them
     "`time` or `sampling_time` must tell the seconds between samples: {} in continuous "
     "time. Got neither. Name the column of times by `time=`, or give `sampling_time=`; "
@@ -39,6 +50,16 @@ NO_TIME = (  # what a message says where seconds are needed and nothing tells th
 
 _ALIKE = 0.6  # likeness (difflib's, its default) from which a name may have been meant
 _N_SHOWN = 10  # names in an error message, lest a wide table fills the screen
+
+# What else to do about a missing value, in a fit and in a simulation.
+_IDENTIFIED = (
+    ", or identify with missing='split' (of SubspaceLTI), which cuts the record there; "
+    "dropping single rows breaks it."
+)
+_SIMULATED = (
+    ". A simulation needs every sample; predict_with_initial_state(X, y) begins anew "
+    "after a gap with missing='split' (of SubspaceLTI)."
+)
 
 
 def roles_of(estimator: Any) -> dict[str, Any]:
@@ -101,6 +122,11 @@ def _did_you_mean(key: Any, names: Sequence[Any]) -> str:
     return f" Did you mean {lower[close[0]]!r}?" if close else ""
 
 
+def _shown(names: Sequence[Any]) -> str:
+    """The first of the names, for a message."""
+    return ", ".join(map(repr, names[:_N_SHOWN])) + ", ..." * (len(names) > _N_SHOWN)
+
+
 def _first_not_a_number(values: Iterable[Any]) -> int | None:
     for row, value in enumerate(values):
         try:
@@ -109,6 +135,11 @@ def _first_not_a_number(values: Iterable[Any]) -> int | None:
             if value is not pd.NA and value is not None:
                 return row
     return None
+
+
+def _keys(role: str, value: Any) -> list[Any]:
+    """The columns with a role, which only some roles may share."""
+    return as_list(value) if role in _SEVERAL or value is None else [value]
 
 
 def as_list(keys: Any) -> list[Any]:
@@ -122,6 +153,11 @@ def as_list(keys: Any) -> list[Any]:
 def is_table(X: Any) -> bool:
     """Whether `X` has named columns, as a pandas or polars DataFrame has."""
     return hasattr(X, "columns") and hasattr(X, "__getitem__") and hasattr(X, "shape")
+
+
+def n_rows_of(X: Any) -> int:
+    """Number of samples of a table of any kind."""
+    return X.shape[0] if hasattr(X, "shape") else np.asarray(X, dtype=object).shape[0]
 
 
 class Table:
@@ -177,8 +213,7 @@ class Table:
         elif not self.named:
             rule = "be an integer position, as X is an array without column names"
         else:
-            shown = ", ".join(map(repr, self.names[:_N_SHOWN]))
-            shown += ", ..." if n_columns > _N_SHOWN else ""
+            shown = _shown(self.names)
             named = [repr(level) for level in self.levels if level is not None]
             shown += f"; index levels: {', '.join(named)}" if named else ""
             rule = f"name a column or an index level of X ({shown})"
@@ -227,6 +262,8 @@ class Experiment:
     operating_point: Hashable = None  # label of the column with that role
     sampling_time: float | None = None  # seconds, of the time column; None without
     input_names: tuple[Hashable, ...] = ()  # of the columns, or their positions
+    breaks: tuple[int, ...] = ()  # samples before which time says that some are missing
+    jitter: float = 0.0  # largest deviation from even time, relative to the step
 
 
 @contextmanager
@@ -244,8 +281,10 @@ def read_experiments(
     y: Any = None,
     *,
     sampling_time: float | None = None,
+    fitted_step: float | None = None,
     reset: bool = True,
-    allow_missing: bool = False,
+    allow_missing: str = "",
+    optional: Sequence[str] = OPTIONAL_ROLES,
     **roles: Any,
 ) -> list[Experiment]:
     """Read a table as a list of experiments, in the order of first appearance.
@@ -253,20 +292,29 @@ def read_experiments(
     Rows of an experiment must be in the order of time but need not be adjacent. Roles
     are those of the estimator, unless given; without `inputs`, every column without
     another role is one. `n_features_in_` and `feature_names_in_` of the estimator are
-    set when `reset` (fitting), else checked. The declared `sampling_time` is compared
-    with the time column.
+    set when `reset` (fitting). Afterwards the columns of a table are found by name:
+    those with a role in the fit must be there, the `optional` roles excepted, and
+    others are left alone. The time column is compared with the declared
+    `sampling_time`, and with the step of the fit.
 
-    Raises a ValueError when a role names no column, a value is missing (inputs and
-    outputs with `allow_missing` excepted), infinite or not a number, time within an
-    experiment does not increase evenly or disagrees with `sampling_time`, or an
-    operating point changes within an experiment.
+    `allow_missing` names the tables in which samples may be missing: "", "y" or "Xy"
+    (inputs, scheduling variables, and whole rows that the time column misses). Outputs
+    with the labels of X in another order are put into that of X.
+
+    Raises a ValueError when a role names no column, a value is missing, infinite or not
+    a number, time within an experiment does not increase evenly (up to the `time_tol`
+    of the estimator) or has another step than it should, or an operating point changes
+    within an experiment.
     """
     roles = roles_of(estimator) | roles
     if not is_table(X):
         numeric = all(role is None for role in roles.values())
         X = _as_matrix(estimator, X, numeric=numeric)
     table = Table(X)
-    if y is None and not reset:
+    y = align_outputs(X, y)
+    if not reset and table.named and hasattr(estimator, "feature_names_in_"):
+        roles = fitted_roles(estimator, table, roles, optional)
+    elif y is None and not reset:
         validate_data(estimator, X, reset=False, skip_check_array=True)
     else:
         validate_data(estimator, X, y, reset=reset, skip_check_array=True)
@@ -284,12 +332,32 @@ def read_experiments(
         check_consistent_length(U, Y)
     labels, groups = group_rows(by_label, table.n_rows)
     names = [c.name for c in u]
-    _check_finite(U, names, "X", labels, groups, allow_missing)
-    if K is not None:
-        _check_finite(K, [c.name for c in kappa], "X", labels, groups)
-    if Y is not None:
-        _check_finite(Y, y_names, "y", labels, groups, allow_missing)
-    steps = _sampling_times(by_time, labels, groups, sampling_time)
+    gaps, remedy = "X" in allow_missing, _SIMULATED if Y is None else _IDENTIFIED
+    for values, columns, argument in (
+        (U, names, "X"),
+        (K, [c.name for c in kappa], "X"),
+        (Y, y_names, "y"),
+    ):
+        if values is not None:
+            allow = argument in allow_missing
+            _check_finite(values, columns, argument, labels, groups, allow, remedy)
+    clocks = _clocks(
+        by_time,
+        labels,
+        groups,
+        time_tol=check_time_tol(getattr(estimator, "time_tol", TIME_TOL)),
+        allow_missing=gaps,
+        expected=[
+            (
+                UNTIMED._replace(step=sampling_time),
+                "`sampling_time` must be the step of the time column",
+            ),
+            (
+                UNTIMED._replace(step=fitted_step),
+                "X must have the time step of the fit",
+            ),
+        ],
+    )
     if by_time is None:
         warn_of_disorder(X, groups)
     if reset and roles["inputs"] is None:
@@ -302,10 +370,12 @@ def read_experiments(
             outputs=None if Y is None else Y[rows],
             scheduling=None if K is None else K[rows],
             operating_point=operating_point_of(by_point, rows, label),
-            sampling_time=step,
+            sampling_time=clock.step,
             input_names=tuple(names),
+            breaks=tuple(clock.breaks.tolist()),
+            jitter=clock.jitter,
         )
-        for label, rows, step in zip(labels, groups, steps, strict=True)
+        for label, rows, clock in zip(labels, groups, clocks, strict=True)
     ]
 
 
@@ -323,6 +393,47 @@ def _check_apart(single: Mapping[str, Column | None], inputs: Sequence[Column]) 
                     f"`{taken[column.name]}` column already. Got {column.name!r}."
                 )
         taken |= {column.name: role for column in columns}
+
+
+def fitted_roles(
+    estimator: Any,
+    table: Table,
+    roles: Mapping[str, Any] | None = None,
+    optional: Sequence[str] = (),
+) -> dict[str, Any]:
+    """The roles of a fit by names that are in the table; inputs are all named.
+
+    An `optional` role becomes None where the table lacks its columns; a ValueError
+    names what else is missing. Where fit or table had no names, roles stay as they are:
+    those of the estimator, unless given.
+    """
+    roles = roles_of(estimator) if roles is None else roles
+    if not table.named or not hasattr(estimator, "feature_names_in_"):
+        return dict(roles)
+    seen, found = list(estimator.feature_names_in_), dict.fromkeys(ROLES)
+    there, lacking = {*table.names, *table.levels}, []
+
+    def name_of(key: Any) -> Any:
+        is_position = isinstance(key, Integral) and key not in seen
+        return seen[key] if is_position and -len(seen) <= key < len(seen) else key
+
+    others = {name_of(k) for r in ROLES[1:] for k in _keys(r, roles[r])}
+    for role in ROLES:
+        names = [name_of(key) for key in _keys(role, roles[role])]
+        if role == "inputs":
+            names = names or [name for name in seen if name not in others]
+        absent = [name for name in names if name not in there]
+        if names and not absent:
+            found[role] = names if role in _SEVERAL else names[0]
+        elif absent and role not in optional:
+            lacking += [f"{name!r} ({role})" for name in absent]
+            hint = _did_you_mean(absent[0], table.names)
+    if lacking:
+        raise ValueError(
+            "X must have the columns that the fit read. Got none of name "
+            f"{', '.join(lacking)} among {_shown(table.names)}.{hint}"
+        )
+    return found
 
 
 def _as_matrix(estimator: Any, X: Any, *, numeric: bool) -> NDArray[Any]:
@@ -405,7 +516,8 @@ def _check_finite(
     argument: str,
     labels: Sequence[Hashable],
     groups: Sequence[Indices],
-    allow_missing: bool = False,
+    allow_missing: bool,
+    remedy: str,
 ) -> None:
     """Refuse infinity, and NaN where it may not be, naming the first."""
     finite = np.isfinite(matrix) | (allow_missing & np.isnan(matrix))
@@ -418,34 +530,36 @@ def _check_finite(
     what = "NaN" if missing else "infinity or a value too large for dtype('float64')"
     raise ValueError(
         f"Input {argument} contains {what}. First in column {names[column]!r} of "
-        f"experiment {labels[where]!r}, at row {row}: fill the gap (interpolate) or "
-        "leave the experiment out; dropping single rows breaks the record."
+        f"experiment {labels[where]!r}, at row {row}: fill the gap (interpolate)"
+        f"{remedy}"
     )
 
 
-def _sampling_times(
+def _clocks(
     column: Column | None,
     labels: Sequence[Hashable],
     groups: Sequence[Indices],
-    sampling_time: float | None,
-) -> list[float | None]:
-    """Check the time column, and return each experiment's step."""
+    *,
+    expected: Sequence[tuple[Clock, str]],
+    **options: Any,
+) -> list[Clock]:
+    """Read the time column in every experiment; options as in `read_clock`."""
     if column is None:
-        return [None] * len(labels)
+        return [UNTIMED] * len(labels)
     seconds = time_in_seconds(column.values, column.name)
-    steps: list[float | None] = []
-    common = None
+    clocks: list[Clock] = []
+    rule = "All experiments must have the same time step"
     for label, rows in zip(labels, groups, strict=True):
-        step = check_uniform_time(
+        common = next((c for c in clocks if c.step is not None), UNTIMED)
+        clock = read_clock(
             seconds[rows],
             column=column.name,
             experiment=label,
-            sampling_time=sampling_time,
-            other_step=common,
+            expected=[*expected, (common, rule)],
+            **options,
         )
-        common = step if common is None else common
-        steps.append(step)
-    return steps
+        clocks.append(clock)
+    return clocks
 
 
 def group_rows(

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ..exceptions import ExtrapolationWarning, warn
+from ..exceptions import warn
 from .experiments import Experiment, as_numbers
 
 Array = NDArray[np.float64]
@@ -28,7 +28,6 @@ _MAX_SPREAD = 0.25
 _ROUNDING = 1e-6  # of scheduling values, relative to the range they are compared with
 _CLOSE = 0.01  # share of the range within which means are one point, if not more
 _CHAIN = 3  # a chain of neighbours longer than this many tolerances is no single point
-_DIGITS = 3  # of a range that a message shows
 
 
 @dataclass(frozen=True)
@@ -227,35 +226,3 @@ def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) ->
                 f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
                 "drop it from X, or list the inputs in `inputs`."
             )
-
-
-def warn_extrapolation(
-    experiments: Sequence[Experiment],
-    identified_range: Array,
-    names: Sequence[object],
-) -> None:
-    """Warn, once, of scheduling values outside the (2, n_scheduling) range identified.
-
-    The message names the variable, its range and the farthest value.
-    """
-    signals = [e.scheduling for e in experiments if e.scheduling is not None]
-    if not signals:
-        return
-    kappa = np.vstack(signals)
-    low, high = identified_range
-    width = np.where(high > low, high - low, 1.0)
-    excess = np.maximum(low - kappa, kappa - high) / width
-    outside = int((excess > 0).any(axis=1).sum())
-    if not outside:
-        return
-    row, j = np.unravel_index(np.argmax(excess), excess.shape)
-    digits = _DIGITS - int(np.floor(np.log10(width[j])))
-    shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
-    warn(
-        f"Scheduling variable {names[int(j)]!r} must be within the identified range, "
-        f"{shown[0]} to {shown[1]}. Got {outside} of {len(kappa)} samples "
-        f"outside, the farthest at {kappa[row, j]:.4g}: the model is extrapolated. "
-        "Identify a model there too, or hold the border's with "
-        "interpolator=PolynomialLPV(extrapolation='clip').",
-        ExtrapolationWarning,
-    )

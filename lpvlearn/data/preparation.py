@@ -9,17 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .experiments import Experiment
+from .experiments import Experiment, read_experiments
 
 Array = NDArray[np.float64]
 
 Pairs = list[tuple[Array, Array]]
 
-DETRENDS = (None, "constant", "linear")
+DETRENDS = (None, "constant", "linear")  # by the number of signals in a trend
 
 # Relative singular value below which inputs count as collinear, and the ratio of the
 # eigenvalues of their Gram matrix below which that is looked into: its rounding hides
@@ -27,14 +29,39 @@ DETRENDS = (None, "constant", "linear")
 _COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 
 
+def read_runs(
+    estimator: Any, X: Any, y: Any, *, split: bool, outputs: bool = True, **options: Any
+) -> list[Experiment]:
+    """Experiments of a table, as `read_experiments` reads them with these options.
+
+    With `split` they are cut where samples are missing, if there is a `y`: a simulation
+    alone needs all inputs. Without `outputs` these may be missing, and cut nothing.
+    """
+    split = split and y is not None
+    allowed = "Xy" if split else "" if outputs else "y"
+    found = read_experiments(estimator, X, y, allow_missing=allowed, **options)
+    if split and outputs:
+        return split_at_gaps(found)
+    if not split:
+        return found
+    return [run for e in found for run in complete_runs(e, 1, outputs=False)]
+
+
 def has_gaps(experiment: Experiment) -> bool:
-    """Whether an input or an output of an experiment is missing."""
-    signals = (experiment.inputs, experiment.outputs)
-    return any(np.isnan(values).any() for values in signals if values is not None)
+    """Whether a sample of an experiment is missing, or a part of one."""
+    return bool(experiment.breaks) or not _is_complete(experiment).all()
+
+
+def _is_complete(experiment: Experiment, outputs: bool = True) -> NDArray[np.bool_]:
+    """Samples of which no value is missing, of outputs only where asked."""
+    signals = [experiment.inputs, experiment.scheduling]
+    signals += [experiment.outputs] if outputs else []
+    known = [np.isfinite(x).all(axis=1) for x in signals if x is not None]
+    return np.logical_and.reduce(known)
 
 
 def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
-    """Cut experiments where an input or an output is missing (NaN).
+    """Cut experiments where a value is missing (NaN), or time has a hole.
 
     Every run of at least two complete samples keeps its label, and starts from an
     initial state of its own. Raises a ValueError if there is none.
@@ -56,16 +83,20 @@ def split_at_gaps(experiments: Sequence[Experiment]) -> list[Experiment]:
     return parts
 
 
-def complete_runs(experiment: Experiment, shortest: int = 2) -> list[Experiment]:
-    """Runs of at least `shortest` consecutive samples of which nothing is missing."""
-    complete = np.isfinite(experiment.inputs).all(axis=1)
-    if experiment.outputs is not None:
-        complete &= np.isfinite(experiment.outputs).all(axis=1)
-    edges = np.flatnonzero(np.diff(complete, prepend=False, append=False))
+def complete_runs(
+    experiment: Experiment, shortest: int = 2, *, outputs: bool = True
+) -> list[Experiment]:
+    """Runs of at least `shortest` consecutive samples of which nothing is missing.
+
+    Without `outputs`, these may be missing.
+    """
+    complete = _is_complete(experiment, outputs)
+    edges = np.flatnonzero(np.diff(complete)) + 1
+    cuts = np.unique([0, *edges, *experiment.breaks, len(complete)])
     return [
         _rows(experiment, slice(start, stop))
-        for start, stop in edges.reshape(-1, 2)
-        if stop - start >= shortest
+        for start, stop in pairwise(cuts)
+        if complete[start] and stop - start >= shortest
     ]
 
 
@@ -79,14 +110,15 @@ def _rows(experiment: Experiment, part: slice) -> Experiment:
         inputs=experiment.inputs[part],
         outputs=cut(experiment.outputs),
         scheduling=cut(experiment.scheduling),
+        breaks=(),
     )
 
 
 def remove_trends(pairs: Pairs, detrend: str | None) -> tuple[Pairs, Array, Array]:
     """Subtract its mean or its straight line from every channel of every experiment.
 
-    The pairs come back with the offsets of the inputs and of the outputs: means over
-    all samples, zero with ``detrend=None``.
+    The pairs come back with the offsets of inputs and outputs, a row per experiment:
+    means over its samples, zero with ``detrend=None``.
 
     Examples
     --------
@@ -94,17 +126,14 @@ def remove_trends(pairs: Pairs, detrend: str | None) -> tuple[Pairs, Array, Arra
     >>> t = np.arange(4.0)[:, None]
     >>> pairs, u0, y0 = remove_trends([(t, 2.0 * t + 1.0)], "linear")
     >>> u0, y0, np.abs(pairs[0][1]).max() < 1e-12
-    (array([1.5]), array([4.]), np.True_)
+    (array([[1.5]]), array([[4.]]), np.True_)
     """
+    means = [np.array([pair[k].mean(axis=0) for pair in pairs]) for k in (0, 1)]
     if detrend is None:
-        return pairs, np.zeros(pairs[0][0].shape[1]), np.zeros(pairs[0][1].shape[1])
+        return pairs, np.zeros_like(means[0]), np.zeros_like(means[1])
     degree = 0 if detrend == "constant" else 1
     cleaned = [(u - _trend(u, degree), y - _trend(y, degree)) for u, y in pairs]
-    total = sum(len(u) for u, _ in pairs)
-    offsets = [
-        np.asarray(sum(pair[k].sum(axis=0) for pair in pairs)) / total for k in (0, 1)
-    ]
-    return cleaned, offsets[0], offsets[1]
+    return cleaned, means[0], means[1]
 
 
 def _trend(values: Array, degree: int) -> Array:

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from typing import Any, NoReturn
+from collections.abc import Hashable, Sequence
+from numbers import Real
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+Indices = NDArray[np.intp]
+
 # Relative tolerance on a single time step (beyond the rounding of its stamps), and on
 # the mean step against a declared one, which may be a rounded number itself.
 _STEP_RTOL, _SAMPLING_TIME_RTOL = 1e-6, 1e-4
+
+# Steps beyond so many typical ones leave out a sample. Stamps may be off the grid by
+# less than half of what is left to that: then no jitter looks like a gap.
+_GAP, _LARGEST_TOL = 1.6, 0.25
+
+TIME_TOL = 0.01  # of the estimators: what a clock's jitter costs is far below noise
 
 # Decimals that stamps are tried for, down to nanoseconds. A stamp counts as a multiple
 # of the unit within the first slop, or its own rounding if that is larger; beyond the
@@ -22,8 +31,15 @@ _SLOP, _LARGEST_SLOP = 1e-6, 0.01
 _USE_INSTEAD = (
     "A dynamic model needs the samples of an experiment complete and in the order of "
     "time. Do not shuffle rows: split by experiment with ExperimentSplit, GroupKFold "
-    "or LeaveOneGroupOut, or in time with BlockedTimeSeriesSplit or TimeSeriesSplit; "
-    "resample a record that was taken unevenly."
+    "or LeaveOneGroupOut, or in time with BlockedTimeSeriesSplit or TimeSeriesSplit."
+)
+
+_CUT_THERE = (
+    "Identify with missing='split' (of SubspaceLTI), which cuts the record there, or "
+    "fill short gaps with lpvlearn.resample. Predictions past a gap need an initial "
+    "state: predict_with_initial_state, or a scorer with initial_state='estimate'. In "
+    "cross-validation split by experiment with ExperimentSplit, or in time with "
+    "BlockedTimeSeriesSplit: blocks of rows leave others with a hole."
 )
 
 _RESTARTS = (
@@ -31,8 +47,8 @@ _RESTARTS = (
     "tells them apart. "
 )
 
-# Share of the steps that go back in time, up to which a table looks like experiments
-# one after the other rather than shuffled.
+# Share of the steps up to which a table does not look shuffled: those that go back in
+# time, where experiments follow each other, or leave rows out, as a logger does.
 _FEW = 0.05
 
 
@@ -67,25 +83,54 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
     return seconds
 
 
-def check_uniform_time(
+class Clock(NamedTuple):
+    """What the stamps of one experiment tell."""
+
+    step: float | None  # seconds; None for a single sample
+    jitter: float  # largest deviation from the even grid, relative to the step
+    breaks: Indices  # samples before which others are missing
+    slack: float = 0.0  # seconds, by which the step may be wrong
+
+
+UNTIMED = Clock(None, 0.0, np.empty(0, dtype=np.intp))  # a table without stamps
+
+
+def check_time_tol(time_tol: Any) -> float:
+    """The argument `time_tol` as a float, or a ValueError that names its limits."""
+    number = isinstance(time_tol, Real) and not isinstance(time_tol, bool)
+    if not number or not 0.0 <= time_tol < _LARGEST_TOL:
+        raise ValueError(
+            "`time_tol` must be a share of the time step, at least 0 and less than "
+            f"{_LARGEST_TOL}. Got {time_tol!r}. For worse use lpvlearn.resample."
+        )
+    return float(time_tol)
+
+
+def read_clock(
     seconds: NDArray[Any],
     *,
     column: Hashable,
     experiment: Hashable,
-    sampling_time: float | None = None,
-    other_step: float | None = None,
-) -> float | None:
-    """Check that time increases evenly; its mean step (None for a single sample).
+    time_tol: float = 0.0,
+    allow_missing: bool = False,
+    expected: Sequence[tuple[Clock, str]] = (),
+) -> Clock:
+    """Read the stamps of an experiment, which must increase on an even grid.
 
-    Stamps may be rounded, to a number of decimals or to single precision: they then
-    scatter around an even grid by one unit of the last place, which is accepted as
-    long as that unit is less than half the step. Raises a ValueError when time does
-    not increase, is uneven, or has another step than declared to the estimator
-    (`sampling_time`) or found in the other experiments (`other_step`).
+    They may deviate from it by `time_tol` times the step, and by their rounding (to a
+    number of decimals or to single precision: by one unit of the last place, as long
+    as that is less than half the step). With `allow_missing` samples may be missing;
+    the grid after them need not be that before. Raises a ValueError where time is
+    otherwise, or its step not the one `expected`: pairs of a clock and of the rule that
+    the message begins with.
+
+    >>> clock = read_clock(np.array([0, 1, 2, 5, 6, 7]), column="t", experiment=0,
+    ...                    allow_missing=True)
+    >>> clock.step, clock.breaks
+    (1.0, array([3]))
     """
-    n_samples = len(seconds)
-    if n_samples < 2:
-        return None
+    if len(seconds) < 2:
+        return UNTIMED
     precision = _float_precision(seconds) * float(np.abs(seconds).max())
     t = seconds.astype(np.float64)
     steps = np.diff(t)
@@ -95,43 +140,107 @@ def check_uniform_time(
         remedy = _USE_INSTEAD
         if steps[k] == 0:
             remedy = "Drop rows that stand twice (drop_duplicates of pandas). " + remedy
-        elif np.sum(steps <= 0) <= _FEW * n_samples:
+        elif np.sum(steps <= 0) <= _FEW * len(t):
             remedy = _RESTARTS + remedy
         raise ValueError(
             f"{where} must increase. Got {t[k]:.9g} s followed by {t[k + 1]:.9g} s at "
             f"its samples {k} and {k + 1}. {remedy}"
         )
-    step = float(t[-1] - t[0]) / (n_samples - 1)
+    missing = missing_after(steps)
+    step, off = float(steps[~missing].mean()), _off_grid(t, missing)
     unit = _decimal_unit(t)
     # A step is the difference of two rounded stamps: off by one unit of their decimals,
     # and by twice their precision, as long as these are well below the step itself.
     rounding = (unit if unit < 0.5 * step else 0.0) + min(2 * precision, 0.25 * step)
-    tolerance = _STEP_RTOL * step + rounding
-    # The second condition only bites on rounded stamps: it tells a scatter around one
-    # even grid from a clock that changes its pace within the record.
-    grid = t[0] + step * np.arange(n_samples)
-    drift = rounding + n_samples * (_STEP_RTOL * step + 2 * precision)
-    deviation = np.abs(steps - step)
-    if deviation.max() > tolerance or np.abs(t - grid).max() > drift:
-        typical = float(np.median(steps))
-        k = int(np.argmax(np.abs(steps - typical)))
+    single = _STEP_RTOL * step + rounding + 2 * time_tol * step
+    # The second condition tells a scatter around one even grid from a clock that
+    # changes its pace within the record.
+    drift = rounding + len(t) * (_STEP_RTOL * step + 2 * precision) + time_tol * step
+    uneven = np.abs(steps - step)[~missing].max() > single
+    if uneven or np.abs(off).max() > drift:
+        if uneven and missing.any():  # then it is rather one grid that nothing keeps to
+            off = _off_grid(t, np.zeros_like(missing))
+        typical, k = float(np.median(steps)), int(np.argmax(np.abs(off)))
+        j = int(np.argmax(np.abs(steps - typical)))
+        raise ValueError(
+            f"{where} must be evenly spaced. Got a step of {steps[j]:.9g} s after its "
+            f"sample {j}, against {typical:.9g} s elsewhere. The largest deviation "
+            f"from an even grid is {abs(off[k]):.3g} s at sample {k}, "
+            f"{abs(off[k]) / typical:.2g} of the step; `time_tol` accepts a share of "
+            f"the step (here {time_tol:g}). For more, lpvlearn.resample puts the "
+            f"record on an even grid. {_USE_INSTEAD}"
+        )
+    if missing.any() and not allow_missing:
+        k = int(np.argmax(missing))
+        remedy = _CUT_THERE
+        if missing.sum() > _FEW * len(t):
+            remedy = (
+                f"{_USE_INSTEAD} If a logger lost them: {remedy[0].lower()}{remedy[1:]}"
+            )
+        n_missing = np.maximum(1, np.rint(steps[missing] / step) - 1).sum()
         raise ValueError(
             f"{where} must be evenly spaced. Got a step of {steps[k]:.9g} s after its "
-            f"sample {k}, against {typical:.9g} s elsewhere. {_USE_INSTEAD}"
+            f"sample {k}, against {step:.9g} s elsewhere: about {n_missing:.0f} row(s) "
+            f"are missing, at {missing.sum()} place(s). {remedy}"
         )
-    slack = 2 * rounding / (n_samples - 1)
-    for expected, source in (
-        (sampling_time, "`sampling_time` must be the step of the time column"),
-        (other_step, "All experiments must have the same time step"),
-    ):
-        if expected is None:
+    slack = 2 * (rounding + time_tol * step) / (len(t) - 1 - missing.sum())
+    for clock, rule in expected:
+        known = step if clock.step is None else clock.step
+        if abs(step - known) <= _SAMPLING_TIME_RTOL * known + slack + clock.slack:
             continue
-        if abs(step - expected) > _SAMPLING_TIME_RTOL * expected + slack:
-            raise ValueError(
-                f"{source}. Got {expected:.9g} s, and {step:.9g} s in column "
-                f"{column!r} of experiment {experiment!r}; times are in seconds."
-            )
-    return step
+        raise ValueError(
+            f"{rule}. Got {known:.9g} s, and {step:.9g} s in column {column!r} of "
+            f"experiment {experiment!r}; {_about_units(step / known)}."
+        )
+    jitter = float(np.abs(off).max()) / step
+    return Clock(step, jitter, np.flatnonzero(missing) + 1, slack)
+
+
+def missing_after(steps: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Steps so long that samples must be missing within."""
+    return steps > _GAP * np.median(steps)
+
+
+def _off_grid(
+    t: NDArray[np.float64], missing: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Stamps about even grids of one step, the best (least squares) through all runs.
+
+    Runs are what is between missing samples.
+    """
+    run = np.concatenate([[0], np.cumsum(missing)])
+    first = np.concatenate([[0], np.flatnonzero(missing) + 1])
+    number, elapsed = (x - x[first][run] for x in (np.arange(len(t)), t))
+    number, elapsed = (
+        x - (np.bincount(run, x) / np.bincount(run))[run] for x in (number, elapsed)
+    )
+    return elapsed - number * (number @ elapsed) / (number @ number)
+
+
+def check_unit(step: float | None, fitted: float, column: Hashable) -> None:
+    """Refuse a step that is that of the fit in another unit of time."""
+    if step is not None and _power_of_1000(step / fitted):
+        raise ValueError(
+            f"X must have the unit of time of the fit. Got a step of {step:.9g} s in "
+            f"column {column!r}, and {fitted:.9g} s in the fit; "
+            f"{_about_units(step / fitted)}."
+        )
+
+
+def _power_of_1000(ratio: float) -> bool:
+    power = np.log(ratio) / np.log(1000.0)
+    return abs(power) > 0.5 and abs(power - round(power)) < _SAMPLING_TIME_RTOL
+
+
+def _about_units(ratio: float) -> str:
+    """What a step that is so many times another may come from."""
+    if not _power_of_1000(ratio):
+        return "times are in seconds"
+    return (
+        f"{max(ratio, 1 / ratio):.0f} times {'as long' if ratio > 1 else 'shorter'}: "
+        "numbers are read as seconds. Divide a column of milliseconds by 1000, or give "
+        "dates or time differences, which tell their unit"
+    )
 
 
 def _float_precision(seconds: NDArray[Any]) -> float:

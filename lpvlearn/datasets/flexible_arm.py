@@ -210,16 +210,51 @@ class FlexibleArm:
         loops = np.linalg.solve(M, self._damping[:2, :2])
         return StateSpace(-loops, loops, np.eye(2))
 
-    def structure(self) -> GrayBoxStructure:
+    def structure(self, form: str = "rate") -> GrayBoxStructure:
         """Gray-box structure of `linearize`, Eq. (32) corrected: p1, ..., p16.
 
         The parameters fill rows 3 to 6 of A column by column; B repeats columns 3
         and 4 with the opposite sign; C holds the lengths of the links and is known.
+
+        Parameters
+        ----------
+        form : {"rate", "momentum"}, default="rate"
+            The state: ``(v, q')``, as in the paper, or ``(v, z)`` with the momenta
+            ``M q' = [G Lambda, K] z``. The parameters are the same, and so are the
+            frozen models; but while theta2 moves, only momenta change by the forces
+            alone: ``z' = [u - theta'; -v]``.
+
+        Raises
+        ------
+        ValueError
+            If `form` is unknown.
+
+        Examples
+        --------
+        >>> arm = FlexibleArm()
+        >>> momentum = arm.structure("momentum").model(arm.parameters(1.0))
+        >>> bool((momentum - arm.linearize(1.0)).hinf_norm() < 1e-9)
+        True
         """
+        if form not in ("rate", "momentum"):
+            raise ValueError(f"`form` must be 'rate' or 'momentum'. Got {form!r}.")
         p = np.array([f"p{i}" for i in range(1, 17)]).reshape(4, 4).T
-        A: list[list[float | str]] = [[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]]
+        A: list[list[float | str]]
+        B: list[list[float | str]]
+        if form == "momentum":  # q' = Q z, the columns of Q are -p[:, [2, 3, 0, 1]]
+            columns = p[:, [2, 3, 0, 1]]
+            A = [[0, 0, *(f"-{name}" for name in row)] for row in columns[2:]]
+            A += [[0, 0, *map(str, row)] for row in columns[:2]]
+            A += [[-1, 0, 0, 0, 0, 0], [0, -1, 0, 0, 0, 0]]
+            B = [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0], [0, 0]]
+            C: list[list[float | str]] = [
+                [0, 0, *(_weighed_sum(-row, column) for column in columns.T)]
+                for row in self._output_matrix()[:, 2:]
+            ]
+            return GrayBoxStructure.from_template(A, B, C)
+        A = [[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]]
         A += [[*map(str, row), 0, 0] for row in p]
-        B: list[list[float | str]] = [[0, 0], [0, 0]]
+        B = [[0, 0], [0, 0]]
         B += [[f"-{name}" for name in row] for row in p[:, 2:]]
         return GrayBoxStructure.from_template(A, B, self._output_matrix().tolist())
 
@@ -393,6 +428,13 @@ class ArmResponse:
     def kappa(self) -> Array:
         """Scheduling variable cos(theta2), shape (n_experiments, n_samples)."""
         return np.cos(self.theta2)
+
+
+def _weighed_sum(weights: Array, names: NDArray[np.str_]) -> str:
+    """An expression of a template: the names that weigh."""
+    return " + ".join(
+        f"{w:.17g}*{name}" for w, name in zip(weights, names, strict=True) if w
+    )
 
 
 def _pair_experiments(

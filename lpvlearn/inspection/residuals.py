@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from ..data.experiments import is_table, read_experiments, read_outputs
+from ..data.alignment import align_outputs
+from ..data.experiments import is_table, read_outputs
+from ..data.preparation import read_runs
 from ..subspace import SubspaceLTI
 from ..subspace.residuals import (
     Residuals,
@@ -34,8 +36,6 @@ from .drawing import (
 from .fitted import unwrapped
 
 Array = NDArray[np.float64]
-
-_ROLES = ("inputs", "experiment", "time", "scheduling", "operating_point")
 
 # Bands hold the correlations of strangers with this probability, each for itself: of
 # the 76 values of a panel pair some are outside a 95 % band always.
@@ -204,13 +204,11 @@ class ResidualDisplay:
             residuals = estimator._residuals(X, y, errors)
         elif simulates and hasattr(estimator, "predict_with_initial_state"):
             X = X if is_table(X) else np.asarray(X)
+            y = align_outputs(X, y)
             outputs, names = read_outputs(y)
             simulated = estimator.predict_with_initial_state(X, y)
             wrong = outputs - np.reshape(simulated, outputs.shape)
-            roles: dict[str, Any] = {
-                role: getattr(estimator, role, None) for role in _ROLES
-            }
-            runs = read_experiments(estimator, X, y, reset=False, **roles)
+            runs = read_runs(estimator, X, y, split=True, reset=False)
             labels = input_labels(runs[0].input_names)
             residuals = Residuals(
                 [wrong[e.rows] for e in runs], [e.inputs for e in runs], names, labels

@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..data.experiments import Table, as_numbers, is_table, read_outputs
+from ..data.alignment import align_outputs
+from ..data.experiments import (
+    ROLES,
+    Table,
+    as_numbers,
+    fitted_roles,
+    is_table,
+    read_outputs,
+)
 from ..data.timestamps import time_in_seconds
 from ..metrics.scorers import check_options, simulate
 from ..metrics.scores import bft_score
@@ -42,7 +50,7 @@ class SimulationDisplay:
     time : ndarray of shape (n_samples,)
         Seconds (or sample numbers, with another `time_label`).
     y_true : ndarray of shape (n_samples, n_outputs)
-        Measured outputs.
+        Measured outputs; missing ones (NaN) leave a gap, and do not count.
     predictions : dict from str to ndarray of shape (n_samples, n_outputs)
         Simulated outputs, by name of the model.
     output_names : sequence of str, default=None
@@ -55,6 +63,8 @@ class SimulationDisplay:
     ----------
     bft_ : dict from str to ndarray of shape (n_outputs,)
         Best fit ratios, percent, over the whole record.
+    n_missing_ : ndarray of shape (n_outputs,)
+        Samples of every output that are missing.
     axes_ : ndarray of Axes of shape (n_outputs,)
     figure_ : Figure
     lines_ : dict from str to list of Line2D
@@ -97,7 +107,7 @@ class SimulationDisplay:
             raise ValueError(
                 "`y_pred` must not name a simulation 'measured', which names `y_true`."
             )
-        self.bft_ = {}
+        self.bft_, self.n_missing_ = {}, np.isnan(self.y_true).sum(axis=0)
         for name, y_pred in self.predictions.items():
             if y_pred.shape != self.y_true.shape:
                 raise ValueError(
@@ -147,7 +157,8 @@ class SimulationDisplay:
         Raises
         ------
         ValueError
-            If shapes differ, a value is not finite, or `zoom` holds no samples.
+            If shapes differ, a value is infinite, a simulation is NaN where there is a
+            measurement, or `zoom` holds no samples.
         """
         named = y_pred if isinstance(y_pred, Mapping) else {"simulated": y_pred}
         display = cls(time, y_true, named, output_names=output_names, units=units)
@@ -206,15 +217,16 @@ class SimulationDisplay:
                 "it and use from_predictions()."
             )
         X = X if is_table(X) else np.asarray(X)
-        outputs, names = read_outputs(y)
+        outputs, names = read_outputs(align_outputs(X, y))
         rows = _rows_of(estimator, X, experiment)
         part = X.iloc[rows] if hasattr(X, "iloc") else X[rows]
-        y_pred = simulate(estimator, part, outputs[rows], initial_state)
+        found = simulate(estimator, part, outputs[rows], initial_state)
+        found.warn_of_motion(estimator, part)
         time, label = _time_of(estimator, Table(part))
         display = cls(
             time,
-            outputs[rows],
-            {name: y_pred},
+            found.measured,
+            {name: found.simulated},
             output_names=names,
             units=units,
             time_label=label,
@@ -248,7 +260,9 @@ class SimulationDisplay:
         if zoom is not None:
             title = f"BFT of the whole record, {self.time[0]:g} to {self.time[-1]:g} s"
         for i, one in enumerate(self.axes_):
-            signals = {"measured": (self.y_true, "measured")}
+            lost = self.n_missing_[i]
+            known = f"measured, {lost} missing" if lost else "measured"
+            signals = {"measured": (self.y_true, known)}
             for name, y_pred in self.predictions.items():
                 signals[name] = (y_pred, f"{name}: BFT {self.bft_[name][i]:.1f} %")
             for k, (name, (signal, label)) in enumerate(signals.items()):
@@ -309,7 +323,7 @@ def _rows_of(estimator: Any, X: Any, label: Hashable) -> NDArray[np.intp]:
 
 def _time_of(estimator: Any, table: Table) -> tuple[Array, str]:
     """Time of every row in seconds, else sample numbers; and the axis label."""
-    column = table.one(getattr(estimator, "time", None), "time")
+    column = table.one(fitted_roles(estimator, table, optional=ROLES)["time"], "time")
     if column is not None:
         seconds = time_in_seconds(column.values, column.name)
         return np.asarray(seconds, dtype=float), "Time (s)"

@@ -1,6 +1,9 @@
 """Step 5 of the method: parameters over the scheduling variables; the LPV model."""
 
+from .auto import AutoLPV
 from .model import LPVStateSpace
 from .polynomial import PolynomialLPV
+from .rational import RationalLPV
+from .spline import SplineLPV
 
-__all__ = ["LPVStateSpace", "PolynomialLPV"]
+__all__ = ["AutoLPV", "LPVStateSpace", "PolynomialLPV", "RationalLPV", "SplineLPV"]

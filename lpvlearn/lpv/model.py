@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import DivergenceError, finite_simulation
+from ..exceptions import (
+    DivergenceError,
+    ExtrapolationWarning,
+    finite_simulation,
+    warn,
+)
 from ..models.statespace import StateSpace, sorted_poles
 from ..models.system_matrix import blocks
+from ..structures.map import numerical_jacobian
 from ..structures.structure import GrayBoxStructure
 from ..systems.sampling import sample_zoh
 from ..systems.simulation import state_trajectory
 from ..systems.tabulation import tabulate
 from ..validation import (
     finite_samples,
+    matrix,
     positive_time,
     real_array,
     state_vector,
 )
 
 Array = NDArray[np.float64]
+
+_Basis = Callable[[Array], ArrayLike] | ArrayLike
+
+_DIGITS = 3  # of a range that a message shows
 
 # Samples whose matrices are held at once: for 6 states, 2 inputs and outputs 17 MB.
 _BLOCK = 32_768
@@ -45,6 +57,15 @@ class LPVStateSpace:
         n_params). Says itself what it makes of values outside of the range.
     scheduling_range : array-like of shape (2, n_scheduling)
         Smallest and largest scheduling values that the model was identified on.
+    scheduling_names : sequence, default=None
+        Names of the scheduling variables, to give their values by; None is numbers.
+    identified_range : array-like of shape (2, n_scheduling), default=None
+        Beyond which `at` and `simulate` warn, whatever the interpolator does but for
+        holding the border's value. A pipeline's is `scheduling_range`, widened by how
+        far the variables moved within an experiment. None leaves it to the
+        interpolator.
+    bases : tuple of callables or arrays of shape (order, order), default=()
+        Changes of the structure's state basis, see :meth:`change_basis`.
 
     Attributes
     ----------
@@ -85,11 +106,22 @@ class LPVStateSpace:
     >>> free = lpv.free_responses(trajectory, sampling_time=0.1)
     >>> np.allclose(moved - y, free @ [1, 0])
     True
+
+    The momentum of a mass 1 + kappa in place of the rate: the same system.
+
+    >>> momentum = lpv.change_basis(lambda kappa: np.diag([1, 1 + kappa[0]]))
+    >>> momentum.at(0.5).A[0].round(9), momentum.at(0.5, rate=3.0).A[1].round(9)
+    (array([0.        , 0.66666667]), array([-9.75,  1.5 ]))
+    >>> np.allclose(momentum.simulate(np.ones(500), trajectory, 0.1), y)
+    True
     """
 
     structure: GrayBoxStructure
     interpolator: Any
     scheduling_range: Array
+    scheduling_names: Sequence[Hashable] | None = None
+    identified_range: ArrayLike | None = None
+    bases: tuple[_Basis, ...] = ()
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -115,6 +147,12 @@ class LPVStateSpace:
         bounds.setflags(write=False)
         object.__setattr__(self, "scheduling_range", bounds)
         object.__setattr__(self, "n_scheduling", bounds.shape[1])
+        names = self.scheduling_names
+        if names is not None and len(names) != bounds.shape[1]:
+            raise ValueError(
+                f"`scheduling_names` must name the {bounds.shape[1]} scheduling "
+                f"variables. Got {list(names)}."
+            )
         for name in ("order", "n_inputs", "n_outputs"):
             object.__setattr__(self, name, getattr(self.structure, name))
 
@@ -151,12 +189,21 @@ class LPVStateSpace:
             )
         return values.reshape(len(kappa), n_params)
 
-    def at(self, kappa: ArrayLike) -> StateSpace:
+    def at(
+        self,
+        kappa: ArrayLike | Mapping[Any, float],
+        rate: ArrayLike | Mapping[Any, float] | None = None,
+    ) -> StateSpace:
         """The frozen model at one scheduling value, Eq. (2).
 
         Parameters
         ----------
-        kappa : float or array-like of shape (n_scheduling,)
+        kappa : float, array-like of shape (n_scheduling,) or mapping
+            By position, or by the names of the variables:
+            ``{"mass": 150, "speed": 25}``.
+        rate : float, array-like of shape (n_scheduling,) or mapping, default=None
+            Rate of change of `kappa` (1/s), which A depends on after a change of basis
+            that follows kappa; None is rest.
 
         Returns
         -------
@@ -167,9 +214,66 @@ class LPVStateSpace:
         ------
         ValueError
             If `kappa` is not one finite value of every scheduling variable.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Outside of `identified_range`.
         """
-        theta = self.parameters(np.reshape(kappa, (1, -1)))[0]
-        return self.structure.model(theta)
+        place = self._place(kappa)
+        self._tell_extrapolation(place[None])
+        return self.silenced()._at(place, rate)
+
+    def _at(self, place: Array, rate: Any = None) -> StateSpace:
+        model = self.structure.model(self.parameters(place[None])[0])
+        if not self.bases:
+            return model
+        T = self._basis_at(place)
+        model = model.transform(T)
+        if rate is None:
+            return model
+        speed = self._place(rate)
+        slopes = numerical_jacobian(self._basis_at, place, self.scheduling_range[1])
+        term = np.tensordot(speed, slopes, 1) @ np.linalg.inv(T)
+        return StateSpace(model.A + term, model.B, model.C, model.D)
+
+    def change_basis(self, T: _Basis) -> LPVStateSpace:
+        """The same system in the state ``z = T(kappa) x``.
+
+        Parameters
+        ----------
+        T : callable or array-like of shape (order, order)
+            Invertible; a function gets the scheduling values, shape (n_scheduling,).
+
+        Returns
+        -------
+        LPVStateSpace
+            Of the same outputs along any trajectory. Its states, and the frozen models
+            of :meth:`at`, are those of the new basis.
+
+        Raises
+        ------
+        ValueError
+            If T has another shape or is singular in the middle of the range.
+
+        Notes
+        -----
+        While kappa moves, T does:
+        ``z' = (T A T^-1 + T' T^-1) z + T B u``, ``T' = sum_j dT/dkappa_j kappa_j'``.
+        The term ``T' T^-1`` is that of `at` with a `rate`. Models that are interpolated
+        in the new basis leave it out and are another system: that choice is the
+        structure's, see :ref:`guide_state_basis`.
+        """
+        changed = replace(self, bases=(*self.bases, T))
+        changed._at(self.scheduling_range.mean(axis=0))  # refuses what is no basis
+        return changed
+
+    def _basis_at(self, kappa: Array) -> Array:
+        """T from the structure's state to this one's."""
+        T = np.eye(self.order)
+        for basis in self.bases:
+            T = matrix("T", basis(kappa) if callable(basis) else basis) @ T
+        return T
 
     def frozen_poles(self, kappa: ArrayLike) -> NDArray[np.complex128]:
         """Poles (rad/s) of the frozen models, each row by modulus.
@@ -192,7 +296,7 @@ class LPVStateSpace:
     def simulate(
         self,
         u: ArrayLike,
-        scheduling: ArrayLike,
+        scheduling: ArrayLike | Mapping[Any, ArrayLike],
         sampling_time: float,
         initial_state: ArrayLike | None = None,
     ) -> Array:
@@ -205,6 +309,8 @@ class LPVStateSpace:
         ----------
         u : array-like of shape (n_samples, n_inputs)
         scheduling : array-like of shape (n_samples, n_scheduling) or (n_samples,)
+            Or a mapping from the names of the variables to (n_samples,), or a table
+            with such columns.
         sampling_time : float
             Seconds.
         initial_state : array-like of shape (order,), default=None
@@ -221,12 +327,19 @@ class LPVStateSpace:
             finite matrices at a scheduling value.
         DivergenceError
             If the outputs overflow; the first sample and value are told.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Outside of `identified_range`.
         """
         u = finite_samples("u", u, self.n_inputs)
         x = np.zeros(self.order)
         if initial_state is not None:
             x = state_vector(initial_state, self.order)
         kappa = self._scheduling(scheduling)
+        if self.bases and len(kappa):
+            x[:] = np.linalg.solve(self._basis_at(kappa[0]), x)
         return self._response(u[:, :, None], kappa, sampling_time, x[:, None])[:, :, 0]
 
     def free_responses(self, scheduling: ArrayLike, sampling_time: float) -> Array:
@@ -249,11 +362,13 @@ class LPVStateSpace:
             As `simulate`.
         """
         kappa = self._scheduling(scheduling)
-        none = np.zeros((len(kappa), 0, self.order))
-        return self._response(none, kappa, sampling_time, np.eye(self.order))
+        none, x = np.zeros((len(kappa), 0, self.order)), np.eye(self.order)
+        if self.bases and len(kappa):
+            x[:] = np.linalg.inv(self._basis_at(kappa[0]))
+        return self._response(none, kappa, sampling_time, x)
 
     def silenced(self) -> LPVStateSpace:
-        """The model whose interpolator extrapolates without a warning."""
+        """The model that extrapolates without a warning."""
         known: dict[str, Any] = getattr(self.interpolator, "get_params", dict)()
         loud = [
             name
@@ -263,7 +378,18 @@ class LPVStateSpace:
         quiet = copy.deepcopy(self.interpolator) if loud else self.interpolator
         for name in loud:
             quiet.set_params(**{name: "ignore"})
-        return replace(self, interpolator=quiet)
+        return replace(self, interpolator=quiet, identified_range=None)
+
+    def _tell_extrapolation(self, kappa: Array) -> None:
+        """Warn of values out of the range, or have the interpolator tell of them."""
+        extrapolation = getattr(self.interpolator, "extrapolation", None)
+        if self.identified_range is None or extrapolation == "error":
+            low, high = self.scheduling_range
+            if ((kappa < low) | (kappa > high)).any():
+                self.interpolator.predict(kappa)
+        elif extrapolation != "clip":
+            names = self.scheduling_names or range(1, self.n_scheduling + 1)
+            warn_extrapolation(kappa, np.asarray(self.identified_range), list(names))
 
     def _response(self, u: Array, kappa: Array, dt: float, x: Array) -> Array:
         """Outputs of runs along one trajectory: inputs (n_samples, n_inputs, n_runs).
@@ -277,11 +403,8 @@ class LPVStateSpace:
                 f"`scheduling` must have one row for each of the {len(u)} samples of "
                 f"`u`. Got {len(kappa)}."
             )
-        low, high = self.scheduling_range
-        model = self
-        if ((kappa < low) | (kappa > high)).any():
-            self.interpolator.predict(kappa)  # which says how far out the samples are
-            model = self.silenced()  # not once more, of the nodes of the table
+        self._tell_extrapolation(kappa)
+        model = self.silenced()  # not once more, of the nodes of the table
         y = np.empty((len(u), self.n_outputs, u.shape[2]))
         for start in range(0, len(u), _BLOCK):
             rows = slice(start, start + _BLOCK)
@@ -304,7 +427,7 @@ class LPVStateSpace:
         beyond = ((kappa[worst] < low) | (kappa[worst] > high)).any()
         cause = (
             "It is outside of the identified range: identify a model there too, or "
-            "hold the border's by PolynomialLPV(extrapolation='clip')."
+            "hold the border's by AutoLPV(extrapolation='clip')."
             if beyond
             else "Look at the parameters of the local models: inputs or outputs about "
             "an offset, shuffled rows, or times in another unit spoil them. If they "
@@ -344,7 +467,35 @@ class LPVStateSpace:
             return np.broadcast_to(S[0], (len(kappa), *S.shape[1:]))
         return held(kappa)
 
-    def _scheduling(self, kappa: ArrayLike) -> Array:
+    def _place(self, kappa: Any) -> Array:
+        """One value of every scheduling variable."""
+        by_name = isinstance(kappa, Mapping)
+        values = self._scheduling(kappa if by_name else np.reshape(kappa, (1, -1)))
+        if len(values) != 1:
+            raise ValueError(
+                "`kappa` must be one value of every scheduling variable. Got "
+                f"{len(values)}."
+            )
+        return values[0]
+
+    def _scheduling(self, kappa: Any) -> Array:
+        names = self.scheduling_names
+        if isinstance(kappa, Mapping):
+            if names is None or set(kappa) != set(names):
+                known = "no names" if names is None else list(names)
+                raise ValueError(
+                    "`scheduling` by name must have a value for each scheduling "
+                    f"variable; the model knows {known}. Got {list(kappa)}."
+                )
+            columns = [np.ravel(kappa[name]) for name in names]
+            if len({len(column) for column in columns}) > 1:
+                raise ValueError(
+                    "`scheduling` must have as many values of each variable. Got "
+                    f"{[len(column) for column in columns]}."
+                )
+            kappa = np.column_stack(columns)
+        elif names is not None and set(names) <= set(getattr(kappa, "columns", ())):
+            kappa = kappa[list(names)]
         values = real_array("scheduling", kappa)
         if values.ndim < 2:
             values = values.reshape(-1, 1)
@@ -359,3 +510,32 @@ class LPVStateSpace:
                 f"`scheduling` must be finite. Got {values[k]} in row {k}."
             )
         return values
+
+
+def warn_extrapolation(
+    kappa: Array, identified_range: Array, names: Sequence[Hashable]
+) -> None:
+    """Warn, once, of scheduling values outside the (2, n_scheduling) range identified.
+
+    The message names every such variable, its range and the farthest value.
+    """
+    low, high = identified_range
+    width = np.where(high > low, high - low, 1.0)
+    excess = np.maximum(low - kappa, kappa - high) / width
+    said = []
+    for j in np.flatnonzero((excess > 0).any(axis=0)):
+        digits = _DIGITS - int(np.floor(np.log10(width[j])))
+        shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
+        farthest = kappa[np.argmax(excess[:, j]), j]
+        said.append(
+            f"Scheduling variable {names[int(j)]!r} must be within the identified "
+            f"range, {shown[0]} to {shown[1]}. Got {int((excess[:, j] > 0).sum())} of "
+            f"{len(kappa)} samples outside, the farthest at {farthest:.4g}"
+        )
+    if said:
+        warn(
+            f"{'. '.join(said)}: the model is extrapolated. Identify a model there "
+            "too, or hold the border's with "
+            "interpolator=AutoLPV(extrapolation='clip').",
+            ExtrapolationWarning,
+        )

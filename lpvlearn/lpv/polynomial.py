@@ -9,23 +9,15 @@ import numpy as np
 from numpy.polynomial import Chebyshev, Legendre, Polynomial
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
-from sklearn.utils.validation import (
-    check_array,
-    check_consistent_length,
-    check_is_fitted,
-    validate_data,
-)
 
-from ..exceptions import ExtrapolationWarning, RankWarning, warn
+from ..exceptions import RankWarning, warn
 from ..validation import one_of, whole_number
+from .interpolator import Interpolator, domains, to_unit
+from .weighting import WeightedPoints
+
+Array = NDArray[np.float64]
 
 _BASES = ("power", "chebyshev", "legendre")
-_EXTRAPOLATIONS = ("ignore", "warn", "clip", "error")
-
-# Values this close to the identified range, relative to its width, are in it: a
-# measured mean and a range read from a report differ by rounding.
-_RANGE_RTOL = 1e-6
 
 # With more scheduling variables than this, the points are a scattered cloud that no
 # polynomial grid fills: the minimum-norm surface is then expected, as in any linear
@@ -33,7 +25,7 @@ _RANGE_RTOL = 1e-6
 _MAX_VARIABLES_TO_WARN = 3
 
 
-class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class PolynomialLPV(Interpolator):
     """Polynomial interpolation of local models' parameters over scheduling variables.
 
     A sample is an operating point: `X` holds its scheduling values, `y` the parameters
@@ -63,6 +55,14 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Smallest and largest scheduling values of the points with positive weight.
     rank_ : int
         Number of independent terms; below `n_terms`, `coef_` has minimum norm.
+    chi2_ : float
+        Least distance of polynomials from the points, squared, in units of their
+        covariances; NaN where these are not known.
+    degrees_of_freedom_ : int
+        Number of values at the points less that of coefficients.
+    weighted_ : bool
+        Whether the covariances weigh the points: they are known, and `chi2_` is
+        plausible for its degrees of freedom.
     n_features_in_ : int
         Number of scheduling variables.
     feature_names_in_ : ndarray of shape (n_features_in_,)
@@ -83,6 +83,11 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Among several scheduling variables, one that takes only m distinct values enters
     with powers up to m - 1: two levels carry a straight line, whatever the degree.
     With more terms than points left, the solution of minimum norm is taken.
+
+    Covariances of the parameters, where given and regular at all points, weigh the
+    errors: ``sum_i e_i^T P_i^-1 e_i``. If the polynomial is true, nothing is more
+    precise. Where its degree is too low the errors are its own, and precise points
+    would bend it: then (`chi2_` too large to be chance) the points count alike.
 
     Examples
     --------
@@ -108,8 +113,12 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.basis = basis
         self.extrapolation = extrapolation
 
-    def fit(
-        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
+    def fit(  # type: ignore[override]  # scikit-learn has weights in third place
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
     ) -> Self:
         """Fit the polynomial by least squares.
 
@@ -121,6 +130,8 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Parameters of the local models.
         sample_weight : array-like of shape (n_points,), optional
             Weights of the squared errors, not negative.
+        covariance : array-like of shape (n_points, n_params, n_params), optional
+            Covariances of the parameters, or (n_points,) variances of one parameter.
 
         Returns
         -------
@@ -139,74 +150,30 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             scheduling variables.
         """
         self._check_options()
-        points, params = validate_data(
-            self, X, y, dtype=np.float64, multi_output=True, y_numeric=True
-        )
-        weight = _check_weight(sample_weight, points)
-        # A point of weight zero counts as absent, for the range too.
-        used = weight > 0
-        kappa, theta = points[used], params[used].astype(np.float64)
-        self.scheduling_range_ = np.array([kappa.min(axis=0), kappa.max(axis=0)])
-        self.powers_ = _resolvable_powers(self.degree, kappa)
-        root = np.sqrt(weight[used])[:, None]
+        kappa, points = self._read(X, y, sample_weight, covariance)
+        self._fit(kappa, points)
+        return self
+
+    def _fit(self, kappa: Array, points: WeightedPoints) -> None:
+        self.powers_ = resolvable_powers(self.degree, kappa)
         terms = self._terms(kappa)
-        solution, _, rank, _ = np.linalg.lstsq(
-            root * terms, root * theta.reshape(len(theta), -1), rcond=None
-        )
-        self.rank_ = int(rank)
+        solution, self.rank_ = points.coefficients(terms)
+        self._judge(points, terms @ solution, self.rank_ * points.theta.shape[1])
+        if not self.weighted_:
+            solution, self.rank_ = points.unweighted().coefficients(terms)
         self._warn_of_rank(kappa)
         coef = _conversion(self.basis, self.powers_, self.scheduling_range_) @ solution
         # Predictions use the well-conditioned form, not the published one.
-        self._chebyshev_coef = solution[:, 0] if params.ndim == 1 else solution
-        self.coef_ = coef[:, 0] if params.ndim == 1 else coef.T
-        return self
+        self._chebyshev_coef = solution
+        self.coef_ = coef[:, 0] if self._single_parameter else coef.T
 
-    def predict(self, X: ArrayLike) -> NDArray[np.float64]:
-        """Evaluate the polynomial.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_scheduling)
-            Scheduling values.
-
-        Returns
-        -------
-        ndarray of shape (n_samples, n_params), or (n_samples,)
-            Parameters; one-dimensional if `y` was.
-
-        Raises
-        ------
-        ValueError
-            When a value is outside of `scheduling_range_` and
-            `extrapolation="error"`.
-
-        Warns
-        -----
-        ExtrapolationWarning
-            When a value is outside of it and `extrapolation="warn"`.
-        """
-        check_is_fitted(self)
-        self._check_options()
-        kappa = validate_data(self, X, dtype=np.float64, reset=False)
-        if self.extrapolation == "clip":
-            kappa = np.clip(kappa, *self.scheduling_range_)
-        elif self.extrapolation != "ignore":
-            message = _describe_extrapolation(kappa, self.scheduling_range_)
-            if message and self.extrapolation == "error":
-                raise ValueError(message)
-            if message:
-                warn(message, ExtrapolationWarning)
+    def _evaluate(self, kappa: Array) -> Array:
         return self._terms(kappa) @ self._chebyshev_coef
 
-    def _terms(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The Chebyshev terms at scheduling values, (n_points, n_terms)."""
-        terms = np.ones((len(kappa), len(self.powers_)))
-        for j, (low, high) in enumerate(_domains(self.scheduling_range_)):
-            scaled = (2 * kappa[:, j] - (low + high)) / (high - low)
-            terms *= chebvander(scaled, self.degree)[:, self.powers_[:, j]]
-        return terms
+    def _terms(self, kappa: Array) -> Array:
+        return chebyshev_terms(kappa, self.powers_, self.scheduling_range_)
 
-    def _warn_of_rank(self, kappa: NDArray[np.float64]) -> None:
+    def _warn_of_rank(self, kappa: Array) -> None:
         """Warn of terms that distinct operating points leave open."""
         n_points, n_scheduling = kappa.shape
         open_terms = self.rank_ < len(self.powers_)
@@ -223,9 +190,9 @@ class PolynomialLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             )
 
     def _check_options(self) -> None:
+        super()._check_options()
         whole_number("degree", self.degree, 0)
         one_of("basis", self.basis, _BASES)
-        one_of("extrapolation", self.extrapolation, _EXTRAPOLATIONS)
 
 
 def total_degree_powers(degree: int, n_variables: int) -> NDArray[np.intp]:
@@ -243,21 +210,23 @@ def total_degree_powers(degree: int, n_variables: int) -> NDArray[np.intp]:
     )
 
 
-def _domains(scheduling_range: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """The interval of each variable; of width 2 around a constant one."""
-    return [
-        (low, high) if high > low else (low - 1.0, low + 1.0)
-        for low, high in scheduling_range.T.tolist()
-    ]
+def chebyshev_terms(
+    kappa: Array, powers: NDArray[np.intp], scheduling_range: Array
+) -> Array:
+    """Products of Chebyshev polynomials of the mapped values, (n_points, n_terms)."""
+    terms = np.ones((len(kappa), len(powers)))
+    for scaled, degrees in zip(
+        to_unit(kappa, scheduling_range).T, powers.T, strict=True
+    ):
+        terms *= chebvander(scaled, int(degrees.max(initial=0)))[:, degrees]
+    return terms
 
 
-def _conversion(
-    basis: str, powers: NDArray[np.intp], scheduling_range: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _conversion(basis: str, powers: NDArray[np.intp], scheduling_range: Array) -> Array:
     """The matrix from Chebyshev coefficients to those of `basis`."""
     degree = int(powers.max(initial=0))
     matrix = np.ones((len(powers), len(powers)))
-    for j, domain in enumerate(_domains(scheduling_range)):
+    for j, domain in enumerate(domains(scheduling_range).T.tolist()):
         kinds: dict[str, dict[str, Any]] = {
             "power": {"kind": Polynomial},
             "chebyshev": {"kind": Chebyshev, "domain": domain},
@@ -271,29 +240,10 @@ def _conversion(
     return matrix
 
 
-def _check_weight(
-    sample_weight: ArrayLike | None, X: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    if sample_weight is None:
-        return np.ones(len(X))
-    weight = check_array(
-        sample_weight, dtype=np.float64, ensure_2d=False, input_name="sample_weight"
-    )
-    if weight.ndim != 1:
-        raise ValueError(
-            f"`sample_weight` must be one-dimensional. Got shape {weight.shape}."
-        )
-    check_consistent_length(X, weight)
-    if weight.min() < 0 or weight.max() == 0:
-        raise ValueError(
-            "`sample_weight` must be non-negative and not all zero. Got values from "
-            f"{weight.min():g} to {weight.max():g}."
-        )
-    return weight
-
-
-def _resolvable_powers(degree: int, kappa: NDArray[np.float64]) -> NDArray[np.intp]:
-    """The terms up to a degree whose powers the points can tell apart."""
+def resolvable_powers(
+    degree: int, kappa: Array, *, tensor: bool = False
+) -> NDArray[np.intp]:
+    """The terms up to a degree, total or (tensor) each, that the points tell apart."""
     highest = np.array([len(np.unique(column)) - 1 for column in kappa.T])
     if len(highest) == 1 and degree > highest[0]:
         n_points = highest[0] + 1
@@ -301,23 +251,8 @@ def _resolvable_powers(degree: int, kappa: NDArray[np.float64]) -> NDArray[np.in
             f"`degree` must be at most {highest[0]} for {n_points} operating "
             f"point{'s' if n_points > 1 else ' (1 sample)'}. Got {degree}."
         )
+    if tensor:
+        powers = np.indices(np.minimum(degree, highest) + 1).reshape(len(highest), -1).T
+        return powers[np.argsort(powers.sum(axis=1), kind="stable")]
     powers = total_degree_powers(degree, len(highest))
     return powers[(powers <= highest).all(axis=1)]
-
-
-def _describe_extrapolation(
-    X: NDArray[np.float64], scheduling_range: NDArray[np.float64]
-) -> str:
-    """Say how far values are out of range; nothing when they are in it."""
-    low, high = scheduling_range
-    excess = np.maximum(low - X, X - high) - _RANGE_RTOL * (high - low)
-    if not (excess > 0).any():
-        return ""
-    row, j = np.unravel_index(np.argmax(excess), excess.shape)
-    outside = int((excess > 0).any(axis=1).sum())
-    return (
-        f"Scheduling values must be within the identified range, [{low[j]:.6g}, "
-        f"{high[j]:.6g}] for variable {j + 1}. Got {outside} of {len(X)} outside, the "
-        f"farthest {X[row, j]:.6g}. A polynomial is not to be trusted there: identify "
-        "a model there too, or hold the border's value with `extrapolation='clip'`."
-    )

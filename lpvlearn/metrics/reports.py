@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..data.experiments import ROLES, Table, read_outputs, roles_of
+from ..data.experiments import OPTIONAL_ROLES, ROLES, Table, fitted_roles
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..validation import one_of
@@ -43,7 +43,7 @@ def fit_report(
         one experiment.
     X : DataFrame or array-like of shape (n_samples, n_features)
     y : DataFrame, Series or array-like of shape (n_samples,) or (n_samples, n_outputs)
-        Measured outputs.
+        Measured outputs; missing ones (NaN) are left out.
     initial_state : {"rest", "estimate"}, default="rest"
     burn_in : int, default=0
         As in `make_bft_scorer`.
@@ -53,7 +53,9 @@ def fit_report(
     DataFrame
         One row per experiment and output; columns `experiment`, `operating_point` (the
         label, else the mean of the scheduling variable, a tuple for several),
-        `output`, `BFT` and `VAF` (percent), `RMSE` (units of the output) and `R2`.
+        `output`, `BFT` and `VAF` (percent), `RMSE` (units of the output), `R2`, and
+        `n_missing`, samples of the output that were not measured or, for want of an
+        input, not simulated.
 
     Raises
     ------
@@ -62,6 +64,11 @@ def fit_report(
     TypeError
         When the estimator lacks the method that an option needs.
 
+    Warns
+    -----
+    UserWarning
+        When an experiment that is simulated from rest starts in mid-motion.
+
     Examples
     --------
     >>> import numpy as np
@@ -69,47 +76,61 @@ def fit_report(
     >>> from lpvlearn import fit_report
     >>> u = np.array([[0.0], [1.0], [2.0]])
     >>> fit_report(LinearRegression().fit(u, [0, 1, 2]), u, [0, 1, 3]).round(3)
-       experiment operating_point output     BFT     VAF   RMSE     R2
-    0           0            None     y1  53.709  85.714  0.577  0.786
+       experiment operating_point output     BFT     VAF   RMSE     R2  n_missing
+    0           0            None     y1  53.709  85.714  0.577  0.786          0
     """
     check_options(initial_state, burn_in)
     simulator, X = unwrap(estimator, X)
-    Y, names = read_outputs(y)
-    Y_pred = simulate(simulator, X, y, initial_state)
+    found = simulate(simulator, X, y, initial_state)
+    Y, names = found.measured, found.names
     groups = [np.arange(len(Y))]
     labels: list[tuple[Hashable, Hashable]] = [(0, None)]
     if burn_in or owner_of_experiments(simulator) is not None:
         groups = split(simulator, X)
-        roles = owner_of_experiments(simulator).get_params(deep=False)
-        labels = _labels(roles, X, groups)
+        owner, table = owner_of_experiments(simulator), Table(X)
+        labels = _labels(fitted_roles(owner, table, optional=ROLES), table, groups)
     parts = []
     for rows, (experiment, operating_point) in zip(
         drop_start(groups, burn_in), labels, strict=True
     ):
-        true, pred = Y[rows], Y_pred[rows]
-        columns = {
-            "output": names,
-            "BFT": bft_score(true, pred, multioutput="raw_values"),
-            "VAF": vaf_score(true, pred, multioutput="raw_values"),
-            "RMSE": np.sqrt(np.mean((true - pred) ** 2, axis=0)),
-            "R2": r2_ratio(true, pred),
-        }
+        true, pred = Y[rows], found.simulated[rows]
+        columns: dict[str, Any] = {"output": names, **_measures(true, pred)}
         parts += [
             {"experiment": experiment, "operating_point": operating_point}
             | {column: values[k] for column, values in columns.items()}
             for k in range(len(names))
         ]
+    if not burn_in:
+        found.warn_of_motion(simulator, X)
     return pd.DataFrame(parts)
 
 
+def _measures(
+    true: NDArray[np.float64], pred: NDArray[np.float64]
+) -> dict[str, NDArray[Any]]:
+    """Measures of fit of every output; NaN for one that was never measured."""
+    missing = np.isnan(true)
+    known = np.asarray(~missing.all(axis=0))
+    columns: dict[str, NDArray[Any]] = {}
+    true, pred = true[:, known], pred[:, known]
+    for name, values in {
+        "BFT": bft_score(true, pred, multioutput="raw_values"),
+        "VAF": vaf_score(true, pred, multioutput="raw_values"),
+        "RMSE": np.sqrt(np.nanmean((true - pred) ** 2, axis=0)),
+        "R2": r2_ratio(true, pred),
+    }.items():
+        columns[name] = np.full(len(known), np.nan)
+        columns[name][known] = values
+    return columns | {"n_missing": missing.sum(axis=0)}
+
+
 def _labels(
-    roles: Mapping[str, Any], X: Any, groups: Sequence[NDArray[np.intp]]
+    roles: Mapping[str, Any], table: Table, groups: Sequence[NDArray[np.intp]]
 ) -> list[tuple[Hashable, Hashable]]:
     """The experiment's and operating point's label for each group of rows."""
-    table = Table(X)
-    label = table.one(roles.get("experiment"), "experiment")
-    point = table.one(roles.get("operating_point"), "operating_point")
-    kappa = table.several(roles.get("scheduling"), "scheduling")
+    label = table.one(roles["experiment"], "experiment")
+    point = table.one(roles["operating_point"], "operating_point")
+    kappa = table.several(roles["scheduling"], "scheduling")
     names: list[Hashable] = [0] * len(groups)
     points: list[Hashable] = [None] * len(groups)
     if label is not None:
@@ -118,7 +139,7 @@ def _labels(
         points = point.labels([rows[0] for rows in groups])
     elif kappa:
         values = np.column_stack([column.numbers("X") for column in kappa])
-        means = [tuple(values[rows].mean(axis=0).tolist()) for rows in groups]
+        means = [tuple(np.nanmean(values[rows], axis=0).tolist()) for rows in groups]
         points = [mean if len(mean) > 1 else mean[0] for mean in means]
     return list(zip(names, points, strict=True))
 
@@ -135,6 +156,7 @@ _READABLE = {
     "VAF": ("VAF", "{:.2f}"),
     "RMSE": ("RMSE", "{:.3g}"),
     "R2": ("R2", "{:.4f}"),
+    "n_missing": ("missing", "{:.0f}"),
     "n_experiments": ("experiments", "{:.0f}"),
     "n_samples": ("samples", "{:.0f}"),
     "order": ("order", "{:.0f}"),
@@ -273,7 +295,7 @@ def compare_models(
         )
     for name in roles:
         one_of("roles", name, (*ROLES, "sampling_time"))
-    known = _roles_of(models.values()) | roles
+    known = _roles_of(models.values(), X) | roles
     if known.get("time") is not None and "sampling_time" not in roles:
         known["sampling_time"] = None  # every experiment tells its own
     parts = []
@@ -294,11 +316,14 @@ def compare_models(
     return table[["model", *table.columns.drop("model")]]
 
 
-def _roles_of(models: Any) -> dict[str, Any]:
-    """Roles and sampling time of the first estimator that has them."""
+def _roles_of(models: Any, X: Any) -> dict[str, Any]:
+    """Roles, sampling time and tolerance of the first estimator that has them."""
     for model in models:
         owner = owner_of_experiments(model)
         if owner is not None:
             step = getattr(owner, "sampling_time_", owner.sampling_time)
-            return {**roles_of(owner), "sampling_time": step}
+            return fitted_roles(owner, Table(X), optional=OPTIONAL_ROLES) | {
+                "sampling_time": step,
+                "time_tol": owner.time_tol,
+            }
     return {}

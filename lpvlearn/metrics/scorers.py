@@ -9,7 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.experiments import read_outputs
+from ..data.alignment import align_outputs
+from ..data.experiments import ROLES, Table, fitted_roles, read_outputs
+from ..data.scoring import warn_of_motion
 from ..validation import one_of, whole_number
 from .scores import Multioutput, bft_score, vaf_score
 
@@ -23,7 +25,10 @@ class TrajectoryScorer:
     """A scorer, `scorer(estimator, X, y) -> float`, for estimators that simulate.
 
     Made by `make_bft_scorer` and `make_vaf_scorer`; usable as `scoring=` wherever
-    scikit-learn takes a callable.
+    scikit-learn takes a callable. Samples that were not measured (NaN in `y`) are left
+    out, and so are those that cannot be simulated for want of an input; any other
+    simulation that is not finite is an error. From rest, a table that starts in
+    mid-motion is warned of.
 
     Attributes
     ----------
@@ -44,8 +49,8 @@ class TrajectoryScorer:
         """Score an estimator's simulation of `X` against `y`."""
         score = bft_score if self.metric == "BFT" else vaf_score
         simulator, X = unwrap(estimator, X)
-        Y, names = read_outputs(y)
-        Y_pred = simulate(simulator, X, y, self.initial_state)
+        found = simulate(simulator, X, y, self.initial_state)
+        Y, names = found.measured, found.names
         pool = self.average == "pool"
         groups = [np.arange(len(Y))]
         if self.burn_in or not pool:
@@ -53,9 +58,11 @@ class TrajectoryScorer:
         if pool:
             groups = [np.concatenate(groups)]
         scores = [
-            score(Y[rows], Y_pred[rows], multioutput=self.multioutput)
+            score(Y[rows], found.simulated[rows], multioutput=self.multioutput)
             for rows in groups
         ]
+        if not self.burn_in:
+            found.warn_of_motion(simulator, X)
         mean = np.mean(scores, axis=0)
         if self.multioutput != "raw_values":
             return float(mean)
@@ -213,17 +220,58 @@ def owner_of_experiments(estimator: Any) -> Any:
     return estimator
 
 
-def simulate(estimator: Any, X: Any, y: Any, initial_state: str) -> NDArray[np.float64]:
-    """Simulated outputs of a table, one column for each output."""
+@dataclass(frozen=True)
+class Simulated:
+    """Measured outputs of a table, NaN where missing, and simulated ones."""
+
+    y: Any  # like the table in length and order
+    measured: NDArray[np.float64]  # (n_samples, n_outputs)
+    names: list[Any]
+    simulated: NDArray[np.float64]
+    from_rest: bool
+
+    def warn_of_motion(self, estimator: Any, X: Any) -> None:
+        """Warn where a simulation from rest misses how an experiment starts."""
+        if self.from_rest:
+            warn_of_motion(estimator, X, self.y, self.simulated)
+
+
+def simulate(estimator: Any, X: Any, y: Any, initial_state: str) -> Simulated:
+    """Measured and simulated outputs of a table.
+
+    What lacks an input, and is not simulated therefore, counts as not measured.
+    """
+    y = align_outputs(X, y)
+    measured, names = read_outputs(y)
     if initial_state == "rest":
-        return read_outputs(estimator.predict(X))[0]
-    if not hasattr(estimator, "predict_with_initial_state"):
+        found = read_outputs(estimator.predict(X))[0]
+    elif not hasattr(estimator, "predict_with_initial_state"):
         raise TypeError(
             "`initial_state='estimate'` needs an estimator with the method "
             f"predict_with_initial_state(X, y). Got {type(estimator).__name__}; use "
             "`initial_state='rest'`, with `burn_in` to leave out the transient."
         )
-    return read_outputs(estimator.predict_with_initial_state(X, y))[0]
+    else:
+        found = read_outputs(estimator.predict_with_initial_state(X, y))[0]
+        if np.isnan(found).any():
+            measured = np.where(_lacks_inputs(estimator, X)[:, None], np.nan, measured)
+    if found.shape != measured.shape:
+        raise ValueError(
+            "`y` and the outputs of the estimator must have the same shape. Got "
+            f"{measured.shape} and {found.shape}."
+        )
+    return Simulated(y, measured, names, found, initial_state == "rest")
+
+
+def _lacks_inputs(estimator: Any, X: Any) -> NDArray[np.bool_]:
+    """Rows of which an input or a scheduling value is missing."""
+    table = Table(X)
+    roles = fitted_roles(estimator, table, optional=ROLES)
+    single = ("experiment", "time", "operating_point")
+    kappa = table.several(roles["scheduling"], "scheduling")
+    others = [*(table.one(roles[name], name) for name in single), *kappa]
+    columns = [*table.inputs(roles["inputs"], others), *kappa]
+    return np.any([np.isnan(column.numbers("X")) for column in columns], axis=0)
 
 
 def split(estimator: Any, X: Any) -> list[NDArray[np.intp]]:

@@ -24,7 +24,8 @@ def bft_score(
     Parameters
     ----------
     y_true, y_pred : array-like of shape (n_samples,) or (n_samples, n_outputs)
-        Measured and simulated outputs.
+        Measured and simulated outputs. Samples of an output that were not measured
+        (NaN in `y_true`) are left out of its score.
     multioutput : {"raw_values", "uniform_average"} or array-like of shape (n_outputs,)
         One score per output, their mean, or their weighted mean.
 
@@ -36,7 +37,8 @@ def bft_score(
     Raises
     ------
     ValueError
-        When shapes differ or a value is not finite.
+        When shapes differ, a value is infinite, an output was never measured, or a
+        simulation is NaN where there is a measurement.
 
     Notes
     -----
@@ -54,6 +56,7 @@ def bft_score(
     55.27...
     """
     true, pred = _read_pair(y_true, y_pred)
+    _check_measured(true)
     return _percent(_norm(true - pred), _norm(_centred(true)), multioutput)
 
 
@@ -68,7 +71,8 @@ def vaf_score(
     Parameters
     ----------
     y_true, y_pred : array-like of shape (n_samples,) or (n_samples, n_outputs)
-        Measured and simulated outputs.
+        Measured and simulated outputs. Samples of an output that were not measured
+        (NaN in `y_true`) are left out of its score.
     multioutput : {"raw_values", "uniform_average"} or array-like of shape (n_outputs,)
         One score per output, their mean, or their weighted mean.
 
@@ -80,7 +84,8 @@ def vaf_score(
     Raises
     ------
     ValueError
-        When shapes differ or a value is not finite.
+        When shapes differ, a value is infinite, an output was never measured, or a
+        simulation is NaN where there is a measurement.
 
     Notes
     -----
@@ -97,6 +102,7 @@ def vaf_score(
     80.0
     """
     true, pred = _read_pair(y_true, y_pred)
+    _check_measured(true)
     error, spread = _norm(_centred(true - pred)), _norm(_centred(true))
     return _percent(error**2, spread**2, multioutput)
 
@@ -140,22 +146,32 @@ def parameter_fit(params_true: ArrayLike, params_pred: ArrayLike) -> float:
             f"`{names[0]}` and `{names[1]}` must have the same shape, not empty. Got "
             f"{eta.shape} and {eta_hat.shape}."
         )
-    true, pred = _read_pair(eta.ravel(), eta_hat.ravel(), names)
+    true, pred = _read_pair(eta.ravel(), eta_hat.ravel(), names, missing=False)
     return float(100 * _fit_ratio(_norm(true - pred), _norm(_centred(true)))[0])
 
 
 def r2_ratio(y_true: ArrayLike, y_pred: ArrayLike) -> NDArray[np.float64]:
-    """Coefficient of determination of each output, defined for a single sample too."""
+    """Coefficient of determination of each output, defined for a single sample too.
+
+    Of measured samples; NaN where there are none.
+    """
     true, pred = _read_pair(y_true, y_pred)
     with np.errstate(over="ignore"):
-        error = np.sum((true - pred) ** 2, axis=0)
-    return _fit_ratio(error, np.sum(_centred(true) ** 2, axis=0))
+        error = np.nansum((true - pred) ** 2, axis=0)
+    return _fit_ratio(error, np.nansum(_centred(true) ** 2, axis=0))
 
 
 def _read_pair(
-    y_true: Any, y_pred: Any, names: tuple[str, str] = ("y_true", "y_pred")
+    y_true: Any,
+    y_pred: Any,
+    names: tuple[str, str] = ("y_true", "y_pred"),
+    *,
+    missing: bool = True,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return two matrices of equal shape, (n_samples, n_outputs)."""
+    """Return two matrices of equal shape, (n_samples, n_outputs).
+
+    Unless refused, `missing` values of the first are NaN in both.
+    """
     pair = zip((y_true, y_pred), names, strict=True)
     true, pred = (read_outputs(values, name)[0] for values, name in pair)
     if true.shape != pred.shape or len(true) == 0:
@@ -163,8 +179,9 @@ def _read_pair(
             f"`{names[0]}` and `{names[1]}` must have the same shape, with at least 1 "
             f"sample. Got {true.shape} and {pred.shape}."
         )
+    unknown = np.isnan(true) & missing
     for array, name in ((true, names[0]), (pred, names[1])):
-        finite = np.isfinite(array)
+        finite = np.isfinite(array) | unknown
         if not finite.all():
             row, column = np.argwhere(~finite)[0]
             raise ValueError(
@@ -172,18 +189,33 @@ def _read_pair(
                 f"column {column}; a simulation that diverges comes from an unstable "
                 "model."
             )
-    return true, pred
+    return true, np.where(unknown, np.nan, pred)
+
+
+def _check_measured(true: NDArray[np.float64]) -> None:
+    """Refuse an output of which every sample is missing."""
+    unknown = np.isnan(true).all(axis=0)
+    if unknown.any():
+        raise ValueError(
+            "`y_true` must hold a measured sample of every output. Got NaN throughout "
+            f"column {int(np.argmax(unknown))}; leave that output or experiment out."
+        )
 
 
 def _centred(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Subtract the mean of each column, exactly zero where it does not vary."""
     # The rounded mean of equal numbers may differ from them in the last digit.
-    return np.where(np.ptp(values, axis=0) == 0, 0.0, values - values.mean(axis=0))
+    known = ~np.isnan(values)
+    count = np.maximum(known.sum(axis=0), 1)
+    mean = np.where(known, values, 0.0).sum(axis=0) / count
+    highest = np.where(known, values, -np.inf).max(axis=0)
+    lowest = np.where(known, values, np.inf).min(axis=0)
+    return np.where(known & (highest == lowest), 0.0, values - mean)
 
 
 def _norm(values: NDArray[np.float64]) -> NDArray[np.float64]:
     with np.errstate(over="ignore"):
-        return np.linalg.norm(values, axis=0)
+        return np.linalg.norm(np.nan_to_num(values, posinf=np.inf), axis=0)
 
 
 def _fit_ratio(

@@ -9,13 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..data.experiments import NO_TIME, Experiment, naming, read_experiments
+from ..data.experiments import (
+    NO_TIME,
+    Experiment,
+    n_rows_of,
+    naming,
+    read_experiments,
+)
+from ..data.preparation import read_runs
+from ..data.timestamps import TIME_TOL
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
     state_trajectory,
+    trend_signals,
 )
 from .scores import bft_score
 
@@ -23,11 +32,15 @@ Array = NDArray[np.float64]
 
 
 def fit_of(
-    model: StateSpace, group: Sequence[Experiment], sampling_time: float
+    model: StateSpace,
+    group: Sequence[Experiment],
+    sampling_time: float,
+    n_trend: int = 0,
 ) -> float:
     """BFT (percent, mean over the outputs) of a continuous model on experiments.
 
-    The initial state of every experiment is estimated by least squares. Experiments of
+    The initial state of every experiment is estimated by least squares, and with
+    `n_trend` a constant (1), a constant and a drift (2) of every output. Experiments of
     one length are simulated together; realizations of one input, once.
     """
     sampled = model.to_discrete(sampling_time)
@@ -43,7 +56,9 @@ def fit_of(
             sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
         )
         forced = sampled.C @ x + sampled.D @ u
-        free = free_responses(sampled.A, sampled.C, length)
+        free = free_responses(
+            sampled.A, sampled.C, length, trend_signals(length, n_trend)
+        )
         found = forced + free @ estimate_initial_state(free, y - forced)
         true.append(np.moveaxis(y, -1, 0).reshape(-1, model.n_outputs))
         simulated.append(np.moveaxis(found, -1, 0).reshape(-1, model.n_outputs))
@@ -54,16 +69,17 @@ def simulate_experiments(
     model: StateSpace | LPVStateSpace,
     experiments: Sequence[Experiment],
     sampling_time: float | None,
+    n_samples: int,
     *,
     estimate: bool,
 ) -> Array:
     """Outputs (n_samples, n_outputs) of a model along the experiments of a table.
 
-    Rows stand where they do in the table; `sampling_time` is that of experiments that
-    do not tell it, None where it is not known. From rest, or from initial states
-    estimated on the outputs.
+    Rows stand where they do in the table, NaN in those of no experiment;
+    `sampling_time` is that of experiments that do not tell it, None where it is not
+    known. From rest, or from initial states estimated on the outputs.
     """
-    table = np.empty((sum(len(e.rows) for e in experiments), model.n_outputs))
+    table = np.full((n_samples, model.n_outputs), np.nan)
     for e in experiments:
         dt = e.sampling_time or sampling_time
         with naming(e):
@@ -112,6 +128,7 @@ class TableSimulator(BaseEstimator):
         experiment: Any = None,
         time: Any = None,
         operating_point: Any = None,
+        time_tol: float = TIME_TOL,
     ) -> None:
         self.model = model
         self.sampling_time = sampling_time
@@ -120,27 +137,31 @@ class TableSimulator(BaseEstimator):
         self.experiment = experiment
         self.time = time
         self.operating_point = operating_point
+        self.time_tol = time_tol
 
     def predict(self, X: Any) -> Array:
         """Simulate from rest."""
-        return self._simulate(self._read(X, None), estimate=False)
+        return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate from initial states estimated on the outputs."""
-        return self._simulate(self._read(X, y), estimate=True)
+        return self._simulate(
+            self._read(X, y, outputs=False), n_rows_of(X), estimate=True
+        )
 
     def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
         """Rows of every experiment."""
-        return [e.rows for e in self._read(X, None)]
+        return [e.rows for e in read_experiments(self, X, allow_missing="Xy")]
 
-    def _read(self, X: Any, y: Any) -> list[Experiment]:
+    def _read(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
         is_lpv = isinstance(self.model, LPVStateSpace)
         if is_lpv and self.scheduling is None and self.model.scheduling_range.any():
             raise ValueError(
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
                 "that the LPV model follows. Got None."
             )
-        found = read_experiments(self, X, y, sampling_time=self.sampling_time)
+        options |= {"split": True, "sampling_time": self.sampling_time}
+        found = read_runs(self, X, y, **options)
         if len(found[0].input_names) != self.model.n_inputs:
             raise ValueError(
                 f"`inputs` must name the {self.model.n_inputs} input(s) of the model "
@@ -148,7 +169,9 @@ class TableSimulator(BaseEstimator):
             )
         return found
 
-    def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
+    def _simulate(
+        self, experiments: list[Experiment], n_samples: int, *, estimate: bool
+    ) -> Array:
         return simulate_experiments(
-            self.model, experiments, self.sampling_time, estimate=estimate
+            self.model, experiments, self.sampling_time, n_samples, estimate=estimate
         )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
+from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
@@ -129,6 +130,8 @@ class InnovationModel:
         ----------
         u : array-like of shape (n_samples, n_inputs)
         y : array-like of shape (n_samples, n_outputs)
+            Missing values (NaN) are predicted from those beside them, and correct
+            nothing.
         steps : int, default=1
             Prediction horizon in samples.
         initial_state : array-like of shape (order,), default=None
@@ -148,7 +151,13 @@ class InnovationModel:
             return simulated
         A, C, K, _ = self.noise
         error = np.asarray(y, dtype=float).reshape(simulated.shape) - simulated
-        ahead = state_trajectory(A - K @ C, error @ K.T)
+        known = ~np.isnan(error)
+        if known.all():
+            ahead = state_trajectory(A - K @ C, error @ K.T)
+        else:
+            gains = self._gains(K, known)
+            forcing = np.einsum("tij,tj->ti", gains, np.where(known, error, 0.0))
+            ahead = state_trajectory(A - gains @ C, forcing)
         decay = C @ np.linalg.matrix_power(A, delay)
         simulated[delay:] += ahead[: max(len(error) - delay, 0)] @ decay.T
         return simulated
@@ -158,35 +167,81 @@ class InnovationModel:
     ) -> Array:
         """By the predictor of all states, which is stable where the plant is not."""
         u = finite_samples("u", u, self.lti.n_inputs)
-        y = finite_samples("y", y, self.lti.n_outputs)
-        A, B, C, D, K = self.A, self.B, self.C, self.D, self.K
+        y = np.asarray(y, dtype=float).reshape(len(u), -1)
+        A, B, C, D = self.A, self.B, self.C, self.D
+        gains, known = self._filter_gains(y)
         x0 = np.zeros(len(A))
         if initial_state is not None:
             given = np.ravel(np.asarray(initial_state, dtype=float))
             x0[: len(given)] = given
-        driven = u @ (B - K @ D).T + y @ K.T
-        x = state_trajectory(A - K @ C, driven, x0)
+        corrected = np.where(known, y - u @ D.T, 0.0)
+        driven = u @ B.T + (gains @ corrected[:, :, None])[:, :, 0]
+        x = state_trajectory(A - gains @ C, driven, x0)
         for _ in range(min(delay, len(u))):  # one sample on, without the latest output
             x[1:] = x[:-1] @ A.T + u[:-1] @ B.T
             x[0] = x0
         return x @ C.T + u @ D.T
 
-    def estimate_initial_state(self, u: ArrayLike, y: ArrayLike) -> Array:
+    def estimate_initial_state(
+        self, u: ArrayLike, y: ArrayLike, trend: Array | None = None
+    ) -> Array:
         """Initial state for `predict`, by least squares over all samples.
 
         Parameters
         ----------
         u : array-like of shape (n_samples, n_inputs)
         y : array-like of shape (n_samples, n_outputs)
+            Missing values (NaN) are left out.
+        trend : ndarray of shape (n_trend, n_samples), default=None
+            Signals that any multiple of may be in every output, beside the model's.
 
         Returns
         -------
         ndarray of shape (order,) or (order + n_noise_states,)
             Behind the errors of the simulation; with a `gain` that of all states,
-            behind the errors of one-step prediction.
+            behind the errors of one-step prediction. The multiples of the trends
+            follow: signal by signal, output by output.
         """
+        y = np.asarray(y, dtype=float).reshape(-1, self.lti.n_outputs)
         if self.gain is None:
-            return self.lti.estimate_initial_state(u, y)
-        error = finite_samples("y", y, self.lti.n_outputs) - self.predict(u, y)
-        responses = free_responses(self.A - self.K @ self.C, self.C, len(error))
+            error = y - self.lti.simulate(u)
+            responses = free_responses(self.lti.A, self.lti.C, len(y), trend)
+        else:
+            error, (gains, _) = y - self.predict(u, y), self._filter_gains(y)
+            responses = prediction_responses(self.A, self.C, gains, len(y), trend)
         return estimate_initial_state(responses, error)
+
+    def _filter_gains(self, y: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """K, one for every sample where outputs are missing, and which are known."""
+        known = ~np.isnan(y)
+        gains = self.K if known.all() else self._gains(self.K, known)
+        return gains, known
+
+    def _gains(self, K: Array, known: NDArray[np.bool_]) -> Array:
+        """K for the outputs that are known: of the others the expected innovation."""
+        covariance = self.noise.covariance
+        gains = np.zeros((len(known), *K.shape))
+        for pattern in np.unique(known, axis=0):
+            own = np.flatnonzero(pattern)
+            others, _ = scaled_lstsq(covariance[np.ix_(own, own)], covariance[own])
+            rows = np.flatnonzero((known == pattern).all(axis=1))
+            gains[np.ix_(rows, np.arange(len(K)), own)] = K @ others.T
+        return gains
+
+
+def prediction_responses(
+    A: Array, C: Array, K: Array, n_samples: int, trend: Array | None = None
+) -> Array:
+    """As `free_responses`, of the errors of one-step prediction.
+
+    `K` is one gain or one for every sample. A trend of an output passes the predictor
+    like the output, and what that predicts of it is no error.
+    """
+    (ny, n), signals = C.shape, np.zeros((0, n_samples)) if trend is None else trend
+    trends = free_responses(A, C, n_samples, signals)[:, :, n:]
+    forcing = np.zeros((n_samples, n, n + len(signals) * ny))
+    forcing[:, :, n:] = K @ trends
+    x = state_trajectory(A - K @ C, forcing, np.eye(*forcing.shape[1:]))
+    responses = C @ x
+    responses[:, :, n:] = trends - responses[:, :, n:]
+    return responses

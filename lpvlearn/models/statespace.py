@@ -24,6 +24,7 @@ from ..validation import (
     matrix,
     one_of,
     positive_time,
+    real_array,
     state_vector,
     whole_number,
 )
@@ -294,6 +295,7 @@ class StateSpace:
         ----------
         u : array-like of shape (n_samples, n_inputs) or (n_samples,)
         y : array-like of shape (n_samples, n_outputs) or (n_samples,)
+            Missing values (NaN) are left out.
 
         Returns
         -------
@@ -303,8 +305,8 @@ class StateSpace:
         Raises
         ------
         ValueError
-            If the model is in continuous time, a shape does not fit, or a value is
-            not finite.
+            If the model is in continuous time, a shape does not fit, or another value
+            is not finite.
 
         Examples
         --------
@@ -319,7 +321,10 @@ class StateSpace:
                 f"{self}. Convert with to_discrete(sampling_time) first."
             )
         u = finite_samples("u", u, self.n_inputs)
-        y = finite_samples("y", y, self.n_outputs)
+        measured = real_array("y", y)
+        missing = np.isnan(measured)
+        y = finite_samples("y", np.where(missing, 0.0, measured), self.n_outputs)
+        y[missing.reshape(y.shape)] = np.nan
         if len(u) == 0 or len(u) != len(y):
             raise ValueError(
                 "`u` and `y` must have one row for each of the same samples, at least "

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
 from .. import (
+    AutoLPV,
     GrayBoxRestructurer,
     LocalLPVPipeline,
     LPVStateSpace,
@@ -26,9 +27,11 @@ from ..pipeline.estimator import Stopwatch
 from ..pipeline.points import balanced_entries
 from .tables import (
     ParameterSet,
+    both_sweeps,
     interpolation_table,
     local_table,
     restructuring_table,
+    sweeps_table,
     validation_table,
 )
 
@@ -50,7 +53,7 @@ class PaperExperiment:
     lpv : dict of str to LPVStateSpace
         Interpolated with the requested degree.
     tables : dict of str to DataFrame
-        "table1", "table1_other", "table2", "table3", "table4", "timing".
+        "table1", "table1_other", "table2", "table3", "table4", "momentum", "timing".
     degree, n_realizations : int
         Of the interpolation; of the noise at each operating point.
     method, other_method : str
@@ -126,6 +129,7 @@ def run_paper_experiment(
         comparison = LocalLPVPipeline(
             SubspaceLTI(data.structure.order, method=other, feedthrough=False),
             "passthrough",
+            PolynomialLPV(degree),
             **roles,
         ).fit(data.X, data.y)
     with watch.step("validation"):
@@ -147,6 +151,7 @@ def run_paper_experiment(
             "table2": restructuring_table(pipeline, data),
             "table3": interpolation_table(parameters, kappa),
             "table4": validation_table(lpv, data),
+            "momentum": sweeps_table(_of_momenta(pipeline, data), both_sweeps(data)),
         }
     tables["timing"] = watch.table()
     return PaperExperiment(
@@ -169,4 +174,18 @@ def _interpolated(found: ParameterSet, kappa: Array, degree: int) -> LPVStateSpa
     interpolator = PolynomialLPV(degree).fit(kappa, found.theta)
     return LPVStateSpace(
         found.structure, interpolator, np.array([kappa.min(0), kappa.max(0)])
+    )
+
+
+def _of_momenta(pipeline: LocalLPVPipeline, data: Bunch) -> LPVStateSpace:
+    """The same local models, interpolated in the momenta and by the form they choose.
+
+    Parameters of the arm are those of either state.
+    """
+    kappa = pipeline.operating_points_
+    form = AutoLPV().fit(
+        kappa, pipeline.parameters_, covariance=pipeline.parameters_covariance_
+    )
+    return LPVStateSpace(
+        data.arm.structure("momentum"), form, np.array([kappa.min(0), kappa.max(0)])
     )

@@ -57,6 +57,9 @@ def tables_text(
         + _paired_text(
             tables["table4"], "model", tables["table4"]["model"].unique(), fits
         ),
+        "Beyond the paper: the same local models in the momentum basis, interpolated "
+        "by AutoLPV,\nalong sweeps of theta2, simulated from rest, in percent\n\n"
+        + _momentum_text(tables["momentum"]),
         "Computation time in seconds\n\n" + _timing_text(tables["timing"]),
     ]
     return "\n" + "\n\n\n".join(parts)
@@ -69,6 +72,14 @@ def _restructuring_text(table: pd.DataFrame, angles: list[str]) -> str:
         [title, *_cells(table[name], "{:.2e}")] for title, name in titles.items()
     ]
     return aligned_text([["theta2", *angles], *columns])
+
+
+def _momentum_text(table: pd.DataFrame) -> str:
+    """A row for each sweep."""
+    wide = table.pivot(index="sweep", columns=["metric", "output"], values="ours")
+    wide = wide.loc[table["sweep"].unique()]
+    columns = [[" ".join(key), *_cells(wide[key], "{:.1f}")] for key in wide]
+    return aligned_text([["sweep", *wide.index], *columns])
 
 
 def _timing_text(table: pd.DataFrame) -> str:

@@ -15,18 +15,27 @@ import pandas as pd
 from joblib import Memory, hash
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
-from sklearn.utils.validation import check_is_fitted, check_memory
+from sklearn.utils.validation import (
+    check_is_fitted,
+    check_memory,
+    has_fit_parameter,
+)
 
 from ..data.experiments import (
     NO_TIME,
     Experiment,
     as_list,
+    n_rows_of,
     read_experiments,
     read_outputs,
 )
-from ..data.operating_points import check_outputs, local_experiments, warn_extrapolation
-from ..data.preparation import split_at_gaps
-from ..lpv.model import LPVStateSpace
+from ..data.operating_points import check_outputs, local_experiments
+from ..data.preparation import read_runs
+from ..data.scoring import score_from_rest
+from ..data.timestamps import TIME_TOL, check_unit
+from ..exceptions import warn
+from ..lpv.auto import AutoLPV
+from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
@@ -41,14 +50,16 @@ Array = NDArray[np.float64]
 _DEFAULTS = {
     "local": SubspaceLTI,
     "restructurer": GrayBoxRestructurer,
-    "interpolator": PolynomialLPV,
+    "interpolator": AutoLPV,
 }
+
+_WITHOUT = ("aligned", "passthrough")  # what restructures without a structure
 
 # Methods that the steps need, an example, and what else is allowed.
 _STEPS = {
-    "local": (("fit",), "SubspaceLTI()", None),
-    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", "passthrough"),
-    "interpolator": (("fit", "predict"), "PolynomialLPV()", None),
+    "local": (("fit",), "SubspaceLTI()", ()),
+    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", _WITHOUT),
+    "interpolator": (("fit", "predict"), "AutoLPV() or PolynomialLPV()", ()),
 }
 
 
@@ -84,14 +95,16 @@ class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Step 3, a black-box model per operating point; None is ``SubspaceLTI()``. Its
         column roles are set by the pipeline. ``order="auto"`` becomes the order of the
         restructurer's structure where it has one.
-    restructurer : GrayBoxRestructurer, "passthrough" or None, default=None
-        Step 4; None is ``GrayBoxRestructurer()``, the observable canonical form.
-        "passthrough" interpolates the entries of the balanced local models: the
-        baseline without structure.
+    restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
+        Step 4. Without a structure, "aligned" (None) interpolates the entries of
+        the balanced local models, each turned to its neighbour by the rotation that
+        brings their states nearest; "passthrough" those whose signs alone agree, the
+        paper's baseline. ``GrayBoxRestructurer()`` is the observable canonical form.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
-        (n_points, n_params); None is ``PolynomialLPV()``, a parabola (a line through
-        two points). Any scikit-learn regressor with several outputs serves. One
+        (n_points, n_params); None is ``AutoLPV()``, which chooses by the covariances
+        of the parameters. Any scikit-learn regressor with several outputs serves; one
+        whose `fit` takes a `covariance` gets these (n_points, n_params, n_params). One
         operating point makes a constant, whatever the interpolator.
     inputs, scheduling, experiment, time, operating_point : column name, position or \
 list, default=None
@@ -106,6 +119,10 @@ list, default=None
         Seconds between samples. None reads it from the time column, else takes that of
         `local`. One of them must tell it where there is a structure or a scheduling
         variable, for the model is in continuous time; 1 counts time in samples.
+    time_tol : float, default=0.01
+        Largest deviation of a time stamp from an even grid, relative to the step. For
+        more, see `resample`. Where samples are missing, ``local=SubspaceLTI(
+        missing="split")`` cuts the records.
     combine : {"pool", "average"}, default="pool"
         Several experiments at one operating point enter one fit, or are identified
         one by one and their balanced models averaged (the paper's Monte Carlo).
@@ -137,22 +154,25 @@ list, default=None
     local_models_ : list of StateSpace
         Black-box models, continuous time, balanced.
     structured_models_ : list of StateSpace
-        Gray-box models (the balanced ones after "passthrough").
+        Gray-box models (without a structure, the balanced ones).
     restructurers_ : list
-        The fitted restructurers, empty after "passthrough".
+        The fitted restructurers, empty without a structure.
     parameters_ : DataFrame of shape (n_points, n_params)
         Gray-box parameters, one row per operating point: the efficient ones, where
         `efficient` applies.
     hinf_parameters_ : DataFrame of shape (n_points, n_params)
         Those of the H-infinity optimum; equal to `parameters_` where that is kept.
+    parameters_covariance_ : ndarray of shape (n_points, n_params, n_params)
+        Their covariances, of use to the interpolator.
     parameters_std_ : DataFrame of shape (n_points, n_params)
         Their standard deviations, to first order: from the covariance of the pooled
         black box, or with ``combine="average"`` and ``efficient=False`` from the spread
         of the realizations. NaN where that is not known: a local model that does not
         minimise the simulation error (``refine=False``, a stability that had to be
-        enforced), collinear inputs, or "passthrough".
+        enforced), collinear inputs, or no structure.
     interpolator_ : fitted regressor
     lpv_ : LPVStateSpace
+        Knows the names of the scheduling variables: ``lpv_.at({"kappa": 0.5})``.
     report_ : DataFrame
         One row per operating point: experiments, samples, order, BFT of the local and
         of the gray-box model on the estimation data (percent, mean over the outputs),
@@ -174,13 +194,15 @@ list, default=None
         Beyond which `predict` warns: the operating points, widened by how far the
         scheduling variables moved within an experiment.
     sampling_time_ : float
+    time_jitter_ : float
+        Largest deviation of a time stamp from an even grid, relative to the step.
     output_names_, scheduling_names_ : list
     n_outputs_, n_features_in_ : int
     feature_names_in_ : ndarray of str
 
     See Also
     --------
-    SubspaceLTI, GrayBoxRestructurer, PolynomialLPV : The three steps.
+    SubspaceLTI, GrayBoxRestructurer, AutoLPV : The three steps.
 
     Examples
     --------
@@ -221,6 +243,7 @@ list, default=None
         operating_point: Any = None,
         scheduling_tol: float | None = None,
         sampling_time: float | None = None,
+        time_tol: float = TIME_TOL,
         combine: str = "pool",
         discretization: str = "zoh",
         efficient: bool = True,
@@ -239,6 +262,7 @@ list, default=None
         self.operating_point = operating_point
         self.scheduling_tol = scheduling_tol
         self.sampling_time = sampling_time
+        self.time_tol = time_tol
         self.combine = combine
         self.discretization = discretization
         self.efficient = efficient
@@ -289,6 +313,7 @@ list, default=None
             self.n_outputs_ = len(self.output_names_)
             self._single_output = np.asarray(y).ndim == 1
             check_outputs(experiments, self.output_names_)
+            self.time_jitter_ = max(e.jitter for e in experiments)
             structure = getattr(restructurer, "structure", None)
             _check_channels(
                 structure, experiments[0].input_names, self.output_names_, self.inputs
@@ -311,16 +336,27 @@ list, default=None
         with watch.step("restructuring"):  # step 4: all of them in one structure
             found = restructure_points(restructurer, local, points, runner)
             self.local_models_ = [model.lti for model in found.local]
+            self._n_with_offset = sum(model.n_trend > 0 for model in found.local)
             self.structured_models_ = found.models
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
             kappa = self.operating_points_ = found.points.kappa
-            self.interpolator_ = self._interpolator(len(kappa)).fit(kappa, found.theta)
+            interpolator, known = self._interpolator(len(kappa)), {}
+            if has_fit_parameter(interpolator, "covariance"):
+                known["covariance"] = found.covariance
+            self.interpolator_ = interpolator.fit(kappa, found.theta, **known)
             span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
-            self.lpv_ = LPVStateSpace(found.structure, self.interpolator_, span)
             self.scheduling_range_ = found.points.identified_range
             self.scheduling_names_ = as_list(self.scheduling)
+            self.lpv_ = LPVStateSpace(
+                found.structure,
+                self.interpolator_,
+                span,
+                scheduling_names=self.scheduling_names_ or None,
+                identified_range=self.scheduling_range_,
+            )
+            self.parameters_covariance_ = found.covariance
             report = tables(found, self.lpv_, self.sampling_time_)
             self.parameters_, self.parameters_std_ = (
                 report.parameters,
@@ -357,9 +393,12 @@ list, default=None
         -----
         ExtrapolationWarning
             Where a scheduling variable leaves `scheduling_range_`.
+        UserWarning
+            Where local models have constants (`SubspaceLTI.offset_`), which the LPV
+            model leaves out.
         """
         check_is_fitted(self, "lpv_")
-        return self._simulate(self._read(X, None, reset=False), estimate=False)
+        return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate from initial states estimated on the measured outputs.
@@ -371,18 +410,47 @@ list, default=None
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+            Missing outputs (NaN) are left out.
 
         Returns
         -------
         ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+            Where `local` has ``missing="split"``, NaN at missing inputs or scheduling
+            values; the simulation begins anew after them.
         """
         check_is_fitted(self, "lpv_")
-        return self._simulate(self._read(X, y, reset=False), estimate=True)
+        return self._simulate(
+            self._read(X, y, outputs=False), n_rows_of(X), estimate=True
+        )
+
+    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
+        """Coefficient of determination of the simulation from rest.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+            Samples of which an output is missing (NaN) are left out.
+        sample_weight : array-like of shape (n_samples,), default=None
+
+        Returns
+        -------
+        float
+            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
+
+        Warns
+        -----
+        UserWarning
+            If an experiment starts in mid-motion, which a simulation from rest misses.
+        """
+        return score_from_rest(self, X, y, sample_weight)
 
     def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
         """Rows of every experiment of a table, in the order of time."""
         check_is_fitted(self, "lpv_")
-        return [e.rows for e in self._read(X, None, reset=False)]
+        gaps = "Xy" if self._splits else ""
+        found = read_experiments(self, X, reset=False, allow_missing=gaps)
+        return [e.rows for e in found]
 
     def summary(self) -> str:
         """What was identified and how well, as text: ``print(pipeline.summary())``."""
@@ -401,26 +469,46 @@ list, default=None
             restructurer=_name_of_step(self.restructurer, "restructurer"),
         )
 
-    def _simulate(self, experiments: list[Experiment], estimate: bool) -> Array:
-        if getattr(self.interpolator_, "extrapolation", None) != "clip":
+    def _simulate(
+        self, experiments: list[Experiment], n_samples: int, *, estimate: bool
+    ) -> Array:
+        if self._n_with_offset:
+            warn(
+                f"The experiments at {self._n_with_offset} of "
+                f"{len(self.local_models_)} operating point(s) have constants in their "
+                "outputs, which local models allow for. The LPV model has none: its "
+                "outputs are about zero. Subtract from y what it is at rest at input "
+                "zero, at every operating point, or say that it is zero: "
+                "local=SubspaceLTI(offset=None)."
+            )
+        signals = [e.scheduling for e in experiments if e.scheduling is not None]
+        if signals and getattr(self.interpolator_, "extrapolation", None) != "clip":
             warn_extrapolation(
-                experiments, self.scheduling_range_, self.scheduling_names_
+                np.vstack(signals), self.scheduling_range_, self.scheduling_names_
             )
         model = self.lpv_.silenced()  # said above, of all experiments at once
         out = simulate_experiments(
-            model, experiments, self.sampling_time_, estimate=estimate
+            model, experiments, self.sampling_time_, n_samples, estimate=estimate
         )
         return out[:, 0] if self._single_output else out
 
     # -- helpers -------------------------------------------------------------------
 
-    def _read(self, X: Any, y: Any, *, reset: bool) -> list[Experiment]:
-        gaps = reset and getattr(self.local, "missing", None) == "split"
-        options: dict[str, Any] = {"reset": reset, "allow_missing": gaps}
-        if reset:
-            options["sampling_time"] = self.sampling_time
-        experiments = read_experiments(self, X, y, **options)
-        return split_at_gaps(experiments) if gaps else experiments
+    @property
+    def _splits(self) -> bool:
+        return getattr(self.local, "missing", None) == "split"
+
+    def _read(
+        self, X: Any, y: Any, *, reset: bool = False, **options: Any
+    ) -> list[Experiment]:
+        """Experiments of a table; options as in `read_runs`."""
+        declared = self.sampling_time if reset else None
+        options |= {"split": self._splits, "reset": reset, "sampling_time": declared}
+        experiments = read_runs(self, X, y, **options)
+        if not reset:  # another step will do, but hardly another unit
+            for e in experiments:
+                check_unit(e.sampling_time, self.sampling_time_, self.time)
+        return experiments
 
     def _sampling_time(self, experiments: list[Experiment], structure: Any) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]
@@ -438,17 +526,13 @@ list, default=None
         raise ValueError(NO_TIME.format(needed))
 
     def _restructurer(self) -> Any:
-        """The restructurer to clone, or None for "passthrough"."""
-        if self.restructurer is None:
-            return GrayBoxRestructurer()
-        return None if isinstance(self.restructurer, str) else self.restructurer
+        """The restructurer to clone, or the way without one."""
+        return _WITHOUT[0] if self.restructurer is None else self.restructurer
 
     def _interpolator(self, n_points: int) -> Any:
         if n_points == 1:
             return PolynomialLPV(degree=0)
-        if self.interpolator is None:
-            return PolynomialLPV(degree=min(2, n_points - 1))
-        return clone(self.interpolator)
+        return AutoLPV() if self.interpolator is None else clone(self.interpolator)
 
     def _check_options(self) -> None:
         one_of("combine", self.combine, ("pool", "average"))
@@ -528,20 +612,22 @@ def _check_channels(
 
 
 def _name_of_step(step: Any, name: str) -> str:
+    if name == "restructurer" and (step is None or isinstance(step, str)):
+        return step or _WITHOUT[0]
     return (_DEFAULTS[name] if step is None else type(step)).__name__
 
 
 def _check_step(name: str, step: Any) -> None:
     """Refuse what cannot be a step of the method, and say what can."""
     methods, example, other = _STEPS[name]
-    if step is None or (other and isinstance(step, str) and step == other):
+    if step is None or (isinstance(step, str) and step in other):
         return
     got = f"{step!r}" if isinstance(step, str) else type(step).__name__
     if isinstance(step, type):
         got = f"the class {step.__name__}, not an instance"
     elif all(hasattr(step, method) for method in (*methods, "get_params")):
         return
-    choice = f"an estimator, {other!r} or None" if other else "an estimator or None"
+    choice = ", ".join(["an estimator", *map(repr, other)]) + " or None"
     raise ValueError(
         f"`{name}` must be {choice}. Got {got}. Give an instance with the "
         f"method(s) {', '.join(methods)}, such as {example}."

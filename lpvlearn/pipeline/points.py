@@ -12,6 +12,7 @@ import inspect
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,9 @@ from threadpoolctl import ThreadpoolController
 
 from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
+from ..data.preparation import DETRENDS
 from ..exceptions import Told, collected, warn
+from ..lpv.alignment import aligned_models
 from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
@@ -62,6 +65,7 @@ class LocalModel:
     horizon: int | None  # of the subspace step, where the estimator tells it
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
     deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
+    n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
     # the model as identified (of every realization) with models to either side of it,
     # where the covariance is known; with "zoh" in discrete time
     estimates: list[Estimate] = field(default_factory=list)
@@ -131,6 +135,7 @@ def identify_point(
             fitted.lti_.order,
             _horizon(fitted),
             deviated=_all_continuous(pairs, discretization),
+            n_trend=_n_trend(fitted),
         )
         if efficient and pairs:
             found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
@@ -145,10 +150,11 @@ def identify_point(
     for name in ("order", "horizon", "method"):
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
-    models, failures = [], []
+    models, failures, n_trend = [], [], 0
     estimates: list[Estimate] = []
     for realisation in realisations:
         refitted = _fit_local(chosen, realisation, sampling_time)
+        n_trend = max(n_trend, _n_trend(refitted))
         model, pairs = refitted.lti_, _deviated(refitted) if efficient else []
         try:
             models.append(_continuous(model, discretization, advice))
@@ -171,6 +177,7 @@ def identify_point(
         _horizon(fitted),
         models,
         estimates=estimates if known else [],
+        n_trend=n_trend,
     )
 
 
@@ -182,6 +189,11 @@ def _deviated(fitted: Any) -> list[ModelPair]:
 
 def _from_closed_loop(fitted: Any) -> bool:
     return getattr(fitted, "method_", None) == "pbsid"
+
+
+def _n_trend(fitted: Any) -> int:
+    """Trends of every output and experiment in a model, as `LocalModel` has them."""
+    return DETRENDS.index(getattr(fitted, "offset_", None))
 
 
 def _in_own_time(
@@ -312,7 +324,7 @@ class StructuredModels(NamedTuple):
     local: list[LocalModel]  # the black boxes
     structure: GrayBoxStructure
     theta: Array  # (n_points, n_params), parameters
-    std: Array  # (n_points, n_params), their standard deviations: NaN where not known
+    covariance: Array  # (n_points, n_params, n_params): NaN where not known
     models: list[StateSpace]
     restructurers: list[Any]  # fitted; empty without that step
 
@@ -325,15 +337,17 @@ def restructure_points(
 ) -> StructuredModels:
     """Bring the local models of all operating points into one structure.
 
-    Without a restructurer (None), the entries of the balanced models are parameters.
+    "aligned" or "passthrough": the entries of the balanced models are parameters.
     """
-    if restructurer is None:
+    if isinstance(restructurer, str):
         # poles on the negative real axis make the order grow in continuous time
-        structure, theta = balanced_entries(
-            [model.lti.balance(min(model.order, model.lti.order)) for model in local]
-        )
+        models = [
+            model.lti.balance(min(model.order, model.lti.order)) for model in local
+        ]
+        kappa = points.kappa if restructurer == "aligned" else None
+        structure, theta = balanced_entries(models, kappa)
         balanced = [structure.model(row) for row in theta]
-        unknown = np.full(theta.shape, np.nan)
+        unknown = _unknown_covariance(theta)
         return StructuredModels(points, local, structure, theta, unknown, balanced, [])
     restructurer = _with_structure(restructurer, local)
     # What a fit is about: the model, and where they are known its realizations and
@@ -374,8 +388,8 @@ def restructure_points(
     helped = [done.result for done in found if done is not None]
     points, local = points.keep(kept), [local[k] for k in kept]
     theta = np.array([fitted.params_ for fitted in helped])
-    std = np.full(theta.shape, np.nan)
-    for row, fitted, model in zip(std, helped, local, strict=True):
+    covariance = _unknown_covariance(theta)
+    for P, fitted, model in zip(covariance, helped, local, strict=True):
         known = getattr(fitted, "params_covariance_", None)  # where it tells its own
         if known is None and model.deviated:
             known = runner.call(
@@ -387,11 +401,15 @@ def restructure_points(
                 model.deviated,
             )
         if known is not None:
-            row[:] = np.sqrt(np.diag(known))
+            P[:] = known
     models = [fitted.lti_ for fitted in helped]
     return StructuredModels(
-        points, local, helped[0].structure_, theta, std, models, helped
+        points, local, helped[0].structure_, theta, covariance, models, helped
     )
+
+
+def _unknown_covariance(theta: Array) -> Array:
+    return np.full((*theta.shape, theta.shape[1]), np.nan)
 
 
 def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
@@ -512,25 +530,28 @@ def _plain(model: StateSpace) -> StateSpace:
     return StateSpace(A, B, C, D, model.sampling_time)
 
 
-def balanced_entries(models: Sequence[StateSpace]) -> tuple[GrayBoxStructure, Array]:
-    """The entries of balanced models as parameters, signs aligned along the points.
+def balanced_entries(
+    models: Sequence[StateSpace], kappa: Array | None = None
+) -> tuple[GrayBoxStructure, Array]:
+    """The entries of balanced models as parameters. Orders must agree.
 
-    The baseline of the paper: no common state basis is guaranteed. Orders must agree.
+    Aligned with one another over `kappa`; without it their signs only, along the
+    points: the baseline of the paper, of no common state basis.
     """
     orders = sorted({model.order for model in models})
     if len(orders) > 1:
         raise ValueError(
-            "`restructurer='passthrough'` interpolates matrices and needs local models "
-            f"of one order. Got orders {orders}. Fix the order: "
+            "Without a structure the matrices are interpolated, which needs local "
+            f"models of one order. Got orders {orders}. Fix the order: "
             "local=SubspaceLTI(order=...)."
         )
+    if kappa is not None:
+        models = aligned_models(models, kappa)
+    else:
+        models = list(accumulate(models, with_signs_of))
     first = models[0]
     structure = GrayBoxStructure.full(orders[0], first.n_inputs, first.n_outputs)
-    rows = []
-    previous = first
-    for model in models:
-        previous = with_signs_of(previous, model)
-        rows.append(np.concatenate([getattr(previous, M).ravel() for M in "ABCD"]))
+    rows = [np.concatenate([getattr(m, M).ravel() for M in "ABCD"]) for m in models]
     return structure, np.array(rows)
 
 

@@ -32,7 +32,8 @@ class Tables(NamedTuple):
 
 def tables(found: StructuredModels, lpv: LPVStateSpace, sampling_time: float) -> Tables:
     """Tabulate the results of steps 3 to 5 at the operating points."""
-    points, theta, spread = found.points, found.theta, found.std
+    points, theta = found.points, found.theta
+    spread = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     labels = [row[0] if len(row) == 1 else tuple(row) for row in points.kappa.tolist()]
     index = pd.Index(labels, name="operating_point", tupleize_cols=False)
     names = pd.Index(found.structure.parameter_names)
@@ -48,10 +49,11 @@ def tables(found: StructuredModels, lpv: LPVStateSpace, sampling_time: float) ->
             "n_samples": sum(len(e.rows) for e in group),
             "order": model.order,
             "horizon": model.horizon,
-            "local_BFT": fit_of(model.lti, group, sampling_time),
+            "local_BFT": fit_of(model.lti, group, sampling_time, model.n_trend),
         }
         if found.restructurers:
-            row["structured_BFT"] = fit_of(gray_box, group, sampling_time)
+            structured = fit_of(gray_box, group, sampling_time, model.n_trend)
+            row["structured_BFT"] = structured
             row |= _restructuring(found.restructurers[k])
         distance = (gray_box - found.structure.model(interpolated[k])).hinf_norm()
         size = gray_box.hinf_norm()
@@ -179,14 +181,21 @@ def summarise(
                 "point(s): see `parameters_std_`"
             )
     else:
+        basis = (
+            "each turned to its neighbour"
+            if restructurer == "aligned"
+            else "which have no common state basis"
+        )
         lines.append(
             "Restructuring: none; the entries of balanced models are interpolated, "
-            "which have no common state basis"
+            + basis
         )
     distance = 100 * report["interpolation_error"]
+    form = getattr(lpv.interpolator, "form_", "")
+    fit = parameter_fit(found.parameters, lpv.parameters(kappa))
     lines += [
-        f"Interpolation: {lpv.interpolator}, parameter fit (FIT) "
-        f"{parameter_fit(found.parameters, lpv.parameters(kappa)):.2f} %",
+        f"Interpolation: {lpv.interpolator}{form and f' ({form})'}, "
+        f"parameter fit (FIT) {fit:.2f} %",
         f"    H-infinity error {_span(distance)} % of the model's norm, the largest at "
         f"{_label_of_largest(distance)}",
     ]

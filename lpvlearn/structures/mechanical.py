@@ -1,14 +1,19 @@
-"""Equations of motion as structures: implicit equations, solved for accelerations.
+"""Implicit equations as structures: equations of motion, descriptor forms.
 
 Physics writes ``M(theta) X = N(theta)`` with M and N affine in the parameters; the
 system matrix ``S = offset + W X`` is affine only where M holds no parameter. Its
 derivatives follow from those of the equations: ``M X_i = N_i - M_i X``.
+
+Equations ``E(theta) x' = A x + B u`` are such ones, in the state x. Read as a balance
+of fluxes, ``d(E x)/dt = A x + B u``, their state is ``z = E x`` (momenta of a mass
+matrix), and S is a quotient from the other side, ``[[A, B], [C, D]] diag(E, I)^-1``.
+Without a change of E they are the same model.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..validation import matrix, one_of
 from .map import AffineMap, StructureMap
-from .templates import affine_arrays, check_shapes, parse_cells
+from .templates import Affine, affine_arrays, check_shapes, parse_cells, system_cells
 
 Array = NDArray[np.float64]
 
@@ -38,6 +43,7 @@ class ImplicitMap(StructureMap):
     W: Array  # (order + n_outputs, n_dof)
     offset: Array  # (order + n_outputs, order + n_inputs)
     order: int
+    name: str = "M"  # of M, to the user
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -74,7 +80,7 @@ class ImplicitMap(StructureMap):
             np.concatenate([X[:1] + np.tensordot(known, X[1:], 1), X[1:]])[keep]
             for X in (self.M, self.N)
         )
-        return ImplicitMap(M, N, self.W, self.offset, self.order).simplest()
+        return replace(self, M=M, N=N).simplest()
 
     def simplest(self) -> AffineMap | ImplicitMap:
         """The same map, affine where M holds no parameter; then it must be regular."""
@@ -82,8 +88,8 @@ class ImplicitMap(StructureMap):
             return self
         if not 1.0 / np.linalg.cond(self.M[0]) > _SINGULAR:
             raise ValueError(
-                "`M` must be regular: a coordinate without mass is no state. Got "
-                f"{self.M[0].tolist()}."
+                f"`{self.name}` must be regular: a coordinate without mass is no "
+                f"state. Got {self.M[0].tolist()}."
             )
         S = self.W @ np.linalg.solve(self.M[0], self.N) + 0.0  # no negative zeros
         return AffineMap(self.offset + S[0], S[1:])
@@ -131,9 +137,80 @@ class ImplicitMap(StructureMap):
             if 1.0 / np.linalg.cond(M) > _SINGULAR:
                 return candidate
         raise ValueError(
-            "`M` must be regular for some parameters. Got a template that is singular "
-            "for all; a coordinate without mass is no state."
+            f"`{self.name}` must be regular for some parameters. Got a template that "
+            "is singular for all; a coordinate without mass is no state."
         )
+
+
+@dataclass(frozen=True, eq=False)
+class FluxMap(StructureMap):
+    """S in the state ``z = E x`` of equations ``d(E x)/dt = A x + B u``."""
+
+    equations: ImplicitMap  # in the state x
+    transposed: ImplicitMap  # of S^T, which is a quotient from the left
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.equations.shape
+
+    def system_matrix(self, theta: Array) -> Array:
+        return self.transposed.system_matrix(theta).T
+
+    def jacobian(self, theta: Array) -> Array:
+        return self.transposed.jacobian(theta).swapaxes(-1, -2)
+
+    def curvature(self, theta: Array) -> Array:
+        return self.transposed.curvature(theta).swapaxes(-1, -2)
+
+    def fix(self, values: Array, free: NDArray[np.bool_]) -> AffineMap | FluxMap:
+        return _flux_of(
+            self.equations.fix(values, free), self.transposed.fix(values, free)
+        )
+
+
+def _flux_of(
+    equations: AffineMap | ImplicitMap, transposed: AffineMap | ImplicitMap
+) -> AffineMap | FluxMap:
+    if isinstance(transposed, AffineMap):  # E holds no parameter
+        offset, basis = transposed.offset, transposed.basis
+        return AffineMap(offset.T.copy(), basis.swapaxes(1, 2).copy())
+    assert isinstance(equations, ImplicitMap)
+    return FluxMap(equations, transposed)
+
+
+def _quotient(E: Array, S: Array) -> ImplicitMap:
+    """``diag(E, I)^-1 S``; constant parts, then those of the parameters."""
+    order, (q, rows, columns) = E.shape[1], S.shape
+    M = np.zeros((q, rows, rows))
+    M[0] = np.eye(rows)
+    M[:, :order, :order] = E
+    return ImplicitMap(M, S, np.eye(rows), np.zeros((rows, columns)), order, "E")
+
+
+def descriptor_map(
+    E: Any,
+    A: Any,
+    B: Any,
+    C: Any,
+    D: Any,
+    descriptor: str,
+    parameter_names: Sequence[str] | None,
+) -> tuple[AffineMap | FluxMap | ImplicitMap, list[str]]:
+    """Descriptor equations, see `GrayBoxStructure.from_template`; parameter names."""
+    one_of("descriptor", descriptor, ("rate", "flux"))
+    n, system = system_cells(A, B, C, D)
+    given = {"E": parse_cells("E", E)}
+    check_shapes(given, {"E": (n, n)}, "`A`")
+    none: list[list[Affine]] = [[{"": 0.0}] * n for _ in system[n:]]
+    rows = zip([*given["E"], *none], system, strict=True)
+    offset, basis, names = affine_arrays([e + s for e, s in rows], parameter_names)
+    stacked = np.concatenate([offset[None], basis])
+    left, S = stacked[:, :n, :n], stacked[:, :, n:]
+    equations = _quotient(left, S)
+    if descriptor == "rate":
+        return equations.simplest(), names
+    transposed = _quotient(left.swapaxes(1, 2), S.swapaxes(1, 2))
+    return _flux_of(equations, transposed.simplest()), names
 
 
 def mechanical_map(
@@ -142,11 +219,19 @@ def mechanical_map(
     K: Any,
     F: Any,
     outputs: str,
+    state: str,
     sensors: ArrayLike | None,
     parameter_names: Sequence[str] | None,
-) -> tuple[ImplicitMap, list[str]]:
+) -> tuple[AffineMap | FluxMap | ImplicitMap, list[str]]:
     """Equations of motion, see `GrayBoxStructure.mechanical`; and parameter names."""
     one_of("outputs", outputs, ("position", "velocity", "acceleration"))
+    one_of("state", state, ("rate", "momentum"))
+    if state == "momentum" and outputs == "acceleration":
+        raise ValueError(
+            "`outputs` must be 'position' or 'velocity' with state='momentum': of a "
+            "mass that varies, the acceleration is no function of the momenta and the "
+            "forces alone. Got 'acceleration'; take state='rate'."
+        )
     given = {"M": M, "D": D, "K": K, "F": F}
     cells = {name: parse_cells(name, block) for name, block in given.items()}
     n, m = len(cells["M"]), len(cells["F"][0]) if cells["F"] else 0
@@ -179,4 +264,11 @@ def mechanical_map(
     else:
         first = 0 if outputs == "position" else n
         fixed[2 * n :, first : first + n] = H
-    return ImplicitMap(mass, rest, W, fixed, 2 * n), names
+    equations = ImplicitMap(mass, rest, W, fixed, 2 * n)
+    if state == "rate":
+        return equations.simplest(), names
+    E, S = np.zeros((len(mass), 2 * n, 2 * n)), np.zeros((len(mass), *fixed.shape))
+    E[0], S[0] = np.eye(2 * n), fixed
+    E[:, n:, n:], S[:, n : 2 * n] = mass, rest
+    transposed = _quotient(E.swapaxes(1, 2), S.swapaxes(1, 2))
+    return _flux_of(equations, replace(transposed, name="M").simplest()), names

@@ -19,7 +19,7 @@ from ..models.statespace import StateSpace
 from ..models.system_matrix import Blocks, blocks
 from ..validation import named_values, real_array
 from .map import AffineMap, FunctionMap, RowsMap, StructureMap
-from .mechanical import ImplicitMap, mechanical_map
+from .mechanical import FluxMap, ImplicitMap, descriptor_map, mechanical_map
 from .templates import (
     Entry,
     affine_system,
@@ -105,7 +105,8 @@ class GrayBoxStructure:
         self.offset = None if affine is None else affine.offset
         self.basis = None if affine is None else affine.basis
         # the equations M(theta) X = N(theta) of a structure that solves them
-        self.implicit = map if isinstance(map, ImplicitMap) else None
+        equations = map.equations if isinstance(map, FluxMap) else map
+        self.implicit = equations if isinstance(equations, ImplicitMap) else None
         if self.implicit is not None and initial is None:
             self.implicit.regular_point()  # that there is none is told of here
         for array in (self.initial, self.lower, self.upper, self.ranges):
@@ -136,6 +137,8 @@ class GrayBoxStructure:
         C: Sequence[Sequence[Entry]],
         D: Sequence[Sequence[Entry]] | None = None,
         *,
+        E: Sequence[Sequence[Entry]] | None = None,
+        descriptor: str = "rate",
         parameter_names: Sequence[str] | None = None,
     ) -> GrayBoxStructure:
         """Structure whose entries are numbers or affine expressions of names.
@@ -146,6 +149,14 @@ class GrayBoxStructure:
             Shapes (order, order), (order, n_inputs), (n_outputs, order) and
             (n_outputs, n_inputs). A string such as ``"-p9"`` or ``"2*k - 1"`` is an
             affine expression of parameter names; one name may stand in several entries.
+        E : nested sequence of float or str, default=None
+            Left side of descriptor equations, shape (order, order), in the same
+            entries; None is the identity.
+        descriptor : {"rate", "flux"}, default="rate"
+            Equations ``E x' = A x + B u`` in the state x, or ``d(E x)/dt = A x + B u``
+            in the state ``E x``, with outputs ``y = C x + D u``. The frozen models are
+            the same; where E follows a scheduling variable that moves, an LPV model is
+            not: see :ref:`guide_state_basis`.
         parameter_names : sequence of str, default=None
             Order of the parameters; None is the natural alphabetical order
             (p2 before p10).
@@ -153,17 +164,30 @@ class GrayBoxStructure:
         Raises
         ------
         ValueError
-            If shapes do not fit, or an entry is not an affine expression
-            (the message names the cell).
+            If shapes do not fit, an entry is not an affine expression (the message
+            names the cell), or E is singular.
 
         Examples
         --------
+        A tank whose level x drains through a pipe, with the free surface ``area``. The
+        volume ``area * x`` is what flows in and out:
+
+        >>> tank = {"E": [["area"]], "A": [["-r"]], "B": [[1]], "C": [[1]]}
+        >>> level = GrayBoxStructure.from_template(**tank).model([2.0, 0.5])
+        >>> level.A, level.C
+        (array([[-0.25]]), array([[1.]]))
+        >>> volume = GrayBoxStructure.from_template(**tank, descriptor="flux")
+        >>> volume.model([2.0, 0.5]).A, volume.model([2.0, 0.5]).C
+        (array([[-0.25]]), array([[0.5]]))
+
         >>> structure = GrayBoxStructure.from_template(
         ...     A=[["-1 / 2 * a"]], B=[["a"]], C=[[1]], D=[["d"]])
         >>> structure.model({"a": 4.0, "d": 1.0}).A
         array([[-2.]])
         """
-        return cls(*affine_system(A, B, C, D, parameter_names))
+        if E is None:
+            return cls(*affine_system(A, B, C, D, parameter_names))
+        return cls(len(A), *descriptor_map(E, A, B, C, D, descriptor, parameter_names))
 
     @classmethod
     def from_function(
@@ -340,11 +364,12 @@ class GrayBoxStructure:
         F: Sequence[Sequence[Entry]],
         outputs: str = "position",
         *,
+        state: str = "rate",
         sensors: ArrayLike | None = None,
         initial: ArrayLike | Mapping[str, float] | None = None,
         parameter_names: Sequence[str] | None = None,
     ) -> GrayBoxStructure:
-        """Equations of motion ``M q'' + D q' + K q = F u`` with states ``[q, q']``.
+        """Equations of motion ``M q'' + D q' + K q = F u``.
 
         Parameters
         ----------
@@ -353,6 +378,12 @@ class GrayBoxStructure:
         F : nested sequences of float or str
             Shape (n_dof, n_inputs).
         outputs : {"position", "velocity", "acceleration"}, default="position"
+            Acceleration with ``state="rate"`` only.
+        state : {"rate", "momentum"}, default="rate"
+            Coordinates and rates ``[q, q']``, or coordinates and momenta ``[q, M q']``.
+            The frozen models are the same. Where M follows a scheduling variable that
+            moves, forces change momenta: then "momentum" is Newton's law and "rate"
+            leaves the term ``M' q'`` out. See :ref:`guide_state_basis`.
         sensors : array-like of shape (n_outputs, n_dof), default=None
             What the outputs measure, e.g. ``[[1, 0]]`` for the first coordinate alone;
             None is every coordinate.
@@ -384,10 +415,11 @@ class GrayBoxStructure:
         array([[ 0. ,  1. ],
                [-4. , -0.5]])
         """
-        equations, names = mechanical_map(M, D, K, F, outputs, sensors, parameter_names)
+        map, names = mechanical_map(
+            M, D, K, F, outputs, state, sensors, parameter_names
+        )
         guess = None if initial is None else named_values("initial", initial, names)[0]
-        simplest = equations.simplest()
-        return cls(equations.order, simplest, names, initial=guess, is_mechanical=True)
+        return cls(2 * len(M), map, names, initial=guess, is_mechanical=True)
 
     # -- what is known of the parameters -------------------------------------------
 

@@ -35,6 +35,13 @@ def affine_system(
     A: Any, B: Any, C: Any, D: Any, parameter_names: Sequence[str] | None
 ) -> tuple[int, AffineMap, list[str]]:
     """Read templates of A, B, C, D: the order, the map, and the parameter names."""
+    n, rows = system_cells(A, B, C, D)
+    offset, basis, names = affine_arrays(rows, parameter_names)
+    return n, AffineMap(offset, basis), names
+
+
+def system_cells(A: Any, B: Any, C: Any, D: Any) -> tuple[int, list[list[Affine]]]:
+    """The order, and the cells of ``[[A, B], [C, D]]``."""
     given = {"A": A, "B": B, "C": C}
     cells = {name: parse_cells(name, block) for name, block in given.items()}
     n = len(cells["A"])
@@ -56,8 +63,7 @@ def affine_system(
     check_shapes(cells, expected, "the other matrices")
     rows = [a + b for a, b in zip(cells["A"], cells["B"], strict=True)]
     rows += [c + d for c, d in zip(cells["C"], cells["D"], strict=True)]
-    offset, basis, names = affine_arrays(rows, parameter_names)
-    return n, AffineMap(offset, basis), names
+    return n, rows
 
 
 def check_shapes(

@@ -29,6 +29,10 @@ prediction error, which is the simulation error of the predictor, driven by z.
 The states are those of plant and noise together. A mode of the noise alone is one that
 the inputs do not reach, and is told from the others by the covariance of its part of B.
 
+A constant of the outputs (and a drift) is one of their prediction, but for a free
+response of the predictor: it is projected out of the Hankel matrix and is an unknown of
+the refinement, as in open loop.
+
 Every step is invariant to other units, and to an invertible mixing, of inputs and of
 outputs. Where D is free, ``u[t]`` is a regressor of ``y[t]``. That is right as long as
 the controller needs at least one sample to answer: one that answers within the sample
@@ -55,14 +59,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..models.innovation import InnovationModel, NoiseModel
+from ..models.innovation import (
+    InnovationModel,
+    NoiseModel,
+    prediction_responses,
+)
 from ..models.statespace import StateSpace
 from ..systems.least_squares import scaled_lstsq
-from ..systems.simulation import (
-    estimate_initial_state,
-    free_responses,
-    state_trajectory,
-)
+from ..systems.simulation import estimate_initial_state, state_trajectory
 from .hankel import hankel_factor
 from .identification import STABLE_MARGIN, ScaledRecords, Settings
 from .noise import Whitening
@@ -70,7 +74,13 @@ from .realization import reflect_unstable
 from .refinement import refine_simulation
 from .selection import Row, Selection
 from .signals import Record, output_energy
-from .simulation_fit import Freedom, Realization, moved_model, simulation_fit
+from .simulation_fit import (
+    Freedom,
+    Realization,
+    moved_model,
+    simulation_fit,
+    with_initial_states,
+)
 from .statistics import Evidence, parameter_covariance, shorten
 from .varx import longest_past, n_windows, past_window, samples_of
 
@@ -256,7 +266,7 @@ class ClosedLoopFit(NamedTuple):
     stability_loss: float  # increase of the residual that enforced stability cost
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ClosedLoopEvidence(Evidence):
     """A plant with the predictor that it is a part of."""
 
@@ -290,6 +300,34 @@ class ClosedLoopEvidence(Evidence):
         known = _knowledge(self.fitted, self.joint, self.transform, self.kept, direct)
         return known.plant
 
+    @cached_property
+    def one_step(self) -> Evidence:
+        """The predictor as a model driven by inputs and outputs, with its errors."""
+        A, B, C, D, K, _ = self.joint
+        ny, inner = len(C), A - K @ C
+        B, D = np.hstack([B - K @ D, K]), np.hstack([D, np.zeros((ny, ny))])
+        direct = np.hstack([self.free.direct, np.zeros((ny, ny), dtype=bool)])
+        free = self.free._replace(direct=direct)
+        records = [r._replace(u=np.vstack((r.u, r.y))) for r in self.records]
+        start = Realization(inner, B, C, D, np.zeros((len(records), len(A))), np.inf)
+        levels = self.levels
+        if levels is not None:
+            # What a constant of the outputs is in their errors of prediction.
+            predicted = C @ np.linalg.pinv(np.eye(len(A)) - inner) @ K
+            levels = levels - levels @ predicted.T
+        return Evidence(
+            with_initial_states(start, records, free),
+            records,
+            np.concatenate([self.input_scale, self.output_scale]),
+            self.output_scale,
+            np.eye(B.shape[1]),
+            free,
+            self.whitening,
+            False,
+            self.share,
+            levels,
+        )
+
     def predictor(self, lti: StateSpace, n_noise_states: int | None) -> InnovationModel:
         """Innovation model of `lti`; the fit has chosen the states of the noise."""
         noise, sy = self.noise, self.output_scale
@@ -320,19 +358,17 @@ def identify_closed_loop(
     records, free = scaled.records, settings.free
     wanted = (order or 0) + settings.n_noise_states
     subspace = _predictor_subspace(records, wanted, free.direct, horizon)
-    errors = _errors_by_order(subspace, max(wanted, _MAX_ORDER))
-    criteria = _criteria(errors, subspace)
+    left = _errors_by_order(subspace, max(wanted, _MAX_ORDER))
+    criteria = _criteria(left, subspace)
     free_order = order is None or (settings.refine and settings.n_noise_states == 0)
     n_joint = max(wanted, int(np.argmin(criteria))) if free_order else wanted
-    fitted, joint, states, transform, kept = _fit_together(
-        subspace, records, order, n_joint, settings
-    )
-    loss = sum(
-        float(np.sum(_predicted(joint, r, free, x0)[1] ** 2))
-        for r, x0 in zip(records, states, strict=True)
-    )
+    together = _fit_together(subspace, records, order, n_joint, settings)
+    fitted, joint, transform, kept = together
+    own, errors = _predicted(joint, records, free)
+    states, trends = free.own_parts(own, len(joint.A))
+    loss = sum(float(np.sum(e**2)) for e in errors)
     A, B, C = joint.A[kept][:, kept], joint.B[kept], joint.C[:, kept]
-    plant = Realization(A, B, C, joint.D, states[:, kept], loss)
+    plant = Realization(A, B, C, joint.D, states[:, kept], loss, trends=trends)
     energy, stability_loss = output_energy(records) or 1.0, 0.0
     residual = float(np.sqrt(loss / energy))
     heads, share = shorten(records)
@@ -343,14 +379,21 @@ def identify_closed_loop(
     stable_A = reflect_unstable(A, limit)
     if stable_A is A:
         evidence = ClosedLoopEvidence(
-            plant, *known, fitted is not None, share, joint, transform, kept, fitted
+            plant,
+            *known,
+            fitted is not None,
+            share,
+            joint=joint,
+            transform=transform,
+            kept=kept,
+            fitted=fitted,
         )
     else:
         plant = simulation_fit(stable_A, C, records, free)
         stability_loss = float(np.sqrt(plant.loss / energy)) - residual
         residual += stability_loss
         evidence = Evidence(plant, *known, False, share)
-    sizes = [float(np.linalg.norm(e)) / np.sqrt(len(e)) for e in errors]
+    sizes = [float(np.linalg.norm(e)) / np.sqrt(len(e)) for e in left]
     excess = (criteria - criteria.min()).tolist()
     tried = [
         Row(n, subspace.past, size, value, np.nan)
@@ -368,7 +411,6 @@ class _Together(NamedTuple):
 
     fitted: _Predictor | None  # None where it is not at a minimum
     joint: _Innovation  # block diagonal
-    states: Array  # (n_experiments, order), initial
     transform: Array  # from the states of `fitted` to these
     kept: NDArray[np.bool_]  # which states are the plant's
 
@@ -381,24 +423,22 @@ def _fit_together(
     settings: Settings,
 ) -> _Together:
     """Plant and noise of `n_joint` states, told apart; `order` is that of the plant."""
-    free, fitted, states = settings.free, None, None
+    free, fitted = settings.free, None
     joint = _innovation_form(subspace, n_joint)
     if settings.refine:
-        fitted, joint, states = _refined(joint, records, free)
+        fitted, joint = _refined(joint, records, free)
         if fitted.model.blocks is None:  # it could not be refined
             fitted = None
     split = _split(joint, fitted, order, subspace.n_columns)
     if split is None:
         assert order is not None
-        joint, fitted, states = _innovation_form(subspace, order), None, None
+        joint, fitted = _innovation_form(subspace, order), None
         split = _Split(np.eye(order), np.ones(order, dtype=bool))
-    if states is None:
-        states = np.array([_predicted(joint, r, free)[0] for r in records])
     T, kept = split
-    joint, states = joint.transformed(T), linalg.solve(T, states.T).T
+    joint = joint.transformed(T)
     if fitted is not None and not kept.all():
         joint = _without_reached_noise(joint, fitted, T, kept, free.direct)
-    return _Together(fitted, joint, states, T, kept)
+    return _Together(fitted, joint, T, kept)
 
 
 def _predictor_subspace(
@@ -436,7 +476,8 @@ def _predictor_subspace(
             "samples: lower `order` or `horizon`, or take a longer record."
         )
     rows = np.arange((past + 1) * c)
-    factor = hankel_factor(samples_of(records), past + 1, rows)
+    n_trend = len(records[0].trend)
+    factor = hankel_factor(samples_of(records), past + 1, rows, n_trend=n_trend)
     Z, U, Y = factor[: past * c], factor[past * c : past * c + m], factor[-ny:]
     markov, D = _output_regression(Z, U, Y, direct)
     residual = Y - markov @ Z - D @ U
@@ -513,21 +554,16 @@ def _criteria(errors: Sequence[Array], subspace: _Subspace) -> Array:
     return np.array(volumes) + each / n * np.arange(len(errors))
 
 
-class _Refined(NamedTuple):
-    """A predictor at its minimum."""
-
-    fitted: _Predictor
-    joint: _Innovation
-    states: Array  # (n_experiments, order), initial
-
-
-def _refined(model: _Innovation, records: Sequence[Record], free: Freedom) -> _Refined:
+def _refined(
+    model: _Innovation, records: Sequence[Record], free: Freedom
+) -> tuple[_Predictor, _Innovation]:
     r"""Minimise the one-step prediction error, weighted by the innovation covariance.
 
     The predictor ``x[t+1] = A_K x[t] + B_K z[t]``, ``y[t] = C x[t] + D u[t] + e[t]``
     is a stable model without noise states, driven by ``z = [u; y]``: its simulation
     error is the prediction error. `refine_simulation` therefore minimises
-    ``sum_t e[t]^T S^{-1} e[t]`` over A_K, B_K, C, D and the initial states.
+    ``sum_t e[t]^T S^{-1} e[t]`` over A_K, B_K, C, D and the initial states. A trend of
+    the outputs is one of their prediction, but for a free response.
     """
     A, B, C, D, K, covariance = model
     ny = len(C)
@@ -538,39 +574,47 @@ def _refined(model: _Innovation, records: Sequence[Record], free: Freedom) -> _R
     energy = np.array([np.sum(r.y**2, axis=1) for r in records]).sum(axis=0)
     root = _root(covariance, energy / n_samples)
     driven = [
-        Record(np.vstack(r), linalg.solve_triangular(root, r.y, lower=True))
+        r._replace(
+            u=np.vstack((r.u, r.y)), y=linalg.solve_triangular(root, r.y, lower=True)
+        )
         for r in records
     ]
     allowed = np.hstack([free.direct, np.zeros((ny, ny), dtype=bool)])
-    predictor = Freedom(allowed, free.initial_states)
+    predictor = free._replace(direct=allowed)
     weighted = linalg.solve_triangular(root, C, lower=True)
     start = simulation_fit(A - K @ C, weighted, driven, predictor)
     found = refine_simulation(start, driven, predictor)
     heads, share = shorten(driven)
     fitted = _Predictor(found, heads, predictor, root, share)
     joint = fitted.innovation(found, covariance)
-    errors = [
-        _predicted(joint, record, free, x0)[1]
-        for record, x0 in zip(records, found.initial_states, strict=True)
-    ]
-    moments = sum(e.T @ e for e in errors) / n_samples
-    return _Refined(fitted, joint._replace(covariance=moments), found.initial_states)
+    errors = np.vstack(_predicted(joint, records, free)[1])
+    return fitted, joint._replace(covariance=errors.T @ errors / n_samples)
 
 
 def _predicted(
-    model: _Innovation, record: Record, free: Freedom, initial: Array | None = None
-) -> tuple[Array, Array]:
-    """Initial state, of least squares where none is given, and prediction errors."""
-    A, B, C, D, K, _ = model
-    predictor = A - K @ C
-    u, y = record.u.T, record.y.T
-    driven = u @ (B - K @ D).T + y @ K.T
-    errors = y - state_trajectory(predictor, driven, initial) @ C.T - u @ D.T
-    if initial is not None or not free.initial_states or not len(A):
-        return np.zeros(len(A)) if initial is None else initial, errors
-    responses = free_responses(predictor, C, len(y))
-    x0 = estimate_initial_state(responses, errors)
-    return x0, errors - responses @ x0
+    model: _Innovation, records: Sequence[Record], free: Freedom
+) -> tuple[Array, list[Array]]:
+    """Own unknowns of the experiments, of weighted least squares, and what they leave.
+
+    That are the errors of prediction.
+    """
+    A, B, C, D, K, covariance = model
+    n = len(A)
+    energy = np.mean(np.hstack([record.y for record in records]) ** 2, axis=1)
+    weight = linalg.inv(_root(covariance, energy))
+    own, errors = np.zeros((len(records), free.n_own(n))), []
+    for unknowns, record in zip(own, records, strict=True):
+        u, y = record.u.T, record.y.T
+        driven = u @ (B - K @ D).T + y @ K.T
+        error = y - state_trajectory(A - K @ C, driven) @ C.T - u @ D.T
+        if own.size:
+            responses = prediction_responses(A, C, K, len(y), record.trend)
+            responses = responses[:, :, n - free.n_states(n) :]
+            weighted = weight @ responses, error @ weight.T
+            unknowns[:] = estimate_initial_state(*weighted)
+            error = error - responses @ unknowns
+        errors.append(error)
+    return own, errors
 
 
 class _Split(NamedTuple):

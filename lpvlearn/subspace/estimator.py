@@ -13,15 +13,25 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.experiments import (
+    OPTIONAL_ROLES,
     Experiment,
     Table,
+    n_rows_of,
     naming,
     read_experiments,
     read_outputs,
 )
-from ..data.preparation import split_at_gaps
+from ..data.preparation import DETRENDS, read_runs
+from ..data.scoring import score_from_rest
+from ..data.timestamps import TIME_TOL
+from ..exceptions import warn
 from ..models.innovation import InnovationModel
-from ..models.statespace import ModelPair, StateSpace
+from ..models.statespace import ModelPair
+from ..systems.simulation import (
+    estimate_initial_state,
+    free_responses,
+    trend_signals,
+)
 from ..validation import frequencies, one_of
 from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
 from .residuals import (
@@ -49,9 +59,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Parameters
     ----------
     order : int or "auto", default="auto"
-        Number of states. "auto" takes the order with the best value of Schwarz's
-        criterion, or a lower one that simulates parts held out clearly better. 0 is a
-        pure gain.
+        Number of states. "auto" takes the order with the best criterion (minus
+        twice the logarithm of the likelihood, and 4 for each parameter), or a lower one
+        that simulates parts held out clearly better. 0 is a pure gain.
     method : {"auto", "po-moesp", "pi-moesp", "n4sid", "cva", "pbsid"}, default="auto"
         "auto" is "po-moesp", or "pbsid" where the data come from a closed loop, with a
         warning. "pi-moesp" uses past inputs only as instruments: consistent under
@@ -95,17 +105,28 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         State in which every experiment of `fit` starts: estimated along with B and D,
         or zero, which is worth knowing of short experiments that start at rest.
     detrend : {None, "constant", "linear"}, default=None
-        Subtract its mean or straight line from every channel of every experiment.
-        Predictions are then about the means of all training samples.
+        Subtract its mean or straight line from every channel of every experiment
+        beforehand. A mean is not where a system rests: what transients add to it stays
+        as an error, which `offset` does not have.
+    offset : {"auto", None, "constant", "linear"}, default="auto"
+        Unknowns of every output and experiment, estimated with B, D and the initial
+        state: a constant, as signals have that are not measured from a point of rest,
+        or a constant and a drift. None: the outputs are zero at rest at input zero.
+        "auto" takes constants of all experiments where they are significant, else (and
+        with `detrend`, which has dealt with them) none.
     missing : {"raise", "split"}, default="raise"
-        "split" ends an experiment before a sample with NaN and starts another after
-        it, with an initial state of its own.
+        "split" ends an experiment before a sample with NaN, or a row that the `time`
+        column misses, and starts another after it, with an initial state of its own.
+    time_tol : float, default=0.01
+        Largest deviation of a time stamp from an even grid, relative to the step. For
+        more, see `resample`.
     inputs : str, int or list of them, default=None
         Input columns of X. None: all columns without another role.
     experiment : str or int, default=None
         Column that tells experiments apart. None: the table is one experiment.
     time : str or int, default=None
-        Column of sample times, checked for even steps.
+        Column of sample times (seconds, dates or time differences), checked for even
+        steps.
     scheduling, operating_point : str, int or list of them, default=None
         Columns with these roles are read and left alone: the model is time-invariant.
 
@@ -124,11 +145,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         `partial_fit` of a long stream, of its last stretch only.
     selection_ : DataFrame
         What was tried: columns order, horizon, error (relative, whitened, before
-        refinement), criterion (Schwarz's per value, above the best; NaN for horizons
-        that lost within their order), validation_bft (percent, on parts held out; NaN
-        where that was not looked at), chosen. Of
-        "pbsid" orders are those of plant and noise together, error that of the
-        regression on their states.
+        refinement), criterion (per value, above the best; NaN for horizons that
+        lost within their order), validation_bft (percent, on parts held out; NaN
+        where that was not looked at), chosen. Of "pbsid" orders are those of plant and
+        noise together, error that of the regression on their states.
     residual_ : float
         Simulation error on the data relative to the outputs, root mean square; of
         "pbsid" the error of one-step prediction.
@@ -139,8 +159,23 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "pbsid" predicts unstable plants, too.
     poles_std_ : ndarray of complex, shape (order_,)
         Standard deviations of the real and imaginary parts of ``lti_.poles()``.
-    input_offset_, output_offset_ : ndarray
-        Means subtracted with `detrend`, else zero.
+    offset_ : {None, "constant", "linear"}
+        What was estimated.
+    input_offset_ : ndarray of shape (n_experiments, n_inputs)
+        Mean of the inputs of every experiment (a run between two gaps is one); zero
+        without `offset_` and `detrend`, with ``initial_state="rest"``, and where the
+        static gain is infinite: a mode slower than the longest experiment.
+    output_offset_ : ndarray of shape (n_experiments, n_outputs)
+        Where the outputs rest at these inputs: but for transients and drifts
+        ``y - output_offset_ = G (u - input_offset_)``. With `detrend` their means, to
+        which `offset` adds. After `partial_fit` of a long stream there is one row, the
+        mean of all.
+    output_drift_ : ndarray of shape (n_experiments, n_outputs)
+        Change per second (per sample where no time is known), about the middle of
+        the experiment; zero without ``offset="linear"``.
+    time_jitter_ : float
+        Largest deviation of a time stamp of `fit` from an even grid, relative to the
+        step; 0 without a `time` column.
     n_outputs_ : int
     n_features_in_ : int
     feature_names_in_ : ndarray of str
@@ -150,6 +185,17 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     `predict` simulates from rest; `predict_with_initial_state` estimates the
     initial state from outputs first, as a split in the middle of an experiment
     needs. Models of different fits do not share a state basis.
+
+    Signals about a point (u0, y0) are ``y = G u + c`` with ``c = y0 - G(1) u0``, but
+    for a transient that the initial state takes. So one unknown for each output stands
+    for all offsets. Of a system that integrates, an offset of the input makes a
+    straight line: ``offset="linear"``. `predict` then begins at rest at the mean of
+    `input_offset_`, the outputs at that of `output_offset_` (of drifts it knows
+    nothing); where the constants of the experiments differ by more than their
+    uncertainty it warns, as inputs alone cannot tell which one it will be. What is
+    given outputs estimates constant (and drift) of every experiment anew:
+    `predict_with_initial_state`, `residual_tests` and, from estimated initial states,
+    `predict_ahead`.
 
     Without refinement, "po-moesp" with as many noise states as the noise has and
     "pi-moesp" at the order of the system are consistent under coloured noise, others
@@ -211,7 +257,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         n_noise_states: int | str = "auto",
         initial_state: str = "estimate",
         detrend: str | None = None,
+        offset: str | None = "auto",
         missing: str = "raise",
+        time_tol: float = TIME_TOL,
         inputs: Any = None,
         experiment: Any = None,
         time: Any = None,
@@ -228,7 +276,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.n_noise_states = n_noise_states
         self.initial_state = initial_state
         self.detrend = detrend
+        self.offset = offset
         self.missing = missing
+        self.time_tol = time_tol
         self.inputs = inputs
         self.experiment = experiment
         self.time = time
@@ -266,7 +316,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             lacks states, a delay or a nonlinearity.
         """
         choices = check_options(self.get_params(deep=False))
-        experiments, _ = self._read(X, y, reset=True)
+        experiments = self._read(X, y, reset=True)
+        self.time_jitter_ = max(e.jitter for e in experiments)
         self._stream: SampleStream | None = None
         self._single_output = np.asarray(y).ndim == 1
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
@@ -328,6 +379,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         to be poor: the first 131,072 samples hardly excite what comes later, outputs
         drift, or (``refine=False``) the order is higher than the data support.
 
+        ``offset="auto"`` decides from the samples that are kept. From then on every
+        16,384 samples have constants (and drifts) of their own, so that a level that
+        wanders slowly does no harm.
+
         Examples
         --------
         >>> import numpy as np
@@ -348,7 +403,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.detrend is not None:
             raise ValueError(
                 "`detrend` must be None in partial_fit, which never sees a whole "
-                f"experiment. Got {self.detrend!r}."
+                f"experiment. Got {self.detrend!r}. Use offset={self.detrend!r}."
             )
         if choices.method == "pbsid":
             raise ValueError(
@@ -362,7 +417,16 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if before is not None:
             before.check_options(options)
         with self._unchanged_where_refused():
-            experiments, _ = self._read(X, y, reset=before is None, split=False)
+            experiments = read_experiments(
+                self,
+                X,
+                y,
+                sampling_time=self.sampling_time,
+                reset=before is None,
+                allow_missing="Xy" if self.missing == "split" else "",
+            )
+            jitter = 0.0 if before is None else self.time_jitter_
+            self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
             if before is None:
                 step = self._step_of(experiments)
                 stream = SampleStream(choices, options, experiments, step)
@@ -392,14 +456,16 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.horizon_ = fitted.selection.horizon
         self.method_ = fitted.method
         self.selection_ = fitted.selection.table()
-        self.n_outputs_ = len(fitted.output_offset)
+        self.n_outputs_ = len(fitted.evidence.output_scale)
         self.initial_states_ = fitted.model.initial_states
         self.singular_values_ = fitted.singular_values
         self.residual_ = fitted.residual
         self.stability_loss_ = fitted.stability_loss
-        self.input_offset_ = fitted.input_offset
-        self.output_offset_ = fitted.output_offset
-        self._evidence = fitted.evidence
+        self._evidence, self._offsets = fitted.evidence, fitted.offsets
+        self.offset_ = DETRENDS[fitted.evidence.free.n_trend]
+        self.input_offset_ = fitted.offsets.inputs
+        self.output_offset_ = fitted.offsets.outputs
+        self.output_drift_ = fitted.offsets.drifts / step
 
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
         """Seconds between the samples of a table; True where nothing tells them."""
@@ -423,10 +489,22 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ------
         DivergenceError
             If the outputs of an unstable model overflow.
+
+        Warns
+        -----
+        UserWarning
+            If the constants of the experiments of `fit` differ: the outputs are about
+            their mean.
         """
         check_is_fitted(self, "lti_")
-        experiments, n_samples = self._read(X, None, reset=False)
-        return self._in_table(experiments, n_samples, self._simulated)
+        if self._offsets.differ:
+            warn(
+                "The experiments of `fit` have different constants in their outputs "
+                "(`output_offset_`): predictions are about their mean. Where outputs "
+                "are known, predict_with_initial_state(X, y) and "
+                "initial_state='estimate' of scores estimate those of every experiment."
+            )
+        return self._in_table(self._read(X, None), n_rows_of(X), self._simulated)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate the outputs from initial states estimated on measured outputs.
@@ -435,20 +513,46 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs, used for the initial state of every experiment only
-            (least squares over the whole experiment).
+            Measured outputs, used for the initial state of every experiment (and of a
+            model with `offset_` for the constant and drift) only: least squares over
+            the whole experiment. Missing ones (NaN) are left out.
 
         Returns
         -------
         ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            With ``missing="split"`` NaN where an input is missing; the simulation
+            begins anew after that.
         """
         check_is_fitted(self, "lti_")
-        experiments, n_samples = self._read(X, y, reset=False)
 
         def simulated(e: Experiment) -> Array:
-            return self._simulated(e, self._initial_state(e, self.lti_))
+            x0, level = self._own_part(e)
+            u0, _ = self._rest()
+            return level + self.lti_.simulate(e.inputs - u0, initial_state=x0)
 
-        return self._in_table(experiments, n_samples, simulated)
+        return self._in_table(self._read(X, y, outputs=False), n_rows_of(X), simulated)
+
+    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
+        """Coefficient of determination of the simulation from rest.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Measured outputs. Samples of which one is missing (NaN) are left out.
+        sample_weight : array-like of shape (n_samples,), default=None
+
+        Returns
+        -------
+        float
+            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
+
+        Warns
+        -----
+        UserWarning
+            If an experiment starts in mid-motion, which a simulation from rest misses.
+        """
+        return score_from_rest(self, X, y, sample_weight)
 
     def predict_ahead(
         self, X: Any, y: Any, steps: int = 1, *, initial_state: str = "estimate"
@@ -459,7 +563,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs.
+            Measured outputs. Missing ones (NaN) correct nothing.
         steps : int, default=1
             Prediction horizon in samples.
         initial_state : {"estimate", "rest"}, default="estimate"
@@ -474,22 +578,17 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "lti_")
         one_of("initial_state", initial_state, ("estimate", "rest"))
-        experiments, n_samples = self._read(X, y, reset=False)
-        predictor = self.predictor_
+        experiments, predictor = self._read(X, y, outputs=False), self.predictor_
 
         def predicted(e: Experiment) -> Array:
-            return predictor.predict(
-                e.inputs - self.input_offset_,
-                _outputs_of(e) - self.output_offset_,
-                steps=steps,
-                initial_state=(
-                    self._initial_state(e, predictor)
-                    if initial_state == "estimate"
-                    else None
-                ),
-            )
+            u0, level = self._rest()
+            x0 = None
+            if initial_state == "estimate":
+                x0, level = self._own_part(e, predictor)
+            u, y = e.inputs - u0, _outputs_of(e) - level
+            return level + predictor.predict(u, y, steps=steps, initial_state=x0)
 
-        return self._in_table(experiments, n_samples, predicted)
+        return self._in_table(experiments, n_rows_of(X), predicted)
 
     def residual_tests(
         self,
@@ -506,8 +605,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs. Initial states are estimated from them, `detrend` and
-            `missing` act as in `fit`.
+            Measured outputs. Initial states and trends of `offset_` are estimated from
+            them, `detrend` acts as in `fit`. Records are cut where samples are missing.
         errors : {"simulation", "prediction"}, default="simulation"
             Of `predict_with_initial_state`, or of `predict_ahead`. Only the latter
             should be white: they test the noise model too.
@@ -589,7 +688,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """What is tested; `ResidualDisplay` draws it."""
         check_is_fitted(self, "lti_")
         check_kind(errors)
-        experiments, _ = self._read(X, y, reset=False)
+        experiments = self._read(X, y, split=True)
         names = [] if y is None else read_outputs(y)[1]
         if y is not None and len(names) != self.n_outputs_:
             raise ValueError(
@@ -718,7 +817,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         list of ndarray of int
         """
         check_is_fitted(self, "lti_")
-        return [e.rows for e in self._read(X, None, reset=False)[0]]
+        gaps = "Xy" if self.missing == "split" else ""
+        optional = (*OPTIONAL_ROLES, "scheduling")
+        options: dict[str, Any] = {"reset": False, "optional": optional}
+        found = read_experiments(self, X, allow_missing=gaps, **options)
+        return [e.rows for e in found]
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
@@ -727,35 +830,47 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tags.input_tags.allow_nan = self.missing == "split"
         return tags
 
-    def _read(
-        self, X: Any, y: Any, *, reset: bool, split: bool = True
-    ) -> tuple[list[Experiment], int]:
-        # A simulation needs every input; gaps are for what has outputs beside them.
-        gaps = self.missing == "split" and y is not None
-        experiments = read_experiments(
+    def _read(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
+        """Experiments of a table; options as in `read_runs`."""
+        options = {"split": self.missing == "split", "reset": False} | options
+        known = options["reset"] or self.time is None
+        return read_runs(
             self,
             X,
             y,
             sampling_time=self.sampling_time,
-            reset=reset,
-            allow_missing=gaps,
+            fitted_step=None if known else self.lti_.sampling_time,
+            optional=(*OPTIONAL_ROLES, "scheduling"),
+            **options,
         )
-        n_samples = sum(len(e.rows) for e in experiments)
-        if gaps and split:
-            experiments = split_at_gaps(experiments)
-        return experiments, n_samples
 
-    def _simulated(self, experiment: Experiment, x0: Array | None = None) -> Array:
-        """Outputs about their offset."""
-        u = experiment.inputs - self.input_offset_
-        return self.lti_.simulate(u, initial_state=x0)
+    def _rest(self) -> tuple[Array, Array]:
+        """Inputs and outputs of an experiment at rest: the means of all."""
+        pooled = self._offsets.pooled()
+        return pooled.inputs[0], pooled.outputs[0]
 
-    def _initial_state(
-        self, experiment: Experiment, model: StateSpace | InnovationModel
-    ) -> Array:
-        u = experiment.inputs - self.input_offset_
-        y = _outputs_of(experiment) - self.output_offset_
-        return model.estimate_initial_state(u, y)
+    def _simulated(self, experiment: Experiment) -> Array:
+        """Outputs from rest at the mean offsets."""
+        u0, y0 = self._rest()
+        return y0 + self.lti_.simulate(experiment.inputs - u0)
+
+    def _own_part(
+        self, experiment: Experiment, predictor: InnovationModel | None = None
+    ) -> tuple[Array, Array]:
+        """Initial state, and the outputs that the answer to the inputs adds to.
+
+        Behind the errors of simulation, or of a predictor.
+        """
+        (u0, y0), y = self._rest(), _outputs_of(experiment)
+        trend = trend_signals(len(y), self._evidence.free.n_trend)
+        if predictor is None:
+            responses = free_responses(self.lti_.A, self.lti_.C, len(y), trend)
+            own = estimate_initial_state(responses, y - self._simulated(experiment))
+        else:
+            u = experiment.inputs - u0
+            own = predictor.estimate_initial_state(u, y - y0, trend)
+        x0, trends = np.split(own, [len(own) - len(trend) * len(y0)])
+        return x0, y0 + trend.T @ trends.reshape(len(trend), len(y0))
 
     def _in_table(
         self,
@@ -767,7 +882,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         out = np.full((n_samples, self.n_outputs_), np.nan)
         for e in experiments:
             with naming(e):
-                out[e.rows] = outputs(e) + self.output_offset_
+                out[e.rows] = outputs(e)
         return out[:, 0] if self._single_output else out
 
 

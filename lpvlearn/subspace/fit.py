@@ -1,7 +1,8 @@
 """From experiments to everything that `SubspaceLTI` keeps of a fit.
 
 The options are checked (`check_options`), the records made regular, order and
-horizon chosen, the model identified (`fit_pairs`), and what is wrong with it told.
+horizon chosen, the model identified (`fit_pairs`), without constants of the experiments
+and with them where these matter, and what is wrong with it told.
 """
 
 from __future__ import annotations
@@ -22,7 +23,22 @@ from ..data.preparation import (
 from ..exceptions import RankWarning, warn
 from ..validation import one_of, positive_time
 from .closed_loop import identify_closed_loop
-from .identification import ScaledRecords, Settings, identify, scale_records
+from .identification import (
+    ScaledRecords,
+    Settings,
+    centred,
+    identify,
+    scale_records,
+)
+from .offsets import (
+    N_TRENDS,
+    OFFSETS,
+    Offsets,
+    attributed,
+    constants_matter,
+    may_have_constants,
+    with_levels,
+)
 from .realization import METHODS
 from .residuals import lacks
 from .selection import Row, Selection, better_horizon, select
@@ -50,16 +66,19 @@ class Choices(NamedTuple):
     refine: str | bool = "auto"
     enforce_stability: bool = False
     initial_states: bool = True  # False starts every experiment from rest
+    offset: str | None = None  # "auto" is to be chosen
 
-    def settings(self, n_outputs: int, n_inputs: int, basis: Array) -> Settings:
+    def settings(
+        self, n_outputs: int, n_inputs: int, basis: Array, n_trend: int = 0
+    ) -> Settings:
         """How models of these channels are made.
 
         `basis` (n_inputs, rank) are the original inputs in terms of the independent
-        ones, which the models have.
+        ones, which the models have; `n_trend` as in `Freedom`.
         """
         mask = _feedthrough_mask(self.feedthrough, n_outputs, n_inputs, basis.shape[1])
         return Settings(
-            Freedom(mask, self.initial_states),
+            Freedom(mask, self.initial_states, n_trend),
             self.method,
             self.refine is not False,
             self.enforce_stability,
@@ -76,6 +95,7 @@ def check_options(options: Mapping[str, Any]) -> Choices:
     one_of("initial_state", options["initial_state"], ("estimate", "rest"))
     one_of("missing", options["missing"], ("raise", "split"))
     one_of("detrend", options["detrend"], DETRENDS)
+    one_of("offset", options["offset"], OFFSETS)
     feedthrough = options["feedthrough"]
     if np.ndim(feedthrough) == 0 and feedthrough not in (True, False):
         raise ValueError(
@@ -89,6 +109,9 @@ def check_options(options: Mapping[str, Any]) -> Choices:
             "`initial_state` must be 'estimate' with missing='split': what follows a "
             "gap does not start from rest. Got 'rest'."
         )
+    offset = options["offset"]
+    if options["detrend"] is not None and offset == "auto":
+        offset = None  # what is to become of offsets was said
     return Choices(
         _integer_or_auto("order", options["order"], 0),
         _integer_or_auto("horizon", options["horizon"], 1),
@@ -98,6 +121,7 @@ def check_options(options: Mapping[str, Any]) -> Choices:
         _refinement(options["refine"]),
         options["stability"] == "enforce",
         options["initial_state"] == "estimate",
+        offset,
     )
 
 
@@ -160,8 +184,7 @@ class LocalFit(NamedTuple):
     evidence: Evidence
     method: str  # that made the model
     innovations: Array | None  # least variances of the errors, where known and sought
-    input_offset: Array  # what `detrend` subtracted
-    output_offset: Array
+    offsets: Offsets  # of the experiments, what `detrend` subtracted among them
     first_model: Realization  # of `scaled`, the samples that were fitted as one table:
     scaled: ScaledRecords  # all of them, or the first ones of a long table or a stream
 
@@ -180,18 +203,33 @@ def fit_pairs(
     of the inputs, for messages. `TooFewSamples` where an input is constant or the
     samples are too few.
     """
-    n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
-    order, horizon = choices.order, choices.horizon
     try:
         check_excitation(pairs, names)
-        pairs, u_offset, y_offset = remove_trends(pairs, detrend)
+    except ValueError as error:
+        raise TooFewSamples(str(error)) from None
+    pairs, u_mean, y_mean = remove_trends(pairs, detrend)
+    fitted = _fit(pairs, choices, told, N_TRENDS[choices.offset])
+    tested = fitted.evidence.one_step
+    if choices.offset == "auto" and may_have_constants(tested):
+        other = _fit(pairs, choices, told, 1)
+        if constants_matter(tested, other.evidence.one_step):
+            fitted = other
+    return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
+
+
+def _fit(pairs: Pairs, choices: Choices, told: set[str], n_trend: int) -> LocalFit:
+    """Choose and identify, with `n_trend` trends of every output and experiment."""
+    n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
+    order, horizon = choices.order, choices.horizon
+    whole, (pairs, centres) = pairs, centred(pairs, n_trend, choices.initial_states)
+    try:
         pairs, basis = _with_independent_inputs(pairs, told)
-        settings = choices.settings(n_outputs, n_inputs, basis)
+        settings = choices.settings(n_outputs, n_inputs, basis, n_trend)
         if settings.method != "pbsid":
             settings.check_size([len(u) for u, _ in pairs], order, horizon)
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
-    scaled = scale_records(pairs)
+    scaled = scale_records(pairs, n_trend)
     feedback = find_feedback(scaled.records)
     settings = _heed(feedback, settings, choices.feedthrough is True, told)
     if settings.method == "pbsid":
@@ -199,18 +237,19 @@ def fit_pairs(
             closed = identify_closed_loop(scaled, basis, order, horizon, settings)
         except ValueError as error:
             raise TooFewSamples(str(error)) from None
+        offsets = attributed(closed.evidence, centres, whole)
+        evidence, offsets = with_levels(closed.evidence, offsets)
         return LocalFit(
-            closed.evidence.model,
+            evidence.model,
             closed.singular_values,
             closed.residual,
             closed.stability_loss,
             closed.selection,
-            closed.evidence,
+            evidence,
             settings.method,
             None,
-            u_offset,
-            y_offset,
-            closed.evidence.model,
+            offsets,
+            evidence.model,
             scaled,
         )
     chosen = None
@@ -234,6 +273,8 @@ def fit_pairs(
         refined=found.refined and found.stability_loss == 0.0,
         share=share,
     )
+    offsets = attributed(evidence, centres, whole)
+    evidence, offsets = with_levels(evidence, offsets)
     return LocalFit(
         found.model,
         found.singular_values,
@@ -243,8 +284,7 @@ def fit_pairs(
         evidence,
         settings.method,
         None if feedback is None else feedback.innovations,
-        u_offset,
-        y_offset,
+        offsets,
         found.model,
         scaled,
     )

@@ -9,6 +9,11 @@ from the previous one by one sample at each end (displacement rank two), and one
 Cholesky factorisation of size ``r`` gives the same factor. Where squaring the
 condition number would cost accuracy, the QR decomposition is used instead.
 
+A constant of every experiment, or a constant and a drift, that is not the system's is
+projected out of the columns of that experiment (`n_trend`): shifted in time a constant
+stays one, so that nothing of it is left, where subtracting the mean of the samples
+leaves what the means of the windows differ by.
+
 Several experiments are pooled by adding Gram matrices or by stacking factors; no
 column ever crosses the border between two experiments. A stream is pooled likewise,
 batch by batch: its `HankelSum` grows by the columns that each batch completes.
@@ -22,6 +27,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg
+
+from ..systems.simulation import trend_signals
 
 Array = NDArray[np.float64]
 
@@ -47,13 +54,20 @@ def data_factors(
     horizons: Collection[int],
     *,
     past_outputs: bool = True,
+    n_trend: int = 0,
 ) -> Iterator[Array]:
     """`data_factor` of every horizon; one correlation sequence serves them all."""
     longest = 2 * max(horizons)
+    records = [without_trend(z, n_trend) for z in records]
     shared = [correlation_sequence(z, min(longest, len(z))) for z in records]
     for horizon in horizons:
         yield data_factor(
-            records, n_inputs, horizon, past_outputs=past_outputs, correlations=shared
+            records,
+            n_inputs,
+            horizon,
+            past_outputs=past_outputs,
+            correlations=shared,
+            n_trend=n_trend,
         )
 
 
@@ -65,6 +79,7 @@ def data_factor(
     past_outputs: bool = True,
     engine: str = "cholesky",
     correlations: Sequence[Array] | None = None,
+    n_trend: int = 0,
 ) -> Array:
     """Lower triangular factor of ``[U_f; U_p; Y_p; Y_f]`` of pooled experiments.
 
@@ -73,7 +88,9 @@ def data_factor(
     Identification*, 2007, Chapter 9). The engine "cholesky" builds the Gram matrix from
     correlations and falls back to "qr" where that would lose accuracy; both give the
     same factor. `correlations` are known `correlation_sequence`s of the records, of
-    ``2 * horizon`` lags at least where a record is long enough.
+    ``2 * horizon`` lags at least where a record is long enough. `n_trend` takes a
+    constant (1) or a straight line (2) out of every experiment, whose samples should
+    have none to speak of (`without_trend`).
 
     >>> z = np.random.default_rng(0).standard_normal((300, 3))
     >>> L = data_factor([z], n_inputs=2, horizon=4)
@@ -83,8 +100,8 @@ def data_factor(
     n_outputs = records[0].shape[1] - n_inputs
     rows = _past_future_rows(n_inputs, n_outputs, horizon, past_outputs=past_outputs)
     if engine == "cholesky":
-        return hankel_factor(records, 2 * horizon, rows, correlations)
-    return _qr_factor(records, 2 * horizon, rows)
+        return hankel_factor(records, 2 * horizon, rows, correlations, n_trend)
+    return _qr_factor(records, 2 * horizon, rows, n_trend)
 
 
 def hankel_factor(
@@ -92,13 +109,20 @@ def hankel_factor(
     n_rows: int,
     rows: NDArray[np.intp],
     correlations: Sequence[Array] | None = None,
+    n_trend: int = 0,
 ) -> Array:
-    """Lower triangular factor of some `rows` of `n_rows` block rows, in that order."""
-    lower = cholesky_factor(_pooled_gram(records, n_rows, rows, correlations))
-    return _qr_factor(records, n_rows, rows) if lower is None else lower
+    """Lower triangular factor of some `rows` of `n_rows` block rows, in that order.
+
+    `correlations` and `n_trend` as in `data_factor`.
+    """
+    gram = _pooled_gram(records, n_rows, rows, correlations, n_trend)
+    lower = cholesky_factor(gram)
+    return _qr_factor(records, n_rows, rows, n_trend) if lower is None else lower
 
 
-def _qr_factor(records: Sequence[Array], n_rows: int, rows: NDArray[np.intp]) -> Array:
+def _qr_factor(
+    records: Sequence[Array], n_rows: int, rows: NDArray[np.intp], n_trend: int = 0
+) -> Array:
     """Triangular factor of the pooled Hankel columns by a blocked QR.
 
     Records shorter than `n_rows` give no column; `rows` are kept, in that order.
@@ -109,8 +133,12 @@ def _qr_factor(records: Sequence[Array], n_rows: int, rows: NDArray[np.intp]) ->
         if len(z) < n_rows:
             continue
         columns = _hankel_matrix(z, n_rows)
+        Q = _trend_basis(columns.shape[1], n_trend)
+        sums = _trend_sums(z, n_rows, Q)[rows]
         for start in range(0, columns.shape[1], block):
             part = columns[:, start : start + block][rows]
+            if n_trend:
+                part = part - sums @ Q[:, start : start + block]
             factor = stack_factors([factor, part])
     return factor if factor.shape[1] else np.zeros((len(rows), len(rows)))
 
@@ -120,6 +148,7 @@ def _pooled_gram(
     n_rows: int,
     rows: NDArray[np.intp],
     correlations: Sequence[Array] | None = None,
+    n_trend: int = 0,
 ) -> Array:
     """Gram matrix of the rows to keep, over all Hankel columns."""
     gram = np.zeros((n_rows * records[0].shape[1],) * 2)
@@ -127,7 +156,35 @@ def _pooled_gram(
         if len(z) >= n_rows:
             known = None if correlations is None else correlations[i]
             gram += _hankel_gram(z, n_rows, known)
+            if n_trend:
+                Q = _trend_basis(len(z) - n_rows + 1, n_trend)
+                sums = _trend_sums(z, n_rows, Q)
+                gram -= sums @ sums.T
     return gram[np.ix_(rows, rows)]
+
+
+def without_trend(z: Array, n_trend: int) -> Array:
+    """Samples less their mean (1) or straight line (2), by least squares.
+
+    Changes nothing of what is left after the projection but its rounding.
+    """
+    Q = _trend_basis(len(z), n_trend)
+    return z - Q.T @ (Q @ z) if n_trend else z
+
+
+def _trend_basis(n_samples: int, n_trend: int) -> Array:
+    """Orthonormal rows with the span of the trends."""
+    # The constant and the line are orthogonal to one another.
+    trends = trend_signals(n_samples, min(n_trend, n_samples))
+    size = np.linalg.norm(trends, axis=1, keepdims=True)
+    return trends / size
+
+
+def _trend_sums(z: Array, n_rows: int, Q: Array) -> Array:
+    """Products of all rows of a Hankel matrix with those of Q, (height, n_trend)."""
+    n_cols = Q.shape[1]
+    rows = [(Q @ z[j : j + n_cols]).T for j in range(n_rows if len(Q) else 0)]
+    return np.concatenate(rows) if rows else np.zeros((n_rows * z.shape[1], 0))
 
 
 def _past_future_rows(
@@ -153,6 +210,7 @@ class HankelSum(NamedTuple):
     gram: Array | None  # (r, r), of all windows; None where the data need the factor
     factor: Array | None  # (r, r), triangular, instead of the Gram matrix
     tail: Array  # at most 2 * horizon - 1 last samples of what may continue
+    n_trend: int = 0  # that is projected out of every stretch of samples
 
     @property
     def rows(self) -> NDArray[np.intp]:
@@ -173,7 +231,12 @@ class HankelSum(NamedTuple):
 
 
 def start_hankel_sum(
-    samples: Sequence[Array], n_inputs: int, horizon: int, *, past_outputs: bool = True
+    samples: Sequence[Array],
+    n_inputs: int,
+    horizon: int,
+    *,
+    past_outputs: bool = True,
+    n_trend: int = 0,
 ) -> HankelSum:
     """Summary of the first experiments, of which the last may continue.
 
@@ -186,14 +249,15 @@ def start_hankel_sum(
     True
     """
     c = samples[0].shape[1]
-    empty = HankelSum(
-        n_inputs, c - n_inputs, horizon, past_outputs, None, None, np.zeros((0, c))
-    )
+    none, sizes = np.zeros((0, c)), (n_inputs, c - n_inputs, horizon)
+    empty = HankelSum(*sizes, past_outputs, None, None, none, n_trend)
     rows, n_rows = empty.rows, 2 * horizon
     tail = samples[-1][-(n_rows - 1) :].copy()
-    gram = _pooled_gram(samples, n_rows, rows)
+    samples = [without_trend(z, n_trend) for z in samples]
+    gram = _pooled_gram(samples, n_rows, rows, n_trend=n_trend)
     if cholesky_factor(gram) is None:
-        return empty._replace(factor=_qr_factor(samples, n_rows, rows), tail=tail)
+        factor = _qr_factor(samples, n_rows, rows, n_trend)
+        return empty._replace(factor=factor, tail=tail)
     return empty._replace(gram=gram, tail=tail)
 
 
@@ -204,12 +268,13 @@ def extend_hankel_sum(state: HankelSum, samples: Array, *, starts: bool) -> Hank
     tail = z[-(n_rows - 1) :].copy()
     if len(z) < n_rows:
         return state._replace(tail=tail)
+    z = without_trend(z, state.n_trend)
     if state.gram is not None:
-        gram = state.gram + _pooled_gram([z], n_rows, state.rows)
-        return state._replace(gram=gram, tail=tail)
+        added = _pooled_gram([z], n_rows, state.rows, n_trend=state.n_trend)
+        return state._replace(gram=state.gram + added, tail=tail)
     assert state.factor is not None
-    factor = stack_factors([state.factor, _qr_factor([z], n_rows, state.rows)])
-    return state._replace(factor=factor, tail=tail)
+    added = _qr_factor([z], n_rows, state.rows, state.n_trend)
+    return state._replace(factor=stack_factors([state.factor, added]), tail=tail)
 
 
 def cholesky_factor(gram: Array) -> Array | None:

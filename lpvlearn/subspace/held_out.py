@@ -2,9 +2,9 @@
 
 Each experiment is cut into pieces of equal length, and every piece but the first is
 held out once: the model is fitted again without it, from where it was, and simulated
-through it from the state that the samples before tell. What a likelihood says rests on
-its noise model being right; this does not, and so has the last word where a system is
-not quite what the models can be.
+through it from the state (and the constant) that the samples before tell. What a
+likelihood says rests on its noise model being right; this does not, and so has the last
+word where a system is not quite what the models can be.
 """
 
 from __future__ import annotations
@@ -29,9 +29,7 @@ _N_BLOCKS = 5  # of a piece: sums over time whose spread tells that of their tot
 
 _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 
-# A model is clearly better where its error is less by this many standard errors of the
-# difference, and by this share.
-_STANDARD_ERRORS, _SHARE = 1.5, 0.03
+_SHARE = 0.03  # by which an error must be less to matter
 
 
 class HeldOut(NamedTuple):
@@ -40,14 +38,17 @@ class HeldOut(NamedTuple):
     blocks: Array  # (n_blocks,): sums of squares over consecutive blocks of time
     bft: float  # best fit, percent, mean over outputs; NaN where nothing is held out
 
-    def clearly_better_than(self, other: HeldOut) -> bool:
-        """Whether errors are less, by more than chance and by enough to matter."""
+    def clearly_better_than(self, other: HeldOut, standard_errors: float) -> bool:
+        """Whether errors are less, by more than chance and by enough to matter.
+
+        Chance is so many standard errors of the difference.
+        """
         total = other.blocks.sum()
         if not np.isfinite(total):
             return bool(np.isfinite(self.blocks.sum()))
         gap = other.blocks - self.blocks
         chance = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
-        return bool(gap.sum() > max(_STANDARD_ERRORS * chance, _SHARE * total))
+        return bool(gap.sum() > max(standard_errors * chance, _SHARE * total))
 
 
 def held_out(
@@ -70,7 +71,7 @@ def held_out(
     for k in range(1, _N_PIECES + 1):
         cuts = [_cut(record.u.shape[1], k) for record in records]
         train = [
-            Record(record.u[:, part].copy(), record.y[:, part].copy())
+            Record(*(signals[:, part].copy() for signals in record))
             for record, (start, stop) in zip(records, cuts, strict=True)
             for part in (slice(0, start), slice(stop, None))
             if part == slice(0, start) or record.u.shape[1] - stop >= _TOO_SHORT
@@ -82,10 +83,12 @@ def held_out(
             u, y = record.u.T[:stop], record.y.T[:stop]
             with np.errstate(over="ignore", invalid="ignore"):
                 error = y - lti_response(model.A, model.B, model.C, model.D, u)
-                if not at_rest:
-                    free = free_responses(model.A, W @ model.C, stop)
-                    x0 = estimate_initial_state(free[:start], error[:start] @ W.T)
-                    error = error - np.linalg.solve(W, (free @ x0).T).T
+                if len(record.trend) or not at_rest:
+                    trend = record.trend[:, :stop]
+                    free = free_responses(model.A, W @ model.C, stop, trend)
+                    free = free[:, :, len(model.A) * at_rest :]
+                    own = estimate_initial_state(free[:start], error[:start] @ W.T)
+                    error = error - np.linalg.solve(W, (free @ own).T).T
             error = error[start:]
             errors.append(error)
             outputs.append(y[start:])

@@ -11,7 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
+from ..data.preparation import Pairs
+from ..systems.simulation import trend_signals
 from .hankel import data_factors
 from .held_out import HeldOut, held_out
 from .noise import Whitening
@@ -36,6 +39,10 @@ Array = NDArray[np.float64]
 # per cent, and by more than growing states explain of the last samples' noise: this
 # many times what the parameters of a model absorb of it.
 STABLE_LOSS, _BY_CHANCE = 1.01, 10.0
+
+# Mean of an input in standard deviations, beyond which it is subtracted to keep digits.
+# Nearer to zero it stays: with an integrator in the model it tells something.
+_FAR = 100.0
 
 # Enforced stability keeps this distance from the unit circle, where rounding could
 # bring a pole back.
@@ -141,11 +148,39 @@ def _root_mean_square(parts: Sequence[Array]) -> Array:
     return rms
 
 
-def scale_records(experiments: Sequence[tuple[Array, Array]]) -> ScaledRecords:
+def scale_records(
+    experiments: Sequence[tuple[Array, Array]], n_trend: int = 0
+) -> ScaledRecords:
     """Scale all experiments (u, y), a row per sample, together."""
     su = _root_mean_square([u for u, _ in experiments])
     sy = _root_mean_square([y for _, y in experiments])
-    return ScaledRecords([Record.of(u / su, y / sy) for u, y in experiments], su, sy)
+    records = [Record.of(u / su, y / sy, n_trend) for u, y in experiments]
+    return ScaledRecords(records, su, sy)
+
+
+class Centres(NamedTuple):
+    """What was subtracted from the samples of the experiments."""
+
+    inputs: Array  # (n_experiments, n_inputs)
+    trends: Array  # (n_experiments, n_trend, n_outputs)
+
+
+def centred(pairs: Pairs, n_trend: int, initial_states: bool) -> tuple[Pairs, Centres]:
+    """Take the trends out of the outputs, and far inputs to zero: digits are kept.
+
+    A model with trends (and initial states, for inputs) of its own is not changed.
+    """
+    moved, levels, trends = [], [], []
+    for u, y in pairs:
+        signals = trend_signals(len(u), n_trend).T
+        trend = linalg.lstsq(signals, y)[0] if n_trend else np.zeros((0, y.shape[1]))
+        level = u.mean(axis=0)
+        far = n_trend > 0 and initial_states
+        level = np.where(far & (np.abs(level) > _FAR * u.std(axis=0)), level, 0.0)
+        moved.append((u - level, y - signals @ trend) if n_trend else (u, y))
+        levels.append(level)
+        trends.append(trend)
+    return moved, Centres(np.array(levels), np.array(trends))
 
 
 def subspaces_of(
@@ -153,9 +188,11 @@ def subspaces_of(
 ) -> dict[int, ObservabilitySubspace]:
     """Observability subspace of every horizon, of as many directions as given."""
     m, ny = len(records[0].u), len(records[0].y)
-    samples = [np.ascontiguousarray(np.vstack(record).T) for record in records]
-    past_outputs = method != "pi-moesp"
-    factors = data_factors(samples, m, widths, past_outputs=past_outputs)
+    samples = [np.ascontiguousarray(np.vstack((r.u, r.y)).T) for r in records]
+    past_outputs, n_trend = method != "pi-moesp", len(records[0].trend)
+    factors = data_factors(
+        samples, m, widths, past_outputs=past_outputs, n_trend=n_trend
+    )
     return {
         horizon: observability_subspace(factor, m, ny, horizon, width, method)
         for (horizon, width), factor in zip(widths.items(), factors, strict=True)
@@ -327,6 +364,11 @@ def identify(
     )
 
 
+# Standard errors by which another way to the model must be better: errors that are not
+# whitened, or no refinement, lose to whitened ones unless the system is not linear.
+_DOUBT = 2.0
+
+
 def _best_held_out(
     candidates: Sequence[Candidate], records: Sequence[Record], settings: Settings
 ) -> Candidate:
@@ -335,7 +377,7 @@ def _best_held_out(
     error = validate(best, records, settings)
     for candidate in candidates[1:]:
         other = validate(candidate, records, settings)
-        if other.clearly_better_than(error):
+        if other.clearly_better_than(error, _DOUBT):
             best, error = candidate, other
     return best
 

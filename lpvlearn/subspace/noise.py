@@ -127,14 +127,18 @@ class Whitening(NamedTuple):
         lost = len(self.filter) - 1
         first = lost if free.initial_states else 0
         out = []
-        for u, y in records:
+        for u, y, trend in records:
             if u.shape[1] > 2 * lost:
                 if lost:
                     u = scipy.signal.lfilter(self.filter, [1.0], u, axis=1)[:, first:]
                     y = scipy.signal.lfilter(self.filter, [1.0], y, axis=1)[:, first:]
+                    if len(trend):
+                        trend = scipy.signal.lfilter(self.filter, [1.0], trend, axis=1)
+                        trend = trend[:, first:]
                 if not _is_identity(self.weight):
                     y = self.weight @ y
-                out.append(Record(np.ascontiguousarray(u), np.ascontiguousarray(y)))
+                signals = (np.ascontiguousarray(z) for z in (u, y, trend))
+                out.append(Record(*signals))
         return out
 
     def model(self, model: Realization) -> Realization:

@@ -204,8 +204,8 @@ def extend_recursion(
     *,
     starts: bool,
     point: Realization | None = None,
-) -> tuple[Recursion, Array]:
-    """Add a stretch of data, linearised at the present model; its initial state.
+) -> tuple[Recursion, StretchError]:
+    """Add a stretch of data, linearised at the present model; its own unknowns.
 
     `record` is scaled as the pilot's data; `starts` says whether an experiment begins
     with it. `point` is another model to linearise at, from `input_matrices`. Where the
@@ -218,18 +218,20 @@ def extend_recursion(
         step = change_between(recursion.pilot, point, recursion.free)
         position = recursion.coordinates @ step
     # A linearisation point for the initial state; the stretch corrects it.
-    loss, x0 = stretch_error(model, record.head(_HEAD), recursion.free, starts=starts)
-    if not np.isfinite(loss):
-        return recursion, x0
+    head = record.head(_HEAD)
+    own = stretch_error(model, head, recursion.free, starts=starts)
+    if not np.isfinite(own.loss):
+        return recursion, own
     free = _freedom_of_stretch(recursion.free, starts)
-    M = linearised(model._replace(initial_states=x0[None]), [record], free)
+    states = own.initial_state[None]
+    M = linearised(model._replace(initial_states=states), [record], free)
     if M is None:
-        return recursion, x0
+        return recursion, own
     J = M[:, :-1] @ recursion.directions
     rows = np.column_stack([J, M[:, -1] + J @ position])
     information = _triangle(np.vstack([recursion.information, rows]))
     position = _solve(information, recursion.restraint)
-    return recursion._replace(information=information, position=position), x0
+    return recursion._replace(information=information, position=position), own
 
 
 def _freedom_of_stretch(free: Freedom, starts: bool) -> Freedom:
@@ -237,22 +239,29 @@ def _freedom_of_stretch(free: Freedom, starts: bool) -> Freedom:
     return free if starts else free._replace(initial_states=True)
 
 
+class StretchError(NamedTuple):
+    """What a stretch of data is explained by, beside the model."""
+
+    loss: float  # sum of squared errors; infinite where the responses overflow
+    initial_state: Array
+    trends: Array  # (n_trend, n_outputs)
+
+
 def stretch_error(
     model: Realization, record: Record, free: Freedom, *, starts: bool
-) -> tuple[float, Array]:
-    """Sum of squared errors of a stretch, and its best initial state.
-
-    The model is in section form; the error is infinite where the responses overflow.
-    """
+) -> StretchError:
+    """Error of a stretch with its best own unknowns; the model is in section form."""
     assert model.blocks is not None
     free, n = _freedom_of_stretch(free, starts), len(model.A)
     own = free.n_own(n)
     R = signal_factor(model.blocks, record)
     if R is None:
-        return np.inf, np.zeros(n)
+        states, trends = free.own_parts(np.zeros((1, own)), n)
+        return StretchError(np.inf, states[0], trends[0])
     M = linear_regression(R, model.blocks, model.C, free)
     known = np.concatenate([model.B.ravel(), model.D[free.direct]])
     error = M[:, -1] - M[:, own:-1] @ known
-    x0 = scaled_lstsq(M[:, :own], error)[0]
-    error -= M[:, :own] @ x0
-    return float(error @ error), x0 if own else np.zeros(n)
+    best = scaled_lstsq(M[:, :own], error)[0]
+    error -= M[:, :own] @ best
+    states, trends = free.own_parts(best[None], n)
+    return StretchError(float(error @ error), states[0], trends[0])

@@ -39,13 +39,18 @@ import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-from ..data.preparation import remove_trends
+from ..data.preparation import DETRENDS, remove_trends
 from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import StateSpace
-from ..systems.simulation import estimate_initial_state, free_responses
+from ..systems.simulation import (
+    estimate_initial_state,
+    free_responses,
+    trend_signals,
+)
 from ..validation import one_of, whole_number
 from .hankel import cholesky_factor, correlation_sequence, stack_factors
+from .identification import centred
 from .noise import autoregression
 from .simulation_fit import simulation_errors, with_initial_states
 from .statistics import Evidence
@@ -156,16 +161,21 @@ def model_residuals(
     the outputs of one of theirs. Where only a part was fitted that costs some power,
     and no test becomes wrong.
     """
-    pairs, errors = remove_trends(list(pairs), detrend)[0], []
+    n_trend = evidence.free.n_trend
+    pairs = remove_trends(list(pairs), detrend)[0]
+    pairs, errors = centred(pairs, n_trend, True)[0], []
     with np.errstate(over="ignore", invalid="ignore"):  # refused below
         for u, y in pairs:
-            if predictor is not None:
-                x0 = predictor.estimate_initial_state(u, y)
-                errors.append(y - predictor.predict(u, y, initial_state=x0))
+            trend = trend_signals(len(y), n_trend)
+            if predictor is None:
+                free = free_responses(lti.A, lti.C, len(y), trend)
+                error = y - lti.simulate(u)
+                errors.append(error - free @ estimate_initial_state(free, error))
                 continue
-            free = free_responses(lti.A, lti.C, len(y))
-            error = y - lti.simulate(u)
-            errors.append(error - free @ estimate_initial_state(free, error))
+            own = predictor.estimate_initial_state(u, y, trend)
+            x0, trends = np.split(own, [len(own) - n_trend * y.shape[1]])
+            y = y - trend.T @ trends.reshape(n_trend, y.shape[1])
+            errors.append(y - predictor.predict(u, y, initial_state=x0))
     if not all(np.isfinite(e).all() for e in errors):
         raise ValueError(
             "residual tests need a simulation that stays finite. The model is unstable "
@@ -173,9 +183,11 @@ def model_residuals(
             "errors='prediction' with method='pbsid'."
         )
     inputs = [u for u, _ in pairs]
-    # The trend of an answer is not quite the answer to the trend of an input.
-    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), detrend)[0]
-    errors = [e for _, e in cleaned]
+    # The trend of an answer is not quite the answer to the trend of an input. Inputs
+    # are compared with what trends have left of the errors.
+    removed = DETRENDS[n_trend] or detrend
+    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), removed)[0]
+    inputs, errors = [u for u, _ in cleaned], [e for _, e in cleaned]
     y, e = np.vstack([y for _, y in pairs]), np.vstack(errors)
     size, largest = np.sqrt(np.mean(e**2, axis=0)), np.abs(y).max(axis=0)
     rounding = size <= _ROUNDING * y.std(axis=0)
@@ -396,9 +408,12 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
         left -= record.u.shape[1]
     if not np.isfinite(evidence.model.loss):
         return False
-    inputs, weight = [record.u.T for record in records], evidence.whitening.weight
+    weight, trend = evidence.whitening.weight, DETRENDS[evidence.free.n_trend]
     model = with_initial_states(evidence.model, records, evidence.free, weight)
     errors = simulation_errors(model, records)
+    inputs = [record.u.T for record in records]
+    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), trend)[0]
+    inputs, errors = [u for u, _ in cleaned], [e for _, e in cleaned]
     outputs = np.hstack([record.y for record in records])
     size = np.mean(outputs**2, axis=1)
     variances = np.mean(np.vstack(errors) ** 2, axis=0)

@@ -23,6 +23,7 @@ import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg
 
+from ..systems.simulation import trend_signals
 from .hankel import cholesky_factor, stack_factors
 
 Array = NDArray[np.float64]
@@ -38,15 +39,17 @@ class Record(NamedTuple):
 
     u: Array  # (n_inputs, n_samples)
     y: Array  # (n_outputs, n_samples)
+    trend: Array = np.zeros((0, 0))  # (n_trend, n_samples), free in every output
 
     @classmethod
-    def of(cls, u: Array, y: Array) -> Record:
+    def of(cls, u: Array, y: Array, n_trend: int = 0) -> Record:
         """The record of samples with one row per time instant, rows contiguous."""
-        return cls(np.ascontiguousarray(u.T), np.ascontiguousarray(y.T))
+        trend = trend_signals(len(u), n_trend)
+        return cls(np.ascontiguousarray(u.T), np.ascontiguousarray(y.T), trend)
 
     def head(self, n_samples: int) -> Record:
         """The first samples."""
-        return Record(self.u[:, :n_samples].copy(), self.y[:, :n_samples].copy())
+        return Record(*(signals[:, :n_samples].copy() for signals in self))
 
 
 def output_energy(records: Sequence[Record]) -> float:
@@ -123,7 +126,7 @@ def signal_pieces(
 ) -> Iterator[Array]:
     """Signals of consecutive stretches of a record, (n_signals, n_samples_i).
 
-    Rows: section signals, inputs, outputs, and second responses block by block.
+    Rows: section signals, inputs, outputs, second responses block by block, trends.
     Section signals: for each block and each of its signals, the answer to an impulse
     that sets the state at time 0, then those to each input. Second responses come
     where `driven` is given, ``[x0, B]`` of shape (order, 1 + n_inputs): what every
@@ -131,12 +134,13 @@ def signal_pieces(
     ``d = N g + [x0, B] g_u`` for states driven by signals with answers ``g_u``.
     The memory is used again for the next piece.
     """
-    (m, n_samples), ny = record.u.shape, len(record.y)
+    (m, n_samples), ny, n_trend = record.u.shape, len(record.y), len(record.trend)
     order = sum(len(block) for block in blocks)
     base = order * (1 + m)
     state_map = None if driven is None else state_coefficients(blocks, driven)
     second = 0 if state_map is None else order
-    memory = np.empty((base + m + ny + second, min(n_samples, _PIECE)))
+    last = base + m + ny + second
+    memory = np.empty((last + n_trend, min(n_samples, _PIECE)))
     first_bank = _SectionBank(blocks, [1 + m] * len(blocks))
     second_bank = _SectionBank(blocks, [len(block) for block in blocks])
     source = np.zeros((1 + m, memory.shape[1]))
@@ -159,7 +163,9 @@ def signal_pieces(
             late[:, 1:n] = state_map @ X[:base, :-1]
             last_state = state_map @ X[:base, -1]
             parts = [late[part, :n] for part in block_slices(blocks)]
-            second_bank.run(parts, X[base + m + ny :], last_only=True)
+            second_bank.run(parts, X[base + m + ny : last], last_only=True)
+        if n_trend:
+            X[last:] = record.trend[:, start:stop]
         yield X
 
 

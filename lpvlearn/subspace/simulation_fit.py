@@ -6,8 +6,8 @@ few section signals (see `signals`), so that the triangular factor of these sign
 computed once, stands for the samples: the regressions here have as many rows as there
 are signals, for each output. The derivative of the simulation error with respect to
 all parameters, which `refinement` takes its steps by, is a regression on the same
-signals and on second responses. The unknowns of an experiment (its initial state) are
-projected out before experiments are pooled.
+signals and on second responses. The unknowns of an experiment (its initial state, a
+constant and a drift of every output) are projected out before experiments are pooled.
 
 The parameters of a model in section form are one vector: B (state-major), the free
 entries of D, the blocks of A (row-major) and C, as in the columns of the Jacobian.
@@ -46,13 +46,27 @@ class Freedom(NamedTuple):
 
     direct: NDArray[np.bool_]  # (n_outputs, n_inputs): entries of D; others are zero
     initial_states: bool = True  # False starts every experiment from rest
+    n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
 
-    def n_own(self, order: int) -> int:
-        """Number of unknowns that belong to one experiment."""
+    def n_states(self, order: int) -> int:
+        """Number of entries of an initial state that are unknown."""
         return order if self.initial_states else 0
 
+    def n_own(self, order: int) -> int:
+        """Number of unknowns of one experiment: initial state, then its trends.
+
+        These are constants of all outputs, then drifts of all of them.
+        """
+        return self.n_states(order) + self.n_trend * len(self.direct)
+
+    def own_parts(self, own: Array, order: int) -> tuple[Array, Array]:
+        """Initial states and trends of (n_experiments, n_own) own unknowns."""
+        k, n = len(own), self.n_states(order)
+        states = own[:, :n] if n else np.zeros((k, order))
+        return states, own[:, n:].reshape(k, self.n_trend, len(self.direct))
+
     def n_linear(self, order: int) -> int:
-        """Number of unknowns that outputs are linear in: initial state, B and D."""
+        """Number of unknowns that outputs are linear in: the own ones, B and D."""
         n_d, m = int(self.direct.sum()), self.direct.shape[1]
         return self.n_own(order) + order * m + n_d
 
@@ -68,6 +82,15 @@ class Realization(NamedTuple):
     loss: float  # sum of squared simulation errors; infinite where they overflow
     rank_deficit: int = 0  # directions of B and D that the data leave undetermined
     blocks: tuple[Array, ...] | None = None  # of A, where it is in section form
+    trends: Array = np.zeros((0, 0, 0))  # (n_experiments, n_trend, n_outputs)
+
+    def outputs(self, record: Record, experiment: int) -> Array:
+        """Simulated outputs (n_samples, n_outputs) of a record, its trends included."""
+        x0 = self.initial_states[experiment]
+        fitted = lti_response(self.A, self.B, self.C, self.D, record.u.T, x0)
+        if len(record.trend):
+            fitted += record.trend.T @ self.trends[experiment]
+        return fitted
 
 
 def _block_diagonal(blocks: Sequence[Array]) -> Array:
@@ -111,7 +134,7 @@ def parameter_slices(model: Realization, free: Freedom) -> list[slice]:
 def moved_model(model: Realization, change: Array, free: Freedom) -> Realization:
     """The model after a change of its parameters; what else it tells is not updated.
 
-    An initial state may stand before the parameters, as in `linearised`: it is ignored.
+    Own unknowns may stand before the parameters, as in `linearised`: they are ignored.
     """
     assert model.blocks is not None
     n_b, n_d, n_c = model.B.size, int(free.direct.sum()), model.C.size
@@ -182,8 +205,7 @@ def simulation_errors(model: Realization, records: Sequence[Record]) -> list[Arr
     """What is left of the outputs of every experiment, (n_samples, n_outputs) each."""
     with np.errstate(over="ignore", invalid="ignore"):
         return [
-            record.y.T - lti_response(*model[:4], record.u.T, x0)
-            for record, x0 in zip(records, model.initial_states, strict=True)
+            record.y.T - model.outputs(record, k) for k, record in enumerate(records)
         ]
 
 
@@ -193,24 +215,27 @@ def with_initial_states(
     free: Freedom,
     weight: Array | None = None,
 ) -> Realization:
-    """The model with the initial states that fit records best, and its loss on them.
+    """The model with the own unknowns that fit records best, and its loss on them.
 
-    `weight` (n_outputs, n_outputs) is that of the errors of which the states make the
+    `weight` (n_outputs, n_outputs) is that of the errors of which the unknowns make the
     least, not of the loss.
     """
-    W = np.eye(len(model.C)) if weight is None else weight
-    at_rest = np.zeros((len(records), len(model.A)))
-    model = model._replace(initial_states=at_rest)
+    W, n = np.eye(len(model.C)) if weight is None else weight, len(model.A)
+    own = np.zeros((len(records), free.n_own(n)))
+    states, trends = free.own_parts(own, n)
+    model = model._replace(initial_states=states, trends=trends)
     errors = simulation_errors(model, records)
     if not all(np.isfinite(error).all() for error in errors):
         return model._replace(loss=np.inf)
-    if free.initial_states and model.A.size:
-        states = []
-        for i, error in enumerate(errors):
-            responses = free_responses(model.A, W @ model.C, len(error))
-            states.append(estimate_initial_state(responses, error @ W.T))
-            errors[i] = error - np.linalg.solve(W, (responses @ states[-1]).T).T
-        model = model._replace(initial_states=np.array(states))
+    if own.size:
+        for i, (record, error) in enumerate(zip(records, errors, strict=True)):
+            responses = free_responses(model.A, W @ model.C, len(error), record.trend)
+            responses = responses[:, :, n - free.n_states(n) :]
+            own[i] = estimate_initial_state(responses, error @ W.T)
+            errors[i] = error - np.linalg.solve(W, (responses @ own[i]).T).T
+        states, trends = free.own_parts(own, n)
+        trends = trends @ np.linalg.inv(W).T
+        model = model._replace(initial_states=states, trends=trends)
     return model._replace(loss=sum(float((error**2).sum()) for error in errors))
 
 
@@ -221,15 +246,17 @@ def _general_regression(A: Array, C: Array, record: Record, free: Freedom) -> Ar
     ``(A.T, c)`` driven by ``u_j``. Slower, but free of any transformation.
     """
     (m, n_samples), (ny, n) = record.u.shape, C.shape
-    own = free.n_own(n)
+    own, n_states = free.n_own(n), free.n_states(n)
     where = np.argwhere(free.direct)
     eye, none = np.eye(n), np.zeros((n, 1))
     parts = []
     for i in range(ny):
         M = np.zeros((own + n * m + len(where) + 1, n_samples))
-        if own:
+        if n_states:
             at_rest = np.zeros((n_samples, 1))
             M[:n] = lti_response(A.T, none, eye, none, at_rest, C[i]).T
+        for j, trend in enumerate(record.trend):
+            M[n_states + j * ny + i] = trend
         for j in range(m):
             M[own + j : own + n * m : m] = lti_response(
                 A.T, C[i][:, None], eye, none, record.u[j][:, None]
@@ -250,15 +277,12 @@ def _realization(
     blocks: tuple[Array, ...] | None,
 ) -> Realization:
     n, m = len(A), free.direct.shape[1]
-    own = free.n_own(n)
-    common, states, loss, deficit = _solve_regressions(factors, own)
+    common, own, loss, deficit = _solve_regressions(factors, free.n_own(n))
+    states, trends = free.own_parts(own, n)
     D = np.zeros(free.direct.shape)
     D[free.direct] = common[n * m :]
-    if not own:
-        states = np.zeros((len(factors), n))
-    return Realization(
-        A, common[: n * m].reshape(n, m), C, D, states, loss, deficit, blocks
-    )
+    B = common[: n * m].reshape(n, m)
+    return Realization(A, B, C, D, states, loss, deficit, blocks, trends)
 
 
 def _overflowing(A: Array, C: Array, records: Sequence[Record]) -> Realization:
@@ -292,13 +316,13 @@ def _solve_regressions(
 
 def _stack_regressions(regressions: Sequence[Array], n: int) -> Array:
     """One regression on the common unknowns, the first `n` of each projected out."""
-    reduced = [_project_out(M, n) for M in regressions]
+    reduced = [project_out(M, n) for M in regressions]
     if len(reduced) == 1:
         return reduced[0]
     return triangularize(np.vstack(reduced).T)
 
 
-def _project_out(M: Array, n: int) -> Array:
+def project_out(M: Array, n: int) -> Array:
     """The columns after the first `n`, without what the first `n` explain."""
     if n == 0:
         return M
@@ -309,10 +333,10 @@ def _project_out(M: Array, n: int) -> Array:
 def linear_regression(
     R: Array, blocks: tuple[Array, ...], C: Array, free: Freedom
 ) -> Array:
-    """Regression of the outputs on initial state, B and D, with A and C given.
+    """Regression of the outputs on own unknowns, B and D, with A and C given.
 
     `R` (k, n_signals) comes from `signal_factor`. Rows: outputs times k; columns:
-    initial state (if free), B (state-major), free entries of D, output.
+    own unknowns (`Freedom.n_own`), B (state-major), free entries of D, output.
     """
     (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
     out = np.zeros((ny, k, free.n_linear(n) + 1))
@@ -328,8 +352,8 @@ def jacobian_regression(
     """Regression of the simulation error on changes of all parameters.
 
     `R` (k, n_signals) comes from `signal_factor`, with second responses of the model,
-    in section form, with ``driven = [x0, B]``. Rows: outputs times k; columns: initial
-    state (if free), then the parameters, then the simulation error.
+    in section form, with ``driven = [x0, B]``. Rows: outputs times k; columns: own
+    unknowns, then the parameters, then the simulation error, trends not taken off.
     """
     blocks, C, D = model.blocks, model.C, model.D
     assert blocks is not None
@@ -369,9 +393,9 @@ def linearised(
 ) -> Array | None:
     """Simulation error of all experiments, linearised at a model in section form.
 
-    A regression as `jacobian_regression`, but without the initial states, which are
-    projected out; with `keep_one` that of a single experiment stays among the unknowns,
-    where it costs less. None where responses overflow.
+    A regression as `jacobian_regression`, but without the own unknowns, which are
+    projected out; with `keep_one` the initial state of a single experiment without
+    trends stays, where it costs less. None where responses overflow.
     """
     assert model.blocks is not None
     parts = []
@@ -381,7 +405,7 @@ def linearised(
         if R is None:
             return None
         parts.append(jacobian_regression(R, model, driven, free))
-    if keep_one and len(parts) == 1:
+    if keep_one and len(parts) == 1 and not free.n_trend:
         return parts[0]
     return _stack_regressions(parts, free.n_own(len(model.A)))
 
@@ -389,12 +413,15 @@ def linearised(
 def _fill_linear(
     out: Array, R: Array, blocks: tuple[Array, ...], C: Array, free: Freedom
 ) -> None:
-    """Fill in the effects of initial state (if free), B and the free entries of D."""
+    """Fill in the effects of own unknowns, B and the free entries of D."""
     (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
-    own, base = free.n_own(n), n * (1 + m)
+    own, n_states, base = free.n_own(n), free.n_states(n), n * (1 + m)
     signals = R[:, :base].reshape(k, n, 1 + m).transpose(0, 2, 1)
     effect = signals[None] @ _output_coefficients(blocks, C)[:, None]
-    out[:, :, :own] = effect[:, :, 0, :own]
+    out[:, :, :n_states] = effect[:, :, 0, :n_states]
+    trends = R[:, R.shape[1] - free.n_trend :]
+    for i in range(ny):
+        out[i, :, n_states + i : own : ny] = trends
     by_state = effect[:, :, 1:].transpose(0, 1, 3, 2)
     out[:, :, own : own + n * m] = by_state.reshape(ny, k, n * m)
     for column, (i, j) in enumerate(np.argwhere(free.direct), start=own + n * m):

@@ -67,6 +67,7 @@ class Evidence:
     whitening: Whitening  # of the errors whose squares the model minimises,
     refined: bool  # if it does
     share: float  # samples in `records` by all samples that were used
+    levels: Array | None = None  # (n_experiments, n_outputs): constants less trends
 
     @cached_property
     def noise(self) -> NoiseModel:
@@ -100,6 +101,11 @@ class Evidence:
         Its initial states are those of the records themselves.
         """
         return in_sections(self.whitening.model(self.model))
+
+    @property
+    def one_step(self) -> Evidence:
+        """What tells of constants: itself, or a predictor, where inputs know errors."""
+        return self
 
     def state_space(
         self, model: Realization, sampling_time: float | None
@@ -204,7 +210,7 @@ def _square_root(covariance: Array) -> Array:
 def parameter_covariance(
     model: Realization, records: Sequence[Record], free: Freedom, noise: NoiseModel
 ) -> Array:
-    """Covariance of the parameters (B, D, A, C), initial states allowed for.
+    """Covariance of the parameters (B, D, A, C), own unknowns allowed for.
 
     Of a model in section form, at the minimum of the simulation error on the records.
     Along changes of the state basis, which the data do not determine, it is zero.
@@ -216,7 +222,7 @@ def parameter_covariance(
     for record, x0 in zip(records, model.initial_states, strict=True):
         H, S = _experiment_terms(model, record, x0, free, noise)
         if own:
-            # What the initial state can explain tells nothing about the others.
+            # What the own unknowns can explain tells nothing about the others.
             explain = np.linalg.pinv(H[:own, :own], hermitian=True) @ H[:own, own:]
             keep = np.vstack([-explain, np.eye(len(H) - own)])
             H, S = keep.T @ H @ keep, keep.T @ S @ keep
@@ -239,7 +245,7 @@ def parameter_covariance(
 def _experiment_terms(
     model: Realization, record: Record, x0: Array, free: Freedom, noise: NoiseModel
 ) -> tuple[Array, Array]:
-    """``J.T J`` and ``J.T cov(v) J`` of one experiment, initial state first."""
+    """``J.T J`` and ``J.T cov(v) J`` of one experiment, own unknowns first."""
     assert model.blocks is not None
     driven = np.column_stack([x0, model.B])
     pieces = signal_pieces(model.blocks, record, driven)

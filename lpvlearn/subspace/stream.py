@@ -27,7 +27,7 @@ from ..data.preparation import (
     independent_inputs,
     remove_trends,
 )
-from ..data.timestamps import check_uniform_time, time_in_seconds
+from ..data.timestamps import TIME_TOL, Clock, read_clock, time_in_seconds
 from .fit import (
     Choices,
     LocalFit,
@@ -57,55 +57,67 @@ _REMEMBERED = 256
 class StreamClock:
     """Guard on the times of consecutive batches.
 
+    The tolerance on their jitter is `time_tol`; with `gaps` samples may be missing.
     `step` is the mean step of the first experiment so far, seconds; None before its
     second sample.
 
     >>> clock = StreamClock()
     >>> clock.check(Column("t", np.array([0.0, 0.1, 0.2])), 0, continues=False)
+    True
     >>> clock.check(Column("t", np.array([0.3, 0.4])), 0, continues=True)
+    True
     >>> round(clock.step, 9)
     0.1
     """
 
-    def __init__(self) -> None:
+    def __init__(self, time_tol: float = TIME_TOL, gaps: bool = False) -> None:
         self.step: float | None = None
+        self._options: dict[str, Any] = {"time_tol": time_tol, "allow_missing": gaps}
         self._tail: Any = None
-        self._first: Any = None
-        self._n_first = 0
+        self._elapsed, self._n_steps = 0.0, 0  # of the first experiment, without gaps
         self._in_first = True
         self._reference: Any = None
 
-    def check(self, stamps: Column, label: Hashable, *, continues: bool) -> None:
+    def check(self, stamps: Column, label: Hashable, *, continues: bool) -> bool:
         """Refuse a batch that repeats or leaves out time, or has another step.
 
         `stamps` are those of one experiment, even among themselves; `continues` tells
-        whether it was the last one of the batch before.
+        whether it was the last one of the batch before. False if samples are missing
+        between the two.
         """
         times = pd.Series(stamps.values).reset_index(drop=True)
-        joined = times
+        joined, n_before, goes_on = times, 0, True
         if continues and self._tail is not None:
             joined = pd.concat([self._tail, times], ignore_index=True)
-            self._check_border(joined, stamps.name, label)
+            n_before = len(self._tail)
+            goes_on = self._check_border(joined, stamps.name, label)
         self._check_step(joined, stamps.name, label)
+        self._in_first &= continues or self._tail is None
         self._tail = joined.iloc[-_REMEMBERED:]
-        if self._first is None:
-            self._first = times.iloc[:1]
-        self._in_first &= continues or self._n_first == 0
-        if self._in_first:
-            self._n_first += len(times)
-            ends = pd.concat([self._first, times.iloc[-1:]], ignore_index=True)
-            if self._n_first > 1:
-                first, last = time_in_seconds(ends, stamps.name)
-                self.step = float(last - first) / (self._n_first - 1)
+        if self._in_first and len(joined) > 1:
+            seconds = time_in_seconds(joined, stamps.name)
+            steps = np.diff(seconds.astype(float))
+            new = np.arange(1, len(joined)) >= n_before
+            new[self._read(joined, stamps.name, label).breaks - 1] = False
+            self._elapsed += float(steps[new].sum())
+            self._n_steps += int(new.sum())
+            self.step = self._elapsed / self._n_steps if self._n_steps else None
+        return goes_on
 
-    def _check_border(self, joined: Any, name: Hashable, label: Hashable) -> None:
+    def _read(
+        self, times: Any, name: Hashable, label: Hashable, **options: Any
+    ) -> Clock:
+        seconds = time_in_seconds(times, name)
+        known = {"column": name, "experiment": label} | self._options
+        return read_clock(seconds, **known, **options)
+
+    def _check_border(self, joined: Any, name: Hashable, label: Hashable) -> bool:
         n_before = len(self._tail)
-        seconds = time_in_seconds(joined, name)
         try:
-            check_uniform_time(seconds, column=name, experiment=label)
+            return n_before not in self._read(joined, name, label).breaks
         except ValueError as error:
             last, first = joined.iloc[n_before - 1], joined.iloc[n_before]
-            if seconds[n_before] <= seconds[n_before - 1]:
+            if first <= last:
                 what, remedy = "repeats samples", "Feed every sample once"
             else:
                 what = "does not continue where that ended"
@@ -126,24 +138,16 @@ class StreamClock:
             return
         # Rounded stamps tell the step the better the more there are.
         short, long = sorted((self._reference, times), key=len)
-        step = check_uniform_time(
-            time_in_seconds(long, name), column=name, experiment=label
-        )
+        longer = self._read(long, name, label)
         try:
-            check_uniform_time(
-                time_in_seconds(short, name),
-                column=name,
-                experiment=label,
-                other_step=step,
-            )
+            self._read(short, name, label, expected=[(longer, "")])
         except ValueError as error:
-            steps = [
-                np.diff(time_in_seconds(t.iloc[[0, -1]], name))[0] / (len(t) - 1)
-                for t in (self._reference, times)
-            ]
+            first, other = (
+                self._read(t, name, label).step for t in (self._reference, times)
+            )
             raise ValueError(
                 "All batches must have the same time step. Got "
-                f"{steps[0]:.9g} s first, and {steps[1]:.9g} s in column {name!r} of "
+                f"{first:.9g} s first, and {other:.9g} s in column {name!r} of "
                 f"experiment {label!r}. Resample the stream, or fit again from here."
             ) from error
         self._reference = long
@@ -233,10 +237,11 @@ class SampleStream:
         settings = choices.settings(self._n_outputs, n_inputs, np.eye(n_inputs))
         settings.check_size([BUFFER], choices.order, choices.horizon)
         self._told: set[str] = set()
-        self._clock = StreamClock()
+        gaps = options["missing"] == "split"
+        self._clock = StreamClock(options["time_tol"], gaps)
         self._label: Hashable = None  # of the sample that came last
         self._open = False  # whether nothing of that experiment is missing since
-        self._buffer = SampleBuffer(options["missing"] == "split")
+        self._buffer = SampleBuffer(gaps)
         self._summary: StreamSummary | None = None
         self._first_residual = np.nan
 
@@ -299,18 +304,19 @@ class SampleStream:
         begun = self._label is not None and bool(first)
         if begun:
             ordered = first[:1] + [e for e in ordered if e is not first[0]]
-        out, unbroken = [], False
+        out, unbroken = [], self._open
         for i, e in enumerate(ordered):
             continues = begun and i == 0
             if times is not None:
                 stamps = Column(times.name, pd.Series(times.values).iloc[e.rows])
-                self._clock.check(stamps, e.label, continues=continues)
+                goes_on = self._clock.check(stamps, e.label, continues=continues)
+                unbroken &= goes_on
             parts = complete_runs(e, shortest=1) if has_gaps(e) else [e]
             for part in parts:
                 assert part.outputs is not None
-                joins = continues and self._open and part.rows[0] == e.rows[0]
-                goes_on = part.rows[-1] == e.rows[-1]
-                if len(part.rows) > 1 or joins or goes_on:
+                joins = continues and unbroken and part.rows[0] == e.rows[0]
+                last = part.rows[-1] == e.rows[-1]
+                if len(part.rows) > 1 or joins or last:
                     out.append(Piece(part.inputs, part.outputs, not joins))
             unbroken = bool(parts) and parts[-1].rows[-1] == e.rows[-1]
         self._label, self._open = ordered[-1].label, unbroken
@@ -382,7 +388,7 @@ def fit_as_stream(
     """
     if sum(len(u) for u, _ in pairs) <= BUFFER or choices.method == "pbsid":
         return None
-    pairs, u_offset, y_offset = remove_trends(pairs, detrend)
+    pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     buffer = SampleBuffer(gaps)
     left = buffer.add([Piece(u, y, True) for u, y in pairs])
     first = buffer.pairs
@@ -400,13 +406,13 @@ def fit_as_stream(
     except ValueError:
         return None
     kept = [Piece(u, y, True) for u, y in first]
-    states = summary.initial_states(fitted.model, kept, left)
-    if states is None:
+    own = summary.own_unknowns(fitted.model, kept, left)
+    if own is None:
         return None
+    states, offsets = own
     return fitted._replace(
         model=fitted.model._replace(initial_states=states),
-        input_offset=u_offset,
-        output_offset=y_offset,
+        offsets=offsets.shifted(u_mean, y_mean),
     )
 
 

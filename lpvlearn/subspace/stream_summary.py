@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from .fit import Choices, LocalFit
 from .hankel import HankelSum, extend_hankel_sum, start_hankel_sum
-from .identification import STABLE_LOSS, STABLE_MARGIN
+from .identification import STABLE_LOSS, STABLE_MARGIN, Centres, centred
+from .offsets import Offsets, attributed, joined
 from .realization import (
     ObservabilitySubspace,
     factor_input_matrices,
@@ -30,6 +31,7 @@ from .realization import (
 )
 from .recursive_refinement import (
     Recursion,
+    StretchError,
     current_model,
     extend_recursion,
     input_matrices,
@@ -72,6 +74,7 @@ class _Sums(NamedTuple):
     hankel: HankelSum
     recursion: Recursion | None  # None where the first model cannot be linearised at
     initial_state: Array  # of the last stretch
+    offsets: Offsets  # mean of all so far, one row
     energy: Array  # per channel: the subspace step weighs outputs by their final size
     n_samples: int
     point: Realization | None = None  # where to linearise if not at the minimum
@@ -101,13 +104,16 @@ class StreamSummary:
         self._order, self._horizon = fitted.selection.order, fitted.selection.horizon
         self._basis = fitted.evidence.basis
         self._su, self._sy = scaled.input_scale, scaled.output_scale
-        samples = [np.vstack(record).T for record in scaled.records]
+        samples = [np.vstack((r.u, r.y)).T for r in scaled.records]
         hankel = start_hankel_sum(
             samples,
             len(self._su),
             self._horizon,
             past_outputs=choices.method != "pi-moesp",
+            n_trend=self._free.n_trend,
         )
+        if self._free.n_trend:  # what follows is about another level
+            hankel = hankel._replace(tail=hankel.tail[:0])
         self._waiting = self._latest = np.zeros((0, samples[0].shape[1]))
         self._starts = False
         pilot = in_sections(fitted.model)
@@ -115,6 +121,7 @@ class StreamSummary:
             hankel,
             start_recursion(pilot, scaled.records, self._free),
             pilot.initial_states[-1],
+            fitted.offsets.pooled(),
             np.sum([(z**2).sum(axis=0) for z in samples], axis=0),
             sum(len(z) for z in samples),
         )
@@ -165,6 +172,7 @@ class StreamSummary:
         kept = sum(record.u.shape[1] for record in evidence.records)
         return self._first._replace(
             model=model._replace(rank_deficit=self._first.model.rank_deficit),
+            offsets=sums.offsets,
             singular_values=step.subspace.singular_values,
             residual=float(np.sqrt(model.loss / energy)),
             stability_loss=lost,
@@ -185,17 +193,16 @@ class StreamSummary:
         n, m = len(self._latest), len(self._su)
         if model.blocks is None or n == 0:
             return np.nan
-        loss, _ = stretch_error(
-            model, self._record(self._latest), self._free, starts=False
-        )
+        record, _ = self._record(self._latest)
+        loss = stretch_error(model, record, self._free, starts=False).loss
         power = self._sums.energy[m:].sum() / self._sums.n_samples
-        power = max(power, (self._latest[:, m:] ** 2).sum() / n)
+        power = max(power, (record.y**2).sum() / n)
         return float(np.sqrt(loss / n / (power or 1.0)))
 
-    def initial_states(
+    def own_unknowns(
         self, model: Realization, first: Sequence[Piece], others: Sequence[Piece]
-    ) -> Array | None:
-        """Initial states, where the samples themselves are still there.
+    ) -> tuple[Array, Offsets] | None:
+        """Initial states and offsets, where the samples themselves are still there.
 
         For a model of `fit`, the pieces that the summaries began with, and all that
         were added. None where the simulation error of the samples is not what the
@@ -204,15 +211,17 @@ class StreamSummary:
         if self._sums.recursion is None or model.blocks is None:
             return None
         states, loss = [], 0.0
+        offsets: list[list[Offsets]] = []
         for samples, starts in chain(
             ((self._scaled(u, y), True) for u, y, _ in first), self._stretches(others)
         ):
-            error, x0 = stretch_error(
-                model, self._record(samples), self._free, starts=starts
-            )
-            loss += error
+            record, centres = self._record(samples)
+            found = stretch_error(model, record, self._free, starts=starts)
+            loss += found.loss
             if starts:
-                states.append(x0)
+                states.append(found.initial_state)
+                offsets.append([])
+            offsets[-1].append(self._offsets(model, found, samples, centres))
         sums = self._with_waiting()
         energy = float(sums.energy[len(self._su) :].sum())
         n_values = sums.n_samples * len(self._sy)
@@ -221,7 +230,12 @@ class StreamSummary:
             share = max(share, _EXCESS_UNREFINED)
         if not abs(loss - model.loss) <= share * model.loss + _ROUNDING * energy:
             return None
-        return np.array(states).reshape(len(states), len(model.A))
+        by_experiment = joined([joined(parts).pooled() for parts in offsets])
+        differ = self._first.offsets.differ
+        return (
+            np.array(states).reshape(len(states), len(model.A)),
+            by_experiment._replace(differ=differ),
+        )
 
     def _stretches(self, pieces: Sequence[Piece]) -> Iterator[tuple[Array, bool]]:
         for u, y, starts in pieces:
@@ -241,9 +255,26 @@ class StreamSummary:
                 )
         return np.hstack([u / self._su, outputs / self._sy])
 
-    def _record(self, samples: Array) -> Record:
-        m = len(self._su)
-        return Record.of(samples[:, :m], samples[:, m:])
+    def _record(self, samples: Array) -> tuple[Record, Centres]:
+        """The record of a stretch, and what was subtracted from it."""
+        m, n_trend = len(self._su), self._free.n_trend
+        pairs = [(samples[:, :m], samples[:, m:])]
+        pairs, centres = centred(pairs, n_trend, self._free.initial_states)
+        return Record.of(*pairs[0], n_trend), centres
+
+    def _offsets(
+        self, model: Realization, found: StretchError, samples: Array, centres: Centres
+    ) -> Offsets:
+        """Offsets of a stretch, in the units of the data."""
+        m, back = len(self._su), self._su[:, None] * np.linalg.pinv(self._basis)
+        evidence = replace(
+            self._first.evidence, model=model._replace(trends=found.trends[None])
+        )
+        return attributed(
+            evidence,
+            Centres(centres.inputs @ back, centres.trends * self._sy),
+            [(samples[:, :m] @ back, samples[:, m:])],
+        )
 
     def _with_waiting(self) -> _Sums:
         # A single sample tells nothing but its own initial state.
@@ -253,20 +284,25 @@ class StreamSummary:
 
     def _with(self, sums: _Sums, samples: Array, starts: bool) -> _Sums:
         """The sums, continued by a stretch of samples."""
-        recursion = sums.recursion
+        recursion, (record, centres) = sums.recursion, self._record(samples)
         if recursion is not None:
             if self._choices.refine is False and sums.n_samples >= sums.next_point:
                 # The subspace step, not the minimum, is where the model will be.
                 sums = sums._replace(
                     point=self._subspace_model(sums), next_point=2 * sums.n_samples
                 )
-            recursion, x0 = extend_recursion(
-                recursion, self._record(samples), starts=starts, point=sums.point
+            recursion, found = extend_recursion(
+                recursion, record, starts=starts, point=sums.point
             )
-            sums = sums._replace(recursion=recursion, initial_state=x0)
+            sums = sums._replace(recursion=recursion, initial_state=found.initial_state)
+            if self._free.n_trend and np.isfinite(found.loss):
+                model = current_model(recursion)
+                latest = self._offsets(model, found, samples, centres)
+                sums = sums._replace(offsets=joined([sums.offsets, latest]).pooled())
+        power = [(signals**2).sum(axis=1) for signals in (record.u, record.y)]
         return sums._replace(
             hankel=extend_hankel_sum(sums.hankel, samples, starts=starts),
-            energy=sums.energy + (samples**2).sum(axis=0),
+            energy=sums.energy + np.concatenate(power),
             n_samples=sums.n_samples + len(samples),
         )
 

@@ -10,6 +10,7 @@ inputs that follow know it (Sims, 1972; Caines and Chan, 1975). Past inputs and 
 are regressors already, so that a missing state, coloured noise or coloured inputs raise
 no alarm: all that is asked of p is to be long enough, which the data choose.
 
+Constants of the experiments, and drifts, are regressors too, projected out of all rows.
 Everything follows from the triangular factor of one Hankel matrix. In the columns
 beyond those of some first rows stand the other rows less what the first explain: of
 rows ordered from the newest sample to the oldest, the residuals for every p.
@@ -24,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-from .hankel import hankel_factor
+from .hankel import hankel_factor, without_trend
 from .signals import Record
 
 Array = NDArray[np.float64]
@@ -82,13 +83,23 @@ class Feedback(NamedTuple):
 
 
 def samples_of(records: Sequence[Record]) -> list[Array]:
-    """Rows ``[u, y]`` of every record."""
-    return [np.ascontiguousarray(np.vstack(record).T) for record in records]
+    """Rows ``[u, y]`` of every record, less its trends."""
+    return [
+        without_trend(
+            np.ascontiguousarray(np.vstack((record.u, record.y)).T), len(record.trend)
+        )
+        for record in records
+    ]
 
 
 def n_windows(records: Sequence[Record], past: int) -> int:
-    """Samples that have `past` others of their experiment before them."""
-    return sum(max(0, record.u.shape[1] - past) for record in records)
+    """Samples that have `past` others of their experiment before them.
+
+    Less one for each of its trends, which are projected out of all channels.
+    """
+    return sum(
+        max(0, record.u.shape[1] - past - len(record.trend)) for record in records
+    )
 
 
 def longest_past(records: Sequence[Record], most_rows: int, ahead: int = 0) -> int:
@@ -123,6 +134,8 @@ def past_window(
 
 def find_feedback(records: Sequence[Record]) -> Feedback | None:
     """Test of feedback; None where the samples are too few.
+
+    Every channel may have a constant of its own in every experiment.
 
     Canonical correlations of the innovations with future inputs, given present and past
     ones and past outputs, by Bartlett's approximation of Wilks' criterion.
@@ -175,14 +188,17 @@ def _curved_share(
 
 
 def _some(records: Sequence[Record]) -> list[Record]:
-    """Records to look at: the first of them, each cut."""
+    """Records to look at: the first of them, each cut, with constants."""
     kept, left = [], _MAX_SAMPLES
     for record in records:
         kept.append(record.head(left))
         left -= record.u.shape[1]
         if left <= 0:
             break
-    return kept
+    return [
+        record if len(record.trend) else Record.of(record.u.T, record.y.T, 1)
+        for record in kept
+    ]
 
 
 def _newest_first(records: Sequence[Record], past: int, ahead: int) -> Array:
@@ -191,7 +207,8 @@ def _newest_first(records: Sequence[Record], past: int, ahead: int) -> Array:
     lags = np.arange((past + 1 + ahead) * c).reshape(-1, c)
     rows = [lags[:past][::-1], lags[past], lags[past + 1 :, :m]]
     flat = np.concatenate([part.ravel() for part in rows])
-    return hankel_factor(samples_of(records), past + 1 + ahead, flat)
+    samples, n_trend = samples_of(records), len(records[0].trend)
+    return hankel_factor(samples, past + 1 + ahead, flat, n_trend=n_trend)
 
 
 def _chosen_past(

@@ -73,11 +73,32 @@ def lti_response(
     return state_trajectory(A, u @ B.T, x0) @ C.T + u @ D.T
 
 
-def free_responses(A: Array, C: Array, n_samples: int) -> Array:
-    """Outputs ``C A^k`` from every unit initial state, (n_samples, n_outputs, n)."""
+def trend_signals(n_samples: int, n_trend: int) -> Array:
+    """A constant one (and a straight line from -1 to 1), (n_trend, n_samples).
+
+    >>> trend_signals(3, 2)
+    array([[ 1.,  1.,  1.],
+           [-1.,  0.,  1.]])
+    """
+    t = np.linspace(-1.0, 1.0, n_samples)
+    return t ** np.arange(n_trend)[:, None]
+
+
+def free_responses(
+    A: Array, C: Array, n_samples: int, trend: Array | None = None
+) -> Array:
+    """Outputs ``C A^k`` from every unit initial state, (n_samples, n_outputs, n).
+
+    Those to signals that are free in every output, `trend` (n_trend, n_samples), follow
+    along the last axis: signal by signal, output by output.
+    """
     # (C A^k)^T = (A^T)^k C^T takes one run per output instead of one per state.
     rest = np.zeros((n_samples, *C.T.shape))
-    return state_trajectory(A.T, rest, C.T).swapaxes(1, 2)
+    free = state_trajectory(A.T, rest, C.T).swapaxes(1, 2)
+    if trend is None or not len(trend):
+        return free
+    trends = [np.multiply.outer(t, np.eye(len(C))) for t in trend]
+    return np.concatenate([free, *trends], axis=2)
 
 
 def estimate_initial_state(responses: Array, error: Array) -> Array:
@@ -85,8 +106,12 @@ def estimate_initial_state(responses: Array, error: Array) -> Array:
 
     ``min || error - sum_i responses[:, :, i] x0[i] ||``, of minimum norm where the
     responses (of every unit initial state) do not determine it. The error has shape
-    (n_samples, n_outputs), and one more axis for several runs.
+    (n_samples, n_outputs), and one more axis for several runs. Of one run, entries may
+    be missing (NaN).
     """
     n_rows = error.shape[0] * error.shape[1]
     columns = responses.reshape(n_rows, -1)
+    if error.ndim == 2 and np.isnan(error).any():
+        known = ~np.isnan(error.reshape(n_rows))
+        return scaled_lstsq(columns[known], error.reshape(n_rows)[known])[0]
     return scaled_lstsq(columns, error.reshape(n_rows, *error.shape[2:]))[0]

@@ -197,7 +197,7 @@ def test_feature_names_are_set_in_fit_and_checked_in_predict():
     assert reader.n_features_in_ == 5
     assert list(reader.feature_names_in_) == list(X)
     assert read_experiments(reader, X, reset=False, **ROLES)[0].outputs is None
-    with pytest.raises(ValueError, match="Feature names unseen at fit time"):
+    with pytest.raises(ValueError, match=r"none of name 'u1' \(inputs\) among 'v'"):
         read_experiments(reader, X.rename(columns={"u1": "v"}), reset=False, **ROLES)
     with pytest.raises(ValueError, match="requires y to be passed"):
         read_experiments(reader, X, **ROLES)

@@ -1,10 +1,17 @@
 """Time stamps: even however they are stored, or refused."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from lpvlearn.data.timestamps import check_uniform_time, time_in_seconds
+from lpvlearn.data.timestamps import (
+    UNTIMED,
+    check_time_tol,
+    read_clock,
+    time_in_seconds,
+)
 
 
 @pytest.mark.parametrize(
@@ -31,26 +38,107 @@ from lpvlearn.data.timestamps import check_uniform_time, time_in_seconds
 )  # fmt: skip
 def test_even_time_passes_however_it_is_stored(stamps):
     seconds = time_in_seconds(stamps, "t")
-    step = check_uniform_time(seconds, column="t", experiment=0)
+    step = read_clock(seconds, column="t", experiment=0).step
     expected = float(seconds[-1] - seconds[0]) / 2999
     np.testing.assert_allclose(step, expected, rtol=1e-6)
     # One sample lost is seen in all of them.
-    with pytest.raises(ValueError, match="evenly spaced"):
-        check_uniform_time(np.delete(seconds, 1500), column="t", experiment=0)
+    lost = np.delete(seconds, 1500)
+    with pytest.raises(ValueError, match=r"1 row\(s\) are missing, at 1 place"):
+        read_clock(lost, column="t", experiment=0)
+    clock = read_clock(lost, column="t", experiment=0, allow_missing=True)
+    np.testing.assert_allclose(clock.step, expected, rtol=1e-4)
+    assert clock.breaks.tolist() == [1500]
 
 
 @pytest.mark.parametrize(
-    "stamps",
+    ("stamps", "remedy"),
     [
-        [0, 1, 2, 4],
-        [0.0, 0.1, 0.25, 0.3],
-        [0.0, 0.1, 0.1, 0.2],
-        [0.3, 0.2, 0.1],
-        np.concatenate([np.arange(100) / 10, 9.9 + 0.11 * np.arange(1, 100)]),
-        np.round(np.cumsum(np.r_[np.full(500, 1.00), np.full(500, 1.06)]), 1),
+        ([0, 1, 2, 4], "missing='split'.*resample"),
+        ([0.0, 0.1, 0.25, 0.3], "`time_tol`.*resample"),
+        ([0.0, 0.1, 0.1, 0.2], "stand twice"),
+        ([0.3, 0.2, 0.1], "Do not shuffle"),
+        (np.r_[np.arange(100) / 10, 9.9 + 0.11 * np.arange(1, 100)], "`time_tol`"),
+        (np.round(np.cumsum(np.repeat([1.00, 1.06], 500)), 1), "`time_tol`"),
     ],
     ids=["gap", "jitter", "repeat", "reversed", "two paces", "two rounded paces"],
 )
-def test_uneven_time_raises_and_says_what_to_use(stamps):
-    with pytest.raises(ValueError, match="GroupKFold.*TimeSeriesSplit.*resample"):
-        check_uniform_time(np.asarray(stamps, float), column="t", experiment=0)
+def test_uneven_time_raises_and_says_what_to_use(stamps, remedy):
+    with pytest.raises(ValueError, match="GroupKFold.*TimeSeriesSplit") as raised:
+        read_clock(np.asarray(stamps, float), column="t", experiment=0)
+    assert re.search(remedy, str(raised.value))
+
+
+def test_a_few_lost_rows_do_not_look_shuffled():
+    t = np.delete(np.arange(200.0), [50, 120])
+    with pytest.raises(ValueError, match="missing='split'.*resample") as raised:
+        read_clock(t, column="t", experiment=0)
+    assert "shuffle" not in str(raised.value)
+
+
+# ------------------------------------------------------------------- jitter and gaps
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e4])
+@pytest.mark.parametrize("share", [0.002, 0.0095])
+def test_jitter_within_the_tolerance_is_accepted_and_measured(scale, share):
+    off = np.random.default_rng(1).uniform(-1, 1, 2000)
+    t = scale * (np.arange(2000) + share * off)
+    clock = read_clock(t, column="t", experiment=0, time_tol=0.01)
+    rest = off - np.polyval(np.polyfit(np.arange(2000), off, 1), np.arange(2000))
+    np.testing.assert_allclose(clock.jitter, share * abs(rest).max(), rtol=1e-4)
+    np.testing.assert_allclose(clock.step, scale, rtol=2 * share / 1999)
+    with pytest.raises(ValueError, match="largest deviation .* of the step"):
+        read_clock(t, column="t", experiment=0, time_tol=share / 2)
+
+
+def test_the_largest_deviation_and_its_place_are_told():
+    t = np.arange(500) * 0.1
+    t[321] += 0.004
+    with pytest.raises(ValueError, match="0.00399 s at sample 321, 0.04 of the step"):
+        read_clock(t, column="t", experiment=0, time_tol=0.01)
+    clock = read_clock(t, column="t", experiment=0, time_tol=0.05)
+    np.testing.assert_allclose(clock.jitter, 0.04, rtol=0.01)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.009])
+@pytest.mark.parametrize("shift", [0.0, 0.37])
+def test_gaps_are_found_whatever_the_phase_after_them(share, shift):
+    """A logger that lost rows, or was stopped and started again."""
+    rng = np.random.default_rng(1)
+    t = np.arange(1000) + share * rng.uniform(-1, 1, 1000)
+    t[400:] += shift
+    kept = np.ones(1000, dtype=bool)
+    kept[[100, 101, 399, 700]] = False
+    clock = read_clock(
+        t[kept], column="t", experiment=0, time_tol=0.01, allow_missing=True
+    )
+    assert clock.breaks.tolist() == [100, 397, 697]
+    np.testing.assert_allclose(clock.step, 1.0, rtol=1e-4)
+    assert clock.jitter <= 1.05 * share + 1e-9
+
+
+@pytest.mark.parametrize("power", [-2, -1, 1, 2, 3])
+def test_another_unit_of_time_is_recognised(power):
+    t = np.arange(20) * 0.05 * 1000.0**power
+    for step, words in ((0.05, "milliseconds by 1000"), (0.02, "times are in seconds")):
+        expected = [(UNTIMED._replace(step=step), "the rule")]
+        with pytest.raises(ValueError, match=f"the rule. Got {step} s.*{words}"):
+            read_clock(t, column="t", experiment=0, expected=expected)
+
+
+def test_steps_agree_as_far_as_jitter_lets_them_be_known():
+    off = 0.009 * np.random.default_rng(2).uniform(-1, 1, 500)
+    options = {"column": "t", "experiment": 0, "time_tol": 0.01}
+    long = read_clock(np.arange(500) + off, **options)
+    for n in (2, 3, 10, 100):
+        short = read_clock(np.arange(n) + off[:n], **options)
+        read_clock(np.arange(n) + off[:n], expected=[(long, "rule")], **options)
+        read_clock(np.arange(500) + off, expected=[(short, "rule")], **options)
+    with pytest.raises(ValueError, match="rule. Got"):
+        read_clock(1.01 * np.arange(100), expected=[(long, "rule")], **options)
+
+
+@pytest.mark.parametrize("tol", [-0.1, 0.25, np.nan, "1 %", True])
+def test_a_tolerance_is_a_share_of_the_step(tol):
+    with pytest.raises(ValueError, match="`time_tol` must be a share"):
+        check_time_tol(tol)

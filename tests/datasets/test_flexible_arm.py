@@ -177,3 +177,29 @@ def test_bad_simulations(reference, theta2, options, message):
     arguments = {"sampling_time": 1e-3, **options}
     with pytest.raises(ValueError, match=message):
         FlexibleArm().simulate(reference, theta2, **arguments)
+
+
+def test_momenta_are_another_state_of_the_same_models():
+    arm = FlexibleArm()
+    rates, momenta = arm.structure(), arm.structure(form="momentum")
+    assert momenta.parameter_names == rates.parameter_names
+    for angle in (0.5, 1.5, 2.5):
+        theta = arm.parameters(angle)
+        found, expected = momenta.model(theta), rates.model(theta)
+        omega = np.geomspace(0.1, 1e3, 30)
+        np.testing.assert_allclose(
+            found.frequency_response(omega),
+            expected.frequency_response(omega),
+            atol=1e-9,
+        )
+        # z is what M q' = [G Lambda, K] z makes it
+        M = arm.mass_matrix([0.0, angle, 0.0, 0.0])
+        loads = np.diag([*arm.gains, 4 * arm.EI1 * arm.l1, 4 * arm.EI2 * arm.l2])
+        T = np.zeros((6, 6))
+        T[:2, :2], T[2:, 2:] = np.eye(2), np.linalg.solve(loads, M)
+        moved = expected.transform(T)
+        np.testing.assert_allclose(found.A, moved.A, atol=1e-9 * np.abs(moved.A).max())
+        np.testing.assert_allclose(found.B, moved.B, atol=1e-9)
+        np.testing.assert_allclose(found.C, moved.C, rtol=1e-9, atol=1e-6)
+    with pytest.raises(ValueError, match="`form` must be 'rate' or 'momentum'"):
+        arm.structure("rates")

@@ -65,6 +65,7 @@ def test_simulation_of_an_experiment_is_the_prediction_there(pipeline, tables):
     assert display.axes_[-1].get_xlabel() == "Time (s)"
 
 
+@pytest.mark.filterwarnings("ignore:The scored table starts in mid-motion")
 def test_simulation_from_an_estimated_state_fits_a_record_cut_in_the_middle(
     pipeline, tables
 ):
@@ -112,3 +113,18 @@ def test_simulation_errors_teach_about_shapes_and_estimators(tables):
     X, y = (table.iloc[:300] for table in tables)
     with pytest.raises(ValueError, match="`experiment` must be None"):
         SimulationDisplay.from_estimator(alone.fit(X, y), X, y, experiment="a")
+
+
+def test_missing_measurements_leave_a_gap_and_do_not_count(pipeline, tables):
+    X, y = tables[0].iloc[:300], tables[1].iloc[:300].copy()
+    y.iloc[20:32] = np.nan
+    display = SimulationDisplay.from_estimator(pipeline, X, y)
+    drawn = display.lines_["measured"][0].get_ydata()
+    assert_array_equal(np.isnan(drawn), np.isin(np.arange(300), range(20, 32)))
+    assert legend_texts(display.axes_[0])[0] == "measured, 12 missing"
+    assert display.n_missing_.tolist() == [12]
+    known = y.notna().to_numpy()[:, 0]
+    expected = bft_score(y[known], pipeline.predict(X)[known])
+    assert_allclose(display.bft_["simulated"], expected)
+    with pytest.raises(ValueError, match="`y_pred` must be finite"):
+        SimulationDisplay.from_predictions([0, 1], [1.0, np.nan], [np.nan, 1.0])

@@ -6,11 +6,14 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from sklearn.base import clone
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -331,3 +334,186 @@ def test_a_diverging_simulation_names_the_frozen_model():
     with pytest.raises(DivergenceError, match="diverges within one sample of 1000 s"):
         inside.simulate(np.ones(3), np.full(3, -2.0), 1000.0)
     assert np.isfinite(inside.simulate(np.ones(300), kappa[:300], 0.1)).all()
+
+
+# ---------------------------------------------------------------- changes of the basis
+
+
+def growing(kappa):
+    """An invertible T that follows the scheduling variable."""
+    return np.array([[1.0, 0.3 * kappa[0]], [np.sin(kappa[0]), 2.0 + kappa[0]]])
+
+
+def test_a_change_of_basis_changes_no_output():
+    model, u, kappa = spring(), inputs(200), sweep(200)
+    x0 = np.array([0.3, -1.0])
+    changed = model.change_basis(growing)
+    y = model.simulate(u, kappa, DT, x0)
+    assert_allclose(changed.simulate(u, kappa, DT, growing(kappa[:1]) @ x0), y)
+    free = changed.free_responses(kappa, DT)
+    expected = model.free_responses(kappa, DT)
+    assert_allclose(free @ growing(kappa[:1]), expected, atol=1e-12)
+    assert_allclose(changed.frozen_poles(kappa), model.frozen_poles(kappa))
+
+
+def test_the_model_in_the_new_basis_is_that_of_the_moving_state():
+    """``z = T x`` along a trajectory, from the matrices of `at` with a rate."""
+    model = spring()
+    changed = model.change_basis(growing)
+    t, dt = 0.7, 1e-6
+
+    def kappa(t):
+        return np.array([1 + np.sin(t)])
+
+    x, u = np.array([0.5, -0.2]), np.array([1.0, 0.4])
+    local = model.at(kappa(t))
+    ahead, behind = (
+        growing(kappa(t + h)) @ (x + h * (local.A @ x + local.B @ u)) for h in (dt, -dt)
+    )
+    new = changed.at(kappa(t), rate=np.cos(t))
+    z = growing(kappa(t)) @ x
+    assert_allclose(new.A @ z + new.B @ u, (ahead - behind) / (2 * dt), atol=1e-8)
+    assert_allclose(new.C @ z + new.D @ u, local.C @ x + local.D @ u, atol=1e-12)
+    at_rest = changed.at(kappa(t))
+    assert_allclose(
+        at_rest.A, growing(kappa(t)) @ local.A @ np.linalg.inv(growing(kappa(t)))
+    )
+
+
+def test_changes_of_basis_follow_one_another_and_back():
+    model = spring()
+    T = np.array([[2.0, 1.0], [0.0, 1.0]])
+    there = model.change_basis(T).change_basis(growing)
+    back = there.change_basis(lambda k: np.linalg.inv(growing(k) @ T))
+    assert_allclose(back.at(0.7, rate=2.0).A, model.at(0.7).A, atol=1e-8)
+    assert_allclose(
+        model.change_basis(T).at(0.7, rate=2.0).A,
+        T @ model.at(0.7).A @ np.linalg.inv(T),
+    )
+    assert pickle.loads(pickle.dumps(model.change_basis(growing))).bases == (growing,)
+
+
+def test_a_change_of_basis_over_two_variables():
+    model = two_variables()
+
+    def T(kappa):
+        return np.diag([1.0 + kappa[0], 2.0 + kappa[1] * kappa[0]])
+
+    kappa, rate = np.array([0.5, 0.2]), np.array([3.0, -1.0])
+    changed = model.change_basis(T).at(kappa, rate=rate)
+    slope = np.diag([rate[0], rate[1] * kappa[0] + kappa[1] * rate[0]])
+    expected = (T(kappa) @ model.at(kappa).A + slope) @ np.linalg.inv(T(kappa))
+    assert_allclose(changed.A, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("T", [np.eye(3), np.ones((2, 2)), lambda k: np.zeros((2, 2))])
+def test_what_is_no_basis_is_refused(T):
+    with pytest.raises(ValueError):
+        spring().change_basis(T)
+
+
+def test_a_model_of_momenta_follows_newtons_law_while_the_mass_moves():
+    """``(m q')' = u - c q' - k q`` integrated; the frozen models do not tell it."""
+    kappa = np.array([[0.0], [1.0]])
+    mass = PolynomialLPV(1).fit(kappa, 3.0 - 2.0 * kappa)
+    t = 0.01 * np.arange(1000)
+
+    def moves(time):
+        return 0.5 - 0.5 * np.cos(2.0 * time)
+
+    def law(time, state):
+        rate = state[1] / (3.0 - 2.0 * moves(time))
+        return [rate, 1.0 - 0.1 * rate - state[0]]
+
+    true = solve_ivp(law, (0, t[-1]), [0, 0], t_eval=t, max_step=0.01, rtol=1e-9).y[0]
+    errors = []
+    for state in ("rate", "momentum"):
+        structure = GrayBoxStructure.mechanical(
+            [["m"]], [[0.1]], [[1]], [[1]], state=state
+        )
+        y = LPVStateSpace(structure, mass, kappa).simulate(
+            np.ones(1000), moves(t), 0.01
+        )
+        errors.append(np.abs(y[:, 0] - true).max() / np.ptp(true))
+    assert errors[1] < 0.02 < 0.3 < errors[0]
+
+
+# ------------------------------------------------------------------ names and ranges
+
+
+def of_mass_and_speed(extrapolation="ignore"):
+    """Two named variables, 0 to 2 and -1 to 1, identified a little beyond."""
+    model = two_variables()
+    quiet = clone(model.interpolator).set_params(extrapolation=extrapolation)
+    points = np.array([[i, j] for i in (0.0, 1.0, 2.0) for j in (-1.0, 0.0, 1.0)])
+    return replace(
+        model,
+        interpolator=quiet.fit(points, model.parameters(points)),
+        scheduling_names=["mass", "speed"],
+        identified_range=[[-0.1, -1.1], [2.1, 1.1]],
+    )
+
+
+def test_values_go_by_name_in_any_order():
+    model, u, t = of_mass_and_speed(), inputs(50), np.linspace(0, 1, 50)
+    by_name, by_place = model.at({"speed": 0.5, "mass": 1.5}), model.at([1.5, 0.5])
+    assert_array_equal(by_name.A, by_place.A)
+    expected = model.simulate(u, np.column_stack([t, -t]), DT)
+    named = {"speed": -t, "mass": t}
+    assert_array_equal(model.simulate(u, named, DT), expected)
+    table = pd.DataFrame(named).assign(other=0.0)
+    assert_array_equal(model.simulate(u, table, DT), expected)
+    held = model.change_basis(lambda kappa: np.diag([1, 2 + kappa[1]]))
+    A = held.at({"speed": 0.5, "mass": 1.5}, rate={"mass": 0.0, "speed": 1.0}).A
+    assert_allclose(A, held.at([1.5, 0.5], rate=[0.0, 1.0]).A)
+
+
+@pytest.mark.parametrize(
+    "kappa, words",
+    [
+        ({"mass": 1.0}, r"the model knows \['mass', 'speed'\]. Got \['mass'\]"),
+        ({"mass": 1.0, "sped": 2.0}, r"Got \['mass', 'sped'\]"),
+        ({"mass": [1.0, 2.0], "speed": 0.0}, r"as many values .* Got \[2, 1\]"),
+        ({"mass": [1.0, 2.0], "speed": [0.0, 1.0]}, "one value of every"),
+        ({"mass": np.nan, "speed": 0.0}, "must be finite"),
+    ],
+)
+def test_names_that_do_not_fit_are_refused(kappa, words):
+    with pytest.raises(ValueError, match=words):
+        of_mass_and_speed().at(kappa)
+
+
+def test_a_model_without_names_says_so():
+    with pytest.raises(ValueError, match="knows no names"):
+        spring().at({"kappa": 1.0})
+    with pytest.raises(ValueError, match="`scheduling_names` must name the 1"):
+        replace(spring(), scheduling_names=["mass", "speed"])
+
+
+@pytest.mark.parametrize("extrapolation", ["ignore", "warn"])
+def test_values_out_of_range_are_named_with_their_range(extrapolation):
+    model, u = of_mass_and_speed(extrapolation), inputs(50)
+    with pytest.warns(ExtrapolationWarning) as caught:
+        model.at({"mass": 3.0, "speed": 0.5})
+    text = str(caught[0].message)
+    assert "'mass' must be within the identified range, -0.1 to 2.1." in text
+    assert "farthest at 3:" in text and "'speed'" not in text
+    kappa = {"mass": np.linspace(0, 2.5, 50), "speed": np.linspace(-2, 1, 50)}
+    with pytest.warns(ExtrapolationWarning) as caught:
+        model.simulate(u, kappa, DT)
+    assert len(caught) == 1
+    text = str(caught[0].message)
+    assert "'mass' must be" in text and "8 of 50 samples outside, the farthest" in text
+    assert "'speed' must be" in text and "farthest at -2:" in text
+
+
+def test_what_is_within_the_range_or_held_at_its_border_is_not_told():
+    u = inputs(50)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        of_mass_and_speed("warn").at([2.05, -1.05])
+        of_mass_and_speed("clip").at([3.0, 0.0])
+        of_mass_and_speed().silenced().at([3.0, 0.0])
+        of_mass_and_speed().simulate(u, np.tile([2.05, 0.0], (50, 1)), DT)
+    with pytest.raises(ValueError, match="identified range"):
+        of_mass_and_speed("error").at([3.0, 0.0])

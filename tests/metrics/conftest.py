@@ -8,6 +8,7 @@ from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from lpvlearn.data.experiments import read_experiments
 
 RNG = np.random.default_rng(0)
+IN_MOTION = pytest.mark.filterwarnings("ignore:The scored table starts in mid-motion")
 Y_TRUE = RNG.normal(size=(50, 2))
 Y_PRED = Y_TRUE + RNG.normal(scale=[0.1, 0.4], size=(50, 2)) + [0.2, 0.0]
 

@@ -26,7 +26,7 @@ from ..conftest import (
     spring_tables,
     spring_truth,
 )
-from .conftest import RNG
+from .conftest import IN_MOTION, RNG, GainFromRest
 
 
 @pytest.fixture(scope="module")
@@ -43,11 +43,13 @@ def balanced(spring):
 # -- one model -------------------------------------------------------------------------
 
 
+@IN_MOTION
 def test_the_report_has_a_row_for_each_experiment_and_output(data):
     model, X, y = data
     report = fit_report(model, X, y)
     assert list(report) == [
         "experiment", "operating_point", "output", "BFT", "VAF", "RMSE", "R2",
+        "n_missing",
     ]  # fmt: skip
     assert report["experiment"].tolist() == ["a", "a", "b", "b", "c", "c"]
     assert report["output"].tolist() == 3 * ["vx", "vy"]
@@ -63,6 +65,7 @@ def test_the_report_has_a_row_for_each_experiment_and_output(data):
         assert row["R2"] == pytest.approx(r2_score(true, pred))
 
 
+@IN_MOTION
 def test_the_report_takes_the_scorers_options(data):
     model, X, y = data
     assert (fit_report(model, X, y, initial_state="estimate")["BFT"] == 100).all()
@@ -123,6 +126,7 @@ def test_models_without_an_estimator_take_roles(spring):
     assert bare["BFT"].item() > 100 - 1e-6
 
 
+@IN_MOTION
 def test_the_start_of_a_record_in_the_middle_is_estimated(spring):
     X, y = (table.iloc[400:900] for table in spring[2:])
     models = {"lpv": spring_lpv(), "lti": spring_lpv().at(0.75)}
@@ -225,3 +229,32 @@ def test_the_analytic_model_may_be_any_lpv_model(spring):
         [[0.0], [1.5]],
     )
     assert compare_models({"lpv": lpv}, *spring[2:], **ROLES)["BFT"].item() > 99.999
+
+
+# -- missing samples -------------------------------------------------------------------
+
+
+@IN_MOTION
+def test_missing_samples_are_counted_and_left_out(data):
+    model, X, y = data
+    y = y.copy()
+    y.loc[X["run"] == "b", "vy"] = np.nan
+    y.loc[5:11, "vx"] = np.nan
+    report = fit_report(model, X, y)
+    assert report["n_missing"].tolist() == [7, 0, 0, 40, 0, 0]
+    measures = ["BFT", "VAF", "RMSE", "R2"]
+    assert report.loc[3, measures].isna().all()  # that output was never measured there
+    whole = fit_report(model, X, data[2])
+    same = report["n_missing"] == 0
+    pd.testing.assert_frame_equal(report[same], whole[same])
+    assert readable_report(report)["missing"].tolist() == list("700") + ["40", "0", "0"]
+    known = y["vx"].notna().to_numpy() & (X["run"] == "a").to_numpy()
+    expected = bft_score(y["vx"][known], model.predict(X)[known, 0])
+    assert report["BFT"][0] == pytest.approx(expected)
+
+
+def test_a_simulation_that_is_not_finite_is_no_missing_sample(data):
+    model, X, y = data
+    broken = GainFromRest(np.nan, experiment="run", scheduling="kappa").fit(X, X["u"])
+    with pytest.raises(ValueError, match="`y_pred` must be finite. Got nan at row 0"):
+        fit_report(broken, X, y)

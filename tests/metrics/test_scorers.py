@@ -25,7 +25,10 @@ from lpvlearn import (
     vaf_scorer,
 )
 
-from .conftest import RNG
+from .conftest import IN_MOTION, RNG
+
+# The table `data` does: warnings of it have a test of their own.
+pytestmark = IN_MOTION
 
 
 def test_scorers_from_rest_score_predict():
@@ -162,3 +165,33 @@ def test_an_estimator_without_the_method_for_an_option_raises(options, words):
     model = LinearRegression().fit([[0.0], [1.0]], [0, 1])
     with pytest.raises(TypeError, match=words):
         make_bft_scorer(**options)(model, [[0.0], [1.0]], [0, 1])
+
+
+@pytest.mark.parametrize("average", ["pool", "experiment"])
+@pytest.mark.parametrize("initial_state", ["rest", "estimate"])
+def test_missing_samples_are_left_out(data, average, initial_state):
+    model, X, y = data
+    lost = np.random.default_rng(5).random(len(y)) < 0.2
+    both = lost[:, None].repeat(2, axis=1)
+    scorer = make_bft_scorer(average=average, initial_state=initial_state, burn_in=3)
+    wrong = y.mask(both, 1e3)  # what is missing may have been anything
+    found = scorer(model, X, y.mask(both))
+    assert found != scorer(model, X, wrong)
+    known = ~lost & (np.arange(120) % 40 >= 3)
+    simulated = (
+        model.predict(X)
+        if initial_state == "rest"
+        else model.predict_with_initial_state(X, y)
+    )
+    groups = [known] if average == "pool" else [known & (X["run"] == r) for r in "abc"]
+    expected = np.mean([bft_score(y[rows], simulated[rows]) for rows in groups])
+    assert found == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("scorer", [bft_scorer, vaf_scorer])
+def test_a_prefix_of_the_outputs_is_refused(data, scorer):
+    model, X, y = data
+    with pytest.raises(ValueError, match=r"inconsistent .* samples: \[120, 119\]"):
+        scorer(model, X, y[:-1])
+    with pytest.raises(ValueError, match="inconsistent"):
+        scorer(model, X[:-1], y.to_numpy())

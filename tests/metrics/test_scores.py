@@ -94,7 +94,9 @@ def test_parameter_fit_is_the_unclipped_ratio_of_all_parameters_together():
         (lambda: bft_score([1, 2], [1, 2, 3]), ["same shape", "(2, 1)", "(3, 1)"]),
         (lambda: vaf_score(Y_TRUE, Y_TRUE[:, :1]), ["same shape", "(50, 1)"]),
         (lambda: bft_score([1, 2], [1, np.inf]), ["`y_pred`", "row 1", "unstable"]),
-        (lambda: bft_score([np.nan, 2], [1, 2]), ["`y_true`", "row 0"]),
+        (lambda: bft_score([np.inf, 2], [1, 2]), ["`y_true`", "row 0"]),
+        (lambda: bft_score([1, 2], [1, np.nan]), ["`y_pred`", "row 1"]),
+        (lambda: vaf_score([[1, np.nan]], [[1, 2]]), ["measured sample", "column 1"]),
         (lambda: bft_score([1, 2], [1, 2], multioutput="mean"), ["'mean'"]),
         (lambda: bft_score(Y_TRUE, Y_PRED, multioutput=[1]), ["2 output(s)", "[1]"]),
         (lambda: parameter_fit([1, 2], [[1, 2]]), ["`params_true`", "(1, 2)"]),
@@ -106,3 +108,17 @@ def test_bad_calls_raise_and_name_the_cause(call, words):
         call()
     for word in words:
         assert word in str(raised.value)
+
+
+@pytest.mark.parametrize("score", [bft_score, vaf_score, r2_ratio])
+def test_missing_samples_of_an_output_are_left_out_of_its_score(score):
+    lost = np.random.default_rng(4).random(Y_TRUE.shape) < 0.3
+    options = {} if score is r2_ratio else {"multioutput": "raw_values"}
+    found = score(np.where(lost, np.nan, Y_TRUE), Y_PRED, **options)
+    for k in (0, 1):
+        known = ~lost[:, k]
+        alone = score(Y_TRUE[known, k], Y_PRED[known, k], **options)
+        np.testing.assert_allclose(found[k], alone, rtol=1e-12)
+    # A simulation need not be known where nothing was measured.
+    both = np.where(lost, np.nan, Y_TRUE), np.where(lost, np.nan, Y_PRED)
+    np.testing.assert_array_equal(score(*both, **options), found)

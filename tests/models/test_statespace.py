@@ -433,7 +433,7 @@ def test_the_estimated_initial_state_is_the_one_simulated_from(n_outputs):
         (StateSpace(-1, 1, 1), [1.0], [1.0], "needs a discrete-time model"),
         (StateSpace(0.5, 1, 1, None, 1.0), [1.0, 2.0], [1.0], "Got 2 and 1"),
         (StateSpace(0.5, 1, 1, None, 1.0), [], [], "at least one. Got 0 and 0"),
-        (StateSpace(0.5, 1, 1, None, 1.0), [1.0], [np.nan], "`y` must be finite"),
+        (StateSpace(0.5, 1, 1, None, 1.0), [1.0], [np.inf], "`y` must be finite"),
         (StateSpace(0.5, 1, 1, None, 1.0), [1.0], [[1.0, 2.0]], r"`y`.*samples, 1\)"),
     ],
 )

@@ -23,6 +23,7 @@ COLUMNS = {
     "table2": ["theta2", "relative_error", "floor", "paper"],
     "table3": ["model", "degree", "matrix", "ours", "paper"],
     "table4": ["model", "output", "metric", "ours", "paper"],
+    "momentum": ["sweep", "output", "metric", "ours"],
     "timing": ["step", "seconds"],
 }
 ANGLES = np.arange(1, 8) * np.pi / 8
@@ -117,6 +118,14 @@ def test_lpv_model_follows_the_sweep_as_well_as_the_analytic_one(
     for output in ("y1", "y2"):
         assert bft[output, "restructured"] > bft[output, "analytic"] - 1.5
         assert bft[output, "balanced"] < bft[output, "restructured"] - 10.0
+
+
+def test_momenta_and_their_form_follow_sweeps_both_ways(results: Path) -> None:
+    table = read(results, "momentum")
+    assert table["sweep"].unique().tolist() == ["up", "down"]
+    bft = table[table["metric"] == "BFT"]["ours"]
+    assert len(bft) == 4
+    assert bft.min() > 96.0
 
 
 def test_total_time_is_the_sum_of_the_steps(results: Path) -> None:

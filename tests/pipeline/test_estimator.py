@@ -10,6 +10,7 @@ from sklearn.ensemble import RandomForestRegressor
 from sklearn.linear_model import LinearRegression
 
 from lpvlearn import (
+    AutoLPV,
     GrayBoxRestructurer,
     LocalLPVPipeline,
     PolynomialLPV,
@@ -100,9 +101,28 @@ def test_baseline_without_structure_is_worse(fitted, spring, memory):
     assert score < bft_score(y_sweep, fitted.predict(X_sweep)) - 1
 
 
-def test_default_restructurer_is_the_canonical_form(spring):
+def test_without_a_structure_black_boxes_are_aligned(fitted, spring):
     X, y, X_sweep, y_sweep = spring
-    pipeline = LocalLPVPipeline(SubspaceLTI(feedthrough=False), **ROLES).fit(X, y)
+    pipeline = LocalLPVPipeline(SubspaceLTI(2, feedthrough=False), **ROLES).fit(X, y)
+    assert pipeline.restructurers_ == []
+    assert pipeline.parameters_.shape == (4, 4 + 2 + 2 + 1)
+    for turned, true in zip(
+        pipeline.structured_models_, fitted.structured_models_, strict=True
+    ):
+        assert (turned - true).hinf_norm() < 1e-6 * true.hinf_norm()
+    assert "each turned to its neighbour" in pipeline.summary()
+    signs = spring_pipeline(restructurer="passthrough").fit(X, y)
+    aligned, baseline = (
+        bft_score(y_sweep, model.predict(X_sweep)) for model in (pipeline, signs)
+    )
+    assert aligned > baseline - 0.1
+
+
+def test_a_restructurer_without_structure_takes_the_canonical_form(spring):
+    X, y, X_sweep, y_sweep = spring
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(feedthrough=False), GrayBoxRestructurer(), **ROLES
+    ).fit(X, y)
     assert pipeline.parameters_.shape == (4, 4)  # two poles, two entries of B
     assert bft_score(y_sweep, pipeline.predict(X_sweep)) > 99.9
 
@@ -117,6 +137,35 @@ def test_any_regressor_interpolates(spring, memory):
     forest = RandomForestRegressor(5, random_state=0)
     steps = spring_pipeline(interpolator=forest, memory=memory).fit(X, y)
     assert bft_score(y_sweep, steps.predict(X_sweep)) > 50
+
+
+@pytest.mark.slow
+def test_points_of_few_samples_count_by_their_covariances():
+    """Two operating points of 100 samples among five of 3000."""
+    kappas = np.linspace(0, 1.5, 7)
+    parts = [
+        spring_tables(
+            0.1, 100 if k in (1, 4) else 3000, seed=20 + k, kappas=kappas[k : k + 1]
+        )
+        for k in range(7)
+    ]
+    X = pd.concat([X.assign(run=k) for k, (X, _) in enumerate(parts)])
+    y = pd.concat([y for _, y in parts])
+    pipeline = spring_pipeline(local=SubspaceLTI(2, feedthrough=False)).fit(X, y)
+    assert pipeline.interpolator_.form_ == "polynomial 2"
+    assert pipeline.interpolator_.best_estimator_.weighted_
+    assert "(polynomial 2)" in pipeline.summary()
+    unweighted = PolynomialLPV().fit(kappas[:, None], pipeline.parameters_)
+    fine = np.linspace(0, 1.5, 50)
+    truth = spring_truth(fine)
+    errors = [
+        np.sqrt(np.mean(((found - truth) / truth) ** 2))
+        for found in (
+            pipeline.lpv_.parameters(fine),
+            unweighted.predict(fine[:, None]),
+        )
+    ]
+    assert errors[0] < errors[1] / 1.5
 
 
 def test_sub_estimators_are_cloned(spring):
@@ -267,9 +316,9 @@ def test_nested_parameters_reach_the_steps():
 
 def test_parameters_of_a_default_step_can_be_set():
     pipeline = LocalLPVPipeline(**ROLES)
-    pipeline.set_params(local__horizon=12, interpolator__degree=1)
+    pipeline.set_params(local__horizon=12, interpolator__criterion="bic")
     assert pipeline.local.get_params() == SubspaceLTI(horizon=12).get_params()
-    assert pipeline.interpolator.degree == 1
+    assert pipeline.interpolator.get_params() == AutoLPV("bic").get_params()
     assert pipeline.restructurer is None
     with pytest.raises(ValueError, match="Invalid parameter 'horizn'"):
         pipeline.set_params(local__horizn=3)
@@ -294,6 +343,21 @@ def test_leaving_the_identified_range_warns_once_for_all_experiments(fitted, spr
     assert "'kappa' must be within the identified range, 0 to 1.5." in text
     assert f"Got {outside} of 3000 samples outside, the farthest at 3.5" in text
     assert warning.filename == __file__
+
+
+def test_the_model_tells_of_extrapolation_as_predict_does(fitted, spring):
+    _, _, X_sweep, _ = spring
+    u, kappa = X_sweep[["force"]], X_sweep["kappa"] + 0.2
+    for use in (
+        lambda: fitted.predict(X_sweep.assign(kappa=kappa)),
+        lambda: fitted.lpv_.simulate(u, {"kappa": kappa}, 0.02),
+        lambda: fitted.lpv_.at({"kappa": 1.7}),
+    ):
+        with pytest.warns(ExtrapolationWarning, match="'kappa' must be within the ide"):
+            use()
+    np.testing.assert_array_equal(
+        fitted.lpv_.at({"kappa": 0.7}).A, fitted.lpv_.at(0.7).A
+    )
 
 
 def test_holding_the_border_is_no_extrapolation(spring, memory):
@@ -350,7 +414,7 @@ def test_two_points_carry_a_line_by_default(spring, memory):
     X, y, _, _ = spring
     two = X["kappa"].isin([0.0, 0.5])
     pipeline = spring_pipeline(memory=memory).fit(X[two], y[two])
-    assert pipeline.interpolator_.degree == 1
+    assert pipeline.interpolator_.form_ == "polynomial 1"
 
 
 # -------------------------------------------------------------------- tables and arrays
@@ -393,7 +457,7 @@ def test_names_of_columns_are_kept_and_checked(fitted, spring):
     assert fitted.n_features_in_ == 4
     assert fitted.output_names_ == ["position"]
     assert fitted.scheduling_names_ == ["kappa"]
-    with pytest.raises(ValueError, match="feature names should match"):
+    with pytest.raises(ValueError, match=r"none of name 'force' \(inputs\)"):
         fitted.predict(X.rename(columns={"force": "u"}))
 
 
@@ -507,3 +571,33 @@ def test_time_may_come_from_the_local_estimator_or_be_counted_in_samples(spring)
     u = X.loc[X["run"] == "p0r0", ["force"]]
     lti = LocalLPVPipeline(SubspaceLTI(2, horizon=8)).fit(u, y.loc[u.index])
     assert lti.sampling_time_ == 1.0  # one black box: nothing means seconds
+
+
+@pytest.mark.slow
+def test_local_models_have_constants_of_their_experiments():
+    """Different at every experiment; the LPV model, which has none, says so."""
+    X, y = spring_tables(noise=0.02, n_repeats=2, seed=3)
+    level = X["run"].astype("category").cat.codes.to_numpy() % 3 - 1.0
+    moved = y + 0.2 * level[:, None]
+    plain, fitted = (
+        spring_pipeline(local=SubspaceLTI(offset=offset)).fit(X, outputs)
+        for offset, outputs in ((None, y), ("auto", moved))
+    )
+    np.testing.assert_allclose(fitted.parameters_, plain.parameters_, rtol=0.02)
+    np.testing.assert_allclose(fitted.parameters_std_, plain.parameters_std_, rtol=0.3)
+    for column in ("local_BFT", "structured_BFT"):
+        np.testing.assert_allclose(
+            fitted.report_[column], plain.report_[column], atol=10.0
+        )
+        assert fitted.report_[column].min() > 95.0
+    with pytest.warns(UserWarning, match="at 4 of 4 operating point.* have constants"):
+        fitted.predict(X)
+    plain.predict(X)  # is silent
+
+
+def test_averaged_realizations_have_constants_of_their_own():
+    X, y = spring_tables(noise=0.02, n_repeats=2, seed=3, kappas=KAPPA[:2])
+    level = X["run"].astype("category").cat.codes.to_numpy() % 3 - 1.0
+    fitted = spring_pipeline(combine="average").fit(X, y + 0.2 * level[:, None])
+    np.testing.assert_allclose(fitted.parameters_, spring_truth(KAPPA[:2]), rtol=0.05)
+    assert fitted.report_["local_BFT"].min() > 95.0

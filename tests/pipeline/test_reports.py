@@ -149,7 +149,7 @@ def test_the_summary_tells_what_was_found(fitted, balanced):
         "Local models: SubspaceLTI",
         "Restructuring: GrayBoxRestructurer",
         "rad/s",
-        "Interpolation: PolynomialLPV",
+        "Interpolation: AutoLPV() (polynomial 2)",
         "gray-box BFT",
         "parameter",
     ):

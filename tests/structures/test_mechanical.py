@@ -159,3 +159,122 @@ def test_a_coordinate_does_not_lose_its_mass(mass, values):
     structure = MECHANICAL(mass, stiffness, stiffness, [[1]] * n)
     with pytest.raises(ValueError, match=r"`M` must be regular.* without mass"):
         structure.fix(values)
+
+
+# -------------------------------------------------------- momenta and descriptor forms
+
+
+def as_momenta(values):
+    """T from coordinates and rates to coordinates and momenta."""
+    return np.diag([1, 1, values["m1"], values["m2"]])
+
+
+@pytest.mark.parametrize("outputs", ["position", "velocity"])
+def test_momenta_are_another_basis_of_the_same_frozen_models(outputs):
+    rates, momenta = (
+        MECHANICAL(M2, D2, K2, UNIT, outputs, state=state)
+        for state in ("rate", "momentum")
+    )
+    assert momenta.parameter_names == rates.parameter_names
+    expected = rates.model(VALUES).transform(as_momenta(VALUES))
+    found = momenta.model(VALUES)
+    for block in "ABCD":
+        assert_allclose(getattr(found, block), getattr(expected, block), atol=1e-14)
+    fixed = momenta.fix({"m1": 1.5, "m2": 0.4})
+    assert fixed.is_affine
+    rest = {name: VALUES[name] for name in fixed.parameter_names}
+    assert_allclose(fixed.model(rest).A, found.A)
+    partly = momenta.fix({"m1": 1.5})
+    rest = {name: VALUES[name] for name in partly.parameter_names}
+    assert_allclose(partly.model(rest).A, found.A)
+
+
+def test_a_known_mass_gives_an_affine_structure_of_momenta():
+    structure = MECHANICAL([[2.0]], [["c"]], [["k"]], [[1]], state="momentum")
+    assert structure.is_affine and structure.implicit is None
+    assert_array_equal(structure.model([3.0, 5.0]).A, [[0, 0.5], [-5, -1.5]])
+
+
+def test_searches_begin_in_the_equations_of_motion_in_either_state():
+    rates, momenta = (
+        MECHANICAL(M2, D2, K2, [[1], [0]], state=state)
+        for state in ("rate", "momentum")
+    )
+    assert_array_equal(momenta.reference, rates.reference)
+    gains = np.array([0.1, 0.2])
+    assert_array_equal(
+        momenta.implicit.natural_sizes(3.0, gains),
+        rates.implicit.natural_sizes(3.0, gains),
+    )
+
+
+E_, A_ = [["m + j", "j"], ["j", 2]], [["-a", 1], ["-j", "-2*b"]]
+B_, C_ = [["g"], [1]], [["c", 1], [0, 1], ["j", 0]]
+
+
+@pytest.mark.parametrize("descriptor", ["rate", "flux"])
+def test_descriptor_equations_are_solved_for_their_state(descriptor):
+    structure = GrayBoxStructure.from_template(
+        A_, B_, C_, [["g"], [0], [0]], E=E_, descriptor=descriptor
+    )
+    v = {"a": 1.5, "b": 0.3, "c": 2.0, "g": 0.7, "j": 0.4, "m": 3.0}
+    E = np.array([[3.4, 0.4], [0.4, 2.0]])
+    A, B = np.array([[-1.5, 1], [-0.4, -0.6]]), np.array([[0.7], [1]])
+    C = np.array([[2.0, 1], [0, 1], [0.4, 0]])
+    inverse = np.linalg.inv(E)
+    model = structure.model(v)
+    if descriptor == "rate":
+        expected = inverse @ A, inverse @ B, C
+    else:
+        expected = A @ inverse, B, C @ inverse
+    for found, block in zip((model.A, model.B, model.C), expected, strict=True):
+        assert_allclose(found, block, atol=1e-14)
+    assert_allclose(model.D, [[0.7], [0], [0]])
+    theta = np.array([v[name] for name in structure.parameter_names])
+    J = structure.jacobian(theta)
+    assert_allclose(J, complex_step(structure, theta), atol=1e-13)
+    H = np.array(
+        [
+            (structure.jacobian(theta + h) - structure.jacobian(theta - h)) / 2e-5
+            for h in 1e-5 * np.eye(len(theta))
+        ]
+    )
+    assert_allclose(structure.curvature(theta), H, atol=1e-7)
+    copy = pickle.loads(pickle.dumps(structure))
+    assert_array_equal(copy.system_matrix(theta), structure.system_matrix(theta))
+
+
+@pytest.mark.parametrize("descriptor", ["rate", "flux"])
+def test_without_parameters_in_it_e_leaves_the_structure_affine(descriptor):
+    template = GrayBoxStructure.from_template([["-a"]], [[3]], [["c"]])
+    structure = GrayBoxStructure.from_template(
+        [["-2*a"]], [[6]], [["c"]], E=[[2]], descriptor=descriptor
+    )
+    assert structure.is_affine
+    theta = {"a": 0.7, "c": 5.0}
+    found, expected = structure.model(theta), template.model(theta)
+    assert_allclose(found.frequency_response(OMEGA), expected.frequency_response(OMEGA))
+    assert_allclose(found.C, 5.0 if descriptor == "rate" else 2.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"E": [[1, 0]]}, r"`E` must have shape \(1, 1\) to fit `A`"),
+        ({"E": [[0]]}, "`E` must be regular"),
+        ({"E": [["m*m"]]}, r"`E\[0\]\[0\]` must be a number or an affine"),
+        ({"E": [["m"]], "descriptor": "momentum"}, "`descriptor` must be 'rate' or"),
+    ],
+)
+def test_descriptor_equations_that_do_not_fit_are_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        GrayBoxStructure.from_template([["-a"]], [[1]], [[1]], **options)
+
+
+def test_states_that_do_not_exist_are_refused():
+    with pytest.raises(ValueError, match="`state` must be 'rate' or 'momentum'"):
+        MECHANICAL([["m"]], [[0]], [["k"]], [[1]], state="velocity")
+    with pytest.raises(ValueError, match="no function of the momenta"):
+        MECHANICAL([["m"]], [[0]], [["k"]], [[1]], "acceleration", state="momentum")
+    with pytest.raises(ValueError, match="`M` must be regular"):
+        MECHANICAL([[0]], [[0]], [["k"]], [[1]], state="momentum")

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from lpvlearn.subspace import identification
+from lpvlearn.subspace import stream as stream_module
+from lpvlearn.subspace import stream_summary as summary_module
 from lpvlearn.subspace.simulation_fit import Freedom
 from lpvlearn.systems.simulation import lti_response
 
@@ -116,3 +118,24 @@ def closed_loop(
         u[t] = r[t] - gain * (y[t - delay] if t >= delay else 0.0)
         x = A @ x + B[:, 0] * u[t] + (drive * e[t] if pole is None else 0.0)
     return u[:, None], y[:, None]
+
+
+def fed(model, u, y, sizes):
+    start = 0
+    for size in sizes:
+        model.partial_fit(u[start : start + size], y[start : start + size])
+        start += size
+    assert start == len(u)
+    return model
+
+
+@pytest.fixture
+def short_buffer(monkeypatch):
+    """Summaries from 1000 samples on."""
+    monkeypatch.setattr(stream_module, "BUFFER", 1000)
+
+
+@pytest.fixture
+def short_stream(short_buffer, monkeypatch):
+    """Stretches of 2000 samples as well, so that tests stay small."""
+    monkeypatch.setattr(summary_module, "STRETCH", 2000)

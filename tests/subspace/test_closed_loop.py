@@ -1,5 +1,7 @@
 """PBSID: exact without noise, consistent under feedback, honest about its errors."""
 
+import warnings
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -61,9 +63,10 @@ def test_the_error_falls_under_feedback_where_that_of_others_stays():
     errors = {"po-moesp": [], "pbsid": []}
     for n_samples in (1000, 9000):
         u, y = closed_loop(np.random.default_rng(n_samples), n_samples)
-        with pytest.warns(UserWarning, match="closed loop"):
-            other = SubspaceLTI(2, method="po-moesp", feedthrough=False).fit(u, y)
-        errors["po-moesp"].append(miss(other))
+        other = SubspaceLTI(2, method="po-moesp", feedthrough=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of the closed loop
+            errors["po-moesp"].append(miss(other.fit(u, y)))
         errors["pbsid"].append(miss(pbsid(feedthrough=False).fit(u, y)))
     assert errors["po-moesp"][1] > 0.15
     assert errors["pbsid"][1] < 0.03 and errors["pbsid"][0] < 0.1
@@ -156,6 +159,99 @@ def test_experiments_gaps_rest_and_masks(system):
     shifted = pbsid(5, detrend="constant").fit(u + 3.0, y - 7.0)
     again = pbsid(5, detrend="constant").fit(u, y)
     assert_allclose(shifted.lti_.poles(), again.lti_.poles(), rtol=1e-6)
+
+
+def two_loops(levels, n_samples=1000):
+    """Two experiments, and their channels about levels (2, 2) of input and output."""
+    rng = np.random.default_rng(7)
+    parts = [np.hstack(closed_loop(rng, n_samples)) + level for level in levels]
+    table = pd.DataFrame(np.vstack(parts), columns=["u", "y"])
+    table["experiment"] = np.repeat(["a", "b"], n_samples)
+    return table[["u", "experiment"]], table["y"].to_numpy()
+
+
+LEVELS = np.array([[3.0, -50.0], [-2.0, 7.0]])
+
+
+def loops_fit(X, y, order=2, **options):
+    return pbsid(order, experiment="experiment", feedthrough=False, **options).fit(X, y)
+
+
+def test_constants_change_nothing_but_themselves():
+    about_zero, moved = two_loops(np.zeros((2, 2))), two_loops(LEVELS)
+    models = [loops_fit(*data, offset="constant") for data in (about_zero, moved)]
+    first, other = models
+    assert_allclose(markov(*matrices(other)), markov(*matrices(first)), atol=1e-6)
+    assert_allclose(other.predictor_.covariance, first.predictor_.covariance, rtol=1e-6)
+    gain = first.lti_.dc_gain()
+    c = [m.output_offset_ - m.input_offset_ @ gain.T for m in models]
+    wanted = LEVELS[:, 1:] - LEVELS[:, :1] @ gain.T
+    assert_allclose(c[1] - c[0], wanted, atol=1e-5)
+    ahead = [
+        m.predict_ahead(*data, steps=3)
+        for m, data in zip(models, (about_zero, moved), strict=True)
+    ]
+    assert_allclose(ahead[1] - ahead[0], np.repeat(LEVELS[:, 1], 1000), atol=1e-5)
+    tests = [
+        m.residual_tests(*data, errors="prediction")["p_value"]
+        for m, data in zip(models, (about_zero, moved), strict=True)
+    ]
+    assert_allclose(*tests, atol=1e-4)
+    assert tests[0][:2].min() > 1e-3  # whiteness and past inputs, not the future
+
+
+@pytest.mark.parametrize("order", [2, "auto"])
+def test_constants_are_taken_where_they_are(order):
+    assert loops_fit(*two_loops(np.zeros((2, 2))), order).offset_ is None
+    model = loops_fit(*two_loops(LEVELS), order)
+    assert model.offset_ == "constant" and model.order_ == 2
+    assert miss(model) < 0.1
+    with pytest.warns(UserWarning, match="different constants"):
+        model.predict(two_loops(LEVELS)[0])
+    same = loops_fit(*two_loops(LEVELS[[0, 0]]), order)
+    same.predict(two_loops(LEVELS)[0])  # which does not warn
+
+
+def test_auto_finds_the_loop_about_its_point_of_work():
+    X, y = two_loops(LEVELS)
+    model = SubspaceLTI(2, experiment="experiment")
+    with pytest.warns(UserWarning, match="closed loop") as told:
+        model.fit(X, y)
+    assert len(told) == 1
+    assert (model.method_, model.offset_) == ("pbsid", "constant")
+    assert miss(model) < 0.1
+
+
+def test_a_drift_of_a_loop_is_a_drift_of_its_outputs():
+    u, y = closed_loop(np.random.default_rng(3), 1500)
+    drift = 0.01 * np.arange(1500.0)[:, None]
+    first, other = (
+        pbsid(2, feedthrough=False, offset="linear").fit(u, outputs)
+        for outputs in (y, y + drift)
+    )
+    assert_allclose(markov(*matrices(other)), markov(*matrices(first)), atol=1e-6)
+    assert_allclose(other.output_drift_ - first.output_drift_, 0.01, rtol=1e-5)
+
+
+def test_prediction_goes_on_where_outputs_are_missing():
+    """Of a plant that only the loop holds, about its point of work."""
+    u, y = unstable_loop(0)
+    y = y + 5.0
+    with pytest.warns(UserWarning, match="unstable"):
+        model = pbsid(2, feedthrough=False, offset="constant").fit(u, y)
+    lost = y.copy()
+    lost[1000:1003] = np.nan
+    lost[1200] = np.nan
+    rest = {"initial_state": "rest"}
+    found, whole = (model.predict_ahead(u, outputs, **rest) for outputs in (lost, y))
+    assert_allclose(found[:1001], whole[:1001])
+    for row, steps in ((1001, 2), (1002, 3), (1003, 4), (1201, 2)):
+        ahead = model.predict_ahead(u, y, steps=steps, **rest)
+        assert_allclose(found[row], ahead[row], atol=1e-6)
+    assert_allclose(found[-50:], whole[-50:], atol=1e-6)
+    # Estimated beside the constant, from four outputs less.
+    found, whole = model.predict_ahead(u, lost), model.predict_ahead(u, y)
+    assert_allclose(found[:1001], whole[:1001], atol=0.02)
 
 
 def test_orders_that_no_modes_add_up_to_are_those_of_the_subspace(system):

@@ -119,6 +119,7 @@ def test_prediction_does_not_depend_on_the_order_of_experiments(table):
     np.testing.assert_allclose(model.predict(kept), whole.loc[kept.index], atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:The scored table starts in mid-motion")
 def test_grid_search_over_orders_with_experiments_as_groups(table):
     X, y = table
     search = GridSearchCV(

@@ -11,35 +11,13 @@ from sklearn.exceptions import NotFittedError
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace import stream as stream_module
-from lpvlearn.subspace import stream_summary as summary_module
 from lpvlearn.subspace.hankel import data_factor, extend_hankel_sum, start_hankel_sum
 from lpvlearn.subspace.realization import METHODS, factor_input_matrices
 from lpvlearn.systems.simulation import lti_response
 
-from .conftest import freedom, identify, record
+from .conftest import fed, freedom, identify, record
 
 OMEGA = np.linspace(0.05, 3.0, 40)
-
-
-def fed(model, u, y, sizes):
-    start = 0
-    for size in sizes:
-        model.partial_fit(u[start : start + size], y[start : start + size])
-        start += size
-    assert start == len(u)
-    return model
-
-
-@pytest.fixture
-def short_buffer(monkeypatch):
-    """Summaries from 1000 samples on."""
-    monkeypatch.setattr(stream_module, "BUFFER", 1000)
-
-
-@pytest.fixture
-def short_stream(short_buffer, monkeypatch):
-    """Stretches of 2000 samples as well, so that tests stay small."""
-    monkeypatch.setattr(summary_module, "STRETCH", 2000)
 
 
 def response(model):
@@ -191,7 +169,7 @@ def test_detrended_long_table_is_that_without_its_means(system, short_buffer):
     model = SubspaceLTI(5, horizon=8, detrend="constant").fit(u + 1.0, y + level)
     plain = SubspaceLTI(5, horizon=8).fit(u - u.mean(axis=0), y - y.mean(axis=0))
     np.testing.assert_allclose(response(model), response(plain), rtol=1e-9)
-    np.testing.assert_allclose(model.output_offset_, (y + level).mean(axis=0))
+    np.testing.assert_allclose(model.output_offset_[0], (y + level).mean(axis=0))
 
 
 def test_pure_gain_streams(short_buffer):
@@ -586,3 +564,25 @@ def test_experiments_of_a_stream_have_one_time_step(timed):
     model.partial_fit(X[:200], y[:200])
     with pytest.raises(ValueError, match="same time step. Got 0.1 s first, and 0.2 s"):
         model.partial_fit(X[200:], y[200:])
+
+
+@pytest.mark.parametrize("dates", [False, True])
+def test_dropped_rows_and_jitter_of_a_stream_are_those_of_its_table(timed, dates):
+    """Rows are missing within batches and between them; stamps are off by 0.8 %."""
+    rng = np.random.default_rng(1)
+    t = 0.1 * (np.arange(400) + 0.008 * rng.uniform(-1, 1, 400))
+    if dates:
+        t = pd.Timestamp("2024-02-28 23:59:50") + pd.to_timedelta(t, unit="s")
+    kept = ~np.isin(np.arange(400), [70, 71, 150, 201, 202, 300])
+    X, y = timed[0].assign(t=t)[kept], timed[1][kept]
+    options = {"order": 1, "horizon": 5, "time": "t", "missing": "split"}
+    whole, stream = SubspaceLTI(**options).fit(X, y), SubspaceLTI(**options)
+    assert len(whole.initial_states_) == 5
+    for start, stop in [(0, 60), (60, 148), (148, 149), (149, 250), (250, 394)]:
+        stream.partial_fit(X[start:stop], y[start:stop])
+    assert stream.lti_.sampling_time == pytest.approx(whole.lti_.sampling_time)
+    assert 0.006 < stream.time_jitter_ < 0.01
+    np.testing.assert_allclose(response(stream), response(whole), rtol=1e-9)
+    with pytest.raises(ValueError, match=r"row\(s\) are missing|does not continue"):
+        strict = SubspaceLTI(**{**options, "missing": "raise"})
+        strict.partial_fit(X[:60], y[:60]).partial_fit(X[60:148], y[60:148])

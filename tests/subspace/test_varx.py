@@ -33,7 +33,7 @@ def open_loop(rng, n_samples, signal, *, order=3, pole=0.0):
 
 
 def test_it_is_a_regression_on_past_and_future():
-    """Of two experiments, by long matrices."""
+    """Of two experiments, each with its own constant, by long matrices."""
     rng, f = np.random.default_rng(0), 8
     pairs = [open_loop(rng, n, "white") for n in (300, 200)]
     records = records_of(*pairs)
@@ -42,15 +42,15 @@ def test_it_is_a_regression_on_past_and_future():
     losses = {}
     for p in range(1, longest + 1):
         rows = []
-        for u, y in zip(*zip(*records, strict=True), strict=True):
-            u, y = u[0], y[0]
+        for own, record in zip(np.eye(2), records, strict=True):
+            u, y = record.u[0], record.y[0]
             for t in range(longest, len(u) - f):
                 past = [s[t - p : t][::-1] for s in (u, y)]
-                rows.append(np.r_[past[0], past[1], u[t : t + f + 1], y[t]])
+                rows.append(np.r_[own, past[0], past[1], u[t : t + f + 1], y[t]])
         M = np.array(rows)
-        n, fits = len(M), []
+        n, fits = len(M) - 2, []
         for k in (2 * p + 1, 2 * p + 1 + f):
-            X = M[:, :k]
+            X = M[:, : 2 + k]
             fits.append(np.sum((M[:, -1] - X @ np.linalg.lstsq(X, M[:, -1])[0]) ** 2))
         n_parameters = 2 * p + 2
         penalty = 2.0 * n_parameters * n / (n - 2 * p - 3)
@@ -92,6 +92,20 @@ def test_units_and_order_of_channels_do_not_matter():
     assert_allclose(mixed.p_value, found.p_value, rtol=1e-5)
     assert_allclose(mixed.share, found.share, rtol=1e-6)
     assert_allclose(mixed.innovations, 1e-8 * found.innovations, rtol=1e-8)
+
+
+def test_constants_of_the_experiments_are_no_feedback():
+    """Nor do they hide it."""
+    rng = np.random.default_rng(5)
+    loops = [closed_loop(rng, 600) for _ in range(3)]
+    for pairs in (loops, [open_loop(rng, 600, "coloured") for _ in range(3)]):
+        moved = [(u + 3.0 * k, y - 5.0 * k) for k, (u, y) in enumerate(pairs)]
+        scale = [(u / 4.0, y / 6.0) for u, y in pairs]
+        first, other = (
+            find_feedback([Record.of(u, y) for u, y in data]) for data in (scale, moved)
+        )
+        assert_allclose(other[:3], first[:3], rtol=1e-6)
+        assert first.found == (pairs is loops)
 
 
 @pytest.mark.parametrize("seed", range(4))

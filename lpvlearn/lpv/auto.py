@@ -1,0 +1,186 @@
+"""The choice of the form that carries parameters over the scheduling variables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..validation import one_of
+from .interpolator import Interpolator
+from .polynomial import PolynomialLPV, chebyshev_terms, resolvable_powers
+from .rational import RationalLPV
+from .spline import SplineLPV
+from .weighting import WeightedPoints, is_chance
+
+Array = NDArray[np.float64]
+
+_CRITERIA = ("aic", "bic")
+
+# Degrees of numerators and denominator, the simplest first: higher ones swing.
+_DEGREES = (
+    *((degree, 0) for degree in range(5)),
+    *((1, 1), (1, 2), (2, 1), (2, 2), (3, 2), (3, 3)),
+)
+_SATURATED = 2  # the highest degree whose coefficients the points may just determine
+# Forms whose criterion is higher than the lowest by more than this have no support
+# (Burnham and Anderson 2002, section 2.6). Without it one in three of AIC's choices
+# would have coefficients too many.
+_SUPPORT = 10.0
+
+_INTERPOLATION = "pchip"  # where no form is true
+
+
+class AutoLPV(Interpolator):
+    """Interpolation by the form that the covariances of the parameters speak for.
+
+    A sample is an operating point: `X` holds its scheduling values, `y` the parameters
+    of its local model. Polynomials and rational functions compete where the covariances
+    of the parameters are known; of those whose errors can be chance, and whose
+    criterion is within 10 of the lowest, the one with fewest coefficients is taken.
+    Where none is left, or the covariances are not known, the interpolation follows the
+    points and keeps their shape (`SplineLPV`).
+
+    Parameters
+    ----------
+    criterion : {"aic", "bic"}, default="aic"
+        ``chi2 + 2 k`` or ``chi2 + k log(n)``, with k coefficients for n values.
+    extrapolation : {"ignore", "warn", "clip", "error"}, default="ignore"
+        What `predict` does outside of `scheduling_range_`: go on without or with an
+        `ExtrapolationWarning`, hold the value at the border, or raise.
+
+    Attributes
+    ----------
+    selection_ : DataFrame
+        A row for every form: "form", "chi2" (its least distance from the points,
+        squared, in units of their covariances), "dof" (degrees of freedom), "aic" (or
+        "bic"), and "chosen". NaN where covariances are not known.
+    form_ : str
+        The form chosen.
+    best_estimator_ : PolynomialLPV, RationalLPV or SplineLPV
+        The form, fitted.
+    scheduling_range_ : ndarray of shape (2, n_scheduling)
+    n_features_in_ : int
+        Number of scheduling variables.
+
+    Notes
+    -----
+    If a form is true, its chi-square is about its degrees of freedom. A form whose
+    chi-square is more than four times that (and no chance, for few degrees of freedom)
+    is not taken, unless what it leaves of the variation over the points is next to
+    nothing (1e-4 of the variance): very precise points show deviations of any form. If
+    only such forms are left, the lowest of their chi-squares per degree of freedom
+    divides all chi-squares in the criterion, as errors larger than known do.
+
+    Rational forms have one denominator: the entries of ``M(kappa)^-1 K(kappa)``, of any
+    equation of motion, are such functions. With several scheduling variables
+    polynomials and rational forms of a total degree compete with those of a degree in
+    each variable ("tensor").
+
+    References
+    ----------
+    K. P. Burnham, D. R. Anderson, Model Selection and Multimodel Inference. Springer,
+    2002: a difference of 10 in the criterion leaves a form without support.
+
+    Examples
+    --------
+    Spring constants with their standard deviations, 0.01:
+
+    >>> import numpy as np
+    >>> from lpvlearn import AutoLPV
+    >>> kappa = np.linspace(0, 2, 6)[:, None]
+    >>> noise = 0.01 * np.array([1.0, -0.4, 0.3, -1.1, 0.5, 0.2])
+    >>> stiffness = 4 + 3 * kappa[:, 0] ** 2 + noise
+    >>> model = AutoLPV().fit(kappa, stiffness, covariance=np.full(6, 1e-4))
+    >>> model.form_
+    'polynomial 2'
+    >>> model.selection_.round(1).head(4)
+               form       chi2  dof        aic  chosen
+    0  polynomial 0  1093953.1    5  1093955.1   False
+    1  polynomial 1    86601.0    4    86605.0   False
+    2  polynomial 2        1.6    3        7.6    True
+    3  polynomial 3        1.5    2        9.5   False
+    """
+
+    def __init__(
+        self, criterion: str = "aic", *, extrapolation: str = "ignore"
+    ) -> None:
+        self.criterion = criterion
+        self.extrapolation = extrapolation
+
+    def _fit(self, kappa: Array, points: WeightedPoints) -> None:
+        found: list[tuple[str, Any]] = []
+        for name, form in _forms(kappa) if points.whitening is not None else ():
+            form.fit(kappa, points.theta, covariance=points.covariance)
+            saturated = form.degrees_of_freedom_ <= 0  # it meets any points
+            if isinstance(form, PolynomialLPV) or not saturated:
+                found.append((name, form))
+        chi2 = np.array([form.chi2_ for _, form in found])
+        dof = np.array([form.degrees_of_freedom_ for _, form in found], dtype=int)
+        good = np.array([form.weighted_ for _, form in found], dtype=bool)
+        excess = 1.0
+        if not any(map(is_chance, chi2, dof)) and good.any():
+            excess = np.min(chi2[good] / dof[good])
+        n = points.theta.size
+        price = 2.0 if self.criterion == "aic" else math.log(n)
+        cost = chi2 / excess + price * (n - dof)
+        if good.any():
+            supported = np.flatnonzero(good & (cost <= cost[good].min() + _SUPPORT))
+            chosen = int(min(supported, key=lambda k: (-dof[k], cost[k])))
+        else:
+            spline = SplineLPV(_INTERPOLATION).fit(kappa, points.theta)
+            chosen = len(found)
+            found.append((_INTERPOLATION, spline))
+            chi2, dof, cost = np.r_[chi2, np.nan], np.r_[dof, 0], np.r_[cost, np.nan]
+        self.form_, self.best_estimator_ = found[chosen]
+        self.selection_ = pd.DataFrame(
+            {
+                "form": [name for name, _ in found],
+                "chi2": chi2,
+                "dof": dof,
+                self.criterion: cost,
+                "chosen": np.arange(len(found)) == chosen,
+            }
+        )
+
+    def _evaluate(self, kappa: Array) -> Array:
+        return self.best_estimator_._evaluate(kappa)
+
+    def _check_options(self) -> None:
+        super()._check_options()
+        one_of("criterion", self.criterion, _CRITERIA)
+
+
+def _forms(kappa: Array) -> Iterator[tuple[str, PolynomialLPV | RationalLPV]]:
+    """Name and form of all whose numerators the points determine."""
+    places = np.unique(kappa, axis=0)
+    n, n_variables = places.shape
+    for kind in ("total", "tensor")[:n_variables]:
+        tensor = kind == "tensor"
+        prefix = "tensor " if tensor else ""
+        for degree, below in _DEGREES:
+            n_terms = (
+                (degree + 1) ** n_variables
+                if tensor
+                else math.comb(degree + n_variables, degree)
+            )
+            if n_terms > n or (n_terms == n and degree > _SATURATED):
+                continue
+            powers = resolvable_powers(degree, places, tensor=tensor)
+            ends = np.array([places.min(axis=0), places.max(axis=0)])
+            terms = chebyshev_terms(places, powers, ends)
+            if np.linalg.matrix_rank(terms) < len(powers):
+                continue
+            if below:
+                yield (
+                    f"{prefix}rational {degree}/{below}",
+                    RationalLPV(degree, below, terms=kind),
+                )
+            elif not tensor:
+                yield f"polynomial {degree}", PolynomialLPV(degree)
+            elif degree:
+                yield f"tensor polynomial {degree}", RationalLPV(degree, 0, terms=kind)

@@ -1,0 +1,196 @@
+"""What all interpolators share: points in, a range, and what happens beyond it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.utils.validation import (
+    check_array,
+    check_consistent_length,
+    check_is_fitted,
+    validate_data,
+)
+
+from ..exceptions import ExtrapolationWarning, warn
+from ..validation import one_of
+from .weighting import WeightedPoints, weighted_points
+
+Array = NDArray[np.float64]
+
+_EXTRAPOLATIONS = ("ignore", "warn", "clip", "error")
+
+# Values this close to the identified range, relative to its width, are in it: a
+# measured mean and a range read from a report differ by rounding.
+_RANGE_RTOL = 1e-6
+
+
+class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
+    """A regressor from scheduling values to parameters of local models.
+
+    A sample is an operating point. An heir has the option `extrapolation`, tells in
+    `_fit` what it makes of points, and in `_evaluate` what it says of other ones.
+    """
+
+    extrapolation: str
+
+    def fit(
+        self, X: ArrayLike, y: ArrayLike, covariance: ArrayLike | None = None
+    ) -> Self:
+        """Fit the parameters of operating points.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_points, n_scheduling)
+            Scheduling values of the operating points.
+        y : array-like of shape (n_points, n_params) or (n_points,)
+            Parameters of the local models.
+        covariance : array-like of shape (n_points, n_params, n_params), default=None
+            Their covariances, or (n_points,) variances of one parameter; of use where
+            they are finite and regular at all points.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            When an option is not one of those above, or shapes do not fit.
+        """
+        self._check_options()
+        kappa, points = self._read(X, y, None, covariance)
+        self._fit(kappa, points)
+        return self
+
+    def predict(self, X: ArrayLike) -> Array:
+        """Evaluate at scheduling values.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_scheduling)
+            Scheduling values.
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_params), or (n_samples,)
+            Parameters; one-dimensional if `y` was.
+
+        Raises
+        ------
+        ValueError
+            When a value is outside of `scheduling_range_` and
+            `extrapolation="error"`.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            When a value is outside of it and `extrapolation="warn"`.
+        """
+        check_is_fitted(self)
+        self._check_options()
+        kappa = validate_data(self, X, dtype=np.float64, reset=False)
+        if self.extrapolation == "clip":
+            kappa = np.clip(kappa, *self.scheduling_range_)
+        elif self.extrapolation != "ignore":
+            message = _describe_extrapolation(kappa, self.scheduling_range_)
+            if message and self.extrapolation == "error":
+                raise ValueError(message)
+            if message:
+                warn(message, ExtrapolationWarning)
+        values = self._evaluate(kappa)
+        return values[:, 0] if self._single_parameter else values
+
+    @abstractmethod
+    def _fit(self, kappa: Array, points: WeightedPoints) -> None:
+        """Fit points; `scheduling_range_` is known."""
+
+    @abstractmethod
+    def _evaluate(self, kappa: Array) -> Array:
+        """Parameters (n_samples, n_params) at checked values."""
+
+    def _check_options(self) -> None:
+        one_of("extrapolation", self.extrapolation, _EXTRAPOLATIONS)
+
+    def _read(
+        self,
+        X: Any,
+        y: Any,
+        sample_weight: ArrayLike | None,
+        covariance: ArrayLike | None,
+    ) -> tuple[Array, WeightedPoints]:
+        """Scheduling values and points, without those of weight zero."""
+        kappa, params = validate_data(
+            self, X, y, dtype=np.float64, multi_output=True, y_numeric=True
+        )
+        weight = _check_weight(sample_weight, kappa)
+        self._single_parameter = params.ndim == 1
+        theta = params.astype(np.float64).reshape(len(params), -1)
+        # A point of weight zero counts as absent, for the range too.
+        kappa = kappa[weight > 0]
+        self.scheduling_range_ = np.array([kappa.min(axis=0), kappa.max(axis=0)])
+        return kappa, weighted_points(theta, weight, covariance)
+
+    def _judge(
+        self, points: WeightedPoints, values: Array, n_coefficients: int
+    ) -> None:
+        """Tell whether a form with these values at the points may be true."""
+        known = points.whitening is not None
+        self.degrees_of_freedom_ = points.theta.size - n_coefficients
+        self.chi2_ = points.misfit(values) if known else np.nan
+        self.weighted_ = known and points.is_plausible(
+            self.chi2_, self.degrees_of_freedom_
+        )
+
+
+def _check_weight(sample_weight: ArrayLike | None, X: Array) -> Array:
+    if sample_weight is None:
+        return np.ones(len(X))
+    weight = check_array(
+        sample_weight, dtype=np.float64, ensure_2d=False, input_name="sample_weight"
+    )
+    if weight.ndim != 1:
+        raise ValueError(
+            f"`sample_weight` must be one-dimensional. Got shape {weight.shape}."
+        )
+    check_consistent_length(X, weight)
+    if weight.min() < 0 or weight.max() == 0:
+        raise ValueError(
+            "`sample_weight` must be non-negative and not all zero. Got values from "
+            f"{weight.min():g} to {weight.max():g}."
+        )
+    return weight
+
+
+def domains(scheduling_range: Array) -> Array:
+    """Ends (2, n_scheduling) of the intervals; of width 2 around a constant one."""
+    low, high = scheduling_range
+    constant = low == high
+    return np.array(
+        [np.where(constant, low - 1.0, low), np.where(constant, low + 1.0, high)]
+    )
+
+
+def to_unit(kappa: Array, scheduling_range: Array) -> Array:
+    """Scheduling values mapped linearly from their range to [-1, 1]."""
+    low, high = domains(scheduling_range)
+    return (2 * kappa - (low + high)) / (high - low)
+
+
+def _describe_extrapolation(X: Array, scheduling_range: Array) -> str:
+    """Say how far values are out of range; nothing when they are in it."""
+    low, high = scheduling_range
+    excess = np.maximum(low - X, X - high) - _RANGE_RTOL * (high - low)
+    if not (excess > 0).any():
+        return ""
+    row, j = np.unravel_index(np.argmax(excess), excess.shape)
+    outside = int((excess > 0).any(axis=1).sum())
+    return (
+        f"Scheduling values must be within the identified range, [{low[j]:.6g}, "
+        f"{high[j]:.6g}] for variable {j + 1}. Got {outside} of {len(X)} outside, the "
+        f"farthest {X[row, j]:.6g}. No interpolation is to be trusted there: identify "
+        "a model there too, or hold the border's value with `extrapolation='clip'`."
+    )

@@ -1,0 +1,288 @@
+"""Rational functions of the scheduling variables, with one denominator for all.
+
+``theta(kappa) = N^T phi(kappa) / (1 + d^T psi(kappa))``: what equations
+``M(kappa) x' = K(kappa) x`` with polynomial M and K give. For a given denominator the
+numerators are a linear least-squares problem, so that a search has only d to find
+(variable projection).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import orth
+
+from ..validation import one_of, whole_number
+from .interpolator import Interpolator
+from .polynomial import chebyshev_terms, resolvable_powers
+from .weighting import WeightedPoints
+
+Array = NDArray[np.float64]
+
+_TERMS = ("total", "tensor")
+
+# The denominator has no zero within the range widened by this share of it on either
+# side: a sweep overshoots the outermost of the points.
+_MARGIN = 0.1
+
+_LEAST = 0.02  # of the denominator's largest value there: smaller is as good as a zero
+
+# Places over that range where the denominator is looked at; of many variables, the
+# corners, and then the points alone.
+_PLACES = 4096
+
+_MAX_ITERATIONS = 50
+_SAME = (
+    1e-8  # relative change of the misfit, or of the coefficients, that ends a search
+)
+_DAMPING, _LESS, _MORE = 1e-3, 0.2, 8.0  # of Levenberg and Marquardt
+_MAX_DAMPING = 1e12
+
+
+class RationalLPV(Interpolator):
+    """Rational interpolation with one denominator for all parameters.
+
+    A sample is an operating point: `X` holds its scheduling values, `y` the parameters
+    of its local model.
+
+    Parameters
+    ----------
+    degree : int, default=2
+        Of the numerators, one for every parameter.
+    denominator : int, default=2
+        Degree of the denominator; 0 is a polynomial. Lowered where the numerators leave
+        fewer values at the points than it has coefficients.
+    terms : {"total", "tensor"}, default="total"
+        With several scheduling variables: `degree` and `denominator` limit the sum of
+        the powers in a product, or every one of them.
+    extrapolation : {"ignore", "warn", "clip", "error"}, default="ignore"
+        What `predict` does outside of `scheduling_range_`: evaluate without or with an
+        `ExtrapolationWarning`, hold the value at the border, or raise.
+
+    Attributes
+    ----------
+    numerator_ : ndarray of shape (n_terms, n_params)
+        Coefficients of products of Chebyshev polynomials in the scheduling variables,
+        each mapped linearly from `scheduling_range_` to [-1, 1].
+    denominator_ : ndarray of shape (n_denominator_terms,)
+        The same of the denominator; the first is 1.
+    powers_ : ndarray of int, shape (n_terms, n_scheduling)
+        Degree of each term in each scheduling variable.
+    denominator_powers_ : ndarray of int, shape (n_denominator_terms, n_scheduling)
+    scheduling_range_ : ndarray of shape (2, n_scheduling)
+    rank_ : int
+        Number of independent terms of a numerator.
+    chi2_ : float
+        Least distance from the points, squared, in units of their covariances; NaN
+        where these are not known.
+    degrees_of_freedom_ : int
+        Number of values at the points less that of coefficients.
+    weighted_ : bool
+        Whether the covariances weigh the points: they are known, and `chi2_` is
+        plausible for its degrees of freedom.
+    n_features_in_ : int
+        Number of scheduling variables.
+
+    Notes
+    -----
+    Minimises ``sum_i |theta(kappa_i) - theta_i|^2``, weighed by the covariances where
+    `weighted_`, else by the spread of every parameter over the points. Sanathanan and
+    Koerner's iteration and the polynomial are starts of a Levenberg-Marquardt search on
+    this error itself.
+
+    The denominator is positive, 0.02 of its largest value at least, within the range
+    of the points and a margin of 10 % of its width on either side. Beyond there may be
+    a pole.
+
+    References
+    ----------
+    C. Sanathanan, J. Koerner, Transfer function synthesis as a ratio of two complex
+    polynomials. IEEE Transactions on Automatic Control 8, 1963.
+
+    Examples
+    --------
+    A mass that grows with the scheduling variable, on a spring: stiffness and damping
+    over mass.
+
+    >>> import numpy as np
+    >>> from lpvlearn import RationalLPV
+    >>> kappa = np.array([[0.0], [1.0], [2.0], [4.0]])
+    >>> theta = np.hstack([8 + kappa, 1 + 0 * kappa]) / (1 + kappa / 2)
+    >>> model = RationalLPV(degree=1, denominator=1).fit(kappa, theta)
+    >>> model.predict([[3.0]]).round(9)
+    array([[4.4, 0.4]])
+    """
+
+    def __init__(
+        self,
+        degree: int = 2,
+        denominator: int = 2,
+        *,
+        terms: str = "total",
+        extrapolation: str = "ignore",
+    ) -> None:
+        self.degree = degree
+        self.denominator = denominator
+        self.terms = terms
+        self.extrapolation = extrapolation
+
+    def _fit(self, kappa: Array, points: WeightedPoints) -> None:
+        tensor = self.terms == "tensor"
+        self.powers_ = resolvable_powers(self.degree, kappa, tensor=tensor)
+        n, q = points.theta.shape
+        spare = (n - len(self.powers_)) * q
+        for degree in range(min(self.denominator, n - 1), -1, -1):
+            self.denominator_powers_ = resolvable_powers(degree, kappa, tensor=tensor)
+            if len(self.denominator_powers_) <= max(spare, 0) + 1:
+                break
+        phi = self._terms(kappa, self.powers_)
+        psi = self._terms(kappa, self.denominator_powers_)[:, 1:]
+        places = self._terms(
+            _places(self.scheduling_range_, kappa), self.denominator_powers_
+        )[:, 1:]
+        found = fit_rational(phi, psi, places, points)
+        values = phi @ found.numerator / (1.0 + psi @ found.denominator)[:, None]
+        self._judge(points, values, found.rank * q + psi.shape[1])
+        if points.whitening is not None and not self.weighted_:
+            found = fit_rational(phi, psi, places, points.unweighted())
+        self.numerator_, self.rank_ = found.numerator, found.rank
+        self.denominator_ = np.concatenate([[1.0], found.denominator])
+
+    def _evaluate(self, kappa: Array) -> Array:
+        numerator = self._terms(kappa, self.powers_) @ self.numerator_
+        below = self._terms(kappa, self.denominator_powers_) @ self.denominator_
+        return numerator / below[:, None]
+
+    def _terms(self, kappa: Array, powers: NDArray[np.intp]) -> Array:
+        return chebyshev_terms(kappa, powers, self.scheduling_range_)
+
+    def _check_options(self) -> None:
+        super()._check_options()
+        whole_number("degree", self.degree, 0)
+        whole_number("denominator", self.denominator, 0)
+        one_of("terms", self.terms, _TERMS)
+
+
+class Rational(NamedTuple):
+    """Coefficients of a rational function."""
+
+    numerator: Array  # (n_terms, n_params)
+    denominator: Array  # (n_denominator_terms - 1,), without the constant 1
+    rank: int  # of the terms of a numerator
+
+
+def fit_rational(
+    phi: Array, psi: Array, places: Array, points: WeightedPoints
+) -> Rational:
+    """The least misfit among functions without a pole.
+
+    Terms of the numerators (n_points, n_terms), of the denominator but for its
+    constant (n_points, n_denominator_terms - 1), and these at places where it must
+    stay positive.
+    """
+    search = _Search(orth(phi), psi, places, points)
+    found = [search.descend(start) for start in search.starts()]
+    d = min(found, key=lambda state: state.misfit).denominator
+    numerator, rank = points.coefficients(phi / (1.0 + psi @ d)[:, None])
+    return Rational(numerator, d, rank)
+
+
+class _State(NamedTuple):
+    """Where a search stands."""
+
+    denominator: Array  # coefficients but for the constant
+    misfit: float
+    errors: Array
+    slopes: Array  # derivatives of the errors (Kaufman's approximation)
+
+
+class _Search(NamedTuple):
+    """The search for the denominator."""
+
+    phi: Array  # independent terms of the numerators
+    psi: Array
+    places: Array
+    points: WeightedPoints
+
+    def starts(self) -> Iterator[Array]:
+        """Denominators: none, and the one of Sanathanan and Koerner."""
+        yield np.zeros(self.psi.shape[1])
+        if self.psi.shape[1]:
+            guess = self._sanathanan_koerner()
+            if self._is_allowed(guess):
+                yield guess
+
+    def _is_allowed(self, d: Array) -> bool:
+        below = 1.0 + self.places @ d
+        return bool(below.min() >= _LEAST * below.max())  # False of NaN
+
+    def _sanathanan_koerner(self) -> Array:
+        """Minimise ``sum_i |(N^T phi_i - theta_i (1 + d^T psi_i)) / old_i|^2``."""
+        d: Array = np.zeros(self.psi.shape[1])
+        with np.errstate(all="ignore"):
+            for _ in range(_MAX_ITERATIONS):
+                old = (1.0 + self.psi @ d)[:, None]
+                if not (np.isfinite(old).all() and old.all()):
+                    break
+                theta = self.points.theta / old
+                basis = np.linalg.qr(self.points.design(self.phi / old))[0]
+                columns = [theta, *(theta * column[:, None] for column in self.psi.T)]
+                rest = self._unexplained(basis, columns)
+                last = d
+                solution = np.linalg.lstsq(rest[:, 1:], -rest[:, 0], rcond=None)[0]
+                d = np.array(solution, dtype=np.float64)
+                if np.abs(d - last).max() <= _SAME * np.abs(d).max(initial=1.0):
+                    break
+        return d
+
+    def _unexplained(self, basis: Array, values: list[Array]) -> Array:
+        """What is orthogonal to a basis in values (n_points, n_params), as columns."""
+        rows = np.array([self.points.errors(value) for value in values])
+        return (rows - basis @ (basis.T @ rows)).reshape(len(values), -1).T
+
+    def _at(self, d: Array) -> _State:
+        below = (1.0 + self.psi @ d)[:, None]
+        terms = self.phi / below
+        fitted = terms @ self.points.coefficients(terms)[0]
+        errors = self.points.errors(fitted - self.points.theta).ravel()
+        basis = np.linalg.qr(self.points.design(terms))[0]
+        columns = [-fitted * column[:, None] / below for column in self.psi.T]
+        slopes = self._unexplained(basis, columns) if columns else np.zeros((0, 0))
+        return _State(d, float(errors @ errors), errors, slopes)
+
+    def descend(self, d: Array) -> _State:
+        """To a local minimum, by Levenberg and Marquardt's steps that are allowed."""
+        state, damping = self._at(d), _DAMPING
+        for _ in range(_MAX_ITERATIONS if len(d) else 0):
+            size = np.linalg.norm(state.slopes, axis=0)
+            target = np.concatenate([-state.errors, np.zeros(len(d))])
+            while damping < _MAX_DAMPING:
+                rows = np.vstack([state.slopes, np.diag(np.sqrt(damping) * size)])
+                step = np.linalg.lstsq(rows, target, rcond=None)[0]
+                if self._is_allowed(state.denominator + step):
+                    trial = self._at(state.denominator + step)
+                    if trial.misfit < state.misfit:
+                        break
+                damping *= _MORE
+            else:
+                return state
+            gain, state = state.misfit - trial.misfit, trial
+            damping *= _LESS
+            if gain <= _SAME * state.misfit:
+                return state
+        return state
+
+
+def _places(scheduling_range: Array, kappa: Array) -> Array:
+    """Where the denominator must not vanish: the range and its margin, as a grid."""
+    n = kappa.shape[1]
+    levels = int(_PLACES ** (1 / n) + 1e-9)
+    if levels < 2:
+        return kappa
+    low, high = scheduling_range
+    margin = _MARGIN * (high - low)
+    axes = np.linspace(low - margin, high + margin, levels).T
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, n)

@@ -1,0 +1,244 @@
+r"""Constants of the experiments: are they there, and what are they?
+
+Measured signals stand about a point of work, ``y - y0 = G(q) (u - u0)`` but for the
+free response, which is ``y = G(q) u + c`` with ``c = y0 - G(1) u0``: the transient of a
+constant input is a free response. So an experiment has one unknown for each output, c,
+that outputs are linear in, like the initial state; u0 and y0 need not be known. With an
+integrator G(1) is infinite: the answer to ``-u0`` is a straight line, which takes the
+drift (``offset="linear"``), and c itself is a matter of the initial state.
+
+All experiments have constants or none: where one has, another may well have, and one
+that is not needed costs what an unknown does.
+
+Are constants significant? At a model, fitted with or without them, the effect t of the
+constants on the outputs is freed of what initial states and parameters could explain
+(their Jacobian). With the errors v of the model the score ``g = t.T v`` does not depend
+on small errors of the parameters (Neyman), and has covariance ``t.T cov(v) t``; as t is
+slow, the spectral density of v at frequency zero stands for cov(v).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, stats
+
+from ..data.preparation import Pairs
+from ..systems.least_squares import column_scale
+from ..systems.simulation import lti_response, trend_signals
+from .identification import Centres
+from .noise import autoregression, spectral_density
+from .signals import Record, signal_factor
+from .simulation_fit import in_sections, jacobian_regression, project_out
+from .statistics import Evidence
+
+Array = NDArray[np.float64]
+
+OFFSETS = ("auto", None, "constant", "linear")
+
+# Trends of every output and experiment; "auto" begins without.
+N_TRENDS = {"auto": 0, None: 0, "constant": 1, "linear": 2}
+
+# Chance of a constant that is not there: of fitting again with constants, and of
+# keeping them. One that is kept costs what an unknown does.
+_SUSPICIOUS, _SIGNIFICANT = 1e-2, 1e-3
+
+_N_TESTED = 20  # experiments that the tests look at; more of them tell the same
+
+# Part of a constant, squared, that the model does not explain, below which rounding and
+# curvature decide: beside a pole this close to one there is no constant.
+_EXPLAINED = 1e-6
+
+_RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refinement`
+_ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
+_SLOW = 3.0  # time constants per experiment of a mode that may stand for a constant
+
+# A model with constants, perhaps of a lower order, whose squared errors are larger by
+# this factor leaves out more than constants explain.
+_AS_GOOD = 1.05
+
+
+class Offsets(NamedTuple):
+    """Where the experiments stand: ``y - outputs = G(q) (u - inputs)``, and drift."""
+
+    inputs: Array  # (n_experiments, n_inputs)
+    outputs: Array  # (n_experiments, n_outputs)
+    drifts: Array  # (n_experiments, n_outputs), per sample, about the middle
+    constants: Array  # (n_experiments, n_outputs), outputs at rest at input zero
+    n_samples: Array  # (n_experiments,)
+    differ: bool = False  # the constants do, by more than their uncertainty
+
+    def shifted(self, inputs: Array, outputs: Array) -> Offsets:
+        """Of samples before these were subtracted."""
+        inputs, outputs = self.inputs + inputs, self.outputs + outputs
+        return self._replace(inputs=inputs, outputs=outputs)
+
+    def pooled(self) -> Offsets:
+        """As of one experiment: the means over all samples."""
+        total = self.n_samples.sum(keepdims=True)
+        share = (self.n_samples / total)[None]
+        u, y, drift = share @ self.inputs, share @ self.outputs, share @ self.drifts
+        return Offsets(u, y, drift, share @ self.constants, total, self.differ)
+
+
+def joined(parts: Sequence[Offsets]) -> Offsets:
+    """Of the experiments of all parts."""
+    u, y, drifts, c, n = (np.concatenate([p[k] for p in parts]) for k in range(5))
+    return Offsets(u, y, drifts, c, n, any(part.differ for part in parts))
+
+
+def with_levels(evidence: Evidence, offsets: Offsets) -> tuple[Evidence, Offsets]:
+    """What is left to be told of the constants, once they are known."""
+    trends = evidence.model.trends
+    if trends.shape[1]:
+        levels = offsets.constants / evidence.output_scale - trends[:, 0]
+        evidence = replace(evidence, levels=levels)
+        if len(trends) > 1:
+            chance = chance_of_constants(evidence.one_step, equal=True)
+            offsets = offsets._replace(differ=chance < _SIGNIFICANT)
+    return evidence, offsets
+
+
+def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
+    """Offsets of the experiments `pairs`, from a model of the centred ones.
+
+    The inputs stand at their means, the outputs where the static gain then has them.
+    Where that is infinite (a mode slower than the longest experiment), and where
+    experiments are known to start at rest, inputs stand at zero.
+    """
+    model, lengths = evidence.model, np.array([len(u) for u, _ in pairs])
+    n_trend, ny = centres.trends.shape[1:]
+    levels, none = centres.inputs, np.zeros((len(pairs), ny))
+    if not n_trend:
+        return Offsets(levels, none, none, none, lengths)
+    trends = centres.trends + evidence.output_scale * model.trends
+    outputs, constants, drifts = trends[:, 0], trends[:, 0], none
+    if n_trend > 1:
+        drifts = trends[:, 1] * 2.0 / np.maximum(lengths - 1, 1)[:, None]
+    distance = np.abs(1.0 - np.linalg.eigvals(model.A)).min(initial=1.0)
+    if distance * lengths.max() > 1.0 and evidence.free.initial_states:
+        means = np.array([u.mean(axis=0) for u, _ in pairs])
+        gain = evidence.state_space(model, 1.0).dc_gain()
+        constants = outputs - levels @ gain.T
+        outputs, levels = constants + means @ gain.T, means
+    return Offsets(levels, outputs, drifts, constants, lengths)
+
+
+def may_have_constants(evidence: Evidence) -> bool:
+    """Whether a model without constants should be tried with them.
+
+    They show in its errors, or a slow mode that the inputs hardly reach stands for
+    them.
+    """
+    return _has_idle_mode(evidence) or chance_of_constants(evidence) < _SUSPICIOUS
+
+
+def constants_matter(without: Evidence, other: Evidence) -> bool:
+    """Whether the model with constants, `other`, is to be preferred."""
+    ratio = _error_energies(other) / _error_energies(without)
+    as_good = np.exp(np.log(ratio).mean()) <= _AS_GOOD
+    return bool(as_good) and chance_of_constants(other) < _SIGNIFICANT
+
+
+def _error_energies(evidence: Evidence) -> Array:
+    """Of every output, in its units; what is rounding counts as the same."""
+    total, n_samples = np.zeros(len(evidence.output_scale)), 0
+    for k, record in enumerate(evidence.records):
+        error = record.y.T - evidence.model.outputs(record, k)
+        total += (error**2).sum(axis=0)
+        n_samples += len(error)
+    return (total + n_samples * _ROUNDING**2) * evidence.output_scale**2
+
+
+def _has_idle_mode(evidence: Evidence) -> bool:
+    """Whether a slow mode moves by its initial state more than by the inputs."""
+    model, records = evidence.model, evidence.records
+    if not model.A.size:
+        return False
+    longest = max(record.u.shape[1] for record in records)
+    poles, left, _ = linalg.eig(model.A, left=True)
+    for pole, w in zip(poles, left.T.conj(), strict=True):
+        if abs(1.0 - pole) * longest > _SLOW or pole.imag < 0.0:
+            continue
+        step = np.array([[pole.real, -pole.imag], [pole.imag, pole.real]])
+        B = np.array([(w @ model.B).real, (w @ model.B).imag])
+        eye, none = np.eye(2), np.zeros((2, B.shape[1]))
+        free = forced = 0.0
+        for record, x0 in zip(records, model.initial_states, strict=True):
+            start, u = np.array([(w @ x0).real, (w @ x0).imag]), record.u.T
+            free += (lti_response(step, none, eye, none, u, start) ** 2).sum()
+            forced += (lti_response(step, B, eye, none, u) ** 2).sum()
+        if free > forced:
+            return True
+    return False
+
+
+def chance_of_constants(evidence: Evidence, *, equal: bool = False) -> float:
+    """Chance of estimated constants as large as these, where there are none.
+
+    With `equal`: as different, where they are the same in all experiments. 1 where
+    nothing can be told.
+    """
+    model, free = in_sections(evidence.model), evidence.free._replace(n_trend=1)
+    if model.blocks is None or not np.isfinite(model.loss):
+        return 1.0
+    last, parts, errors = len(evidence.records) - 1, [], []
+    for k in sorted({round(k) for k in np.linspace(0, last, _N_TESTED)}):
+        whole, x0 = evidence.records[k], model.initial_states[k]
+        record = Record(whole.u, whole.y, trend_signals(whole.u.shape[1], 1))
+        driven = np.column_stack([x0, model.B])
+        R = signal_factor(model.blocks, record, driven)
+        if R is None:
+            return 1.0
+        regression = jacobian_regression(R, model, driven, free)
+        part = project_out(regression, free.n_states(len(model.A)))
+        if evidence.levels is not None:
+            part[:, -1] += part[:, : len(whole.y)] @ evidence.levels[k]
+        parts.append(part)
+        error = whole.y.T - lti_response(*model[:4], whole.u.T, x0)
+        errors.append(error - error.mean(axis=0))
+    return _chance(parts, errors, equal)
+
+
+def _chance(parts: Sequence[Array], errors: Sequence[Array], equal: bool) -> float:
+    """As `chance_of_constants`, from regressions ``[constants, Jacobian, error]``."""
+    ny, n_samples = errors[0].shape[1], sum(map(len, errors))
+    rows = np.vstack(parts)
+    constants, jacobian, error = rows[:, :ny], rows[:, ny:-1], rows[:, -1]
+    own = linalg.block_diag(*(part[:, :ny] for part in parts))
+    size = np.sqrt(np.repeat([len(v) for v in errors], ny))
+    if equal:
+        jacobian = np.column_stack([jacobian, constants])
+    explained = linalg.orth(jacobian / column_scale(jacobian), _RCOND)
+    own = (own - explained @ (explained.T @ own)) / size
+    values, vectors = np.linalg.eigh(own.T @ own)
+    own = own @ vectors[:, values > _EXPLAINED]
+    if own.shape[1] == 0:
+        return 1.0
+    # Rows: experiments times outputs times signals.
+    effect = own.reshape(len(parts), ny, -1, own.shape[1])
+    score, stacked = own.T @ error, np.vstack(errors)
+    rounding = _ROUNDING**2 * np.eye(ny)
+    white = stacked.T @ stacked / n_samples + rounding
+    n_error = n_samples - jacobian.shape[1] - own.shape[1]
+    chance = _tail(score, effect, white, n_error)
+    if chance > _SUSPICIOUS:
+        return chance  # that of coloured noise takes as long as a step of refinement
+    # Noise of long memory tells its density at zero no better than few samples do.
+    density = spectral_density(autoregression(errors), np.zeros(1))[0].real + rounding
+    share = min(1.0, float(np.min(np.diagonal(white) / np.diagonal(density))))
+    return _tail(score, effect, density, share * n_error)
+
+
+def _tail(score: Array, effect: Array, density: Array, n_error: float) -> float:
+    """Chance of such a score, by the F distribution."""
+    covariance = np.einsum("eikp,ij,ejkq->pq", effect, density, effect, optimize=True)
+    scale = np.sqrt(np.diagonal(covariance))
+    inverse = np.linalg.pinv(covariance / scale[:, None] / scale, hermitian=True)
+    statistic = float((score / scale) @ inverse @ (score / scale))
+    q = len(score)
+    return float(stats.f.sf(statistic / q, q, n_error)) if n_error >= 1.0 else 1.0

@@ -1,0 +1,102 @@
+"""Alignment of black boxes: bases that are known are found again."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.stats import ortho_group
+
+from lpvlearn import StateSpace
+from lpvlearn.lpv.alignment import aligned_models, rotation_to
+
+from ..conftest import modes, stable_model
+
+
+def turned(models, seed):
+    """Each in another orthogonal basis, as balancing may leave it."""
+    rng = np.random.default_rng(seed)
+    return [
+        model.transform(ortho_group.rvs(model.order, random_state=rng))
+        for model in models
+    ]
+
+
+def family(points):
+    """Balanced at the first point, smooth entries over one or two variables."""
+    start = stable_model(3, feedthrough=True).balance()
+    slopes = np.random.default_rng(4).normal(size=(2, 4, 4))
+    return [
+        StateSpace(
+            start.A + 0.05 * np.tensordot(np.r_[k, 0.0][:2], slopes, 1),
+            start.B,
+            start.C,
+            start.D,
+        )
+        for k in points
+    ]
+
+
+@pytest.mark.parametrize("order", [1, 2, 5])
+def test_a_model_and_itself_turned_agree(order):
+    model = stable_model(order, order).balance()
+    other = turned([model], 1)[0]
+    T = rotation_to(other, model)
+    assert_allclose(T @ T.T, np.eye(order), atol=1e-10)
+    back = other.transform(T.T)
+    for block in "ABC":
+        assert_allclose(getattr(back, block), getattr(model, block), atol=1e-8)
+
+
+def test_equal_singular_values_leave_nothing_open():
+    """Two alike modes: balanced up to any rotation, which signs cannot undo."""
+    A = modes(-0.5 + 2j, -0.5 + 2j)
+    model = StateSpace(A, np.eye(4), np.eye(4)).balance()
+    back = turned([model], 2)[0]
+    back = back.transform(rotation_to(back, model).T)
+    assert_allclose(back.A, model.A, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.random.default_rng(0).uniform([0, 10], [1, 30], (12, 2)) / [1, 30],
+        np.array([[0.0], [1.0], [0.0]]),
+        np.array([[2.0]]),
+    ],
+)
+def test_the_models_stay_what_they_are(points):
+    truth = family(points)
+    omega = np.geomspace(0.1, 10, 9)
+    found = aligned_models(turned(truth, 5), points)
+    for model, true in zip(found, truth, strict=True):
+        assert_allclose(model.frequency_response(omega), true.frequency_response(omega))
+
+
+def test_a_smooth_family_is_smooth_again():
+    """The jump from point to point goes to zero with their distance."""
+
+    def jump(n_points):
+        points = np.linspace(0, 1, n_points)[:, None]
+        models = [model.balance() for model in family(points)]
+        A = np.array([m.A for m in aligned_models(turned(models, 5), points)])
+        return np.abs(np.diff(A, axis=0)).max()
+
+    assert jump(41) < 0.35 * jump(11)
+
+
+def test_the_order_of_the_points_does_not_matter():
+    points = np.random.default_rng(1).uniform(size=(9, 2))
+    models = turned(family(points), 6)
+    found = aligned_models(models, points)
+    mixed = np.random.default_rng(2).permutation(9)
+    again = aligned_models([models[k] for k in mixed], points[mixed])
+    for k, model in zip(mixed, again, strict=True):
+        assert_allclose(model.A, found[k].A, atol=1e-9)
+
+
+def test_units_of_the_scheduling_variables_do_not_matter():
+    points = np.random.default_rng(3).uniform(size=(9, 2))
+    models = turned(family(points), 7)
+    found = aligned_models(models, points)
+    again = aligned_models(models, points * [1e-6, 1e6])
+    for one, other in zip(found, again, strict=True):
+        assert_allclose(one.A, other.A, atol=1e-9)

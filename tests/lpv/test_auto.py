@@ -1,0 +1,114 @@
+"""The choice of the form: true ones are found, untrue ones are left to the points."""
+
+import numpy as np
+import pytest
+
+from lpvlearn import AutoLPV, PolynomialLPV, SplineLPV
+
+KAPPA = np.linspace(0, 2, 7)[:, None]
+FINE = np.linspace(0, 2, 101)[:, None]
+
+TRUTHS = {
+    "polynomial 0": lambda k: np.hstack([0 * k + 2, 0 * k + 3]),
+    "polynomial 1": lambda k: np.hstack([2 + k, 3 - 2 * k]),
+    "polynomial 2": lambda k: np.hstack([2 + k + k**2, 3 + 0 * k]),
+    "rational 1/1": lambda k: np.hstack([2 + 3 * k, 5 + 0 * k]) / (1 + k),
+}
+
+
+def noisy(truth, rng, deviation=0.01):
+    """Parameters with correlated errors, and their covariances."""
+    clean = truth(KAPPA)
+    roots = (
+        deviation * np.array([[1.0, 0.0], [0.8, 0.6]]) * rng.uniform(0.3, 3, (7, 1, 1))
+    )
+    errors = (roots @ rng.normal(size=(7, 2, 1)))[:, :, 0]
+    return clean + errors, roots @ roots.swapaxes(1, 2)
+
+
+@pytest.mark.parametrize("form", TRUTHS)
+def test_the_true_form_is_chosen(form):
+    rng = np.random.default_rng(0)
+    chosen = []
+    for _ in range(10):
+        theta, P = noisy(TRUTHS[form], rng)
+        chosen.append(AutoLPV().fit(KAPPA, theta, covariance=P).form_)
+    assert chosen.count(form) >= 9
+
+
+def test_the_table_tells_what_was_compared():
+    theta, P = noisy(TRUTHS["polynomial 2"], np.random.default_rng(1))
+    model = AutoLPV().fit(KAPPA, theta, covariance=P)
+    table = model.selection_
+    assert table.columns.tolist() == ["form", "chi2", "dof", "aic", "chosen"]
+    assert table["form"][table["chosen"]].tolist() == [model.form_] == ["polynomial 2"]
+    np.testing.assert_allclose(table["aic"], table["chi2"] + 2 * (14 - table["dof"]))
+    parabola = PolynomialLPV(2).fit(KAPPA, theta, covariance=P)
+    row = table[table["chosen"]].iloc[0]
+    assert (row["chi2"], row["dof"]) == (parabola.chi2_, 8)
+    np.testing.assert_array_equal(model.predict(FINE), parabola.predict(FINE))
+    np.testing.assert_array_equal(
+        model.best_estimator_.predict(FINE), model.predict(FINE)
+    )
+    bayes = AutoLPV(criterion="bic").fit(KAPPA, theta, covariance=P).selection_
+    np.testing.assert_allclose(
+        bayes["bic"], table["chi2"] + np.log(14) * (14 - table["dof"])
+    )
+
+
+def test_a_form_that_is_not_true_is_not_taken_however_good():
+    """A kink, known precisely."""
+    theta = np.abs(KAPPA - 0.9) + KAPPA
+    model = AutoLPV().fit(KAPPA, theta, covariance=np.full(7, 1e-12))
+    assert model.form_ == "pchip"
+    assert model.selection_["chosen"].tolist()[-1]
+    np.testing.assert_allclose(model.predict(KAPPA), theta)
+
+
+def test_without_covariances_the_points_are_followed():
+    theta, _ = noisy(TRUTHS["polynomial 2"], np.random.default_rng(2))
+    model = AutoLPV().fit(KAPPA, theta)
+    assert model.selection_["form"].tolist() == ["pchip"]
+    expected = SplineLPV().fit(KAPPA, theta).predict(FINE)
+    np.testing.assert_array_equal(model.predict(FINE), expected)
+
+
+@pytest.mark.parametrize(("n_points", "form"), [(1, 0), (2, 1), (3, 2)])
+def test_few_points_carry_a_constant_a_line_or_a_parabola(n_points, form):
+    theta = np.exp(KAPPA[:n_points])
+    variance = np.full((n_points, 1, 1), 1e-8)
+    model = AutoLPV().fit(KAPPA[:n_points], theta, covariance=variance)
+    assert model.form_ == f"polynomial {form}"
+    np.testing.assert_allclose(model.predict(KAPPA[:n_points]), theta)
+
+
+def test_forms_of_two_variables():
+    axes = np.meshgrid(np.linspace(0, 1, 5), np.linspace(20, 40, 4), indexing="ij")
+    kappa = np.stack(axes, axis=-1).reshape(-1, 2)
+    load, speed = kappa[:, 0], kappa[:, 1] / 30
+    rng = np.random.default_rng(3)
+    truths = {
+        "polynomial 1": [1 + load - speed, 2 * speed],
+        "tensor polynomial 1": [1 + load * speed, 2 - load],
+        "polynomial 2": [1 + load**2, 2 + speed**2 + load * speed],
+        "rational 1/1": [(1 + load) / (1 + speed), speed / (1 + speed)],
+    }
+    for form, truth in truths.items():
+        theta = np.column_stack(truth) + 1e-3 * rng.normal(size=(20, 2))
+        P = np.tile(1e-6 * np.eye(2), (20, 1, 1))
+        model = AutoLPV().fit(kappa, theta, covariance=P)
+        assert model.form_ == form, model.selection_
+        error = model.predict(kappa) - np.column_stack(truth)
+        assert np.sqrt(np.mean(error**2)) < 1e-3
+
+
+def test_points_on_a_curve_choose_among_what_they_determine():
+    kappa = np.linspace(0, 1, 8)[:, None] * [1.0, 2.0]
+    model = AutoLPV().fit(kappa, kappa[:, 0] ** 2, covariance=np.full(8, 1e-6))
+    assert set(model.selection_["form"]) <= {"polynomial 0", "pchip"}
+    np.testing.assert_allclose(model.predict(kappa), kappa[:, 0] ** 2, atol=1e-9)
+
+
+def test_criteria_that_are_not_known_are_refused():
+    with pytest.raises(ValueError, match="`criterion` must be 'aic' or 'bic'"):
+        AutoLPV(criterion="press").fit(KAPPA, KAPPA)

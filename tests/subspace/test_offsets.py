@@ -1,0 +1,377 @@
+"""Constants and drifts of the experiments, estimated with the model."""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.signal import lfilter
+
+from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
+from lpvlearn.subspace import hankel
+from lpvlearn.subspace.identification import centred
+from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.simulation_fit import Freedom, _general_regression, block_fit
+from lpvlearn.systems.simulation import lti_response, trend_signals
+
+from ..conftest import modes
+from .conftest import fed, record
+
+OMEGA = np.geomspace(0.01, 3.0, 40)
+A = modes(0.9 * np.exp(0.4j), 0.7)
+B = np.array([[1.0, 0.3], [-0.5, 1.0], [0.4, -0.8]])
+C = np.array([[1.0, -0.4, 0.7], [0.2, 0.9, -1.0]])
+SYSTEM = StateSpace(A, B, C, sampling_time=1.0)
+LEVELS = (3.0, -7.0, 100.0)
+
+
+def table(rng, *, levels=LEVELS, n=200, noise=0.0, pole=0.0, drift=0.0, u0=0.0):
+    """Experiments of `SYSTEM` about a level each, from any state."""
+    X, Y = [], []
+    for run, level in enumerate(levels):
+        u, t = rng.standard_normal((n, 2)), np.linspace(-1.0, 1.0, n)[:, None]
+        y = lti_response(A, B, C, np.zeros((2, 2)), u, rng.standard_normal(3))
+        e = lfilter(
+            [np.sqrt(1 - pole**2)], [1.0, -pole], rng.standard_normal(y.shape).T
+        )
+        y = y + noise * e.T + (level + drift * t) * np.array([1.0, -2.0])
+        X.append(np.column_stack([u + u0, np.full(n, run)]))
+        Y.append(y)
+    return np.vstack(X), np.vstack(Y)
+
+
+def error_of(model, truth=SYSTEM):
+    G = truth.frequency_response(OMEGA)
+    return np.abs(model.lti_.frequency_response(OMEGA) - G).max() / np.abs(G).max()
+
+
+def options(**others):
+    return {"experiment": 2, **others}
+
+
+# -- exact cases -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["po-moesp", "pi-moesp", "n4sid", "cva"])
+@pytest.mark.parametrize("refine", [True, False])
+def test_without_noise_constants_are_exact(rng, method, refine):
+    X, y = table(rng)
+    settings = options(horizon=6, method=method, refine=refine)
+    model = SubspaceLTI(3, offset="constant", **settings).fit(X, y)
+    assert error_of(model) < 1e-9
+    np.testing.assert_allclose(model.predict_with_initial_state(X, y), y, atol=1e-8)
+
+
+def test_offsets_tell_where_the_outputs_rest_at_the_mean_inputs(rng):
+    X, y = table(rng, u0=2.0)
+    model = SubspaceLTI(3, horizon=6, **options()).fit(X, y)
+    assert model.offset_ == "constant"
+    means = np.array([X[X[:, 2] == run, :2].mean(axis=0) for run in range(3)])
+    np.testing.assert_allclose(model.input_offset_, means)
+    level = np.outer(LEVELS, [1.0, -2.0])
+    gain = SYSTEM.C @ np.linalg.solve(np.eye(3) - A, B)
+    np.testing.assert_allclose(model.output_offset_, level + (means - 2.0) @ gain.T)
+    assert not model.output_drift_.any()
+
+
+def test_drifts_are_exact_and_told_per_second(rng):
+    X, y = table(rng, drift=4.0)
+    settings = options(horizon=6, sampling_time=0.5)
+    model = SubspaceLTI(3, offset="linear", **settings).fit(X, y)
+    poles = SYSTEM.poles()
+    np.testing.assert_allclose(model.lti_.poles(), poles, atol=1e-10)
+    drift = 4.0 * 2.0 / (199 * 0.5) * np.array([1.0, -2.0])
+    np.testing.assert_allclose(model.output_drift_, np.tile(drift, (3, 1)))
+    np.testing.assert_allclose(model.predict_with_initial_state(X, y), y, atol=1e-8)
+
+
+@pytest.mark.parametrize("offset, degree", [("constant", 0), ("linear", 1)])
+def test_what_is_estimated_may_be_added_to_the_outputs(rng, offset, degree):
+    """Also with noise: the model is the same to rounding."""
+    X, y = table(rng, noise=0.2)
+    t = np.tile(np.linspace(0, 1, 200), 3)[:, None]
+    moved = y + 30.0 * (1 + X[:, 2:]) + 50.0 * degree * t
+    first, other = (
+        SubspaceLTI(3, horizon=6, offset=offset, **options()).fit(X, outputs)
+        for outputs in (y, moved)
+    )
+    assert error_of(first, other.lti_) < 1e-9
+
+
+@pytest.mark.parametrize("u0", [0.0, 1e6])
+def test_a_millionth_of_the_level_is_enough(rng, u0):
+    X, y = table(rng, levels=(1e6, -1e6, 3e5), u0=u0)
+    model = SubspaceLTI(3, horizon=6, **options()).fit(X, y)
+    assert error_of(model) < 1e-9
+
+
+def test_constants_are_free_where_experiments_start_at_rest(rng):
+    u = rng.standard_normal((100, 2))
+    y = SYSTEM.simulate(u) + [4.0, -1.0]
+    model = SubspaceLTI(3, horizon=6, offset="constant", initial_state="rest")
+    model.fit(u, y)
+    assert error_of(model) < 1e-10
+    assert not model.initial_states_.any()
+    np.testing.assert_allclose(model.predict(u), y, atol=1e-8)
+
+
+def test_runs_between_gaps_have_constants_of_their_own(rng):
+    X, y = table(rng)
+    y[250] = np.nan
+    y[250:400] += 5.0
+    model = SubspaceLTI(3, horizon=6, missing="split", **options()).fit(X, y)
+    assert error_of(model) < 1e-9
+    assert model.output_offset_.shape == (4, 2)
+
+
+def test_a_gain_has_a_constant(rng):
+    u = rng.standard_normal((50, 1))
+    model = SubspaceLTI(0, offset="constant").fit(u, 3.0 * u + 2.0)
+    np.testing.assert_allclose(model.predict(u), 3.0 * u + 2.0)
+
+
+def test_detrending_may_be_followed_by_constants(rng):
+    """What transients add to the mean is an error without them."""
+    X, y = table(rng)
+    settings = options(horizon=6, detrend="constant")
+    centred_only = SubspaceLTI(3, **settings).fit(X, y)
+    both = SubspaceLTI(3, offset="constant", **settings).fit(X, y)
+    assert centred_only.offset_ is None
+    assert error_of(both) < 1e-9 < 1e-5 < error_of(centred_only)
+    np.testing.assert_allclose(both.predict_with_initial_state(X, y), y, atol=1e-8)
+
+
+# -- the pieces ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ["cholesky", "qr"])
+@pytest.mark.parametrize("n_trend", [1, 2])
+def test_trends_are_projected_out_of_the_hankel_columns(rng, engine, n_trend):
+    records = [rng.standard_normal((n, 3)) for n in (80, 50)]
+    parts = []
+    for z in records:
+        H = np.array([z[k : len(z) - 5 + k] for k in range(6)])
+        H = H.transpose(0, 2, 1).reshape(18, -1)
+        Q = np.linalg.qr(trend_signals(H.shape[1], n_trend).T)[0]
+        parts.append(H - H @ Q @ Q.T)
+    rows = hankel._past_future_rows(2, 1, 3)
+    expected = np.hstack(parts)[rows]
+    moved = [
+        z + 7.0 * (1 + np.arange(len(z))[:, None] * (n_trend - 1)) for z in records
+    ]
+    L = hankel.data_factor(moved, 2, 3, engine=engine, n_trend=n_trend)
+    np.testing.assert_allclose(L @ L.T, expected @ expected.T, atol=1e-8)
+
+
+def test_both_regressions_know_trends(rng):
+    X, y = table(rng, noise=0.1)
+    pairs = [(X[X[:, 2] == run, :2], y[X[:, 2] == run]) for run in range(3)]
+    moved, _ = centred(pairs, 2, True)
+    records = [Record.of(*pair, n_trend=2) for pair in moved]
+    free = Freedom(np.ones((2, 2), bool), n_trend=2)
+    blocks = (A[:2, :2], A[2:, 2:])
+    model = block_fit(blocks, C, records, free)
+    for k, (r, x0) in enumerate(zip(records, model.initial_states, strict=True)):
+        M = _general_regression(A, C, r, free)
+        own = np.concatenate([x0, model.trends[k].ravel()])
+        known = np.concatenate([own, model.B.ravel(), model.D.ravel()])
+        loss = np.sum((M[:, -1] - M[:, :-1] @ known) ** 2)
+        direct = np.sum((r.y.T - model.outputs(r, k)) ** 2)
+        assert loss == pytest.approx(direct)
+
+
+# -- "auto" ----------------------------------------------------------------------------
+
+
+def test_order_and_constants_are_found_together_without_noise(rng):
+    X, y = table(rng)
+    model = SubspaceLTI(**options()).fit(X, y)
+    assert (model.order_, model.offset_) == (3, "constant")
+    assert error_of(model) < 1e-9
+
+
+def test_data_about_zero_stay_as_they_are(rng):
+    X, y = table(rng, levels=(0.0, 0.0, 0.0))
+    model = SubspaceLTI(3, horizon=6, **options()).fit(X, y)
+    assert model.offset_ is None
+    assert not model.output_offset_.any()
+    assert error_of(model) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pole", [0.0, 0.9])
+def test_constants_that_are_not_there_are_hardly_ever_found(pole):
+    found = 0
+    for seed in range(60):
+        X, y = table(
+            np.random.default_rng(seed), levels=(0.0,) * 3, noise=0.5, pole=pole
+        )
+        auto, none = (
+            SubspaceLTI(3, horizon=6, offset=offset, **options()).fit(X, y)
+            for offset in ("auto", None)
+        )
+        found += auto.offset_ is not None
+        if auto.offset_ is None:
+            np.testing.assert_array_equal(auto.lti_.A, none.lti_.A)
+    assert found <= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pole", [0.0, 0.9])
+def test_constants_of_the_size_of_the_noise_are_found(pole):
+    errors = {"auto": [], "constant": [], None: []}
+    for seed in range(8):
+        X, y = table(
+            np.random.default_rng(seed), levels=(2.0, -2.0, 3.0), noise=0.5, pole=pole
+        )
+        for offset, found in errors.items():
+            model = SubspaceLTI(3, horizon=6, offset=offset, **options()).fit(X, y)
+            found.append(error_of(model))
+    np.testing.assert_allclose(errors["auto"], errors["constant"])
+    assert np.mean(errors["auto"]) < 0.7 * np.mean(errors[None])
+
+
+def test_an_offset_of_an_integrators_input_is_a_line(rng):
+    u = rng.standard_normal((300, 1))
+    y = np.vstack([[0.0], np.cumsum(u, axis=0)[:-1]]) + 5.0
+    model = SubspaceLTI(1, horizon=5).fit(u, y)
+    assert model.offset_ is None  # the initial state has it
+    np.testing.assert_allclose(model.lti_.poles(), 1.0, atol=1e-6)
+    biased = SubspaceLTI(1, horizon=5, offset="linear").fit(u + 0.3, y)
+    np.testing.assert_allclose(biased.lti_.poles(), 1.0, atol=1e-6)
+    np.testing.assert_allclose(biased.lti_.B @ biased.lti_.C, 1.0, atol=1e-6)
+    np.testing.assert_allclose(biased.output_drift_, -0.3, atol=1e-6)
+    assert not biased.input_offset_.any()
+
+
+def test_short_step_responses_are_not_spoilt():
+    """All windows of the input are constant: a constant would take the gain."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        X, Y = [], []
+        for run in range(6):
+            u = np.full((40, 1), rng.choice([-1.0, 1.0]) * (1 + run % 3))
+            y = lfilter([0.0, 0.2], [1.0, -0.8], u[:, 0])
+            X.append(np.column_stack([u, np.full(40, run)]))
+            Y.append(y + 0.05 * rng.standard_normal(40))
+        data = np.vstack(X), np.concatenate(Y)
+        model = SubspaceLTI(1, horizon=4, experiment=1, initial_state="rest")
+        assert model.fit(*data).offset_ is None
+        assert model.lti_.frequency_response([1e-3])[0, 0, 0].real == pytest.approx(
+            1.0, abs=0.05
+        )
+
+
+# -- use -------------------------------------------------------------------------------
+
+
+def test_prediction_rests_at_the_common_offset(rng):
+    """An experiment that stands at rest before its first sample."""
+    u = np.vstack([np.zeros((20, 2)), rng.standard_normal((300, 2))])
+    y = SYSTEM.simulate(u) + [50.0, -20.0]
+    model = SubspaceLTI(3, horizon=6).fit(u + [4.0, 1.0], y)
+    u0, y0 = model.input_offset_[0], model.output_offset_[0]
+    still = model.predict(np.tile(u0, (5, 1)))
+    np.testing.assert_allclose(still, np.tile(y0, (5, 1)))
+    found = model.predict(u + u0)
+    np.testing.assert_allclose(found - y0, SYSTEM.simulate(u), atol=1e-8)
+
+
+def test_prediction_warns_where_constants_differ(rng):
+    X, y = table(rng, noise=0.1)
+    model = SubspaceLTI(3, horizon=6, **options()).fit(X, y)
+    with pytest.warns(UserWarning, match="have different constants in their outputs"):
+        model.predict(X)
+    score = make_bft_scorer(initial_state="estimate")(model, X, y)
+    assert score > 99.0
+    ahead = model.predict_ahead(X, y, steps=2)
+    assert np.abs(ahead - y).std() < 0.15
+    same = SubspaceLTI(3, horizon=6, **options())
+    X, y = table(rng, levels=(5.0, 5.0, 5.0), noise=0.1)
+    assert same.fit(X, y).offset_ == "constant"
+    assert same.score(X, y) > 0.97
+
+
+def test_residual_tests_allow_for_constants():
+    passed = []
+    for seed in range(4):
+        X, y = table(np.random.default_rng(seed), n=400, noise=0.3, u0=3.0)
+        model = SubspaceLTI(3, horizon=6, **options()).fit(X, y)
+        passed += list(model.residual_tests(X, y)["passed"])
+        passed += list(model.residual_tests(X, y, errors="prediction")["passed"])
+    assert np.mean(passed) > 0.97
+
+
+def test_labels_of_dataframes_do_not_matter(rng):
+    X, y = table(rng, noise=0.1)
+    named = pd.DataFrame(X, columns=["a", "b", "run"]).astype({"run": int})
+    named["run"] = named["run"].map({0: "x", 1: "z", 2: "y"})
+    first = SubspaceLTI(3, horizon=6, experiment="run").fit(named, y)
+    other = SubspaceLTI(3, horizon=6, **options()).fit(X, y)
+    np.testing.assert_array_equal(first.output_offset_, other.output_offset_)
+
+
+def test_options_teach():
+    with pytest.raises(ValueError, match="`offset` must be 'auto', None, 'constant'"):
+        SubspaceLTI(offset="mean").fit(np.zeros((9, 1)), np.zeros(9))
+
+
+@pytest.mark.parametrize("shape", [(10, 3), (15, 4), (5, 1), (3, 1)])
+@pytest.mark.parametrize("offset", ["auto", "constant", "linear"])
+def test_tiny_tables_are_fitted(rng, shape, offset):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        X, y = rng.standard_normal(shape), rng.standard_normal(shape[0])
+        assert SubspaceLTI(offset=offset).fit(X, y).predict(X).shape == y.shape
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pole", [0.0, 0.9])
+def test_deviations_cover_the_truth_with_constants(pole):
+    """95 % of the poles and responses within 1.96 standard deviations."""
+    inside = []
+    truth = SYSTEM.frequency_response([0.05, 0.5, 2.0])
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        X, y = table(rng, levels=(3.0, -2.0), n=500, noise=0.5, pole=pole)
+        model = SubspaceLTI(3, horizon=6, offset="constant", **options()).fit(X, y)
+        std = model.frequency_response_std([0.05, 0.5, 2.0])
+        error = model.lti_.frequency_response([0.05, 0.5, 2.0]) - truth
+        inside.append(np.abs(error.real) < 1.96 * std.real)
+        inside.append(np.abs(error.imag) < 1.96 * std.imag)
+    assert 0.92 < np.mean(inside) < 0.975
+
+
+# -- streams ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("offset", ["auto", "constant", "linear"])
+def test_long_tables_and_streams_have_constants(system, short_stream, offset):
+    u, y = record(system, 9000)
+    y = y + [40.0, -300.0]
+    stream = fed(SubspaceLTI(5, horizon=8, offset=offset), u, y, [2500, 3500, 3000])
+    whole = SubspaceLTI(5, horizon=8, offset=offset).fit(u, y)
+    plain = SubspaceLTI(5, horizon=8, offset=None).fit(u, y - [40.0, -300.0])
+    G = plain.lti_.frequency_response(OMEGA)
+    for model in (stream, whole):
+        assert model.offset_ == ("linear" if offset == "linear" else "constant")
+        gap = np.abs(model.lti_.frequency_response(OMEGA) - G).max()
+        assert gap < 0.02 * np.abs(G).max()
+        rest = model.lti_.D + model.lti_.C @ np.linalg.solve(
+            np.eye(5) - model.lti_.A, model.lti_.B
+        )
+        constant = model.output_offset_[0] - rest @ model.input_offset_[0]
+        np.testing.assert_allclose(constant, [40.0, -300.0], rtol=0.01)
+    np.testing.assert_allclose(
+        stream.lti_.frequency_response(OMEGA), whole.lti_.frequency_response(OMEGA)
+    )
+
+
+def test_experiments_of_a_long_table_have_their_own_constants(system, short_stream):
+    u, y = record(system, 9000)
+    run = np.repeat([0, 1, 2], 3000)
+    levels = np.array([5.0, -80.0, 30.0])[:, None] * [1.0, 2.0]
+    X = np.column_stack([u, run])
+    model = SubspaceLTI(5, horizon=8, experiment=2).fit(X, y + levels[run])
+    assert model.output_offset_.shape == (3, 2)
+    np.testing.assert_allclose(model.output_offset_, levels, rtol=0.2, atol=3.0)
