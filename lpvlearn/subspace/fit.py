@@ -23,6 +23,7 @@ from ..data.preparation import (
 from ..exceptions import RankWarning, warn
 from ..validation import one_of, positive_time
 from .closed_loop import identify_closed_loop
+from .held_out import HeldOut
 from .identification import (
     ScaledRecords,
     Settings,
@@ -383,6 +384,14 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
 
 _USELESS = 0.9  # share of the outputs' size left unexplained that is reported
 _HALF = 0.5  # share of their energy that enforced stability must cost to be reported
+# Share of its fit in percent that parts held out must confirm; with 200 samples at
+# equal noise and signal a right model comes to two thirds.
+_CONFIRMED = 0.5
+
+# A standard deviation of the static gain by the root mean square of the whole response:
+# above it, a gain that is not known matters.
+_OPEN = 0.3
+
 _ROUNDING = 1e-8  # an integrator's pole may lie this far outside the unit circle
 
 # A stream fits much worse than its first samples where its error exceeds theirs by
@@ -438,6 +447,8 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
         )
+    if fitted.selection.held_out is not None and residual <= _USELESS:
+        _warn_about_choice(fitted, fitted.selection.held_out, told)
     if fitted.innovations is None or fitted.stability_loss or "lack" in told:
         return
     if lacks(fitted.evidence, fitted.innovations):
@@ -451,6 +462,37 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             f"tenth of it: the model of order {len(model.A)} lacks states, a delay or "
             f"a nonlinearity. Try {remedy}, `input_delay`, or, if the system is "
             "nonlinear, smaller inputs; `residual_tests` tells which input it is.",
+        )
+
+
+def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> None:
+    """Tell what the samples do not confirm of a model of automatic order.
+
+    Without figures, so that a search says it once.
+    """
+    if held_out.bft < _CONFIRMED * 100.0 * (1.0 - fitted.residual):
+        tell(
+            told,
+            "held out",
+            "The model simulates parts of the record that it was not fitted to far "
+            "worse than the others (`selection_`): the system is nonlinear, changes "
+            "over the record or drifts, or the record is too short for it. Give a "
+            "lower `order`, leave disturbed parts out, or use offset='linear'.",
+        )
+    gain = fitted.evidence.static_gain()
+    if gain is None:
+        return
+    unknown = (gain.std > np.abs(gain.value)) & (gain.std > _OPEN * gain.size)
+    if unknown.any():
+        output, which = np.argwhere(unknown)[0] + 1
+        tell(
+            told,
+            "static gain",
+            f"The static gain (from input {which} to output {output}) is known no "
+            "better than to its own size: the record excites slow motions too little "
+            "to tell it. Record for longer, with inputs that are held for longer, or "
+            "lower `order`; at higher frequencies the model may be right "
+            "(`frequency_response_std`).",
         )
 
 

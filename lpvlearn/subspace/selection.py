@@ -158,13 +158,15 @@ def select(
 ) -> Selection:
     """Choose the order, the horizon or both (None) for scaled records."""
     records = thinned(records)
-    # The order is that of the system, whatever a stable or rough model can show of it.
-    as_found = settings._replace(enforce_stability=False, refine=True)
+    # The order is that of the system, whatever a stable or rough model can show of it,
+    # or one that minimises other errors.
+    by_evidence = settings._replace(enforce_stability=False, refine=True)
     if settings.refine and not settings.enforce_stability:
-        return _search(records, order, horizon, as_found)
+        chosen = _search(records, order, horizon, by_evidence)
+        return chosen if settings.weigh else chosen._replace(candidate=None)
     rows: list[Row] = []
     if order is None:
-        chosen = _search(records, None, horizon, as_found)
+        chosen = _search(records, None, horizon, by_evidence)
         order = chosen.order
         rows = [row for row in chosen.rows if row.order != order]
     spaces = _spaces(records, order, order, horizon, settings)
@@ -196,12 +198,11 @@ def _search(
     if highest is None:
         highest = _highest_order(records, _horizons(records, 0, settings), settings)
     wanted = _Range(range(order or 0, highest + 1), horizon)
-    noise = _Noise(Whitening.none(len(records[0].y)))
-    if settings.weigh:
-        noise = _noise_of(_pilot(records, wanted, settings), records, wanted, settings)
+    pilot = _pilot(records, wanted, settings)
+    noise = _noise_of(pilot, records, wanted, settings)
     tried = _try_orders(wanted, records, noise, settings)
     best = min(tried, key=lambda one: one.criterion)
-    for _ in range(_MORE_ROUNDS if settings.weigh else 0):
+    for _ in range(_MORE_ROUNDS):
         model = _unwhitened(best.model, noise.whitening, records, settings)
         again = _noise_of(model, records, wanted, settings)
         if again.whitening.is_close_to(noise.whitening):
@@ -217,7 +218,7 @@ def _search(
     }
     errors = {best.order: validate(candidates[best.order], records, settings)}
     chosen = best.order
-    for order in (best.order - step for step in _LOWER if settings.compare):
+    for order in (best.order - step for step in _LOWER):
         if order in candidates:
             errors[order] = validate(candidates[order], records, settings)
             if errors[order].clearly_better_than(errors[chosen], _DOUBT):

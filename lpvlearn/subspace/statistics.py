@@ -21,6 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,6 +50,17 @@ _MAX_SAMPLES = 30_000
 _NEGLIGIBLE = 1e-12  # relative variance below which a direction is rounding
 
 _RCOND = 1e-15  # the weakest direction of the information that is told from rounding
+
+
+_N_FREQUENCIES = 200  # over which a response is averaged
+
+
+class StaticGain(NamedTuple):
+    """Gain at frequency zero, each of shape (n_outputs, n_inputs)."""
+
+    value: Array
+    std: Array
+    size: Array  # root mean square of the response over all frequencies
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +184,22 @@ class Evidence:
         """Standard deviations, shape (n_freq, n_outputs, n_inputs)."""
         covariance = self.covariance
         return _deviations(self._frequency_jacobian(omega), covariance)
+
+    def static_gain(self) -> StaticGain | None:
+        """What is known of the gain at rest; None where there is none, or no saying.
+
+        A mode as slow as the longest record is an integrator to it.
+        """
+        radius = float(np.abs(np.linalg.eigvals(self.model.A)).max(initial=0.0))
+        longest = max(record.u.shape[1] for record in self.records)
+        known = self.refined and self.sections.blocks is not None
+        if not known or radius >= 1.0 - 1.0 / longest or not len(self.model.A):
+            return None
+        lti = self.state_space(self.model, 1.0)
+        response = lti.frequency_response(np.linspace(0.0, np.pi, _N_FREQUENCIES))
+        std = self.frequency_response_std(np.zeros(1))[0].real
+        size = np.sqrt(np.mean(np.abs(response) ** 2, axis=0))
+        return StaticGain(response[0].real, std, size)
 
     def _frequency_jacobian(self, omega: Array) -> NDArray[np.complex128]:
         J = _frequency_response_jacobian(self.sections, self.free, omega)

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.data.preparation import remove_trends
@@ -292,3 +293,32 @@ def test_repeated_inputs_warn_once_and_fit(rng):
     np.testing.assert_allclose(model.predict(np.hstack([u, u[:, :1]])), y, atol=1e-8)
     std = model.frequency_response_std([0.5])
     assert std.shape == (1, 2, 3)
+
+
+def test_a_static_gain_that_is_not_known_is_told():
+    """A slow mode that inputs of high frequency hardly reach, in slow noise."""
+    rng = np.random.default_rng(0)
+    fast = rng.standard_normal((600, 1))
+    u = np.diff(np.diff(fast, axis=0), axis=0)
+    slow = lfilter([0.0, 0.02], [1.0, -0.98], u, axis=0)
+    y = lfilter([0.0, 1.0], [1.0, 0.3], u, axis=0) + slow
+    y = y + lfilter([0.05], [1.0, -0.97], rng.standard_normal(u.shape), axis=0)
+    with pytest.warns(UserWarning, match="static gain .* known no better than"):
+        model = SubspaceLTI(offset=None).fit(u, y)
+    gain = model._evidence.static_gain()
+    assert gain.std.item() > abs(gain.value.item())
+    np.testing.assert_allclose(
+        gain.value, model.lti_.frequency_response([1e-9])[0].real, rtol=1e-6
+    )
+
+
+def test_a_fit_that_parts_held_out_do_not_confirm_is_told():
+    """A system that changes in the middle of the record."""
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((400, 1))
+    before = lfilter([0.0, 1.0], [1.0, -0.5], u, axis=0)
+    after = lfilter([0.0, 0.0, 0.0, 5.0], [1.0, 0.8], u, axis=0)
+    y = np.where(np.arange(400)[:, None] < 330, 0.05 * before, after)
+    with pytest.warns(UserWarning) as told:
+        SubspaceLTI().fit(u, y + 1e-3 * rng.standard_normal(y.shape))
+    assert any("not fitted to far worse" in str(w.message) for w in told)
