@@ -115,14 +115,41 @@ def finite_samples(name: str, value: ArrayLike, width: int) -> Array:
     return _finite(name, array, f"sample {{}}, {channel} {{}}")
 
 
-def state_vector(x0: ArrayLike, order: int) -> Array:
-    """`x0` as a finite array of shape (order,), or a ValueError that names it."""
+def state_vector(x0: ArrayLike, order: int, n_more: int = 0) -> Array:
+    """`x0` as a finite array of shape (order + n_more,), or a ValueError that names it.
+
+    The entries after the first `order` may be left out: they are zero then.
+    """
     x0 = real_array("initial_state", x0).reshape(-1)
-    if x0.shape != (order,):
-        raise ValueError(f"`initial_state` must have shape ({order},). Got {x0.shape}.")
+    if x0.shape not in ((order,), (order + n_more,)):
+        more = f", or with the inputs in transit ({order + n_more},)" if n_more else ""
+        raise ValueError(
+            f"`initial_state` must have shape ({order},){more}. Got {x0.shape}."
+        )
     if not np.isfinite(x0).all():
         raise ValueError(f"`initial_state` must be finite. Got {x0}.")
-    return x0
+    return np.concatenate([x0, np.zeros(order + n_more - len(x0))])
+
+
+def input_delays(value: ArrayLike, n_inputs: int, *, samples: bool) -> NDArray[Any]:
+    """`value` as a read-only delay of every input: whole samples, else seconds.
+
+    One number is the delay of all inputs. A ValueError where it is no delay.
+    """
+    delay = real_array("input_delay", value)
+    shape_fits = delay.shape in ((), (n_inputs,))
+    if shape_fits and np.isfinite(delay).all() and (delay >= 0).all():
+        delay = np.broadcast_to(delay, (n_inputs,)).copy()
+        if samples and (delay == np.floor(delay)).all():
+            delay = delay.astype(np.intp)
+        if not samples or delay.dtype == np.intp:
+            delay.setflags(write=False)
+            return delay
+    unit = "a whole number of samples" if samples else "a number of seconds"
+    raise ValueError(
+        f"`input_delay` must be {unit}, 0 or more, for all inputs or one for each of "
+        f"the {n_inputs}. Got {value!r}."
+    )
 
 
 def named_values(

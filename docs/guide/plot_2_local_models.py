@@ -146,6 +146,40 @@ pd.DataFrame(
 )
 
 # %%
+# Delays
+# ------
+# Valves, transport and field buses act late. A delay of five samples would cost five
+# states, or bend the parameters that a structure without delay finds.
+# ``input_delay=5``, or ``[5, 0]`` for two inputs, takes it out:
+# the model is identified from inputs as they arrive, and ``lti_`` carries the delay
+# beside its matrices, in simulations and responses. ``input_delay="auto"`` looks for
+# it: a delay is taken where it is certain, else none.
+
+
+late = StateSpace([[1.6, -0.8], [1, 0]], [[1], [0]], [[0.2, 0.1]], None, 0.01, 5)
+rng = np.random.default_rng(0)
+u = rng.standard_normal((600, 1))
+noisy = late.simulate(u) + 0.05 * rng.standard_normal((600, 1))
+for delay in (0, "auto"):
+    model = SubspaceLTI(input_delay=delay, sampling_time=0.01).fit(u, noisy)
+    print(delay, model.lti_)
+
+# %%
+# Delays count from :math:`\mathfrak{D}`: a sampled system without feedthrough, which
+# answers one sample after its input, has a delay of 0.
+#
+# What arrives in the first samples of an experiment was sent before it began. The fit
+# leaves these samples out, or takes the input before as zero with
+# ``initial_state="rest"``, as ``predict`` does. ``predict_with_initial_state``
+# estimates what was in transit along with the state. ``partial_fit`` needs a delay that
+# is given.
+#
+# In a pipeline, ``LocalLPVPipeline(SubspaceLTI(input_delay="auto"), ...)``: the
+# structure is compared with what is left of the local model and has no delay itself;
+# the structured model and ``lpv_`` carry it. ``report_`` has it in columns "delay_" by
+# input. Where operating points differ, a warning lists them, and ``lpv_`` takes the
+# median.
+#
 # .. _guide_offsets:
 #
 # Offsets and drifts

@@ -30,20 +30,28 @@ _COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 
 
 def read_runs(
-    estimator: Any, X: Any, y: Any, *, split: bool, outputs: bool = True, **options: Any
+    estimator: Any,
+    X: Any,
+    y: Any,
+    *,
+    split: bool,
+    outputs: bool = True,
+    cut: bool = True,
+    **options: Any,
 ) -> list[Experiment]:
     """Experiments of a table, as `read_experiments` reads them with these options.
 
     With `split` they are cut where samples are missing, if there is a `y`: a simulation
-    alone needs all inputs. Without `outputs` these may be missing, and cut nothing.
+    alone needs all inputs. Without `outputs` these may be missing, and cut nothing;
+    without `cut` nothing does.
     """
     split = split and y is not None
     allowed = "Xy" if split else "" if outputs else "y"
     found = read_experiments(estimator, X, y, allow_missing=allowed, **options)
-    if split and outputs:
-        return split_at_gaps(found)
-    if not split:
+    if not (split and cut):
         return found
+    if outputs:
+        return split_at_gaps(found)
     return [run for e in found for run in complete_runs(e, 1, outputs=False)]
 
 
@@ -98,6 +106,14 @@ def complete_runs(
         for start, stop in pairwise(cuts)
         if complete[start] and stop - start >= shortest
     ]
+
+
+def unbroken_runs(experiment: Experiment) -> list[Experiment]:
+    """The parts between holes in time; values may be missing in them."""
+    if not experiment.breaks:
+        return [experiment]
+    edges = [0, *experiment.breaks, len(experiment.rows)]
+    return [_rows(experiment, slice(*part)) for part in pairwise(edges)]
 
 
 def _rows(experiment: Experiment, part: slice) -> Experiment:

@@ -225,7 +225,12 @@ class ErrorDisplay:
                 f"{model}."
             )
         compared = StateSpace(
-            model.A, model.B, model.C, model.D - dropped, model.sampling_time
+            model.A,
+            model.B,
+            model.C,
+            model.D - dropped,
+            model.sampling_time,
+            model.input_delay,
         )
         if isinstance(start, str):
             if start != "auto":
@@ -237,6 +242,7 @@ class ErrorDisplay:
         before = start
         if before is not None and not isinstance(before, StateSpace):
             before = restructurer.structure_.model(start, model.sampling_time)
+            before = before.with_input_delay(model.input_delay)
         return cls.from_models(
             restructurer.lti_,
             compared,

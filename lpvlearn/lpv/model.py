@@ -16,15 +16,16 @@ from ..exceptions import (
     finite_simulation,
     warn,
 )
-from ..models.statespace import StateSpace, sorted_poles
+from ..models.statespace import StateSpace, sorted_poles, split_delay
 from ..models.system_matrix import blocks
 from ..structures.map import numerical_jacobian
 from ..structures.structure import GrayBoxStructure
 from ..systems.sampling import sample_zoh
-from ..systems.simulation import state_trajectory
+from ..systems.simulation import delayed, state_trajectory
 from ..systems.tabulation import tabulate
 from ..validation import (
     finite_samples,
+    input_delays,
     matrix,
     positive_time,
     real_array,
@@ -46,7 +47,8 @@ class LPVStateSpace:
     """A continuous-time state-space model scheduled by measured variables, Eq. (1).
 
     ``dx/dt = A(kappa) x + B(kappa) u``, ``y = C(kappa) x + D(kappa) u`` with static
-    dependence on the scheduling variables kappa.
+    dependence on the scheduling variables kappa, which act at once; an input may act
+    late, ``u_j(t - input_delay[j])`` in the place of ``u_j(t)``.
 
     Parameters
     ----------
@@ -66,6 +68,8 @@ class LPVStateSpace:
         interpolator.
     bases : tuple of callables or arrays of shape (order, order), default=()
         Changes of the structure's state basis, see :meth:`change_basis`.
+    input_delay : float or array-like of shape (n_inputs,), default=0
+        Seconds, whole samples of every simulation. As attribute, an array.
 
     Attributes
     ----------
@@ -76,7 +80,7 @@ class LPVStateSpace:
     ------
     ValueError
         If `scheduling_range` is not two rows of finite numbers, the first not above
-        the second.
+        the second, or a delay is negative.
 
     Examples
     --------
@@ -122,6 +126,7 @@ class LPVStateSpace:
     scheduling_names: Sequence[Hashable] | None = None
     identified_range: ArrayLike | None = None
     bases: tuple[_Basis, ...] = ()
+    input_delay: Any = 0
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -155,11 +160,15 @@ class LPVStateSpace:
             )
         for name in ("order", "n_inputs", "n_outputs"):
             object.__setattr__(self, name, getattr(self.structure, name))
+        delay = input_delays(self.input_delay, self.n_inputs, samples=False)
+        object.__setattr__(self, "input_delay", delay)
 
     def __repr__(self) -> str:
+        each = ", ".join(f"{d:g}" for d in self.input_delay)
         return (
             f"LPVStateSpace(order={self.order}, n_inputs={self.n_inputs}, "
-            f"n_outputs={self.n_outputs}, n_scheduling={self.n_scheduling})"
+            f"n_outputs={self.n_outputs}, n_scheduling={self.n_scheduling}"
+            f"{f', input_delay=[{each}] s' if self.input_delay.any() else ''})"
         )
 
     def parameters(self, kappa: ArrayLike) -> Array:
@@ -226,6 +235,7 @@ class LPVStateSpace:
 
     def _at(self, place: Array, rate: Any = None) -> StateSpace:
         model = self.structure.model(self.parameters(place[None])[0])
+        model = model.with_input_delay(self.input_delay)
         if not self.bases:
             return model
         T = self._basis_at(place)
@@ -235,7 +245,8 @@ class LPVStateSpace:
         speed = self._place(rate)
         slopes = numerical_jacobian(self._basis_at, place, self.scheduling_range[1])
         term = np.tensordot(speed, slopes, 1) @ np.linalg.inv(T)
-        return StateSpace(model.A + term, model.B, model.C, model.D)
+        A, delay = model.A + term, self.input_delay
+        return StateSpace(A, model.B, model.C, model.D, input_delay=delay)
 
     def change_basis(self, T: _Basis) -> LPVStateSpace:
         """The same system in the state ``z = T(kappa) x``.
@@ -314,7 +325,8 @@ class LPVStateSpace:
         sampling_time : float
             Seconds.
         initial_state : array-like of shape (order,), default=None
-            None is rest.
+            None is rest. The inputs before the first sample are zero; those in transit
+            may follow the state, as `StateSpace.estimate_initial_state` has them.
 
         Returns
         -------
@@ -323,8 +335,8 @@ class LPVStateSpace:
         Raises
         ------
         ValueError
-            If shapes do not fit, a value is not finite, or the structure gives no
-            finite matrices at a scheduling value.
+            If shapes do not fit, a value is not finite, a delay is no whole number of
+            samples, or the structure gives no finite matrices at a scheduling value.
         DivergenceError
             If the outputs overflow; the first sample and value are told.
 
@@ -334,16 +346,17 @@ class LPVStateSpace:
             Outside of `identified_range`.
         """
         u = finite_samples("u", u, self.n_inputs)
-        x = np.zeros(self.order)
-        if initial_state is not None:
-            x = state_vector(initial_state, self.order)
+        delay, n = self._samples_of_delay(sampling_time), self.order
+        x = np.zeros(n) if initial_state is None else initial_state
+        x, before = np.split(state_vector(x, n, int(delay.sum())), [n])
+        late = delayed(u, delay, before)[:, :, None]
         kappa = self._scheduling(scheduling)
         if self.bases and len(kappa):
             x[:] = np.linalg.solve(self._basis_at(kappa[0]), x)
-        return self._response(u[:, :, None], kappa, sampling_time, x[:, None])[:, :, 0]
+        return self._response(late, kappa, sampling_time, x[:, None])[:, :, 0]
 
     def free_responses(self, scheduling: ArrayLike, sampling_time: float) -> Array:
-        """Outputs that each unit initial state causes without input.
+        """Outputs that each unit initial state, and input in transit, causes.
 
         Parameters
         ----------
@@ -353,19 +366,37 @@ class LPVStateSpace:
 
         Returns
         -------
-        ndarray of shape (n_samples, n_outputs, order)
-            ``y = free_responses @ x0`` for ``u = 0``: regressors of an initial state.
+        ndarray of shape (n_samples, n_outputs, order + n_in_transit)
+            ``y = free_responses @ x0`` for ``u = 0``: regressors of an initial state,
+            with one entry for each sample of delay after it.
 
         Raises
         ------
         ValueError
             As `simulate`.
         """
-        kappa = self._scheduling(scheduling)
-        none, x = np.zeros((len(kappa), 0, self.order)), np.eye(self.order)
+        kappa, n = self._scheduling(scheduling), self.order
+        delay = self._samples_of_delay(sampling_time)
+        unit = np.eye(n + delay.sum())
+        n_driving = self.n_inputs if delay.any() else 0
+        x: Array = unit[:n]
         if self.bases and len(kappa):
-            x[:] = np.linalg.inv(self._basis_at(kappa[0]))
-        return self._response(none, kappa, sampling_time, x)
+            x = np.linalg.inv(self._basis_at(kappa[0])) @ x
+        none = np.zeros((len(kappa), n_driving, len(unit)))
+        late = delayed(none, delay, unit[n:])
+        return self._response(late, kappa, sampling_time, x)
+
+    def _samples_of_delay(self, sampling_time: float) -> NDArray[np.intp]:
+        """Delays in samples, which they must be a whole number of."""
+        dt = positive_time("sampling_time", sampling_time)
+        whole, rest = split_delay(self.input_delay, dt)
+        if rest.any():
+            raise ValueError(
+                "`sampling_time` must divide the input delay of "
+                f"{self.input_delay.tolist()} s. Got {dt:g} s. Resample the record, or "
+                "round the delay: dataclasses.replace(model, input_delay=...)."
+            )
+        return whole
 
     def silenced(self) -> LPVStateSpace:
         """The model that extrapolates without a warning."""

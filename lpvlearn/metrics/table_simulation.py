@@ -21,10 +21,12 @@ from ..data.timestamps import TIME_TOL
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..systems.simulation import (
+    delayed,
     estimate_initial_state,
     free_responses,
     state_trajectory,
     trend_signals,
+    with_transit,
 )
 from .scores import bft_score
 
@@ -50,7 +52,7 @@ def fit_of(
         inputs = [e.inputs for e in part]
         if all(np.array_equal(u, inputs[0]) for u in inputs[1:]):
             inputs = inputs[:1]
-        u = np.stack(inputs, axis=-1)
+        u = delayed(np.stack(inputs, axis=-1), sampled.input_delay)
         y = np.stack([_outputs(e, model.n_outputs) for e in part], axis=-1)
         x = state_trajectory(
             sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
@@ -59,6 +61,7 @@ def fit_of(
         free = free_responses(
             sampled.A, sampled.C, length, trend_signals(length, n_trend)
         )
+        free = with_transit(free, sampled.B, sampled.D, sampled.input_delay)
         found = forced + free @ estimate_initial_state(free, y - forced)
         true.append(np.moveaxis(y, -1, 0).reshape(-1, model.n_outputs))
         simulated.append(np.moveaxis(found, -1, 0).reshape(-1, model.n_outputs))

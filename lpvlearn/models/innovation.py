@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 
 from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import (
+    delayed,
     estimate_initial_state,
     free_responses,
     state_trajectory,
@@ -167,6 +168,7 @@ class InnovationModel:
     ) -> Array:
         """By the predictor of all states, which is stable where the plant is not."""
         u = finite_samples("u", u, self.lti.n_inputs)
+        u = delayed(u, self.lti.input_delay)
         y = np.asarray(y, dtype=float).reshape(len(u), -1)
         A, B, C, D = self.A, self.B, self.C, self.D
         gains, known = self._filter_gains(y)

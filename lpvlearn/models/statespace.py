@@ -12,15 +12,18 @@ from ..exceptions import finite_simulation, warn
 from ..systems.balancing import align_signs, balancing_transformation
 from ..systems.hinf_norm import hinf_norm
 from ..systems.response import frequency_response
-from ..systems.sampling import c2d_tustin, d2c_tustin, d2c_zoh, sample_zoh
+from ..systems.sampling import c2d_tustin, d2c_tustin, d2c_zoh, sample_zoh_late
 from ..systems.simulation import (
+    delayed,
     estimate_initial_state,
     free_responses,
     lti_response,
+    with_transit,
 )
 from ..validation import (
     finite_samples,
     frequencies,
+    input_delays,
     matrix,
     one_of,
     positive_time,
@@ -45,7 +48,8 @@ class StateSpace:
     """A linear time-invariant model in state-space form.
 
     Continuous time, ``dx/dt = A x + B u, y = C x + D u``, or discrete time,
-    ``x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k]``.
+    ``x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k]``; every input may act late,
+    ``u_j(t - input_delay[j])`` in the place of ``u_j(t)``.
 
     Parameters
     ----------
@@ -58,6 +62,9 @@ class StateSpace:
         Seconds between samples; None is continuous time. True is discrete time with a
         step that is not known: time is counted in samples, frequencies in radians per
         sample, and there is no way to continuous time.
+    input_delay : number or array-like of shape (n_inputs,), default=0
+        Delay of the inputs, beyond what the matrices make: samples in discrete time,
+        seconds in continuous time. As attribute, an array with one of each input.
 
     Attributes
     ----------
@@ -67,12 +74,17 @@ class StateSpace:
     Raises
     ------
     ValueError
-        If the shapes do not fit together, or an entry is not a finite real number.
+        If the shapes do not fit together, an entry is not a finite real number, or a
+        delay is negative or, in discrete time, not a whole number.
 
     Notes
     -----
     A pure gain has order 0: ``StateSpace([], [], [], D)``. The arrays of a model are
     read-only; a change makes a new model.
+
+    A delay stands beside the matrices. It is in the responses of a model, and does
+    nothing to its poles and norms, nor to Hankel singular values and balancing, which
+    are those of the matrices. `absorb_delay` makes states of it.
 
     Examples
     --------
@@ -89,6 +101,7 @@ class StateSpace:
     C: Array
     D: Array
     sampling_time: float | None
+    input_delay: NDArray[Any]
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -100,6 +113,7 @@ class StateSpace:
         C: ArrayLike,
         D: ArrayLike | None = None,
         sampling_time: float | None = None,
+        input_delay: ArrayLike = 0,
     ) -> None:
         A, B, C = matrix("A", A), matrix("B", B), matrix("C", C)
         n = len(A)
@@ -132,18 +146,23 @@ class StateSpace:
         dt = sampling_time
         if dt is not None and dt is not True:
             dt = positive_time("sampling_time", dt)
-        names = ("sampling_time", "order", "n_outputs", "n_inputs")
-        for name, number in zip(names, (dt, n, *shape), strict=True):
+        delay = input_delays(input_delay, shape[1], samples=dt is not None)
+        names = ("sampling_time", "input_delay", "order", "n_outputs", "n_inputs")
+        for name, number in zip(names, (dt, delay, n, *shape), strict=True):
             object.__setattr__(self, name, number)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles are built anew, so that their arrays are read-only too.
-        return type(self), (self.A, self.B, self.C, self.D, self.sampling_time)
+        matrices = self.A, self.B, self.C, self.D
+        return type(self), (*matrices, self.sampling_time, self.input_delay)
 
     def __repr__(self) -> str:
         dt = self.sampling_time
         named = {None: "continuous time", True: "time in samples"}
         time = f"sampling_time={dt:g}" if isinstance(dt, float) else named[dt]
+        if self.input_delay.any():
+            each = ", ".join(f"{d:g}" for d in self.input_delay)
+            time += f", input_delay=[{each}]{' s' if dt is None else ''}"
         return (
             f"{type(self).__name__}(order={self.order}, n_inputs={self.n_inputs}, "
             f"n_outputs={self.n_outputs}, {time})"
@@ -176,6 +195,8 @@ class StateSpace:
     def frequency_response(self, omega: ArrayLike) -> NDArray[np.complex128]:
         """Response ``C (s I - A)^-1 B + D`` on the imaginary axis or unit circle.
 
+        An input with a delay d turns its column by ``exp(-j omega d)``.
+
         Parameters
         ----------
         omega : array-like of shape (n_freq,)
@@ -184,7 +205,8 @@ class StateSpace:
         Returns
         -------
         ndarray of shape (n_freq, n_outputs, n_inputs)
-            Infinite at a pole.
+            Infinite at a pole. At infinite frequency without the turn of a delay, which
+            has no limit there.
 
         Raises
         ------
@@ -198,7 +220,12 @@ class StateSpace:
         array([1. +0.j , 0.5-0.5j])
         """
         omega, dt = frequencies(omega), self.sampling_time
-        return frequency_response(self.A, self.B, self.C, self.D, omega, dt=dt)
+        G = frequency_response(self.A, self.B, self.C, self.D, omega, dt=dt)
+        if self.input_delay.any():
+            turn = np.where(np.isfinite(omega), omega, 0.0)[:, None, None]
+            late = np.exp(-1j * turn * self.input_delay * (dt or 1.0))
+            np.multiply(G, late, out=G, where=np.isfinite(G))
+        return G
 
     def dc_gain(self) -> Array:
         """Gain at zero frequency, shape (n_outputs, n_inputs); infinite at a pole.
@@ -214,7 +241,7 @@ class StateSpace:
         """H-infinity norm: the largest singular value over all frequencies.
 
         Infinite for an unstable model. Computed from Hamiltonian eigenvalues (level
-        sets), Eq. (15)-(17), to a relative accuracy of 1e-10.
+        sets), Eq. (15)-(17), to a relative accuracy of 1e-10. Delays do not change it.
 
         Examples
         --------
@@ -240,7 +267,9 @@ class StateSpace:
             Seconds between the samples of `u`; needed by a continuous-time model, whose
             input is held between samples (zero-order hold, exact).
         initial_state : array-like of shape (order,), default=None
-            None is rest.
+            None is rest. The inputs before the first sample are zero; of a
+            discrete-time model those in transit may follow the state, as
+            `estimate_initial_state` returns them.
 
         Returns
         -------
@@ -260,19 +289,24 @@ class StateSpace:
         array([0. , 1. , 1.5])
         """
         u = finite_samples("u", u, self.n_inputs)
-        x0 = None if initial_state is None else state_vector(initial_state, self.order)
-        A, B, dt = self.A, self.B, self.sampling_time
+        model, dt = self, self.sampling_time
         if dt is None or sampling_time is not None:
             held = positive_time("sampling_time", sampling_time)
             if dt is None:
-                A, B = sample_zoh(A, B, held)
+                model = self.to_discrete(held)
             elif not _same_time(held, dt):
                 raise ValueError(
                     f"`sampling_time` must be {dt} s, the model's own. "
                     f"Got {sampling_time}. Convert with to_continuous() first."
                 )
+        n, delay = model.order, model.input_delay
+        x0 = before = None
+        if initial_state is not None:
+            n_more = n - self.order + int(delay.sum())
+            x0, before = np.split(state_vector(initial_state, self.order, n_more), [n])
+        u = delayed(u, delay, before)
         with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
-            y = lti_response(A, B, self.C, self.D, u, x0)
+            y = lti_response(model.A, model.B, model.C, model.D, u, x0)
         return finite_simulation(y, self._why_it_diverges)
 
     def _why_it_diverges(self) -> str:
@@ -289,7 +323,8 @@ class StateSpace:
         """Initial state of a discrete-time model with which it fits a record best.
 
         The least-squares solution over all samples; of minimum norm where the record
-        does not determine it.
+        does not determine it. With delays the inputs in transit, sent before the record
+        began, are estimated as well.
 
         Parameters
         ----------
@@ -299,8 +334,10 @@ class StateSpace:
 
         Returns
         -------
-        ndarray of shape (order,)
-            To be given to `simulate` as `initial_state`.
+        ndarray of shape (order + sum(input_delay),)
+            To be given to `simulate` as `initial_state`: the state, then for one input
+            after another those that arrive with sample 0, 1, ...; it is the state of
+            the model that `absorb_delay` returns.
 
         Raises
         ------
@@ -333,8 +370,68 @@ class StateSpace:
         error = y - self.simulate(u)
         with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
             free = free_responses(self.A, self.C, len(y))
+            free = with_transit(free, self.B, self.D, self.input_delay)
         finite_simulation(free, self._why_it_diverges)
         return estimate_initial_state(free, error)
+
+    def with_input_delay(self, input_delay: ArrayLike) -> StateSpace:
+        """The model with other delays: `input_delay` as of the class, 0 for none.
+
+        Examples
+        --------
+        >>> late = StateSpace(0.5, 1, 1, sampling_time=1.0).with_input_delay(2)
+        >>> late.simulate([1, 1, 1, 1]).ravel()
+        array([0., 0., 0., 1.])
+        """
+        dt = self.sampling_time
+        return StateSpace(self.A, self.B, self.C, self.D, dt, input_delay)
+
+    def absorb_delay(self) -> StateSpace:
+        """The same discrete-time model with its delays as states, poles at the origin.
+
+        Returns
+        -------
+        StateSpace
+            Of order ``order + sum(input_delay)``: the states, then for one input after
+            another the values in transit, the next to arrive first.
+
+        Raises
+        ------
+        ValueError
+            If the model is in continuous time: a delay there is no finite number of
+            states.
+
+        Examples
+        --------
+        >>> late = StateSpace(0.5, 1, 1, sampling_time=1.0, input_delay=2)
+        >>> late.absorb_delay()
+        StateSpace(order=3, n_inputs=1, n_outputs=1, sampling_time=1)
+        """
+        if not self.input_delay.any():
+            return self
+        if self.is_continuous:
+            raise ValueError(
+                "`absorb_delay` needs a discrete-time model: no finite number of "
+                f"states is a delay in continuous time. Got {self}. Sample it with "
+                "to_discrete(sampling_time) first, or leave the delay out by "
+                "with_input_delay(0)."
+            )
+        n, delay = self.order, self.input_delay
+        size = n + int(delay.sum())
+        A, B = np.zeros((size, size)), np.zeros((size, self.n_inputs))
+        C, D = np.zeros((self.n_outputs, size)), self.D.copy()
+        A[:n, :n], B[:n], C[:, :n] = self.A, self.B, self.C
+        first = n
+        for j, d in enumerate(delay):
+            if d == 0:
+                continue
+            last = first + d
+            A[:n, first], C[:, first] = self.B[:, j], self.D[:, j]
+            A[first : last - 1, first + 1 : last] = np.eye(d - 1)
+            B[:, j], D[:, j] = 0.0, 0.0
+            B[last - 1, j] = 1.0
+            first = last
+        return StateSpace(A, B, C, D, self.sampling_time)
 
     def transform(self, T: ArrayLike) -> StateSpace:
         """Change the state basis: ``(T A T^-1, T B, C T^-1, D)``.
@@ -364,7 +461,8 @@ class StateSpace:
         if self.order and not np.linalg.cond(scaled) < _SINGULAR:
             raise ValueError("`T` must be invertible. Got a singular matrix.")
         A, C = (np.linalg.solve(T.T, M.T).T for M in (T @ self.A, self.C))
-        return StateSpace(A, T @ self.B, C, self.D, self.sampling_time)
+        dt = self.sampling_time
+        return StateSpace(A, T @ self.B, C, self.D, dt, self.input_delay)
 
     def __sub__(self, other: StateSpace) -> StateSpace:
         """The error system ``G - G_other``, whose norms are distances (Eq. (8))."""
@@ -377,11 +475,19 @@ class StateSpace:
                 f"time. Got {self} and {other}."
             )
         dt = other.sampling_time if self.sampling_time is True else self.sampling_time
+        delay = self.input_delay
+        if not np.allclose(other.input_delay, delay, rtol=_SAME_TIME, atol=0.0):
+            raise ValueError(
+                "models to subtract must have the same `input_delay`: their difference "
+                f"is no state-space model otherwise. Got {self} and {other}. Make "
+                "states of the delays of discrete-time models by absorb_delay(), or "
+                "compare what is left of them by with_input_delay(0)."
+            )
         n, k = self.order, other.order
         A = np.zeros((n + k, n + k))
         A[:n, :n], A[n:, n:] = self.A, other.A
         B, C = np.vstack([self.B, other.B]), np.hstack([self.C, -other.C])
-        return StateSpace(A, B, C, self.D - other.D, dt)
+        return StateSpace(A, B, C, self.D - other.D, dt, delay)
 
     def hankel_singular_values(self) -> Array:
         """Hankel singular values of a stable model, descending, shape (order,).
@@ -420,7 +526,7 @@ class StateSpace:
         A, B, C = left @ self.A @ right, left @ self.B, self.C @ right
         signs = np.where(B.sum(1) < 0, -1.0, 1.0)
         A, B, C = signs[:, None] * A * signs, signs[:, None] * B, C * signs
-        return StateSpace(A, B, C, self.D, self.sampling_time)
+        return StateSpace(A, B, C, self.D, self.sampling_time, self.input_delay)
 
     def _balancing(self, what: str) -> tuple[Array, Array, Array]:
         """Hankel singular values and projections of a stable model, for `what`."""
@@ -443,13 +549,14 @@ class StateSpace:
             Seconds.
         method : {"zoh", "tustin"}, default="zoh"
             Zero-order hold is exact for inputs held between samples; Tustin is the
-            bilinear approximation.
+            bilinear approximation. A delay that is no whole number of samples stays
+            exact with "zoh" by one state more for its input.
 
         Raises
         ------
         ValueError
-            If the model is discrete, a pole is at 2 / sampling_time for "tustin", or
-            the sampled model overflows.
+            If the model is discrete, a pole is at 2 / sampling_time or a delay no whole
+            number of samples for "tustin", or the sampled model overflows.
 
         Examples
         --------
@@ -463,10 +570,16 @@ class StateSpace:
             )
         dt = positive_time("sampling_time", sampling_time)
         one_of("method", method, _METHODS)
+        delay, late = split_delay(self.input_delay, dt)
+        matrices = self.A, self.B, self.C, self.D
         if method == "zoh":
-            A, B = sample_zoh(self.A, self.B, dt)
-            return StateSpace(A, B, self.C, self.D, dt)
-        return StateSpace(*c2d_tustin(self.A, self.B, self.C, self.D, dt), dt)
+            return StateSpace(*sample_zoh_late(*matrices, dt, late), dt, delay)
+        if late.any():
+            raise ValueError(
+                "`method='tustin'` needs delays that are whole numbers of samples of "
+                f"{dt:g} s. Got {self}. Use `method='zoh'`, which is exact."
+            )
+        return StateSpace(*c2d_tustin(*matrices, dt), dt, delay)
 
     def to_continuous(self, method: str = "zoh") -> StateSpace:
         """Convert a discrete-time model to continuous time.
@@ -504,7 +617,8 @@ class StateSpace:
                 "`sampling_time=` (seconds; 1 where a sample is the unit of time)."
             )
         if method == "tustin":
-            return StateSpace(*d2c_tustin(self.A, self.B, self.C, self.D, dt))
+            matrices = d2c_tustin(self.A, self.B, self.C, self.D, dt)
+            return StateSpace(*matrices, input_delay=dt * self.input_delay)
         A, B, C, doubled = d2c_zoh(self.A, self.B, self.C, dt)
         if len(doubled):
             warn(
@@ -514,10 +628,23 @@ class StateSpace:
                 "grows by one. A shorter sampling time or a lower order avoids it.",
                 RuntimeWarning,
             )
-        return StateSpace(A, B, C, self.D)
+        return StateSpace(A, B, C, self.D, input_delay=dt * self.input_delay)
 
     def to_control(self) -> Any:
-        """The model as a ``control.StateSpace`` (needs python-control)."""
+        """The model as a ``control.StateSpace`` (needs python-control).
+
+        Raises
+        ------
+        ValueError
+            If the model has a delay, which python-control does not know.
+        """
+        if self.input_delay.any():
+            raise ValueError(
+                "`to_control` needs a model without delay, which python-control does "
+                f"not know. Got {self}. Make states of it by absorb_delay() (in "
+                "continuous time after to_discrete(sampling_time)), or leave it out by "
+                "with_input_delay(0)."
+            )
         import control
 
         dt = 0 if self.is_continuous else self.sampling_time
@@ -557,7 +684,22 @@ DEVIATION = 1e-2
 def with_signs_of(reference: StateSpace, model: StateSpace) -> StateSpace:
     """A balanced model with the signs of its states turned to those of another."""
     s = align_signs(model.B, model.C, reference.B, reference.C)[:, None]
-    return StateSpace(s * model.A * s.T, s * model.B, model.C * s.T, model.D)
+    return StateSpace(
+        s * model.A * s.T,
+        s * model.B,
+        model.C * s.T,
+        model.D,
+        input_delay=model.input_delay,
+    )
+
+
+def split_delay(seconds: Array, dt: float) -> tuple[NDArray[np.intp], Array]:
+    """Delays as whole samples, and the share of another one that is left of each."""
+    samples = seconds / dt
+    whole = np.round(samples)
+    near = np.abs(samples - whole) <= _SAME_TIME * np.maximum(whole, 1.0)
+    whole = np.where(near, whole, np.floor(samples))
+    return whole.astype(np.intp), np.where(near, 0.0, samples - whole)
 
 
 def sorted_poles(A: Array) -> NDArray[np.complex128]:

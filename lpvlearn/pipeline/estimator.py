@@ -42,7 +42,7 @@ from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
-from .points import PointRunner, identify_points, restructure_points
+from .points import PointRunner, common_delay, identify_points, restructure_points
 from .reports import Tables, summarise, tables
 
 Array = NDArray[np.float64]
@@ -181,7 +181,8 @@ list, default=None
         remains, stationarity; with `efficient`, the error of the H-infinity optimum
         ("relative_hinf_error"; floor, remainder and stationarity are its own), and
         "chi2", "degrees_of_freedom" and "p_value" of the gray-box model's distance in
-        standard deviations of the black box; the distance from the gray-box
+        standard deviations of the black box; the delays of the inputs in samples
+        ("delay_"), where there are any; the distance from the gray-box
         model to the interpolated one (H-infinity norm, relative), and the FIT (percent,
         Eq. (36)) of its parameters; the parameters ("param_"), and their standard
         deviations ("std_") where known.
@@ -299,6 +300,13 @@ list, default=None
         ValueError
             If a role names no column, an experiment is not local, or a step fails at
             an operating point (which the message names).
+
+        Warns
+        -----
+        UserWarning
+            If the delays of the inputs (``local=SubspaceLTI(input_delay=...)``) differ
+            between operating points: `lpv_` has their median, the models of the points
+            their own. The warnings of the steps name the point.
         """
         self._check_options()
         steps = {"local": self.local, "restructurer": self.restructurer}
@@ -355,6 +363,7 @@ list, default=None
                 span,
                 scheduling_names=self.scheduling_names_ or None,
                 identified_range=self.scheduling_range_,
+                input_delay=common_delay(found.local, kappa, self.sampling_time_),
             )
             self.parameters_covariance_ = found.covariance
             report = tables(found, self.lpv_, self.sampling_time_)

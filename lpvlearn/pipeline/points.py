@@ -147,7 +147,7 @@ def identify_point(
     if _from_closed_loop(fitted):
         advice = _HELD + advice
     chosen = clone(local)
-    for name in ("order", "horizon", "method"):
+    for name in ("order", "horizon", "method", "input_delay"):
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
     models, failures, n_trend = [], [], 0
@@ -249,7 +249,8 @@ def _column_names(inputs: Sequence[Hashable], n_inputs: int) -> list[str]:
 def _average(models: Sequence[StateSpace]) -> StateSpace:
     """Average balanced models of one order, state signs aligned to the first."""
     aligned = [with_signs_of(models[0], model) for model in models]
-    return StateSpace(*(np.mean([getattr(m, M) for m in aligned], 0) for M in "ABCD"))
+    A, B, C, D = (np.mean([getattr(m, M) for m in aligned], axis=0) for M in "ABCD")
+    return StateSpace(A, B, C, D, input_delay=models[0].input_delay)
 
 
 def _bare(experiment: Experiment) -> Experiment:
@@ -309,6 +310,31 @@ def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpa
     return lti.balance()
 
 
+def common_delay(
+    local: Sequence[LocalModel], kappa: Array, sampling_time: float
+) -> Array:
+    """Delay of the inputs, seconds, of all operating points: their lower median.
+
+    Warns where they do not agree.
+    """
+    delays = np.array([model.lti.input_delay for model in local])
+    median = np.sort(delays, axis=0)[(len(delays) - 1) // 2]
+    samples = np.round(delays / sampling_time).astype(int)
+    if (samples != samples[0]).any():
+        each = "; ".join(
+            f"{_label(row)}: {', '.join(map(str, own))}"
+            for row, own in zip(kappa, samples.tolist(), strict=True)
+        )
+        taken = ", ".join(map(str, np.round(median / sampling_time).astype(int)))
+        warn(
+            "the input delay differs between operating points (scheduling: samples of "
+            f"each input; {each}). The LPV model takes the median, {taken}; the local "
+            "models keep their own. Where the system has one delay, give it: "
+            "local=SubspaceLTI(input_delay=...)."
+        )
+    return median
+
+
 def _horizon(fitted: Any) -> int | None:
     horizon = getattr(fitted, "horizon_", None)
     return None if horizon is None else int(horizon)
@@ -346,7 +372,10 @@ def restructure_points(
         ]
         kappa = points.kappa if restructurer == "aligned" else None
         structure, theta = balanced_entries(models, kappa)
-        balanced = [structure.model(row) for row in theta]
+        balanced = [
+            structure.model(row).with_input_delay(model.input_delay)
+            for row, model in zip(theta, models, strict=True)
+        ]
         unknown = _unknown_covariance(theta)
         return StructuredModels(points, local, structure, theta, unknown, balanced, [])
     restructurer = _with_structure(restructurer, local)
@@ -515,11 +544,11 @@ def covariance_of_parameters(
     `frequency_weight` of `GrayBoxRestructurer`.
     """
     problem = problem_from_models(structure, [model], weight)
-    changes = [
-        above.frequency_response(problem.omega)
-        - below.frequency_response(problem.omega)
-        for above, below in deviated
-    ]
+
+    def response(of: StateSpace) -> NDArray[np.complex128]:
+        return of.with_input_delay(0).frequency_response(problem.omega)
+
+    changes = [response(above) - response(below) for above, below in deviated]
     T = problem.parameter_changes(theta, np.array(changes)) / (2.0 * DEVIATION)
     return T.T @ T
 
@@ -527,7 +556,7 @@ def covariance_of_parameters(
 def _plain(model: StateSpace) -> StateSpace:
     """The model with matrices laid out as a memory returns them, to be found there."""
     A, B, C, D = (np.array(M, order="C") for M in (model.A, model.B, model.C, model.D))
-    return StateSpace(A, B, C, D, model.sampling_time)
+    return StateSpace(A, B, C, D, model.sampling_time, model.input_delay.copy())
 
 
 def balanced_entries(
@@ -740,5 +769,8 @@ def _tell(found: Sequence[Done | None], kappa: Array) -> None:
 
 
 def _place(number: int, kappa: Array) -> str:
-    values = ", ".join(f"{value:.4g}" for value in kappa[number])
-    return f"operating point {number} (scheduling {values})"
+    return f"operating point {number} (scheduling {_label(kappa[number])})"
+
+
+def _label(kappa: Array) -> str:
+    return ", ".join(f"{value:.4g}" for value in kappa)

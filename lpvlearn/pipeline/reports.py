@@ -40,6 +40,7 @@ def tables(found: StructuredModels, lpv: LPVStateSpace, sampling_time: float) ->
     interpolated = lpv.parameters(points.kappa)
     deviations = pd.DataFrame(spread, index, list(names))
 
+    delayed = any(model.lti.input_delay.any() for model in found.local)
     rows = []
     for k, (group, model, gray_box) in enumerate(
         zip(points.experiments, found.local, found.models, strict=True)
@@ -55,7 +56,12 @@ def tables(found: StructuredModels, lpv: LPVStateSpace, sampling_time: float) ->
             structured = fit_of(gray_box, group, sampling_time, model.n_trend)
             row["structured_BFT"] = structured
             row |= _restructuring(found.restructurers[k])
-        distance = (gray_box - found.structure.model(interpolated[k])).hinf_norm()
+        if delayed:
+            samples = np.round(model.lti.input_delay / sampling_time).astype(int)
+            inputs = group[0].input_names
+            row |= {f"delay_{u}": d for u, d in zip(inputs, samples, strict=True)}
+        met = found.structure.model(interpolated[k])
+        distance = (gray_box.with_input_delay(0) - met).hinf_norm()
         size = gray_box.hinf_norm()
         row["interpolation_error"] = distance / size if size > 0 else np.nan
         row["interpolation_FIT"] = parameter_fit(theta[k], interpolated[k])
@@ -139,6 +145,9 @@ def summarise(
         "",
         f"Local models: {local}, simulation fit (BFT) {_span(report['local_BFT'])} %",
     ]
+    if lpv.input_delay.any():
+        samples = np.round(lpv.input_delay / sampling_time).astype(int)
+        lines.insert(2, f"Input delay: {', '.join(map(str, samples))} sample(s)")
     hidden = ["param_", "std_", "n_", "stationarity", "horizon", "order"]
     hidden += ["relative_hinf_error", "chi2", "degrees_of_freedom"]
     restructured = "structured_BFT" in report

@@ -222,7 +222,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         model : StateSpace or sequence of StateSpace
             Stable; its time domain (continuous, or discrete with its sampling time) is
             that of the gray-box model. Several models of one operating point are
-            matched together: the norm is that of their errors stacked.
+            matched together: the norm is that of their errors stacked. An
+            `input_delay` is left out of the comparison, and put into `lti_`.
         starts : sequence of array-like of shape (n_params,), default=()
             Further candidates, e.g. the parameters of neighbouring operating points.
         realizations : sequence of StateSpace, default=()
@@ -439,7 +440,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         """Attributes that describe the result."""
         system = problem.system
         self.structure_ = problem.structure
-        self.lti_ = self.structure_.model(self.params_, system.dt)
+        self.lti_ = problem.model(self.params_)
         peaks = system.peaks(self.params_)
         self.error_ = peaks.norm
         size = problem.reference
@@ -476,7 +477,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         if found is None:
             return
         self.params_, self.params_covariance_ = found.theta, found.covariance
-        self.lti_ = self.structure_.model(self.params_, dt)
+        self.lti_ = problem.model(self.params_)
         self.error_ = problem.system.peaks(self.params_).norm
         self.relative_error_ = self.error_ / size if size > 0 else np.nan
         self.chi2_, self.objective_ = found.cost, np.sqrt(found.cost)

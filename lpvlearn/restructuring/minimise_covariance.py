@@ -96,16 +96,17 @@ def uncertain_response(
     """Response of a black box with its covariance, from models on either side of it.
 
     `pairs` stand along independent directions as `deviated_models` has them, in any
-    state basis; `omega` must tell models of that order apart. None where no uncertainty
-    is known, or none is left beyond rounding.
+    state basis; `omega` must tell models of that order apart. Delays are left out. None
+    where no uncertainty is known, or none is left beyond rounding.
     """
     if len(pairs) == 0:
         return None
-    G = model.frequency_response(omega)
-    changes = [
-        above.frequency_response(omega) - below.frequency_response(omega)
-        for above, below in pairs
-    ]
+
+    def response(of: StateSpace) -> Complex:
+        return of.with_input_delay(0).frequency_response(omega)
+
+    G = response(model)
+    changes = [response(above) - response(below) for above, below in pairs]
     V = np.column_stack([_parts(change) for change in changes]) / (2 * DEVIATION)
     std = np.linalg.norm(V, axis=1)
     largest = np.broadcast_to(np.abs(G).max(0), G.shape)

@@ -46,6 +46,8 @@ _LEAST_DECAY = 1e-4
 # their derivatives are exact to about 1e-13, behind resolvents less so.
 _RANK_TOLERANCE = 1e-9
 
+_SAME = 1e-6  # relative difference of delays that is rounding
+
 _NAMED = 0.1  # smaller parts of an undetermined combination would only clutter its name
 
 
@@ -61,6 +63,7 @@ class RestructuringProblem:
     reference: float  # H-infinity norm of the weighted black box
     dropped_feedthrough: Array  # (n_outputs, n_inputs)
     lower_bound: float  # no parameters have a smaller error
+    input_delay: Array  # (n_inputs,) of the black box, which no structure has
 
     @cached_property
     def response(self) -> Complex:
@@ -74,6 +77,11 @@ class RestructuringProblem:
         G = W @ self.response
         square = np.mean(np.sum(np.abs(G) ** 2, axis=(1, 2)))
         return W, G, max(float(np.sqrt(square)), 1e-300)
+
+    def model(self, theta: Array) -> StateSpace:
+        """The gray-box model of parameters, with the delay of the black box."""
+        model = self.structure.model(theta, self.system.dt)
+        return model.with_input_delay(self.input_delay)
 
     def is_stable(self, theta: Array) -> bool:
         """Whether parameters give a model that keeps the stability margin."""
@@ -163,7 +171,8 @@ class RestructuringProblem:
                 f"a spread. Got {len(models)} of "
                 f"{', '.join(sorted({type(m).__name__ for m in models}))}."
             )
-        G = np.array([model.frequency_response(self.omega) for model in models])
+        undelayed = [model.with_input_delay(0) for model in models]
+        G = np.array([model.frequency_response(self.omega) for model in undelayed])
         changes = self.parameter_changes(theta, G - G.mean(0))
         return np.cov(changes.T, ddof=1).reshape(len(theta), -1) / len(G)
 
@@ -184,7 +193,8 @@ def problem_from_models(
     """Match state-space models with the exact H-infinity norm.
 
     The feedthrough of the black boxes is left out where the structure has none,
-    as in Eq. (4). Several models are stacked.
+    as in Eq. (4), and so is their delay: it turns all errors alike and leaves norms as
+    they are. Several models are stacked.
     """
     for model in models:
         _check_model(model)
@@ -205,6 +215,11 @@ def problem_from_models(
             raise ValueError(
                 "models to be matched together must have one sampling time. Got "
                 f"{dt} and {model.sampling_time}."
+            )
+        if not np.allclose(model.input_delay, first.input_delay, rtol=_SAME, atol=0.0):
+            raise ValueError(
+                "`model` must be models of one `input_delay` to be matched together. "
+                f"Got {first} and {model}. Give them the same by with_input_delay()."
             )
     boxes = [
         Target(m.A, m.B, m.C, structure.feedthrough_of(m.D), m.sampling_time)
@@ -235,6 +250,7 @@ def problem_from_models(
         hinf_norm(*parts, dt=dt).norm,
         first.D - boxes[0].D,
         bound,
+        first.input_delay,
     )
 
 
@@ -332,6 +348,7 @@ def problem_from_response(
         float(np.linalg.norm(system.W @ system.G, 2, axis=(1, 2)).max()),
         np.zeros(G.shape[1:]),
         0.0,
+        np.zeros(structure.n_inputs),
     )
 
 
@@ -349,6 +366,11 @@ def _weight_model(
         raise ValueError(
             "`frequency_weight` must be in the time domain of the model: sampling time "
             f"{sampling_time}. Got {weight.sampling_time}."
+        )
+    if weight.input_delay.any():
+        raise ValueError(
+            f"`frequency_weight` must be without delay. Got {weight}. A delay changes "
+            "no gain: leave it out by with_input_delay(0)."
         )
     if not weight.is_stable:
         raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -21,19 +22,29 @@ from ..data.experiments import (
     read_experiments,
     read_outputs,
 )
-from ..data.preparation import DETRENDS, read_runs
+from ..data.preparation import DETRENDS, read_runs, remove_trends, split_at_gaps
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL
 from ..exceptions import warn
 from ..models.innovation import InnovationModel
-from ..models.statespace import ModelPair
+from ..models.statespace import ModelPair, StateSpace
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
     trend_signals,
+    with_transit,
 )
-from ..validation import frequencies, one_of
-from .fit import LocalFit, check_options, fit_pairs, warn_about, warn_about_horizon
+from ..validation import frequencies, input_delays, one_of
+from .delay import Delay, find_delays, with_late_inputs
+from .fit import (
+    Choices,
+    LocalFit,
+    check_options,
+    fit_pairs,
+    warn_about,
+    warn_about_horizon,
+)
+from .offsets import N_TRENDS
 from .residuals import (
     Residuals,
     check_kind,
@@ -83,6 +94,12 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         shape (n_outputs, n_inputs) single entries of D. A feedthrough in a closed loop
         can be told only where the controller needs a sample to answer: method="auto"
         takes ``D = 0`` instead of True where something acts within the sample.
+    input_delay : int, array-like of shape (n_inputs,) or "auto", default=0
+        Samples by which the inputs, or each of them, act late: ``y[t]`` depends on
+        ``u[t - input_delay]`` through D, on earlier inputs through the state. A sampled
+        system without feedthrough has a delay of 0: its first answer, a sample after
+        the input, is in the state. "auto" looks for delays of up to 30 samples, a tenth
+        of the longest experiment, and takes those that are certain.
     refine : {"auto", "simulation", "prediction", False}, default="auto"
         What is minimised after the subspace step: "simulation" the simulation error,
         "prediction" that error whitened by an autoregression of itself and weighted by
@@ -142,7 +159,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Of the estimated observability subspace, descending.
     initial_states_ : ndarray of shape (n_experiments, order_)
         Initial state of every experiment, in the order of first appearance; after
-        `partial_fit` of a long stream, of its last stretch only.
+        `partial_fit` of a long stream, of its last stretch only. With delays and
+        ``initial_state="estimate"``, that of the first sample with known inputs, number
+        ``max(input_delay_)``.
+    input_delay_ : ndarray of shape (n_inputs,)
+        Samples, as found or given; also that of `lti_`.
     selection_ : DataFrame
         What was tried: columns order, horizon, error (relative, whitened, before
         refinement), criterion (per value, above the best; NaN for horizons that
@@ -207,6 +228,15 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     the others are added in one pass, as `partial_fit` does, which refines on the
     simulation error.
 
+    With delays, what arrives in the first samples of an experiment was sent before it
+    began. These samples are left out of the fit, unless ``initial_state="rest"`` takes
+    those inputs as zero, which is what `predict` does. `predict_with_initial_state`
+    estimates them beside the state. ``input_delay="auto"`` compares models of several
+    orders and delays, with feedthrough and without, by Schwarz's criterion, with the
+    noise whitened; a delay is none where a model without it does as well with a state
+    more, or on samples held out. Where the first answers of a system are fainter than
+    the noise, its delay may come out a sample off.
+
     Data are taken for those of a closed loop where future inputs tell of the errors
     of a long regression of the outputs on the past, with a p-value below 1e-4, and
     nonlinear terms of the past do not tell more. What minimises the simulation error
@@ -252,6 +282,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         horizon: int | str = "auto",
         sampling_time: float | None = None,
         feedthrough: Any = True,
+        input_delay: Any = 0,
         refine: str | bool = "auto",
         stability: str = "warn",
         n_noise_states: int | str = "auto",
@@ -271,6 +302,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.horizon = horizon
         self.sampling_time = sampling_time
         self.feedthrough = feedthrough
+        self.input_delay = input_delay
         self.refine = refine
         self.stability = stability
         self.n_noise_states = n_noise_states
@@ -316,18 +348,21 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             lacks states, a delay or a nonlinearity.
         """
         choices = check_options(self.get_params(deep=False))
-        experiments = self._read(X, y, reset=True)
+        experiments = self._read(X, y, reset=True, cut=False)
         self.time_jitter_ = max(e.jitter for e in experiments)
+        delay = self._delay_of(experiments, choices)
+        gaps, rest = self.missing == "split", not choices.initial_states
+        experiments = with_late_inputs(experiments, delay, rest=rest, gaps=gaps)
         self._stream: SampleStream | None = None
         self._single_output = np.asarray(y).ndim == 1
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
-        gaps = self.missing == "split"
         told: set[str] = set()
+        gaps |= bool(delay.any()) and not rest
         fitted = fit_as_stream(pairs, choices, told, detrend=self.detrend, gaps=gaps)
         if fitted is None:
             names = experiments[0].input_names
             fitted = fit_pairs(pairs, choices, told, detrend=self.detrend, names=names)
-        self._take(fitted, self._step_of(experiments))
+        self._take(fitted, self._step_of(experiments), delay)
         warn_about(fitted, told)
         if choices.order is not None and choices.horizon is not None:
             warn_about_horizon(fitted, choices)
@@ -405,6 +440,12 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 "`detrend` must be None in partial_fit, which never sees a whole "
                 f"experiment. Got {self.detrend!r}. Use offset={self.detrend!r}."
             )
+        if isinstance(self.input_delay, str):
+            raise ValueError(
+                "`input_delay` must be a number in partial_fit, which keeps so many "
+                f"samples from batch to batch. Got {self.input_delay!r}. Find it by "
+                "`fit` of a first part of the record, in `input_delay_`."
+            )
         if choices.method == "pbsid":
             raise ValueError(
                 "`method` must not be 'pbsid' in partial_fit: of a stream, what it "
@@ -435,7 +476,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 stream = before.branch()
             fitted = stream.add(experiments, Table(X).one(self.time, "time"))
             if fitted is not None:
-                self._take(fitted, stream.step)
+                self._take(fitted, stream.step, stream.delay)
             self._stream = stream
         return self
 
@@ -449,9 +490,34 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self.__dict__ = before
             raise
 
-    def _take(self, fitted: LocalFit, step: float) -> None:
+    def _delay_of(self, experiments: list[Experiment], choices: Choices) -> Delay:
+        """Delays in samples, given or found."""
+        first = experiments[0]
+        n_inputs = first.inputs.shape[1]
+        if not isinstance(self.input_delay, str):
+            return input_delays(self.input_delay, n_inputs, samples=True)
+        if self.input_delay != "auto":
+            raise ValueError(
+                "`input_delay` must be 'auto' or whole numbers of samples. Got "
+                f"{self.input_delay!r}."
+            )
+        if self.missing == "split":
+            experiments = split_at_gaps(experiments)
+        pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
+        pairs = remove_trends(pairs, self.detrend)[0]
+        n_outputs = pairs[0][1].shape[1]
+        if choices.method in ("auto", "pbsid"):  # a loop leaves delays where they are
+            choices = choices._replace(method="po-moesp")
+        # A constant more than there is costs little, one less is taken for a mode.
+        n_trend = 1 if choices.offset == "auto" else N_TRENDS[choices.offset]
+        settings = choices.settings(n_outputs, n_inputs, np.eye(n_inputs), n_trend)
+        return find_delays(pairs, settings, choices.order, choices.horizon)
+
+    def _take(self, fitted: LocalFit, step: float, delay: Delay) -> None:
         """Set the fitted attributes."""
-        self.lti_ = fitted.evidence.state_space(fitted.model, step)
+        self._evidence = replace(fitted.evidence, input_delay=delay)
+        self.lti_ = self._evidence.state_space(fitted.model, step)
+        self.input_delay_ = self.lti_.input_delay
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
         self.method_ = fitted.method
@@ -461,7 +527,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.singular_values_ = fitted.singular_values
         self.residual_ = fitted.residual
         self.stability_loss_ = fitted.stability_loss
-        self._evidence, self._offsets = fitted.evidence, fitted.offsets
+        self._offsets = fitted.offsets
         self.offset_ = DETRENDS[fitted.evidence.free.n_trend]
         self.input_offset_ = fitted.offsets.inputs
         self.output_offset_ = fitted.offsets.outputs
@@ -475,7 +541,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return True if self.sampling_time is None else float(self.sampling_time)
 
     def predict(self, X: Any) -> Array:
-        """Simulate the outputs of every experiment from rest.
+        """Simulate the outputs of every experiment from rest, inputs before it zero.
 
         Parameters
         ----------
@@ -515,7 +581,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Measured outputs, used for the initial state of every experiment (and of a
             model with `offset_` for the constant and drift) only: least squares over
-            the whole experiment. Missing ones (NaN) are left out.
+            the whole experiment. Missing ones (NaN) are left out. Where inputs act
+            late, those in transit are estimated too: the first samples are then met
+            more or less exactly.
 
         Returns
         -------
@@ -643,9 +711,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         -----
         Errors that depend on *past* inputs tell of a model that lacks states, a delay
         or a nonlinearity; on the *present* input, of a lacking feedthrough; on *future*
-        inputs, of feedback, where errors of prediction are the ones to look at. The
-        errors are whitened by an autoregression before
-        they are regressed on the inputs, so that coloured noise raises no alarm.
+        inputs, of feedback, where errors of prediction are the ones to look at. An
+        input with a delay is present when it arrives. The errors are whitened by an
+        autoregression before they are regressed on the inputs, so that coloured noise
+        raises no alarm.
 
         On the samples of the fit, the errors have lost what the parameters could
         explain: sensitivities of the errors to the parameters join the regressions, and
@@ -688,16 +757,21 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """What is tested; `ResidualDisplay` draws it."""
         check_is_fitted(self, "lti_")
         check_kind(errors)
-        experiments = self._read(X, y, split=True)
+        experiments = self._read(X, y, split=True, cut=False)
         names = [] if y is None else read_outputs(y)[1]
         if y is not None and len(names) != self.n_outputs_:
             raise ValueError(
                 f"`y` must hold the {self.n_outputs_} output(s) of the model. Got "
                 f"{len(names)}."
             )
+        rest = self.initial_state == "rest"
+        experiments = with_late_inputs(
+            experiments, self.input_delay_, rest=rest, gaps=True
+        )
+        undelayed = self.lti_.with_input_delay(0)
         return model_residuals(
-            self.lti_,
-            self.predictor_ if errors == "prediction" else None,
+            undelayed,
+            self._predictor(undelayed) if errors == "prediction" else None,
             [(e.inputs, _outputs_of(e)) for e in experiments],
             self._evidence,
             names,
@@ -709,8 +783,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def predictor_(self) -> InnovationModel:
         """Innovation model: `lti_`, the noise model, K and innovation covariance."""
         check_is_fitted(self, "lti_")
+        return self._predictor(self.lti_)
+
+    def _predictor(self, lti: StateSpace) -> InnovationModel:
         n_states = None if self.n_noise_states == "auto" else int(self.n_noise_states)
-        return self._evidence.predictor(self.lti_, n_states)
+        return self._evidence.predictor(lti, n_states)
 
     @property
     def poles_std_(self) -> NDArray[np.complex128]:
@@ -857,14 +934,15 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _own_part(
         self, experiment: Experiment, predictor: InnovationModel | None = None
     ) -> tuple[Array, Array]:
-        """Initial state, and the outputs that the answer to the inputs adds to.
+        """Initial state, inputs in transit; and the outputs their answers add to.
 
-        Behind the errors of simulation, or of a predictor.
+        Behind the errors of simulation, or (without inputs in transit) of a predictor.
         """
         (u0, y0), y = self._rest(), _outputs_of(experiment)
-        trend = trend_signals(len(y), self._evidence.free.n_trend)
+        lti, trend = self.lti_, trend_signals(len(y), self._evidence.free.n_trend)
         if predictor is None:
-            responses = free_responses(self.lti_.A, self.lti_.C, len(y), trend)
+            responses = free_responses(lti.A, lti.C, len(y), trend)
+            responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
             own = estimate_initial_state(responses, y - self._simulated(experiment))
         else:
             u = experiment.inputs - u0

@@ -14,7 +14,7 @@ whole only, the correlation of the innovations completely.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,6 @@ Array = NDArray[np.float64]
 # Lags that are allowed for by the number of samples: 10 log10(n), a customary limit.
 _LAGS_PER_DECADE = 10.0
 
-_RCOND_LAGS = 1e-13  # directions of past errors that are their rounding
 _MAX_CONDITION = 1e8  # of eigenvectors, which would lose half of the spectrum's digits
 
 _ROUNDING = 1e-9  # size of an error, relative to the output, that is not noise
@@ -58,7 +57,6 @@ class Whitening(NamedTuple):
 
     filter: Array  # (n_lags + 1,), the first is 1
     weight: Array  # (n_outputs, n_outputs), of determinant 1
-    colour: float = 1.0  # largest spectral density of what is left, by its mean
 
     @classmethod
     def none(cls, n_outputs: int) -> Whitening:
@@ -92,8 +90,7 @@ class Whitening(NamedTuple):
             model = autoregression(channels, highest=middle // _LEAST_LEFT)
             coefficients = np.concatenate([coefficients, -model.C[0]])
         whitened = cls(coefficients, np.eye(len(size)))._filtered(errors)
-        weight = _weight(np.vstack(whitened), free)
-        return cls(coefficients, weight, _colour([e @ weight.T for e in whitened]))
+        return cls(coefficients, _weight(np.vstack(whitened), free))
 
     @property
     def is_none(self) -> bool:
@@ -107,6 +104,18 @@ class Whitening(NamedTuple):
         ratio = linalg.svdvals(linalg.solve(other.weight, self.weight))
         close = np.abs(self.filter - other.filter).max() <= _SAME_FILTER
         return bool(close and ratio[0] <= _SAME_WEIGHT * ratio[-1])
+
+    def colour_left(self, errors: Sequence[Array]) -> float:
+        """Largest spectral density of an output's errors, whitened, by its mean."""
+        white = [e @ self.weight.T for e in self._filtered(errors)]
+        omega = np.linspace(0.0, np.pi, _N_FREQUENCIES)
+        largest = 1.0
+        for i in range(len(self.weight)):
+            model = autoregression([e[:, [i]] for e in white])
+            density = spectral_density(model, omega).real
+            if len(model.A) and density.mean() > 0.0:
+                largest = max(largest, float(density.max() / density.mean()))
+        return largest
 
     def _filtered(self, samples: Sequence[Array]) -> list[Array]:
         """Samples without those to which the filter would need others before them."""
@@ -153,18 +162,6 @@ class Whitening(NamedTuple):
 
 def _is_identity(weight: Array) -> bool:
     return np.array_equal(weight, np.eye(len(weight)))
-
-
-def _colour(errors: Sequence[Array]) -> float:
-    """Largest spectral density of an output's errors by its mean, 1 for white ones."""
-    omega = np.linspace(0.0, np.pi, _N_FREQUENCIES)
-    largest = 1.0
-    for i in range(errors[0].shape[1]):
-        model = autoregression([e[:, [i]] for e in errors])
-        density = spectral_density(model, omega).real
-        if len(model.A) and density.mean() > 0.0:
-            largest = max(largest, float(density.max() / density.mean()))
-    return largest
 
 
 def _weight(errors: Array, free: Freedom) -> Array:
@@ -229,8 +226,7 @@ def autoregression(
     scale[scale == 0.0] = 1.0
     lags = lags / scale[:, None] / scale
     best, found = np.inf, (np.zeros((ny, 0)), lags[0])
-    for p in range(highest + 1):
-        coefficients, covariance = _yule_walker(lags, p)
+    for p, (coefficients, covariance) in enumerate(_regressions(lags)):
         sign, logdet = np.linalg.slogdet(covariance)
         if not sign > 0.0:  # errors without noise
             break
@@ -246,23 +242,34 @@ def autoregression(
     return NoiseModel(A, C, np.eye(n, ny), covariance * np.outer(scale, scale))
 
 
-def _yule_walker(lags: Array, order: int) -> tuple[Array, Array]:
-    """Coefficients ``[Phi_1, ..., Phi_p]`` and innovation covariance.
+def _regressions(lags: Array) -> Iterator[tuple[Array, Array]]:
+    """Coefficients ``[Phi_1, ..., Phi_p]`` and innovation covariance for every order p.
 
-    ``lags[d] = E v[t] v[t + d].T``, of more lags than the order.
+    ``lags[d] = E v[t] v[t + d].T``. The recursion of Levinson for several channels
+    (Whittle, 1963): the errors of predictions forth and back over p samples tell what
+    one sample more adds to either.
     """
-    ny = lags.shape[1]
-    if order == 0:
-        return np.zeros((ny, 0)), lags[0]
-    gram = np.empty((order * ny, order * ny))
-    for i in range(order):
-        for j in range(order):
-            block = lags[i - j] if i >= j else lags[j - i].T
-            gram[i * ny : (i + 1) * ny, j * ny : (j + 1) * ny] = block
-    right = lags[1 : order + 1].reshape(order * ny, ny)
-    solution = linalg.lstsq(gram, right, cond=_RCOND_LAGS, check_finite=False)[0]
-    covariance = lags[0] - right.T @ solution
-    return solution.T, 0.5 * (covariance + covariance.T)
+    n_lags, ny = len(lags) - 1, lags.shape[1]
+    # E v[t] v[t - d].T for d = n_lags .. 1, one below the other
+    before = lags[:0:-1].transpose(0, 2, 1).reshape(-1, ny)
+    forth = back = np.zeros((ny, 0))  # the coefficients of the latter last to first
+    ahead = behind = lags[0]  # covariances of the errors
+    yield forth, ahead
+    for p in range(n_lags):
+        known = before[(n_lags - p) * ny :]
+        new = before[(n_lags - p - 1) * ny : (n_lags - p) * ny] - forth @ known
+        try:
+            gain = np.linalg.solve(behind.T, new.T).T
+            other = np.linalg.solve(ahead.T, new).T
+        except np.linalg.LinAlgError:  # nothing is left to explain
+            return
+        forth, back = (
+            np.hstack([forth - gain @ back, gain]),
+            np.hstack([other, back - other @ forth]),
+        )
+        ahead, behind = ahead - gain @ new.T, behind - other @ new
+        ahead, behind = 0.5 * (ahead + ahead.T), 0.5 * (behind + behind.T)
+        yield forth, ahead
 
 
 def reduced_noise_model(model: NoiseModel, order: int) -> NoiseModel:

@@ -174,6 +174,20 @@ def select(
     return Selection(order, best, sorted(rows + _rows([tried], records, {})))
 
 
+class _Range(NamedTuple):
+    """What is to be tried; one order, or one horizon, is given."""
+
+    orders: range
+    horizon: int | None
+
+
+class _Noise(NamedTuple):
+    """How errors are whitened, and how coloured they are then."""
+
+    whitening: Whitening
+    colour: float = 1.0
+
+
 def _search(
     records: list[Record], order: int | None, horizon: int | None, settings: Settings
 ) -> Selection:
@@ -181,70 +195,80 @@ def _search(
     highest = order
     if highest is None:
         highest = _highest_order(records, _horizons(records, 0, settings), settings)
-    whitening = Whitening.none(len(records[0].y))
-
-    def try_orders(orders: Sequence[int], max_iter: int | None = None) -> list[_Tried]:
-        white = whitening.records(records, settings.free)
-        spaces = _spaces(white, orders[0], orders[-1], horizon, settings)
-        return _try_orders(orders, spaces, white, settings, whitening.colour, max_iter)
-
-    def unwhitened(tried: _Tried) -> Realization:
-        model = whitening.undone(tried.model)
-        return with_initial_states(model, records, settings.free, whitening.weight)
-
-    def noise_of(model: Realization) -> Whitening:
-        found = Whitening.of(simulation_errors(model, records), settings.free)
-        lengths = [r.u.shape[1] for r in found.records(records, settings.free)]
-        room = settings.max_horizon(lengths)  # the filter takes samples away
-        fits = room >= (horizon or 1) and settings.max_order(room) >= (order or 0)
-        return found if fits else Whitening.none(len(records[0].y))
-
+    wanted = _Range(range(order or 0, highest + 1), horizon)
+    noise = _Noise(Whitening.none(len(records[0].y)))
     if settings.weigh:
-        pilot = min(highest, _PILOT_ORDER) if order is None else order
-        model = try_orders([pilot], _PILOT_STEPS)[0].model
-        for _ in range(_WEIGHINGS if len(records[0].y) > 1 else 0):
-            errors = simulation_errors(model, records)
-            again = Whitening.of(errors, settings.free, filtered=False)
-            if again.is_close_to(whitening):
-                break
-            whitening, white = again, again.records(records, settings.free)
-            weighted = whitening.model(model)
-            start = simulation_fit(weighted.A, weighted.C, white, settings.free)
-            weighted = refine_simulation(start, white, settings.free, _PILOT_STEPS)
-            model = with_initial_states(
-                whitening.undone(weighted), records, settings.free, whitening.weight
-            )
-        whitening = noise_of(model)
-    orders = range(0 if order is None else order, highest + 1)
-    tried = try_orders(orders)
+        noise = _noise_of(_pilot(records, wanted, settings), records, wanted, settings)
+    tried = _try_orders(wanted, records, noise, settings)
     best = min(tried, key=lambda one: one.criterion)
     for _ in range(_MORE_ROUNDS if settings.weigh else 0):
-        again = noise_of(unwhitened(best))
-        if again.is_close_to(whitening):
+        model = _unwhitened(best.model, noise.whitening, records, settings)
+        again = _noise_of(model, records, wanted, settings)
+        if again.whitening.is_close_to(noise.whitening):
             break
-        whitening = again
-        tried = try_orders(orders)
+        noise = again
+        tried = _try_orders(wanted, records, noise, settings)
         best = min(tried, key=lambda one: one.criterion)
     candidates = {
         one.order: Candidate(
-            whitening.undone(one.model), one.horizon, whitening, refined=True
+            noise.whitening.undone(one.model), one.horizon, noise.whitening, True
         )
         for one in tried
     }
-    held_out = {best.order: validate(candidates[best.order], records, settings)}
+    errors = {best.order: validate(candidates[best.order], records, settings)}
     chosen = best.order
-    if settings.compare:
-        for step in _LOWER:
-            lower = best.order - step
-            if lower not in candidates:
-                continue
-            error = held_out[lower] = validate(candidates[lower], records, settings)
-            if error.clearly_better_than(held_out[chosen], _DOUBT):
-                chosen = lower
-    white = whitening.records(records, settings.free)
-    rows = _rows(tried, white, held_out)
-    candidate = candidates[chosen]
-    return Selection(chosen, candidate.horizon, rows, candidate, held_out[chosen])
+    for order in (best.order - step for step in _LOWER if settings.compare):
+        if order in candidates:
+            errors[order] = validate(candidates[order], records, settings)
+            if errors[order].clearly_better_than(errors[chosen], _DOUBT):
+                chosen = order
+    white = noise.whitening.records(records, settings.free)
+    rows, found = _rows(tried, white, errors), candidates[chosen]
+    return Selection(chosen, found.horizon, rows, found, errors[chosen])
+
+
+def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realization:
+    """A model whose errors are the noise, or little else: outputs are weighted."""
+    free, whitening = settings.free, Whitening.none(len(records[0].y))
+    order = max(wanted.orders[0], min(wanted.orders[-1], _PILOT_ORDER))
+    wanted = wanted._replace(orders=range(order, order + 1))
+    tried = _try_orders(wanted, records, _Noise(whitening), settings, _PILOT_STEPS)
+    model = tried[0].model
+    for _ in range(_WEIGHINGS if len(records[0].y) > 1 else 0):
+        errors = simulation_errors(model, records)
+        again = Whitening.of(errors, free, filtered=False)
+        if again.is_close_to(whitening):
+            break
+        whitening, white = again, again.records(records, free)
+        start = whitening.model(model)
+        start = simulation_fit(start.A, start.C, white, free)
+        model = refine_simulation(start, white, free, _PILOT_STEPS)
+        model = _unwhitened(model, whitening, records, settings)
+    return model
+
+
+def _unwhitened(
+    model: Realization,
+    whitening: Whitening,
+    records: Sequence[Record],
+    settings: Settings,
+) -> Realization:
+    """The model of the records themselves."""
+    weight, model = whitening.weight, whitening.undone(model)
+    return with_initial_states(model, records, settings.free, weight)
+
+
+def _noise_of(
+    model: Realization, records: Sequence[Record], wanted: _Range, settings: Settings
+) -> _Noise:
+    """Noise in the errors of a model; none where a filter takes too many samples."""
+    errors = simulation_errors(model, records)
+    found = Whitening.of(errors, settings.free)
+    lengths = [r.u.shape[1] for r in found.records(records, settings.free)]
+    room, horizon = settings.max_horizon(lengths), wanted.horizon or 1
+    if room < horizon or settings.max_order(room) < wanted.orders[0]:
+        return _Noise(Whitening.none(len(records[0].y)))
+    return _Noise(found, found.colour_left(errors))
 
 
 def _rows(
@@ -329,18 +353,16 @@ def _highest_order(
 
 
 def _try_orders(
-    orders: Sequence[int],
-    spaces: Mapping[int, ObservabilitySubspace],
+    wanted: _Range,
     records: Sequence[Record],
+    noise: _Noise,
     settings: Settings,
-    colour: float,
     max_iter: int | None = None,
 ) -> list[_Tried]:
-    """Every order in turn, until further states gain nothing.
-
-    `colour` is that of the errors: where it is above one, states that fit their peak
-    gain as much by chance.
-    """
+    """Every order in turn on whitened records, until further states gain nothing."""
+    records = noise.whitening.records(records, settings.free)
+    orders, horizon = wanted
+    spaces = _spaces(records, orders[0], orders[-1], horizon, settings)
     tried: list[_Tried] = []
     best, stale = np.inf, 0
     energy = output_energy(records)
@@ -356,7 +378,7 @@ def _try_orders(
             other = _with_more_states(tried[-1].model, records, settings)
             if other is not None and other.loss < model.loss:
                 model = other
-        criterion = _criterion(model, energy, n_values, settings, colour)
+        criterion = _criterion(model, energy, n_values, settings, noise.colour)
         tried.append(_Tried(order, horizon, model, criterion, starts))
         stale = 0 if criterion < best else stale + 1
         best = min(best, criterion)
@@ -375,7 +397,8 @@ def _criterion(
     """Likelihood and number of parameters of a model of whitened records.
 
     Minus twice the logarithm of the likelihood, and the price of the parameters with
-    the correction that a ratio of sums of squares in few samples needs.
+    the correction that a ratio of sums of squares in few samples needs. States that
+    fit the peak of errors that are still coloured gain as much more by chance.
     """
     n, (ny, m) = len(model.A), settings.free.direct.shape
     own = len(model.initial_states) * settings.free.n_own(n)

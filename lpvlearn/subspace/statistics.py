@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from ..models.innovation import InnovationModel, NoiseModel
@@ -68,6 +68,7 @@ class Evidence:
     refined: bool  # if it does
     share: float  # samples in `records` by all samples that were used
     levels: Array | None = None  # (n_experiments, n_outputs): constants less trends
+    input_delay: ArrayLike = 0  # samples, which the records' inputs have already
 
     @cached_property
     def noise(self) -> NoiseModel:
@@ -118,6 +119,7 @@ class Evidence:
             sy * model.C,
             sy * model.D / su @ self.basis.T,
             sampling_time,
+            self.input_delay,
         )
 
     def predictor(self, lti: StateSpace, n_noise_states: int | None) -> InnovationModel:
@@ -174,6 +176,8 @@ class Evidence:
     def _frequency_jacobian(self, omega: Array) -> NDArray[np.complex128]:
         J = _frequency_response_jacobian(self.sections, self.free, omega)
         J = np.einsum("foip,ui->foup", J, self.basis / self.input_scale)
+        delays = np.broadcast_to(self.input_delay, len(self.basis))
+        J = J * np.exp(-1j * np.multiply.outer(omega, delays))[:, None, :, None]
         to_outputs = self.output_scale[:, None] * np.linalg.inv(self.whitening.weight)
         return np.einsum("yo,foup->fyup", to_outputs, J)
 

@@ -26,8 +26,11 @@ from ..data.preparation import (
     has_gaps,
     independent_inputs,
     remove_trends,
+    unbroken_runs,
 )
 from ..data.timestamps import TIME_TOL, Clock, read_clock, time_in_seconds
+from ..validation import input_delays
+from .delay import late_inputs
 from .fit import (
     Choices,
     LocalFit,
@@ -241,7 +244,11 @@ class SampleStream:
         self._clock = StreamClock(options["time_tol"], gaps)
         self._label: Hashable = None  # of the sample that came last
         self._open = False  # whether nothing of that experiment is missing since
-        self._buffer = SampleBuffer(gaps)
+        self.delay = input_delays(options["input_delay"], n_inputs, samples=True)
+        self._rest = not choices.initial_states
+        self._in_transit: Array | None = None  # inputs of that experiment
+        unknown = bool(self.delay.any()) and not self._rest
+        self._buffer = SampleBuffer(gaps or unknown)
         self._summary: StreamSummary | None = None
         self._first_residual = np.nan
 
@@ -307,11 +314,17 @@ class SampleStream:
         out, unbroken = [], self._open
         for i, e in enumerate(ordered):
             continues = begun and i == 0
+            sent = self._in_transit if continues else None
             if times is not None:
                 stamps = Column(times.name, pd.Series(times.values).iloc[e.rows])
                 goes_on = self._clock.check(stamps, e.label, continues=continues)
                 unbroken &= goes_on
-            parts = complete_runs(e, shortest=1) if has_gaps(e) else [e]
+                sent = sent if goes_on else None
+            parts: list[Experiment] = []
+            for run in unbroken_runs(e):
+                late, sent = late_inputs(run, self.delay, rest=self._rest, before=sent)
+                parts += complete_runs(late, shortest=1) if has_gaps(late) else [late]
+                transit, sent = sent, None
             for part in parts:
                 assert part.outputs is not None
                 joins = continues and unbroken and part.rows[0] == e.rows[0]
@@ -319,7 +332,7 @@ class SampleStream:
                 if len(part.rows) > 1 or joins or last:
                     out.append(Piece(part.inputs, part.outputs, not joins))
             unbroken = bool(parts) and parts[-1].rows[-1] == e.rows[-1]
-        self._label, self._open = ordered[-1].label, unbroken
+        self._label, self._open, self._in_transit = ordered[-1].label, unbroken, transit
         return out
 
     def _fit_kept(self, pieces: Sequence[Piece]) -> tuple[LocalFit | None, list[Piece]]:

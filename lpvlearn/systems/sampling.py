@@ -54,6 +54,27 @@ def sample_zoh(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
     return E[..., :n, :n], E[..., :n, n:]
 
 
+def sample_zoh_late(
+    A: Array, B: Array, C: Array, D: Array, dt: float, late: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Zero-order-hold equivalent with inputs that change after the sampling instants.
+
+    Input j does so by the share ``late[j]`` (0 to 1) of a period. The value that it had
+    before is a state more for each of them where that is not 0. Exact (the modified
+    z-transform of the hold).
+    """
+    which, n = np.flatnonzero(late), len(A)
+    Ad, held = sample_zoh(A, B, dt)
+    new, direct = held.copy(), D.copy()
+    for j in which:
+        new[:, j] = sample_zoh(A, B[:, [j]], (1.0 - late[j]) * dt)[1][:, 0]
+        direct[:, j] = 0.0
+    extended = np.zeros((n + len(which),) * 2)
+    extended[:n, :n], extended[:n, n:] = Ad, (held - new)[:, which]
+    inputs = np.vstack([new, np.eye(B.shape[1])[which]])
+    return extended, inputs, np.hstack([C, D[:, which]]), direct
+
+
 def _expm(M: Array) -> Array:
     """Exponentials of a stack of matrices, shape (..., n, n).
 

@@ -73,6 +73,44 @@ def lti_response(
     return state_trajectory(A, u @ B.T, x0) @ C.T + u @ D.T
 
 
+def delayed(u: Array, delay: NDArray[np.intp], before: Array | None = None) -> Array:
+    """Inputs as they arrive, ``u[t - delay[j], j]``; one row a sample, any runs.
+
+    `before` are the inputs in transit at the start, in the order of their arrival, all
+    of one input after another; None: none.
+
+    >>> delayed(np.array([[1.0, 5.0], [2.0, 6.0]]), np.array([0, 1]))
+    array([[1., 0.],
+           [2., 5.]])
+    """
+    late = u.copy()
+    stops = np.cumsum(delay)
+    for j, (d, stop) in enumerate(zip(delay, stops, strict=True)):
+        if d:
+            late[d:, j] = u[: max(len(u) - d, 0), j]
+            late[:d, j] = 0.0 if before is None else before[stop - d : stop][: len(u)]
+    return late
+
+
+def with_transit(free: Array, B: Array, D: Array, delay: NDArray[np.intp]) -> Array:
+    """Free responses, with those to the inputs in transit after those to the states.
+
+    `free` comes from `free_responses`, trends or not; inputs are in the order of
+    `delayed`.
+    """
+    if not delay.any():
+        return free
+    states, trends = free[:, :, : len(B)], free[:, :, len(B) :]
+    forced = np.concatenate([D[None], states @ B])[:-1]  # impulse responses
+    columns = [states]
+    for j, d in enumerate(delay):
+        late = np.zeros((*free.shape[:2], d))
+        for arrival in range(min(d, len(free))):
+            late[arrival:, :, arrival] = forced[: len(free) - arrival, :, j]
+        columns.append(late)
+    return np.concatenate([*columns, trends], axis=2)
+
+
 def trend_signals(n_samples: int, n_trend: int) -> Array:
     """A constant one (and a straight line from -1 to 1), (n_trend, n_samples).
 

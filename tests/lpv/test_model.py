@@ -22,6 +22,8 @@ from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV, StateSpace
 from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
 from lpvlearn.lpv import model as model_module
 
+from ..conftest import spring_lpv
+
 DT = 0.05
 
 
@@ -336,6 +338,29 @@ def test_a_diverging_simulation_names_the_frozen_model():
     assert np.isfinite(inside.simulate(np.ones(300), kappa[:300], 0.1)).all()
 
 
+def test_delayed_inputs_are_shifted_inputs():
+    rng, plain = np.random.default_rng(0), spring_lpv()
+    lpv = replace(plain, input_delay=0.06)
+    u, kappa = rng.normal(size=(80, 1)), np.linspace(0, 1.5, 80)
+    late = np.vstack([np.zeros((3, 1)), u[:-3]])
+    np.testing.assert_array_equal(
+        lpv.simulate(u, kappa, 0.02), plain.simulate(late, kappa, 0.02)
+    )
+    x0 = rng.normal(size=5)  # two states, three inputs in transit
+    y = lpv.simulate(u, kappa, 0.02, initial_state=x0)
+    free = lpv.free_responses(kappa, 0.02)
+    np.testing.assert_allclose(lpv.simulate(u, kappa, 0.02) + free @ x0, y, atol=1e-12)
+    frozen = lpv.at(1.0)
+    np.testing.assert_array_equal(frozen.input_delay, [0.06])
+    constant = lpv.simulate(u, np.ones(80), 0.02)
+    np.testing.assert_allclose(
+        frozen.simulate(u, sampling_time=0.02), constant, atol=1e-12
+    )
+    assert "input_delay=[0.06] s" in repr(lpv)
+    with pytest.raises(ValueError, match="must divide the input delay"):
+        lpv.simulate(u, kappa, 0.025)
+
+
 # ---------------------------------------------------------------- changes of the basis
 
 
@@ -354,6 +379,20 @@ def test_a_change_of_basis_changes_no_output():
     expected = model.free_responses(kappa, DT)
     assert_allclose(free @ growing(kappa[:1]), expected, atol=1e-12)
     assert_allclose(changed.frozen_poles(kappa), model.frozen_poles(kappa))
+
+
+def test_a_change_of_basis_leaves_inputs_in_transit_alone():
+    lpv = replace(spring(), input_delay=[3 * DT, DT])
+    u, kappa = inputs(60), sweep(60)
+    x0, transit = np.array([0.3, -1.0]), np.array([1.0, -2.0, 0.5, 3.0])
+    changed = lpv.change_basis(growing)
+    moved = np.concatenate([growing(kappa[:1]) @ x0, transit])
+    y = lpv.simulate(u, kappa, DT, np.concatenate([x0, transit]))
+    assert_allclose(changed.simulate(u, kappa, DT, moved), y)
+    forced = changed.simulate(u, kappa, DT)
+    assert_allclose(forced + changed.free_responses(kappa, DT) @ moved, y, atol=1e-12)
+    for rate in (None, 2.0):
+        assert_array_equal(changed.at(1.0, rate=rate).input_delay, lpv.input_delay)
 
 
 def test_the_model_in_the_new_basis_is_that_of_the_moving_state():

@@ -440,3 +440,139 @@ def test_the_estimated_initial_state_is_the_one_simulated_from(n_outputs):
 def test_an_initial_state_needs_a_record_of_a_sampled_model(model, u, y, message):
     with pytest.raises(ValueError, match=message):
         model.estimate_initial_state(u, y)
+
+
+# -- input delays ----------------------------------------------------------------
+
+
+def late_model(seed=0, delay=(3, 0)):
+    model = random_model(seed, 3, sampling_time=0.1)
+    return model.with_input_delay(delay)
+
+
+def test_delayed_inputs_are_shifted_inputs():
+    model, u = late_model(), np.random.default_rng(0).normal(size=(60, 2))
+    late = np.column_stack([np.r_[np.zeros(3), u[:-3, 0]], u[:, 1]])
+    x0 = np.arange(3.0)
+    np.testing.assert_array_equal(
+        model.simulate(u, initial_state=x0),
+        model.with_input_delay(0).simulate(late, initial_state=x0),
+    )
+    short = model.simulate(u[:2], initial_state=x0)  # nothing of input 0 has arrived
+    np.testing.assert_array_equal(short, model.simulate(u, initial_state=x0)[:2])
+
+
+def test_absorbed_delays_are_states_at_the_origin():
+    model, u = late_model(), np.random.default_rng(0).normal(size=(60, 2))
+    absorbed = model.absorb_delay()
+    assert absorbed.order == 6 and not absorbed.input_delay.any()
+    assert np.sum(np.abs(absorbed.poles()) < 1e-4) == 3
+    x0 = np.arange(6.0)  # the state, and the inputs in transit
+    y = model.simulate(u, initial_state=x0)
+    np.testing.assert_allclose(absorbed.simulate(u, initial_state=x0), y, atol=1e-11)
+    omega = np.linspace(0, np.pi / 0.1, 30)
+    np.testing.assert_allclose(
+        absorbed.frequency_response(omega), model.frequency_response(omega), atol=1e-11
+    )
+    for one in (model, absorbed):
+        estimated = one.estimate_initial_state(u, y)
+        np.testing.assert_allclose(
+            one.simulate(u, initial_state=estimated), y, atol=1e-10
+        )
+
+
+def test_the_initial_state_of_a_part_holds_the_inputs_in_transit():
+    model, u = late_model(), np.random.default_rng(0).normal(size=(80, 2))
+    y = model.simulate(u)
+    x0 = model.estimate_initial_state(u[30:], y[30:])
+    np.testing.assert_allclose(x0[3:], u[27:30, 0], atol=1e-9)
+    np.testing.assert_allclose(model.simulate(u[30:], initial_state=x0), y[30:])
+
+
+@pytest.mark.parametrize("sampling_time", [None, 0.1])
+def test_a_delay_turns_the_response(sampling_time):
+    plain = random_model(3, sampling_time=sampling_time)
+    delay = np.array([2, 5]) if sampling_time else np.array([0.17, 0.4])
+    omega = np.array([0.0, 0.3, 2.0, 20.0])
+    seconds = delay * (sampling_time or 1.0)
+    np.testing.assert_allclose(
+        plain.with_input_delay(delay).frequency_response(omega),
+        plain.frequency_response(omega)
+        * np.exp(-1j * np.outer(omega, seconds))[:, None],
+        atol=1e-12,
+    )
+    late = plain.with_input_delay(delay)
+    np.testing.assert_array_equal(late.dc_gain(), plain.dc_gain())
+    np.testing.assert_array_equal(late.poles(), plain.poles())
+
+
+@pytest.mark.parametrize("delay", [4, (1, 4)])
+def test_delays_leave_norms_as_they_are(delay):
+    model = late_model(2, delay)
+    assert model.hinf_norm() == model.with_input_delay(0).hinf_norm()
+    assert model.absorb_delay().hinf_norm() == pytest.approx(model.hinf_norm())
+    late = model.to_continuous("tustin").with_input_delay((0.3, 0.1))
+    omega = np.array([0.5, np.inf])
+    gains = np.linalg.svd(late.frequency_response(omega), compute_uv=False)
+    plain = late.with_input_delay(0).frequency_response(omega)
+    np.testing.assert_allclose(gains, np.linalg.svd(plain, compute_uv=False))
+
+
+def test_a_delay_does_not_spoil_what_is_infinite():
+    integrator = StateSpace(0, 1, 1, input_delay=0.5)
+    assert np.isinf(integrator.dc_gain()).all()
+
+
+def test_delays_go_along_with_conversions_and_changes_of_basis():
+    model = late_model(1)
+    T = np.random.default_rng(0).normal(size=(3, 3))
+    for one in (model.transform(T), model.balance(), model.balance(2), model - model):
+        np.testing.assert_array_equal(one.input_delay, [3, 0])
+    continuous = model.to_continuous("tustin")
+    np.testing.assert_allclose(continuous.input_delay, [0.3, 0.0])
+    np.testing.assert_array_equal(
+        continuous.to_discrete(0.1, "tustin").input_delay, [3, 0]
+    )
+    np.testing.assert_array_equal(continuous.to_discrete(0.05).input_delay, [6, 0])
+    for one in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
+        np.testing.assert_array_equal(one.input_delay, [3, 0])
+        assert not one.input_delay.flags.writeable
+    assert "input_delay=[3, 0])" in repr(model)
+    assert "input_delay=[0.3, 0] s)" in repr(continuous)
+
+
+@pytest.mark.parametrize("feedthrough", [False, True])
+def test_delays_between_samples_are_exact_for_held_inputs(feedthrough):
+    model = stable_model(2, 3, feedthrough=feedthrough).with_input_delay([0.13, 0.3])
+    sampled = model.to_discrete(0.1)
+    assert sampled.order == 4  # one of the delays is whole
+    np.testing.assert_array_equal(sampled.input_delay, [1, 3])
+    u, x0 = np.random.default_rng(0).normal(size=(50, 2)), np.arange(3.0)
+    fine = model.to_discrete(0.01)
+    assert fine.order == 3
+    expected = fine.simulate(u.repeat(10, axis=0), initial_state=x0)[::10]
+    found = model.simulate(u, sampling_time=0.1, initial_state=x0)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_what_cannot_be_done_with_delays_says_what_can():
+    model = late_model()
+    with pytest.raises(ValueError, match=r"absorb_delay\(\), or"):
+        model - model.with_input_delay(0)
+    continuous = random_model(0).with_input_delay(0.25)
+    with pytest.raises(ValueError, match="Use `method='zoh'`"):
+        continuous.to_discrete(0.1, "tustin")
+    with pytest.raises(ValueError, match="needs a discrete-time model: no finite"):
+        continuous.absorb_delay()
+    with pytest.raises(ValueError, match="`to_control` needs a model without delay"):
+        model.to_control()
+    with pytest.raises(
+        ValueError, match=r"\(3,\), or with the inputs in transit \(6,\)"
+    ):
+        model.simulate(np.zeros((5, 2)), initial_state=np.zeros(5))
+
+
+@pytest.mark.parametrize("delay", [-1, 1.5, [1, 2, 3], "2", np.nan, [[1, 2]]])
+def test_what_is_no_delay_is_refused(delay):
+    with pytest.raises(ValueError, match="`input_delay` must"):
+        late_model(delay=delay)

@@ -552,8 +552,9 @@ def test_a_stopwatch_adds_up_the_times_of_the_steps():
 @pytest.mark.filterwarnings("ignore:Scheduling variable 'kappa' must be within")
 def test_a_prediction_that_diverges_names_the_experiment(spring):
     X, y, _, _ = spring
-    model = spring_pipeline().fit(X, y)
-    far = X.assign(kappa=X["kappa"].where(X["run"] != "p2r0", 1e9))
+    line = PolynomialLPV(1)  # whose stiffness is negative far below
+    model = spring_pipeline(interpolator=line).fit(X, y)
+    far = X.assign(kappa=X["kappa"].where(X["run"] != "p2r0", -1e9))
     with pytest.raises(DivergenceError, match="Experiment 'p2r0': .*at scheduling"):
         model.predict(far)
 
@@ -601,3 +602,74 @@ def test_averaged_realizations_have_constants_of_their_own():
     fitted = spring_pipeline(combine="average").fit(X, y + 0.2 * level[:, None])
     np.testing.assert_allclose(fitted.parameters_, spring_truth(KAPPA[:2]), rtol=0.05)
     assert fitted.report_["local_BFT"].min() > 95.0
+
+
+# -- input delays ----------------------------------------------------------------
+
+
+def late_springs(delays, noise=0.02):
+    """Local experiments on the spring whose force acts late, by samples at each."""
+    X, y = spring_tables(noise=noise, n_samples=N_SAMPLES)
+    parts = [
+        np.vstack([np.zeros((d, 1)), y.loc[rows.index].to_numpy()[: len(rows) - d]])
+        for d, (_, rows) in zip(delays, X.groupby("run"), strict=True)
+    ]
+    return X, pd.DataFrame(np.vstack(parts), columns=["position"])
+
+
+@pytest.mark.parametrize("input_delay", [5, "auto"])
+def test_a_delay_of_the_input_does_not_bend_the_parameters(input_delay):
+    X, y = late_springs([5] * 4)
+    pipeline = spring_pipeline(local=SubspaceLTI(input_delay=input_delay)).fit(X, y)
+    np.testing.assert_allclose(
+        pipeline.parameters_["k"], spring_truth(KAPPA)[:, 2], rtol=0.01
+    )
+    assert (pipeline.report_["delay_force"] == 5).all()
+    assert (pipeline.report_["local_BFT"] > 97).all()
+    assert (pipeline.report_["structured_BFT"] > 97).all()
+    np.testing.assert_allclose(pipeline.lpv_.input_delay, [0.1])
+    for model in (*pipeline.local_models_, *pipeline.structured_models_):
+        np.testing.assert_allclose(model.input_delay, [0.1])
+    assert pipeline.score(X, y) > 0.99
+    fit = bft_score(y, pipeline.predict_with_initial_state(X, y))
+    assert fit > 95
+    assert "Input delay: 5 sample(s)" in pipeline.summary()
+
+
+@pytest.mark.parametrize("options", [{"combine": "average"}, {"efficient": False}])
+def test_delays_go_along_with_the_options(options):
+    X, y = late_springs([3] * 4, noise=0.0)
+    local = SubspaceLTI(input_delay=3)
+    pipeline = spring_pipeline(local=local, **options).fit(X, y)
+    np.testing.assert_allclose(pipeline.parameters_, spring_truth(KAPPA), rtol=1e-5)
+
+
+def test_no_delay_is_imagined():
+    X, y = late_springs([0] * 4)
+    pipeline = spring_pipeline(local=SubspaceLTI(input_delay="auto")).fit(X, y)
+    assert not pipeline.lpv_.input_delay.any()
+    assert "delay_force" not in pipeline.report_
+    assert "Input delay" not in pipeline.summary()
+
+
+def test_delays_that_differ_between_points_are_told():
+    X, y = late_springs([5, 5, 6, 5])
+    local = SubspaceLTI(input_delay="auto")
+    with pytest.warns(UserWarning, match=r"0: 5; 0.5: 5; 1: 6; 1.5: 5\)") as told:
+        pipeline = spring_pipeline(local=local).fit(X, y)
+    assert "takes the median, 5;" in str(told[0].message)
+    np.testing.assert_allclose(pipeline.lpv_.input_delay, [0.1])
+    np.testing.assert_array_equal(pipeline.report_["delay_force"], [5, 5, 6, 5])
+    assert (pipeline.report_["structured_BFT"] > 97).all()
+    np.testing.assert_allclose(
+        pipeline.parameters_["k"], spring_truth(KAPPA)[:, 2], rtol=0.01
+    )
+
+
+def test_a_passed_through_model_keeps_its_delay():
+    X, y = late_springs([2] * 4, noise=0.0)
+    local = SubspaceLTI(2, input_delay=2)
+    pipeline = spring_pipeline(local=local, restructurer="passthrough").fit(X, y)
+    for model in pipeline.structured_models_:
+        np.testing.assert_allclose(model.input_delay, [0.04])
+    assert pipeline.score(X, y) > 0.99

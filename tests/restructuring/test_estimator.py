@@ -693,3 +693,19 @@ def test_a_black_box_of_lower_order_is_matched_exactly(order):
     )
     for structure in (controllable, GrayBoxStructure.observable_canonical(n)):
         assert GrayBoxRestructurer(structure).fit_model(box).relative_error_ < 1e-9
+
+
+def test_a_delay_is_left_out_and_put_back():
+    structure = spring_structure()
+    box = structure.model([30.0, 1.2, 40.0])
+    late = box.with_input_delay(0.1)
+    found = GrayBoxRestructurer(structure).fit_model(late)
+    plain = GrayBoxRestructurer(structure).fit_model(box)
+    np.testing.assert_array_equal(found.params_, plain.params_)
+    np.testing.assert_array_equal(found.lti_.input_delay, [0.1])
+    assert (found.lti_ - late).hinf_norm() < 1e-6
+    with pytest.raises(ValueError, match="models of one `input_delay`"):
+        GrayBoxRestructurer(structure).fit_model([box, late])
+    with pytest.raises(ValueError, match="`frequency_weight` must be without delay"):
+        weight = StateSpace(-1, 1, 1, input_delay=0.1)
+        GrayBoxRestructurer(structure, frequency_weight=weight).fit_model(box)

@@ -1,0 +1,365 @@
+"""Input delays: inputs as they arrive, and the delays that the records show.
+
+A model with a delay is identified from late inputs, ``u[t - d]`` in the place of
+``u[t]``: all other rooms see these only (`with_late_inputs`).
+
+Which delay (`find_delays`)? A regression on past outputs and on inputs from ``u[t]``
+back tells how many of the latest inputs can be left out: the delay is not longer. It
+may be shorter, as smooth systems begin to answer below the noise. But a model with a
+delay that is k samples too short needs k states more, and a delay of one sample more
+can stand for a first answer that is a feedthrough then. So models of several orders and
+delays, with feedthrough and without, are compared by Schwarz's criterion, in samples
+whose noise is whitened. The best one's delay is certain only where a model without
+delay has not done as well with a state more, nor at the same order on samples held out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # which loads its signal package when that is first used: slowly
+from numpy.typing import NDArray
+from scipy import stats
+
+from ..data.experiments import Experiment
+from ..data.preparation import (
+    DETRENDS,
+    Pairs,
+    remove_trends,
+    split_at_gaps,
+    unbroken_runs,
+)
+from ..systems.simulation import delayed
+from .identification import Settings, identify
+from .noise import autoregression
+from .selection import select
+from .signals import Record
+
+Array = NDArray[np.float64]
+
+Delay = NDArray[np.intp]
+
+LONGEST = 30  # samples that a delay is looked for, of each input
+
+_SHARE = 10  # and no longer than this part of the longest experiment, a tenth
+
+_MAX_SAMPLES = 12_000  # that are looked at: as many as for the choice of an order
+
+# Past outputs and, after the longest delay, inputs in the regression: enough for its
+# error to be nearly white, and for the answers of systems of usual orders.
+_PAST = 12
+
+_CHANCE = 1e-4  # probability by chance of an answer that is certain
+
+# No delay, with a state more, must be worse than several samples of delay by this, in
+# twice the logarithm of the likelihood. One sample that state can take the place of:
+# there it must gain no more than by chance, and the sample be worth this factor of the
+# mean square error.
+_WORSE, _BY_CHANCE, _CLEARLY = 6.0, 0.05, 1.05
+
+_STATES = range(-2, 3)  # about the order chosen at the longest delay, that are tried
+
+_GIVEN_UP = 2  # delays in turn without any good model: shorter ones have none either
+
+_SHORTEST_HORIZON = 8  # of the models compared, which the refinement makes equal
+
+_ROUNDING = 1e-14  # share of an output's energy that is rounding
+
+_LARGEST_RATIO = 1e4  # of an output's size to its noise by which outputs are weighed
+
+_ESTIMATED = 0.7  # part of the samples to estimate on where others are held out
+
+
+def late_inputs(
+    experiment: Experiment, delay: Delay, *, rest: bool, before: Array | None = None
+) -> tuple[Experiment, Array]:
+    """An experiment with its inputs as they arrive, and the inputs still in transit.
+
+    What arrives in the first samples was sent `before` (the inputs in transit where an
+    experiment goes on), or else is unknown: NaN, or zero from `rest`.
+    """
+    sent, longest = experiment.inputs, int(delay.max())
+    if before is None:
+        before = np.full((longest, sent.shape[1]), 0.0 if rest else np.nan)
+    sent, n_samples = np.vstack([before, sent]), len(sent)
+    late = [
+        column[longest - d : longest - d + n_samples]
+        for column, d in zip(sent.T, delay, strict=True)
+    ]
+    return replace(experiment, inputs=np.column_stack(late)), sent[n_samples:]
+
+
+def with_late_inputs(
+    experiments: Sequence[Experiment], delay: Delay, *, rest: bool, gaps: bool
+) -> list[Experiment]:
+    """Experiments with inputs as they arrive, cut at gaps where there may be some.
+
+    Without `rest` the first samples, to which unknown inputs arrive, are left out. A
+    ValueError where that leaves no two samples of any experiment.
+    """
+    if not delay.any():
+        return split_at_gaps(experiments) if gaps else list(experiments)
+    late = [
+        late_inputs(run, delay, rest=rest and i == 0)[0]
+        for e in experiments
+        for i, run in enumerate(unbroken_runs(e))
+    ]
+    if rest and not gaps:
+        return late
+    longest = max(len(e.rows) for e in experiments)
+    if longest < delay.max() + 2:
+        raise ValueError(
+            f"`input_delay` of {delay.max()} samples needs an experiment of at least "
+            f"{delay.max() + 2} samples: what arrives before is not known. Got "
+            f"{longest}. initial_state='rest' takes it as zero."
+        )
+    return split_at_gaps(late)
+
+
+def find_delays(
+    pairs: Pairs, settings: Settings, order: int | None, horizon: int | None
+) -> Delay:
+    """Delay of every input, in samples, as far as it is certain; else 0.
+
+    `order` and `horizon` as of `select`. Experiments have the trends of `settings`,
+    whose removal here leaves little for the models to tell.
+    """
+    pairs = remove_trends(_head(pairs), DETRENDS[settings.free.n_trend])[0]
+    longest = min(LONGEST, max(len(u) for u, _ in pairs) // _SHARE)
+    answers = first_answers(pairs, longest)
+    direct = settings.free.direct.any(axis=0)
+    delay = np.where(answers < 0, 0, np.maximum(answers - ~direct, 0))
+    if not delay.any():
+        return delay
+    settings = settings._replace(
+        free=settings.free._replace(initial_states=True),
+        refine=True,
+        enforce_stability=False,
+    )
+    plain = settings._replace(weigh=False, compare=False)
+    trial = _Trial.of(pairs, plain, int(delay.max()), horizon or 1)
+    orders = [] if order is None else [order]
+    if order is None or horizon is None:
+        chosen = select(trial.records(delay), order, horizon, settings)
+        trial = replace(trial, horizon=chosen.horizon)
+        about = [chosen.order + more for more in _STATES if chosen.order + more >= 0]
+        orders = orders or about
+    trial = trial.whitened(delay, orders[-1])
+    for j in np.flatnonzero(delay):
+        delay[j] = trial.delay_of(int(j), delay, orders)
+    return delay
+
+
+def _head(pairs: Pairs) -> Pairs:
+    """The first experiments, some thousand samples of them."""
+    out, left = [], _MAX_SAMPLES
+    for u, y in pairs:
+        if left > 0:
+            out.append((u[:left], y[:left]))
+            left -= len(u)
+    return out
+
+
+def first_answers(pairs: Pairs, longest: int) -> Delay:
+    """Latest input that certainly shows in an output, counted back from the present.
+
+    For every input 0 to `longest`, or -1 where none of these is certain.
+
+    >>> u, e = np.random.default_rng(0).standard_normal((2, 500, 1))
+    >>> first_answers([(u[3:], u[:-3] + 0.1 * e[3:])], 10)
+    array([3])
+    """
+    m, ny = pairs[0][0].shape[1], pairs[0][1].shape[1]
+    n_samples = sum(len(u) for u, _ in pairs)
+    # No more unknowns than a quarter of the samples
+    past = int(np.clip((n_samples / 4 - m * longest) / (m + ny), 1, _PAST))
+    span = longest + past
+    long = [(u, y) for u, y in pairs if len(u) > span]
+    found = np.full(m, -1)
+    if not long:
+        return found
+    window = np.lib.stride_tricks.sliding_window_view
+    inputs = np.concatenate([window(u, span + 1, axis=0) for u, _ in long])
+    outputs = [window(y[span - past : -1], past, axis=0) for _, y in long]
+    earlier = np.concatenate(outputs).reshape(len(inputs), -1)
+    y = np.concatenate([y[span:] for _, y in long])
+    for j in range(m):
+        rest = np.delete(inputs, j, axis=1).reshape(len(inputs), -1)
+        own = inputs[:, j]  # the present last
+        X = np.column_stack([np.ones(len(y)), earlier, rest, own])
+        k = X.shape[1]
+        error = len(X) - k
+        if error < 1:
+            return found
+        R = np.asarray(np.linalg.qr(np.column_stack([X, y]), mode="r"))
+        explained = R[k - longest - 1 : k, k:][::-1] ** 2
+        left = (R[k:, k:] ** 2).sum(axis=0)
+        left = np.maximum(left, _ROUNDING * (y**2).sum(axis=0)) / error
+        count = np.arange(1, longest + 2)[:, None]
+        F = np.cumsum(explained, axis=0) / count / left
+        certain = (stats.f.sf(F, count, error) < _CHANCE / (longest + 1)).any(axis=1)
+        if certain.any():
+            found[j] = np.argmax(certain)
+    return found
+
+
+class _Size(NamedTuple):
+    """How many parameters a model has: sizes are in their order."""
+
+    order: int
+    direct: bool  # whether the input whose delay is looked for acts at once
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Samples to try delays on; from row `longest` on all inputs are known."""
+
+    pairs: Pairs
+    settings: Settings
+    longest: int
+    horizon: int  # of the models compared, at least
+    known: dict[tuple[int, ...], float] = field(default_factory=dict)  # losses
+
+    @classmethod
+    def of(
+        cls,
+        pairs: Pairs,
+        settings: Settings,
+        longest: int,
+        horizon: int,
+        noise: Array | float = np.inf,
+    ) -> _Trial:
+        """The trial of inputs of unit size, and outputs in units of their noise.
+
+        Where that is not known, or very small, their own size counts.
+        """
+        unit = [
+            np.sqrt(np.mean(np.vstack([pair[k] for pair in pairs]) ** 2, axis=0))
+            for k in (0, 1)
+        ]
+        su, sy = (np.where(size > 0.0, size, 1.0) for size in unit)
+        sy = np.where(np.isfinite(noise), np.maximum(noise, sy / _LARGEST_RATIO), sy)
+        # the largest output has unit size
+        sy = sy * max(float((unit[1] / sy).max()), np.finfo(float).tiny)
+        kept = [(u / su, y / sy) for u, y in pairs if len(u) > longest + 1]
+        return cls(kept, settings, longest, horizon)
+
+    def records(self, delay: Delay) -> list[Record]:
+        cut, n_trend = slice(self.longest, None), self.settings.free.n_trend
+        late = [(delayed(u, delay)[cut], y[cut]) for u, y in self.pairs]
+        return [Record.of(u, y, n_trend) for u, y in late]
+
+    def errors(
+        self, delay: Delay, size: _Size, j: int, part: float = 1.0
+    ) -> list[Array]:
+        """Simulation errors of a model of these; with `part` those of the rest."""
+        order, direct = size
+        settings = self.settings
+        if not direct:
+            mask = settings.free.direct.copy()
+            mask[:, j] = False
+            settings = settings._replace(free=settings.free._replace(direct=mask))
+        records = self.records(delay)
+        cuts = [int(np.ceil(part * r.u.shape[1])) for r in records]
+        heads = [r.head(cut) for r, cut in zip(records, cuts, strict=True)]
+        horizon = max(self.horizon, _SHORTEST_HORIZON, 2 * (order + 1))
+        horizon = min(horizon, self.settings.max_horizon(cuts))
+        if self.settings.max_order(horizon) < order:
+            return [np.full_like(r.y.T, np.inf) for r in records]
+        model = identify(heads, order, horizon, settings).model
+        if part == 1.0:
+            cuts = [0] * len(cuts)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return [
+                (r.y.T - model.outputs(r, k))[cut:]
+                for k, (r, cut) in enumerate(zip(records, cuts, strict=True))
+            ]
+
+    def loss(self, delay: Delay, size: _Size, j: int) -> float:
+        """Mean square of the simulation errors; at least that of rounding."""
+        key = (*delay.tolist(), *size, j)
+        if key not in self.known:
+            mean = float(np.mean(np.concatenate(self.errors(delay, size, j)) ** 2))
+            self.known[key] = (mean if np.isfinite(mean) else np.inf) + _ROUNDING
+        return self.known[key]
+
+    def whitened(self, delay: Delay, order: int) -> _Trial:
+        """The trial of samples filtered alike, so that noise becomes nearly white.
+
+        One filter for all inputs and outputs leaves the system as it is.
+        """
+        errors = self.errors(delay, _Size(order, True), 0)
+        size = np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0))
+        size[size == 0.0] = 1.0
+        model = autoregression(
+            [e[:, [i]] / size[i] for e in errors for i in range(len(size))]
+        )
+        a = np.concatenate([[1.0], -model.C[0]])
+
+        def white(signal: Array) -> Array:
+            return scipy.signal.lfilter(a, [1.0], signal, axis=0)[len(a) - 1 :]
+
+        filtered = [(white(u), white(y)) for u, y in self.pairs]
+        return self.of(filtered, self.settings, self.longest, self.horizon, size)
+
+    def delay_of(self, j: int, longest: Delay, orders: Sequence[int]) -> int:
+        """Delay of one input, up to the `longest`; those of the others stay."""
+
+        def at(d: int) -> Delay:
+            return np.where(np.arange(len(longest)) == j, d, longest)
+
+        m, ny = self.pairs[0][0].shape[1], self.pairs[0][1].shape[1]
+        may_be_direct = bool(self.settings.free.direct[:, j].any())
+        families = [
+            [_Size(n, direct) for n in sorted(orders, reverse=True)]
+            for direct in (False, True)[: 1 + may_be_direct]
+        ]
+
+        def n_parameters(size: _Size) -> int:
+            return size.order * (m + ny) + size.direct * ny
+
+        def price(size: _Size) -> float:  # Schwarz's criterion
+            return float(np.log(self.n_values)) * n_parameters(size)
+
+        least, best, tried_in_vain = np.inf, (families[0][0], 0), 0
+        for d in range(longest[j], -1, -1):
+            tried_in_vain += 1
+            for sizes in families:
+                for size in sizes:
+                    misfit = self.n_values * np.log(self.loss(at(d), size, j))
+                    if misfit + price(size) < least:
+                        least, best = misfit + price(size), (size, d)
+                    if misfit + price(sizes[-1]) > least:
+                        break  # smaller models fit no better
+                    tried_in_vain = 0
+            if tried_in_vain == _GIVEN_UP:
+                break
+        size, d = best
+        if d == 0:
+            return 0
+        loss = self.loss(at(d), size, j)
+        same, more = (_Size(size.order + k, may_be_direct) for k in (0, 1))
+        gain = self._evidence(loss, self.loss(at(0), more, j))
+        certain = gain < -_WORSE
+        if d == 1:
+            dof = n_parameters(more) - n_parameters(size)
+            certain = gain < stats.chi2.isf(_BY_CHANCE, dof)
+            certain &= self.loss(at(0), same, j) > _CLEARLY * loss
+        if not certain:
+            return 0
+        late, present = (
+            np.sum(np.concatenate(self.errors(at(one), same, j, _ESTIMATED)) ** 2)
+            for one in (d, 0)
+        )
+        return 0 if late > present else d
+
+    @property
+    def n_values(self) -> int:
+        return sum(y[self.longest :].size for _, y in self.pairs)
+
+    def _evidence(self, loss: float, best: float) -> float:
+        """Twice the logarithm of the ratio of two likelihoods."""
+        return self.n_values * float(np.log(loss / best))
