@@ -135,13 +135,16 @@ def may_have_constants(evidence: Evidence) -> bool:
     They show in its errors, or a slow mode that the inputs hardly reach stands for
     them; where a channel is far from zero, nothing but its mean may have been fitted.
     """
-    if any(_is_far(np.vstack((r.u, r.y))) for r in evidence.records):
+    if _is_far([np.vstack((r.u, r.y)) for r in evidence.records]):
         return True
     return _has_idle_mode(evidence) or chance_of_constants(evidence) < _SUSPICIOUS
 
 
-def _is_far(signals: Array) -> bool:
-    return bool((np.abs(signals.mean(axis=1)) > _FAR * signals.std(axis=1)).any())
+def _is_far(parts: Sequence[Array]) -> bool:
+    """Whether means are next to all there is of a channel, (n_channels, n_samples)."""
+    level = sum(part.shape[1] * part.mean(axis=1) ** 2 for part in parts)
+    motion = sum(part.shape[1] * part.var(axis=1) for part in parts)
+    return bool((level > _FAR**2 * motion).any())
 
 
 def constants_matter(without: Evidence, other: Evidence) -> bool:
