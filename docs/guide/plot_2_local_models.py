@@ -280,6 +280,7 @@ display = BodeDisplay.from_models(
 #   states there; modes that only the noise drives are told from those of the plant.
 #   Standard deviations and ``predict_ahead`` are right under feedback, and the plant
 #   may be unstable: the model is then good for prediction, not for long simulations.
+#   Constants and drifts of the experiments (``offset``) are estimated there as well.
 # * Say ``feedthrough=False`` unless the controller needs a sample to answer: a
 #   feedthrough and a controller that answers within the sample cannot be told apart.
 

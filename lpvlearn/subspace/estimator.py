@@ -936,11 +936,12 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ) -> tuple[Array, Array]:
         """Initial state, inputs in transit; and the outputs their answers add to.
 
-        Behind the errors of simulation, or (without inputs in transit) of a predictor.
+        Behind the errors of simulation, or of a predictor that has a gain, for which
+        inputs in transit are those at rest: what they miss dies out.
         """
         (u0, y0), y = self._rest(), _outputs_of(experiment)
         lti, trend = self.lti_, trend_signals(len(y), self._evidence.free.n_trend)
-        if predictor is None:
+        if predictor is None or predictor.gain is None:
             responses = free_responses(lti.A, lti.C, len(y), trend)
             responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
             own = estimate_initial_state(responses, y - self._simulated(experiment))

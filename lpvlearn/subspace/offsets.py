@@ -55,6 +55,7 @@ _EXPLAINED = 1e-6
 
 _RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refinement`
 _ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
+_FAR = 10.0  # standard deviations between the mean of a channel and zero
 _SLOW = 3.0  # time constants per experiment of a mode that may stand for a constant
 
 # A model with constants, perhaps of a lower order, whose squared errors are larger by
@@ -132,9 +133,18 @@ def may_have_constants(evidence: Evidence) -> bool:
     """Whether a model without constants should be tried with them.
 
     They show in its errors, or a slow mode that the inputs hardly reach stands for
-    them.
+    them; where a channel is far from zero, nothing but its mean may have been fitted.
     """
+    if _is_far([np.vstack((r.u, r.y)) for r in evidence.records]):
+        return True
     return _has_idle_mode(evidence) or chance_of_constants(evidence) < _SUSPICIOUS
+
+
+def _is_far(parts: Sequence[Array]) -> bool:
+    """Whether means are next to all there is of a channel, (n_channels, n_samples)."""
+    level = sum(part.shape[1] * part.mean(axis=1) ** 2 for part in parts)
+    motion = sum(part.shape[1] * part.var(axis=1) for part in parts)
+    return bool((level > _FAR**2 * motion).any())
 
 
 def constants_matter(without: Evidence, other: Evidence) -> bool:

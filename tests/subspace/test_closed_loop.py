@@ -212,6 +212,16 @@ def test_constants_are_taken_where_they_are(order):
     same.predict(two_loops(LEVELS)[0])  # which does not warn
 
 
+@pytest.mark.parametrize("level", [1.0, 1e2, 1e6])
+def test_constants_are_found_near_and_far(level):
+    """A slow mode stands for near ones, and far ones hide everything else."""
+    for seed in (6, 10, 15):
+        u, y = closed_loop(np.random.default_rng(seed), 500)
+        model = pbsid(2, feedthrough=False).fit(u + level, y + 0.1 * level)
+        assert model.offset_ == "constant"
+        assert miss(model) < 0.15
+
+
 def test_auto_finds_the_loop_about_its_point_of_work():
     X, y = two_loops(LEVELS)
     model = SubspaceLTI(2, experiment="experiment")

@@ -104,11 +104,23 @@ def test_an_experiment_goes_on_with_the_inputs_in_transit():
     np.testing.assert_array_equal(np.vstack(parts), whole.inputs)
 
 
+def test_prediction_begins_with_the_inputs_in_transit():
+    """Without states of the noise it is the simulation from the same start."""
+    _, u, y = late_record(600, noise=0.05)
+    model = estimator(n_noise_states=0).fit(u, y)
+    u, y = u[37:], y[37:]
+    np.testing.assert_allclose(
+        model.predict_ahead(u, y), model.predict_with_initial_state(u, y)
+    )
+
+
 def test_residuals_tell_of_a_delay_that_is_missing():
     _, u, y = late_record(600, noise=0.05)
     tests = estimator().fit(u, y).residual_tests(u, y, n_lags=10)
     assert tests["passed"].all()
-    wrong = estimator(input_delay=0, horizon=10).fit(u, y)
+    wrong = estimator(input_delay=0, horizon=10)
+    with pytest.warns(UserWarning, match="lacks states, a delay"):
+        wrong.fit(u, y)
     tests = wrong.residual_tests(u, y, n_lags=10).set_index("test")
     assert not tests.loc["past inputs", "passed"].all()
 

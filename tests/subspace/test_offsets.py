@@ -277,6 +277,15 @@ def test_prediction_rests_at_the_common_offset(rng):
     np.testing.assert_allclose(found - y0, SYSTEM.simulate(u), atol=1e-8)
 
 
+@pytest.mark.parametrize("level", [1e2, 1e4, 1e6])
+def test_constants_are_found_far_from_zero(rng, level):
+    u = rng.standard_normal((400, 2))
+    y = SYSTEM.simulate(u) + 0.1 * rng.standard_normal((400, 2))
+    model = SubspaceLTI(3, horizon=6).fit(u + level, y + 0.1 * level)
+    assert model.offset_ == "constant"
+    assert error_of(model) < 0.1
+
+
 def test_prediction_warns_where_constants_differ(rng):
     X, y = table(rng, noise=0.1)
     model = SubspaceLTI(3, horizon=6, **options()).fit(X, y)
