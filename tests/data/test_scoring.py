@@ -75,6 +75,17 @@ def test_rest_is_not_taken_for_motion(order, pole):
         SubspaceLTI(order, horizon=8).fit(u, y).score(u, y)
 
 
+def test_inputs_in_transit_at_rest_are_not_taken_for_motion():
+    """Estimated, the twenty of them meet the noise of twenty samples."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        system = stable_model(rng, 2, 1, 1, sampling_time=1.0).with_input_delay(20)
+        u = rng.standard_normal((400, 1))
+        y = system.simulate(u)
+        y = y + y.std() * rng.standard_normal(y.shape)
+        SubspaceLTI(2, horizon=8, input_delay=20).fit(u, y).score(u, y)
+
+
 def test_an_experiment_without_a_measurement_tells_nothing(spring):
     model, X, y = spring
     lost = y.copy()

@@ -186,6 +186,20 @@ def test_from_rest_the_input_before_is_the_offset():
     np.testing.assert_allclose(found.predict(still), rest, atol=1e-7)
 
 
+def test_rest_at_the_mean_is_that_of_the_inputs_before():
+    """Detrended, an experiment from rest is the same wherever its inputs stand."""
+    _, u, y = late_record(noise=0.05)
+    plain, moved = (
+        estimator(initial_state="rest", detrend="constant").fit(u + level, y + level[0])
+        for level in (np.zeros(2), np.array([30.0, -4.0]))
+    )
+    np.testing.assert_allclose(moved.lti_.poles(), plain.lti_.poles(), atol=1e-6)
+    expected = plain.predict(u) + 30.0
+    np.testing.assert_allclose(
+        moved.predict(u + [30.0, -4.0]), expected, atol=1e-5 * y.std()
+    )
+
+
 def test_holes_in_time_end_what_is_known_of_the_inputs():
     _, u, y = late_record()
     rows = np.r_[0:120, 123:300]
@@ -260,6 +274,18 @@ def test_without_noise_the_delay_is_exact():
     found = SubspaceLTI(input_delay="auto").fit(u, y)
     np.testing.assert_array_equal(found.input_delay_, DELAY)
     assert found.order_ == 3
+
+
+@pytest.mark.parametrize("n_trend", [1, 2])
+def test_offsets_and_drifts_are_no_delays(n_trend):
+    """What is found does not depend on them at all."""
+    _, u, y = late_record(200, noise=0.02)
+    v, z = late_record(150, seed=5, noise=0.02)[1:]
+    settings = Choices().settings(2, 2, np.eye(2), n_trend)
+    line = np.arange(200.0)[:, None] * (n_trend - 1)
+    pairs = [(u + [100.0, -5.0] + 0.1 * line, y - 1e3 + line), (v - 7.0, z + 55.0)]
+    for found in (pairs, [(u, y), (v, z)]):
+        np.testing.assert_array_equal(find_delays(found, settings, 3, 6), DELAY)
 
 
 @pytest.mark.parametrize("n_samples", [10, 15, 21, 40])
