@@ -12,7 +12,7 @@ Two experiments at each of four operating points of a spring that stiffens:
 >>> from sklearn.model_selection import GridSearchCV, cross_val_score
 >>> from lpvlearn import ExperimentSplit, GrayBoxRestructurer, GrayBoxStructure
 >>> from lpvlearn import LocalLPVPipeline, SubspaceLTI, bft_scorer, from_trajectories
->>> from lpvlearn import make_bft_scorer
+>>> from lpvlearn import PolynomialLPV, make_bft_scorer
 >>> spring = GrayBoxStructure.from_template(
 ...     A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0]])
 >>> rng = np.random.default_rng(0)
@@ -26,7 +26,8 @@ Two experiments at each of four operating points of a spring that stiffens:
 >>> roles = {"scheduling": "kappa", "experiment": "experiment"}
 >>> pipeline = LocalLPVPipeline(
 ...     SubspaceLTI(order=2, horizon=10, feedthrough=False),
-...     GrayBoxRestructurer(spring, norm="similarity"), time="time", **roles)
+...     GrayBoxRestructurer(spring, norm="similarity"), PolynomialLPV(),
+...     time="time", **roles)
 
 How well a new experiment is simulated:
 

@@ -453,7 +453,7 @@ STEPS = {
     ),
     "an unknown subspace method": (
         lambda: fit(local=SubspaceLTI(method="moesp")),
-        ["`method` must be 'po-moesp', 'pi-moesp'", "Got 'moesp'"],
+        ["`method` must be 'auto', 'po-moesp'", "Got 'moesp'"],
     ),
     "an unknown norm": (
         lambda: fit(restructurer=GrayBoxRestructurer(spring_structure(), norm="inf")),

@@ -40,12 +40,14 @@ any number of inputs and outputs.
 # white. The plain error (``refine="simulation"``) is taken where it predicts parts of
 # the record better that were held out, as it may where the system is not linear.
 #
-# ``method`` says what serves as past data: inputs and outputs (``"po-moesp"``, the
-# default; ``"n4sid"`` and ``"cva"`` weight them differently), or inputs alone
-# (``"pi-moesp"``, the paper's choice, which coloured measurement noise does not
-# disturb).
+# ``method`` says what serves as past data: inputs and outputs (``"po-moesp"``, what the
+# default is in open loop; ``"n4sid"`` and ``"cva"`` weight them differently), or inputs
+# alone (``"pi-moesp"``, the paper's choice, which coloured measurement noise does not
+# disturb). For ``"pbsid"`` see :ref:`guide_closed_loop`.
 
-from lpvlearn import SubspaceLTI
+import numpy as np
+
+from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.datasets import load_flexible_arm
 
 data = load_flexible_arm()
@@ -153,9 +155,6 @@ pd.DataFrame(
 # beside its matrices, in simulations and responses. ``input_delay="auto"`` looks for
 # it: a delay is taken where it is certain, else none.
 
-import numpy as np
-
-from lpvlearn import StateSpace
 
 late = StateSpace([[1.6, -0.8], [1, 0]], [[1], [0]], [[0.2, 0.1]], None, 0.01, 5)
 rng = np.random.default_rng(0)
@@ -229,7 +228,72 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 # * In a :class:`~lpvlearn.LocalLPVPipeline` constants of the local experiments are
 #   allowed for in local models and scores. The LPV model has none, and its ``predict``
 #   says so.
+
+# %%
+# .. _guide_closed_loop:
 #
+# Data from a closed loop
+# -----------------------
+# Often a controller cannot be switched off. Its inputs then know the noise of the
+# outputs, and whatever minimises the simulation error has a bias that no number of
+# samples removes. Every fit looks for that: do future inputs tell of the errors that a
+# long regression leaves? A plant under proportional feedback, with process noise:
+
+import warnings
+
+rng = np.random.default_rng(0)
+A, B, C = np.array([[1.5, -0.7], [1.0, 0.0]]), np.array([1.0, 0.0]), [0.5, 0.3]
+K = np.array([0.4, 0.2])
+plant = StateSpace(A, B[:, None], [C], sampling_time=1.0)
+reference, noise = rng.standard_normal((2, 4000))
+force, position, x = np.zeros((4000, 1)), np.zeros(4000), np.zeros(2)
+for k in range(4000):
+    position[k] = C @ x + 0.5 * noise[k]
+    force[k] = reference[k] - 0.4 * position[k]
+    x = A @ x + B * force[k] + K * noise[k]
+
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    in_loop = SubspaceLTI(2).fit(force, position)
+print(told[0].message)
+
+# %%
+# ``method="auto"`` has taken ``"pbsid"``, predictor-based subspace identification,
+# which minimises the error of prediction. What the others make of these data:
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    biased = SubspaceLTI(2, method="po-moesp", feedthrough=False).fit(force, position)
+display = BodeDisplay.from_models(
+    {"truth": plant, "pbsid": in_loop.lti_, "po-moesp": biased.lti_}
+)
+
+# %%
+# What to do with data from a closed loop:
+#
+# * Best, let a reference or a signal added to the controller's output excite the
+#   loop, and record it. With it as input the data are those of an open loop: the model
+#   is that of the loop, and the controller, which is known, belongs into the structure.
+#   A plant that is stable only in its loop can be brought into a structure in this
+#   way alone.
+# * Else leave ``method="auto"``, or say ``method="pbsid"``. Plant and noise share their
+#   states there; modes that only the noise drives are told from those of the plant.
+#   Standard deviations and ``predict_ahead`` are right under feedback, and the plant
+#   may be unstable: the model is then good for prediction, not for long simulations.
+# * Say ``feedthrough=False`` unless the controller needs a sample to answer: a
+#   feedthrough and a controller that answers within the sample cannot be told apart.
+
+in_loop.predictor_.K.round(2)
+
+# %%
+# Does it lack something?
+# -----------------------
+# A fit of whose errors past inputs explain more than a tenth warns: states, a delay or
+# a nonlinearity is missing. ``residual_tests`` says more:
+
+local.residual_tests(X, y)
+
+# %%
 # Long records and gaps
 # ---------------------
 # * ``partial_fit`` takes a record batch by batch, in memory that does not grow with it.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import fdtrc
 from sklearn.metrics import r2_score
 
-from ..exceptions import warn
+from ..exceptions import collected, warn
 from .alignment import align_outputs
 from .experiments import read_outputs
 
@@ -61,8 +60,7 @@ def warn_of_motion(estimator: Any, X: Any, y: Any, simulated: Array) -> None:
     if not hasattr(estimator, "predict_with_initial_state"):
         return
     measured = read_outputs(y)[0]
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")  # what there is to say, predict has said
+    with collected(), np.errstate(all="ignore"):  # predict has said what there is
         estimated = read_outputs(estimator.predict_with_initial_state(X, y))[0]
     n_late = int(np.sum(getattr(estimator, "input_delay_", 0)))
     for rows in estimator.split_experiments(X):

@@ -41,7 +41,8 @@ class AutoLPV(Interpolator):
     A sample is an operating point: `X` holds its scheduling values, `y` the parameters
     of its local model. Polynomials and rational functions compete where the covariances
     of the parameters are known; of those whose errors can be chance, and whose
-    criterion is within 10 of the lowest, the one with fewest coefficients is taken.
+    criterion is within 10 of the lowest, a polynomial of degree 2 at most, and then the
+    one with fewest coefficients, is taken.
     Where none is left, or the covariances are not known, the interpolation follows the
     points and keeps their shape (`SplineLPV`).
 
@@ -130,7 +131,12 @@ class AutoLPV(Interpolator):
         cost = chi2 / excess + price * (n - dof)
         if good.any():
             supported = np.flatnonzero(good & (cost <= cost[good].min() + _SUPPORT))
-            chosen = int(min(supported, key=lambda k: (-dof[k], cost[k])))
+            # few points tell a parabola from a pole poorly: then it is the parabola
+            bent = [
+                form.degree > _SATURATED or getattr(form, "denominator", 0) > 0
+                for _, form in found
+            ]
+            chosen = int(min(supported, key=lambda k: (bent[k], -dof[k], cost[k])))
         else:
             spline = SplineLPV(_INTERPOLATION).fit(kappa, points.theta)
             chosen = len(found)

@@ -10,8 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
 from ..systems.least_squares import scaled_lstsq
-from ..systems.simulation import state_trajectory
-from ..validation import whole_number
+from ..systems.simulation import (
+    delayed,
+    estimate_initial_state,
+    free_responses,
+    state_trajectory,
+    with_transit,
+)
+from ..validation import finite_samples, whole_number
 from .statespace import StateSpace
 
 Array = NDArray[np.float64]
@@ -32,14 +38,19 @@ class InnovationModel:
 
     ``x[t+1] = A x[t] + B u[t] + K e[t]``, ``y[t] = C x[t] + D u[t] + e[t]`` with white
     innovations e. The states are those of the deterministic model, then those of the
-    noise model, which the inputs do not reach.
+    noise model, which the inputs do not reach. Without a `gain` the innovations do not
+    move the former: the noise model is that of the simulation error.
 
     Parameters
     ----------
     lti : StateSpace
         Deterministic part, discrete time.
     noise : NoiseModel
-        Of the simulation error; ``A - K C`` stable.
+        States that only the innovations drive, and the covariance of these. Without a
+        `gain` its ``A - K C`` is stable.
+    gain : ndarray of shape (order, n_outputs), default=None
+        Rows of K of the deterministic states; ``A - K C`` of all states together is
+        stable, whatever `lti` is. None: zero.
 
     Examples
     --------
@@ -59,6 +70,7 @@ class InnovationModel:
 
     lti: StateSpace
     noise: NoiseModel
+    gain: Array | None = None
 
     def __repr__(self) -> str:
         return (
@@ -96,8 +108,10 @@ class InnovationModel:
     @property
     def K(self) -> Array:
         """Innovation (Kalman) gain, shape (order + n_noise_states, n_outputs)."""
-        zero = np.zeros((self.lti.order, self.lti.n_outputs))
-        return np.vstack([zero, self.noise.K])
+        gain = self.gain
+        if gain is None:
+            gain = np.zeros((self.lti.order, self.lti.n_outputs))
+        return np.vstack([gain, self.noise.K])
 
     @property
     def covariance(self) -> Array:
@@ -123,7 +137,8 @@ class InnovationModel:
         steps : int, default=1
             Prediction horizon in samples.
         initial_state : array-like of shape (order,), default=None
-            Of the deterministic part; None is rest.
+            Of the deterministic part, or, with a `gain`, of all states (order +
+            n_noise_states). Inputs in transit may follow. None is rest.
 
         Returns
         -------
@@ -131,6 +146,8 @@ class InnovationModel:
             Row t uses the inputs up to t and the outputs up to ``t - steps``.
         """
         delay = whole_number("steps", steps, 1) - 1
+        if self.gain is not None:
+            return self._predict_jointly(u, y, delay, initial_state)
         simulated = self.lti.simulate(u, initial_state=initial_state)
         if self.n_noise_states == 0:
             return simulated
@@ -140,16 +157,90 @@ class InnovationModel:
         if known.all():
             ahead = state_trajectory(A - K @ C, error @ K.T)
         else:
-            gains = self._gains(known)
+            gains = self._gains(K, known)
             forcing = np.einsum("tij,tj->ti", gains, np.where(known, error, 0.0))
             ahead = state_trajectory(A - gains @ C, forcing)
         decay = C @ np.linalg.matrix_power(A, delay)
         simulated[delay:] += ahead[: max(len(error) - delay, 0)] @ decay.T
         return simulated
 
-    def _gains(self, known: NDArray[np.bool_]) -> Array:
+    def _predict_jointly(
+        self, u: ArrayLike, y: ArrayLike, delay: int, initial_state: ArrayLike | None
+    ) -> Array:
+        """By the predictor of all states, which is stable where the plant is not."""
+        u = finite_samples("u", u, self.lti.n_inputs)
+        y = np.asarray(y, dtype=float).reshape(len(u), -1)
+        A, B, C, D = self.A, self.B, self.C, self.D
+        gains, known = self._filter_gains(y)
+        late = self.lti.input_delay
+        x0 = np.zeros(len(A) + int(late.sum()))
+        if initial_state is not None:
+            given = np.ravel(np.asarray(initial_state, dtype=float))
+            x0[: len(given)] = given
+        x0, before = np.split(x0, [len(A)])
+        u = delayed(u, late, before)
+        corrected = np.where(known, y - u @ D.T, 0.0)
+        driven = u @ B.T + (gains @ corrected[:, :, None])[:, :, 0]
+        x = state_trajectory(A - gains @ C, driven, x0)
+        for _ in range(min(delay, len(u))):  # one sample on, without the latest output
+            x[1:] = x[:-1] @ A.T + u[:-1] @ B.T
+            x[0] = x0
+        return x @ C.T + u @ D.T
+
+    def estimate_initial_state(
+        self, u: ArrayLike, y: ArrayLike, trend: Array | None = None
+    ) -> Array:
+        """Initial state for `predict`, by least squares over all samples.
+
+        Parameters
+        ----------
+        u : array-like of shape (n_samples, n_inputs)
+        y : array-like of shape (n_samples, n_outputs)
+            Missing values (NaN) are left out.
+        trend : ndarray of shape (n_trend, n_samples), default=None
+            Signals that any multiple of may be in every output, beside the model's.
+
+        Returns
+        -------
+        ndarray of shape (order,) or (order + n_noise_states,)
+            Behind the errors of the simulation; with a `gain` that of all states,
+            behind the errors of one-step prediction. The inputs in transit follow, and
+            the multiples of the trends: signal by signal, output by output.
+        """
+        y = np.asarray(y, dtype=float).reshape(-1, self.lti.n_outputs)
+        if self.gain is None:
+            lti, error = self.lti, y - self.lti.simulate(u)
+            responses = free_responses(lti.A, lti.C, len(y), trend)
+            responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
+        else:
+            error, (gains, _) = y - self.predict(u, y), self._filter_gains(y)
+            responses = prediction_responses(self.A, self.C, gains, len(y), trend)
+            states, trends = np.split(responses, [len(self.A)], axis=2)
+            transit = self._transit_responses(gains, len(y))
+            responses = np.concatenate([states, transit, trends], axis=2)
+        return estimate_initial_state(responses, error)
+
+    def _transit_responses(self, gains: Array, n_samples: int) -> Array:
+        """Of one-step prediction to every input in transit, as of `with_transit`."""
+        delay = self.lti.input_delay
+        n_late = int(delay.sum())
+        if not n_late:
+            return np.zeros((n_samples, self.lti.n_outputs, 0))
+        none = np.zeros((n_samples, self.lti.n_inputs, n_late))
+        late = delayed(none, delay, np.eye(n_late))
+        forcing = self.B @ late - gains @ (self.D @ late)
+        x = state_trajectory(self.A - gains @ self.C, forcing)
+        return self.C @ x + self.D @ late
+
+    def _filter_gains(self, y: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """K, one for every sample where outputs are missing, and which are known."""
+        known = ~np.isnan(y)
+        gains = self.K if known.all() else self._gains(self.K, known)
+        return gains, known
+
+    def _gains(self, K: Array, known: NDArray[np.bool_]) -> Array:
         """K for the outputs that are known: of the others the expected innovation."""
-        K, covariance = self.noise.K, self.noise.covariance
+        covariance = self.noise.covariance
         gains = np.zeros((len(known), *K.shape))
         for pattern in np.unique(known, axis=0):
             own = np.flatnonzero(pattern)
@@ -157,3 +248,21 @@ class InnovationModel:
             rows = np.flatnonzero((known == pattern).all(axis=1))
             gains[np.ix_(rows, np.arange(len(K)), own)] = K @ others.T
         return gains
+
+
+def prediction_responses(
+    A: Array, C: Array, K: Array, n_samples: int, trend: Array | None = None
+) -> Array:
+    """As `free_responses`, of the errors of one-step prediction.
+
+    `K` is one gain or one for every sample. A trend of an output passes the predictor
+    like the output, and what that predicts of it is no error.
+    """
+    (ny, n), signals = C.shape, np.zeros((0, n_samples)) if trend is None else trend
+    trends = free_responses(A, C, n_samples, signals)[:, :, n:]
+    forcing = np.zeros((n_samples, n, n + len(signals) * ny))
+    forcing[:, :, n:] = K @ trends
+    x = state_trajectory(A - K @ C, forcing, np.eye(*forcing.shape[1:]))
+    responses = C @ x
+    responses[:, :, n:] = trends - responses[:, :, n:]
+    return responses

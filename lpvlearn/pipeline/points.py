@@ -46,6 +46,11 @@ _NEIGHBOURS = 2  # points that help one: those to either side along one variable
 
 _BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
 
+_HELD = (
+    "If only its controller holds the plant, identify the closed loop, with the "
+    "controller's reference as input and the controller in the structure. "
+)
+
 _SKIP = " (Mend the experiments there, or leave the point out by on_error='skip'.)"
 
 # -- step 3: a black box at every point ------------------------------------------------
@@ -122,6 +127,8 @@ def identify_point(
     if combine == "pool" or len(labels) == 1:
         fitted = _fit_local(local, experiments, sampling_time)
         pairs = _deviated(fitted)
+        if _from_closed_loop(fitted):
+            advice = _HELD + advice
         lti = _continuous(fitted.lti_, discretization, advice)
         found = LocalModel(
             lti,
@@ -133,12 +140,14 @@ def identify_point(
         if efficient and pairs:
             found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
         return found
-    # The first realisation chooses order and horizon, the others follow it.
+    # The first realisation chooses order, horizon and method, the others follow it.
     # A realisation with gaps is several experiments of one label.
     realisations = [[e for e in experiments if e.label == label] for label in labels]
     fitted = _fit_local(local, realisations[0], sampling_time)
+    if _from_closed_loop(fitted):
+        advice = _HELD + advice
     chosen = clone(local)
-    for name in ("order", "horizon", "input_delay"):
+    for name in ("order", "horizon", "method", "input_delay"):
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
     models, failures, n_trend = [], [], 0
@@ -176,6 +185,10 @@ def _deviated(fitted: Any) -> list[ModelPair]:
     """Models to either side of a fitted one, where the estimator knows them."""
     pairs = getattr(fitted, "deviated_models", None)
     return [] if pairs is None else pairs()
+
+
+def _from_closed_loop(fitted: Any) -> bool:
+    return getattr(fitted, "method_", None) == "pbsid"
 
 
 def _n_trend(fitted: Any) -> int:

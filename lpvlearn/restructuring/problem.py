@@ -261,7 +261,10 @@ def _check_model(model: Any) -> None:
         worst = model.poles()[np.argmax(growth(model.poles(), model.sampling_time))]
         raise ValueError(
             "`model` must be stable: its distance to a gray-box model is infinite "
-            f"otherwise. Got a pole at {worst:.4g}."
+            f"otherwise. Got a pole at {worst:.4g}. Identify it with "
+            "stability='enforce'; or, if only a controller holds the system, identify "
+            "the closed loop, with the controller's reference as input and the "
+            "controller in the structure."
         )
 
 

@@ -73,12 +73,16 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Number of states. "auto" takes the order with the best criterion (minus
         twice the logarithm of the likelihood, and 4 for each parameter), or a lower one
         that simulates parts held out clearly better. 0 is a pure gain.
-    method : {"po-moesp", "pi-moesp", "n4sid", "cva"}, default="po-moesp"
-        "pi-moesp" uses past inputs only as instruments: consistent under coloured
-        measurement noise, but it needs long horizons. The others use past inputs and
-        outputs and differ in the weighting.
+    method : {"auto", "po-moesp", "pi-moesp", "n4sid", "cva", "pbsid"}, default="auto"
+        "auto" is "po-moesp", or "pbsid" where the data come from a closed loop, with a
+        warning. "pi-moesp" uses past inputs only as instruments: consistent under
+        coloured measurement noise, but it needs long horizons. "n4sid" and "cva" use
+        past inputs and outputs, as "po-moesp", and differ in the weighting. "pbsid"
+        minimises the error of prediction instead of simulation: feedback does not
+        bias it, and the plant may be unstable.
     horizon : int or "auto", default="auto"
-        Past and future horizon in samples. "auto" tries a geometric grid and takes
+        Past and future horizon in samples; for "pbsid" the past that its first
+        regression needs, by Akaike's criterion. "auto" tries a geometric grid and takes
         one whose model simulates the data as well as any. Of more than 12,000
         samples "auto" looks at that many, spread over the experiments.
     sampling_time : float, default=None
@@ -87,7 +91,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         refused where continuous time is asked of it.
     feedthrough : bool or array-like of bool, default=True
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
-        shape (n_outputs, n_inputs) single entries of D.
+        shape (n_outputs, n_inputs) single entries of D. A feedthrough in a closed loop
+        can be told only where the controller needs a sample to answer: method="auto"
+        takes ``D = 0`` instead of True where something acts within the sample.
     input_delay : int, array-like of shape (n_inputs,) or "auto", default=0
         Samples by which the inputs, or each of them, act late: ``y[t]`` depends on
         ``u[t - input_delay]`` through D, on earlier inputs through the state. A sampled
@@ -99,16 +105,19 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "prediction" that error whitened by an autoregression of itself and weighted by
         the inverse covariance of its innovations, which has the least variance
         under coloured or unequal noise. "auto" is "prediction" unless the other one, or
-        none, simulates parts held out clearly better.
+        none, simulates parts held out clearly better. "pbsid" minimises the error of
+        prediction whatever is said, but for False.
     stability : {"warn", "enforce"}, default="warn"
         "warn" keeps an unstable model, with a warning, where a stable one fits
         clearly worse; "enforce" returns a stable one and reports in
-        `stability_loss_` what that cost.
+        `stability_loss_` what that cost. "pbsid" keeps what it finds, or, enforced,
+        reflects poles into the unit circle and fits B and D to the simulation error.
     n_noise_states : int or "auto", default="auto"
         States of the noise model in `predictor_`. A number also raises the order of
         the subspace step by that much, which makes "po-moesp" consistent under
         coloured noise without refinement; only states that the inputs reach are
-        kept in `lti_`.
+        kept in `lti_`. "pbsid" has plant and noise share their states; what only the
+        noise drives is told from that, or a number of states besides `order`.
     initial_state : {"estimate", "rest"}, default="estimate"
         State in which every experiment of `fit` starts: estimated along with B and D,
         or zero, which is worth knowing of short experiments that start at rest.
@@ -142,6 +151,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ----------
     lti_ : StateSpace
         Discrete-time model.
+    method_ : str
+        As chosen or given.
     order_, horizon_ : int
         As chosen or given.
     singular_values_ : ndarray of shape (horizon_ * n_outputs,)
@@ -157,13 +168,16 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         What was tried: columns order, horizon, error (relative, whitened, before
         refinement), criterion (per value, above the best; NaN for horizons that
         lost within their order), validation_bft (percent, on parts held out; NaN
-        where that was not looked at), chosen.
+        where that was not looked at), chosen. Of "pbsid" orders are those of plant and
+        noise together, error that of the regression on their states.
     residual_ : float
-        Simulation error on the data relative to the outputs, root mean square.
+        Simulation error on the data relative to the outputs, root mean square; of
+        "pbsid" the error of one-step prediction.
     stability_loss_ : float
         Increase of `residual_` that enforced stability cost; 0 where it cost nothing.
     predictor_ : InnovationModel
-        `lti_` with a noise model, Kalman gain and innovation covariance.
+        `lti_` with a noise model, Kalman gain and innovation covariance. That of
+        "pbsid" predicts unstable plants, too.
     poles_std_ : ndarray of complex, shape (order_,)
         Standard deviations of the real and imaginary parts of ``lti_.poles()``.
     offset_ : {None, "constant", "linear"}
@@ -223,6 +237,13 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
     more, or on samples held out. Where the first answers of a system are fainter than
     the noise, its delay may come out a sample off.
 
+    Data are taken for those of a closed loop where future inputs tell of the errors
+    of a long regression of the outputs on the past, with a p-value below 1e-4, and
+    nonlinear terms of the past do not tell more. What minimises the simulation error
+    has then a bias that no number of samples removes. A loop through which nothing but
+    white noise of the sensors goes does not show; it does no harm with
+    ``feedthrough=False``.
+
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.
 
@@ -233,6 +254,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     M. Verhaegen and V. Verdult, *Filtering and System Identification*, Cambridge
     University Press, 2007.
+
+    A. Chiuso, "The role of vector autoregressive modeling in predictor-based subspace
+    identification", Automatica 43, 2007.
 
     Examples
     --------
@@ -254,7 +278,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         order: int | str = "auto",
         *,
-        method: str = "po-moesp",
+        method: str = "auto",
         horizon: int | str = "auto",
         sampling_time: float | None = None,
         feedthrough: Any = True,
@@ -318,7 +342,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         RankWarning
             If inputs are collinear or do not excite the system sufficiently.
         UserWarning
-            If the model is unstable or explains next to nothing of the outputs.
+            If the model is unstable or explains next to nothing of the outputs, if
+            the data come from a closed loop, and if more than a tenth of the errors
+            depends on past inputs (beyond chance, and 1 % of the outputs): the model
+            lacks states, a delay or a nonlinearity.
         """
         choices = check_options(self.get_params(deep=False))
         experiments = self._read(X, y, reset=True, cut=False)
@@ -329,13 +356,14 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._stream: SampleStream | None = None
         self._single_output = np.asarray(y).ndim == 1
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
+        told: set[str] = set()
         gaps |= bool(delay.any()) and choices.initial_states
-        fitted = fit_as_stream(pairs, choices, detrend=self.detrend, gaps=gaps)
+        fitted = fit_as_stream(pairs, choices, told, detrend=self.detrend, gaps=gaps)
         if fitted is None:
             names = experiments[0].input_names
-            fitted = fit_pairs(pairs, choices, set(), detrend=self.detrend, names=names)
+            fitted = fit_pairs(pairs, choices, told, detrend=self.detrend, names=names)
         self._take(fitted, self._step_of(experiments), delay)
-        warn_about(fitted, set())
+        warn_about(fitted, told)
         if choices.order is not None and choices.horizon is not None:
             warn_about_horizon(fitted, choices)
         return self
@@ -360,10 +388,11 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            If an option is unknown or not the one that the stream began with, or
-            `detrend` is set: a trend needs the whole experiment. If the `time` column
-            repeats or leaves out samples between two batches of an experiment, or
-            its step changes. If a batch has other columns than the first one.
+            If an option is unknown or not the one that the stream began with, the
+            method is "pbsid", or `detrend` is set: a trend needs the whole experiment.
+            If the `time` column repeats or leaves out samples between two batches of
+            an experiment, or its step changes. If a batch has other columns than the
+            first one.
             Everything is then as before the batch, and the right one may follow.
 
         Warns
@@ -417,6 +446,14 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 f"samples from batch to batch. Got {self.input_delay!r}. Find it by "
                 "`fit` of a first part of the record, in `input_delay_`."
             )
+        if choices.method == "pbsid":
+            raise ValueError(
+                "`method` must not be 'pbsid' in partial_fit: of a stream, what it "
+                "needs is not kept. `fit` the table as a whole, or, if the plant "
+                "stands in no feedback loop, leave method='auto'."
+            )
+        if choices.method == "auto":
+            choices = choices._replace(method="po-moesp")
         before = getattr(self, "_stream", None)
         if before is not None:
             before.check_options(options)
@@ -469,6 +506,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
         pairs = remove_trends(pairs, self.detrend)[0]
         n_outputs = pairs[0][1].shape[1]
+        if choices.method in ("auto", "pbsid"):  # a loop leaves delays where they are
+            choices = choices._replace(method="po-moesp")
         # A constant more than there is costs little, one less is taken for a mode.
         n_trend = 1 if choices.offset == "auto" else N_TRENDS[choices.offset]
         settings = choices.settings(n_outputs, n_inputs, np.eye(n_inputs), n_trend)
@@ -489,6 +528,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.input_delay_ = self.lti_.input_delay
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
+        self.method_ = fitted.method
         self.selection_ = fitted.selection.table()
         self.n_outputs_ = len(fitted.evidence.output_scale)
         self.initial_states_ = fitted.model.initial_states
@@ -604,7 +644,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Prediction horizon in samples.
         initial_state : {"estimate", "rest"}, default="estimate"
             "estimate" takes the deterministic initial state from the whole experiment,
-            as `predict_with_initial_state` does; "rest" uses no later output.
+            as `predict_with_initial_state` does (with "pbsid" that of plant and noise,
+            from the errors of prediction); "rest" uses no later output.
 
         Returns
         -------
@@ -619,7 +660,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             u0, level = self._rest()
             x0 = None
             if initial_state == "estimate":
-                x0, level = self._own_part(e)
+                x0, level = self._own_part(e, predictor)
             u, y = e.inputs - u0, _outputs_of(e) - level
             return level + predictor.predict(u, y, steps=steps, initial_state=x0)
 
@@ -678,9 +719,10 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         -----
         Errors that depend on *past* inputs tell of a model that lacks states, a delay
         or a nonlinearity; on the *present* input, of a lacking feedthrough; on *future*
-        inputs, of feedback. An input with a delay is present when it arrives. The
-        errors are whitened by an autoregression before they are regressed on the
-        inputs, so that coloured noise raises no alarm.
+        inputs, of feedback, where errors of prediction are the ones to look at. An
+        input with a delay is present when it arrives. The errors are whitened by an
+        autoregression before they are regressed on the inputs, so that coloured noise
+        raises no alarm.
 
         On the samples of the fit, the errors have lost what the parameters could
         explain: sensitivities of the errors to the parameters join the regressions, and
@@ -708,12 +750,13 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         >>> from lpvlearn import SubspaceLTI
         >>> u, e = np.random.default_rng(0).standard_normal((2, 600))
         >>> y = lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.8], u) + 0.1 * e
-        >>> for order in (1, 2):
-        ...     model = SubspaceLTI(order, horizon=10).fit(u[:, None], y)
-        ...     tests = model.residual_tests(u[:, None], y).set_index("test")
-        ...     print(order, tests["passed"].to_dict())
-        1 {'whiteness': False, 'past inputs': False, ...}
-        2 {'whiteness': True, 'past inputs': True, ...}
+        >>> model = SubspaceLTI(2, horizon=10).fit(u[:, None], y)
+        >>> model.residual_tests(u[:, None], y)[["test", "passed"]]
+                    test  passed
+        0      whiteness    True
+        1    past inputs    True
+        2  present input    True
+        3  future inputs    True
         """
         residuals = self._residuals(X, y, errors)
         return residual_tests(residuals, n_lags=n_lags, level=level)
@@ -801,7 +844,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            If the model does not minimise the simulation error (``refine=False``).
+            If the model does not minimise the simulation error, with "pbsid" the
+            prediction error (``refine=False``).
         """
         check_is_fitted(self, "lti_")
         return self._evidence.frequency_response_covariance(self._per_sample(omega))
@@ -892,16 +936,24 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         u0, y0 = self._rest()
         return y0 + self.lti_.simulate(experiment.inputs - u0)
 
-    def _own_part(self, experiment: Experiment) -> tuple[Array, Array]:
-        """Initial state, inputs in transit; and the outputs their answers add to."""
-        y, n_trend = _outputs_of(experiment), self._evidence.free.n_trend
-        trend = trend_signals(len(y), n_trend)
-        lti = self.lti_
-        responses = free_responses(lti.A, lti.C, len(y), trend)
-        responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
-        own = estimate_initial_state(responses, y - self._simulated(experiment))
-        n = lti.order + int(lti.input_delay.sum())
-        return own[:n], self._rest()[1] + responses[:, :, n:] @ own[n:]
+    def _own_part(
+        self, experiment: Experiment, predictor: InnovationModel | None = None
+    ) -> tuple[Array, Array]:
+        """Initial state, inputs in transit; and the outputs their answers add to.
+
+        Behind the errors of simulation, or of a predictor.
+        """
+        (u0, y0), y = self._rest(), _outputs_of(experiment)
+        lti, trend = self.lti_, trend_signals(len(y), self._evidence.free.n_trend)
+        if predictor is None:
+            responses = free_responses(lti.A, lti.C, len(y), trend)
+            responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
+            own = estimate_initial_state(responses, y - self._simulated(experiment))
+        else:
+            u = experiment.inputs - u0
+            own = predictor.estimate_initial_state(u, y - y0, trend)
+        x0, trends = np.split(own, [len(own) - len(trend) * len(y0)])
+        return x0, y0 + trend.T @ trends.reshape(len(trend), len(y0))
 
     def _in_table(
         self,

@@ -22,6 +22,7 @@ from ..data.preparation import (
 )
 from ..exceptions import RankWarning, warn
 from ..validation import one_of, positive_time
+from .closed_loop import identify_closed_loop
 from .identification import (
     ScaledRecords,
     Settings,
@@ -39,9 +40,11 @@ from .offsets import (
     with_levels,
 )
 from .realization import METHODS
+from .residuals import lacks
 from .selection import Row, Selection, better_horizon, select
 from .simulation_fit import Freedom, Realization
 from .statistics import Evidence, shorten
+from .varx import Feedback, find_feedback
 
 Array = NDArray[np.float64]
 
@@ -50,12 +53,15 @@ REFINEMENTS = ("auto", "simulation", "prediction")
 
 
 class Choices(NamedTuple):
-    """Checked options that decide about a fit."""
+    """Checked options that decide about a fit.
+
+    The method "auto" is "pbsid" where there is feedback, else "po-moesp".
+    """
 
     order: int | None = None  # None is to be chosen
     horizon: int | None = None
     n_noise_states: int = 0
-    method: str = "po-moesp"
+    method: str = "auto"
     feedthrough: Any = True
     refine: str | bool = "auto"
     enforce_stability: bool = False
@@ -84,7 +90,7 @@ class Choices(NamedTuple):
 
 def check_options(options: Mapping[str, Any]) -> Choices:
     """Refuse what is not an option of `SubspaceLTI`, naming those that are."""
-    one_of("method", options["method"], METHODS)
+    one_of("method", options["method"], ("auto", *METHODS, "pbsid"))
     one_of("stability", options["stability"], ("warn", "enforce"))
     one_of("initial_state", options["initial_state"], ("estimate", "rest"))
     one_of("missing", options["missing"], ("raise", "split"))
@@ -176,6 +182,8 @@ class LocalFit(NamedTuple):
     stability_loss: float
     selection: Selection
     evidence: Evidence
+    method: str  # that made the model
+    innovations: Array | None  # least variances of the errors, where known and sought
     offsets: Offsets  # of the experiments, what `detrend` subtracted among them
     first_model: Realization  # of `scaled`, the samples that were fitted as one table:
     scaled: ScaledRecords  # all of them, or the first ones of a long table or a stream
@@ -201,9 +209,10 @@ def fit_pairs(
         raise TooFewSamples(str(error)) from None
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = _fit(pairs, choices, told, N_TRENDS[choices.offset])
-    if choices.offset == "auto" and may_have_constants(fitted.evidence):
+    tested = fitted.evidence.one_step
+    if choices.offset == "auto" and may_have_constants(tested):
         other = _fit(pairs, choices, told, 1)
-        if constants_matter(fitted.evidence, other.evidence):
+        if constants_matter(tested, other.evidence.one_step):
             fitted = other
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
 
@@ -216,10 +225,33 @@ def _fit(pairs: Pairs, choices: Choices, told: set[str], n_trend: int) -> LocalF
     try:
         pairs, basis = _with_independent_inputs(pairs, told)
         settings = choices.settings(n_outputs, n_inputs, basis, n_trend)
-        settings.check_size([len(u) for u, _ in pairs], order, horizon)
+        if settings.method != "pbsid":
+            settings.check_size([len(u) for u, _ in pairs], order, horizon)
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
     scaled = scale_records(pairs, n_trend)
+    feedback = find_feedback(scaled.records)
+    settings = _heed(feedback, settings, choices.feedthrough is True, told)
+    if settings.method == "pbsid":
+        try:
+            closed = identify_closed_loop(scaled, basis, order, horizon, settings)
+        except ValueError as error:
+            raise TooFewSamples(str(error)) from None
+        offsets = attributed(closed.evidence, centres, whole)
+        evidence, offsets = with_levels(closed.evidence, offsets)
+        return LocalFit(
+            evidence.model,
+            closed.singular_values,
+            closed.residual,
+            closed.stability_loss,
+            closed.selection,
+            evidence,
+            settings.method,
+            None,
+            offsets,
+            evidence.model,
+            scaled,
+        )
     chosen = None
     if order is None or horizon is None:
         chosen = select(scaled.records, order, horizon, settings)
@@ -250,10 +282,57 @@ def _fit(pairs: Pairs, choices: Choices, told: set[str], n_trend: int) -> LocalF
         found.stability_loss,
         chosen,
         evidence,
+        settings.method,
+        None if feedback is None else feedback.innovations,
         offsets,
         found.model,
         scaled,
     )
+
+
+def _heed(
+    feedback: Feedback | None, settings: Settings, by_default: bool, told: set[str]
+) -> Settings:
+    """The settings with their method chosen, and the user told of feedback.
+
+    `by_default` tells that D is free because nobody said otherwise.
+    """
+    chooses, direct = settings.method == "auto", settings.free.direct
+    if feedback is None or not feedback.found:
+        return settings._replace(method="po-moesp") if chooses else settings
+    what = (
+        "The inputs know the noise of the outputs (future inputs explain "
+        f"{100.0 * feedback.share:.2g} % of the innovations, p = "
+        f"{feedback.p_value:.1g}): the data come from a closed loop. "
+    )
+    loop = direct.any() and feedback.instantaneous
+    if not chooses and settings.method != "pbsid":
+        what += (
+            f"That biases method={settings.method!r} however many samples there are. "
+            "Use method='pbsid', or identify with the controller's reference as input."
+        )
+    elif not chooses and loop:
+        what += (
+            "Inputs and outputs also depend on each other within the sample, and the "
+            "data do not tell a feedthrough from a controller that answers at once. "
+            "Use feedthrough=False unless the controller needs a sample to answer."
+        )
+    elif not chooses:
+        return settings
+    else:
+        what += "method='pbsid' was taken, which that does not bias."
+        settings = settings._replace(method="pbsid")
+        if loop and by_default:
+            what += (
+                " Inputs and outputs also depend on each other within the sample, and "
+                "the data do not tell a feedthrough from a controller that answers at "
+                "once: D = 0 was taken. If the controller needs a sample to answer, "
+                "use method='pbsid', which leaves D free."
+            )
+            none = np.zeros_like(direct)
+            settings = settings._replace(free=settings.free._replace(direct=none))
+    tell(told, "feedback", what)
+    return settings
 
 
 def _with_independent_inputs(pairs: Pairs, told: set[str]) -> tuple[Pairs, Array]:
@@ -279,9 +358,11 @@ def _with_independent_inputs(pairs: Pairs, told: set[str]) -> tuple[Pairs, Array
 
 def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
     """Tell the user when another horizon fits clearly better than the one given."""
+    if fitted.method == "pbsid":
+        return
     settings = Settings(
         fitted.evidence.free,
-        choices.method,
+        fitted.method,
         choices.refine is not False,
         choices.enforce_stability,
     )
@@ -336,7 +417,7 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "more richly, or lower `order`.",
             RankWarning,
         )
-    warn_about_pole(model.A, told)
+    warn_about_pole(model.A, told, fitted.method)
     as_found = residual - fitted.stability_loss
     if residual**2 - as_found**2 > _HALF:
         tell(
@@ -357,18 +438,41 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
         )
+    if fitted.innovations is None or fitted.stability_loss or "lack" in told:
+        return
+    if lacks(fitted.evidence, fitted.innovations):
+        tried = {row.order for row in fitted.selection.rows}
+        remedy = "a higher `order`" if len(tried) > 1 else "order='auto'"
+        # Without figures, so that a search over orders says it once of each.
+        tell(
+            told,
+            "lack",
+            "The simulation error depends on past inputs, which explain more than a "
+            f"tenth of it: the model of order {len(model.A)} lacks states, a delay or "
+            f"a nonlinearity. Try {remedy}, `input_delay`, or, if the system is "
+            "nonlinear, smaller inputs; `residual_tests` tells which input it is.",
+        )
 
 
-def warn_about_pole(A: Array, told: set[str]) -> None:
+def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
     """Tell the user that a model is unstable."""
     radius = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
     if radius > 1.0 + _ROUNDING:
+        remedy = (
+            "Use stability='enforce' for a stable one, another `order`, or a longer "
+            "`horizon`."
+        )
+        if method == "pbsid":
+            remedy = (
+                "Such a plant can be predicted (`predict_ahead`), but not simulated "
+                "for long nor brought into a structure: for that, identify the closed "
+                "loop, with the controller's reference as input."
+            )
         tell(
             told,
             "pole",
             f"The identified model is unstable: a pole has modulus {radius:.6g}. "
-            "Use stability='enforce' for a stable one, another `order`, or a "
-            "longer `horizon`.",
+            + remedy,
         )
 
 

@@ -100,11 +100,24 @@ def data_factor(
     n_outputs = records[0].shape[1] - n_inputs
     rows = _past_future_rows(n_inputs, n_outputs, horizon, past_outputs=past_outputs)
     if engine == "cholesky":
-        gram = _pooled_gram(records, 2 * horizon, rows, correlations, n_trend)
-        lower = cholesky_factor(gram)
-        if lower is not None:
-            return lower
+        return hankel_factor(records, 2 * horizon, rows, correlations, n_trend)
     return _qr_factor(records, 2 * horizon, rows, n_trend)
+
+
+def hankel_factor(
+    records: Sequence[Array],
+    n_rows: int,
+    rows: NDArray[np.intp],
+    correlations: Sequence[Array] | None = None,
+    n_trend: int = 0,
+) -> Array:
+    """Lower triangular factor of some `rows` of `n_rows` block rows, in that order.
+
+    `correlations` and `n_trend` as in `data_factor`.
+    """
+    gram = _pooled_gram(records, n_rows, rows, correlations, n_trend)
+    lower = cholesky_factor(gram)
+    return _qr_factor(records, n_rows, rows, n_trend) if lower is None else lower
 
 
 def _qr_factor(

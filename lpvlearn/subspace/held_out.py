@@ -29,7 +29,8 @@ _N_BLOCKS = 5  # of a piece: sums over time whose spread tells that of their tot
 
 _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 
-_SHARE = 0.03  # by which an error must be less to matter
+# By which an error must be less to matter, and by which it is so beyond doubt.
+_SHARE, _MUCH = 0.03, 0.5
 
 
 class HeldOut(NamedTuple):
@@ -41,14 +42,16 @@ class HeldOut(NamedTuple):
     def clearly_better_than(self, other: HeldOut, standard_errors: float) -> bool:
         """Whether errors are less, by more than chance and by enough to matter.
 
-        Chance is so many standard errors of the difference.
+        Chance is so many standard errors of the difference. Of half the errors it is
+        not asked: a model that loses the system now and then makes them large as well.
         """
         total = other.blocks.sum()
         if not np.isfinite(total):
             return bool(np.isfinite(self.blocks.sum()))
         gap = other.blocks - self.blocks
         chance = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
-        return bool(gap.sum() > max(standard_errors * chance, _SHARE * total))
+        least = min(standard_errors * chance, _MUCH * total)
+        return bool(gap.sum() > max(least, _SHARE * total))
 
 
 def held_out(

@@ -98,7 +98,7 @@ def with_levels(evidence: Evidence, offsets: Offsets) -> tuple[Evidence, Offsets
         levels = offsets.constants / evidence.output_scale - trends[:, 0]
         evidence = replace(evidence, levels=levels)
         if len(trends) > 1:
-            chance = chance_of_constants(evidence, equal=True)
+            chance = chance_of_constants(evidence.one_step, equal=True)
             offsets = offsets._replace(differ=chance < _SIGNIFICANT)
     return evidence, offsets
 

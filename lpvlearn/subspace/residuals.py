@@ -51,7 +51,9 @@ from ..systems.simulation import (
 from ..validation import one_of, whole_number
 from .hankel import cholesky_factor, correlation_sequence, stack_factors
 from .identification import centred
-from .statistics import Evidence, autoregression
+from .noise import autoregression
+from .simulation_fit import simulation_errors, with_initial_states
+from .statistics import Evidence
 
 Array = NDArray[np.float64]
 
@@ -74,6 +76,13 @@ _ROUNDING, _ROUNDING_OF_LARGEST = 1e-8, 1e-13
 _HEAD = 50  # outputs by which an experiment is recognised: measured, hardly the same
 
 _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligible
+
+# A lack is told that explains this share of the errors, is larger than this share of
+# the output, and so improbable by chance; it is looked for in so many samples.
+_MUCH, _MUCH_OF_OUTPUT, _CERTAIN, _MAX_SAMPLES = 0.1, 0.01, 1e-8, 4_096
+
+# Lags by which it is seen at little cost that errors are no larger than need be.
+_N_SCREEN = 10
 
 _PIECE = 8192  # windows worked on at a time: they stay in memory
 
@@ -152,29 +161,32 @@ def model_residuals(
     the outputs of one of theirs. Where only a part was fitted that costs some power,
     and no test becomes wrong.
     """
-    n, n_trend = lti.order, evidence.free.n_trend
+    n_trend = evidence.free.n_trend
     pairs = remove_trends(list(pairs), detrend)[0]
     pairs, errors = centred(pairs, n_trend, True)[0], []
     with np.errstate(over="ignore", invalid="ignore"):  # refused below
         for u, y in pairs:
-            free = free_responses(lti.A, lti.C, len(y), trend_signals(len(y), n_trend))
-            error = y - lti.simulate(u)
-            own = estimate_initial_state(free, error)
+            trend = trend_signals(len(y), n_trend)
             if predictor is None:
-                errors.append(error - free @ own)
-            else:
-                y = y - free[:, :, n:] @ own[n:]
-                errors.append(y - predictor.predict(u, y, initial_state=own[:n]))
+                free = free_responses(lti.A, lti.C, len(y), trend)
+                error = y - lti.simulate(u)
+                errors.append(error - free @ estimate_initial_state(free, error))
+                continue
+            own = predictor.estimate_initial_state(u, y, trend)
+            x0, trends = np.split(own, [len(own) - n_trend * y.shape[1]])
+            y = y - trend.T @ trends.reshape(n_trend, y.shape[1])
+            errors.append(y - predictor.predict(u, y, initial_state=x0))
     if not all(np.isfinite(e).all() for e in errors):
         raise ValueError(
             "residual tests need a simulation that stays finite. The model is unstable "
-            "and diverges over these samples: use stability='enforce'."
+            "and diverges over these samples: use stability='enforce', or "
+            "errors='prediction' with method='pbsid'."
         )
     inputs = [u for u, _ in pairs]
     # The trend of an answer is not quite the answer to the trend of an input. Inputs
     # are compared with what trends have left of the errors.
-    trend = DETRENDS[n_trend] or detrend
-    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), trend)[0]
+    removed = DETRENDS[n_trend] or detrend
+    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), removed)[0]
     inputs, errors = [u for u, _ in cleaned], [e for _, e in cleaned]
     y, e = np.vstack([y for _, y in pairs]), np.vstack(errors)
     size, largest = np.sqrt(np.mean(e**2, axis=0)), np.abs(y).max(axis=0)
@@ -197,11 +209,11 @@ def model_residuals(
     if any((y[:head] / scale).T.tobytes() in known for _, y in pairs):
         response, n_noise = [np.eye(lti.n_outputs)], 0
         if predictor is not None:
-            n_noise = -(-predictor.n_noise_states // lti.n_outputs)
-            noise = predictor.noise
-            state, A = noise.K, noise.A - noise.K @ noise.C
+            K, C = predictor.K, predictor.C
+            n_noise = -(-int(K.any(axis=1).sum()) // lti.n_outputs)
+            state, A = K, predictor.A - K @ C
             while len(response) < _LONGEST_RESPONSE and state.any():
-                response.append(-noise.C @ state)
+                response.append(-C @ state)
                 state = A @ state
         fitted = Fitted(lti.poles(), lti.D != 0.0, np.array(response), n_noise)
     return Residuals(errors, inputs, output_names, input_names, fitted)
@@ -383,6 +395,68 @@ def input_tests(
     return tests
 
 
+def lacks(evidence: Evidence, innovations: Array) -> bool:
+    """Whether errors of a fit clearly depend on past inputs, and not just by a little.
+
+    `innovations` are variances of the errors of a long regression on the past, in the
+    scale of the records: a model whose errors are as small is not looked at.
+    """
+    records, left = [], _MAX_SAMPLES
+    for record in evidence.records:
+        if left > 0:
+            records.append(record.head(left))
+        left -= record.u.shape[1]
+    if not np.isfinite(evidence.model.loss):
+        return False
+    weight, trend = evidence.whitening.weight, DETRENDS[evidence.free.n_trend]
+    model = with_initial_states(evidence.model, records, evidence.free, weight)
+    errors = simulation_errors(model, records)
+    inputs = [record.u.T for record in records]
+    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), trend)[0]
+    inputs, errors = [u for u, _ in cleaned], [e for _, e in cleaned]
+    outputs = np.hstack([record.y for record in records])
+    size = np.mean(outputs**2, axis=1)
+    variances = np.mean(np.vstack(errors) ** 2, axis=0)
+
+    def much(variance: Array) -> NDArray[np.bool_]:
+        lacking = variance - innovations
+        return (lacking > _MUCH * variance) & (lacking > _MUCH_OF_OUTPUT**2 * size)
+
+    if not much(variances).any():
+        return False
+    suspects = np.flatnonzero(much(_predicted_variances(errors)))
+    if not len(suspects):
+        return False
+    poles = np.linalg.eigvals(model.A).astype(complex)
+    fitted = Fitted(poles, evidence.free.direct, np.eye(len(size))[None])
+    names = list(range(len(size))), list(range(inputs[0].shape[1]))
+    try:
+        residuals, n_lags = with_windows(
+            Residuals(errors, inputs, *names, fitted), None
+        )
+    except ValueError:  # too few samples
+        return False
+    tests = input_tests(residuals.errors, residuals.inputs, n_lags, fitted).past
+    n = sum(map(len, residuals.errors))
+    return any(
+        test.p_value < _CERTAIN
+        and test.statistic - test.dof > _MUCH * (test.statistic + n)
+        for i in suspects
+        for test in tests[i]
+    )
+
+
+def _predicted_variances(errors: Sequence[Array]) -> Array:
+    """Variances of the errors of every output, given some of its last ones."""
+    r = autocorrelations(errors, _N_SCREEN)
+    r[0] *= 1.0 + _DEPENDENT**2
+    explained = [
+        one[1:] @ linalg.solve_toeplitz(one[:-1], one[1:]) if one[0] else 0.0
+        for one in r.T
+    ]
+    return np.mean(np.vstack(errors) ** 2, axis=0) * (1.0 - np.array(explained))
+
+
 def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:
     r"""Signals that span the change of one output's errors by A, B, C and free D.
 
@@ -403,12 +477,11 @@ def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:
         denominator = np.poly([pole, pole.conj()] if pole.imag else [pole]).real
         signals = scipy.signal.lfilter(denominator[::-1], denominator, signals, axis=0)
     states = np.hstack(spanned)
+    driven = [np.hstack([states, u[:, free]]) for free in fitted.direct]
     return [
-        scipy.signal.lfilter(
-            h, [1.0], np.hstack([states, u[:, fitted.direct[k]]]), axis=0
-        )
-        for k, h in enumerate(fitted.filter[:, output].T)
-        if h.any()
+        scipy.signal.lfilter(h, [1.0], signals, axis=0)
+        for h, signals in zip(fitted.filter[:, output].T, driven, strict=True)
+        if h.any() and signals.size
     ]
 
 

@@ -79,7 +79,7 @@ class Evidence:
 
     @cached_property
     def covariance(self) -> Array:
-        """Of the parameters, as `_parameter_covariance` has them, where it is known."""
+        """Of the parameters, as `parameter_covariance` has them, where it is known."""
         if not self.refined:
             raise ValueError(
                 "The covariance is that of a refined model at an unconstrained "
@@ -92,7 +92,7 @@ class Evidence:
         records = self.whitening.records(self.records, self.free)
         model = with_initial_states(self.sections, records, self.free)
         noise = autoregression(simulation_errors(model, records))
-        covariance = _parameter_covariance(model, records, self.free, noise)
+        covariance = parameter_covariance(model, records, self.free, noise)
         return covariance * self.share
 
     @cached_property
@@ -102,6 +102,11 @@ class Evidence:
         Its initial states are those of the records themselves.
         """
         return in_sections(self.whitening.model(self.model))
+
+    @property
+    def one_step(self) -> Evidence:
+        """What tells of constants: itself, or a predictor, where inputs know errors."""
+        return self
 
     def state_space(
         self, model: Realization, sampling_time: float | None
@@ -206,7 +211,7 @@ def _square_root(covariance: Array) -> Array:
     return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
 
 
-def _parameter_covariance(
+def parameter_covariance(
     model: Realization, records: Sequence[Record], free: Freedom, noise: NoiseModel
 ) -> Array:
     """Covariance of the parameters (B, D, A, C), own unknowns allowed for.

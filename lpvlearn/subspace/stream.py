@@ -392,13 +392,14 @@ def _same(first: Any, other: Any) -> bool:
 
 
 def fit_as_stream(
-    pairs: Pairs, choices: Choices, *, detrend: str | None, gaps: bool
+    pairs: Pairs, choices: Choices, told: set[str], *, detrend: str | None, gaps: bool
 ) -> LocalFit | None:
     """Fit a long table as a stream of its samples; `gaps` as in `SampleBuffer`.
 
-    None where that would not do: few samples, or first ones that say too little.
+    None where that would not do: few samples, first ones that say too little, or a
+    closed loop. `told` as in `fit_pairs`.
     """
-    if sum(len(u) for u, _ in pairs) <= BUFFER:
+    if sum(len(u) for u, _ in pairs) <= BUFFER or choices.method == "pbsid":
         return None
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     buffer = SampleBuffer(gaps)
@@ -407,9 +408,11 @@ def fit_as_stream(
     if not _as_independent(first, pairs):
         return None
     try:
-        summary = StreamSummary(
-            fit_pairs(first, choices, set()), choices, buffer.n_samples
-        )
+        begun = fit_pairs(first, choices, told)
+        if begun.method == "pbsid":
+            return None
+        choices = choices._replace(method=begun.method)
+        summary = StreamSummary(begun, choices, buffer.n_samples)
         for piece in left:
             summary.add(piece)
         fitted = summary.fit()

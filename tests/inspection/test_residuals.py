@@ -91,7 +91,8 @@ def test_panels_are_the_correlations_of_the_estimators_errors(plant, fitted, err
 
 
 def test_a_model_that_lacks_states_is_seen_and_said(plant, fitted):
-    poor = SubspaceLTI(order=2, horizon=8, **ROLES).fit(*plant)
+    with pytest.warns(UserWarning, match="order 2 lacks states"):
+        poor = SubspaceLTI(order=2, horizon=8, **ROLES).fit(*plant)
     shown = {}
     for name, model in (("good", fitted), ("poor", poor)):
         display = ResidualDisplay.from_estimator(model, *plant)

@@ -82,6 +82,18 @@ def test_few_points_carry_a_constant_a_line_or_a_parabola(n_points, form):
     np.testing.assert_allclose(model.predict(KAPPA[:n_points]), theta)
 
 
+def test_three_points_of_one_parameter_that_varies_carry_a_parabola():
+    """A rational function of degrees 1 and 1 meets them with fewer coefficients."""
+    kappa = np.array([[0.0], [1.0], [1.5]])
+    theta = np.hstack(
+        [30 + 0 * kappa, 1.2 + 0 * kappa, 40 + 10 * kappa + 20 * kappa**2]
+    )
+    P = np.tile(np.diag([1e-4, 1e-6, 1e-4]), (3, 1, 1))
+    model = AutoLPV().fit(kappa, theta, covariance=P)
+    assert model.form_ == "polynomial 2"
+    np.testing.assert_allclose(model.predict([[0.5]]), [[30, 1.2, 50]], rtol=1e-6)
+
+
 def test_forms_of_two_variables():
     axes = np.meshgrid(np.linspace(0, 1, 5), np.linspace(20, 40, 4), indexing="ij")
     kappa = np.stack(axes, axis=-1).reshape(-1, 2)

@@ -552,8 +552,9 @@ def test_a_stopwatch_adds_up_the_times_of_the_steps():
 @pytest.mark.filterwarnings("ignore:Scheduling variable 'kappa' must be within")
 def test_a_prediction_that_diverges_names_the_experiment(spring):
     X, y, _, _ = spring
-    model = spring_pipeline().fit(X, y)
-    far = X.assign(kappa=X["kappa"].where(X["run"] != "p2r0", 1e9))
+    line = PolynomialLPV(1)  # whose stiffness is negative far below
+    model = spring_pipeline(interpolator=line).fit(X, y)
+    far = X.assign(kappa=X["kappa"].where(X["run"] != "p2r0", -1e9))
     with pytest.raises(DivergenceError, match="Experiment 'p2r0': .*at scheduling"):
         model.predict(far)
 

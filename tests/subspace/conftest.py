@@ -92,6 +92,34 @@ def identify(pairs, order, horizon, *, feedthrough=True, **options):
     return Found(A, B / su, C, D, x0, found.singular_values, found.residual)
 
 
+# A lightly damped plant, and how the innovations drive its states.
+LOOP_PLANT = (
+    np.array([[1.5, -0.7], [1.0, 0.0]]),
+    np.array([[1.0], [0.0]]),
+    np.array([[0.5, 0.3]]),
+    np.zeros((1, 1)),
+)
+LOOP_GAIN = np.array([0.8, 0.4])
+
+
+def closed_loop(
+    rng, n_samples, plant=LOOP_PLANT, *, gain=0.4, delay=0, drive=LOOP_GAIN, pole=None
+):
+    """``u = r - gain y``, y some samples late, under process or coloured noise.
+
+    With a `pole` the noise is of first order and does not drive the plant.
+    """
+    A, B, C, _ = plant
+    r, e = rng.standard_normal((2, n_samples)) * [[1.0], [0.5]]
+    x, v, u, y = np.zeros(len(A)), 0.0, np.zeros(n_samples), np.zeros(n_samples)
+    for t in range(n_samples):
+        v = e[t] if pole is None else pole * v + 0.43 * e[t]
+        y[t] = C[0] @ x + v
+        u[t] = r[t] - gain * (y[t - delay] if t >= delay else 0.0)
+        x = A @ x + B[:, 0] * u[t] + (drive * e[t] if pole is None else 0.0)
+    return u[:, None], y[:, None]
+
+
 def fed(model, u, y, sizes):
     start = 0
     for size in sizes:

@@ -6,6 +6,7 @@ from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.data.experiments import Experiment
+from lpvlearn.models.innovation import InnovationModel, NoiseModel
 from lpvlearn.subspace.delay import find_delays, first_answers, late_inputs
 from lpvlearn.subspace.fit import Choices
 
@@ -108,7 +109,8 @@ def test_residuals_tell_of_a_delay_that_is_missing():
     _, u, y = late_record(600, noise=0.05)
     tests = estimator().fit(u, y).residual_tests(u, y, n_lags=10)
     assert tests["passed"].all()
-    wrong = estimator(input_delay=0, horizon=10).fit(u, y)
+    with pytest.warns(UserWarning, match="lacks states, a delay"):
+        wrong = estimator(input_delay=0, horizon=10).fit(u, y)
     tests = wrong.residual_tests(u, y, n_lags=10).set_index("test")
     assert not tests.loc["past inputs", "passed"].all()
 
@@ -176,6 +178,27 @@ def test_without_noise_all_own_unknowns_are_exact():
         for predict in (found.predict_with_initial_state, found.predict_ahead):
             z = predict(X[rows], y[rows])
             np.testing.assert_allclose(z[known[rows]], y[rows][known[rows]], atol=1e-7)
+
+
+@pytest.mark.parametrize("lost", [[], [20, 21, 90]])
+def test_a_predictor_with_a_gain_estimates_what_is_in_transit(lost):
+    """All states and inputs in transit, of time-varying gains where outputs miss."""
+    rng = np.random.default_rng(2)
+    lti = stable_model(3, 3, sampling_time=1.0, feedthrough=True)
+    lti = lti.with_input_delay(DELAY)
+    noise = NoiseModel(
+        0.8 * np.eye(1), np.ones((2, 1)), np.full((1, 2), 0.2), np.eye(2)
+    )
+    model = InnovationModel(lti, noise, 0.1 * rng.normal(size=(3, 2)))
+    u, own = rng.normal(size=(100, 2)), rng.normal(size=4 + sum(DELAY) + 2)
+    x0, level = own[:-2], own[-2:]
+    y = lti.simulate(u, initial_state=np.delete(x0, 3))
+    y += x0[3] * 0.8 ** np.arange(100.0)[:, None]
+    assert np.abs(model.predict(u, y, initial_state=x0) - y).max() < 1e-12
+    z = y + level
+    z[lost] = np.nan
+    found = model.estimate_initial_state(u, z, np.ones((1, 100)))
+    np.testing.assert_allclose(found, own, atol=1e-8)
 
 
 def test_from_rest_the_input_before_is_the_offset():

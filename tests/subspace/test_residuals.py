@@ -208,13 +208,9 @@ def test_what_the_model_lacks_shows_in_past_inputs_only():
     u = coloured(rng, 1500, 0.7)
     y = lti_response(A, np.ones((3, 1)), np.ones((1, 3)), np.zeros((1, 1)), u)
     y += 0.1 * y.std() * coloured(rng, 1500, 0.9)
-    tables = {
-        order: SubspaceLTI(order=order, horizon=10)
-        .fit(u, y)
-        .residual_tests(u, y)
-        .set_index("test")
-        for order in (1, 3)
-    }
+    with pytest.warns(UserWarning, match="order 1 lacks states"):
+        models = {order: SubspaceLTI(order, horizon=10).fit(u, y) for order in (1, 3)}
+    tables = {n: m.residual_tests(u, y).set_index("test") for n, m in models.items()}
     assert tables[1].loc["past inputs", "p_value"] < 1e-6
     assert tables[3].loc["past inputs", "passed"]
     for table in tables.values():
@@ -433,3 +429,45 @@ def test_a_model_that_diverges_is_refused():
     model.lti_ = StateSpace([[1.5]], [[1.0]], [[1.0]], sampling_time=1.0)
     with pytest.raises(ValueError, match="unstable .*: use stability='enforce'"):
         model.residual_tests(u, e)
+
+
+# -- a lack that a fit tells of --------------------------------------------------------
+
+
+def resonance(rng, n_samples, noise, pole=0.0):
+    """A fourth-order system, 0 to 1 samples per radian, with noise at its output."""
+    A = modes(0.95 * np.exp(0.3j), 0.9 * np.exp(1.2j))
+    system = StateSpace(
+        A, [[1.0], [0.3], [1.0], [0.2]], [[0.5, 0.2, 1.0, 0.4]], None, 1
+    )
+    u = rng.standard_normal((n_samples, 1))
+    y = system.simulate(u)
+    e = coloured(rng, n_samples, pole)
+    return u, y + noise * y.std() / e.std() * e
+
+
+def test_a_fit_tells_of_missing_states():
+    u, y = resonance(np.random.default_rng(0), 800, 0.1)
+    with pytest.warns(UserWarning, match="order 2 lacks states.*order='auto'"):
+        SubspaceLTI(2, horizon=12).fit(u, y)
+    SubspaceLTI(4, horizon=12).fit(u, y)  # silently
+
+
+def test_a_small_lack_is_not_told():
+    """Neither next to the noise, nor next to the output."""
+    rng = np.random.default_rng(1)
+    u = rng.standard_normal((3000, 1))
+    y = lfilter([0.0, 1.0], [1.0, -0.5], u, axis=0)
+    weak = 0.05 * lfilter([0.0, 0.0, 0.0, 1.0], [1.0, 0.8], u, axis=0)
+    noise = rng.standard_normal(y.shape)
+    SubspaceLTI(1, horizon=8).fit(u, y + weak + 0.5 * noise)
+    SubspaceLTI(1, horizon=8).fit(u, y + 0.05 * weak)
+    with pytest.warns(UserWarning, match="lacks states"):
+        SubspaceLTI(1, horizon=8).fit(u, y + weak + 0.01 * noise)
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.9])
+def test_noise_alone_is_no_lack(pole):
+    for seed in range(8):
+        u, y = resonance(np.random.default_rng(seed), 600, 0.3, pole)
+        SubspaceLTI(4, horizon=12).fit(u, y)

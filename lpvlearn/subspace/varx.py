@@ -1,0 +1,279 @@
+r"""Vector autoregression of the outputs, and what it tells of feedback.
+
+Without a model, and without assuming that the inputs do not know the noise, the outputs
+are regressed on the last samples of all channels (VARX):
+
+.. math:: y_t = \sum_{l=1}^{p} M_l z_{t-l} + D u_t + e_t, \qquad z_t = [u_t; y_t].
+
+What is left is white, and in open loop independent of all inputs; under feedback the
+inputs that follow know it (Sims, 1972; Caines and Chan, 1975). Past inputs and outputs
+are regressors already, so that a missing state, coloured noise or coloured inputs raise
+no alarm: all that is asked of p is to be long enough, which the data choose.
+
+Constants of the experiments, and drifts, are regressors too, projected out of all rows.
+Everything follows from the triangular factor of one Hankel matrix. In the columns
+beyond those of some first rows stand the other rows less what the first explain: of
+rows ordered from the newest sample to the oldest, the residuals for every p.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, stats
+
+from .hankel import hankel_factor, without_trend
+from .signals import Record
+
+Array = NDArray[np.float64]
+
+# Samples per regressor of the longest past window that is tried: beyond that the small
+# sample term of the criterion exceeds what any lag could gain.
+_SAMPLES_PER_REGRESSOR = 4
+
+# Part of an output's energy below which innovations are rounding: added to their
+# variance, it makes criteria stop where nothing but rounding is left to explain.
+_EXACT = 1e-16
+
+# What the feedback is looked for in: so many samples of at most so many rows, and so
+# many future samples of every input, on which controllers answer.
+_MAX_SAMPLES, _MAX_ROWS, _N_FUTURE = 10_000, 120, 8
+
+# p-value of what is called feedback, and lags of the nonlinear terms that may be it
+_LEVEL, _N_CURVED = 1e-4, 3
+
+_INSTANTANEOUS = 0.01  # p-value below which something acts within the sample
+
+# Part of a future input that the past does not explain, below which it is known
+# beforehand: sines, or values that are held.
+_FORESEEN = 1e-3
+
+_DEPENDENT = 1e-9  # part of a regressor below which it is rounding
+
+# Innovations, relative to the outputs, too small to do harm or to be told from rounding
+_NOISE_FREE = 1e-5
+
+
+class Feedback(NamedTuple):
+    """What the inputs know about the noise."""
+
+    p_value: float  # of innovations and future inputs that do not correlate
+    share: float  # of the innovations that future inputs explain, beyond chance
+    p_instantaneous: float  # of ``u[t]`` and ``y[t]`` not correlated, given the past
+    curved: float  # share that nonlinear terms of the past explain
+    innovations: Array  # (n_outputs,), their variances
+
+    @property
+    def found(self) -> bool:
+        """Whether there is feedback.
+
+        Errors of a nonlinearity know future inputs, too, where these follow from
+        the past nonlinearly (chirps, values that are held); but they follow from
+        the past themselves, which noise does not.
+        """
+        return self.p_value < _LEVEL and self.share > self.curved
+
+    @property
+    def instantaneous(self) -> bool:
+        """Whether an output knows an input of the same sample: or the other way."""
+        return self.p_instantaneous < _INSTANTANEOUS
+
+
+def samples_of(records: Sequence[Record]) -> list[Array]:
+    """Rows ``[u, y]`` of every record, less its trends."""
+    return [
+        without_trend(
+            np.ascontiguousarray(np.vstack((record.u, record.y)).T), len(record.trend)
+        )
+        for record in records
+    ]
+
+
+def n_windows(records: Sequence[Record], past: int) -> int:
+    """Samples that have `past` others of their experiment before them.
+
+    Less one for each of its trends, which are projected out of all channels.
+    """
+    return sum(
+        max(0, record.u.shape[1] - past - len(record.trend)) for record in records
+    )
+
+
+def longest_past(records: Sequence[Record], most_rows: int, ahead: int = 0) -> int:
+    """Longest past window that the records can carry; 0 where there is none.
+
+    `ahead` future samples of every input are regressed on too.
+    """
+    m, ny = len(records[0].u), len(records[0].y)
+    past = 0
+    while past * (m + ny) < most_rows:
+        n_regressors = (past + 1) * (m + ny) + (1 + ahead) * m
+        if n_windows(records, past + 1 + ahead) < _SAMPLES_PER_REGRESSOR * n_regressors:
+            break
+        past += 1
+    return past
+
+
+def past_window(
+    records: Sequence[Record], shortest: int, longest: int, direct: NDArray[np.bool_]
+) -> int:
+    """Number of past samples that the VARX needs, by Akaike's criterion.
+
+    `direct` (n_inputs,) are the inputs that act at once. Truncating the past is a bias,
+    whence the most generous of the criteria, corrected for small samples (Hurvich and
+    Tsai, 1993).
+    """
+    c = len(records[0].u) + len(records[0].y)
+    factor = _newest_first(records, longest, 0)
+    n = n_windows(records, longest)
+    return _chosen_past(factor[-c:], n, shortest, longest, direct)
+
+
+def find_feedback(records: Sequence[Record]) -> Feedback | None:
+    """Test of feedback; None where the samples are too few.
+
+    Every channel may have a constant of its own in every experiment.
+
+    Canonical correlations of the innovations with future inputs, given present and past
+    ones and past outputs, by Bartlett's approximation of Wilks' criterion.
+    """
+    records = _some(records)
+    m, ny = len(records[0].u), len(records[0].y)
+    c = m + ny
+    longest = longest_past(records, _MAX_ROWS - _N_FUTURE * m, _N_FUTURE)
+    if longest == 0:
+        return None
+    factor = _newest_first(records, longest, _N_FUTURE)
+    n = n_windows(records, longest + _N_FUTURE)
+    rows = factor[longest * c :]
+    past = _chosen_past(rows[:c], n, 1, longest, np.ones(m, dtype=bool))
+    u, y, future = np.split(rows[:, past * c :], [m, c])
+    dof = n - past * c
+    within = _wilks(y, _basis(u, rows[:m], _FORESEEN), dof)
+    present = _basis(u, rows[:m], _DEPENDENT)
+    y, future = (x - (x @ present) @ present.T for x in (y, future))
+    noisy = np.linalg.norm(y, axis=1) > _NOISE_FREE * np.linalg.norm(rows[m:c], axis=1)
+    dof -= m
+    found = _wilks(y[noisy], _basis(future, rows[c:], _FORESEEN), dof)
+    curved = 0.0
+    if found.p_value < _LEVEL:
+        curved = _curved_share(records, past, noisy)
+    innovations = np.sum(y**2, axis=1) / max(dof, 1)
+    return Feedback(*found, within.p_value, curved, innovations)
+
+
+def _curved_share(
+    records: Sequence[Record], past: int, noisy: NDArray[np.bool_]
+) -> float:
+    """Share of the innovations that nonlinear terms of the last samples explain."""
+    linear, curved, outputs = [], [], []
+    for z in samples_of(records):
+        m, n_rows = len(records[0].u), past + 1
+        windows = np.lib.stride_tricks.sliding_window_view(z, n_rows, axis=0)
+        windows = windows.transpose(0, 2, 1)[:, ::-1]  # the newest first
+        before = windows[:, 1:].reshape(len(windows), -1)
+        linear.append(np.hstack([windows[:, 0, :m], before]))
+        last = linear[-1][:, : m + _N_CURVED * z.shape[1]]
+        mixed = last[:, :1] * last[:, 1:]
+        constant = np.ones((len(last), 1))
+        curved.append(np.hstack([np.abs(last), last**2, last**3, mixed, constant]))
+        outputs.append(windows[:, 0, m:][:, noisy])
+    L, N, Y = (np.vstack(parts).T for parts in (linear, curved, outputs))
+    Q = _basis(L, L, _DEPENDENT)
+    Y, left = (x - (x @ Q) @ Q.T for x in (Y, N))
+    return _wilks(Y, _basis(left, N, _FORESEEN), len(Q) - Q.shape[1]).share
+
+
+def _some(records: Sequence[Record]) -> list[Record]:
+    """Records to look at: the first of them, each cut, with constants."""
+    kept, left = [], _MAX_SAMPLES
+    for record in records:
+        kept.append(record.head(left))
+        left -= record.u.shape[1]
+        if left <= 0:
+            break
+    return [
+        record if len(record.trend) else Record.of(record.u.T, record.y.T, 1)
+        for record in kept
+    ]
+
+
+def _newest_first(records: Sequence[Record], past: int, ahead: int) -> Array:
+    """Factor of ``z[t-1], ..., z[t-past], z[t], u[t+1], ..., u[t+ahead]``."""
+    m, c = len(records[0].u), len(records[0].u) + len(records[0].y)
+    lags = np.arange((past + 1 + ahead) * c).reshape(-1, c)
+    rows = [lags[:past][::-1], lags[past], lags[past + 1 :, :m]]
+    flat = np.concatenate([part.ravel() for part in rows])
+    samples, n_trend = samples_of(records), len(records[0].trend)
+    return hankel_factor(samples, past + 1 + ahead, flat, n_trend=n_trend)
+
+
+def _chosen_past(
+    present: Array,
+    n: int,
+    shortest: int,
+    longest: int,
+    direct: NDArray[np.bool_],
+) -> int:
+    """The past window, from the rows of ``z[t]`` in a factor of the newest first."""
+    m, c = len(direct), len(present)
+    ny = c - m
+    size = np.linalg.norm(present, axis=1, keepdims=True)
+    scaled = present / np.where(size > 0.0, size, 1.0)
+    acting = np.append(np.flatnonzero(direct), np.arange(m, c))
+    n_direct = int(direct.sum())
+    best, found = np.inf, longest
+    for past in range(shortest, longest + 1):
+        left = scaled[acting, past * c :]
+        spread = left @ left.T + _EXACT * np.eye(len(left))
+        volume = np.linalg.slogdet(spread)[1]
+        volume -= np.linalg.slogdet(spread[:n_direct, :n_direct])[1]
+        n_regressors = n_direct + past * c
+        n_parameters = ny * n_regressors + ny * (ny + 1) / 2
+        penalty = 2.0 * n_parameters * n / max(n - n_regressors - ny - 1, 1)
+        value = n * volume + penalty
+        if value < best:
+            best, found = value, past
+    return found
+
+
+def _basis(rows: Array, whole: Array, least: float) -> Array:
+    """Orthonormal columns that span rows, those left out of which less remains.
+
+    `whole` are the rows before anything was taken from them.
+    """
+    size = np.linalg.norm(whole, axis=1)
+    kept = np.linalg.norm(rows, axis=1) > least * size
+    if not kept.any():
+        return np.zeros((rows.shape[1], 0))
+    scaled = rows[kept] / size[kept, None]
+    Q, R, _ = linalg.qr(scaled.T, mode="economic", pivoting=True, check_finite=False)
+    return Q[:, np.abs(np.diagonal(R)) > least]
+
+
+class _Correlated(NamedTuple):
+    """Rows and what may explain them."""
+
+    p_value: float  # of all that is explained being by chance
+    share: float  # explained of the row of which most is, less what chance does
+
+
+def _wilks(y: Array, known: Array, dof: int) -> _Correlated:
+    """Test whether rows of `dof` degrees of freedom lie in orthonormal columns."""
+    y = y[y.any(axis=1)]
+    q, ny = known.shape[1], len(y)
+    dof -= q
+    if q == 0 or ny == 0 or dof <= ny:
+        return _Correlated(1.0, 0.0)
+    explained = y @ known
+    total = y @ y.T
+    left = total - explained @ explained.T
+    floor = _EXACT * np.diag(np.diagonal(total))
+    log_sines = np.linalg.slogdet(left + floor)[1] - np.linalg.slogdet(total + floor)[1]
+    statistic = -(dof + 0.5 * (q - ny - 1)) * log_sines
+    p_value = float(stats.chi2.sf(max(statistic, 0.0), ny * q))
+    share = 1.0 - np.diagonal(left) / np.diagonal(total) * (dof + q) / dof
+    return _Correlated(p_value, max(0.0, float(share.max())))

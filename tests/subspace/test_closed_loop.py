@@ -1,0 +1,401 @@
+"""PBSID: exact without noise, consistent under feedback, honest about its errors."""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_allclose
+from scipy import linalg
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+from lpvlearn import SubspaceLTI
+from lpvlearn.subspace.closed_loop import _Changes, _Innovation
+from lpvlearn.systems.simulation import lti_response
+
+from ..conftest import modes
+from .conftest import LOOP_PLANT, closed_loop, experiment, markov, record
+
+UNSTABLE = (
+    np.array([[1.1, 0.3], [0.0, 0.7]]),
+    np.array([[1.0], [0.5]]),
+    np.array([[0.5, 0.2]]),
+    np.zeros((1, 1)),
+)
+
+
+def unstable_loop(seed, n_samples=1500):
+    """A plant that only the loop holds; the controller needs a sample to answer."""
+    rng = np.random.default_rng(seed)
+    drive = np.array([0.5, 0.2])
+    return closed_loop(rng, n_samples, UNSTABLE, gain=0.8, delay=1, drive=drive)
+
+
+def matrices(model):
+    return model.lti_.A, model.lti_.B, model.lti_.C, model.lti_.D
+
+
+def miss(model, plant=LOOP_PLANT):
+    """Relative error of the impulse response."""
+    truth = markov(*plant, n=100)
+    return linalg.norm(markov(*matrices(model), n=100) - truth) / linalg.norm(truth)
+
+
+def pbsid(order="auto", **options):
+    return SubspaceLTI(order, method="pbsid", **options)
+
+
+# -- what is identified ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [5, "auto"])
+def test_it_is_exact_without_noise(system, order):
+    u, y = record(system, 400, noise=0.0)
+    model = pbsid(order).fit(u, y)
+    assert model.order_ == 5 and model.method_ == "pbsid"
+    assert_allclose(markov(*matrices(model)), markov(*system), atol=1e-6)
+    assert model.residual_ < 1e-7
+    assert model.singular_values_.shape == (2 * model.horizon_,)
+
+
+def test_the_error_falls_under_feedback_where_that_of_others_stays():
+    errors = {"po-moesp": [], "pbsid": []}
+    for n_samples in (1000, 9000):
+        u, y = closed_loop(np.random.default_rng(n_samples), n_samples)
+        other = SubspaceLTI(2, method="po-moesp", feedthrough=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of the closed loop
+            errors["po-moesp"].append(miss(other.fit(u, y)))
+        errors["pbsid"].append(miss(pbsid(feedthrough=False).fit(u, y)))
+    assert errors["po-moesp"][1] > 0.15
+    assert errors["pbsid"][1] < 0.03 and errors["pbsid"][0] < 0.1
+
+
+@pytest.mark.parametrize("order", [2, "auto"])
+def test_modes_of_the_noise_are_told_from_the_plant(order):
+    u, y = closed_loop(np.random.default_rng(1), 2000, pole=0.9)
+    model = pbsid(order, feedthrough=False).fit(u, y)
+    predictor = model.predictor_
+    assert (model.order_, predictor.n_noise_states) == (2, 1)
+    assert_allclose(predictor.noise.A, [[0.9]], atol=0.05)
+    assert miss(model) < 0.03
+    assert not predictor.B[2:].any()
+
+
+def test_a_plant_may_be_unstable():
+    u, y = unstable_loop(0)
+    with pytest.warns(UserWarning, match="predicted .* controller's reference"):
+        model = pbsid().fit(u, y)
+    assert_allclose(model.lti_.poles(), [0.7, 1.1], atol=0.08)
+    predictor = model.predictor_
+    inner = predictor.A - predictor.K @ predictor.C
+    assert np.abs(linalg.eigvals(inner)).max() < 1.0
+    errors = y - model.predict_ahead(u, y)
+    assert_allclose(np.sqrt(np.sum(errors**2) / np.sum(y**2)), model.residual_)
+    assert 0.45 < errors.std() < 0.55  # the innovations'
+    # Ten samples ahead more is unknown, by the impulse response of the noise.
+    ahead = (y - model.predict_ahead(u, y, 10))[10:]
+    A, C, K = predictor.A, predictor.C, predictor.K
+    weights = [1.0] + [(C @ np.linalg.matrix_power(A, k) @ K).item() for k in range(9)]
+    assert_allclose(ahead.std() / errors.std(), np.linalg.norm(weights), rtol=0.1)
+    tests = model.residual_tests(u, y, errors="prediction").set_index("test")
+    assert tests["passed"].to_dict() == {
+        "whiteness": True,
+        "past inputs": True,
+        "present input": True,
+        "future inputs": False,
+    }
+    with pytest.raises(ValueError, match="diverges"):
+        model.residual_tests(np.tile(u, (9, 1)), np.tile(y, (9, 1)))
+
+
+def test_stability_can_be_enforced():
+    u, y = unstable_loop(1, 600)
+    model = pbsid(2, stability="enforce").fit(u, y)
+    assert model.lti_.is_stable and model.stability_loss_ > 0.0
+    error = y - model.predict_with_initial_state(u, y)
+    assert_allclose(np.sqrt(np.sum(error**2) / np.sum(y**2)), model.residual_)
+    stable = closed_loop(np.random.default_rng(0), 600)
+    options = {"feedthrough": False}
+    models = [
+        pbsid(2, stability=how, **options).fit(*stable) for how in ("warn", "enforce")
+    ]
+    assert_allclose(models[1].lti_.A, models[0].lti_.A)
+    assert models[1].stability_loss_ == 0.0
+
+
+# -- options ---------------------------------------------------------------------------
+
+
+def test_units_do_not_matter(system):
+    u, y = record(system, 300)
+    first = pbsid(5).fit(u, y)
+    other = pbsid(5).fit(u * [1e-6, 1e5], y * [1e4, 1e-7])
+    assert_allclose(other.lti_.poles(), first.lti_.poles(), rtol=1e-7)
+    covariance = other.predictor_.covariance / np.outer([1e4, 1e-7], [1e4, 1e-7])
+    assert_allclose(covariance, first.predictor_.covariance, rtol=1e-6)
+
+
+def test_experiments_gaps_rest_and_masks(system):
+    rng = np.random.default_rng(0)
+    parts = [experiment(rng, system, 100, rng.standard_normal(5)) for _ in range(4)]
+    X = pd.DataFrame(np.vstack([u for u, _ in parts]), columns=["a", "b"])
+    X["run"] = np.repeat(range(4), 100)
+    y = np.vstack([y for _, y in parts])
+    model = pbsid(5, experiment="run").fit(X, y)
+    assert_allclose(markov(*matrices(model)), markov(*system), atol=1e-6)
+    assert model.initial_states_.shape == (4, 5)
+    assert_allclose(model.predict_with_initial_state(X, y), y, atol=1e-6)
+    y[250] = np.nan
+    gappy = pbsid(5, experiment="run", missing="split").fit(X, y)
+    assert gappy.initial_states_.shape == (5, 5)
+    assert_allclose(markov(*matrices(gappy)), markov(*system), atol=1e-6)
+    u, y = record((*system[:3], np.diag([1.0, 0.0])), 400)
+    mask = [[True, False], [False, False]]
+    model = pbsid(5, feedthrough=mask, initial_state="rest").fit(u, y)
+    assert_allclose(model.lti_.D, [[1.0, 0.0], [0.0, 0.0]], atol=0.3)
+    assert (model.lti_.D != 0.0).sum() == 1 and not model.initial_states_.any()
+    shifted = pbsid(5, detrend="constant").fit(u + 3.0, y - 7.0)
+    again = pbsid(5, detrend="constant").fit(u, y)
+    assert_allclose(shifted.lti_.poles(), again.lti_.poles(), rtol=1e-6)
+
+
+def two_loops(levels, n_samples=1000):
+    """Two experiments, and their channels about levels (2, 2) of input and output."""
+    rng = np.random.default_rng(7)
+    parts = [np.hstack(closed_loop(rng, n_samples)) + level for level in levels]
+    table = pd.DataFrame(np.vstack(parts), columns=["u", "y"])
+    table["experiment"] = np.repeat(["a", "b"], n_samples)
+    return table[["u", "experiment"]], table["y"].to_numpy()
+
+
+LEVELS = np.array([[3.0, -50.0], [-2.0, 7.0]])
+
+
+def loops_fit(X, y, order=2, **options):
+    return pbsid(order, experiment="experiment", feedthrough=False, **options).fit(X, y)
+
+
+def test_constants_change_nothing_but_themselves():
+    about_zero, moved = two_loops(np.zeros((2, 2))), two_loops(LEVELS)
+    models = [loops_fit(*data, offset="constant") for data in (about_zero, moved)]
+    first, other = models
+    assert_allclose(markov(*matrices(other)), markov(*matrices(first)), atol=1e-6)
+    assert_allclose(other.predictor_.covariance, first.predictor_.covariance, rtol=1e-6)
+    gain = first.lti_.dc_gain()
+    c = [m.output_offset_ - m.input_offset_ @ gain.T for m in models]
+    wanted = LEVELS[:, 1:] - LEVELS[:, :1] @ gain.T
+    assert_allclose(c[1] - c[0], wanted, atol=1e-5)
+    ahead = [
+        m.predict_ahead(*data, steps=3)
+        for m, data in zip(models, (about_zero, moved), strict=True)
+    ]
+    assert_allclose(ahead[1] - ahead[0], np.repeat(LEVELS[:, 1], 1000), atol=1e-5)
+    tests = [
+        m.residual_tests(*data, errors="prediction")["p_value"]
+        for m, data in zip(models, (about_zero, moved), strict=True)
+    ]
+    assert_allclose(*tests, atol=1e-4)
+    assert tests[0][:2].min() > 1e-3  # whiteness and past inputs, not the future
+
+
+@pytest.mark.parametrize("order", [2, "auto"])
+def test_constants_are_taken_where_they_are(order):
+    assert loops_fit(*two_loops(np.zeros((2, 2))), order).offset_ is None
+    model = loops_fit(*two_loops(LEVELS), order)
+    assert model.offset_ == "constant" and model.order_ == 2
+    assert miss(model) < 0.1
+    with pytest.warns(UserWarning, match="different constants"):
+        model.predict(two_loops(LEVELS)[0])
+    same = loops_fit(*two_loops(LEVELS[[0, 0]]), order)
+    same.predict(two_loops(LEVELS)[0])  # which does not warn
+
+
+def test_auto_finds_the_loop_about_its_point_of_work():
+    X, y = two_loops(LEVELS)
+    model = SubspaceLTI(2, experiment="experiment")
+    with pytest.warns(UserWarning, match="closed loop") as told:
+        model.fit(X, y)
+    assert len(told) == 1
+    assert (model.method_, model.offset_) == ("pbsid", "constant")
+    assert miss(model) < 0.1
+
+
+def test_a_drift_of_a_loop_is_a_drift_of_its_outputs():
+    u, y = closed_loop(np.random.default_rng(3), 1500)
+    drift = 0.01 * np.arange(1500.0)[:, None]
+    first, other = (
+        pbsid(2, feedthrough=False, offset="linear").fit(u, outputs)
+        for outputs in (y, y + drift)
+    )
+    assert_allclose(markov(*matrices(other)), markov(*matrices(first)), atol=1e-6)
+    assert_allclose(other.output_drift_ - first.output_drift_, 0.01, rtol=1e-5)
+
+
+def test_prediction_goes_on_where_outputs_are_missing():
+    """Of a plant that only the loop holds, about its point of work."""
+    u, y = unstable_loop(0)
+    y = y + 5.0
+    with pytest.warns(UserWarning, match="unstable"):
+        model = pbsid(2, feedthrough=False, offset="constant").fit(u, y)
+    lost = y.copy()
+    lost[1000:1003] = np.nan
+    lost[1200] = np.nan
+    rest = {"initial_state": "rest"}
+    found, whole = (model.predict_ahead(u, outputs, **rest) for outputs in (lost, y))
+    assert_allclose(found[:1001], whole[:1001])
+    for row, steps in ((1001, 2), (1002, 3), (1003, 4), (1201, 2)):
+        ahead = model.predict_ahead(u, y, steps=steps, **rest)
+        assert_allclose(found[row], ahead[row], atol=1e-6)
+    assert_allclose(found[-50:], whole[-50:], atol=1e-6)
+    # Estimated beside the constant, from four outputs less.
+    found, whole = model.predict_ahead(u, lost), model.predict_ahead(u, y)
+    assert_allclose(found[:1001], whole[:1001], atol=0.02)
+
+
+def test_orders_that_no_modes_add_up_to_are_those_of_the_subspace(system):
+    u, y = record(system, 600)
+    model = pbsid(1).fit(u, y)
+    assert model.order_ == 1 and model.lti_.is_stable
+    with pytest.raises(AttributeError, match="modes of the plant add up to"):
+        _ = model.poles_std_
+    with pytest.warns(UserWarning, match="next to nothing"):
+        assert pbsid(0).fit(u, y).order_ == 0
+    noisy = pbsid(5, n_noise_states=2, refine=False).fit(u, y)
+    assert noisy.order_ == 5 and noisy.predictor_.n_noise_states == 2
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"horizon": 30}, "needs more than 62 windows of 30 past samples"),
+        ({"order": 6, "horizon": 4}, "`horizon` must be at least 6 for order 6"),
+    ],
+)
+def test_windows_are_refused_with_the_remedy(options, message):
+    u, y = closed_loop(np.random.default_rng(0), 60)
+    with pytest.raises(ValueError, match=message):
+        pbsid(**{"order": 2, **options}).fit(u, y)
+
+
+def test_streams_are_refused():
+    u, y = closed_loop(np.random.default_rng(0), 60)
+    with pytest.raises(ValueError, match="`method` must not be 'pbsid'.*`fit`"):
+        pbsid().partial_fit(u, y)
+
+
+# -- auto ------------------------------------------------------------------------------
+
+
+def test_auto_takes_it_where_there_is_feedback():
+    u, y = closed_loop(np.random.default_rng(3), 2000)
+    with pytest.warns(UserWarning, match="closed loop.*'pbsid' was taken.*D = 0"):
+        model = SubspaceLTI().fit(u, y)
+    assert model.method_ == "pbsid" and not model.lti_.D.any()
+    same = pbsid(feedthrough=False).fit(u, y)  # without a warning
+    assert_allclose(model.lti_.A, same.lti_.A)
+    with pytest.warns(UserWarning, match="feedthrough=False unless"):
+        assert pbsid().fit(u, y).lti_.D.any()
+    late = closed_loop(np.random.default_rng(0), 6000, gain=0.15, delay=3)
+    with pytest.warns(UserWarning, match="does not bias.$"):
+        assert SubspaceLTI(2).fit(*late).lti_.D.any()
+    with pytest.warns(UserWarning, match="closed loop.*biases method='po-moesp'"):
+        streamed = SubspaceLTI(2).partial_fit(u, y)
+    assert streamed.method_ == "po-moesp"
+
+
+def test_auto_is_po_moesp_in_open_loop(system):
+    u, y = record(system, 500)
+    model = SubspaceLTI(5).fit(u, y)
+    assert model.method_ == "po-moesp"
+    same = SubspaceLTI(5, method="po-moesp").fit(u, y)
+    np.testing.assert_array_equal(model.lti_.A, same.lti_.A)
+
+
+# -- uncertainty -----------------------------------------------------------------------
+
+
+def test_a_part_changes_as_its_response_does():
+    """First-order changes of a part against its modes of the changed model."""
+    rng = np.random.default_rng(0)
+    A = modes(0.9 * np.exp(0.5j), 0.7, -0.4)
+    B, C = rng.standard_normal((4, 2)), rng.standard_normal((2, 4))
+    D, K = np.zeros((2, 2)), np.zeros((4, 2))
+    model, part = _Innovation(A, B, C, D, K, np.eye(2)), np.array([1, 1, 0, 1]) > 0
+
+    def response(A, B, C, of):
+        """Of the modes whose poles are near those of the part."""
+        poles, T = np.linalg.eig(A)
+        near = np.abs(poles[:, None] - np.linalg.eigvals(of)).min(axis=1) < 0.05
+        assert near.sum() == 3
+        left = np.linalg.inv(T)[near] @ B
+        return [C @ T[:, near] @ np.diag(poles[near] ** k) @ left for k in range(8)]
+
+    step = [1e-5 * rng.standard_normal((1, *M.shape)) for M in model[:4]]
+    change = _Changes(*step).of_part(model, part)
+    own = A[part][:, part], B[part], C[:, part]
+    moved = [M + d[0] for M, d in zip(own, change, strict=False)]
+    expected = response(
+        *(M + d[0] for M, d in zip((A, B, C), step, strict=False)), own[0]
+    )
+    found = markov(*moved, D, n=8)[1:]
+    assert_allclose(found, np.real(expected), atol=1e-8)
+
+
+def test_the_predictor_has_the_least_prediction_error():
+    u, y = closed_loop(np.random.default_rng(5), 800)
+    model = pbsid(2, feedthrough=False).fit(u, y)
+    raw = pbsid(2, feedthrough=False, refine=False).fit(u, y)
+    assert model.residual_ < raw.residual_ < 1.02 * model.residual_
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pole", [None, 0.9])
+def test_standard_deviations_cover(pole):
+    omega = np.array([0.2, 0.8, 2.0])
+    A, B, C, _ = LOOP_PLANT
+    z = np.exp(1j * omega)[:, None, None]
+    truth = C @ np.linalg.solve(z * np.eye(2) - A, np.broadcast_to(B, (3, 2, 1)))
+    top = np.linalg.eigvals(A)[0]
+    inside = []
+    for seed in range(40):
+        u, y = closed_loop(np.random.default_rng(seed), 1500, pole=pole)
+        model = pbsid(2, feedthrough=False).fit(u, y)
+        k = np.argmax(model.lti_.poles().imag)
+        values = [
+            (model.lti_.poles()[k] - top, model.poles_std_[k]),
+            *zip(
+                (model.lti_.frequency_response(omega) - truth).ravel(),
+                model.frequency_response_std(omega).ravel(),
+                strict=True,
+            ),
+        ]
+        for error, std in values:
+            inside += [abs(error.real) < 1.96 * std.real]
+            inside += [abs(error.imag) < 1.96 * std.imag]
+    # Errors of one record depend on each other: as many as its parameters count.
+    low, high = binom.interval(0.99, 40 * 4, 0.95)
+    assert low <= np.mean(inside) * 160 <= high + 1
+
+
+def test_outputs_of_zero_and_tiny_tables_have_a_model():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((40, 2))
+    model = pbsid().fit(u, np.zeros((40, 2)))
+    assert model.order_ == 0 and not model.predict(u).any()
+    for n in (10, 15, 21):
+        y = lfilter([0.0, 1.0], [1.0, -0.5], u[:n, 0])
+        assert np.isfinite(pbsid().fit(u[:n], y).lti_.A).all()
+
+
+def test_a_record_in_other_words():
+    """The innovation form: x[t+1] = A x + B u + K e, from e and u."""
+    u, y = closed_loop(np.random.default_rng(0), 500, pole=0.9)
+    model = pbsid(feedthrough=False).fit(u, y)
+    P = model.predictor_
+    x0 = P.estimate_initial_state(u, y)
+    e = y - P.predict(u, y, initial_state=x0)
+    driven = np.hstack([u, e])
+    B, D = np.hstack([P.B, P.K]), np.hstack([P.D, np.eye(1)])
+    assert_allclose(lti_response(P.A, B, P.C, D, driven, x0), y, atol=1e-8)

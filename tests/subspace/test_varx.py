@@ -1,0 +1,144 @@
+"""The long autoregression and the test of feedback: exact, of right size and power."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy import stats
+from scipy.signal import lfilter
+
+from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.varx import find_feedback, longest_past, past_window
+
+from ..conftest import stable_model
+from .conftest import closed_loop
+
+
+def records_of(*pairs):
+    return [Record.of(u / u.std(), y / y.std()) for u, y in pairs]
+
+
+def open_loop(rng, n_samples, signal, *, order=3, pole=0.0):
+    """A random system, 10 dB."""
+    system = stable_model(rng, order, 1, 1, sampling_time=1.0)
+    white = rng.standard_normal((n_samples, 1))
+    if signal == "held":
+        u = np.repeat(white, 7, axis=0)[:n_samples]
+    elif signal == "coloured":
+        u = lfilter([1.0], [1.0, -0.97], white, axis=0)
+    else:
+        u = white
+    y = system.simulate(u)
+    e = lfilter([1.0], [1.0, -pole], rng.standard_normal(y.shape), axis=0)
+    return u, y + 0.3 * y.std() / e.std() * e
+
+
+def test_it_is_a_regression_on_past_and_future():
+    """Of two experiments, each with its own constant, by long matrices."""
+    rng, f = np.random.default_rng(0), 8
+    pairs = [open_loop(rng, n, "white") for n in (300, 200)]
+    records = records_of(*pairs)
+    found = find_feedback(records)
+    longest = longest_past(records, 120 - f, f)
+    losses = {}
+    for p in range(1, longest + 1):
+        rows = []
+        for own, record in zip(np.eye(2), records, strict=True):
+            u, y = record.u[0], record.y[0]
+            for t in range(longest, len(u) - f):
+                past = [s[t - p : t][::-1] for s in (u, y)]
+                rows.append(np.r_[own, past[0], past[1], u[t : t + f + 1], y[t]])
+        M = np.array(rows)
+        n, fits = len(M) - 2, []
+        for k in (2 * p + 1, 2 * p + 1 + f):
+            X = M[:, : 2 + k]
+            fits.append(np.sum((M[:, -1] - X @ np.linalg.lstsq(X, M[:, -1])[0]) ** 2))
+        n_parameters = 2 * p + 2
+        penalty = 2.0 * n_parameters * n / (n - 2 * p - 3)
+        losses[n * np.log(fits[0]) + penalty] = (p, *fits)
+    p, short, full = losses[min(losses)]
+    dof = n - 2 * p - 1
+    statistic = (dof - f + 0.5 * (f - 2)) * np.log(short / full)
+    assert_allclose(found.p_value, stats.chi2.sf(statistic, f), rtol=1e-6)
+    assert_allclose(found.innovations, short / dof, rtol=1e-8)
+
+
+@pytest.mark.parametrize("signal", ["white", "held", "coloured"])
+def test_p_values_are_uniform_in_open_loop(signal):
+    rng = np.random.default_rng(1)
+    p = [
+        find_feedback(
+            records_of(open_loop(rng, 400, signal, pole=rng.choice([0.0, 0.9])))
+        ).p_value
+        for _ in range(60)
+    ]
+    assert stats.kstest(p, "uniform").pvalue > 0.01
+
+
+def test_feedback_is_found():
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        found = find_feedback(records_of(closed_loop(rng, 1500)))
+        assert found.found and found.instantaneous and found.p_value < 1e-6
+        late = find_feedback(records_of(closed_loop(rng, 6000, gain=0.15, delay=3)))
+        assert late.found and not late.instantaneous
+
+
+def test_units_and_order_of_channels_do_not_matter():
+    rng = np.random.default_rng(3)
+    u, y = closed_loop(rng, 800)
+    more = np.hstack([u, rng.standard_normal(u.shape)])
+    found = find_feedback([Record.of(more, y)])
+    mixed = find_feedback([Record.of(more @ [[0.0, 1e5], [2.0, 1.0]], 1e-4 * y)])
+    assert_allclose(mixed.p_value, found.p_value, rtol=1e-5)
+    assert_allclose(mixed.share, found.share, rtol=1e-6)
+    assert_allclose(mixed.innovations, 1e-8 * found.innovations, rtol=1e-8)
+
+
+def test_constants_of_the_experiments_are_no_feedback():
+    """Nor do they hide it."""
+    rng = np.random.default_rng(5)
+    loops = [closed_loop(rng, 600) for _ in range(3)]
+    for pairs in (loops, [open_loop(rng, 600, "coloured") for _ in range(3)]):
+        moved = [(u + 3.0 * k, y - 5.0 * k) for k, (u, y) in enumerate(pairs)]
+        scale = [(u / 4.0, y / 6.0) for u, y in pairs]
+        first, other = (
+            find_feedback([Record.of(u, y) for u, y in data]) for data in (scale, moved)
+        )
+        assert_allclose(other[:3], first[:3], rtol=1e-6)
+        assert first.found == (pairs is loops)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_nonlinearity_is_no_feedback(seed):
+    """Not even where inputs that are held, or swept, follow from the past."""
+    rng = np.random.default_rng(seed)
+    u, y = open_loop(rng, 6000, "held")
+    walk = np.clip(np.cumsum(0.2 * rng.standard_normal((6000, 1)), axis=0), -2.0, 2.0)
+    smooth = lfilter([0.0, 0.3], [1.0, -0.7], walk + 0.5 * np.abs(walk), axis=0)
+    smooth = smooth + 1e-2 * rng.standard_normal(smooth.shape)
+    bent = np.clip(y, -y.std(), y.std())
+    assert not find_feedback(records_of((u, bent))).found
+    assert not find_feedback(records_of((walk, smooth))).found
+
+
+def test_there_may_be_nothing_to_test():
+    rng, t = np.random.default_rng(0), np.arange(500)[:, None]
+    sine = np.sin(0.8 * t)  # known from two samples
+    e = 0.1 * rng.standard_normal(sine.shape)
+    assert find_feedback(records_of((sine, np.cumsum(e, axis=0)))).p_value == 1.0
+    u = rng.standard_normal((500, 1))
+    exact = find_feedback(records_of((u, lfilter([1.0, 0.5], [1.0, -0.5], u, axis=0))))
+    assert exact.p_value == 1.0 and exact.innovations < 1e-10
+    assert find_feedback([Record.of(u, 0.0 * u)]).p_value == 1.0
+    assert find_feedback(records_of((u[:20], u[:20] + 1.0))) is None
+
+
+def test_the_past_is_as_long_as_the_memory():
+    rng = np.random.default_rng(2)
+    u, e = rng.standard_normal((2, 4000, 1))
+    y = lfilter([1.0], [1.0, 0.0, 0.0, 0.0, -0.6], u + e, axis=0)
+    records = records_of((u, y))
+    assert past_window(records, 1, 20, np.array([True])) in (4, 5)
+    assert past_window(records, 6, 20, np.array([True])) == 6
+    assert longest_past(records_of((u[:20], y[:20])), 400) == 1
+    assert longest_past(records, 40) == 20
