@@ -62,9 +62,10 @@ def warn_of_motion(estimator: Any, X: Any, y: Any, simulated: Array) -> None:
     measured = read_outputs(y)[0]
     with collected(), np.errstate(all="ignore"):  # predict has said what there is
         estimated = read_outputs(estimator.predict_with_initial_state(X, y))[0]
+    n_late = int(np.sum(getattr(estimator, "input_delay_", 0)))
     for rows in estimator.split_experiments(X):
         known = np.where(np.isnan(estimated[rows]), np.nan, measured[rows])
-        if _starts_in_motion(known, simulated[rows], estimated[rows]):
+        if _starts_in_motion(known, simulated[rows], estimated[rows], n_late):
             warn(
                 "The scored table starts in mid-motion: a simulation from rest misses "
                 "what the system brings along, and its score is too low. Splits "
@@ -75,8 +76,13 @@ def warn_of_motion(estimator: Any, X: Any, y: Any, simulated: Array) -> None:
             return
 
 
-def _starts_in_motion(measured: Array, from_rest: Array, estimated: Array) -> bool:
-    """Whether an experiment does, by its outputs (NaN: missing) and two simulations."""
+def _starts_in_motion(
+    measured: Array, from_rest: Array, estimated: Array, n_late: int
+) -> bool:
+    """Whether an experiment does, by its outputs (NaN: missing) and two simulations.
+
+    `n_late` inputs in transit are estimated along with the state.
+    """
     known = ~np.isnan(measured)
     finite = np.isfinite(from_rest) & np.isfinite(estimated)
     if not known.any(axis=0).all() or not finite[known].all():
@@ -102,4 +108,5 @@ def _starts_in_motion(measured: Array, from_rest: Array, estimated: Array) -> bo
     found = np.sum(before[:length] * shape) ** 2
     chance, n_windows = float(np.mean(later)), len(measured) // length - 1
     ratio = found / max(chance, np.finfo(float).eps * found)
-    return bool(fdtrc(_MODE, n_windows, ratio / _MODE) < _CHANCE)
+    dof = _MODE + n_late
+    return bool(fdtrc(dof, n_windows, ratio / dof) < _CHANCE)

@@ -15,6 +15,7 @@ from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
     state_trajectory,
+    with_transit,
 )
 from ..validation import finite_samples, whole_number
 from .statespace import StateSpace
@@ -137,7 +138,7 @@ class InnovationModel:
             Prediction horizon in samples.
         initial_state : array-like of shape (order,), default=None
             Of the deterministic part, or, with a `gain`, of all states (order +
-            n_noise_states). None is rest.
+            n_noise_states). Inputs in transit may follow. None is rest.
 
         Returns
         -------
@@ -168,14 +169,16 @@ class InnovationModel:
     ) -> Array:
         """By the predictor of all states, which is stable where the plant is not."""
         u = finite_samples("u", u, self.lti.n_inputs)
-        u = delayed(u, self.lti.input_delay)
         y = np.asarray(y, dtype=float).reshape(len(u), -1)
         A, B, C, D = self.A, self.B, self.C, self.D
         gains, known = self._filter_gains(y)
-        x0 = np.zeros(len(A))
+        late = self.lti.input_delay
+        x0 = np.zeros(len(A) + int(late.sum()))
         if initial_state is not None:
             given = np.ravel(np.asarray(initial_state, dtype=float))
             x0[: len(given)] = given
+        x0, before = np.split(x0, [len(A)])
+        u = delayed(u, late, before)
         corrected = np.where(known, y - u @ D.T, 0.0)
         driven = u @ B.T + (gains @ corrected[:, :, None])[:, :, 0]
         x = state_trajectory(A - gains @ C, driven, x0)
@@ -201,17 +204,33 @@ class InnovationModel:
         -------
         ndarray of shape (order,) or (order + n_noise_states,)
             Behind the errors of the simulation; with a `gain` that of all states,
-            behind the errors of one-step prediction. The multiples of the trends
-            follow: signal by signal, output by output.
+            behind the errors of one-step prediction. The inputs in transit follow, and
+            the multiples of the trends: signal by signal, output by output.
         """
         y = np.asarray(y, dtype=float).reshape(-1, self.lti.n_outputs)
         if self.gain is None:
-            error = y - self.lti.simulate(u)
-            responses = free_responses(self.lti.A, self.lti.C, len(y), trend)
+            lti, error = self.lti, y - self.lti.simulate(u)
+            responses = free_responses(lti.A, lti.C, len(y), trend)
+            responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
         else:
             error, (gains, _) = y - self.predict(u, y), self._filter_gains(y)
             responses = prediction_responses(self.A, self.C, gains, len(y), trend)
+            states, trends = np.split(responses, [len(self.A)], axis=2)
+            transit = self._transit_responses(gains, len(y))
+            responses = np.concatenate([states, transit, trends], axis=2)
         return estimate_initial_state(responses, error)
+
+    def _transit_responses(self, gains: Array, n_samples: int) -> Array:
+        """Of one-step prediction to every input in transit, as of `with_transit`."""
+        delay = self.lti.input_delay
+        n_late = int(delay.sum())
+        if not n_late:
+            return np.zeros((n_samples, self.lti.n_outputs, 0))
+        none = np.zeros((n_samples, self.lti.n_inputs, n_late))
+        late = delayed(none, delay, np.eye(n_late))
+        forcing = self.B @ late - gains @ (self.D @ late)
+        x = state_trajectory(self.A - gains @ self.C, forcing)
+        return self.C @ x + self.D @ late
 
     def _filter_gains(self, y: Array) -> tuple[Array, NDArray[np.bool_]]:
         """K, one for every sample where outputs are missing, and which are known."""

@@ -173,6 +173,8 @@ list, default=None
     interpolator_ : fitted regressor
     lpv_ : LPVStateSpace
         Knows the names of the scheduling variables: ``lpv_.at({"kappa": 0.5})``.
+    input_delay_ : ndarray of shape (n_inputs,)
+        Of `lpv_`, in samples.
     report_ : DataFrame
         One row per operating point: experiments, samples, order, BFT of the local and
         of the gray-box model on the estimation data (percent, mean over the outputs),
@@ -365,6 +367,8 @@ list, default=None
                 identified_range=self.scheduling_range_,
                 input_delay=common_delay(found.local, kappa, self.sampling_time_),
             )
+            late = self.lpv_.input_delay / self.sampling_time_
+            self.input_delay_ = np.round(late).astype(int)
             self.parameters_covariance_ = found.covariance
             report = tables(found, self.lpv_, self.sampling_time_)
             self.parameters_, self.parameters_std_ = (

@@ -93,20 +93,28 @@ def late_inputs(
 
 
 def with_late_inputs(
-    experiments: Sequence[Experiment], delay: Delay, *, rest: bool, gaps: bool
+    experiments: Sequence[Experiment],
+    delay: Delay,
+    *,
+    rest: bool,
+    gaps: bool,
+    at_mean: bool = False,
 ) -> list[Experiment]:
     """Experiments with inputs as they arrive, cut at gaps where there may be some.
 
+    With `rest` the inputs before are zero, or `at_mean`, where that is to be removed.
     Without `rest` the first samples, to which unknown inputs arrive, are left out. A
     ValueError where that leaves no two samples of any experiment.
     """
     if not delay.any():
         return split_at_gaps(experiments) if gaps else list(experiments)
-    late = [
-        late_inputs(run, delay, rest=rest and i == 0)[0]
-        for e in experiments
-        for i, run in enumerate(unbroken_runs(e))
-    ]
+    late = []
+    for e in experiments:
+        first, *others = unbroken_runs(e)
+        mean = np.tile(first.inputs.mean(axis=0), (delay.max(), 1))
+        before = mean if rest and at_mean else None
+        late.append(late_inputs(first, delay, rest=rest, before=before)[0])
+        late += [late_inputs(run, delay, rest=False)[0] for run in others]
     if rest and not gaps:
         return late
     longest = max(len(e.rows) for e in experiments)

@@ -351,13 +351,13 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         experiments = self._read(X, y, reset=True, cut=False)
         self.time_jitter_ = max(e.jitter for e in experiments)
         delay = self._delay_of(experiments, choices)
-        gaps, rest = self.missing == "split", not choices.initial_states
-        experiments = with_late_inputs(experiments, delay, rest=rest, gaps=gaps)
+        gaps = self.missing == "split"
+        experiments = self._with_late_inputs(experiments, delay, gaps)
         self._stream: SampleStream | None = None
         self._single_output = np.asarray(y).ndim == 1
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
         told: set[str] = set()
-        gaps |= bool(delay.any()) and not rest
+        gaps |= bool(delay.any()) and choices.initial_states
         fitted = fit_as_stream(pairs, choices, told, detrend=self.detrend, gaps=gaps)
         if fitted is None:
             names = experiments[0].input_names
@@ -512,6 +512,14 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         n_trend = 1 if choices.offset == "auto" else N_TRENDS[choices.offset]
         settings = choices.settings(n_outputs, n_inputs, np.eye(n_inputs), n_trend)
         return find_delays(pairs, settings, choices.order, choices.horizon)
+
+    def _with_late_inputs(
+        self, experiments: list[Experiment], delay: Delay, gaps: bool
+    ) -> list[Experiment]:
+        rest, at_mean = self.initial_state == "rest", self.detrend is not None
+        return with_late_inputs(
+            experiments, delay, rest=rest, gaps=gaps, at_mean=at_mean
+        )
 
     def _take(self, fitted: LocalFit, step: float, delay: Delay) -> None:
         """Set the fitted attributes."""
@@ -764,10 +772,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 f"`y` must hold the {self.n_outputs_} output(s) of the model. Got "
                 f"{len(names)}."
             )
-        rest = self.initial_state == "rest"
-        experiments = with_late_inputs(
-            experiments, self.input_delay_, rest=rest, gaps=True
-        )
+        experiments = self._with_late_inputs(experiments, self.input_delay_, True)
         undelayed = self.lti_.with_input_delay(0)
         return model_residuals(
             undelayed,

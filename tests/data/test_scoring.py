@@ -63,6 +63,7 @@ def test_reports_warn_too(spring):
 
 @pytest.mark.parametrize("order", [1, 3])
 @pytest.mark.parametrize("pole", [0.0, 0.9])
+@pytest.mark.filterwarnings("ignore:The simulation error depends on past inputs")
 def test_rest_is_not_taken_for_motion(order, pole):
     """Models of too low an order and the right one, at 10 dB; warnings are errors."""
     for seed in range(5):
@@ -73,6 +74,17 @@ def test_rest_is_not_taken_for_motion(order, pole):
         v = lfilter([1.0], [1.0, -pole], rng.standard_normal((400, 1)), axis=0)[100:]
         y = y + 0.3 * y.std() * v / v.std()
         SubspaceLTI(order, horizon=8).fit(u, y).score(u, y)
+
+
+def test_inputs_in_transit_at_rest_are_not_taken_for_motion():
+    """Estimated, the twenty of them meet the noise of twenty samples."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        system = stable_model(rng, 2, 1, 1, sampling_time=1.0).with_input_delay(20)
+        u = rng.standard_normal((400, 1))
+        y = system.simulate(u)
+        y = y + y.std() * rng.standard_normal(y.shape)
+        SubspaceLTI(2, horizon=8, input_delay=20).fit(u, y).score(u, y)
 
 
 def test_an_experiment_without_a_measurement_tells_nothing(spring):

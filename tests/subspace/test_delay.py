@@ -6,6 +6,7 @@ from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.data.experiments import Experiment
+from lpvlearn.models.innovation import InnovationModel, NoiseModel
 from lpvlearn.subspace.delay import find_delays, first_answers, late_inputs
 from lpvlearn.subspace.fit import Choices
 
@@ -190,12 +191,47 @@ def test_without_noise_all_own_unknowns_are_exact():
             np.testing.assert_allclose(z[known[rows]], y[rows][known[rows]], atol=1e-7)
 
 
+@pytest.mark.parametrize("lost", [[], [20, 21, 90]])
+def test_a_predictor_with_a_gain_estimates_what_is_in_transit(lost):
+    """All states and inputs in transit, of time-varying gains where outputs miss."""
+    rng = np.random.default_rng(2)
+    lti = stable_model(3, 3, sampling_time=1.0, feedthrough=True)
+    lti = lti.with_input_delay(DELAY)
+    noise = NoiseModel(
+        0.8 * np.eye(1), np.ones((2, 1)), np.full((1, 2), 0.2), np.eye(2)
+    )
+    model = InnovationModel(lti, noise, 0.1 * rng.normal(size=(3, 2)))
+    u, own = rng.normal(size=(100, 2)), rng.normal(size=4 + sum(DELAY) + 2)
+    x0, level = own[:-2], own[-2:]
+    y = lti.simulate(u, initial_state=np.delete(x0, 3))
+    y += x0[3] * 0.8 ** np.arange(100.0)[:, None]
+    assert np.abs(model.predict(u, y, initial_state=x0) - y).max() < 1e-12
+    z = y + level
+    z[lost] = np.nan
+    found = model.estimate_initial_state(u, z, np.ones((1, 100)))
+    np.testing.assert_allclose(found, own, atol=1e-8)
+
+
 def test_from_rest_the_input_before_is_the_offset():
     _, X, y, _ = offset_tables(noise=0.0, holes=False)
     found = SubspaceLTI(3, horizon=6, input_delay=DELAY).fit(X[:300, :2], y[:300])
     still = np.broadcast_to(found.input_offset_[0], (10, 2))
     rest = np.broadcast_to(found.output_offset_[0], (10, 2))
     np.testing.assert_allclose(found.predict(still), rest, atol=1e-7)
+
+
+def test_rest_at_the_mean_is_that_of_the_inputs_before():
+    """Detrended, an experiment from rest is the same wherever its inputs stand."""
+    _, u, y = late_record(noise=0.05)
+    plain, moved = (
+        estimator(initial_state="rest", detrend="constant").fit(u + level, y + level[0])
+        for level in (np.zeros(2), np.array([30.0, -4.0]))
+    )
+    np.testing.assert_allclose(moved.lti_.poles(), plain.lti_.poles(), atol=1e-6)
+    expected = plain.predict(u) + 30.0
+    np.testing.assert_allclose(
+        moved.predict(u + [30.0, -4.0]), expected, atol=1e-5 * y.std()
+    )
 
 
 def test_holes_in_time_end_what_is_known_of_the_inputs():
@@ -272,6 +308,18 @@ def test_without_noise_the_delay_is_exact():
     found = SubspaceLTI(input_delay="auto").fit(u, y)
     np.testing.assert_array_equal(found.input_delay_, DELAY)
     assert found.order_ == 3
+
+
+@pytest.mark.parametrize("n_trend", [1, 2])
+def test_offsets_and_drifts_are_no_delays(n_trend):
+    """What is found does not depend on them at all."""
+    _, u, y = late_record(200, noise=0.02)
+    v, z = late_record(150, seed=5, noise=0.02)[1:]
+    settings = Choices().settings(2, 2, np.eye(2), n_trend)
+    line = np.arange(200.0)[:, None] * (n_trend - 1)
+    pairs = [(u + [100.0, -5.0] + 0.1 * line, y - 1e3 + line), (v - 7.0, z + 55.0)]
+    for found in (pairs, [(u, y), (v, z)]):
+        np.testing.assert_array_equal(find_delays(found, settings, 3, 6), DELAY)
 
 
 @pytest.mark.parametrize("n_samples", [10, 15, 21, 40])
