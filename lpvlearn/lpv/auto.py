@@ -27,6 +27,8 @@ _DEGREES = (
     *((1, 1), (1, 2), (2, 1), (2, 2), (3, 2), (3, 3)),
 )
 _SATURATED = 2  # the highest degree whose coefficients the points may just determine
+_TENSOR = 2  # the highest degree in every variable: more takes minutes
+
 # Forms whose criterion is higher than the lowest by more than this have no support
 # (Burnham and Anderson 2002, section 2.6). Without it one in three of AIC's choices
 # would have coefficients too many.
@@ -174,6 +176,8 @@ def _forms(kappa: Array) -> Iterator[tuple[str, PolynomialLPV | RationalLPV]]:
                 if tensor
                 else math.comb(degree + n_variables, degree)
             )
+            if tensor and degree > _TENSOR:
+                continue
             if n_terms > n or (n_terms == n and degree > _SATURATED):
                 continue
             powers = resolvable_powers(degree, places, tensor=tensor)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import orth
+from scipy.linalg import orth, solve_triangular
 
 from ..validation import one_of, whole_number
 from .interpolator import Interpolator
@@ -246,9 +246,13 @@ class _Search(NamedTuple):
     def _at(self, d: Array) -> _State:
         below = (1.0 + self.psi @ d)[:, None]
         terms = self.phi / below
-        fitted = terms @ self.points.coefficients(terms)[0]
-        errors = self.points.errors(fitted - self.points.theta).ravel()
-        basis = np.linalg.qr(self.points.design(terms))[0]
+        basis, R = np.linalg.qr(self.points.design(terms))
+        target = self.points.errors(self.points.theta)
+        errors = (basis @ (basis.T @ target) - target).ravel()
+        numerator = solve_triangular(R, basis.T @ target).reshape(terms.shape[1], -1)
+        if self.points.whitening is None:
+            numerator = numerator * self.points.scale
+        fitted = terms @ numerator
         columns = [-fitted * column[:, None] / below for column in self.psi.T]
         slopes = self._unexplained(basis, columns) if columns else np.zeros((0, 0))
         return _State(d, float(errors @ errors), errors, slopes)
