@@ -389,6 +389,9 @@ _HALF = 0.5  # share of their energy that enforced stability must cost to be rep
 # equal noise and signal a right model comes to two thirds.
 _CONFIRMED = 0.5
 
+_ENOUGH = 100  # samples, for parts of them to tell anything
+
+
 # A standard deviation of the static gain by the root mean square of the whole response:
 # above it, a gain that is not known matters.
 _OPEN = 0.3
@@ -471,6 +474,8 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
 
     Without figures, so that a search says it once.
     """
+    if sum(record.u.shape[1] for record in fitted.evidence.records) < _ENOUGH:
+        return
     if held_out.bft < _CONFIRMED * 100.0 * (1.0 - fitted.residual):
         tell(
             told,

@@ -374,7 +374,8 @@ def _try_orders(
         if not starts:
             break
         horizon = _best_horizon(starts, refine=True)
-        model = refine_simulation(starts[horizon], records, settings.free, **steps)
+        start = starts[horizon]
+        model = refine_simulation(start, records, settings.free, **steps)
         if tried and model.loss > _AS_GOOD * tried[-1].model.loss:
             other = _with_more_states(tried[-1].model, records, settings)
             if other is not None and other.loss < model.loss:
@@ -426,7 +427,8 @@ def _with_more_states(
     more = realize(space, left, 1, settings._replace(n_noise_states=0))
     A = linalg.block_diag(model.A, more.A)
     C = np.hstack([model.C, more.C])
-    return refine_simulation(simulation_fit(A, C, records, free), records, free)
+    start = simulation_fit(A, C, records, free)
+    return refine_simulation(start, records, free)
 
 
 def _starts(
