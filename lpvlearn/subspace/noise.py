@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 # Lags that are allowed for by the number of samples: 10 log10(n), a customary limit.
 _LAGS_PER_DECADE = 10.0
 
+_PATIENCE = 12  # lags beyond the best number that are looked at
+
 _MAX_CONDITION = 1e8  # of eigenvectors, which would lose half of the spectrum's digits
 
 _ROUNDING = 1e-9  # size of an error, relative to the output, that is not noise
@@ -225,14 +227,14 @@ def autoregression(
     scale = np.sqrt(np.maximum(np.diagonal(lags[0]), 0.0))
     scale[scale == 0.0] = 1.0
     lags = lags / scale[:, None] / scale
-    best, found = np.inf, (np.zeros((ny, 0)), lags[0])
+    best, best_p, found = np.inf, 0, (np.zeros((ny, 0)), lags[0])
     for p, (coefficients, covariance) in enumerate(_regressions(lags)):
         sign, logdet = np.linalg.slogdet(covariance)
-        if not sign > 0.0:  # errors without noise
+        if not sign > 0.0 or p > best_p + _PATIENCE:  # no noise is left, or no colour
             break
         criterion = logdet + p * ny * ny * np.log(n_samples) / n_samples
         if criterion < best:
-            best, found = criterion, (coefficients, covariance)
+            best, best_p, found = criterion, p, (coefficients, covariance)
     coefficients, covariance = found
     n = coefficients.shape[1]
     blocks = coefficients.reshape(ny, n // ny, ny) * scale[:, None, None] / scale
