@@ -67,9 +67,14 @@ class Case(NamedTuple):
     sizes: tuple[float, ...] = (1.0,)  # of the noise, relative
 
     def system(self) -> StateSpace:
-        """The same for all seeds."""
+        """The same for all seeds; its poles can be told apart."""
         rng = np.random.default_rng(2024 + self.order + 10 * self.n_outputs)
-        return random_system(rng, self.order, self.n_inputs, self.n_outputs)
+        while True:
+            system = random_system(rng, self.order, self.n_inputs, self.n_outputs)
+            poles = system.poles()
+            gaps = np.abs(poles - poles[:, None]) + np.eye(self.order)
+            if gaps.min() > 0.15 and np.abs(poles).min() > 0.3:
+                return system
 
     def filters(self) -> list[tuple[float, float]]:
         """Size and pole of the noise of every output, of unit variance."""

@@ -217,6 +217,7 @@ def test_constants_that_are_not_there_are_hardly_ever_found(pole):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The simulation error depends on past inputs")
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 def test_constants_of_the_size_of_the_noise_are_found(pole):
     errors = {"auto": [], "constant": [], None: []}
