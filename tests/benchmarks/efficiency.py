@@ -12,10 +12,10 @@ degrees of freedom (1 if the structure is true and the covariance right).
 The bound is that of the gray-box model itself: from the Jacobian J of its simulated
 outputs, whitened by the true noise, ``inv(J^T J)``.
 
-"weighted": the parameters at the least distance in units of the black box's
-covariance. "noise": the same from a black box that is estimated once more with its
-outputs weighted by their noise. "ml": least squares on the whitened outputs, from
-the true parameters.
+"weighted": the parameters at the least distance in units of the covariance of a black
+box that minimises the simulation error. "noise": the same from one whose errors were
+whitened, as `SubspaceLTI` does. "ml": least squares on the whitened outputs, from the
+true parameters.
 """
 
 from __future__ import annotations
@@ -31,10 +31,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace, SubspaceLTI
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, SubspaceLTI
 from lpvlearn.pipeline.points import _average, covariance_of_parameters
 from lpvlearn.restructuring.minimise_covariance import efficient_parameters
-from lpvlearn.subspace.statistics import deviated_models, noise_weighted
 
 STRUCTURE = GrayBoxStructure.mechanical(
     M=[["m1", 0], [0, "m2"]],
@@ -129,17 +128,9 @@ def maximum_likelihood(records: Sequence[Record], case: Case) -> Estimate:
     return Estimate(found.x, np.linalg.inv(found.jac.T @ found.jac))
 
 
-def weighted(
-    models: Sequence[StateSpace],
-    records: Sequence[Record],
-    scales: Sequence[np.ndarray | None],
-    start: np.ndarray,
-) -> Estimate:
+def weighted(fits: Sequence[SubspaceLTI], start: np.ndarray) -> Estimate:
     """Parameters nearest to discrete-time models in their own uncertainty."""
-    identified = []
-    for model, record, scale in zip(models, records, scales, strict=True):
-        pairs = deviated_models(model, [record[:2]], output_scale=scale)
-        identified.append((model, pairs))
+    identified = [(fit.lti_, fit.deviated_models()) for fit in fits]
     found = efficient_parameters(STRUCTURE, identified, start)
     assert found is not None and found.converged
     return Estimate(found.theta, found.covariance, found.cost, found.degrees_of_freedom)
@@ -147,9 +138,13 @@ def weighted(
 
 def estimates(records: Sequence[Record], case: Case) -> Iterator[tuple[str, Estimate]]:
     """What every method makes of the records."""
-    fits = [
-        SubspaceLTI(4, horizon=15, sampling_time=STEP).fit(r.u, r.y) for r in records
-    ]
+    plain, fits = (
+        [
+            SubspaceLTI(4, horizon=15, sampling_time=STEP, refine=refine).fit(r.u, r.y)
+            for r in records
+        ]
+        for refine in ("simulation", "auto")
+    )
     models = [fit.lti_ for fit in fits]
     black_boxes = [model.to_continuous().balance() for model in models]
     if any(box.order != STRUCTURE.order for box in black_boxes):
@@ -167,7 +162,7 @@ def estimates(records: Sequence[Record], case: Case) -> Iterator[tuple[str, Esti
         else:
             pairs = [
                 (above.to_continuous(), below.to_continuous())
-                for above, below in deviated_models(models[0], [records[0][:2]])
+                for above, below in fits[0].deviated_models()
             ]
             covariance = covariance_of_parameters(
                 STRUCTURE, found.params_, None, black_box, pairs
@@ -175,17 +170,8 @@ def estimates(records: Sequence[Record], case: Case) -> Iterator[tuple[str, Esti
         yield norm, Estimate(found.params_, covariance)
         if norm == "hinf":
             start = found.params_
-    yield "weighted", weighted(models, records, [None] * len(records), start)
-    refined = [
-        noise_weighted(model, [record[:2]])
-        for model, record in zip(models, records, strict=True)
-    ]
-    yield (
-        "noise",
-        weighted(
-            [r.lti for r in refined], records, [r.output_scale for r in refined], start
-        ),
-    )
+    yield "weighted", weighted(plain, start)
+    yield "noise", weighted(fits, start)
     yield "ml", maximum_likelihood(records, case)
 
 
