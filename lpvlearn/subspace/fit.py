@@ -385,8 +385,8 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
 
 _USELESS = 0.9  # share of the outputs' size left unexplained that is reported
 _HALF = 0.5  # share of their energy that enforced stability must cost to be reported
-# Share of its fit in percent that parts held out must confirm; with 200 samples at
-# equal noise and signal a right model comes to two thirds.
+# Share of its fit (one less the relative error) that parts held out must confirm; with
+# 200 samples at equal noise and signal a right model comes to two thirds.
 _CONFIRMED = 0.5
 
 _ENOUGH = 100  # samples, for parts of them to tell anything
@@ -476,7 +476,7 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
     """
     if sum(record.u.shape[1] for record in fitted.evidence.records) < _ENOUGH:
         return
-    if held_out.bft < _CONFIRMED * 100.0 * (1.0 - fitted.residual):
+    if 1.0 - held_out.residual < _CONFIRMED * (1.0 - fitted.residual):
         tell(
             told,
             "held out",

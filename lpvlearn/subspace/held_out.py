@@ -27,6 +27,8 @@ _N_PIECES = 3  # held out in turn: a whole number of refits, and most samples st
 
 _N_BLOCKS = 5  # of a piece: sums over time whose spread tells that of their total
 
+_MOST = 0.7  # share of an input's motion without which nothing can be said of it
+
 _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 
 # By which an error must be less to matter, and by which it is so beyond doubt.
@@ -38,6 +40,7 @@ class HeldOut(NamedTuple):
 
     blocks: Array  # (n_blocks,): sums of squares over consecutive blocks of time
     bft: float  # best fit, percent, mean over outputs; NaN where nothing is held out
+    residual: float = np.nan  # root mean square, in units of the scaled records
 
     def clearly_better_than(self, other: HeldOut, standard_errors: float) -> bool:
         """Whether errors are less, by more than chance and by enough to matter.
@@ -72,7 +75,7 @@ def held_out(
     errors, outputs = [], []
     records = thinned(records)
     for k in range(1, _N_PIECES + 1):
-        cuts = [_cut(record.u.shape[1], k) for record in records]
+        cuts = [_cut(record.u, k) for record in records]
         train = [
             Record(*(signals[:, part].copy() for signals in record))
             for record, (start, stop) in zip(records, cuts, strict=True)
@@ -106,7 +109,8 @@ def held_out(
     with np.errstate(over="ignore", invalid="ignore"):
         miss = np.sqrt((error**2).sum(axis=0)) / spread
     bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
-    return HeldOut(np.array(blocks), bft if np.isfinite(bft) else 0.0)
+    residual = float(np.sqrt(np.sum(blocks) / error.size))
+    return HeldOut(np.array(blocks), bft if np.isfinite(bft) else 0.0, residual)
 
 
 def thinned(records: Sequence[Record], n_samples: int = MAX_SAMPLES) -> list[Record]:
@@ -124,13 +128,21 @@ def thinned(records: Sequence[Record], n_samples: int = MAX_SAMPLES) -> list[Rec
     return [records[i].head(n_samples) for i in spread]
 
 
-def _cut(n_samples: int, k: int) -> tuple[int, int]:
-    """Start and end of the k-th piece held out; the end twice for a short experiment.
+def _cut(u: Array, k: int) -> tuple[int, int]:
+    """Start and end of the k-th piece held out.
 
-    >>> [_cut(100, k) for k in (1, 2, 3)], _cut(5, 1)
+    The end twice where it is not: of a short experiment, and of one whose inputs
+    (n_inputs, n_samples) move but in that piece, such as a step.
+
+    >>> [_cut(np.arange(100.0)[None], k) for k in (1, 2, 3)], _cut(np.ones((1, 5)), 1)
     ([(25, 50), (50, 75), (75, 100)], (5, 5))
     """
+    n_samples = u.shape[1]
     if n_samples < _TOO_SHORT:
         return n_samples, n_samples
     size = n_samples // (_N_PIECES + 1)
-    return size * k, n_samples if k == _N_PIECES else size * (k + 1)
+    start, stop = size * k, n_samples if k == _N_PIECES else size * (k + 1)
+    moves = np.diff(u, axis=1, prepend=u[:, :1]) ** 2
+    if (moves[:, start:stop].sum(axis=1) > _MOST * moves.sum(axis=1)).any():
+        return n_samples, n_samples
+    return start, stop

@@ -326,8 +326,8 @@ def test_a_fit_that_parts_held_out_do_not_confirm_is_told(rng):
     y = y + 0.1 * rng.standard_normal(y.shape)
     choices = check_options(SubspaceLTI().get_params())
     fitted = fit_pairs([(u, y)], choices, set())
-    for bft, expected in ((95.0, 0), (60.0, 0), (40.0, 1)):
-        held_out = fitted.selection.held_out._replace(bft=bft)
+    for residual, expected in ((0.05, 0), (0.4, 0), (0.6, 1)):
+        held_out = fitted.selection.held_out._replace(residual=residual)
         poor = fitted._replace(selection=fitted.selection._replace(held_out=held_out))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")

@@ -49,3 +49,18 @@ def test_a_difference_counts_where_it_is_neither_chance_nor_small(rng):
     diverged = HeldOut(np.full(15, np.nan), 0.0)
     assert base.clearly_better_than(diverged, 2.0)
     assert not diverged.clearly_better_than(base, 2.0)
+
+
+def test_what_moves_in_one_piece_alone_is_not_held_out(rng):
+    system = example(rng, modes(*POLES))
+    u, y = experiment(rng, system, 400)
+    u[:150] = u[150:] = u[150]
+    u[:150] = 0.0
+    lengths = []
+
+    def refitted(train):
+        lengths.append([record.u.shape[1] for record in train])
+        return Realization(*system, np.zeros((1, 6)), 0.0)
+
+    held_out(refitted, [Record.of(u, y)])
+    assert lengths == [[400], [200, 100], [300]]
