@@ -264,16 +264,16 @@ class _Correlated(NamedTuple):
 def _wilks(y: Array, known: Array, dof: int) -> _Correlated:
     """Test whether rows of `dof` degrees of freedom lie in orthonormal columns."""
     y = y[y.any(axis=1)]
-    q, ny = known.shape[1], len(y)
+    # Outputs that repeat others tell nothing more.
+    own = _basis(y, y, _DEPENDENT).T
+    q, ny = known.shape[1], len(own)
     dof -= q
     if q == 0 or ny == 0 or dof <= ny:
         return _Correlated(1.0, 0.0)
-    explained = y @ known
-    total = y @ y.T
-    left = total - explained @ explained.T
-    floor = _EXACT * np.diag(np.diagonal(total))
-    log_sines = np.linalg.slogdet(left + floor)[1] - np.linalg.slogdet(total + floor)[1]
-    statistic = -(dof + 0.5 * (q - ny - 1)) * log_sines
+    explained = own @ known
+    left = (1.0 + _EXACT) * np.eye(ny) - explained @ explained.T
+    statistic = -(dof + 0.5 * (q - ny - 1)) * np.linalg.slogdet(left)[1]
     p_value = float(stats.chi2.sf(max(statistic, 0.0), ny * q))
-    share = 1.0 - np.diagonal(left) / np.diagonal(total) * (dof + q) / dof
+    unexplained = 1.0 - np.sum((y @ known) ** 2, axis=1) / np.sum(y**2, axis=1)
+    share = 1.0 - unexplained * (dof + q) / dof
     return _Correlated(p_value, max(0.0, float(share.max())))

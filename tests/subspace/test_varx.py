@@ -142,3 +142,12 @@ def test_the_past_is_as_long_as_the_memory():
     assert past_window(records, 6, 20, np.array([True])) == 6
     assert longest_past(records_of((u[:20], y[:20])), 400) == 1
     assert longest_past(records, 40) == 20
+
+
+def test_an_output_that_repeats_others_makes_no_number_invalid():
+    rng = np.random.default_rng(0)
+    with np.errstate(all="raise"):
+        for _ in range(5):
+            u, y = open_loop(rng, 500, "white")
+            twice = find_feedback(records_of((u, np.hstack([y, y]))))
+            assert np.isfinite(twice.p_value) and not twice.found
