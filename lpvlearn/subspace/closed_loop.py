@@ -73,7 +73,7 @@ from .noise import Whitening
 from .realization import reflect_unstable
 from .refinement import refine_simulation
 from .selection import Row, Selection
-from .signals import Record, output_energy
+from .signals import Record, output_energy, shorten
 from .simulation_fit import (
     Freedom,
     Realization,
@@ -81,7 +81,7 @@ from .simulation_fit import (
     simulation_fit,
     with_initial_states,
 )
-from .statistics import Evidence, parameter_covariance, shorten
+from .statistics import Evidence, parameter_covariance
 from .varx import longest_past, n_windows, past_window, samples_of
 
 Array = NDArray[np.float64]

@@ -43,8 +43,9 @@ from .offsets import (
 from .realization import METHODS
 from .residuals import lacks
 from .selection import Row, Selection, better_horizon, select
+from .signals import shorten
 from .simulation_fit import Freedom, Realization
-from .statistics import Evidence, shorten
+from .statistics import Evidence
 from .varx import Feedback, find_feedback
 
 Array = NDArray[np.float64]

@@ -24,7 +24,7 @@ from .realization import (
     reflect_unstable,
 )
 from .refinement import refine_simulation
-from .signals import Record, output_energy
+from .signals import Record, output_energy, shorten
 from .simulation_fit import (
     Freedom,
     Realization,
@@ -328,12 +328,14 @@ def identify(
     fitted = _fit(records, order, horizon, as_found, first, start)
     chosen = fitted.candidate
     filtered = known is not None or len(records[0].y) == 1
+    some, errors = shorten(records)[0], None
     for _ in range(_ROUNDS if settings.refine and settings.weigh else 0):
-        errors = simulation_errors(chosen.model, records)
+        if errors is None:
+            errors = simulation_errors(chosen.model, some)
         whitening = Whitening.of(errors, settings.free, filtered=filtered)
         if not whitening.is_close_to(chosen.whitening):
             again = _fit(records, order, horizon, as_found, whitening, chosen.model)
-            chosen = again.candidate
+            chosen, errors = again.candidate, None
         elif filtered:
             break
         else:  # the weights of the outputs are found

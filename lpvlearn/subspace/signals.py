@@ -31,6 +31,10 @@ Array = NDArray[np.float64]
 _MAX_CONDITION = 1e8  # of T, beyond which the sections lose half of the digits
 _PARALLEL = 1.0 - 1e-8  # cosine of eigenvectors that leave their plane inaccurate
 _PIECE = 8192  # samples worked on at a time: their signals stay in the cache
+
+# Averages over the record are known to a percent or so from this many samples.
+_MAX_SAMPLES = 30_000
+
 _LARGEST = 1e200  # squares of responses beyond it would overflow
 
 
@@ -55,6 +59,16 @@ class Record(NamedTuple):
 def output_energy(records: Sequence[Record]) -> float:
     """Sum of squares of all outputs."""
     return sum(float((record.y**2).sum()) for record in records)
+
+
+def shorten(records: Sequence[Record]) -> tuple[list[Record], float]:
+    """Heads of the records, some 30,000 samples in total, and their share."""
+    total = sum(record.u.shape[1] for record in records)
+    share = _MAX_SAMPLES / total
+    if share >= 1.0:
+        return list(records), 1.0
+    parts = [r.head(max(2, int(share * r.u.shape[1]))) for r in records]
+    return parts, sum(record.u.shape[1] for record in parts) / total
 
 
 class Sections(NamedTuple):

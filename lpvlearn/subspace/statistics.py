@@ -44,9 +44,6 @@ from .simulation_fit import (
 
 Array = NDArray[np.float64]
 
-# Averages over the record are known to a percent or so from this many samples.
-_MAX_SAMPLES = 30_000
-
 _NEGLIGIBLE = 1e-12  # relative variance below which a direction is rounding
 
 _RCOND = 1e-15  # the weakest direction of the information that is told from rounding
@@ -218,16 +215,6 @@ def _deviations(J: NDArray[np.complex128], covariance: Array) -> NDArray[np.comp
     ]
     real, imag = (np.sqrt(np.maximum(variance, 0.0)) for variance in variances)
     return real + 1j * imag
-
-
-def shorten(records: list[Record]) -> tuple[list[Record], float]:
-    """Heads of the records, some 30,000 samples in total, and their share."""
-    total = sum(record.u.shape[1] for record in records)
-    share = _MAX_SAMPLES / total
-    if share >= 1.0:
-        return records, 1.0
-    parts = [r.head(max(2, int(share * r.u.shape[1]))) for r in records]
-    return parts, sum(record.u.shape[1] for record in parts) / total
 
 
 def _square_root(covariance: Array) -> Array:

@@ -264,14 +264,15 @@ class _Correlated(NamedTuple):
 def _wilks(y: Array, known: Array, dof: int) -> _Correlated:
     """Test whether rows of `dof` degrees of freedom lie in orthonormal columns."""
     y = y[y.any(axis=1)]
-    # Outputs that repeat others tell nothing more.
+    # Outputs that repeat others tell nothing more. They count as degrees of freedom all
+    # the same: where there is no noise, what a short past leaves of them is one signal.
     own = _basis(y, y, _DEPENDENT).T
-    q, ny = known.shape[1], len(own)
+    q, ny = known.shape[1], len(y)
     dof -= q
     if q == 0 or ny == 0 or dof <= ny:
         return _Correlated(1.0, 0.0)
     explained = own @ known
-    left = (1.0 + _EXACT) * np.eye(ny) - explained @ explained.T
+    left = (1.0 + _EXACT) * np.eye(len(own)) - explained @ explained.T
     statistic = -(dof + 0.5 * (q - ny - 1)) * np.linalg.slogdet(left)[1]
     p_value = float(stats.chi2.sf(max(statistic, 0.0), ny * q))
     unexplained = 1.0 - np.sum((y @ known) ** 2, axis=1) / np.sum(y**2, axis=1)
