@@ -297,6 +297,8 @@ class ClosedLoopEvidence(Evidence):
                 "multiplicity two at most."
             )
         direct = self.free.direct
+        if not (len(self.joint.A) or direct.any()):
+            return np.zeros((0, 0))  # no parameters
         known = _knowledge(self.fitted, self.joint, self.transform, self.kept, direct)
         return known.plant
 

@@ -196,7 +196,8 @@ def _search(
     """The choice for settings that suit all orders alike."""
     highest = order
     if highest is None:
-        highest = _highest_order(records, _horizons(records, 0, settings), settings)
+        horizons = [horizon] if horizon else _horizons(records, 0, settings)
+        highest = _highest_order(records, horizons, settings)
     wanted = _Range(range(order or 0, highest + 1), horizon)
     pilot = _pilot(records, wanted, settings)
     noise = _noise_of(pilot, records, wanted, settings)

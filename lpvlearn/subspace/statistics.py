@@ -92,7 +92,7 @@ class Evidence:
         if not self.refined:
             raise ValueError(
                 "The covariance is that of a refined model at an unconstrained "
-                "minimum: refine='auto' and stability='warn'."
+                "minimum: refine='simulation' or 'prediction' and stability='warn'."
             )
         if self.sections.blocks is None:
             raise ValueError(
@@ -173,7 +173,7 @@ class Evidence:
         Shape (n_freq, k, k) with ``k = 2 n_outputs n_inputs``; radians per sample.
         """
         covariance, J = self.covariance, self._frequency_jacobian(omega)
-        flat = J.reshape(len(J), -1, J.shape[-1])
+        flat = J.reshape(len(J), math.prod(J.shape[1:3]), J.shape[-1])
         parts = np.concatenate([flat.real, flat.imag], axis=1)
         return parts @ covariance @ parts.transpose(0, 2, 1)
 
@@ -222,7 +222,7 @@ def _square_root(covariance: Array) -> Array:
     scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     unit = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
-    kept = values > _NEGLIGIBLE * values[-1]
+    kept = values > _NEGLIGIBLE * values.max(initial=0.0)
     return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
 
 
@@ -253,7 +253,7 @@ def parameter_covariance(
     values, vectors = np.linalg.eigh(H / scale[:, None] / scale)
     n_gauge = sum(block.size for block in model.blocks)
     kept = np.arange(len(values)) >= n_gauge
-    kept &= values > _RCOND * values[-1]
+    kept &= values > _RCOND * values.max(initial=0.0)  # order 0, D = 0: none
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     inverse = inverse / scale[:, None] / scale
     n_values = sum(record.y.size for record in records)

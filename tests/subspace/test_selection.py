@@ -68,3 +68,12 @@ def test_a_given_order_is_kept_and_its_horizon_found():
         chosen = select([coloured(3, 400)], order, None, settings)
         assert chosen.order == order == len(chosen.candidate.model.A)
         assert set(chosen.table()["order"]) == {order}
+
+
+def test_a_given_horizon_bounds_the_orders_that_are_tried():
+    record, settings = coloured(0, 300, pole=0.0), Settings(freedom(2, 1))
+    for horizon in (1, 2, 4):  # fewer rows than the pilot has states
+        chosen = select([record], None, horizon, settings)
+        assert chosen.horizon == horizon
+        assert chosen.order <= settings.max_order(horizon)
+    assert chosen.order == 3

@@ -216,9 +216,19 @@ def test_more_data_shrink_the_standard_deviation_as_one_over_root_n():
 
 def test_covariance_of_an_unrefined_model_is_refused():
     model = SubspaceLTI(2, horizon=10, refine=False).fit(*experiment(0, 400))
-    with pytest.raises(ValueError, match="refined model"):
+    with pytest.raises(ValueError, match="refine='simulation' or 'prediction'"):
         model.frequency_response_std(OMEGA)
     assert not hasattr(model, "poles_std_")
+
+
+@pytest.mark.filterwarnings("ignore:The model explains next to nothing")
+@pytest.mark.parametrize("method", ["po-moesp", "pbsid"])
+def test_a_model_without_parameters_is_certain(rng, method):
+    u, y = rng.standard_normal((2, 300, 1))
+    model = SubspaceLTI(0, feedthrough=False, method=method).fit(u, y)
+    assert model.poles_std_.shape == (0,) and model.deviated_models() == []
+    assert (model.frequency_response_std(OMEGA) == np.zeros((4, 1, 1))).all()
+    assert (model.frequency_response_covariance(OMEGA) == np.zeros((4, 2, 2))).all()
 
 
 @pytest.mark.parametrize(
