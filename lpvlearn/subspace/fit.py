@@ -211,9 +211,12 @@ def fit_pairs(
         raise TooFewSamples(str(error)) from None
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = _fit(pairs, choices, told, N_TRENDS[choices.offset])
-    # A slow mode of the noise, which outputs drive, stands for constants only too well.
-    in_loop, tested = fitted.method == "pbsid", fitted.evidence.one_step
-    if choices.offset == "auto" and (in_loop or may_have_constants(tested)):
+    # A slow mode of the noise, which outputs drive, stands for constants only too well;
+    # so does one of a rough model, or of one that has to start at rest.
+    hides = fitted.method == "pbsid" or choices.refine is False
+    hides |= not choices.initial_states
+    tested = fitted.evidence.one_step
+    if choices.offset == "auto" and (hides or may_have_constants(tested)):
         other = _fit(pairs, choices, told, 1)
         if constants_matter(tested, other.evidence.one_step):
             fitted = other

@@ -386,3 +386,19 @@ def test_experiments_of_a_long_table_have_their_own_constants(system, short_stre
     model = SubspaceLTI(5, horizon=8, experiment=2).fit(X, y + levels[run])
     assert model.output_offset_.shape == (3, 2)
     np.testing.assert_allclose(model.output_offset_, levels, rtol=0.2, atol=3.0)
+
+
+@pytest.mark.parametrize(
+    "choice", [{"refine": False}, {"refine": False, "initial_state": "rest"}]
+)
+def test_rough_models_do_not_hide_constants(choice):
+    """Without constants a slow mode would stand for them."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        u = rng.choice([-1.0, 1.0], (250, 2))
+        y = SYSTEM.simulate(u)
+        y = y + 0.1 * y.std(axis=0) * rng.standard_normal(y.shape)
+        y = y + 3.0 * y.std(axis=0)
+        model = SubspaceLTI(3, horizon=10, feedthrough=False, **choice).fit(u, y)
+        assert model.offset_ == "constant"
+        assert error_of(model) < 0.1
