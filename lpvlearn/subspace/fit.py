@@ -210,16 +210,21 @@ def fit_pairs(
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
-    fitted = _fit(pairs, choices, told, N_TRENDS[choices.offset])
+    n_trend = N_TRENDS[choices.offset]
+    # The errors of a rough model are not the noise that constants must stand out of.
+    rough = choices.offset == "auto" and choices.refine is False
+    judged = choices._replace(refine="simulation") if rough else choices
+    fitted = _fit(pairs, judged, told, n_trend)
     # A slow mode of the noise, which outputs drive, stands for constants only too well;
-    # so does one of a rough model, or of one that has to start at rest.
-    hides = fitted.method == "pbsid" or choices.refine is False
-    hides |= not choices.initial_states
+    # so does one of a model that has to start at rest.
+    hides = fitted.method == "pbsid" or not choices.initial_states
     tested = fitted.evidence.one_step
     if choices.offset == "auto" and (hides or may_have_constants(tested)):
-        other = _fit(pairs, choices, told, 1)
+        other = _fit(pairs, judged, told, 1)
         if constants_matter(tested, other.evidence.one_step):
-            fitted = other
+            fitted, n_trend = other, 1
+    if rough:
+        fitted = _fit(pairs, choices, told, n_trend)
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
 
 
