@@ -72,7 +72,7 @@ from .identification import STABLE_MARGIN, ScaledRecords, Settings
 from .noise import Whitening
 from .realization import reflect_unstable
 from .refinement import refine_simulation
-from .selection import Row, Selection
+from .selection import PlantFit, Row, Selection
 from .signals import Record, output_energy, shorten
 from .simulation_fit import (
     Freedom,
@@ -256,16 +256,6 @@ def _knowledge(
     return _Knowledge(J.T @ covariance @ J, -joint.B[~kept].ravel() @ gain)
 
 
-class ClosedLoopFit(NamedTuple):
-    """Result of `identify_closed_loop`."""
-
-    evidence: Evidence
-    selection: Selection
-    singular_values: Array
-    residual: float  # rms of the prediction errors relative to that of all outputs
-    stability_loss: float  # increase of the residual that enforced stability cost
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClosedLoopEvidence(Evidence):
     """A plant with the predictor that it is a part of."""
@@ -345,7 +335,7 @@ def identify_closed_loop(
     order: int | None,
     horizon: int | None,
     settings: Settings,
-) -> ClosedLoopFit:
+) -> PlantFit:
     """Identify a plant that may stand in a feedback loop.
 
     Order and states of plant and noise together follow from one VARX. As many states
@@ -403,7 +393,7 @@ def identify_closed_loop(
         if order in (None, n)
     ]
     chosen = Selection(len(A), subspace.past, tried)
-    return ClosedLoopFit(
+    return PlantFit(
         evidence, chosen, subspace.singular_values, residual, stability_loss
     )
 

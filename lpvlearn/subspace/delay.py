@@ -37,6 +37,7 @@ from .identification import Settings, identify
 from .noise import autoregression
 from .selection import select
 from .signals import Record
+from .simulation_fit import simulation_errors
 
 Array = NDArray[np.float64]
 
@@ -280,11 +281,8 @@ class _Trial:
         model = identify(heads, order, horizon, settings).model
         if part == 1.0:
             cuts = [0] * len(cuts)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return [
-                (r.y.T - model.outputs(r, k))[cut:]
-                for k, (r, cut) in enumerate(zip(records, cuts, strict=True))
-            ]
+        errors = simulation_errors(model, records)
+        return [e[cut:] for e, cut in zip(errors, cuts, strict=True)]
 
     def loss(self, delay: Delay, size: _Size, j: int) -> float:
         """Mean square of the simulation errors; at least that of rounding."""

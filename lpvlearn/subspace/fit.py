@@ -33,7 +33,6 @@ from .identification import (
 )
 from .offsets import (
     N_TRENDS,
-    OFFSETS,
     Offsets,
     attributed,
     constants_matter,
@@ -42,7 +41,7 @@ from .offsets import (
 )
 from .realization import METHODS
 from .residuals import lacks
-from .selection import Row, Selection, better_horizon, select
+from .selection import PlantFit, Row, Selection, better_horizon, select
 from .signals import shorten
 from .simulation_fit import Freedom, Realization
 from .statistics import Evidence
@@ -97,7 +96,8 @@ def check_options(options: Mapping[str, Any]) -> Choices:
     one_of("initial_state", options["initial_state"], ("estimate", "rest"))
     one_of("missing", options["missing"], ("raise", "split"))
     one_of("detrend", options["detrend"], DETRENDS)
-    one_of("offset", options["offset"], OFFSETS)
+    one_of("offset", options["offset"], tuple(N_TRENDS))
+    one_of("refine", options["refine"], (*REFINEMENTS, True, False))
     feedthrough = options["feedthrough"]
     if np.ndim(feedthrough) == 0 and feedthrough not in (True, False):
         raise ValueError(
@@ -120,22 +120,11 @@ def check_options(options: Mapping[str, Any]) -> Choices:
         _integer_or_auto("n_noise_states", options["n_noise_states"], 0) or 0,
         options["method"],
         options["feedthrough"],
-        _refinement(options["refine"]),
+        REFINEMENTS[0] if options["refine"] is True else options["refine"],
         options["stability"] == "enforce",
         options["initial_state"] == "estimate",
         offset,
     )
-
-
-def _refinement(value: Any) -> str | bool:
-    if isinstance(value, (bool, np.bool_)):
-        return "auto" if value else False
-    if not isinstance(value, str) or value not in REFINEMENTS:
-        raise ValueError(
-            "`refine` must be 'auto', 'simulation', 'prediction' or False. "
-            f"Got {value!r}."
-        )
-    return value
 
 
 def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:
@@ -185,7 +174,7 @@ class LocalFit(NamedTuple):
     selection: Selection
     evidence: Evidence
     method: str  # that made the model
-    innovations: Array | None  # least variances of the errors, where known and sought
+    feedback: Feedback | None  # None where the samples are too few for its test
     offsets: Offsets  # of the experiments, what `detrend` subtracted among them
     first_model: Realization  # of `scaled`, the samples that were fitted as one table:
     scaled: ScaledRecords  # all of them, or the first ones of a long table or a stream
@@ -220,16 +209,26 @@ def fit_pairs(
     hides = fitted.method == "pbsid" or not choices.initial_states
     tested = fitted.evidence.one_step
     if choices.offset == "auto" and (hides or may_have_constants(tested)):
-        other = _fit(pairs, judged, told, 1)
+        other = _fit(pairs, judged, told, 1, fitted)
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
     if rough:
-        fitted = _fit(pairs, choices, told, n_trend)
+        fitted = _fit(pairs, choices, told, n_trend, fitted)
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
 
 
-def _fit(pairs: Pairs, choices: Choices, told: set[str], n_trend: int) -> LocalFit:
-    """Choose and identify, with `n_trend` trends of every output and experiment."""
+def _fit(
+    pairs: Pairs,
+    choices: Choices,
+    told: set[str],
+    n_trend: int,
+    known: LocalFit | None = None,
+) -> LocalFit:
+    """Choose and identify, with `n_trend` trends of every output and experiment.
+
+    What is `known` of the same samples with other trends is the feedback, whose test
+    gives every experiment a constant.
+    """
     n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
     order, horizon = choices.order, choices.horizon
     whole, (pairs, centres) = pairs, centred(pairs, n_trend, choices.initial_states)
@@ -241,28 +240,43 @@ def _fit(pairs: Pairs, choices: Choices, told: set[str], n_trend: int) -> LocalF
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
     scaled = scale_records(pairs, n_trend)
-    feedback = find_feedback(scaled.records)
+    feedback = find_feedback(scaled.records) if known is None else known.feedback
     settings = _heed(feedback, settings, choices.feedthrough is True, told)
     if settings.method == "pbsid":
         try:
-            closed = identify_closed_loop(scaled, basis, order, horizon, settings)
+            plant = identify_closed_loop(scaled, basis, order, horizon, settings)
         except ValueError as error:
             raise TooFewSamples(str(error)) from None
-        offsets = attributed(closed.evidence, centres, whole)
-        evidence, offsets = with_levels(closed.evidence, offsets)
-        return LocalFit(
-            evidence.model,
-            closed.singular_values,
-            closed.residual,
-            closed.stability_loss,
-            closed.selection,
-            evidence,
-            settings.method,
-            None,
-            offsets,
-            evidence.model,
-            scaled,
-        )
+    else:
+        plant = _identify_open_loop(scaled, basis, order, horizon, settings)
+    offsets = attributed(plant.evidence, centres, whole)
+    evidence, offsets = with_levels(plant.evidence, offsets)
+    return LocalFit(
+        evidence.model,
+        plant.singular_values,
+        plant.residual,
+        plant.stability_loss,
+        plant.selection,
+        evidence,
+        settings.method,
+        feedback,
+        offsets,
+        evidence.model,
+        scaled,
+    )
+
+
+def _identify_open_loop(
+    scaled: ScaledRecords,
+    basis: Array,
+    order: int | None,
+    horizon: int | None,
+    settings: Settings,
+) -> PlantFit:
+    """Identify a plant whose inputs do not know the noise, by choice where not given.
+
+    `basis` is that of the `Evidence`.
+    """
     chosen = None
     if order is None or horizon is None:
         chosen = select(scaled.records, order, horizon, settings)
@@ -284,20 +298,8 @@ def _fit(pairs: Pairs, choices: Choices, told: set[str], n_trend: int) -> LocalF
         refined=found.refined and found.stability_loss == 0.0,
         share=share,
     )
-    offsets = attributed(evidence, centres, whole)
-    evidence, offsets = with_levels(evidence, offsets)
-    return LocalFit(
-        found.model,
-        found.singular_values,
-        found.residual,
-        found.stability_loss,
-        chosen,
-        evidence,
-        settings.method,
-        None if feedback is None else feedback.innovations,
-        offsets,
-        found.model,
-        scaled,
+    return PlantFit(
+        evidence, chosen, found.singular_values, found.residual, found.stability_loss
     )
 
 
@@ -462,9 +464,10 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
         )
     if fitted.selection.held_out is not None and residual <= _USELESS:
         _warn_about_choice(fitted, fitted.selection.held_out, told)
-    if fitted.innovations is None or fitted.stability_loss or "lack" in told:
+    feedback = None if fitted.method == "pbsid" else fitted.feedback
+    if feedback is None or fitted.stability_loss or "lack" in told:
         return
-    if lacks(fitted.evidence, fitted.innovations):
+    if lacks(fitted.evidence, feedback.innovations):
         tried = {row.order for row in fitted.selection.rows}
         remedy = "a higher `order`" if len(tried) > 1 else "order='auto'"
         # Without figures, so that a search over orders says it once of each.

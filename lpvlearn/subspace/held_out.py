@@ -16,12 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.simulation import estimate_initial_state, free_responses, lti_response
-from .signals import Record
+from .signals import Record, thinned
 from .simulation_fit import Realization
 
 Array = NDArray[np.float64]
-
-MAX_SAMPLES = 12_000  # that a choice is made from: it needs fewer than an estimate
 
 _N_PIECES = 3  # held out in turn: a whole number of refits, and most samples stay
 
@@ -111,21 +109,6 @@ def held_out(
     bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
     residual = float(np.sqrt(np.sum(blocks) / error.size))
     return HeldOut(np.array(blocks), bft if np.isfinite(bft) else 0.0, residual)
-
-
-def thinned(records: Sequence[Record], n_samples: int = MAX_SAMPLES) -> list[Record]:
-    """Evenly spread experiments of about `n_samples` in total, at least one.
-
-    Experiments beyond that length are cut to it.
-
-    >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
-    >>> [run.u.shape[1] for run in thinned(runs, 120)]
-    [50, 60]
-    """
-    lengths = [record.u.shape[1] for record in records]
-    keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
-    spread = [i * len(records) // keep for i in range(keep)]
-    return [records[i].head(n_samples) for i in spread]
 
 
 def _cut(u: Array, k: int) -> tuple[int, int]:

@@ -231,32 +231,21 @@ def realize(
     return as_found if as_found.loss * limit < stable.loss else stable
 
 
-def estimate(
-    subspace: ObservabilitySubspace,
-    records: Sequence[Record],
-    order: int,
-    settings: Settings,
-) -> Realization:
-    """As `realize`, then refined where the settings say so."""
-    start = realize(subspace, records, order, settings)
-    if not settings.refine:
-        return start
-    return refine_simulation(start, records, settings.free)
+class Fitted(NamedTuple):
+    """A candidate, and the singular values of its subspace."""
 
-
-class _Fitted(NamedTuple):
     candidate: Candidate
     singular_values: Array
 
 
-def _fit(
+def fit_once(
     records: Sequence[Record],
     order: int,
     horizon: int,
     settings: Settings,
     whitening: Whitening,
     start: Realization | None = None,
-) -> _Fitted:
+) -> Fitted:
     """Model of whitened records, from their subspace or another model of them."""
     white, free = whitening.records(records, settings.free), settings.free
     width = {horizon: order + settings.n_noise_states}
@@ -264,7 +253,7 @@ def _fit(
     model = realize(subspace, white, order, settings)
     if settings.refine:
         if start is not None:
-            other = _restarted(whitening.model(start), white, free)
+            other = restarted(start, whitening, white, free)
             if other.loss < model.loss and not settings.enforce_stability:
                 model = other
         model = refine_simulation(model, white, free)
@@ -272,14 +261,14 @@ def _fit(
         model = whitening.undone(model)
         model = with_initial_states(model, records, free, whitening.weight)
     candidate = Candidate(model, horizon, whitening, settings.refine)
-    return _Fitted(candidate, subspace.singular_values)
+    return Fitted(candidate, subspace.singular_values)
 
 
-def _restarted(
-    model: Realization, records: Sequence[Record], free: Freedom
+def restarted(
+    model: Realization, whitening: Whitening, white: Sequence[Record], free: Freedom
 ) -> Realization:
-    """The dynamics of a model with other B, D and initial states."""
-    return simulation_fit(model.A, model.C, records, free)
+    """The dynamics of a model with the B, D and own unknowns of whitened records."""
+    return simulation_fit(model.A, whitening.model(model).C, white, free)
 
 
 _REFITS = 4  # steps to the minimum without some samples, from that with them
@@ -295,7 +284,7 @@ def _refitted(
         return candidate.model
     lengths, order = [r.u.shape[1] for r in white], len(candidate.model.A)
     if candidate.refined or settings.max_horizon(lengths) < candidate.horizon:
-        model = _restarted(whitening.model(candidate.model), white, free)
+        model = restarted(candidate.model, whitening, white, free)
         model = refine_simulation(model, white, free, _REFITS)
     else:
         width = {candidate.horizon: order + settings.n_noise_states}
@@ -325,7 +314,7 @@ def identify(
     none = Whitening.none(len(records[0].y))
     as_found = settings._replace(enforce_stability=False)
     first, start = (none, None) if known is None else (known.whitening, known.model)
-    fitted = _fit(records, order, horizon, as_found, first, start)
+    fitted = fit_once(records, order, horizon, as_found, first, start)
     chosen = fitted.candidate
     filtered = known is not None or len(records[0].y) == 1
     some, errors = shorten(records)[0], None
@@ -334,7 +323,7 @@ def identify(
             errors = simulation_errors(chosen.model, some)
         whitening = Whitening.of(errors, settings.free, filtered=filtered)
         if not whitening.is_close_to(chosen.whitening):
-            again = _fit(records, order, horizon, as_found, whitening, chosen.model)
+            again = fit_once(records, order, horizon, as_found, whitening, chosen.model)
             chosen, errors = again.candidate, None
         elif filtered:
             break
@@ -343,16 +332,16 @@ def identify(
     if settings.compare and not chosen.whitening.is_none:
         plain = fitted.candidate
         if not plain.whitening.is_none:
-            plain = _fit(records, order, horizon, as_found, none, chosen.model)[0]
+            plain = fit_once(records, order, horizon, as_found, none, chosen.model)[0]
         rivals = [chosen, plain, plain._replace(refined=False)]
         chosen = _best_held_out(rivals, records, as_found)
         if not chosen.refined:
             unrefined = as_found._replace(refine=False)
-            chosen = _fit(records, order, horizon, unrefined, none).candidate
+            chosen = fit_once(records, order, horizon, unrefined, none).candidate
     energy = output_energy(records) or 1.0
     model, stability_loss = chosen.model, 0.0
     if settings.enforce_stability and not _radius(model.A) < 1.0 - STABLE_MARGIN:
-        model = _fit(records, order, horizon, settings, chosen.whitening)[0].model
+        model = fit_once(records, order, horizon, settings, chosen.whitening)[0].model
         if 0.0 < chosen.model.loss < model.loss:
             stability_loss = np.sqrt(model.loss / energy)
             stability_loss -= np.sqrt(chosen.model.loss / energy)

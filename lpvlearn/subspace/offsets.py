@@ -33,12 +33,15 @@ from ..systems.simulation import lti_response, trend_signals
 from .identification import Centres
 from .noise import autoregression, spectral_density
 from .signals import Record, signal_factor
-from .simulation_fit import in_sections, jacobian_regression, project_out
+from .simulation_fit import (
+    in_sections,
+    jacobian_regression,
+    project_out,
+    simulation_errors,
+)
 from .statistics import Evidence
 
 Array = NDArray[np.float64]
-
-OFFSETS = ("auto", None, "constant", "linear")
 
 # Trends of every output and experiment; "auto" begins without.
 N_TRENDS = {"auto": 0, None: 0, "constant": 1, "linear": 2}
@@ -156,12 +159,9 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
 
 def _error_energies(evidence: Evidence) -> Array:
     """Of every output, in its units; what is rounding counts as the same."""
-    total, n_samples = np.zeros(len(evidence.output_scale)), 0
-    for k, record in enumerate(evidence.records):
-        error = record.y.T - evidence.model.outputs(record, k)
-        total += (error**2).sum(axis=0)
-        n_samples += len(error)
-    return (total + n_samples * _ROUNDING**2) * evidence.output_scale**2
+    errors = np.vstack(simulation_errors(evidence.model, evidence.records))
+    total = (errors**2).sum(axis=0) + len(errors) * _ROUNDING**2
+    return total * evidence.output_scale**2
 
 
 def _has_idle_mode(evidence: Evidence) -> bool:

@@ -52,6 +52,7 @@ from ..validation import one_of, whole_number
 from .hankel import cholesky_factor, correlation_sequence, stack_factors
 from .identification import centred
 from .noise import autoregression
+from .signals import thinned
 from .simulation_fit import simulation_errors, with_initial_states
 from .statistics import Evidence
 
@@ -401,13 +402,9 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
     `innovations` are variances of the errors of a long regression on the past, in the
     scale of the records: a model whose errors are as small is not looked at.
     """
-    records, left = [], _MAX_SAMPLES
-    for record in evidence.records:
-        if left > 0:
-            records.append(record.head(left))
-        left -= record.u.shape[1]
     if not np.isfinite(evidence.model.loss):
         return False
+    records = thinned(evidence.records, _MAX_SAMPLES)
     weight, trend = evidence.whitening.weight, DETRENDS[evidence.free.n_trend]
     model = with_initial_states(evidence.model, records, evidence.free, weight)
     errors = simulation_errors(model, records)

@@ -24,25 +24,27 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from .hankel import correlation_sequence
-from .held_out import HeldOut, thinned
+from .held_out import HeldOut
 from .identification import (
     Candidate,
     Settings,
-    estimate,
+    fit_once,
     realize,
+    restarted,
     subspaces_of,
     validate,
 )
 from .noise import Whitening
 from .realization import ObservabilitySubspace
 from .refinement import refine_simulation
-from .signals import Record, output_energy
+from .signals import Record, output_energy, thinned
 from .simulation_fit import (
     Realization,
     simulation_errors,
     simulation_fit,
     with_initial_states,
 )
+from .statistics import Evidence
 
 Array = NDArray[np.float64]
 
@@ -119,6 +121,16 @@ class Selection(NamedTuple):
         chosen = (columns[0] == self.order) & (columns[1] == self.horizon)
         names = (*Row._fields, "chosen")
         return pd.DataFrame(dict(zip(names, [*columns, chosen], strict=True)))
+
+
+class PlantFit(NamedTuple):
+    """A model of scaled records, of an open or a closed loop, and how it was chosen."""
+
+    evidence: Evidence
+    selection: Selection
+    singular_values: Array
+    residual: float  # rms of simulation or prediction errors relative to the outputs
+    stability_loss: float  # increase of the residual that enforced stability cost
 
 
 def selection_text(table: pd.DataFrame) -> str:
@@ -242,8 +254,7 @@ def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realiza
         if again.is_close_to(whitening):
             break
         whitening, white = again, again.records(records, free)
-        start = whitening.model(model)
-        start = simulation_fit(start.A, start.C, white, free)
+        start = restarted(model, whitening, white, free)
         model = refine_simulation(start, white, free, _PILOT_STEPS)
         model = _unwhitened(model, whitening, records, settings)
     return model
@@ -492,9 +503,9 @@ def better_horizon(
     for other in (2 * horizon, 4 * horizon, horizon // 2):
         if not 2 <= other <= highest or settings.max_order(other) < order:
             continue
-        space = subspaces_of(records, {other: order}, settings.method)[other]
-        trial = estimate(space, records, order, settings)
-        error = float(np.sqrt(trial.loss / energy))
+        none = Whitening.none(len(records[0].y))
+        trial = fit_once(records, order, other, settings, none).candidate
+        error = float(np.sqrt(trial.model.loss / energy))
         if error < _CLEARLY_BETTER * residual:
             return other, error
     return None

@@ -35,6 +35,8 @@ _PIECE = 8192  # samples worked on at a time: their signals stay in the cache
 # Averages over the record are known to a percent or so from this many samples.
 _MAX_SAMPLES = 30_000
 
+_FOR_A_CHOICE = 12_000  # samples: it needs fewer than an estimate
+
 _LARGEST = 1e200  # squares of responses beyond it would overflow
 
 
@@ -69,6 +71,21 @@ def shorten(records: Sequence[Record]) -> tuple[list[Record], float]:
         return list(records), 1.0
     parts = [r.head(max(2, int(share * r.u.shape[1]))) for r in records]
     return parts, sum(record.u.shape[1] for record in parts) / total
+
+
+def thinned(records: Sequence[Record], n_samples: int = _FOR_A_CHOICE) -> list[Record]:
+    """Evenly spread experiments of about `n_samples` in total, at least one.
+
+    Experiments beyond that length are cut to it.
+
+    >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
+    >>> [run.u.shape[1] for run in thinned(runs, 120)]
+    [50, 60]
+    """
+    lengths = [record.u.shape[1] for record in records]
+    keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
+    spread = [i * len(records) // keep for i in range(keep)]
+    return [records[i].head(n_samples) for i in spread]
 
 
 class Sections(NamedTuple):

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from .hankel import hankel_factor, without_trend
-from .signals import Record
+from .signals import Record, thinned
 
 Array = NDArray[np.float64]
 
@@ -188,16 +188,10 @@ def _curved_share(
 
 
 def _some(records: Sequence[Record]) -> list[Record]:
-    """Records to look at: the first of them, each cut, with constants."""
-    kept, left = [], _MAX_SAMPLES
-    for record in records:
-        kept.append(record.head(left))
-        left -= record.u.shape[1]
-        if left <= 0:
-            break
+    """Records to look at, with constants."""
     return [
         record if len(record.trend) else Record.of(record.u.T, record.y.T, 1)
-        for record in kept
+        for record in thinned(records, _MAX_SAMPLES)
     ]
 
 
