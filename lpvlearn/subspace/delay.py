@@ -10,7 +10,8 @@ delay that is k samples too short needs k states more, and a delay of one sample
 can stand for a first answer that is a feedthrough then. So models of several orders and
 delays, with feedthrough and without, are compared by Schwarz's criterion, in samples
 whose noise is whitened. The best one's delay is certain only where a model without
-delay has not done as well with a state more, nor at the same order on samples held out.
+delay has not done as well with a state more (unless the order was given), nor at the
+same order on samples held out.
 """
 
 from __future__ import annotations
@@ -158,7 +159,7 @@ def find_delays(
         orders = orders or about
     trial = trial.whitened(delay, orders[-1])
     for j in np.flatnonzero(delay):
-        delay[j] = trial.delay_of(int(j), delay, orders)
+        delay[j] = trial.delay_of(int(j), delay, orders, given=order is not None)
     return delay
 
 
@@ -311,8 +312,13 @@ class _Trial:
         filtered = [(white(u), white(y)) for u, y in self.pairs]
         return self.of(filtered, self.settings, self.longest, self.horizon, size)
 
-    def delay_of(self, j: int, longest: Delay, orders: Sequence[int]) -> int:
-        """Delay of one input, up to the `longest`; those of the others stay."""
+    def delay_of(
+        self, j: int, longest: Delay, orders: Sequence[int], *, given: bool
+    ) -> int:
+        """Delay of one input, up to the `longest`; those of the others stay.
+
+        An order that is `given` is not raised to do without a delay.
+        """
 
         def at(d: int) -> Delay:
             return np.where(np.arange(len(longest)) == j, d, longest)
@@ -347,12 +353,12 @@ class _Trial:
         if d == 0:
             return 0
         loss = self.loss(at(d), size, j)
-        same, more = (_Size(size.order + k, may_be_direct) for k in (0, 1))
+        same, more = (_Size(size.order + k, may_be_direct) for k in (0, not given))
         gain = self._evidence(loss, self.loss(at(0), more, j))
         certain = gain < -_WORSE
         if d == 1:
             dof = n_parameters(more) - n_parameters(size)
-            certain = gain < stats.chi2.isf(_BY_CHANCE, dof)
+            certain = gain < (stats.chi2.isf(_BY_CHANCE, dof) if dof else -_WORSE)
             certain &= self.loss(at(0), same, j) > _CLEARLY * loss
         if not certain:
             return 0

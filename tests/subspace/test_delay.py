@@ -286,6 +286,18 @@ def test_delays_are_found_and_none_is_imagined(kind, direct):
         np.testing.assert_array_equal(found, [delay])
 
 
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_a_given_order_is_not_raised_to_do_without_a_delay(delay):
+    """A state more would make up for the sample of delay, and for a weak mode."""
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(400, 1))
+    model = StateSpace(np.diag([0.8, -0.5]), [[1.0], [1.0]], [[1.0, 0.2]], [[0.5]], 1.0)
+    y = model.with_input_delay(delay).simulate(u)
+    y += 0.1 * y.std() * rng.normal(size=y.shape)
+    settings = Choices(order=1).settings(1, 1, np.eye(1))
+    np.testing.assert_array_equal(find_delays([(u, y)], settings, 1, None), [delay])
+
+
 def test_every_input_has_its_own_delay():
     _, u, y = late_record(500, noise=0.02)
     found = estimator(input_delay="auto").fit(u, y)
