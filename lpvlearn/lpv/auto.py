@@ -158,6 +158,18 @@ class AutoLPV(Interpolator):
     def _evaluate(self, kappa: Array) -> Array:
         return self.best_estimator_._evaluate(kappa)
 
+    def _coefficients(self) -> Array:
+        return self.best_estimator_._coefficients()
+
+    def _set(self, coefficients: Array) -> None:
+        self.best_estimator_ = self.best_estimator_.with_coefficients(coefficients)
+
+    def _slopes(self, kappa: Array) -> Array:
+        return self.best_estimator_._slopes(kappa)
+
+    def _excess(self) -> float:
+        return self.best_estimator_._excess()
+
     def _check_options(self) -> None:
         super()._check_options()
         one_of("criterion", self.criterion, _CRITERIA)

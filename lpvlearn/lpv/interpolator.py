@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from typing import Any, Self
 
@@ -16,8 +17,8 @@ from sklearn.utils.validation import (
 )
 
 from ..exceptions import ExtrapolationWarning, warn
-from ..validation import one_of
-from .weighting import WeightedPoints, weighted_points
+from ..validation import one_of, real_array
+from .weighting import WeightedPoints, is_chance, weighted_points
 
 Array = NDArray[np.float64]
 
@@ -33,6 +34,12 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     A sample is an operating point. An heir has the option `extrapolation`, tells in
     `_fit` what it makes of points, and in `_evaluate` what it says of other ones.
+
+    Fitted, it is a smooth function of some coefficients: the numbers that a refinement
+    moves, and whose covariance is that of all it predicts. `coefficients` has them as a
+    vector, `with_coefficients` the same form with others, and `sensitivities` the
+    derivatives of what it predicts. An heir tells them in `_coefficients`, `_set` and
+    `_slopes`.
     """
 
     extrapolation: str
@@ -90,6 +97,112 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         ExtrapolationWarning
             When a value is outside of it and `extrapolation="warn"`.
         """
+        values = self._evaluate(self._place(X))
+        return values[:, 0] if self._single_parameter else values
+
+    def coefficients(self) -> Array:
+        """The numbers that the fitted form has, one after another.
+
+        Returns
+        -------
+        ndarray of shape (n_coefficients,)
+        """
+        check_is_fitted(self)
+        return self._coefficients()
+
+    def with_coefficients(self, coefficients: ArrayLike) -> Self:
+        """The same form with other coefficients.
+
+        Parameters
+        ----------
+        coefficients : array-like of shape (n_coefficients,)
+            In the order of `coefficients`.
+
+        Returns
+        -------
+        Interpolator
+            A fitted copy. What tells of the fit to the points (`chi2_`, `selection_`)
+            stays.
+
+        Raises
+        ------
+        ValueError
+            If the number of coefficients is another, one is not finite, or a
+            denominator comes near to zero within the range.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lpvlearn import PolynomialLPV
+        >>> line = PolynomialLPV(1).fit([[0.0], [2.0]], [1.0, 5.0])
+        >>> c = line.coefficients()
+        >>> higher = line.with_coefficients(c + [1.0, 0.0])
+        >>> higher.predict([[0.5]]).round(9), higher.coef_.round(9)
+        (array([3.]), array([2., 2.]))
+        >>> np.allclose(higher.predict([[0.5]]), line.sensitivities([[0.5]])[0] @ c + 1)
+        True
+        """
+        vector = real_array("coefficients", coefficients)
+        if vector.shape != self.coefficients().shape or not np.isfinite(vector).all():
+            raise ValueError(
+                f"`coefficients` must be {len(self.coefficients())} finite numbers. "
+                f"Got shape {vector.shape}."
+            )
+        changed = copy.copy(self)
+        changed._set(vector)
+        return changed
+
+    def sensitivities(self, X: ArrayLike) -> Array:
+        """Derivatives of what `predict` says by the coefficients.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_scheduling)
+            Scheduling values; out of range as `predict` has them.
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_params, n_coefficients)
+            With the covariance P of the coefficients, the parameters at sample i have
+            the covariance ``S[i] @ P @ S[i].T`` to first order.
+        """
+        return self._slopes(self._place(X))
+
+    def information(self, X: ArrayLike, covariance: ArrayLike) -> Array | None:
+        """What operating points tell of the coefficients.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_points, n_scheduling)
+            Operating points.
+        covariance : array-like of shape (n_points, n_params, n_params)
+            Covariances ``P_i`` of the parameters there.
+
+        Returns
+        -------
+        ndarray of shape (n_coefficients, n_coefficients) or None
+            ``sum_i S_i^T P_i^-1 S_i``, the inverse of the coefficients' covariance
+            where the form is true. Where `chi2_` is not plausible, divided by it per
+            degree of freedom: what is left of the points is the form's own error then.
+            None where a covariance is not known.
+        """
+        kappa = self._place(X)
+        points = weighted_points(self._evaluate(kappa), np.ones(len(kappa)), covariance)
+        if points.whitening is None:
+            return None
+        S = self._slopes(kappa)
+        rows = (points.whitening @ S).reshape(-1, S.shape[2])
+        return rows.T @ rows / self._excess()
+
+    def _excess(self) -> float:
+        """Variance of points about the form, in units of what is known; 1 at least."""
+        chi2 = getattr(self, "chi2_", np.nan)
+        dof = getattr(self, "degrees_of_freedom_", 0)
+        implausible = np.isfinite(chi2) and dof > 0 and not is_chance(chi2, dof)
+        return chi2 / dof if implausible else 1.0
+
+    def _place(self, X: ArrayLike) -> Array:
+        """Checked scheduling values; what is out of range is told or clipped."""
         check_is_fitted(self)
         self._check_options()
         kappa = validate_data(self, X, dtype=np.float64, reset=False)
@@ -101,8 +214,7 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
                 raise ValueError(message)
             if message:
                 warn(message, ExtrapolationWarning)
-        values = self._evaluate(kappa)
-        return values[:, 0] if self._single_parameter else values
+        return kappa
 
     @abstractmethod
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
@@ -111,6 +223,18 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     @abstractmethod
     def _evaluate(self, kappa: Array) -> Array:
         """Parameters (n_samples, n_params) at checked values."""
+
+    @abstractmethod
+    def _coefficients(self) -> Array:
+        """Coefficients (n_coefficients,)."""
+
+    @abstractmethod
+    def _set(self, coefficients: Array) -> None:
+        """Take others, and leave alone what a copy shares."""
+
+    @abstractmethod
+    def _slopes(self, kappa: Array) -> Array:
+        """Derivatives (n_samples, n_params, n_coefficients) at checked values."""
 
     def _check_options(self) -> None:
         one_of("extrapolation", self.extrapolation, _EXTRAPOLATIONS)
@@ -144,6 +268,17 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         self.weighted_ = known and points.is_plausible(
             self.chi2_, self.degrees_of_freedom_
         )
+
+
+def slopes_of_terms(terms: Array, n_params: int) -> Array:
+    """Derivatives of ``terms @ N`` by the entries of N, of shape (n_terms, n_params).
+
+    `terms` (n_samples, n_terms), or (n_samples, n_terms, n_params) where those of the
+    parameters differ.
+    """
+    each = terms[:, :, None] if terms.ndim == 2 else terms
+    slopes = each.swapaxes(1, 2)[:, :, :, None] * np.eye(n_params)[:, None, :]
+    return slopes.reshape(len(terms), n_params, -1)
 
 
 def _check_weight(sample_weight: ArrayLike | None, X: Array) -> Array:

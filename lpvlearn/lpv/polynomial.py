@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..exceptions import RankWarning, warn
 from ..validation import one_of, whole_number
-from .interpolator import Interpolator, domains, to_unit
+from .interpolator import Interpolator, domains, slopes_of_terms, to_unit
 from .weighting import WeightedPoints
 
 Array = NDArray[np.float64]
@@ -162,13 +162,27 @@ class PolynomialLPV(Interpolator):
         if not self.weighted_:
             solution, self.rank_ = points.unweighted().coefficients(terms)
         self._warn_of_rank(kappa)
-        coef = _conversion(self.basis, self.powers_, self.scheduling_range_) @ solution
-        # Predictions use the well-conditioned form, not the published one.
         self._chebyshev_coef = solution
+        self._publish()
+
+    def _publish(self) -> None:
+        """Set `coef_`; predictions use the well-conditioned form."""
+        conversion = _conversion(self.basis, self.powers_, self.scheduling_range_)
+        coef = conversion @ self._chebyshev_coef
         self.coef_ = coef[:, 0] if self._single_parameter else coef.T
 
     def _evaluate(self, kappa: Array) -> Array:
         return self._terms(kappa) @ self._chebyshev_coef
+
+    def _coefficients(self) -> Array:
+        return self._chebyshev_coef.ravel()
+
+    def _set(self, coefficients: Array) -> None:
+        self._chebyshev_coef = coefficients.reshape(self._chebyshev_coef.shape)
+        self._publish()
+
+    def _slopes(self, kappa: Array) -> Array:
+        return slopes_of_terms(self._terms(kappa), self._chebyshev_coef.shape[1])
 
     def _terms(self, kappa: Array) -> Array:
         return chebyshev_terms(kappa, self.powers_, self.scheduling_range_)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import orth, solve_triangular
 
 from ..validation import one_of, whole_number
-from .interpolator import Interpolator
+from .interpolator import Interpolator, slopes_of_terms
 from .polynomial import chebyshev_terms, resolvable_powers
 from .weighting import WeightedPoints
 
@@ -156,6 +156,29 @@ class RationalLPV(Interpolator):
         below = self._terms(kappa, self.denominator_powers_) @ self.denominator_
         return numerator / below[:, None]
 
+    def _coefficients(self) -> Array:
+        return np.concatenate([self.numerator_.ravel(), self.denominator_[1:]])
+
+    def _set(self, coefficients: Array) -> None:
+        numerator, d = np.split(coefficients, [self.numerator_.size])
+        ends = self.scheduling_range_
+        places = self._terms(_places(ends, ends), self.denominator_powers_)[:, 1:]
+        if not _is_allowed(places, d):
+            raise ValueError(
+                "`coefficients` must keep the denominator positive within the range "
+                f"of the points, {_LEAST:g} of its largest value at least. Got "
+                f"{d.tolist()} beside its constant 1."
+            )
+        self.numerator_ = numerator.reshape(self.numerator_.shape)
+        self.denominator_ = np.concatenate([[1.0], d])
+
+    def _slopes(self, kappa: Array) -> Array:
+        psi = self._terms(kappa, self.denominator_powers_)
+        below = (psi @ self.denominator_)[:, None]
+        phi, q = self._terms(kappa, self.powers_) / below, self.numerator_.shape[1]
+        by_denominator = -(phi @ self.numerator_ / below)[:, :, None] * psi[:, None, 1:]
+        return np.concatenate([slopes_of_terms(phi, q), by_denominator], axis=2)
+
     def _terms(self, kappa: Array, powers: NDArray[np.intp]) -> Array:
         return chebyshev_terms(kappa, powers, self.scheduling_range_)
 
@@ -212,12 +235,8 @@ class _Search(NamedTuple):
         yield np.zeros(self.psi.shape[1])
         if self.psi.shape[1]:
             guess = self._sanathanan_koerner()
-            if self._is_allowed(guess):
+            if _is_allowed(self.places, guess):
                 yield guess
-
-    def _is_allowed(self, d: Array) -> bool:
-        below = 1.0 + self.places @ d
-        return bool(below.min() >= _LEAST * below.max())  # False of NaN
 
     def _sanathanan_koerner(self) -> Array:
         """Minimise ``sum_i |(N^T phi_i - theta_i (1 + d^T psi_i)) / old_i|^2``."""
@@ -266,7 +285,7 @@ class _Search(NamedTuple):
             while damping < _MAX_DAMPING:
                 rows = np.vstack([state.slopes, np.diag(np.sqrt(damping) * size)])
                 step = np.linalg.lstsq(rows, target, rcond=None)[0]
-                if self._is_allowed(state.denominator + step):
+                if _is_allowed(self.places, state.denominator + step):
                     trial = self._at(state.denominator + step)
                     if trial.misfit < state.misfit:
                         break
@@ -278,6 +297,12 @@ class _Search(NamedTuple):
             if gain <= _SAME * state.misfit:
                 return state
         return state
+
+
+def _is_allowed(places: Array, d: Array) -> bool:
+    """Whether a denominator stays positive at places, by its terms there."""
+    below = 1.0 + places @ d
+    return bool(below.min() >= _LEAST * below.max())  # False of NaN
 
 
 def _places(scheduling_range: Array, kappa: Array) -> Array:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import (
+    CubicHermiteSpline,
     CubicSpline,
     PchipInterpolator,
     RBFInterpolator,
@@ -12,7 +15,7 @@ from scipy.interpolate import (
 )
 
 from ..validation import one_of
-from .interpolator import Interpolator, to_unit
+from .interpolator import Interpolator, slopes_of_terms, to_unit
 from .weighting import WeightedPoints
 
 Array = NDArray[np.float64]
@@ -74,29 +77,94 @@ class SplineLPV(Interpolator):
         weight = np.zeros((len(x), len(kappa)))
         weight[place.ravel(), np.arange(len(kappa))] = points.root**2
         theta = weight @ points.theta / weight.sum(axis=1, keepdims=True)
-        self.n_points_, n = x.shape
-        if n == 1 and len(x) > 1:
-            curves = {
-                "pchip": PchipInterpolator,
-                "cubic": CubicSpline,
-                "linear": lambda x, y: make_interp_spline(x, y, k=1),
-            }
-            self._curve = curves[self.kind](x[:, 0], theta)
-            self._slope = self._curve.derivative()
-            return
-        # a cubic needs points that determine a plane beside it
-        plane = np.linalg.matrix_rank(np.column_stack([np.ones(len(x)), x])) > n
-        kernel = "cubic" if plane and self.kind != "linear" else "linear"
-        self._curve = RBFInterpolator(x, theta, kernel=kernel)
-        self._slope = None
+        self.n_points_, self._nodes = len(x), x
+        self._draw(theta)
+
+    def _draw(self, theta: Array) -> None:
+        """Lay the curve through values (n_points, n_params) at the nodes."""
+        self._theta = theta
+        self._curve = self._through(theta)
+
+    def _through(self, theta: Array) -> Any:
+        x, n = self._nodes, self._nodes.shape[1]
+        if n > 1 or len(x) == 1:
+            # a cubic needs points that determine a plane beside it
+            plane = np.linalg.matrix_rank(np.column_stack([np.ones(len(x)), x])) > n
+            kernel = "cubic" if plane and self.kind != "linear" else "linear"
+            return RBFInterpolator(x, theta, kernel=kernel)
+        curves = {
+            "pchip": PchipInterpolator,
+            "cubic": CubicSpline,
+            "linear": lambda x, y: make_interp_spline(x, y, k=1),
+        }
+        return curves[self.kind](x[:, 0], theta)
 
     def _evaluate(self, kappa: Array) -> Array:
-        x = to_unit(kappa, self.scheduling_range_)
-        if self._slope is None:
-            return np.asarray(self._curve(x))
-        inside = np.clip(x, -1.0, 1.0)
-        return self._curve(inside[:, 0]) + (x - inside) * self._slope(inside[:, 0])
+        return _along(self._curve, to_unit(kappa, self.scheduling_range_))
+
+    def _coefficients(self) -> Array:
+        return self._theta.ravel()
+
+    def _set(self, coefficients: Array) -> None:
+        self._draw(coefficients.reshape(self._theta.shape))
+
+    def _slopes(self, kappa: Array) -> Array:
+        x, (n, q) = to_unit(kappa, self.scheduling_range_), self._theta.shape
+        if isinstance(self._curve, PchipInterpolator):  # its slopes follow the values
+            nodes, units = self._nodes[:, 0], np.eye(n)[:, :, None].repeat(q, axis=2)
+            changes = _pchip_slope_changes(nodes, self._theta)
+            curve = CubicHermiteSpline(nodes, units, changes)
+        else:
+            curve = self._through(np.eye(n))
+        return slopes_of_terms(_along(curve, x), q)
 
     def _check_options(self) -> None:
         super()._check_options()
         one_of("kind", self.kind, _KINDS)
+
+
+def _along(curve: Any, x: Array) -> Array:
+    """Values of a curve; one of one variable goes on along its tangents at the ends."""
+    if isinstance(curve, RBFInterpolator):
+        return np.asarray(curve(x))
+    inside = np.clip(x[:, 0], -1.0, 1.0)
+    values = curve(inside)
+    further = (x[:, 0] - inside).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray(values + further * curve.derivative()(inside))
+
+
+def _pchip_slope_changes(x: Array, theta: Array) -> Array:
+    """Derivatives of the slopes at nodes by the values, (n_nodes, n_nodes, n_params).
+
+    Fritsch and Butland's: zero where the secants on both sides differ in sign, else
+    their weighted harmonic mean; at the ends that of a parabola through three points,
+    zero or three times the secant where this one has another sign or is too steep.
+    """
+    h = np.diff(x)[:, None]
+    secants = np.diff(theta, axis=0) / h
+    n, q = theta.shape
+    by_secant = np.zeros((n, n - 1, q))  # derivatives of the slopes by the secants
+    if n == 2:
+        by_secant[:] = 1.0
+    else:
+        before, after = secants[:-1], secants[1:]
+        inner, k = np.arange(1, n - 1), np.arange(n - 2)
+        alike = before * after > 0
+        w = np.stack([2 * h[1:] + h[:-1], h[1:] + 2 * h[:-1]])
+        w = w / w.sum(axis=0)
+        m = np.where(alike, [before, after], 1.0)
+        mean = 1.0 / (w / m).sum(axis=0)
+        by_secant[inner, k], by_secant[inner, k + 1] = w * (mean / m) ** 2 * alike
+        for node, first, second in ((0, 0, 1), (n - 1, n - 2, n - 3)):
+            share = h[first] / (h[first] + h[second])
+            slope = (1 + share) * secants[first] - share * secants[second]
+            turns = slope * secants[first] <= 0
+            steep = (secants[first] * secants[second] < 0) & (
+                np.abs(slope) > 3 * np.abs(secants[first])
+            )
+            by_secant[node, first] = np.where(steep, 3.0, 1 + share) * ~turns
+            by_secant[node, second] = np.where(steep, 0.0, -share) * ~turns
+    changes = np.zeros((n, n, q))
+    changes[:, 1:] += by_secant / h
+    changes[:, :-1] -= by_secant / h
+    return changes

@@ -102,3 +102,112 @@ def test_one_covariance_that_is_not_known_leaves_all_out(interpolator, bad):
 def test_unknown_options_are_refused(interpolator):
     with pytest.raises(ValueError, match="`extrapolation` must be"):
         interpolator(extrapolation="no").fit(KAPPA, THETA)
+
+
+FORMS = [
+    PolynomialLPV(2),
+    PolynomialLPV(3, basis="legendre"),
+    RationalLPV(2, 1),
+    RationalLPV(1, 2),
+    SplineLPV(),
+    SplineLPV("cubic"),
+    SplineLPV("linear"),
+    AutoLPV(),
+]
+PLACES = np.array([[-1.2], [-1.0], [-0.3], [0.1], [0.77], [1.5], [2.0], [2.3]])
+
+
+def wavy(kappa):
+    """Parameters with turns, which the slopes of a curve depend on."""
+    return np.hstack([np.sin(3 * kappa) / (2 + kappa), 1 / (3 + kappa), kappa**2])
+
+
+@pytest.mark.parametrize("form", FORMS, ids=repr)
+@pytest.mark.parametrize("n_variables", [1, 2])
+def test_sensitivities_equal_differences(form, n_variables):
+    rng = np.random.default_rng(0)
+    kappa, places = KAPPA, PLACES
+    if n_variables == 2:
+        kappa = np.hstack([KAPPA.repeat(3, axis=0), np.tile([[0], [1], [2]], (7, 1))])
+        places = np.hstack([PLACES, rng.uniform(0, 2, PLACES.shape)])
+    model = clone(form).fit(kappa, wavy(kappa[:, :1]) + kappa.sum(1, keepdims=True))
+    c = model.coefficients() + 0.01 * rng.normal(size=len(model.coefficients()))
+    model = model.with_coefficients(c)
+    np.testing.assert_array_equal(model.coefficients(), c)
+    slopes = model.sensitivities(places)
+    h = 1e-6
+    differences = [
+        (
+            model.with_coefficients(c + step).predict(places)
+            - model.with_coefficients(c - step).predict(places)
+        )
+        / (2 * h)
+        for step in h * np.eye(len(c))
+    ]
+    np.testing.assert_allclose(slopes, np.moveaxis(differences, 0, -1), atol=1e-7)
+
+
+@pytest.mark.parametrize("points", [1, 2, 3])
+def test_few_points_have_sensitivities_too(points):
+    for form in (SplineLPV(), SplineLPV("linear"), PolynomialLPV(0)):
+        model = form.fit(KAPPA[:points], THETA[:points])
+        c, places = model.coefficients(), PLACES[:4]
+        np.testing.assert_allclose(  # homogeneous of degree one
+            model.sensitivities(places) @ c, model.predict(places), atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("form", FORMS, ids=repr)
+def test_other_coefficients_leave_the_fitted_form_alone(form):
+    model = clone(form).fit(KAPPA, THETA)
+    before, c = model.predict(PLACES), model.coefficients()
+    same = model.with_coefficients(c)
+    np.testing.assert_array_equal(same.predict(PLACES), before)
+    changed = pickle.loads(pickle.dumps(model.with_coefficients(1.1 * c)))
+    assert (changed.predict(PLACES) != before).any()
+    np.testing.assert_array_equal(model.predict(PLACES), before)
+    with pytest.raises(ValueError, match="`coefficients` must be"):
+        model.with_coefficients(c[:-1])
+
+
+def test_the_published_coefficients_follow():
+    model = PolynomialLPV(2).fit(KAPPA, THETA)
+    doubled = model.with_coefficients(2 * model.coefficients())
+    np.testing.assert_allclose(doubled.coef_, 2 * model.coef_)
+
+
+def test_a_denominator_with_a_zero_in_the_range_is_refused():
+    model = RationalLPV(1, 1).fit(KAPPA, THETA)
+    c = model.coefficients()
+    c[-1] = 1.2  # 1 + 1.2 t
+    with pytest.raises(ValueError, match="keep the denominator positive"):
+        model.with_coefficients(c)
+
+
+def test_information_is_the_inverse_covariance_of_the_coefficients():
+    rng = np.random.default_rng(3)
+    roots = 0.05 * rng.normal(size=(7, 2, 2)) + 0.1 * np.eye(2)
+    P = roots @ roots.swapaxes(1, 2)
+    model = PolynomialLPV(2).fit(KAPPA, THETA, covariance=P)
+    predicted = np.linalg.inv(model.information(KAPPA, P))
+    found = []
+    for _ in range(1000):
+        noise = (roots @ rng.normal(size=(7, 2, 1)))[:, :, 0]
+        fitted = PolynomialLPV(2).fit(KAPPA, THETA + noise, covariance=P)
+        found.append(fitted.coefficients())
+    ratio = np.diag(np.cov(np.transpose(found))) / np.diag(predicted)
+    np.testing.assert_allclose(ratio, 1.0, atol=0.15)
+
+
+def test_information_is_inflated_where_the_form_is_not_true():
+    P = np.tile(1e-6 * np.eye(2), (7, 1, 1))
+    line = PolynomialLPV(1).fit(KAPPA, THETA, covariance=P)
+    exact = PolynomialLPV(2).fit(KAPPA, THETA, covariance=P)
+    S = line.sensitivities(KAPPA).reshape(14, -1)
+    own = S.T @ S / 1e-6 * line.degrees_of_freedom_ / line.chi2_
+    np.testing.assert_allclose(line.information(KAPPA, P), own, rtol=1e-6, atol=1e-9)
+    S = exact.sensitivities(KAPPA).reshape(14, -1)
+    np.testing.assert_allclose(
+        exact.information(KAPPA, P), S.T @ S / 1e-6, rtol=1e-6, atol=1e-3
+    )
+    assert exact.information(KAPPA, np.nan * P) is None
