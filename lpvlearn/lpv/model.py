@@ -48,7 +48,9 @@ class LPVStateSpace:
 
     ``dx/dt = A(kappa) x + B(kappa) u``, ``y = C(kappa) x + D(kappa) u`` with static
     dependence on the scheduling variables kappa, which act at once; an input may act
-    late, ``u_j(t - input_delay[j])`` in the place of ``u_j(t)``.
+    late, ``u_j(t - input_delay[j])`` in the place of ``u_j(t)``. With `offsets` the
+    signals stand about a point of work that follows kappa:
+    ``dx/dt = A (x - x0) + B (u - u0)``, ``y = y0 + C (x - x0) + D (u - u0)``.
 
     Parameters
     ----------
@@ -70,6 +72,9 @@ class LPVStateSpace:
         Changes of the structure's state basis, see :meth:`change_basis`.
     input_delay : float or array-like of shape (n_inputs,), default=0
         Seconds, whole samples of every simulation. As attribute, an array.
+    offsets : fitted regressor, default=None
+        From scheduling values to ``[u0, y0, x0]``, (n_points, n_inputs + n_outputs +
+        order), x0 in the state of the structure. None: all are zero.
 
     Attributes
     ----------
@@ -127,6 +132,7 @@ class LPVStateSpace:
     identified_range: ArrayLike | None = None
     bases: tuple[_Basis, ...] = ()
     input_delay: Any = 0
+    offsets: Any = None
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -138,11 +144,14 @@ class LPVStateSpace:
                 "`structure` must be a GrayBoxStructure. Got "
                 f"{type(self.structure).__name__}."
             )
-        if not hasattr(self.interpolator, "predict"):
-            raise ValueError(
-                "`interpolator` must be a fitted regressor, such as PolynomialLPV. Got "
-                f"{type(self.interpolator).__name__}."
-            )
+        for name in ("interpolator", "offsets"):
+            regressor = getattr(self, name)
+            wanted = name == "interpolator" or regressor is not None
+            if wanted and not hasattr(regressor, "predict"):
+                raise ValueError(
+                    f"`{name}` must be a fitted regressor, such as PolynomialLPV. Got "
+                    f"{type(regressor).__name__}."
+                )
         bounds = real_array("scheduling_range", self.scheduling_range)
         if bounds.ndim != 2 or len(bounds) != 2 or not (bounds[0] <= bounds[1]).all():
             raise ValueError(
@@ -168,7 +177,8 @@ class LPVStateSpace:
         return (
             f"LPVStateSpace(order={self.order}, n_inputs={self.n_inputs}, "
             f"n_outputs={self.n_outputs}, n_scheduling={self.n_scheduling}"
-            f"{f', input_delay=[{each}] s' if self.input_delay.any() else ''})"
+            f"{f', input_delay=[{each}] s' if self.input_delay.any() else ''}"
+            f"{', with offsets' if self.offsets is not None else ''})"
         )
 
     def parameters(self, kappa: ArrayLike) -> Array:
@@ -188,15 +198,82 @@ class LPVStateSpace:
         ValueError
             If `kappa` has another shape or is not finite.
         """
+        n_params, kappa = self.structure.n_params, self._scheduling(kappa)
+        wanted = f"`interpolator` must predict the {n_params} parameters"
+        return _predicted(self.interpolator, kappa, n_params, wanted)
+
+    def input_offset(self, kappa: ArrayLike) -> Array:
+        """Inputs u0 of the point of work at scheduling values.
+
+        Parameters
+        ----------
+        kappa : array-like of shape (n_points, n_scheduling) or (n_points,)
+
+        Returns
+        -------
+        ndarray of shape (n_points, n_inputs)
+            Zero without `offsets`.
+
+        Raises
+        ------
+        ValueError
+            If `kappa` has another shape or is not finite.
+        """
+        return self._point_of_work(self._scheduling(kappa))[0]
+
+    def output_offset(self, kappa: ArrayLike) -> Array:
+        """Outputs y0 at rest at `input_offset`.
+
+        Parameters
+        ----------
+        kappa : array-like of shape (n_points, n_scheduling) or (n_points,)
+
+        Returns
+        -------
+        ndarray of shape (n_points, n_outputs)
+            Zero without `offsets`.
+
+        Raises
+        ------
+        ValueError
+            If `kappa` has another shape or is not finite.
+        """
+        return self._point_of_work(self._scheduling(kappa))[1]
+
+    def state_offset(self, kappa: ArrayLike) -> Array:
+        """State x0 at rest at `input_offset`, in the basis of this model.
+
+        Parameters
+        ----------
+        kappa : array-like of shape (n_points, n_scheduling) or (n_points,)
+
+        Returns
+        -------
+        ndarray of shape (n_points, order)
+            Zero without `offsets`.
+
+        Raises
+        ------
+        ValueError
+            If `kappa` has another shape or is not finite.
+        """
         kappa = self._scheduling(kappa)
-        values = np.asarray(self.interpolator.predict(kappa), dtype=float)
-        n_params = self.structure.n_params
-        if values.size != len(kappa) * n_params:
-            raise ValueError(
-                f"`interpolator` must predict the {n_params} parameters of the "
-                f"structure. Got shape {values.shape} for {len(kappa)} point(s)."
-            )
-        return values.reshape(len(kappa), n_params)
+        x0 = self._point_of_work(kappa)[2]
+        if not self.bases:
+            return x0
+        moved = [self._basis_at(k) @ x for k, x in zip(kappa, x0, strict=True)]
+        return np.reshape(moved, x0.shape)
+
+    def _point_of_work(self, kappa: Array) -> list[Array]:
+        """u0, y0, x0 at checked scheduling values, in the state of the structure."""
+        sizes = (self.n_inputs, self.n_outputs, self.order)
+        total = sum(sizes)
+        if self.offsets is None:
+            values = np.zeros((len(kappa), total))
+        else:
+            wanted = f"`offsets` must predict the {total} values of u0, y0 and x0"
+            values = _predicted(self.offsets, kappa, total, wanted)
+        return np.split(values, np.cumsum(sizes)[:2], axis=1)
 
     def at(
         self,
@@ -217,7 +294,7 @@ class LPVStateSpace:
         Returns
         -------
         StateSpace
-            In continuous time.
+            In continuous time; of deviations from the point of work, with `offsets`.
 
         Raises
         ------
@@ -325,8 +402,9 @@ class LPVStateSpace:
         sampling_time : float
             Seconds.
         initial_state : array-like of shape (order,), default=None
-            None is rest. The inputs before the first sample are zero; those in transit
-            may follow the state, as `StateSpace.estimate_initial_state` has them.
+            None is rest: zero, or the `state_offset` of the first sample. The inputs
+            before that sample are zero, or its `input_offset`; those in transit may
+            follow the state, as `StateSpace.estimate_initial_state` has them.
 
         Returns
         -------
@@ -347,13 +425,21 @@ class LPVStateSpace:
         """
         u = finite_samples("u", u, self.n_inputs)
         delay, n = self._samples_of_delay(sampling_time), self.order
-        x = np.zeros(n) if initial_state is None else initial_state
-        x, before = np.split(state_vector(x, n, int(delay.sum())), [n])
-        late = delayed(u, delay, before)[:, :, None]
         kappa = self._scheduling(scheduling)
-        if self.bases and len(kappa):
-            x[:] = np.linalg.solve(self._basis_at(kappa[0]), x)
-        return self._response(late, kappa, sampling_time, x[:, None])[:, :, 0]
+        u0, _, x0 = self.silenced()._point_of_work(kappa[:1])
+        x, before = x0.sum(axis=0), np.repeat(u0.sum(axis=0), delay)
+        if initial_state is not None:
+            given = state_vector(initial_state, n, int(delay.sum()))
+            x = given[:n]
+            if self.bases and len(kappa):
+                x = np.linalg.solve(self._basis_at(kappa[0]), x)
+            if np.size(initial_state) > n:
+                before = given[n:]
+        late = delayed(u, delay, before)
+        if self.offsets is not None:
+            late = np.column_stack([late, np.ones(len(u))])
+        y = self._response(late[:, :, None], kappa, sampling_time, x[:, None])
+        return y[:, :, 0]
 
     def free_responses(self, scheduling: ArrayLike, sampling_time: float) -> Array:
         """Outputs that each unit initial state, and input in transit, causes.
@@ -367,8 +453,8 @@ class LPVStateSpace:
         Returns
         -------
         ndarray of shape (n_samples, n_outputs, order + n_in_transit)
-            ``y = free_responses @ x0`` for ``u = 0``: regressors of an initial state,
-            with one entry for each sample of delay after it.
+            ``y = free_responses @ x0`` for ``u = 0`` without offsets: regressors of an
+            initial state, with one entry for each sample of delay after it.
 
         Raises
         ------
@@ -400,16 +486,8 @@ class LPVStateSpace:
 
     def silenced(self) -> LPVStateSpace:
         """The model that extrapolates without a warning."""
-        known: dict[str, Any] = getattr(self.interpolator, "get_params", dict)()
-        loud = [
-            name
-            for name, value in known.items()
-            if name.split("__")[-1] == "extrapolation" and value == "warn"
-        ]
-        quiet = copy.deepcopy(self.interpolator) if loud else self.interpolator
-        for name in loud:
-            quiet.set_params(**{name: "ignore"})
-        return replace(self, interpolator=quiet, identified_range=None)
+        quiet, offsets = _quiet(self.interpolator), _quiet(self.offsets)
+        return replace(self, interpolator=quiet, offsets=offsets, identified_range=None)
 
     def _tell_extrapolation(self, kappa: Array) -> None:
         """Warn of values out of the range, or have the interpolator tell of them."""
@@ -426,7 +504,8 @@ class LPVStateSpace:
         """Outputs of runs along one trajectory: inputs (n_samples, n_inputs, n_runs).
 
         ``x[k+1] = A(kappa_k) x[k] + B(kappa_k) u[k]`` with the zero-order-hold matrices
-        at every sample, a block of samples at a time. Inputs left out are zero.
+        at every sample, a block of samples at a time. Inputs left out are zero; one
+        more than the model has is the part that the offsets have.
         """
         dt = positive_time("sampling_time", dt)
         if len(kappa) != len(u):
@@ -470,7 +549,10 @@ class LPVStateSpace:
         )
 
     def _held_matrices(self, kappa: Array, dt: float) -> Array:
-        """``[[Ad, Bd], [C, D]]`` at every row of `kappa`."""
+        """``[[Ad, Bd], [C, D]]`` at every row of `kappa`.
+
+        Offsets are an input that is one: ``f = -A x0 - B u0``, ``y0 - C x0 - D u0``.
+        """
 
         def held(points: Array) -> Array:
             points = points.reshape(-1, self.n_scheduling)
@@ -480,6 +562,12 @@ class LPVStateSpace:
                 raise ValueError(
                     "`structure` must give finite matrices along `scheduling`. Got a "
                     f"NaN or infinity at {points[~finite][0]}."
+                )
+            if self.offsets is not None:
+                u0, y0, x0 = (v[:, :, None] for v in self._point_of_work(points))
+                B, D = (
+                    np.concatenate([B, -A @ x0 - B @ u0], 2),
+                    np.concatenate([D, y0 - C @ x0 - D @ u0], 2),
                 )
             try:
                 Ad, Bd = sample_zoh(A, B, dt)
@@ -541,6 +629,30 @@ class LPVStateSpace:
                 f"`scheduling` must be finite. Got {values[k]} in row {k}."
             )
         return values
+
+
+def _predicted(regressor: Any, kappa: Array, n_values: int, wanted: str) -> Array:
+    """Values (n_points, n_values) of a regressor; `wanted` says which they must be."""
+    values = np.asarray(regressor.predict(kappa), dtype=float)
+    if values.size != len(kappa) * n_values:
+        raise ValueError(
+            f"{wanted}. Got shape {values.shape} for {len(kappa)} point(s)."
+        )
+    return values.reshape(len(kappa), n_values)
+
+
+def _quiet(regressor: Any) -> Any:
+    """The regressor, or where it warns of extrapolation a copy that does not."""
+    known: dict[str, Any] = getattr(regressor, "get_params", dict)()
+    loud = [
+        name
+        for name, value in known.items()
+        if name.split("__")[-1] == "extrapolation" and value == "warn"
+    ]
+    quiet = copy.deepcopy(regressor) if loud else regressor
+    for name in loud:
+        quiet.set_params(**{name: "ignore"})
+    return quiet
 
 
 def warn_extrapolation(

@@ -103,10 +103,12 @@ def _simulate(
         raise ValueError(NO_TIME.format("the model is"))
     if isinstance(model, LPVStateSpace):
         kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
-        if estimate:
-            error = _outputs(e, model.n_outputs) - model.simulate(e.inputs, kappa, dt)
-            x0 = estimate_initial_state(model.free_responses(kappa, dt), error)
-        return model.simulate(e.inputs, kappa, dt, x0)
+        rest = model.simulate(e.inputs, kappa, dt)
+        if not estimate:
+            return rest
+        free = model.free_responses(kappa, dt)
+        error = _outputs(e, model.n_outputs) - rest
+        return rest + free @ estimate_initial_state(free, error)
     return _simulate(model.to_discrete(dt), e, dt, estimate)
 
 

@@ -556,3 +556,121 @@ def test_what_is_within_the_range_or_held_at_its_border_is_not_told():
         of_mass_and_speed().simulate(u, np.tile([2.05, 0.0], (50, 1)), DT)
     with pytest.raises(ValueError, match="identified range"):
         of_mass_and_speed("error").at([3.0, 0.0])
+
+
+# ---------------------------------------------------------------------------- offsets
+
+
+def offsets_of(kappa):
+    """Points of work [u0, y0, x0] that follow kappa, (n_points, 6)."""
+    k = np.reshape(kappa, (-1, 1))
+    one = np.ones_like(k)
+    return np.hstack([1 + k, -2 * one, k**2, 3 - k, 0.5 * k, 0.1 * one])
+
+
+def about_offsets(extrapolation="warn", **changes):
+    model, kappa = spring(extrapolation), np.array([[0.0], [1.0], [2.0]])
+    offsets = PolynomialLPV(2, extrapolation=extrapolation)
+    return replace(model, offsets=offsets.fit(kappa, offsets_of(kappa)), **changes)
+
+
+def test_offsets_are_those_of_the_regressor_and_zero_without():
+    model, kappa = about_offsets(), np.linspace(0, 2, 5)
+    u0, y0, x0 = np.split(offsets_of(kappa), 3, axis=1)
+    assert_allclose(model.input_offset(kappa), u0, atol=1e-12)
+    assert_allclose(model.output_offset(kappa), y0, atol=1e-12)
+    assert_allclose(model.state_offset(kappa), x0, atol=1e-12)
+    assert "with offsets" in repr(model) and "offsets" not in repr(spring())
+    for offset in (spring().input_offset, spring().output_offset):
+        assert_array_equal(offset(kappa), np.zeros((5, 2)))
+    assert_array_equal(spring().state_offset([1.0]), np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize("delay", [0, [3 * DT, DT]])
+def test_constant_scheduling_is_the_sampled_model_about_the_point_of_work(delay):
+    model, u = about_offsets(input_delay=delay), inputs(200)
+    u0, y0, x0 = np.split(offsets_of(0.7)[0], 3)
+    local = model.at(0.7)
+    y = model.simulate(u, np.full(200, 0.7), DT)  # at rest before, inputs too
+    assert_allclose(y, y0 + local.simulate(u - u0, sampling_time=DT), atol=1e-12)
+    moved = x0 + [1.0, -2.0]
+    y = model.simulate(u, np.full(200, 0.7), DT, initial_state=moved)
+    deviation = local.simulate(u - u0, sampling_time=DT, initial_state=[1.0, -2.0])
+    assert_allclose(y, y0 + deviation, atol=1e-12)
+
+
+def test_at_rest_nothing_moves():
+    model, kappa = about_offsets(input_delay=2 * DT), np.full(300, 1.3)
+    y = model.simulate(model.input_offset(kappa), kappa, DT)
+    assert_allclose(y, model.output_offset(kappa), atol=1e-12)
+
+
+def test_simulation_about_offsets_is_the_loop():
+    model, u, kappa = about_offsets(), inputs(300), sweep(300)
+    x, expected = offsets_of(kappa[0])[0, 4:], []
+    for uk, k in zip(u, kappa, strict=True):
+        u0, y0, x0 = np.split(offsets_of(k)[0], 3)
+        local, step = (
+            model.at(k),
+            expm(DT * np.block([[model.at(k).A, np.eye(2)], [np.zeros((2, 4))]])),
+        )
+        expected.append(y0 + local.C @ (x - x0) + local.D @ (uk - u0))
+        x = step[:2, :2] @ x + step[:2, 2:] @ (local.B @ (uk - u0) - local.A @ x0)
+    assert_allclose(model.simulate(u, kappa, DT), expected, atol=1e-11)
+
+
+def test_offsets_of_zero_change_nothing():
+    kappa = np.array([[0.0], [2.0]])
+    none = PolynomialLPV(1).fit(kappa, np.zeros((2, 6)))
+    model, u, trajectory = spring(), inputs(400), sweep(400)
+    y = model.simulate(u, trajectory, DT, [1.0, -1.0])
+    zero = replace(model, offsets=none)
+    assert_allclose(zero.simulate(u, trajectory, DT, [1.0, -1.0]), y, atol=1e-13)
+
+
+def test_another_equilibrium_of_the_same_models_is_the_same_system():
+    """x0, u0 and y0 may move along the steady states, differently at each kappa."""
+    model, u, kappa = about_offsets(), inputs(300), sweep(300)
+
+    class Moved:
+        def predict(self, X):
+            found = offsets_of(X)
+            for row, k in zip(found, X, strict=True):
+                local, step = model.at(k), np.array([np.sin(k[0]), 1.0])
+                row[:2] += step
+                row[2:4] += local.dc_gain() @ step
+                row[4:] -= np.linalg.solve(local.A, local.B @ step)
+            return found
+
+    x0 = [0.3, 2.0]
+    y = replace(model, offsets=Moved()).simulate(u, kappa, DT, x0)
+    assert_allclose(y, model.simulate(u, kappa, DT, x0), atol=1e-10)
+
+
+def test_a_change_of_basis_takes_the_offsets_along():
+    model, u, kappa = about_offsets(), inputs(300), sweep(300)
+    changed = model.change_basis(growing).change_basis([[0.0, 1.0], [2.0, 0.0]])
+    y = model.simulate(u, kappa, DT)
+    assert_allclose(changed.simulate(u, kappa, DT), y, atol=1e-12)
+    T = np.array([[0.0, 1.0], [2.0, 0.0]]) @ growing(kappa[:1])
+    x = model.state_offset(kappa[:1])[0]
+    assert_allclose(changed.state_offset(kappa[:1])[0], T @ x, atol=1e-12)
+    moved = changed.simulate(u, kappa, DT, T @ (x + [1.0, 2.0]))
+    free = model.free_responses(kappa, DT)
+    assert_allclose(moved, y + free @ [1.0, 2.0], atol=1e-11)
+
+
+def test_extrapolated_offsets_are_told_once():
+    kappa = np.linspace(0, 2.2, 100)
+    with pytest.warns(ExtrapolationWarning) as caught:
+        about_offsets().simulate(inputs(100), kappa, DT)
+    assert len(caught) == 1
+
+
+def test_wrong_offsets_are_explained():
+    with pytest.raises(ValueError, match="`offsets` must be a fitted regressor"):
+        replace(spring(), offsets=3.0)
+    model = spring()
+    wrong = replace(model, offsets=model.interpolator)
+    with pytest.raises(ValueError, match="`offsets` must predict the 6 values"):
+        wrong.simulate(inputs(5), sweep(5), DT)
