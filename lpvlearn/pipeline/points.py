@@ -8,7 +8,7 @@ several points at a time, tells progress and failures, and keeps results in a me
 
 from __future__ import annotations
 
-import inspect
+import threading
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from joblib import Memory, Parallel, delayed, hash
+from joblib import Memory, Parallel, delayed
 from numpy.typing import NDArray
 from sklearn.base import clone
 from threadpoolctl import ThreadpoolController
@@ -31,6 +31,7 @@ from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..structures.structure import GrayBoxStructure
+from .memory import Remembered
 
 Array = NDArray[np.float64]
 
@@ -665,45 +666,9 @@ class PointRunner:
         self, function: Callable[..., Any], ignore: Sequence[str] = ()
     ) -> Callable[..., Any]:
         if hasattr(self.memory, "store_backend"):
-            return _Remembered(function, self.memory.store_backend, tuple(ignore))
+            return Remembered(function, self.memory.store_backend, tuple(ignore))
         # An object with the interface of joblib.Memory: its own affair.
         return self.memory.cache(function, ignore=list(ignore))
-
-
-@dataclass(frozen=True)
-class _Remembered:
-    """A function whose results a store keeps by the values of its arguments.
-
-    What ``joblib.Memory.cache`` does, without its record of the arguments as text:
-    joblib warns the user where writing that took long, as under load it may.
-    """
-
-    function: Callable[..., Any]  # at the top of a module
-    store: Any  # joblib's store backend; None keeps nothing
-    ignore: tuple[str, ...] = ()  # as in `PointRunner.call`
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """The result for these arguments: the one kept, else a new one."""
-        if self.store is None:
-            return self.function(*args, **kwargs)
-        item = self._item(args, kwargs)
-        if self.store.contains_item(item):
-            try:
-                return self.store.load_item(item, verbose=0)
-            except Exception:  # cleared meanwhile, or damaged: it is made again
-                pass
-        result = self.function(*args, **kwargs)
-        self.store.dump_item(item, result, verbose=0)
-        return result
-
-    def _item(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[str]:
-        """Place in the store: folders of the function, and of source and arguments."""
-        named = inspect.signature(self.function).bind(*args, **kwargs).arguments
-        told = {name: v for name, v in named.items() if name not in self.ignore}
-        folder = f"{self.function.__module__}.{self.function.__qualname__}"
-        # Results of another version of the function are not taken for its own.
-        source = inspect.getsource(self.function)
-        return [folder, hash((source, told), coerce_mmap=True)]
 
 
 class Done(NamedTuple):
@@ -737,12 +702,39 @@ def _attempt(
     """Run a step at one operating point; `stop_as` is its number if it must succeed."""
     told: list[Told] = []
     try:
-        with _blas().limit(limits=1, user_api="blas"), collected() as told:
+        with _ONE_BLAS_THREAD, collected() as told:
             return Done(function(*args, **shared), told)
     except (ValueError, np.linalg.LinAlgError) as error:
         if stop_as is not None:
             raise _Stopped(stop_as, error, told) from error
         return _Failure(error)  # told by the runner, who knows the other points
+
+
+class _OneBlasThread:
+    """One thread of BLAS as long as any thread of the process is within.
+
+    Their number is that of the process: the first one in sets it, and the last one out
+    puts it back.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._n_within = threading.Lock(), 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._n_within:
+                self._limit = _blas().limit(limits=1, user_api="blas")
+                self._limit.__enter__()
+            self._n_within += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._n_within -= 1
+            if not self._n_within:
+                self._limit.__exit__(*error)
+
+
+_ONE_BLAS_THREAD = _OneBlasThread()
 
 
 @cache

@@ -1,9 +1,5 @@
 """Steps 3 and 4 at the operating points: deviations, what is kept, what fails."""
 
-import itertools
-from functools import partial
-from types import SimpleNamespace
-
 import joblib
 import numpy as np
 import pandas as pd
@@ -30,7 +26,7 @@ from lpvlearn.pipeline.points import (
     restructure_points,
 )
 
-from ..conftest import spring_pipeline, spring_structure, spring_tables
+from ..conftest import spring_pipeline, spring_tables
 
 # -- standard deviations of gray-box parameters ---------------------------------------
 
@@ -355,109 +351,10 @@ def test_without_a_covariance_the_hinf_optimum_is_kept():
 
 # -- the runner -----------------------------------------------------------------------
 
-CALLS = []
-
-
-def square(x, note=None):
-    CALLS.append(x)
-    return np.square(x)
-
-
-@pytest.fixture
-def calls():
-    CALLS.clear()
-    return CALLS
-
 
 def runner(memory, **options):
     return PointRunner(**{"n_jobs": None, "verbose": 0, "on_error": "raise", **options},
                        memory=memory)  # fmt: skip
-
-
-# -- memory ----------------------------------------------------------------------------
-
-
-def test_results_are_kept_by_the_values_of_the_arguments(tmp_path, calls):
-    for _ in range(2):
-        call = partial(runner(Memory(tmp_path, verbose=0)).call, square)
-        assert call(3) == 9
-        assert call(3, "of no influence", ignore=["note"]) == 9
-        np.testing.assert_array_equal(call(np.arange(3)), [0, 1, 4])
-    assert len(calls) == 2
-
-
-def test_nothing_is_kept_without_a_folder(calls):
-    kept = partial(runner(Memory(None)).call, square)
-    assert [kept(2), kept(2)] == [4, 4] and len(calls) == 2
-
-
-def test_a_damaged_or_cleared_result_is_made_again(tmp_path, calls):
-    memory = Memory(tmp_path, verbose=0)
-    kept = partial(runner(memory).call, square)
-    kept(3)
-    (file,) = tmp_path.rglob("output.pkl")
-    file.write_bytes(b"cut")
-    assert kept(3) == 9 and len(calls) == 2
-    memory.clear(warn=False)
-    assert kept(3) == 9 and len(calls) == 3
-
-
-def test_the_size_of_the_memory_can_be_reduced(tmp_path):
-    memory = Memory(tmp_path, verbose=0)
-    kept = partial(runner(memory).call, square)
-    for x in range(3):
-        kept(x)
-    memory.reduce_size(items_limit=1)
-    assert len(list(tmp_path.rglob("output.pkl"))) == 1
-
-
-def test_an_object_with_the_interface_of_a_memory_serves(calls):
-    results = {}
-
-    def cache(function, ignore=None):
-        return lambda x: results.setdefault(x, function(x))
-
-    assert runner(SimpleNamespace(cache=cache)).call(square, 4) == 16
-    assert results == {4: 16}
-
-
-def test_slow_writing_of_the_memory_is_not_told_to_the_user(tmp_path, monkeypatch):
-    """Under load joblib warns of half a second for the record of the arguments."""
-    ticks = itertools.count()
-    slow = SimpleNamespace(**{**vars(joblib.memory.time), "time": ticks.__next__})
-    monkeypatch.setattr(joblib.memory, "time", slow)  # every look takes a second
-    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
-    for _ in range(2):  # a warning would be an error
-        spring_pipeline(memory=tmp_path).fit(X, y)
-
-
-def test_memory_is_a_folder_a_path_or_a_joblib_memory(tmp_path):
-    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
-    expected = spring_pipeline().fit(X, y)
-    for memory in (
-        str(tmp_path / "a"),
-        tmp_path / "b",
-        Memory(tmp_path / "c", verbose=0),
-    ):
-        for _ in range(2):
-            pipeline = spring_pipeline(memory=memory).fit(X, y)
-            pd.testing.assert_frame_equal(pipeline.parameters_, expected.parameters_)
-            pd.testing.assert_frame_equal(pipeline.report_, expected.report_)
-
-
-def test_memory_teaches_what_it_cannot_keep(tmp_path):
-    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
-    with pytest.raises(
-        ValueError, match="`memory` must be None, a folder, or a joblib"
-    ):
-        spring_pipeline(memory=3).fit(X, y)
-    truth = spring_structure()
-    structure = GrayBoxStructure.from_function(
-        lambda theta: truth.matrices(theta), [30.0, 1.2, 50.0]
-    )
-    pipeline = spring_pipeline(restructurer=GrayBoxRestructurer(structure))
-    with pytest.raises(ValueError, match="pickled. Got a `restructurer`.*lambda"):
-        pipeline.set_params(memory=tmp_path).fit(X, y)
 
 
 # -- failures --------------------------------------------------------------------------

@@ -1,0 +1,230 @@
+"""Results that a folder keeps, told apart by all that they depend on.
+
+The values of the arguments, and the code: that of this library, and that of the user's
+functions and classes within the arguments, which a pickle (and a hash of it) knows by
+their names alone. A function is told by its bytecode and constants, what it closes
+over, and what it takes from its module, functions among that likewise. Of installed
+packages the version counts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import pickle
+import sys
+import sysconfig
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from joblib import hash
+
+from ..exceptions import warn
+
+_LIBRARY = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A function whose results a store keeps by all that they depend on.
+
+    What ``joblib.Memory.cache`` does, without its record of the arguments as text:
+    joblib warns the user where writing that took long, as under load it may.
+    """
+
+    function: Callable[..., Any]  # at the top of a module
+    store: Any  # joblib's store backend; None keeps nothing
+    ignore: tuple[str, ...] = ()  # arguments that follow from the others
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """The result for these arguments: the one kept, else a new one."""
+        if self.store is None:
+            return self.function(*args, **kwargs)
+        named = inspect.signature(self.function).bind(*args, **kwargs).arguments
+        told = {name: v for name, v in named.items() if name not in self.ignore}
+        try:
+            key = fingerprint(told)
+        except _Unknown as cause:
+            warn(
+                f"`memory` keeps no result that depends on {cause}, of which another "
+                "version could not be told from this one. Give what it stands for as "
+                "a parameter, or define it at the top of a module."
+            )
+            return self.function(*args, **kwargs)
+        folder = f"{self.function.__module__}.{self.function.__qualname__}"
+        item = [folder, key]
+        if self.store.contains_item(item):
+            kept = self._kept(item)
+            if kept is not None:
+                return kept.result
+            warn(
+                f"`memory` holds an entry that is damaged or not its own: {folder}, "
+                f"{key}. It is computed anew and replaced."
+            )
+        result = self.function(*args, **kwargs)
+        self.store.dump_item(item, _Kept(key, result), verbose=0)
+        return result
+
+    def _kept(self, item: list[str]) -> _Kept | None:
+        try:
+            kept = self.store.load_item(item, verbose=0)
+        except Exception:  # whatever a damaged pickle may raise
+            return None
+        return kept if isinstance(kept, _Kept) and kept.key == item[1] else None
+
+
+class _Kept(NamedTuple):
+    """What the store holds."""
+
+    key: str
+    result: Any
+
+
+class _Unknown(Exception):
+    """Names code that cannot be told from another version of itself."""
+
+
+def fingerprint(value: Any) -> str:
+    """A text that differs where a value does, or code that it leads to.
+
+    >>> def power(n):
+    ...     return lambda x: x**n
+    >>> one, two = fingerprint(power(1)), fingerprint(power(2))
+    >>> one == two, one == fingerprint(power(1))
+    (False, True)
+    """
+    digest = hashlib.blake2b(_library(), digest_size=16)
+    for part in _parts(value, set()):
+        digest.update(part.encode() + b"\0")
+    return digest.hexdigest()
+
+
+@cache
+def _library() -> bytes:
+    """This library's code, and the versions of what it computes with."""
+    digest = hashlib.blake2b(f"{np.__version__} {scipy.__version__}".encode())
+    for file in sorted(_LIBRARY.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.digest()
+
+
+def _parts(value: Any, seen: set[int]) -> Iterator[str]:
+    """What tells a value: its data, and all code within it that is not `seen` yet."""
+    finder = _CodeFinder()
+    try:
+        finder.dump(value)
+        if not isinstance(value, FunctionType | type):
+            yield str(hash(value, coerce_mmap=True))
+    except Exception as error:  # an object that is no data may raise anything
+        raise _Unknown(f"{value!r} ({error})") from error
+    for code in finder.found:
+        yield from _code_parts(code, seen)
+
+
+class _CodeFinder(pickle.Pickler):
+    """Finds functions and classes within an object, which a pickle has by name."""
+
+    def __init__(self) -> None:
+        super().__init__(_Nowhere())
+        self.found: list[Any] = []
+
+    def persistent_id(self, obj: Any) -> str | None:
+        """That of what need not be looked into, code and numbers."""
+        if isinstance(obj, FunctionType | type):
+            self.found.append(obj)
+            return "code"
+        return (
+            "numbers" if isinstance(obj, np.ndarray) and obj.dtype != object else None
+        )
+
+
+class _Nowhere:
+    """A file that keeps nothing."""
+
+    def write(self, data: Any) -> int:
+        return len(data)
+
+
+def _code_parts(code: Any, seen: set[int]) -> Iterator[str]:
+    """What tells a function, class or module."""
+    if id(code) in seen:
+        return
+    seen.add(id(code))
+    is_module = isinstance(code, ModuleType)
+    module = code.__name__ if is_module else code.__module__
+    yield f"{module}.{getattr(code, '__qualname__', '')}"
+    version = _installed_version(module)
+    if version is not None:
+        yield version
+    elif is_module:
+        yield _source_of(code)
+    elif isinstance(code, FunctionType):
+        yield from _function_parts(code, seen)
+    else:
+        for base in code.__bases__:
+            yield from _code_parts(base, seen)
+        for name, value in sorted(vars(code).items()):
+            value = getattr(value, "__func__", getattr(value, "fget", value))
+            if isinstance(value, FunctionType):
+                yield name
+                yield from _code_parts(value, seen)
+            elif not name.startswith("_") and not hasattr(value, "__get__"):
+                yield name
+                yield from _parts(value, seen)
+
+
+def _function_parts(function: FunctionType, seen: set[int]) -> Iterator[str]:
+    yield from _bytecode_parts(function.__code__)
+    yield from _parts([function.__defaults__, function.__kwdefaults__], seen)
+    around, names = function.__globals__, sorted(set(_names(function.__code__)))
+    used = [around[name] for name in names if name in around]
+    used += [cell.cell_contents for cell in function.__closure__ or ()]
+    for value in used:
+        if isinstance(value, FunctionType | type | ModuleType):
+            yield from _code_parts(value, seen)
+        else:
+            yield from _parts(value, seen)
+
+
+def _bytecode_parts(code: CodeType) -> Iterator[str]:
+    yield f"{code.co_code!r} {code.co_names} {code.co_varnames}"
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _bytecode_parts(constant)
+        elif isinstance(constant, frozenset):  # whose order is one of a process
+            yield repr(sorted(map(repr, constant)))
+        else:
+            yield repr(constant)
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+def _source_of(module: ModuleType) -> str:
+    try:
+        return str(hash(Path(str(module.__file__)).read_bytes()))
+    except (AttributeError, OSError) as error:
+        raise _Unknown(f"the module {module.__name__!r} ({error})") from error
+
+
+def _installed_version(module: str) -> str | None:
+    """Version of the package of a module, "" if unknown; None for a user's own."""
+    top = module.split(".")[0]
+    if top in sys.stdlib_module_names or top == _LIBRARY.name:
+        return ""
+    package = sys.modules.get(top)
+    file = getattr(package, "__file__", None)
+    folders = {sysconfig.get_path(name) for name in ("purelib", "platlib")}
+    if file is None or not any(Path(file).is_relative_to(f) for f in folders):
+        return None
+    return str(getattr(package, "__version__", ""))

@@ -1,0 +1,251 @@
+"""What a memory keeps, and by what it tells results apart."""
+
+import importlib
+import itertools
+import pickle
+import sys
+from functools import partial
+from types import SimpleNamespace
+
+import joblib
+import numpy as np
+import pandas as pd
+import pytest
+from joblib import Memory
+
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure
+from lpvlearn.pipeline.memory import fingerprint
+from lpvlearn.pipeline.points import PointRunner
+
+from ..conftest import spring_pipeline, spring_structure, spring_tables
+
+CALLS = []
+
+
+def square(x, note=None):
+    CALLS.append(x)
+    return np.square(x)
+
+
+@pytest.fixture
+def calls():
+    CALLS.clear()
+    return CALLS
+
+
+def runner(memory):
+    return PointRunner(n_jobs=None, verbose=0, on_error="raise", memory=memory)
+
+
+def test_results_are_kept_by_the_values_of_the_arguments(tmp_path, calls):
+    for _ in range(2):
+        call = partial(runner(Memory(tmp_path, verbose=0)).call, square)
+        assert call(3) == 9
+        assert call(3, "of no influence", ignore=["note"]) == 9
+        np.testing.assert_array_equal(call(np.arange(3)), [0, 1, 4])
+    assert len(calls) == 2
+
+
+def test_nothing_is_kept_without_a_folder(calls):
+    kept = partial(runner(Memory(None)).call, square)
+    assert [kept(2), kept(2)] == [4, 4] and len(calls) == 2
+
+
+@pytest.mark.parametrize("content", [b"cut", pickle.dumps({"k": 20.0})])
+def test_a_damaged_or_foreign_entry_is_told_and_replaced(tmp_path, calls, content):
+    memory = Memory(tmp_path, verbose=0)
+    kept = partial(runner(memory).call, square)
+    kept(3)
+    (file,) = tmp_path.rglob("output.pkl")
+    file.write_bytes(content)
+    with pytest.warns(UserWarning, match="damaged or not its own.*computed anew"):
+        assert kept(3) == 9
+    assert kept(3) == 9 and len(calls) == 2
+
+
+def test_a_cleared_memory_begins_anew(tmp_path, calls):
+    memory = Memory(tmp_path, verbose=0)
+    kept = partial(runner(memory).call, square)
+    kept(3)
+    memory.clear(warn=False)
+    assert kept(3) == 9 and len(calls) == 2
+
+
+def test_the_size_of_the_memory_can_be_reduced(tmp_path):
+    memory = Memory(tmp_path, verbose=0)
+    kept = partial(runner(memory).call, square)
+    for x in range(3):
+        kept(x)
+    memory.reduce_size(items_limit=1)
+    assert len(list(tmp_path.rglob("output.pkl"))) == 1
+
+
+def test_an_object_with_the_interface_of_a_memory_serves(calls):
+    results = {}
+
+    def cache(function, ignore=None):
+        return lambda x: results.setdefault(x, function(x))
+
+    assert runner(SimpleNamespace(cache=cache)).call(square, 4) == 16
+    assert results == {4: 16}
+
+
+def test_slow_writing_of_the_memory_is_not_told_to_the_user(tmp_path, monkeypatch):
+    """Under load joblib warns of half a second for the record of the arguments."""
+    ticks = itertools.count()
+    slow = SimpleNamespace(**{**vars(joblib.memory.time), "time": ticks.__next__})
+    monkeypatch.setattr(joblib.memory, "time", slow)  # every look takes a second
+    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
+    for _ in range(2):  # a warning would be an error
+        spring_pipeline(memory=tmp_path).fit(X, y)
+
+
+def test_memory_is_a_folder_a_path_or_a_joblib_memory(tmp_path):
+    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
+    expected = spring_pipeline().fit(X, y)
+    for memory in (
+        str(tmp_path / "a"),
+        tmp_path / "b",
+        Memory(tmp_path / "c", verbose=0),
+    ):
+        for _ in range(2):
+            pipeline = spring_pipeline(memory=memory).fit(X, y)
+            pd.testing.assert_frame_equal(pipeline.parameters_, expected.parameters_)
+            pd.testing.assert_frame_equal(pipeline.report_, expected.report_)
+
+
+def test_memory_teaches_what_it_cannot_keep(tmp_path):
+    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
+    with pytest.raises(
+        ValueError, match="`memory` must be None, a folder, or a joblib"
+    ):
+        spring_pipeline(memory=3).fit(X, y)
+    truth = spring_structure()
+    structure = GrayBoxStructure.from_function(
+        lambda theta: truth.matrices(theta), [30.0, 1.2, 50.0]
+    )
+    pipeline = spring_pipeline(restructurer=GrayBoxRestructurer(structure))
+    with pytest.raises(ValueError, match="pickled. Got a `restructurer`.*lambda"):
+        pipeline.set_params(memory=tmp_path).fit(X, y)
+
+
+# -- code ------------------------------------------------------------------------------
+
+PLANT = """
+from functools import partial
+import numpy as np
+import {helpers}
+from {helpers} import damping
+
+MASS = {mass}
+
+
+class Plant:
+    length = {length}
+
+    def matrices(self, theta):
+        return stiffness(theta) / self.length
+
+
+def stiffness(theta):
+    def scaled(x):
+        return {factor} * x
+    return scaled(theta) / MASS + damping(theta) + {helpers}.offset() + np.abs(theta)
+"""
+
+HELPERS = """
+def damping(theta):
+    return {damping} * theta
+
+def offset():
+    return {offset}
+"""
+
+
+@pytest.fixture
+def written(tmp_path, monkeypatch):
+    """Imports modules of a user, written with some values, under the same names."""
+    monkeypatch.syspath_prepend(tmp_path)
+    usual = {"mass": 2, "factor": 40, "length": 3, "damping": 0.5, "offset": 1}
+
+    def write(comment="", **values):
+        values = {**usual, **values}
+        for name, text in (("users_helpers", HELPERS), ("users_plant", PLANT)):
+            lines = comment + text.format(helpers="users_helpers", **values)
+            (tmp_path / f"{name}.py").write_text(lines)
+            sys.modules.pop(name, None)
+        importlib.invalidate_caches()
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)
+        return importlib.import_module("users_plant")
+
+    yield write
+    for name in ("users_helpers", "users_plant"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"mass": 3}, {"factor": 20}, {"length": 4}, {"damping": 0.4}, {"offset": 2}],
+)
+def test_a_change_of_code_or_of_what_it_uses_is_seen(written, change):
+    def told():
+        module = written()
+        plant = module.Plant()
+        return fingerprint([plant, plant.matrices, partial(module.stiffness)])
+
+    first = told()
+    assert first == told()
+    module = written(**change)
+    plant = module.Plant()
+    assert first != fingerprint([plant, plant.matrices, partial(module.stiffness)])
+
+
+def test_lines_elsewhere_in_a_module_do_not_matter(written):
+    before = fingerprint(written().stiffness)
+    assert before != fingerprint(written(factor=41).stiffness)
+    sys.modules.pop("users_helpers")
+    same = written()
+    same.unused = 3
+    assert before == fingerprint(same.stiffness)
+
+
+def test_functions_that_call_each_other_are_told():
+    def even(n):
+        return n == 0 or odd(n - 1)
+
+    def odd(n):
+        return n != 0 and even(n - 1)
+
+    assert fingerprint(even) == fingerprint(even) != fingerprint(odd)
+
+
+def test_what_cannot_be_told_apart_is_not_kept_and_said(tmp_path, calls):
+    kept = partial(runner(Memory(tmp_path, verbose=0)).call, square)
+    stream = (n for n in range(3))
+    with pytest.warns(UserWarning, match="keeps no result that depends on.*generator"):
+        assert kept(2, stream) == 4
+    with pytest.warns(UserWarning, match="keeps no result"):
+        kept(2, stream)
+    assert len(calls) == 2
+
+
+def test_a_structure_whose_function_was_edited_is_restructured_anew(written, tmp_path):
+    text = """
+def matrices(theta):
+    k, c, b = theta
+    return [[0, 1], [-k * {factor} / 40, -c]], [[0], [b]], [[1, 0]], [[0]]
+"""
+    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
+    found = []
+    for factor in (40, 20, 40):
+        (tmp_path / "users_plant.py").write_text(text.format(factor=factor))
+        sys.modules.pop("users_plant", None)
+        importlib.invalidate_caches()
+        function = importlib.import_module("users_plant").matrices
+        structure = GrayBoxStructure.from_function(function, [30.0, 1.2, 50.0])
+        pipeline = spring_pipeline(
+            restructurer=GrayBoxRestructurer(structure), memory=tmp_path / "kept"
+        )
+        found.append(pipeline.fit(X, y).parameters_.to_numpy())
+    np.testing.assert_allclose(found[1] / found[0], [[2, 1, 1]] * 2, rtol=1e-5)
+    np.testing.assert_array_equal(found[0], found[2])
