@@ -12,7 +12,7 @@ import threading
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -105,6 +105,22 @@ class FunctionMap(StructureMap):
     derivatives: Callable[[Any], Any] | None  # theta to those of the blocks
     dimensions: tuple[int, int, int]  # order, n_inputs, n_outputs
     typical: Array  # values whose sizes set the steps of numerical derivatives
+    takes_complex: bool = False  # parameters, and loses no imaginary part
+
+    def checked(self) -> FunctionMap:
+        """The map that knows whether its function takes complex parameters.
+
+        This changes the warning filters for a moment, which are those of all threads:
+        it belongs where a structure is made, not where it is fitted.
+        """
+        theta = np.where(self.typical == 0.0, 1.0, self.typical)
+        try:
+            with _FILTERS, warnings.catch_warnings():
+                warnings.simplefilter("error", ComplexWarning)
+                _complex_step(self.system_matrix, theta, np.abs(theta))
+        except (TypeError, ValueError, NotImplementedError, ComplexWarning):
+            return self
+        return replace(self, takes_complex=True)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -121,13 +137,17 @@ class FunctionMap(StructureMap):
 
     def jacobian(self, theta: Array) -> Array:
         if self.derivatives is None:
-            return numerical_jacobian(self.system_matrix, theta, self.typical)
+            return numerical_jacobian(
+                self.system_matrix, theta, self.typical, self.takes_complex
+            )
         blocks = self.derivatives(theta)
         return stack_system("jacobian", blocks, self.dimensions, (len(theta),))
 
     def curvature(self, theta: Array) -> Array:
         if self.derivatives is None:
-            return _numerical_curvature(self.system_matrix, theta, self.typical)
+            return _numerical_curvature(
+                self.system_matrix, theta, self.typical, self.takes_complex
+            )
         return _symmetric_differences(self.jacobian, theta, self.typical)
 
 
@@ -181,14 +201,16 @@ class RowsMap(StructureMap):
         return None if H is None else H[:, :, self.rows]
 
 
-def numerical_jacobian(f: Callable[[Any], Any], theta: Array, typical: Array) -> Array:
-    """Derivative of `f` at `theta`, shape (n_params, ...); exact where `f` is analytic.
+def numerical_jacobian(
+    f: Callable[[Any], Any], theta: Array, typical: Array, takes_complex: bool = False
+) -> Array:
+    """Derivative of `f` at `theta`, shape (n_params, ...).
 
-    Where it cannot take complex parameters, or is not analytic, it is that of central
-    differences.
+    That of central differences, but exact where `f` takes complex parameters and is
+    analytic.
     """
     scale = _parameter_scale(theta, typical)
-    exact = _analytic_jacobian(f, theta, scale)
+    exact = _analytic_jacobian(f, theta, scale) if takes_complex else None
     return _central(f, theta, _CENTRAL_STEP * scale) if exact is None else exact
 
 
@@ -210,10 +232,8 @@ def _analytic_jacobian(
     by entry.
     """
     try:
-        with _FILTERS, warnings.catch_warnings():
-            warnings.simplefilter("error", ComplexWarning)
-            exact = _complex_step(f, theta, scale)
-    except (TypeError, ValueError, NotImplementedError, ComplexWarning):
+        exact = _complex_step(f, theta, scale)
+    except (TypeError, ValueError, NotImplementedError):
         return None
     direction = scale * np.cos(1.0 + np.arange(len(theta)) ** 2)
     step = _CENTRAL_STEP * direction
@@ -227,11 +247,11 @@ def _analytic_jacobian(
 
 
 def _numerical_curvature(
-    f: Callable[[Any], Any], theta: Array, typical: Array
+    f: Callable[[Any], Any], theta: Array, typical: Array, takes_complex: bool
 ) -> Array:
     """Second derivatives, (n_params, n_params, ...): differences of the first ones."""
     scale = _parameter_scale(theta, typical)
-    analytic = _analytic_jacobian(f, theta, scale) is not None
+    analytic = takes_complex and _analytic_jacobian(f, theta, scale) is not None
 
     def jacobian(point: Array) -> Array:
         if analytic:  # as around theta: not asked again at every step

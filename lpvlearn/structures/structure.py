@@ -250,6 +250,8 @@ class GrayBoxStructure:
         map = FunctionMap(function, jacobian, dimensions, start)
         if jacobian is not None:
             map.jacobian(start)  # its shapes are told of here, not in a fit
+        else:
+            map = map.checked()
         return cls(model.order, map, names, initial=start)
 
     @classmethod

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import logm, matrix_balance, schur, solve_sylvester
+from scipy.linalg import matrix_balance, schur, solve_sylvester, sqrtm
 from scipy.special import factorial
 
 Array = NDArray[Any]
@@ -17,8 +16,12 @@ Array = NDArray[Any]
 _TAYLOR_NORM = 0.25
 
 # Logarithms by eigenvectors lose as many digits as their condition number has; worse
-# ones leave it to `logm`, forty times slower (2.3 ms).
+# ones take roots, ten times slower.
 _MODAL_CONDITION = 1e4
+
+# Of a matrix as near to one as this (1-norm) the logarithm by so many nodes is exact to
+# rounding; each root comes nearer by half.
+_NEAR_ONE, _N_NODES, _MOST_ROOTS = 0.25, 7, 100
 
 # Rounding moves a pole of multiplicity k by about eps^(1/k). A complex pair this near
 # the negative real axis counts as two poles on it, which is as exact.
@@ -170,13 +173,26 @@ def _on_negative_axis(real: NDArray, imag: NDArray) -> NDArray[np.bool_]:
 
 
 def _logarithm(A: Array) -> Array:
-    """Real principal logarithm of a matrix without poles on the negative axis."""
+    """Real principal logarithm of a matrix without poles on the negative axis.
+
+    In modal form, or near a defective matrix by inverse scaling and squaring (Higham,
+    *Functions of Matrices*, 2008, Section 11.5): of a root of A near one the integral
+    ``log(I + X) = int_0^1 (I + t X)^-1 X dt`` by Gauss and Legendre, which is Pade's
+    approximation.
+    """
     poles, V = np.linalg.eig(A)
     if np.linalg.cond(V) <= _MODAL_CONDITION:
         return np.real((V * np.log(poles.astype(complex))) @ np.linalg.inv(V))
-    with warnings.catch_warnings():  # its estimate of the error warns at 2e-13
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return np.real(logm(A))
+    T, Z = schur(A, output="complex")
+    eye, scale = np.eye(len(A)), 1.0
+    for _ in range(_MOST_ROOTS):
+        if not np.linalg.norm(T - eye, 1) > _NEAR_ONE:
+            break
+        T, scale = sqrtm(T), 2.0 * scale
+    X, (nodes, weights) = T - eye, np.polynomial.legendre.leggauss(_N_NODES)
+    t = 0.5 * (nodes[:, None, None] + 1.0)
+    L = scale * np.tensordot(0.5 * weights, np.linalg.solve(eye + t * X, X), 1)
+    return np.real(Z @ L @ Z.conj().T)
 
 
 def _extended_logarithm(A: Array) -> Array:

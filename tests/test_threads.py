@@ -1,0 +1,66 @@
+"""Fits in threads: as serial ones, and what belongs to the whole process stays."""
+
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+from joblib import Parallel, delayed, parallel_config
+from sklearn.base import clone
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import lpvlearn
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+
+from .conftest import spring_pipeline, spring_tables
+
+ROOT = Path(lpvlearn.__file__).parent
+
+
+def matrices(theta):
+    """Of a kind that takes no complex parameters: they would warn."""
+    k, c, b = theta
+    A = np.zeros((2, 2))
+    A[:] = [[0, 1], [-k, -c]]
+    return A, [[0], [b]], [[1, 0]]
+
+
+def in_threads(pipeline, X, y):
+    with parallel_config("threading", n_jobs=4):
+        found = Parallel()(delayed(clone(pipeline).fit)(X, y) for _ in range(4))
+        return [*found, clone(pipeline).set_params(n_jobs=3).fit(X, y)]
+
+
+def blas_threads():
+    return [pool["num_threads"] for pool in threadpool_info()]
+
+
+def test_threads_agree_with_a_serial_fit_and_put_back_the_threads_of_blas():
+    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0, 2.0))
+    structure = GrayBoxStructure.from_function(matrices, [30.0, 1.2, 50.0])
+    pipeline = spring_pipeline(restructurer=GrayBoxRestructurer(structure))
+    expected = clone(pipeline).fit(X, y).parameters_.to_numpy()
+    with threadpool_limits(2, user_api="blas"):
+        before = blas_threads()
+        found = in_threads(pipeline, X, y)
+        assert blas_threads() == before
+    for fitted in found:
+        np.testing.assert_array_equal(fitted.parameters_.to_numpy(), expected)
+
+
+def test_no_code_that_a_fit_runs_changes_the_filters(monkeypatch):
+    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
+    structure = GrayBoxStructure.from_function(matrices, [30.0, 1.2, 50.0])
+    jordan = StateSpace([[0.9, 1.0], [0.0, 0.9]], [[0], [1]], [[1, 0]], [[0]], 0.1)
+
+    original = warnings.catch_warnings
+
+    def refuse(*args, **kwargs):
+        caller = Path(sys._getframe(1).f_code.co_filename)
+        assert not caller.is_relative_to(ROOT), f"{caller}: the filters of all threads"
+        return original(*args, **kwargs)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(warnings, "catch_warnings", refuse)
+        spring_pipeline(restructurer=GrayBoxRestructurer(structure)).fit(X, y)
+        jordan.to_continuous()
