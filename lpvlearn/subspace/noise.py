@@ -49,8 +49,6 @@ _LARGEST_RATIO = 1e4
 # Filters and weights that differ by less cost the square of it in efficiency.
 _SAME_FILTER, _SAME_WEIGHT = 0.05, 1.05
 
-_N_FREQUENCIES = 100  # at which a density of some ten lags is looked at
-
 _LEAST_VARIANCE = 1e-6  # of a combination of outputs of unit variance, for its weight
 
 
@@ -106,18 +104,6 @@ class Whitening(NamedTuple):
         ratio = linalg.svdvals(linalg.solve(other.weight, self.weight))
         close = np.abs(self.filter - other.filter).max() <= _SAME_FILTER
         return bool(close and ratio[0] <= _SAME_WEIGHT * ratio[-1])
-
-    def colour_left(self, errors: Sequence[Array]) -> float:
-        """Largest spectral density of an output's errors, whitened, by its mean."""
-        white = [e @ self.weight.T for e in self._filtered(errors)]
-        omega = np.linspace(0.0, np.pi, _N_FREQUENCIES)
-        largest = 1.0
-        for i in range(len(self.weight)):
-            model = autoregression([e[:, [i]] for e in white])
-            density = spectral_density(model, omega).real
-            if len(model.A) and density.mean() > 0.0:
-                largest = max(largest, float(density.max() / density.mean()))
-        return largest
 
     def _filtered(self, samples: Sequence[Array]) -> list[Array]:
         """Samples without those to which the filter would need others before them."""

@@ -34,7 +34,7 @@ from .identification import (
     subspaces_of,
     validate,
 )
-from .noise import Whitening
+from .noise import Whitening, autoregression
 from .realization import ObservabilitySubspace
 from .refinement import refine_simulation
 from .signals import Record, output_energy, thinned
@@ -195,13 +195,6 @@ class _Range(NamedTuple):
     horizon: int | None
 
 
-class _Noise(NamedTuple):
-    """How errors are whitened, and how coloured they are then."""
-
-    whitening: Whitening
-    colour: float = 1.0
-
-
 def _search(
     records: list[Record], order: int | None, horizon: int | None, settings: Settings
 ) -> Selection:
@@ -212,21 +205,19 @@ def _search(
         highest = _highest_order(records, horizons, settings)
     wanted = _Range(range(order or 0, highest + 1), horizon)
     pilot = _pilot(records, wanted, settings)
-    noise = _noise_of(pilot, records, wanted, settings)
-    tried = _try_orders(wanted, records, noise, settings)
+    whitening = _noise_of(pilot, records, wanted, settings)
+    tried = _try_orders(wanted, records, whitening, settings)
     best = min(tried, key=lambda one: one.criterion)
     for _ in range(_MORE_ROUNDS):
-        model = _unwhitened(best.model, noise.whitening, records, settings)
+        model = _unwhitened(best.model, whitening, records, settings)
         again = _noise_of(model, records, wanted, settings)
-        if again.whitening.is_close_to(noise.whitening):
+        if again.is_close_to(whitening):
             break
-        noise = again
-        tried = _try_orders(wanted, records, noise, settings)
+        whitening = again
+        tried = _try_orders(wanted, records, whitening, settings)
         best = min(tried, key=lambda one: one.criterion)
     candidates = {
-        one.order: Candidate(
-            noise.whitening.undone(one.model), one.horizon, noise.whitening, True
-        )
+        one.order: Candidate(whitening.undone(one.model), one.horizon, whitening, True)
         for one in tried
     }
     errors = {best.order: validate(candidates[best.order], records, settings)}
@@ -236,7 +227,7 @@ def _search(
             errors[order] = validate(candidates[order], records, settings)
             if errors[order].clearly_better_than(errors[chosen], _DOUBT):
                 chosen = order
-    white = noise.whitening.records(records, settings.free)
+    white = whitening.records(records, settings.free)
     rows, found = _rows(tried, white, errors), candidates[chosen]
     return Selection(chosen, found.horizon, rows, found, errors[chosen])
 
@@ -246,7 +237,7 @@ def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realiza
     free, whitening = settings.free, Whitening.none(len(records[0].y))
     order = max(wanted.orders[0], min(wanted.orders[-1], _PILOT_ORDER))
     wanted = wanted._replace(orders=range(order, order + 1))
-    tried = _try_orders(wanted, records, _Noise(whitening), settings, _PILOT_STEPS)
+    tried = _try_orders(wanted, records, whitening, settings, _PILOT_STEPS)
     model = tried[0].model
     for _ in range(_WEIGHINGS if len(records[0].y) > 1 else 0):
         errors = simulation_errors(model, records)
@@ -273,15 +264,15 @@ def _unwhitened(
 
 def _noise_of(
     model: Realization, records: Sequence[Record], wanted: _Range, settings: Settings
-) -> _Noise:
+) -> Whitening:
     """Noise in the errors of a model; none where a filter takes too many samples."""
     errors = simulation_errors(model, records)
     found = Whitening.of(errors, settings.free)
     lengths = [r.u.shape[1] for r in found.records(records, settings.free)]
     room, horizon = settings.max_horizon(lengths), wanted.horizon or 1
     if room < horizon or settings.max_order(room) < wanted.orders[0]:
-        return _Noise(Whitening.none(len(records[0].y)))
-    return _Noise(found, found.colour_left(errors))
+        return Whitening.none(len(records[0].y))
+    return found
 
 
 def _rows(
@@ -368,18 +359,17 @@ def _highest_order(
 def _try_orders(
     wanted: _Range,
     records: Sequence[Record],
-    noise: _Noise,
+    whitening: Whitening,
     settings: Settings,
     max_iter: int | None = None,
 ) -> list[_Tried]:
     """Every order in turn on whitened records, until further states gain nothing."""
-    records = noise.whitening.records(records, settings.free)
+    records = whitening.records(records, settings.free)
     orders, horizon = wanted
     spaces = _spaces(records, orders[0], orders[-1], horizon, settings)
     tried: list[_Tried] = []
     best, stale = np.inf, 0
     energy = output_energy(records)
-    n_values = sum(record.y.size for record in records)
     steps = {} if max_iter is None else {"max_iter": max_iter}
     for order in orders:
         starts = _starts(order, spaces, records, settings)
@@ -392,7 +382,7 @@ def _try_orders(
             other = _with_more_states(tried[-1].model, records, settings)
             if other is not None and other.loss < model.loss:
                 model = other
-        criterion = _criterion(model, energy, n_values, settings, noise.colour)
+        criterion = _criterion(model, records, settings)
         tried.append(_Tried(order, horizon, model, criterion, starts))
         stale = 0 if criterion < best else stale + 1
         best = min(best, criterion)
@@ -402,24 +392,31 @@ def _try_orders(
 
 
 def _criterion(
-    model: Realization,
-    energy: float,
-    n_values: int,
-    settings: Settings,
-    colour: float,
+    model: Realization, records: Sequence[Record], settings: Settings
 ) -> float:
     """Likelihood and number of parameters of a model of whitened records.
 
     Minus twice the logarithm of the likelihood, and the price of the parameters with
-    the correction that a ratio of sums of squares in few samples needs. States that
-    fit the peak of errors that are still coloured gain as much more by chance.
+    the correction that a ratio of sums of squares in few samples needs. The errors that
+    a model leaves tell the noise of every output anew: by that of the model before,
+    states that follow slow noise would prove themselves right.
     """
     n, (ny, m) = len(model.A), settings.free.direct.shape
+    n_values = sum(record.y.size for record in records)
+    n_samples = n_values // ny
     own = len(model.initial_states) * settings.free.n_own(n)
     n_parameters = n * (m + ny) + int(settings.free.direct.sum()) + own
-    loss = max(model.loss, _EXACT * energy) or 1.0
     few = n_values / max(n_values - n_parameters, 1)
-    return float(n_values * np.log(loss) + colour * few * _PRICE * n_parameters)
+    if not np.isfinite(model.loss):
+        return np.inf
+    misfit = few * _PRICE * n_parameters
+    errors = simulation_errors(model, records)
+    for i in range(ny):
+        noise = autoregression([error[:, [i]] for error in errors])
+        power = sum(float(record.y[i] @ record.y[i]) for record in records) / n_samples
+        variance = max(float(noise.covariance[0, 0]), _EXACT * power) or 1.0
+        misfit += n_samples * np.log(variance) + _PRICE * len(noise.A)
+    return float(misfit)
 
 
 def _with_more_states(
