@@ -209,6 +209,13 @@ def test_lines_elsewhere_in_a_module_do_not_matter(written):
     assert before == fingerprint(same.stiffness)
 
 
+def test_what_a_function_closes_over_tells_it():
+    def power(n):
+        return lambda x: x**n
+
+    assert fingerprint(power(1)) == fingerprint(power(1)) != fingerprint(power(2))
+
+
 def test_functions_that_call_each_other_are_told():
     def even(n):
         return n == 0 or odd(n - 1)
