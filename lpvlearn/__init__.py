@@ -15,7 +15,7 @@ from .metrics import (
     vaf_scorer,
 )
 from .model_selection import BlockedTimeSeriesSplit, ExperimentSplit
-from .models import InnovationModel, StateSpace, peak_gains
+from .models import InnovationModel, StateSpace, gap, peak_gains
 from .pipeline import LocalLPVPipeline
 from .restructuring import GrayBoxRestructurer
 from .structures import GrayBoxStructure
@@ -40,6 +40,7 @@ __all__ = [
     "compare_models",
     "fit_report",
     "from_trajectories",
+    "gap",
     "make_bft_scorer",
     "make_vaf_scorer",
     "parameter_fit",
