@@ -16,7 +16,7 @@ from .metrics import (
 )
 from .model_selection import BlockedTimeSeriesSplit, ExperimentSplit
 from .models import InnovationModel, StateSpace, gap, peak_gains
-from .pipeline import LocalLPVPipeline
+from .pipeline import LocalLPVPipeline, suggest_operating_point
 from .restructuring import GrayBoxRestructurer
 from .structures import GrayBoxStructure
 from .subspace import SubspaceLTI
@@ -47,6 +47,7 @@ __all__ = [
     "peak_gains",
     "readable_report",
     "resample",
+    "suggest_operating_point",
     "vaf_score",
     "vaf_scorer",
 ]

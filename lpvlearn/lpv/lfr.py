@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 # Directions this much weaker than coefficients, which are scaled to one, are rounding.
 _RANK = 1e-12
 
-_SCALING_PASSES = 8  # over rows and columns: each halves the spread, in decades
+_SCALING_PASSES = 16  # over rows and columns: each divides a size, in decades, by four
 
 # Least singular value of the change to variables as they are, relative to what it
 # adds: half of the digits are lost. (Far from zero, in units of its range, a variable
@@ -113,7 +113,7 @@ def linear_fractional(
     upper, lower = np.concatenate([c.A, c.B], 2), np.concatenate([c.C, c.D], 2)
     S, d = np.concatenate([upper, lower], 1), c.denominator
     S, d = S / d[0], d / d[0]
-    rows, columns = _scales(S - d[:, None, None] * S[0])  # what varies
+    rows, columns = scales(S - d[:, None, None] * S[0])  # what varies
     S = S / rows[:, None] / columns
     n = c.powers.shape[1]
     orders = list(permutations(range(n))) if n <= _MANY_VARIABLES else [tuple(range(n))]
@@ -141,7 +141,7 @@ def linear_fractional(
     )
 
 
-def _scales(terms: Array) -> tuple[Array, Array]:
+def scales(terms: Array) -> tuple[Array, Array]:
     """Sizes of rows and columns that bring what varies near to one."""
     size = np.abs(terms).max(axis=0, initial=0.0)
     scales = [np.ones(length) for length in size.shape]

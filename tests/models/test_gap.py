@@ -17,27 +17,19 @@ def chordal(G1, G2, omega):
 
     def inverse_root(M):
         values, vectors = np.linalg.eigh(M)
-        return (vectors / np.sqrt(values)) @ vectors.conj().T
+        return vectors / np.sqrt(values)[:, None] @ vectors.conj().swapaxes(1, 2)
 
-    largest = 0.0
-    for a, b in zip(
-        G1.frequency_response(omega), G2.frequency_response(omega), strict=True
-    ):
-        left = inverse_root(np.eye(len(b)) + b @ b.conj().T)
-        right = inverse_root(np.eye(a.shape[1]) + a.conj().T @ a)
-        largest = max(largest, np.linalg.norm(left @ (b - a) @ right, 2))
-    return largest
+    a, b = G1.frequency_response(omega), G2.frequency_response(omega)
+    left = inverse_root(np.eye(b.shape[1]) + b @ b.conj().swapaxes(1, 2))
+    right = inverse_root(np.eye(a.shape[2]) + a.conj().swapaxes(1, 2) @ a)
+    return np.linalg.norm(left @ (b - a) @ right, 2, axis=(1, 2)).max()
 
 
 def turns(G1, G2, omega):
     """How often det(I + G2* G1) goes around zero, over the whole axis."""
-    determinant = [
-        np.linalg.det(np.eye(a.shape[1]) + b.conj().T @ a)
-        for a, b in zip(
-            G1.frequency_response(omega), G2.frequency_response(omega), strict=True
-        )
-    ]
-    phase = np.unwrap(np.angle(determinant))
+    a, b = G1.frequency_response(omega), G2.frequency_response(omega)
+    loop = np.eye(a.shape[2]) + b.conj().swapaxes(1, 2) @ a
+    phase = np.unwrap(np.angle(np.linalg.det(loop)))
     return round((phase[-1] - phase[0]) / np.pi)
 
 
