@@ -85,6 +85,13 @@ def test_lags_stable_or_not(a, b):
     )
 
 
+def test_matlabs_example():
+    """1 / (s - 0.001), unstable, and 1 / (s + 0.001): gapmetric says 0.0020."""
+    assert_allclose(
+        gap(StateSpace(1e-3, 1, 1), StateSpace(-1e-3, 1, 1)), 2e-3, rtol=1e-5
+    )
+
+
 @pytest.mark.parametrize("n", [1, 2])
 def test_chains_of_integrators(n):
     A, B, C = np.eye(n, k=1), np.eye(n)[:, [-1]], np.eye(n)[[0]]
