@@ -16,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, solve_continuous_are, solve_discrete_are
 
+from ..exceptions import warn
 from ..systems.hinf_norm import linf_norm
-from ..systems.response import equilibrated
+from ..systems.response import equilibrated, frequency_response
 from ..systems.sampling import d2c_tustin
 from .statespace import StateSpace
 
 Array = NDArray[np.float64]
+
+_LOST = 1e-4  # error of coprime factors, of which the gap has no more digits
 
 _ORTHOGONAL = 1.0 - 1e-12  # a norm of 1 but for rounding: somewhere the graphs are
 
@@ -53,6 +56,11 @@ def gap(G1: StateSpace, G2: StateSpace) -> float:
         If the models do not fit together, delays differ in continuous time, or an
         unstable state is not reached by the inputs or not seen in the outputs.
 
+    Warns
+    -----
+    UserWarning
+        If digits are lost, as of models with tens of unstable poles.
+
     Notes
     -----
     A controller that keeps G1 stable with the margin b keeps every G2 stable whose
@@ -83,11 +91,12 @@ def gap(G1: StateSpace, G2: StateSpace) -> float:
     """
     P1, P2 = _without_delay(G1, G2)
     first, second = _right_factors(P1), _right_factors(P2)
-    dt = 1.0 if P1.discrete else None
-    norm = linf_norm(*_product(_annihilator(P2), first), dt=dt).norm
-    if norm >= _ORTHOGONAL or not _winds_as_it_must(first, second):
+    dt, annihilator = 1.0 if P1.discrete else None, _annihilator(P2)
+    found = linf_norm(*_product(annihilator, first), dt=dt)
+    _tell_lost_digits((first, annihilator), found.frequencies[:1], dt)
+    if found.norm >= _ORTHOGONAL or not _winds_as_it_must(first, second):
         return 1.0
-    return float(norm)
+    return float(found.norm)
 
 
 class _System(NamedTuple):
@@ -171,6 +180,28 @@ def _product(G: _System, H: _System) -> tuple[Array, Array, Array, Array]:
     A = np.block([[G.A, G.B @ H.C], [np.zeros((len(H.A), len(G.A))), H.A]])
     B, C = np.vstack([G.B @ H.D, H.B]), np.hstack([G.C, G.D @ H.C])
     return A, B, C, G.D @ H.D
+
+
+def _tell_lost_digits(
+    factors: tuple[_System, _System], omega: Array, dt: float | None
+) -> None:
+    """Warn of factors whose gains, all of them one, are not.
+
+    Riccati equations have large solutions where a model of many unstable poles is
+    hardly to be stabilised.
+    """
+    lost = 0.0
+    for A, B, C, D, _ in factors:
+        gains = np.linalg.svd(
+            frequency_response(A, B, C, D, omega, dt=dt), compute_uv=False
+        )
+        lost = max(lost, np.abs(gains - 1.0).max(initial=0.0))
+    if lost > _LOST:
+        warn(
+            "One of the models is so hard to stabilise that normalised coprime factors "
+            f"of it are exact to {lost:.1g} only, and the gap no more. Reduce its "
+            "order, or scale inputs and outputs so that its gains are about one."
+        )
 
 
 def _winds_as_it_must(G1: _System, G2: _System) -> bool:

@@ -1,5 +1,7 @@
 """The nu-gap: its definition on a grid, limit cases, invariances."""
 
+import sys
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -170,3 +172,22 @@ def test_models_that_do_not_fit_are_refused():
         gap(stable_model(0), 1.0)
     with pytest.raises(ValueError, match="same inputs, outputs and sampling"):
         gap(stable_model(0), stable_model(0, n_inputs=1))
+
+
+def test_poles_that_are_hardly_to_be_told_apart():
+    """Unstable ones side by side: exact, or refused where rounding hides them."""
+
+    def model(n, feedthrough):
+        A, ones = np.diag(np.linspace(1, 2, n)), np.ones((n, 1))
+        return StateSpace(A, ones, ones.T, [[feedthrough]])
+
+    expected = 1e-3 / np.hypot(1.0, 1e-3)  # at infinity
+    assert_allclose(gap(model(6, 0.0), model(6, 1e-3)), expected, rtol=1e-9)
+    with pytest.raises(ValueError, match="feedback stabilises"):
+        gap(model(12, 0.0), model(12, 1e-3))
+
+
+def test_lost_digits_are_told_of(monkeypatch):
+    monkeypatch.setattr(sys.modules["lpvlearn.models.gap"], "_LOST", -1.0)
+    with pytest.warns(UserWarning, match="so hard to stabilise"):
+        gap(stable_model(0), stable_model(1))
