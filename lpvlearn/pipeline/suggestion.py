@@ -125,10 +125,8 @@ def suggest_operating_point(
 
     left_out = np.full((len(kappa), len(places)), np.nan)
     for i in range(len(kappa)):
-        without = _fitted_without(pipeline, i)
-        if without is None:
-            continue
-        for k, values in enumerate(without.predict(places).reshape(theta.shape)):
+        without = _interpolated_without(pipeline, i, places)
+        for k, values in enumerate([] if without is None else without):
             left_out[i, k] = distance(structure.model(values), frozen[k])
     noise = np.full(len(places), np.nan)
     for k, covariance in enumerate(_covariances(pipeline, places)):
@@ -191,8 +189,10 @@ def _in_units(model: StateSpace, units: tuple[Array, Array]) -> StateSpace:
     return StateSpace(model.A, model.B / u, model.C / y, model.D / y / u)
 
 
-def _fitted_without(pipeline: LocalLPVPipeline, point: int) -> Any:
-    """The interpolation without one operating point; None where it needs all."""
+def _interpolated_without(
+    pipeline: LocalLPVPipeline, point: int, places: Array
+) -> Array | None:
+    """Parameters at places without one operating point; None where all are needed."""
     keep = np.arange(len(pipeline.operating_points_)) != point
     form = clone(pipeline.interpolator_)
     if keep.sum() == 1:
@@ -205,7 +205,8 @@ def _fitted_without(pipeline: LocalLPVPipeline, point: int) -> Any:
     kappa, theta = pipeline.operating_points_[keep], pipeline.parameters_[keep]
     try:
         with collected():  # what it warns of, the pipeline has said of all points
-            return form.fit(kappa, theta.to_numpy(), **known)
+            values = form.fit(kappa, theta.to_numpy(), **known).predict(places)
+            return np.reshape(values, (len(places), theta.shape[1]))
     except ValueError:
         return None
 

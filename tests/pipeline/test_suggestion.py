@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.exceptions import NotFittedError
+from sklearn.neighbors import KNeighborsRegressor
 
 from lpvlearn import (
     AutoLPV,
@@ -93,6 +94,9 @@ def test_where_every_point_is_needed_the_gap_ranks(fitted):
     """A cubic through four points: none can be left out, and noise is not known."""
     table = suggest_operating_point(fitted(PolynomialLPV(3)))
     assert table["leave_one_out"].isna().all()
+    nearest = suggest_operating_point(fitted(KNeighborsRegressor(4)))
+    assert nearest["uncertainty"].isna().all()
+    assert nearest["neighbour_gap"].is_monotonic_decreasing
     two = suggest_operating_point(fitted(AutoLPV(), kappas=(0.0, 1.0)))
     assert len(two) == 1 and two["leave_one_out"][0] > 0.01
 
