@@ -15,8 +15,8 @@ from .metrics import (
     vaf_scorer,
 )
 from .model_selection import BlockedTimeSeriesSplit, ExperimentSplit
-from .models import InnovationModel, StateSpace, peak_gains
-from .pipeline import LocalLPVPipeline
+from .models import InnovationModel, StateSpace, gap, peak_gains
+from .pipeline import LocalLPVPipeline, suggest_operating_point
 from .restructuring import GrayBoxRestructurer
 from .structures import GrayBoxStructure
 from .subspace import SubspaceLTI
@@ -40,12 +40,14 @@ __all__ = [
     "compare_models",
     "fit_report",
     "from_trajectories",
+    "gap",
     "make_bft_scorer",
     "make_vaf_scorer",
     "parameter_fit",
     "peak_gains",
     "readable_report",
     "resample",
+    "suggest_operating_point",
     "vaf_score",
     "vaf_scorer",
 ]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,9 @@ from ..validation import (
     real_array,
     state_vector,
 )
+from .coefficients import MatrixCoefficients, matrix_coefficients
+from .export import Grid, control_models, write_mat
+from .lfr import LinearFractionalModel, linear_fractional
 
 Array = NDArray[np.float64]
 
@@ -75,6 +80,8 @@ class LPVStateSpace:
     offsets : fitted regressor, default=None
         From scheduling values to ``[u0, y0, x0]``, (n_points, n_inputs + n_outputs +
         order), x0 in the state of the structure. None: all are zero.
+    input_names, output_names : sequence, default=None
+        Names of the signals, for other programs; None is u1, u2, ... and y1, y2, ...
 
     Attributes
     ----------
@@ -133,6 +140,8 @@ class LPVStateSpace:
     bases: tuple[_Basis, ...] = ()
     input_delay: Any = 0
     offsets: Any = None
+    input_names: Sequence[Hashable] | None = None
+    output_names: Sequence[Hashable] | None = None
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -169,6 +178,12 @@ class LPVStateSpace:
             )
         for name in ("order", "n_inputs", "n_outputs"):
             object.__setattr__(self, name, getattr(self.structure, name))
+        for signal in ("input", "output"):
+            names, n = getattr(self, f"{signal}_names"), getattr(self, f"n_{signal}s")
+            if names is not None and len(names) != n:
+                raise ValueError(
+                    f"`{signal}_names` must name the {n} {signal}s. Got {list(names)}."
+                )
         delay = input_delays(self.input_delay, self.n_inputs, samples=False)
         object.__setattr__(self, "input_delay", delay)
 
@@ -483,6 +498,216 @@ class LPVStateSpace:
                 "round the delay: dataclasses.replace(model, input_delay=...)."
             )
         return whole
+
+    # -- what other programs take --------------------------------------------------
+
+    def grid(self, points: ArrayLike | Mapping[Any, ArrayLike]) -> list[StateSpace]:
+        """The frozen models at several scheduling values.
+
+        Parameters
+        ----------
+        points : array-like of shape (n_points, n_scheduling) or (n_points,), mapping
+            Or the values by the names of the variables, as `simulate` takes them.
+
+        Returns
+        -------
+        list of StateSpace
+            In continuous time; of deviations from the point of work, with `offsets`.
+
+        Raises
+        ------
+        ValueError
+            If `points` has another shape or is not finite.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Outside of `identified_range`.
+        """
+        return list(self._grid(points).models)
+
+    def to_control(self, points: ArrayLike | Mapping[Any, ArrayLike]) -> list[Any]:
+        """The frozen models as ``control.StateSpace`` (needs python-control).
+
+        Parameters
+        ----------
+        points : array-like of shape (n_points, n_scheduling) or (n_points,), mapping
+            As in :meth:`grid`.
+
+        Returns
+        -------
+        list of control.StateSpace
+            With the names of the signals, and the scheduling values as `name`: a
+            decimal point is a p there, ``kappa=0p5``. Without the offsets.
+
+        Raises
+        ------
+        ValueError
+            If the model has a delay, which python-control does not know, or as `grid`.
+        """
+        return control_models(self._grid(points))
+
+    def to_mat(
+        self,
+        path: str | os.PathLike[str],
+        points: ArrayLike | Mapping[Any, ArrayLike],
+    ) -> None:
+        """Write the frozen models for MATLAB's ``ssInterpolant``.
+
+        In MATLAB (R2023a, Control System Toolbox)::
+
+            m = load("model.mat"); g = ss(m.A, m.B, m.C, m.D, InputDelay=m.InputDelay);
+            g.SamplingGrid = m.SamplingGrid; lpv = ssInterpolant(g, m.offsets);
+
+        and, for the names, ``lpv.InputName = m.InputName``, ``lpv.OutputName =
+        m.OutputName``.
+
+        Parameters
+        ----------
+        path : str or path
+            A file there is replaced, when the new one is complete.
+        points : array-like of shape (n_points, n_scheduling) or (n_points,), mapping
+            As in :meth:`grid`. MATLAB interpolates the matrices between them, linearly
+            by default: take them close enough. All combinations of some values of each
+            variable become a rectangular grid, other points a column of scattered ones.
+
+        Raises
+        ------
+        ValueError
+            As `grid`.
+
+        Notes
+        -----
+        The file holds the arrays ``A``, ``B``, ``C``, ``D`` with the axes of the grid
+        behind those of the matrices, ``SamplingGrid`` (a structure with a field for
+        each scheduling variable), ``offsets`` (an array of structures ``dx``, ``x``,
+        ``u``, ``y``, over the grid), ``Ts`` (0: continuous time), ``InputDelay`` (s),
+        ``InputName`` and ``OutputName``. Names of scheduling variables are changed to
+        such as MATLAB takes.
+        """
+        write_mat(path, self._grid(points))
+
+    def _grid(self, points: Any) -> Grid:
+        places = self._scheduling(points)
+        if not len(places):
+            raise ValueError("`points` must have at least one row. Got none.")
+        self._tell_extrapolation(places)
+        model = self.silenced()
+        return Grid(
+            [model._at(place) for place in places],
+            places,
+            {
+                "u": model.input_offset(places),
+                "y": model.output_offset(places),
+                "x": model.state_offset(places),
+            },
+            self._names("scheduling", "kappa"),
+            self._names("input", "u"),
+            self._names("output", "y"),
+        )
+
+    def _names(self, which: str, letter: str) -> tuple[Hashable, ...]:
+        """Names of the signals; numbered ones where they have none, or bare numbers."""
+        names = getattr(self, f"{which}_names")
+        if names is None or any(isinstance(name, Integral) for name in names):
+            n = getattr(self, "n_scheduling" if letter == "kappa" else f"n_{which}s")
+            one = which == "scheduling" and n == 1
+            return (letter,) if one else tuple(f"{letter}{k + 1}" for k in range(n))
+        return tuple(names)
+
+    def coefficients(self, *, normalized: bool = False) -> MatrixCoefficients:
+        """The matrices as polynomials, or fractions, of the scheduling variables.
+
+        Parameters
+        ----------
+        normalized : bool, default=False
+            Powers of the variables mapped linearly from the range of the operating
+            points to [-1, 1], whose coefficients are well conditioned. Those of the
+            variables as they are lose digits where a range is narrow beside its
+            distance from zero.
+
+        Returns
+        -------
+        MatrixCoefficients
+            Arrays ``A``, ``B``, ``C``, ``D`` of shape (n_terms, rows, columns), the
+            coefficients of a common ``denominator``, ``table()`` and ``at(kappa)``.
+
+        Raises
+        ------
+        ValueError
+            If the structure is not affine in its parameters, the interpolation has no
+            coefficients (a spline, another regressor), or the state basis follows the
+            scheduling variables.
+
+        Examples
+        --------
+        >>> from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV
+        >>> structure = GrayBoxStructure.from_template(
+        ...     A=[[0, 1], ["-k", -0.5]], B=[[0], [1]], C=[[1, 0]])
+        >>> stiffness = PolynomialLPV(degree=1).fit([[0.0], [1.0]], [[4.0], [9.0]])
+        >>> lpv = LPVStateSpace(structure, stiffness, [[0.0], [1.0]])
+        >>> lpv.coefficients().A[1].round(9) + 0.0
+        array([[ 0.,  0.],
+               [-5.,  0.]])
+        >>> lpv.coefficients().table().round(9) + 0.0
+                             1  kappa
+        matrix row column
+        A      0   1       1.0    0.0
+               1   0      -4.0   -5.0
+                   1      -0.5    0.0
+        B      1   0       1.0    0.0
+        C      0   0       1.0    0.0
+        """
+        T = None
+        if not any(map(callable, self.bases)):
+            T = self._basis_at(self.scheduling_range[0])
+        return matrix_coefficients(
+            self.structure,
+            self.interpolator,
+            T,
+            self._names("scheduling", "kappa"),
+            self.input_delay,
+            normalized=normalized,
+        )
+
+    def lfr(self, *, normalized: bool = False) -> LinearFractionalModel:
+        """The model as a linear-fractional transformation, as robust control takes it.
+
+        Parameters
+        ----------
+        normalized : bool, default=False
+            The scheduling variables on the diagonal of Delta as they are, or mapped
+            linearly from the range of the operating points to [-1, 1]: the norm of
+            Delta is then 1 at most.
+
+        Returns
+        -------
+        LinearFractionalModel
+            Exact at every scheduling value, to rounding. Each variable is repeated as
+            little as reduction one variable after another finds: of a single one, the
+            least possible.
+
+        Raises
+        ------
+        ValueError
+            As `coefficients`; or if variables as they are would lose the digits.
+
+        Examples
+        --------
+        >>> from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV
+        >>> structure = GrayBoxStructure.from_template(
+        ...     A=[[0, 1], ["-k", -0.5]], B=[[0], [1]], C=[[1, 0]])
+        >>> stiffness = PolynomialLPV(degree=1).fit([[0.0], [1.0]], [[4.0], [9.0]])
+        >>> lfr = LPVStateSpace(structure, stiffness, [[0.0], [1.0]]).lfr()
+        >>> lfr
+        LinearFractionalModel(order=2, n_inputs=1, n_outputs=1, repetitions={kappa: 1})
+        >>> lfr.at(0.5).A.round(9)
+        array([[ 0. ,  1. ],
+               [-6.5, -0.5]])
+        """
+        return linear_fractional(
+            self.coefficients(normalized=True), normalized=normalized
+        )
 
     def silenced(self) -> LPVStateSpace:
         """The model that extrapolates without a warning."""

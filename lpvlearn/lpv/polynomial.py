@@ -167,7 +167,7 @@ class PolynomialLPV(Interpolator):
 
     def _publish(self) -> None:
         """Set `coef_`; predictions use the well-conditioned form."""
-        conversion = _conversion(self.basis, self.powers_, self.scheduling_range_)
+        conversion = conversion_to(self.basis, self.powers_, self.scheduling_range_)
         coef = conversion @ self._chebyshev_coef
         self.coef_ = coef[:, 0] if self._single_parameter else coef.T
 
@@ -236,7 +236,9 @@ def chebyshev_terms(
     return terms
 
 
-def _conversion(basis: str, powers: NDArray[np.intp], scheduling_range: Array) -> Array:
+def conversion_to(
+    basis: str, powers: NDArray[np.intp], scheduling_range: Array
+) -> Array:
     """The matrix from Chebyshev coefficients to those of `basis`."""
     degree = int(powers.max(initial=0))
     matrix = np.ones((len(powers), len(powers)))

@@ -630,8 +630,13 @@ class StateSpace:
             )
         return StateSpace(A, B, C, self.D, input_delay=dt * self.input_delay)
 
-    def to_control(self) -> Any:
+    def to_control(self, **names: Any) -> Any:
         """The model as a ``control.StateSpace`` (needs python-control).
+
+        Parameters
+        ----------
+        **names : str or list of str
+            `name`, `inputs`, `outputs` and `states` of ``control.ss``.
 
         Raises
         ------
@@ -648,7 +653,7 @@ class StateSpace:
         import control
 
         dt = 0 if self.is_continuous else self.sampling_time
-        return control.ss(self.A, self.B, self.C, self.D, dt)
+        return control.ss(self.A, self.B, self.C, self.D, dt, **names)
 
     @classmethod
     def from_control(cls, model: Any) -> StateSpace:

@@ -366,6 +366,8 @@ list, default=None
                 scheduling_names=self.scheduling_names_ or None,
                 identified_range=self.scheduling_range_,
                 input_delay=common_delay(found.local, kappa, self.sampling_time_),
+                input_names=experiments[0].input_names,
+                output_names=self.output_names_,
             )
             late = self.lpv_.input_delay / self.sampling_time_
             self.input_delay_ = np.round(late).astype(int)

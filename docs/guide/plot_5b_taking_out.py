@@ -1,0 +1,112 @@
+r"""
+.. _guide_taking_out:
+
+Taking the model out
+====================
+
+An identified model is of use where a controller is designed. What other programs take
+of an :class:`~lpvlearn.LPVStateSpace`: coefficients, a linear-fractional form, or
+frozen models over a grid. And before that: which experiment would make it better?
+"""
+
+# %%
+import numpy as np
+
+from lpvlearn import (
+    GrayBoxRestructurer,
+    LocalLPVPipeline,
+    SubspaceLTI,
+    gap,
+    suggest_operating_point,
+)
+from lpvlearn.datasets import FlexibleArm, load_flexible_arm
+
+data = load_flexible_arm()
+pipeline = LocalLPVPipeline(
+    SubspaceLTI(horizon=60, feedthrough=False),
+    GrayBoxRestructurer(FlexibleArm().structure("momentum")),
+    scheduling="kappa",
+    experiment="experiment",
+    time="time",
+).fit(data.X, data.y)
+lpv = pipeline.lpv_
+print(pipeline.interpolator_.form_)
+
+# %%
+# Where to measure next
+# ---------------------
+# :func:`~lpvlearn.suggest_operating_point` ranks the middles between neighbouring
+# operating points. "neighbour_gap" is how far the dynamics change from one neighbour to
+# the other; "leave_one_out" how much the interpolated model there hangs on single
+# points; "noise" what the covariances of the parameters make of it:
+
+suggest_operating_point(pipeline).round(5)
+
+# %%
+# A rational form through seven points leaves little more than the noise. Without a
+# structure the same experiments leave ten times as much and more, and another point
+# helps most near the upper end, where neighbours differ most.
+#
+# All of these are nu-gaps: distances between 0 and 1 as a controller feels them. A
+# controller that stabilises one model with a margin above the gap stabilises the other.
+# :func:`~lpvlearn.gap` is the distance of any two models, unstable ones too. It depends
+# on the units of the signals; the table takes such in which gains are about one.
+
+round(gap(lpv.at(-0.8), lpv.at(0.8)), 3)
+
+# %%
+# Coefficients
+# ------------
+# Where the matrices are affine in the parameters (a template without E) and the
+# interpolation has a form, the matrices have coefficients:
+#
+# .. math:: A(\kappa) = \frac{A_0 + A_1 \kappa + A_2 \kappa^2}
+#           {d_0 + d_1 \kappa + d_2 \kappa^2}.
+
+found = lpv.coefficients()
+print(found.A.shape, found.denominator.round(3))
+found.table().round(2)
+
+# %%
+# Entries that are constants stand in a column of their own. With
+# ``normalized=True`` the powers are those of the variable mapped to [-1, 1], which is
+# better conditioned where a range is far from zero (a speed of 900 to 1000 rpm).
+#
+# Linear-fractional form
+# ----------------------
+# Robust control takes the model as a constant matrix M with the scheduling variables
+# fed back around it, :math:`w = \Delta(\kappa) z`:
+
+lfr = lpv.lfr(normalized=True)
+print(lfr, lfr.M.shape)
+print(np.abs(lfr.at(0.3).A - lpv.at(0.3).A).max() / np.abs(lpv.at(0.3).A).max())
+
+# %%
+# The number in ``repetitions`` says how often kappa stands on the diagonal of Delta. In
+# MATLAB's Robust Control Toolbox, with M from ``scipy.io.savemat``,
+# ``lft(ureal("kappa", 0) * eye(n), M)`` is the uncertain matrix ``[A, B; C, D]``.
+#
+# Frozen models
+# -------------
+# ``grid`` gives a list of :class:`~lpvlearn.StateSpace`, ``to_control`` of
+# ``control.StateSpace`` with the names of the signals, and ``to_mat`` a file for
+# MATLAB's ``ssInterpolant``:
+
+models = lpv.grid(np.linspace(-0.8, 0.8, 17))
+print(len(models), models[0])
+
+# %%
+# ::
+#
+#     lpv.to_mat("arm.mat", np.linspace(-0.8, 0.8, 17))
+#
+# and in MATLAB::
+#
+#     m = load("arm.mat"); g = ss(m.A, m.B, m.C, m.D, InputDelay=m.InputDelay);
+#     g.SamplingGrid = m.SamplingGrid; lpv = ssInterpolant(g, m.offsets);
+#
+# MATLAB interpolates the matrices linearly between the points, so take these close.
+# With several scheduling variables, all combinations of some values become a
+# rectangular grid. Offsets go along in ``m.offsets``. Coefficients, the
+# linear-fractional form and ``to_control`` leave them out, to be taken from
+# ``lpv.input_offset``, ``output_offset`` and ``state_offset``.

@@ -1,0 +1,115 @@
+"""Frozen models over a grid, in the form that other programs take."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import savemat
+
+from ..models.statespace import StateSpace
+
+Array = NDArray[np.float64]
+
+_LONGEST = 63  # characters of a name in MATLAB
+
+
+class Grid(NamedTuple):
+    """Frozen models in continuous time, and what is known of their places."""
+
+    models: Sequence[StateSpace]
+    points: Array  # (n_points, n_scheduling)
+    offsets: dict[str, Array]  # "u", "y", "x": (n_points, size)
+    scheduling: Sequence[Hashable]
+    inputs: Sequence[Hashable]
+    outputs: Sequence[Hashable]
+
+
+def control_models(grid: Grid) -> list[Any]:
+    """The models as `control.StateSpace`, named after their places.
+
+    A point is no part of a name there: 0.5 becomes 0p5, a column "u.1" is "u_1".
+    """
+    inputs, outputs = (
+        [str(name).replace(".", "_") for name in names]
+        for names in (grid.inputs, grid.outputs)
+    )
+    found = []
+    for model, place in zip(grid.models, grid.points, strict=True):
+        values = zip(grid.scheduling, place, strict=True)
+        name = ", ".join(f"{variable}={value:g}" for variable, value in values)
+        name = name.replace(".", "p")
+        found.append(model.to_control(name=name, inputs=inputs, outputs=outputs))
+    return found
+
+
+def write_mat(path: str | os.PathLike[str], grid: Grid) -> None:
+    """Write the variables of `LPVStateSpace.to_mat`; a file there stays whole."""
+    order, shape = _rectangular(grid.points)
+    models = [grid.models[k] for k in order]
+
+    def over_grid(values: Sequence[Array]) -> Array:
+        """Arrays of one shape, with the axes of the grid behind their own."""
+        stacked = np.stack([values[k] for k in order], axis=-1)
+        return stacked.reshape(stacked.shape[:-1] + shape)
+
+    n_states = len(models[0].A)
+    offsets = np.empty(shape, dtype=[(name, object) for name in ("dx", "x", "u", "y")])
+    for place, k in zip(np.ndindex(shape), order, strict=True):
+        own = {name: values[k][:, None] for name, values in grid.offsets.items()}
+        offsets[place] = (np.zeros((n_states, 1)), own["x"], own["u"], own["y"])
+    content: dict[str, Any] = {
+        name: over_grid([getattr(model, name) for model in grid.models])
+        for name in "ABCD"
+    }
+    content |= {
+        "Ts": 0.0,
+        "InputDelay": models[0].input_delay[:, None],
+        "SamplingGrid": {
+            name: over_grid(list(column))
+            for name, column in zip(
+                _identifiers(grid.scheduling), grid.points.T, strict=True
+            )
+        },
+        "offsets": offsets,
+        "InputName": np.array([[str(name)] for name in grid.inputs], dtype=object),
+        "OutputName": np.array([[str(name)] for name in grid.outputs], dtype=object),
+    }
+    target = Path(path)
+    part = target.with_name(f".{target.name}.{os.getpid()}")
+    try:
+        with part.open("wb") as file:
+            savemat(file, content, long_field_names=True)
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _rectangular(points: Array) -> tuple[NDArray[np.intp], tuple[int, ...]]:
+    """Order and shape of the points: a full grid's, else (n_points, 1)."""
+    order = np.lexsort(points.T[::-1])
+    axes = [np.unique(column) for column in points.T]
+    shape = tuple(len(axis) for axis in axes)
+    full = len(shape) > 1 and int(np.prod(shape)) == len(points)
+    if full:
+        cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(points.shape)
+        if np.array_equal(points[order], cells):
+            return order, shape
+    return np.arange(len(points)), (len(points), 1)
+
+
+def _identifiers(names: Sequence[Hashable]) -> list[str]:
+    """Names that MATLAB takes for fields, all of them different."""
+    found: list[str] = []
+    for name in names:
+        plain = re.sub(r"\W", "_", str(name), flags=re.ASCII)
+        plain = (plain if plain[:1].isalpha() else f"p{plain}")[:_LONGEST]
+        while plain in found:
+            plain = f"{plain[: _LONGEST - 1]}_"
+        found.append(plain)
+    return found

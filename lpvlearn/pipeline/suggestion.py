@@ -1,0 +1,237 @@
+"""Where to measure next: the operating point that would tell most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial import Delaunay, QhullError
+from scipy.spatial.distance import cdist
+from sklearn.base import clone
+from sklearn.utils.validation import check_is_fitted, has_fit_parameter
+
+from ..exceptions import collected
+from ..lpv.lfr import scales
+from ..lpv.polynomial import PolynomialLPV
+from ..models.gap import gap
+from ..models.statespace import DEVIATION, StateSpace
+from ..validation import one_of
+from .estimator import LocalLPVPipeline
+
+Array = NDArray[np.float64]
+
+_CRITERIA = ("uncertainty", "neighbour_gap")
+
+_MANY_VARIABLES = 4  # beyond, a triangulation has too many edges: the nearest points do
+
+_NO_DIRECTION = 1e-12  # of a covariance, relative to its largest: rounding
+
+
+def suggest_operating_point(
+    pipeline: LocalLPVPipeline, *, criterion: str = "uncertainty"
+) -> pd.DataFrame:
+    """Candidates for the next local experiment, the most useful first.
+
+    Candidates are the middles between neighbouring operating points: of one scheduling
+    variable, between one point and the next; of several, of the edges of a Delaunay
+    triangulation. Distances between frozen models are nu-gaps (`gap`), with inputs and
+    outputs in units in which the gains of the local models are about 1: they are
+    between 0 and 1, and what a controller feels.
+
+    Parameters
+    ----------
+    pipeline : LocalLPVPipeline
+        Fitted, with two operating points at least.
+    criterion : {"uncertainty", "neighbour_gap"}, default="uncertainty"
+        The column to rank by; the other one where that is not known.
+
+    Returns
+    -------
+    DataFrame
+        A row per candidate, with the columns
+
+        - the scheduling variables, by their names;
+        - "from", "to": numbers of the neighbours, rows of `operating_points_`;
+        - "neighbour_gap": from the model of one neighbour to that of the other. Large
+          where the dynamics change much from point to point;
+        - "leave_one_out": how far the interpolated model moves when operating points
+          are left out in turn (the jackknife's standard deviation). Large where the
+          interpolation hangs on few points, or its form is not true;
+        - "noise": standard deviation of the interpolated model by the covariances of
+          the parameters, to first order; NaN where these are not known;
+        - "uncertainty": the larger of the two.
+
+        A difference in delays does not count.
+
+    Raises
+    ------
+    ValueError
+        If the pipeline is not fitted, or has one operating point only.
+
+    References
+    ----------
+    J. P. C. Kleijnen, W. C. M. van Beers, Application-driven sequential designs for
+    simulation experiments. Journal of the Operational Research Society 55, 2004: the
+    jackknife at candidates between points chooses the next one.
+
+    Examples
+    --------
+    A spring measured closely at small values of the scheduling variable:
+
+    >>> import numpy as np
+    >>> from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, LocalLPVPipeline
+    >>> from lpvlearn import from_trajectories, suggest_operating_point
+    >>> spring = GrayBoxStructure.from_template(
+    ...     A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0]])
+    >>> u = np.sign(np.random.default_rng(0).standard_normal(400))
+    >>> X, y = from_trajectories(
+    ...     [(u, kappa, spring.model({"k": 4 * np.exp(kappa), "c": 1}).simulate(
+    ...         u, sampling_time=0.1)) for kappa in (0, 0.5, 1, 2)], sampling_time=0.1)
+    >>> pipeline = LocalLPVPipeline(
+    ...     restructurer=GrayBoxRestructurer(spring),
+    ...     scheduling="kappa", experiment="experiment", time="time").fit(X, y)
+    >>> table = suggest_operating_point(pipeline)
+    >>> float(table["kappa"].iloc[0])
+    1.5
+    """
+    one_of("criterion", criterion, _CRITERIA)
+    if not isinstance(pipeline, LocalLPVPipeline):
+        raise ValueError(
+            "`pipeline` must be a fitted LocalLPVPipeline. Got "
+            f"{type(pipeline).__name__}."
+        )
+    check_is_fitted(pipeline, "lpv_")
+    kappa = pipeline.operating_points_
+    if len(kappa) < 2 or not np.ptp(kappa, axis=0).any():
+        raise ValueError(
+            "`suggest_operating_point` looks between operating points and needs two at "
+            f"least. Got {len(kappa)}. Measure at the ends of the range first."
+        )
+    pairs = _neighbours(kappa)
+    places = kappa[pairs].mean(axis=1)
+    local = [model.with_input_delay(0) for model in pipeline.structured_models_]
+    units = _units(local)
+
+    def distance(one: StateSpace, other: StateSpace) -> float:
+        return gap(_in_units(one, units), _in_units(other, units))
+
+    structure, theta = pipeline.lpv_.structure, pipeline.lpv_.parameters(places)
+    frozen = [structure.model(values) for values in theta]
+
+    left_out = np.full((len(kappa), len(places)), np.nan)
+    for i in range(len(kappa)):
+        without = _interpolated_without(pipeline, i, places)
+        for k, values in enumerate([] if without is None else without):
+            left_out[i, k] = distance(structure.model(values), frozen[k])
+    noise = np.full(len(places), np.nan)
+    for k, covariance in enumerate(_covariances(pipeline, places)):
+        squares = 0.0
+        for direction in _factor(covariance).T:
+            moved = structure.model(theta[k] + DEVIATION * direction)
+            squares += (distance(moved, frozen[k]) / DEVIATION) ** 2
+        noise[k] = np.sqrt(squares)
+
+    n_folds = np.isfinite(left_out).any(axis=1).sum()
+    share = (n_folds - 1) / n_folds if n_folds else np.nan
+    jackknife = np.sqrt(share * np.nansum(left_out**2, axis=0))
+    columns: dict[Any, Any] = dict(
+        zip(pipeline.scheduling_names_, places.T, strict=True)
+    )
+    columns |= {
+        "from": pairs[:, 0],
+        "to": pairs[:, 1],
+        "neighbour_gap": [distance(local[i], local[j]) for i, j in pairs],
+        "leave_one_out": jackknife,
+        "noise": noise,
+        "uncertainty": np.fmax(jackknife, noise),
+    }
+    other = next(name for name in _CRITERIA if name != criterion)
+    table = pd.DataFrame(columns).sort_values([criterion, other], ascending=False)
+    return table.reset_index(drop=True)
+
+
+def _neighbours(kappa: Array) -> NDArray[np.intp]:
+    """Pairs of neighbouring points, (n_pairs, 2), every variable in its range."""
+    span = np.ptp(kappa, axis=0)
+    varies = span > 0
+    scaled = kappa[:, varies] / span[varies]
+    n_points, n = scaled.shape
+    if 1 < n <= _MANY_VARIABLES and n_points > n:
+        try:
+            corners = Delaunay(scaled).simplices
+        except QhullError:  # all of them on a line or plane
+            pass
+        else:
+            edges = {tuple(sorted(e)) for c in corners for e in combinations(c, 2)}
+            return np.array(sorted(edges))
+    # of points at one place (a distance of zero) the graph has no edge: none between
+    first = np.unique(scaled, axis=0, return_index=True)[1]
+    tree = minimum_spanning_tree(cdist(scaled[first], scaled[first])).tocoo()
+    return np.sort(np.column_stack([first[tree.row], first[tree.col]]), axis=1)
+
+
+def _units(models: Sequence[StateSpace]) -> tuple[Array, Array]:
+    """Units of outputs and inputs in which gains near the poles are about one."""
+    omega = np.unique(np.abs(np.concatenate([model.poles() for model in models])))
+    omega = omega[omega > 0] if (omega > 0).any() else np.ones(1)
+    gains = np.abs([model.frequency_response(omega) for model in models])
+    largest = np.where(np.isfinite(gains), gains, 0.0).max(axis=(0, 1))
+    return scales(largest[None])
+
+
+def _in_units(model: StateSpace, units: tuple[Array, Array]) -> StateSpace:
+    y, u = units[0][:, None], units[1]
+    return StateSpace(model.A, model.B / u, model.C / y, model.D / y / u)
+
+
+def _interpolated_without(
+    pipeline: LocalLPVPipeline, point: int, places: Array
+) -> Array | None:
+    """Parameters at places without one operating point; None where all are needed."""
+    keep = np.arange(len(pipeline.operating_points_)) != point
+    form = clone(pipeline.interpolator_)
+    if keep.sum() == 1:
+        form = PolynomialLPV(degree=0)
+    elif getattr(form, "extrapolation", "ignore") in ("warn", "error"):
+        form.set_params(extrapolation="ignore")
+    known = {}
+    if has_fit_parameter(form, "covariance"):
+        known["covariance"] = pipeline.parameters_covariance_[keep]
+    kappa, theta = pipeline.operating_points_[keep], pipeline.parameters_[keep]
+    try:
+        with collected():  # what it warns of, the pipeline has said of all points
+            values = form.fit(kappa, theta.to_numpy(), **known).predict(places)
+            return np.reshape(values, (len(places), theta.shape[1]))
+    except ValueError:
+        return None
+
+
+def _covariances(pipeline: LocalLPVPipeline, places: Array) -> Sequence[Array]:
+    """Covariances of the interpolated parameters at places; none where not known."""
+    form = pipeline.interpolator_
+    if not hasattr(form, "information"):
+        return []
+    found = form.information(
+        pipeline.operating_points_, pipeline.parameters_covariance_
+    )
+    if found is None:
+        return []
+    size = np.sqrt(np.diagonal(found))
+    size = np.where(size > 0, size, 1.0)
+    root = _factor(np.linalg.pinv(found / size[:, None] / size, hermitian=True))
+    slopes = form.sensitivities(places) @ (root / size[:, None])
+    return [S @ S.T for S in slopes]
+
+
+def _factor(covariance: Array) -> Array:
+    """F of as few columns as it has directions, ``F F^T`` the covariance."""
+    size = np.sqrt(np.diagonal(covariance))
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(covariance / size[:, None] / size)
+    kept = values > _NO_DIRECTION * values.max(initial=0.0)
+    return size[:, None] * vectors[:, kept] * np.sqrt(values[kept])
