@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.spatial import Delaunay, QhullError
+from scipy.spatial.distance import cdist
 
 from ..exceptions import warn
 from .experiments import Experiment, as_numbers
@@ -27,6 +30,7 @@ _MAX_SPREAD = 0.25
 
 _ROUNDING = 1e-6  # of scheduling values, relative to the range they are compared with
 _CLOSE = 0.01  # share of the range within which means are one point, if not more
+_MANY_VARIABLES = 4  # beyond, a triangulation has too many edges: the nearest points do
 _CHAIN = 3  # a chain of neighbours longer than this many tolerances is no single point
 
 
@@ -226,3 +230,31 @@ def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) ->
                 f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
                 "drop it from X, or list the inputs in `inputs`."
             )
+
+
+def neighbours(kappa: Array) -> NDArray[np.intp]:
+    """Pairs of neighbouring points, (n_pairs, 2), every variable in its range.
+
+    Of one variable one point and the next, of several the edges of a Delaunay
+    triangulation, or of the shortest tree where there is none.
+
+    >>> neighbours(np.array([[0.0], [5.0], [1.0]]))
+    array([[0, 2],
+           [1, 2]])
+    """
+    span = np.ptp(kappa, axis=0)
+    varies = span > 0
+    scaled = kappa[:, varies] / span[varies]
+    n_points, n = scaled.shape
+    if 1 < n <= _MANY_VARIABLES and n_points > n:
+        try:
+            corners = Delaunay(scaled).simplices
+        except QhullError:  # all of them on a line or plane
+            pass
+        else:
+            edges = {tuple(sorted(e)) for c in corners for e in combinations(c, 2)}
+            return np.array(sorted(edges))
+    # of points at one place (a distance of zero) the graph has no edge: none between
+    first = np.unique(scaled, axis=0, return_index=True)[1]
+    tree = minimum_spanning_tree(cdist(scaled[first], scaled[first])).tocoo()
+    return np.sort(np.column_stack([first[tree.row], first[tree.col]]), axis=1)

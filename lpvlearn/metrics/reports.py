@@ -173,6 +173,7 @@ _READABLE = {
     "degrees_of_freedom": ("degrees of freedom", "{:.0f}"),
     "p_value": ("p-value", "{:.2g}"),
     "interpolation_error": ("interpolation error", "{:.2e}"),
+    "growth_rate": ("growth [1/s]", "{:.3g}"),
     "interpolation_FIT": ("interpolation FIT", "{:.2f}"),
     "interpolation_RMSE": ("interpolation RMSE", "{:.2g}"),
     "lowest": ("lowest", "{:.4g}"),

@@ -44,6 +44,7 @@ from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
 from .points import PointRunner, common_delay, identify_points, restructure_points
 from .reports import Tables, summarise, tables
+from .stability import growth_rates
 
 Array = NDArray[np.float64]
 
@@ -142,7 +143,9 @@ list, default=None
     memory : str, path or joblib.Memory, default=None
         Where local and gray-box models are kept, as in scikit-learn's ``Pipeline``: a
         search over the interpolator then identifies and restructures nothing twice,
-        nor do splits that share operating points. Results from it warn no more.
+        nor do splits that share operating points. Results are known by the values of
+        the arguments, and by the code of the library and of the user's functions and
+        classes. Entries are pickles, which may run code: use a folder that you trust.
     n_jobs : int, default=None
         Operating points worked on at the same time.
     verbose : int, default=0
@@ -186,7 +189,9 @@ list, default=None
         standard deviations of the black box; the delays of the inputs in samples
         ("delay_"), where there are any; the distance from the gray-box
         model to the interpolated one (H-infinity norm, relative), and the FIT (percent,
-        Eq. (36)) of its parameters; the parameters ("param_"), and their standard
+        Eq. (36)) of its parameters; the largest real part (1/s) of the poles of `lpv_`
+        from there half-way to the neighbours ("growth_rate", above zero unstable); the
+        parameters ("param_"), and their standard
         deviations ("std_") where known.
     parameter_report_ : DataFrame
         One row per parameter: lowest and highest value over the points, median
@@ -308,7 +313,8 @@ list, default=None
         UserWarning
             If the delays of the inputs (``local=SubspaceLTI(input_delay=...)``) differ
             between operating points: `lpv_` has their median, the models of the points
-            their own. The warnings of the steps name the point.
+            their own. If `lpv_` is unstable at values between the points. The warnings
+            of the steps name the point.
         """
         self._check_options()
         steps = {"local": self.local, "restructurer": self.restructurer}
@@ -372,7 +378,8 @@ list, default=None
             late = self.lpv_.input_delay / self.sampling_time_
             self.input_delay_ = np.round(late).astype(int)
             self.parameters_covariance_ = found.covariance
-            report = tables(found, self.lpv_, self.sampling_time_)
+            growth = growth_rates(self.lpv_, kappa)
+            report = tables(found, self.lpv_, self.sampling_time_, growth)
             self.parameters_, self.parameters_std_ = (
                 report.parameters,
                 report.deviations,

@@ -30,8 +30,13 @@ class Tables(NamedTuple):
     by_parameter: pd.DataFrame  # `parameter_report_`: a row per parameter
 
 
-def tables(found: StructuredModels, lpv: LPVStateSpace, sampling_time: float) -> Tables:
-    """Tabulate the results of steps 3 to 5 at the operating points."""
+def tables(
+    found: StructuredModels, lpv: LPVStateSpace, sampling_time: float, growth: Array
+) -> Tables:
+    """Tabulate the results of steps 3 to 5 at the operating points.
+
+    `growth` (n_points,) as of `growth_rates`.
+    """
     points, theta = found.points, found.theta
     spread = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     labels = [row[0] if len(row) == 1 else tuple(row) for row in points.kappa.tolist()]
@@ -65,6 +70,7 @@ def tables(found: StructuredModels, lpv: LPVStateSpace, sampling_time: float) ->
         size = gray_box.hinf_norm()
         row["interpolation_error"] = distance / size if size > 0 else np.nan
         row["interpolation_FIT"] = parameter_fit(theta[k], interpolated[k])
+        row["growth_rate"] = growth[k]
         if found.restructurers:
             row |= dict(zip("param_" + names, theta[k], strict=True))
             if not np.isnan(spread).all():
@@ -150,6 +156,8 @@ def summarise(
         lines.insert(2, f"Input delay: {', '.join(map(str, samples))} sample(s)")
     hidden = ["param_", "std_", "n_", "stationarity", "horizon", "order"]
     hidden += ["relative_hinf_error", "chi2", "degrees_of_freedom"]
+    if report["growth_rate"].max() <= 0:
+        hidden.append("growth_rate")
     restructured = "structured_BFT" in report
     if restructured:
         error, floor = 100 * report["relative_error"], 100 * report["relative_floor"]

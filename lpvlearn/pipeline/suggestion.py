@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.spatial import Delaunay, QhullError
-from scipy.spatial.distance import cdist
 from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted, has_fit_parameter
 
+from ..data.operating_points import neighbours
 from ..exceptions import collected
 from ..lpv.lfr import scales
 from ..lpv.polynomial import PolynomialLPV
@@ -26,8 +23,6 @@ from .estimator import LocalLPVPipeline
 Array = NDArray[np.float64]
 
 _CRITERIA = ("uncertainty", "neighbour_gap")
-
-_MANY_VARIABLES = 4  # beyond, a triangulation has too many edges: the nearest points do
 
 _NO_DIRECTION = 1e-12  # of a covariance, relative to its largest: rounding
 
@@ -112,7 +107,7 @@ def suggest_operating_point(
             "`suggest_operating_point` looks between operating points and needs two at "
             f"least. Got {len(kappa)}. Measure at the ends of the range first."
         )
-    pairs = _neighbours(kappa)
+    pairs = neighbours(kappa)
     places = kappa[pairs].mean(axis=1)
     local = [model.with_input_delay(0) for model in pipeline.structured_models_]
     units = _units(local)
@@ -153,26 +148,6 @@ def suggest_operating_point(
     other = next(name for name in _CRITERIA if name != criterion)
     table = pd.DataFrame(columns).sort_values([criterion, other], ascending=False)
     return table.reset_index(drop=True)
-
-
-def _neighbours(kappa: Array) -> NDArray[np.intp]:
-    """Pairs of neighbouring points, (n_pairs, 2), every variable in its range."""
-    span = np.ptp(kappa, axis=0)
-    varies = span > 0
-    scaled = kappa[:, varies] / span[varies]
-    n_points, n = scaled.shape
-    if 1 < n <= _MANY_VARIABLES and n_points > n:
-        try:
-            corners = Delaunay(scaled).simplices
-        except QhullError:  # all of them on a line or plane
-            pass
-        else:
-            edges = {tuple(sorted(e)) for c in corners for e in combinations(c, 2)}
-            return np.array(sorted(edges))
-    # of points at one place (a distance of zero) the graph has no edge: none between
-    first = np.unique(scaled, axis=0, return_index=True)[1]
-    tree = minimum_spanning_tree(cdist(scaled[first], scaled[first])).tocoo()
-    return np.sort(np.column_stack([first[tree.row], first[tree.col]]), axis=1)
 
 
 def _units(models: Sequence[StateSpace]) -> tuple[Array, Array]:

@@ -1,0 +1,61 @@
+"""Whether the interpolated model is stable between the operating points too."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.operating_points import neighbours
+from ..exceptions import warn
+from ..lpv.model import LPVStateSpace
+
+Array = NDArray[np.float64]
+
+_STEPS = 20  # into which the way from a point to its neighbour is cut
+
+_ROUNDING = 1e-8  # of the largest pole: an integrator's may lie so far to the right
+
+
+def growth_rates(lpv: LPVStateSpace, kappa: Array) -> Array:
+    """Largest real part (1/s) of the frozen poles about each operating point.
+
+    Half-way to its neighbours. What grows is told: the range, and what may be done. The
+    local models are stable, so that the interpolation is at fault.
+    """
+    model, ends = lpv.silenced(), neighbours(kappa)
+    rates = _rates(model, kappa)
+    share = np.linspace(0.0, 1.0, _STEPS + 1)[1:-1, None]
+    worst, where = rates.max(initial=-np.inf), kappa[rates.argmax()]
+    unstable = [kappa[k] for k in np.flatnonzero(rates > 0)]
+    for first, last in ends:
+        between = kappa[first] + share * (kappa[last] - kappa[first])
+        found = _rates(model, between)
+        unstable += list(between[found > 0])
+        if found.max() > worst:
+            worst, where = found.max(), between[found.argmax()]
+        half = len(found) // 2 + 1
+        rates[first] = max(rates[first], found[:half].max())
+        rates[last] = max(rates[last], found[half - 1 :].max())
+    if unstable:
+        names = lpv.scheduling_names or range(1, lpv.n_scheduling + 1)
+        spans = zip(np.min(unstable, 0), np.max(unstable, 0), where, names, strict=True)
+        places = ", ".join(
+            f"{name!r} from {low:.4g} to {high:.4g} (worst at {place:.4g})"
+            for low, high, place, name in spans
+        )
+        warn(
+            f"`lpv_` is unstable at values within its range, of {places}: a pole has "
+            f"real part {worst:.3g} 1/s, and simulations that stay there grow without "
+            "bound. The local models are stable; the interpolation between them "
+            "overshoots. Use interpolator=SplineLPV(), which does not, "
+            "a lower degree, or measure there too (`suggest_operating_point`)."
+        )
+    return rates
+
+
+def _rates(model: LPVStateSpace, kappa: Array) -> Array:
+    """Largest real part of the poles at every value; rounding counts as zero."""
+    poles = model.frozen_poles(kappa)
+    rates = poles.real.max(axis=1, initial=-np.inf)
+    size = np.abs(poles).max(axis=1, initial=0.0)
+    return np.where(np.abs(rates) <= _ROUNDING * size, 0.0, rates)
