@@ -24,6 +24,7 @@ from scipy.spatial.distance import cdist
 from ..models.statespace import StateSpace
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.int32]
 
 _APART = 1e-9  # of points at one place: a graph takes a distance of zero for none
 
@@ -34,16 +35,25 @@ def aligned_models(models: Sequence[StateSpace], kappa: Array) -> list[StateSpac
     From the point in the middle of `kappa` (n_points, n_scheduling) outward along a
     minimum spanning tree, every variable in units of its range.
     """
-    span = np.ptp(kappa, axis=0)
-    scaled = (kappa - kappa.min(axis=0)) / np.where(span > 0, span, 1.0)
-    tree = minimum_spanning_tree(cdist(scaled, scaled) + _APART)
-    first = int(np.argmin(np.linalg.norm(scaled - np.median(scaled, axis=0), axis=1)))
-    order, parents = breadth_first_order(tree, first, directed=False)
+    order, parents = spanning_tree(kappa)
     aligned = list(models)
     for k in order[1:]:
         reference = aligned[parents[k]]
         aligned[k] = models[k].transform(rotation_to(models[k], reference).T)
     return aligned
+
+
+def spanning_tree(kappa: Array) -> tuple[Rows, Rows]:
+    """Points in an order in which each follows its neighbour, and these neighbours.
+
+    From the point in the middle outward; the neighbour of point k is ``parents[k]``.
+    """
+    span = np.ptp(kappa, axis=0)
+    scaled = (kappa - kappa.min(axis=0)) / np.where(span > 0, span, 1.0)
+    tree = minimum_spanning_tree(cdist(scaled, scaled) + _APART)
+    first = int(np.argmin(np.linalg.norm(scaled - np.median(scaled, axis=0), axis=1)))
+    order, parents = breadth_first_order(tree, first, directed=False)
+    return order, parents
 
 
 def rotation_to(model: StateSpace, reference: StateSpace) -> Array:

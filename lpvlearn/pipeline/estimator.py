@@ -33,16 +33,23 @@ from ..data.operating_points import check_outputs, local_experiments
 from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
-from ..exceptions import warn
 from ..lpv.auto import AutoLPV
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
+from ..lpv.spline import SplineLPV
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
-from .points import PointRunner, common_delay, identify_points, restructure_points
+from .points import (
+    PointRunner,
+    StructuredModels,
+    common_delay,
+    identify_points,
+    offsets_of_points,
+    restructure_points,
+)
 from .reports import Tables, summarise, tables
 from .stability import growth_rates
 
@@ -129,6 +136,12 @@ list, default=None
         one by one and their balanced models averaged (the paper's Monte Carlo).
     discretization : {"zoh", "tustin"}, default="zoh"
         From discrete to continuous time; "zoh" is exact for inputs that are held.
+    offsets : {"auto", None}, default="auto"
+        Experiments stand about points of work, inputs u0 and outputs y0: where the
+        local models have constants (`SubspaceLTI.offset_`, `detrend`), the LPV model
+        follows these, interpolated by a cubic spline through the points (see Notes).
+        None: its outputs are zero at rest at input zero, with a warning where the
+        experiments speak against it.
     efficient : bool, default=True
         Weigh by the noise: the outputs in the local models, and in step 4 the response
         by the covariance of the black box, begun at the H-infinity optimum, as
@@ -187,7 +200,8 @@ list, default=None
         ("relative_hinf_error"; floor, remainder and stationarity are its own), and
         "chi2", "degrees_of_freedom" and "p_value" of the gray-box model's distance in
         standard deviations of the black box; the delays of the inputs in samples
-        ("delay_"), where there are any; the distance from the gray-box
+        ("delay_"), where there are any; the point of work, where `lpv_` has offsets
+        ("u0_" of every input, "y0_" of every output); the distance from the gray-box
         model to the interpolated one (H-infinity norm, relative), and the FIT (percent,
         Eq. (36)) of its parameters; the largest real part (1/s) of the poles of `lpv_`
         from there half-way to the neighbours ("growth_rate", above zero unstable); the
@@ -211,6 +225,19 @@ list, default=None
     See Also
     --------
     SubspaceLTI, GrayBoxRestructurer, AutoLPV : The three steps.
+
+    Notes
+    -----
+    Experiments at a point tell an equilibrium (u0, y0), the model's nearest to their
+    means, but not the state x0 there, which matters while the scheduling variable
+    moves. It is that of ``y0 = G(0) (u0 - w)``: what holds the system there comes
+    through its inputs. Where the equilibria of the points follow one another by the
+    models' static gains, ``dy0 = G(0) du0``, as where an output schedules the system,
+    x0 moves likewise, by ``A dx0 + B du0 = 0``. Else all points are moved to one u0,
+    and constants that are the same everywhere are those of the sensors. An output that
+    does not answer at rest, ``G(0) = 0``, has the constant of its sensor. `lpv_` is
+    linear about these points: `LPVStateSpace.input_offset`, `output_offset`,
+    `state_offset`. `predict` begins at rest at that of the first sample.
 
     Examples
     --------
@@ -254,6 +281,7 @@ list, default=None
         time_tol: float = TIME_TOL,
         combine: str = "pool",
         discretization: str = "zoh",
+        offsets: str | None = "auto",
         efficient: bool = True,
         on_error: str = "raise",
         memory: Any = None,
@@ -273,6 +301,7 @@ list, default=None
         self.time_tol = time_tol
         self.combine = combine
         self.discretization = discretization
+        self.offsets = offsets
         self.efficient = efficient
         self.on_error = on_error
         self.memory = memory
@@ -352,7 +381,6 @@ list, default=None
         with watch.step("restructuring"):  # step 4: all of them in one structure
             found = restructure_points(restructurer, local, points, runner)
             self.local_models_ = [model.lti for model in found.local]
-            self._n_with_offset = sum(model.n_trend > 0 for model in found.local)
             self.structured_models_ = found.models
             self.restructurers_ = found.restructurers
 
@@ -374,6 +402,7 @@ list, default=None
                 input_delay=common_delay(found.local, kappa, self.sampling_time_),
                 input_names=experiments[0].input_names,
                 output_names=self.output_names_,
+                offsets=self._fit_offsets(found),
             )
             late = self.lpv_.input_delay / self.sampling_time_
             self.input_delay_ = np.round(late).astype(int)
@@ -415,9 +444,6 @@ list, default=None
         -----
         ExtrapolationWarning
             Where a scheduling variable leaves `scheduling_range_`.
-        UserWarning
-            Where local models have constants (`SubspaceLTI.offset_`), which the LPV
-            model leaves out.
         """
         check_is_fitted(self, "lpv_")
         return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
@@ -494,15 +520,6 @@ list, default=None
     def _simulate(
         self, experiments: list[Experiment], n_samples: int, *, estimate: bool
     ) -> Array:
-        if self._n_with_offset:
-            warn(
-                f"The experiments at {self._n_with_offset} of "
-                f"{len(self.local_models_)} operating point(s) have constants in their "
-                "outputs, which local models allow for. The LPV model has none: its "
-                "outputs are about zero. Subtract from y what it is at rest at input "
-                "zero, at every operating point, or say that it is zero: "
-                "local=SubspaceLTI(offset=None)."
-            )
         signals = [e.scheduling for e in experiments if e.scheduling is not None]
         if signals and getattr(self.interpolator_, "extrapolation", None) != "clip":
             warn_extrapolation(
@@ -556,10 +573,20 @@ list, default=None
             return PolynomialLPV(degree=0)
         return AutoLPV() if self.interpolator is None else clone(self.interpolator)
 
+    def _fit_offsets(self, found: StructuredModels) -> Any:
+        """Interpolation of inputs, outputs and states at rest; None for none."""
+        values = offsets_of_points(found) if self.offsets == "auto" else None
+        if values is None:
+            return None
+        held = getattr(self.interpolator_, "extrapolation", None) == "clip"
+        spline = SplineLPV("cubic", extrapolation="clip" if held else "ignore")
+        return spline.fit(found.points.kappa, values)
+
     def _check_options(self) -> None:
         one_of("combine", self.combine, ("pool", "average"))
         one_of("discretization", self.discretization, ("zoh", "tustin"))
         one_of("on_error", self.on_error, ("raise", "skip"))
+        one_of("offsets", self.offsets, ("auto", None))
         one_of("efficient", self.efficient, (True, False))
         if not isinstance(self.verbose, bool):
             whole_number("verbose", self.verbose, 0)

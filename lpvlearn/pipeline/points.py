@@ -27,6 +27,7 @@ from ..data.operating_points import OperatingPoints
 from ..data.preparation import DETRENDS
 from ..exceptions import Told, collected, warn
 from ..lpv.alignment import aligned_models
+from ..lpv.equilibria import points_of_work
 from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
@@ -38,6 +39,10 @@ Array = NDArray[np.float64]
 # Mean of an output in standard deviations, from which it looks like an offset (a record
 # that rises steadily from rest has a mean of 1.7).
 _OFFSET = 5.0
+
+# Standard deviation of the constants of experiments at a point, in those of outputs,
+# that a user should know of.
+_APART = 0.1
 
 _Task = tuple[StateSpace, list[StateSpace], list[Estimate]]
 
@@ -67,6 +72,7 @@ class LocalModel:
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
     deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
     n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
+    rest: tuple[Array, Array] | None = None  # inputs and outputs, where it is known
     # the model as identified (of every realization) with models to either side of it,
     # where the covariance is known; with "zoh" in discrete time
     estimates: list[Estimate] = field(default_factory=list)
@@ -137,6 +143,7 @@ def identify_point(
             _horizon(fitted),
             deviated=_all_continuous(pairs, discretization),
             n_trend=_n_trend(fitted),
+            rest=_equilibrium(lti, [fitted], experiments),
         )
         if efficient and pairs:
             found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
@@ -151,15 +158,15 @@ def identify_point(
     for name in ("order", "horizon", "method", "input_delay"):
         if name in chosen.get_params() and hasattr(fitted, name + "_"):
             chosen.set_params(**{name: getattr(fitted, name + "_")})
-    models, failures, n_trend = [], [], 0
+    models, failures, kept = [], [], []
     estimates: list[Estimate] = []
     for realisation in realisations:
         refitted = _fit_local(chosen, realisation, sampling_time)
-        n_trend = max(n_trend, _n_trend(refitted))
         model, pairs = refitted.lti_, _deviated(refitted) if efficient else []
         try:
             models.append(_continuous(model, discretization, advice))
             estimates.append(_in_own_time(model, pairs, discretization))
+            kept.append(refitted)
         except ValueError as error:
             failures.append((realisation[0].label, error))
     if not models:
@@ -171,14 +178,15 @@ def identify_point(
         )
     lowest = min(model.order for model in models)  # where none grew
     models = [model for model in models if model.order == lowest]
-    known = all(pairs for _, pairs in estimates)
+    known, lti = all(pairs for _, pairs in estimates), _average(models)
     return LocalModel(
-        _average(models),
+        lti,
         fitted.lti_.order,
         _horizon(fitted),
         models,
         estimates=estimates if known else [],
-        n_trend=n_trend,
+        n_trend=max(map(_n_trend, kept)),
+        rest=_equilibrium(lti, kept, experiments),
     )
 
 
@@ -194,7 +202,63 @@ def _from_closed_loop(fitted: Any) -> bool:
 
 def _n_trend(fitted: Any) -> int:
     """Trends of every output and experiment in a model, as `LocalModel` has them."""
-    return DETRENDS.index(getattr(fitted, "offset_", None))
+    trends = (getattr(fitted, name, None) for name in ("offset_", "detrend"))
+    return max(map(DETRENDS.index, trends))
+
+
+def _equilibrium(
+    lti: StateSpace, fitted: Sequence[Any], experiments: Sequence[Experiment]
+) -> tuple[Array, Array] | None:
+    """Inputs and outputs at which the model rests, nearest to the experiments' means.
+
+    In units of how far they move within the experiments. None where the estimator does
+    not tell its constants.
+    """
+    if not all(hasattr(own, "resting_point") for own in fitted):
+        return None
+    _tell_different_constants(lti, fitted, experiments)
+    known = [own.resting_point() for own in fitted]
+    u0, y0 = (np.mean(values, axis=0) for values in zip(*known, strict=True))
+    (u, u_scale), (y, y_scale) = motions(experiments)
+    gain = lti.dc_gain()
+    step, *_ = np.linalg.lstsq(
+        np.vstack([np.diag(1.0 / u_scale), gain / y_scale[:, None]]),
+        np.concatenate([(u - u0) / u_scale, (y - y0) / y_scale]),
+    )
+    return u0 + step, y0 + gain @ step
+
+
+def _tell_different_constants(
+    lti: StateSpace, fitted: Sequence[Any], experiments: Sequence[Experiment]
+) -> None:
+    """Warn of constants that differ from experiment to experiment at one point."""
+    levels = [
+        own.output_offset_ - own.input_offset_ @ lti.dc_gain().T for own in fitted
+    ]
+    apart = np.vstack(levels).std(axis=0) > _APART * motions(experiments)[1][1]
+    differ = len(fitted) > 1 or any(own.offsets_differ_ for own in fitted)
+    if differ and apart.any():
+        warn(
+            "the experiments at one operating point have different constants in their "
+            "outputs. The LPV model takes their mean, and is off by the rest: subtract "
+            "what drifted between experiments from y, or let the scheduling variables "
+            "tell what the constants depend on."
+        )
+
+
+def motions(
+    experiments: Sequence[Experiment],
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Mean, and standard deviation about that of every experiment, of inputs, outputs.
+
+    A channel that stands still counts as moving by one.
+    """
+    found = []
+    for values in zip(*((e.inputs, e.outputs) for e in experiments), strict=True):
+        own = np.vstack([v - v.mean(axis=0) for v in values])
+        scale = np.sqrt(np.mean(own**2, axis=0))
+        found.append((np.vstack(values).mean(axis=0), np.where(scale > 0, scale, 1.0)))
+    return found[0], found[1]
 
 
 def _in_own_time(
@@ -436,6 +500,18 @@ def restructure_points(
     return StructuredModels(
         points, local, helped[0].structure_, theta, covariance, models, helped
     )
+
+
+def offsets_of_points(found: StructuredModels) -> Array | None:
+    """``[u0, y0, x0]`` of every point, as `LPVStateSpace` has them; None for none."""
+    if not any(model.n_trend and model.rest for model in found.local):
+        return None
+    runs = [run for group in found.points.experiments for run in group]
+    (u, u_scale), (y, y_scale) = motions(runs)
+    rest = [model.rest or (np.zeros_like(u), np.zeros_like(y)) for model in found.local]
+    inputs, outputs = (np.array(values) for values in zip(*rest, strict=True))
+    scales = (u_scale, y_scale)
+    return points_of_work(found.models, found.points.kappa, inputs, outputs, scales)
 
 
 def _unknown_covariance(theta: Array) -> Array:

@@ -9,14 +9,20 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ..data.experiments import Experiment
+from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
 from ..metrics.reports import as_shown, readable_report
 from ..metrics.scores import parameter_fit
 from ..metrics.table_simulation import fit_of
 from ..restructuring.estimator import GrayBoxRestructurer
-from .points import StructuredModels
+from .points import LocalModel, StructuredModels, motions
 
 Array = NDArray[np.float64]
+
+# Constants are missed that are worth so many points of BFT, or where a local model is
+# this poor, and was fitted to signals with means so many times their motion.
+_WORTH, _POOR, _FAR = 5.0, 50.0, 2.0
 
 _NO_FLOOR = 1e-8  # share of the black box's norm below which a floor is rounding
 
@@ -45,6 +51,7 @@ def tables(
     interpolated = lpv.parameters(points.kappa)
     deviations = pd.DataFrame(spread, index, list(names))
 
+    missed = False
     delayed = any(model.lti.input_delay.any() for model in found.local)
     rows = []
     for k, (group, model, gray_box) in enumerate(
@@ -57,6 +64,7 @@ def tables(
             "horizon": model.horizon,
             "local_BFT": fit_of(model.lti, group, sampling_time, model.n_trend),
         }
+        missed |= lpv.offsets is None and _misses_constants(model, group, sampling_time)
         if found.restructurers:
             structured = fit_of(gray_box, group, sampling_time, model.n_trend)
             row["structured_BFT"] = structured
@@ -65,6 +73,12 @@ def tables(
             samples = np.round(model.lti.input_delay / sampling_time).astype(int)
             inputs = group[0].input_names
             row |= {f"delay_{u}": d for u, d in zip(inputs, samples, strict=True)}
+        if lpv.offsets is not None:
+            place = points.kappa[[k]]
+            levels = zip(lpv.input_names, lpv.input_offset(place)[0], strict=True)
+            row |= {f"u0_{name}": level for name, level in levels}
+            levels = zip(lpv.output_names, lpv.output_offset(place)[0], strict=True)
+            row |= {f"y0_{name}": level for name, level in levels}
         met = found.structure.model(interpolated[k])
         distance = (gray_box.with_input_delay(0) - met).hinf_norm()
         size = gray_box.hinf_norm()
@@ -77,6 +91,13 @@ def tables(
                 row |= dict(zip("std_" + names, spread[k], strict=True))
         rows.append(row)
 
+    if missed:
+        warn(
+            "inputs or outputs stand away from zero, and the LPV model has no offsets: "
+            "it misses what a constant of every experiment would explain. Have it "
+            "found by offsets='auto', with local=SubspaceLTI(offset='auto'), or "
+            "subtract from X and y where the system rests."
+        )
     by_parameter = {
         "lowest": theta.min(axis=0),
         "highest": theta.max(axis=0),
@@ -93,6 +114,16 @@ def tables(
         pd.DataFrame(rows, index=index),
         pd.DataFrame(by_parameter, index=names.rename("parameter")),
     )
+
+
+def _misses_constants(
+    model: LocalModel, group: Sequence[Experiment], sampling_time: float
+) -> bool:
+    """Whether constants would explain more of the outputs of experiments at a point."""
+    constants = max(1, model.n_trend)
+    best, without = (fit_of(model.lti, group, sampling_time, n) for n in (constants, 0))
+    far = [(abs(mean) > _FAR * scale).any() for mean, scale in motions(group)]
+    return best - without > _WORTH or (without < _POOR and any(far))
 
 
 def _restructuring(fitted: GrayBoxRestructurer) -> dict[str, float]:
@@ -154,7 +185,11 @@ def summarise(
     if lpv.input_delay.any():
         samples = np.round(lpv.input_delay / sampling_time).astype(int)
         lines.insert(2, f"Input delay: {', '.join(map(str, samples))} sample(s)")
-    hidden = ["param_", "std_", "n_", "stationarity", "horizon", "order"]
+    if lpv.offsets is not None:
+        names = [name for name in report if name.startswith(("u0_", "y0_"))]
+        spans = [f"{name[3:]} {_span(report[name])}" for name in names]
+        lines.append(f"Points of work: {', '.join(spans)}")
+    hidden = ["u0_", "y0_", "param_", "std_", "n_", "stationarity", "horizon", "order"]
     hidden += ["relative_hinf_error", "chi2", "degrees_of_freedom"]
     if report["growth_rate"].max() <= 0:
         hidden.append("growth_rate")

@@ -191,6 +191,8 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ``y - output_offset_ = G (u - input_offset_)``. With `detrend` their means, to
         which `offset` adds. After `partial_fit` of a long stream there is one row, the
         mean of all.
+    offsets_differ_ : bool
+        Whether the constants of the experiments do, by more than their uncertainty.
     output_drift_ : ndarray of shape (n_experiments, n_outputs)
         Change per second (per sample where no time is known), about the middle of
         the experiment; zero without ``offset="linear"``.
@@ -540,6 +542,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.input_offset_ = fitted.offsets.inputs
         self.output_offset_ = fitted.offsets.outputs
         self.output_drift_ = fitted.offsets.drifts / step
+        self.offsets_differ_ = fitted.offsets.differ
 
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
         """Seconds between the samples of a table; True where nothing tells them."""
@@ -571,7 +574,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             their mean.
         """
         check_is_fitted(self, "lti_")
-        if self._offsets.differ:
+        if self.offsets_differ_:
             warn(
                 "The experiments of `fit` have different constants in their outputs "
                 "(`output_offset_`): predictions are about their mean. Where outputs "
@@ -603,7 +606,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         def simulated(e: Experiment) -> Array:
             x0, level = self._own_part(e)
-            u0, _ = self._rest()
+            u0, _ = self.resting_point()
             return level + self.lti_.simulate(e.inputs - u0, initial_state=x0)
 
         return self._in_table(self._read(X, y, outputs=False), n_rows_of(X), simulated)
@@ -657,7 +660,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         experiments, predictor = self._read(X, y, outputs=False), self.predictor_
 
         def predicted(e: Experiment) -> Array:
-            u0, level = self._rest()
+            u0, level = self.resting_point()
             x0 = None
             if initial_state == "estimate":
                 x0, level = self._own_part(e, predictor)
@@ -882,6 +885,19 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         step = self.lti_.sampling_time or 1.0
         return frequencies(omega) * step
 
+    def resting_point(self) -> tuple[Array, Array]:
+        """Inputs and outputs at rest: `input_offset_` and `output_offset_` pooled.
+
+        Returns
+        -------
+        u0 : ndarray of shape (n_inputs,)
+            Mean over the samples of all experiments.
+        y0 : ndarray of shape (n_outputs,)
+        """
+        check_is_fitted(self, "lti_")
+        pooled = self._offsets.pooled()
+        return pooled.inputs[0], pooled.outputs[0]
+
     def selection_text(self) -> str:
         """`selection_` as a text table, the choice marked."""
         check_is_fitted(self, "lti_")
@@ -926,14 +942,9 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
             **options,
         )
 
-    def _rest(self) -> tuple[Array, Array]:
-        """Inputs and outputs of an experiment at rest: the means of all."""
-        pooled = self._offsets.pooled()
-        return pooled.inputs[0], pooled.outputs[0]
-
     def _simulated(self, experiment: Experiment) -> Array:
         """Outputs from rest at the mean offsets."""
-        u0, y0 = self._rest()
+        u0, y0 = self.resting_point()
         return y0 + self.lti_.simulate(experiment.inputs - u0)
 
     def _own_part(
@@ -944,7 +955,7 @@ class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Behind the errors of simulation, or of a predictor that has a gain, for which
         inputs in transit are those at rest: what they miss dies out.
         """
-        (u0, y0), y = self._rest(), _outputs_of(experiment)
+        (u0, y0), y = self.resting_point(), _outputs_of(experiment)
         lti, trend = self.lti_, trend_signals(len(y), self._evidence.free.n_trend)
         if predictor is None or predictor.gain is None:
             responses = free_responses(lti.A, lti.C, len(y), trend)

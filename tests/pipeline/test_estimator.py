@@ -1,6 +1,7 @@
 """LocalLPVPipeline: from local experiments to an LPV model."""
 
 import pickle
+import warnings
 
 import numpy as np
 import pandas as pd
@@ -574,34 +575,78 @@ def test_time_may_come_from_the_local_estimator_or_be_counted_in_samples(spring)
     assert lti.sampling_time_ == 1.0  # one black box: nothing means seconds
 
 
-@pytest.mark.slow
-def test_local_models_have_constants_of_their_experiments():
-    """Different at every experiment; the LPV model, which has none, says so."""
-    X, y = spring_tables(noise=0.02, n_repeats=2, seed=3)
-    level = X["run"].astype("category").cat.codes.to_numpy() % 3 - 1.0
-    moved = y + 0.2 * level[:, None]
-    plain, fitted = (
-        spring_pipeline(local=SubspaceLTI(offset=offset)).fit(X, outputs)
-        for offset, outputs in ((None, y), ("auto", moved))
+def shifted(X, y, inputs=0.0, outputs=0.0):
+    """The same experiments, measured with other zeros."""
+    return X.assign(force=X["force"] + inputs), y + outputs
+
+
+@pytest.fixture(scope="module")
+def about_zero(spring):
+    X, y, _, _ = spring
+    return spring_pipeline(local=SubspaceLTI(offset=None)).fit(X, y)
+
+
+@pytest.mark.parametrize(
+    "restructurer", [None, GrayBoxRestructurer(spring_structure())]
+)
+@pytest.mark.parametrize("moved", [{"outputs": 3.0}, {"inputs": -2.0}])
+def test_other_zeros_of_the_sensors_change_nothing(spring, restructurer, moved):
+    X, y, X_sweep, y_sweep = spring
+    local = SubspaceLTI(2, horizon=8, feedthrough=False)
+    pipeline = spring_pipeline(local=local, restructurer=restructurer)
+    plain = clone(pipeline).fit(X, y)
+    pipeline.fit(*shifted(X, y, **moved))
+    assert plain.lpv_.offsets is None
+    at_rest = plain.predict_with_initial_state(X_sweep, y_sweep)
+    there = shifted(X_sweep, y_sweep, **moved)
+    np.testing.assert_allclose(
+        pipeline.predict_with_initial_state(*there),
+        at_rest + moved.get("outputs", 0.0),
+        atol=2e-3 * y_sweep.std().item(),
     )
-    np.testing.assert_allclose(fitted.parameters_, plain.parameters_, rtol=0.02)
-    np.testing.assert_allclose(fitted.parameters_std_, plain.parameters_std_, rtol=0.3)
-    for column in ("local_BFT", "structured_BFT"):
-        np.testing.assert_allclose(
-            fitted.report_[column], plain.report_[column], atol=10.0
-        )
-        assert fitted.report_[column].min() > 95.0
-    with pytest.warns(UserWarning, match="at 4 of 4 operating point.* have constants"):
-        fitted.predict(X)
-    plain.predict(X)  # is silent
 
 
-def test_averaged_realizations_have_constants_of_their_own():
+def test_offsets_are_left_out_where_there_are_none(spring, about_zero):
+    X, y, X_sweep, _ = spring
+    pipeline = spring_pipeline().fit(X, y)
+    assert pipeline.lpv_.offsets is None
+    np.testing.assert_allclose(
+        pipeline.predict(X_sweep), about_zero.predict(X_sweep), atol=1e-6
+    )
+
+
+def test_a_model_without_offsets_says_what_it_misses(spring):
+    X, y, _, _ = spring
+    X, y = X[X["kappa"] < 1], y[X["kappa"] < 1]
+    local = SubspaceLTI(2, horizon=8, offset=None)
+    for options in ({"offsets": None}, {"local": local}):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            pipeline = spring_pipeline(**options).fit(X, y + 3.0)
+        assert any("the LPV model has no offsets" in str(w.message) for w in told)
+        assert pipeline.lpv_.offsets is None
+
+
+@pytest.mark.parametrize("detrend", ["constant", "linear"])
+def test_detrend_of_the_local_step_is_honoured(spring, detrend):
+    X, y, X_sweep, y_sweep = spring
+    local = SubspaceLTI(2, horizon=8, detrend=detrend)
+    pipeline = spring_pipeline(local=local).fit(X, y + 3.0)
+    assert pipeline.report_["local_BFT"].min() > 95
+    assert pipeline.score(X, y + 3.0) > 0.98
+    assert pipeline.score(X_sweep, y_sweep + 3.0) > 0.95
+
+
+def test_constants_that_differ_at_one_point_are_told():
     X, y = spring_tables(noise=0.02, n_repeats=2, seed=3, kappas=KAPPA[:2])
     level = X["run"].astype("category").cat.codes.to_numpy() % 3 - 1.0
-    fitted = spring_pipeline(combine="average").fit(X, y + 0.2 * level[:, None])
-    np.testing.assert_allclose(fitted.parameters_, spring_truth(KAPPA[:2]), rtol=0.05)
-    assert fitted.report_["local_BFT"].min() > 95.0
+    for combine in ("pool", "average"):
+        with pytest.warns(UserWarning, match="have different constants.*At all oper"):
+            fitted = spring_pipeline(combine=combine).fit(X, y + 0.2 * level[:, None])
+        truth = spring_truth(KAPPA[:2])
+        np.testing.assert_allclose(fitted.parameters_, truth, rtol=0.05)
+        assert fitted.report_["local_BFT"].min() > 95.0
+        assert fitted.report_["structured_BFT"].min() > 95.0
 
 
 # -- input delays ----------------------------------------------------------------

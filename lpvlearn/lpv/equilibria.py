@@ -1,0 +1,106 @@
+"""Points of work of local models: inputs, outputs and states at rest, of one family.
+
+Experiments at a point tell an equilibrium (u0, y0) of its model, or as well any other
+one, (u0 + v, y0 + G v) with the static gain G. They do not tell the state x0 there,
+which matters while kappa moves. What moves outputs at rest is taken to come through
+inputs, ``w = u0 - P y0`` with ``P = G^-1``; then ``x0 = S y0`` with ``S = -A^-1 B P``.
+(P is a pseudoinverse without the directions in which G is next to nothing; what it does
+not reach stays an offset of the sensors.) Which family do the points make?
+
+- They follow one another by the models' own gain, ``du0 = P dy0``: they are equilibria
+  of one system that schedules itself, and ``A dx0 + B du0 = 0`` along them. So
+  ``dx0 = S dy0``, from neighbour to neighbour, whatever basis these share.
+- They do not: inputs are free at every point. All points are moved to one u0, for what
+  differs at random would bend the interpolation. Constants ``c = y0 - G u0`` that are
+  the same everywhere are the sensors', ``x0 = S (y0 - c)``, unless w is as constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.statespace import StateSpace
+from .alignment import spanning_tree
+
+Array = NDArray[np.float64]
+
+# Static gain, from motions of the inputs to those of the outputs, that is nothing.
+_STATIC = 0.01
+
+# Part of the steps from point to point, squared, that the models' gain may not explain
+# of equilibria of one system, and that equal constants may not of the constants.
+_UNEXPLAINED = 0.1
+
+# Variance of the levels of inputs over the points, in that of their motion: none.
+_STANDING = 0.1
+
+
+def points_of_work(
+    models: Sequence[StateSpace],
+    kappa: Array,
+    inputs: Array,
+    outputs: Array,
+    scales: tuple[Array, Array],
+) -> Array:
+    """``[u0, y0, x0]`` of stable models, (n_points, n_inputs + n_outputs + order).
+
+    From equilibria, `inputs` (n_points, n_inputs) and `outputs` (n_points, n_outputs);
+    `scales` are the sizes of the motions of inputs and outputs.
+
+    Examples
+    --------
+    A tank, ``h' = u - sqrt(h)``, at two levels:
+
+    >>> import numpy as np
+    >>> h = np.array([[1.0], [4.0]])
+    >>> tanks = [StateSpace(-0.5 / np.sqrt(level), 1.0, 1.0) for level in h]
+    >>> one = (np.ones(1), np.ones(1))
+    >>> points_of_work(tanks, h, np.sqrt(h), h, one)
+    array([[1., 1., 1.],
+           [2., 4., 4.]])
+    """
+    u_scale, y_scale = scales
+    gains = np.array([model.dc_gain() for model in models])
+    inverse = _inverse(gains * u_scale / y_scale[:, None])
+    inverse *= u_scale[:, None] / y_scale
+    states = np.array(
+        [
+            -np.linalg.solve(model.A, model.B) @ P
+            for model, P in zip(models, inverse, strict=True)
+        ]
+    )
+    order, parents = spanning_tree(kappa)
+    child, parent = order[1:], parents[order[1:]]
+    du = (inputs[child] - inputs[parent]) / u_scale
+    half = 0.5 * (inverse[child] + inverse[parent])
+    dy = outputs[child] - outputs[parent]
+    answer = np.einsum("kij,kj->ki", half, dy) / u_scale
+    moved = np.sum(du**2) + np.sum(answer**2)
+    follows = np.sum((du - answer) ** 2) <= _UNEXPLAINED * moved
+    if follows and np.sum(np.var(inputs / u_scale, axis=0)) > _STANDING:
+        x0 = np.einsum("kij,kj->ki", states, outputs)
+        for k, j, step in zip(child, parent, dy, strict=True):
+            x0[k] = x0[j] + 0.5 * (states[k] + states[j]) @ step
+        return np.hstack([inputs, outputs, x0])
+    common = inputs.mean(axis=0)
+    outputs = outputs + np.einsum("kij,kj->ki", gains, common - inputs)
+    constants = outputs - gains @ common
+    through = np.einsum("kij,kj->ki", inverse, constants) / u_scale
+    bias = constants.mean(axis=0)
+    rest = np.einsum("kij,kj->ki", inverse, constants - bias) / u_scale
+    varied = through - through.mean(axis=0)
+    equal = np.sum(rest**2) <= _UNEXPLAINED * np.sum(through**2)
+    if not equal or np.sum(rest**2) > np.sum(varied**2):
+        bias = np.zeros_like(bias)
+    x0 = np.einsum("kij,kj->ki", states, outputs - bias)
+    return np.hstack([np.broadcast_to(common, inputs.shape), outputs, x0])
+
+
+def _inverse(gains: Array) -> Array:
+    """Pseudoinverses of scaled gains, (n_points, n_inputs, n_outputs)."""
+    U, s, V = np.linalg.svd(gains, full_matrices=False)
+    s = np.where(s > _STATIC, 1.0 / np.maximum(s, _STATIC), 0.0)
+    return np.asarray((V.mT * s[:, None]) @ U.mT)

@@ -1,0 +1,105 @@
+"""Points of work of local models as one family."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from lpvlearn import StateSpace
+from lpvlearn.lpv.equilibria import points_of_work
+
+ONE = (np.ones(1), np.ones(1))
+KAPPA = np.linspace(-1.2, 1.2, 13)[:, None]
+
+
+def pendulum(angle, T=None):
+    """``theta'' = u - sin(theta) - 0.3 theta'`` about an angle."""
+    model = StateSpace([[0, 1], [-np.cos(angle), -0.3]], [[0], [1]], [[1, 0]])
+    return model if T is None else model.transform(T)
+
+
+def pendula(T=None):
+    return [pendulum(k, T) for k in KAPPA[:, 0]]
+
+
+def test_equilibria_of_one_system_stay_where_they_were_found():
+    values = points_of_work(pendula(), KAPPA, np.sin(KAPPA), KAPPA, ONE)
+    expected = np.hstack([np.sin(KAPPA), KAPPA, KAPPA, 0 * KAPPA])
+    assert_allclose(values, expected, atol=1e-12)
+
+
+def test_states_at_rest_follow_the_basis():
+    T = np.array([[1.0, 2.0], [-1.0, 3.0]])
+    values = points_of_work(pendula(T), KAPPA, np.sin(KAPPA), KAPPA, ONE)
+    assert_allclose(values[:, 2:], KAPPA * T[:, 0], atol=1e-12)
+
+
+def test_states_of_a_bent_family_meet_its_tangent():
+    """Two springs in a row, of which the first hardens: ``A dx0 + B du0 = 0``."""
+    q = np.linspace(0.0, 1.0, 60)[:, None]  # stretch of the first, y; u = q + q^3
+    models = [
+        StateSpace([[-(1 + 3 * p**2), 0.0], [0.7, -0.7]], [[1.0], [0.3]], [[1.0, 0]])
+        for p in q[:, 0]
+    ]
+    values = points_of_work(models, q, q + q**3, q, ONE)
+    du, x0 = np.gradient(values[:, 0]), values[:, 2:]
+    for model, step, dx in zip(models, du, np.gradient(x0, axis=0), strict=True):
+        assert_allclose(model.A @ dx + model.B[:, 0] * step, 0.0, atol=1e-3)
+    assert_allclose(x0[:, 0], q[:, 0], atol=1e-12)
+
+
+def test_inputs_about_any_level_are_moved_to_one():
+    """What the experiments' means happen to be does not bend the interpolation."""
+    rng = np.random.default_rng(0)
+    stiffness = np.linspace(1.0, 4.0, 6)
+    models = [StateSpace([[0, 1], [-k, -1.0]], [[0], [1]], [[1, 0]]) for k in stiffness]
+    load = np.array([0.5, -1.0, 0.3, 2.0, 1.0, -0.2])  # an input that nobody measures
+    u0 = rng.normal(size=6)
+    y0 = (u0 + load) / stiffness
+    columns = stiffness[:, None], u0[:, None], y0[:, None]
+    values = points_of_work(models, *columns, ONE)
+    assert_allclose(values[:, 0], u0.mean())
+    assert_allclose(values[:, 1], (u0.mean() + load) / stiffness)
+    x0 = np.column_stack([values[:, 1], np.zeros(6)])
+    assert_allclose(values[:, 2:], x0, atol=1e-12)
+
+
+@pytest.mark.parametrize("u_zero, y_zero", [(0.0, 3.0), (2.0, 0.0)])
+def test_zeros_of_sensors_move_no_state(u_zero, y_zero):
+    stiffness = np.linspace(1.0, 4.0, 6)[:, None]
+    models = [
+        StateSpace([[0, 1], [-k, -1.0]], [[0], [1]], [[1, 0]]) for k in stiffness[:, 0]
+    ]
+    u0 = u_zero + np.array([[0.1], [-0.2], [0.05], [0.0], [0.1], [-0.05]])
+    y0 = y_zero + (u0 - u_zero) / stiffness
+    values = points_of_work(models, stiffness, u0, y0, ONE)
+    for row, model in zip(values, models, strict=True):
+        u, y, x = row[0], row[1], row[2:]
+        assert_allclose(model.A @ x + model.B[:, 0] * (u - u_zero), 0.0, atol=1e-12)
+        assert_allclose(model.C @ x, y - y_zero, atol=1e-12)
+
+
+def test_an_output_without_static_gain_has_an_offset_of_its_sensor():
+    rates = [StateSpace([[0, 1], [-k, -1.0]], [[0], [1]], [[0, 1]]) for k in (1.0, 2.0)]
+    kappa, y0 = np.array([[0.0], [1.0]]), np.array([[5.0], [4.0]])
+    values = points_of_work(rates, kappa, np.zeros((2, 1)), y0, ONE)
+    assert_allclose(values, [[0, 5, 0, 0], [0, 4, 0, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("n_inputs, n_outputs", [(1, 3), (3, 1), (2, 2)])
+def test_models_that_are_not_square_rest_where_they_say(n_inputs, n_outputs):
+    rng = np.random.default_rng(1)
+    A, B = -np.diag([1.0, 2.0, 3.0]), rng.normal(size=(3, n_inputs))
+    C, D = rng.normal(size=(n_outputs, 3)), rng.normal(size=(n_outputs, n_inputs))
+    models = [StateSpace(k * A, B, C, D) for k in (1.0, 2.0)]
+    u0, w = rng.normal(size=(2, 2, n_inputs))
+    gains = np.array([model.dc_gain() for model in models])
+    y0 = np.einsum("kij,kj->ki", gains, u0 - w)
+    scales = (rng.uniform(0.5, 2, n_inputs), rng.uniform(0.5, 2, n_outputs))
+    values = points_of_work(models, np.array([[0.0], [1.0]]), u0, y0, scales)
+    for row, model in zip(values, models, strict=True):
+        u, y, x = np.split(row, [n_inputs, n_inputs + n_outputs])
+        v = np.linalg.lstsq(B, -model.A @ x, rcond=None)[0]
+        assert_allclose(model.A @ x + B @ v, 0.0, atol=1e-10)  # it is their answer
+        assert_allclose(C @ x + D @ v, y, atol=1e-10)
+        assert_allclose(u, u0.mean(axis=0))
+    assert_allclose(y - gains[1] @ u, y0[1] - gains[1] @ u0[1], atol=1e-10)
