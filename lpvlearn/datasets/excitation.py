@@ -104,6 +104,17 @@ def spawn_generators(
     return [np.random.default_rng(seed) for seed in seeds]
 
 
+def samples_of(name: str, duration: float, sampling_time: float) -> int:
+    """Number of samples in a duration."""
+    check_size("sampling_time", sampling_time)
+    if not (np.isfinite(duration) and duration >= sampling_time):
+        raise ValueError(
+            f"`{name}` must be finite and at least `sampling_time` "
+            f"({sampling_time} s). Got {duration}."
+        )
+    return round(duration / sampling_time)
+
+
 def check_count(name: str, value: float) -> None:
     """Refuse what is no whole number of at least 1."""
     whole = isinstance(value, Real) and value == np.rint(value)

@@ -12,9 +12,9 @@ from sklearn.utils import Bunch
 
 from .excitation import (
     check_count,
-    check_size,
     measurement_noise,
     prbs,
+    samples_of,
     spawn_generators,
 )
 from .flexible_arm import FlexibleArm
@@ -171,8 +171,8 @@ def make_flexible_arm(
     arm = FlexibleArm() if arm is None else arm
     n_points = int(n_operating_points)
     theta2 = np.pi * np.arange(1, n_points + 1) / (n_points + 1)
-    n_samples = _count("duration", duration, sampling_time)
-    n_sweep = _count("sweep_duration", sweep_duration, sampling_time)
+    n_samples = samples_of("duration", duration, sampling_time)
+    n_sweep = samples_of("sweep_duration", sweep_duration, sampling_time)
     clocks = _clock_samples("clock", clock, sampling_time)
     sweep_clocks = _clock_samples("sweep_clock", sweep_clock, sampling_time)
     if balance_time is not None and not balance_time > 0:
@@ -279,17 +279,6 @@ def _input_table(
     table["experiment"] = np.repeat(np.arange(n_labels), n_samples)
     table["time"] = np.tile(np.arange(n_samples) * sampling_time, n_labels)
     return pd.DataFrame(table)
-
-
-def _count(name: str, duration: float, sampling_time: float) -> int:
-    """Number of samples in a duration."""
-    check_size("sampling_time", sampling_time)
-    if not (np.isfinite(duration) and duration >= sampling_time):
-        raise ValueError(
-            f"`{name}` must be finite and at least `sampling_time` "
-            f"({sampling_time} s). Got {duration}."
-        )
-    return round(duration / sampling_time)
 
 
 def _clock_samples(
