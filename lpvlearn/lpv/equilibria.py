@@ -10,9 +10,11 @@ not reach stays an offset of the sensors.) Which family do the points make?
 - They follow one another by the models' own gain, ``du0 = P dy0``: they are equilibria
   of one system that schedules itself, and ``A dx0 + B du0 = 0`` along them. So
   ``dx0 = S dy0``, from neighbour to neighbour, whatever basis these share.
-- They do not: inputs are free at every point. All points are moved to one u0, for what
-  differs at random would bend the interpolation. Constants ``c = y0 - G u0`` that are
-  the same everywhere are the sensors', ``x0 = S (y0 - c)``, unless w is as constant.
+- They do not: inputs are free at every point. Constants ``c = y0 - G u0`` that are the
+  same everywhere are the sensors', ``x0 = S (y0 - c)``, unless w is as constant.
+
+Where inputs stand about one level, all points are moved to one u0: what differs at
+random would bend the interpolation.
 """
 
 from __future__ import annotations
@@ -72,22 +74,23 @@ def points_of_work(
             for model, P in zip(models, inverse, strict=True)
         ]
     )
+    if np.sum(np.var(inputs / u_scale, axis=0)) <= _STANDING:
+        common = np.broadcast_to(inputs.mean(axis=0), inputs.shape)
+        outputs = outputs + np.einsum("kij,kj->ki", gains, common - inputs)
+        inputs = common
     order, parents = spanning_tree(kappa)
     child, parent = order[1:], parents[order[1:]]
     du = (inputs[child] - inputs[parent]) / u_scale
-    half = 0.5 * (inverse[child] + inverse[parent])
     dy = outputs[child] - outputs[parent]
+    half = 0.5 * (inverse[child] + inverse[parent])
     answer = np.einsum("kij,kj->ki", half, dy) / u_scale
     moved = np.sum(du**2) + np.sum(answer**2)
-    follows = np.sum((du - answer) ** 2) <= _UNEXPLAINED * moved
-    if follows and np.sum(np.var(inputs / u_scale, axis=0)) > _STANDING:
+    if du.any() and np.sum((du - answer) ** 2) <= _UNEXPLAINED * moved:
         x0 = np.einsum("kij,kj->ki", states, outputs)
         for k, j, step in zip(child, parent, dy, strict=True):
             x0[k] = x0[j] + 0.5 * (states[k] + states[j]) @ step
         return np.hstack([inputs, outputs, x0])
-    common = inputs.mean(axis=0)
-    outputs = outputs + np.einsum("kij,kj->ki", gains, common - inputs)
-    constants = outputs - gains @ common
+    constants = outputs - np.einsum("kij,kj->ki", gains, inputs)
     through = np.einsum("kij,kj->ki", inverse, constants) / u_scale
     bias = constants.mean(axis=0)
     rest = np.einsum("kij,kj->ki", inverse, constants - bias) / u_scale
@@ -96,7 +99,7 @@ def points_of_work(
     if not equal or np.sum(rest**2) > np.sum(varied**2):
         bias = np.zeros_like(bias)
     x0 = np.einsum("kij,kj->ki", states, outputs - bias)
-    return np.hstack([np.broadcast_to(common, inputs.shape), outputs, x0])
+    return np.hstack([inputs, outputs, x0])
 
 
 def _inverse(gains: Array) -> Array:

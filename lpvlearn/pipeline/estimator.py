@@ -233,9 +233,9 @@ list, default=None
     moves. It is that of ``y0 = G(0) (u0 - w)``: what holds the system there comes
     through its inputs. Where the equilibria of the points follow one another by the
     models' static gains, ``dy0 = G(0) du0``, as where an output schedules the system,
-    x0 moves likewise, by ``A dx0 + B du0 = 0``. Else all points are moved to one u0,
-    and constants that are the same everywhere are those of the sensors. An output that
-    does not answer at rest, ``G(0) = 0``, has the constant of its sensor. `lpv_` is
+    x0 moves likewise, by ``A dx0 + B du0 = 0``. Else constants that are the same
+    everywhere are those of the sensors, and so is that of an output which does not
+    answer at rest, ``G(0) = 0``. `lpv_` is
     linear about these points: `LPVStateSpace.input_offset`, `output_offset`,
     `state_offset`. `predict` begins at rest at that of the first sample.
 

@@ -47,13 +47,13 @@ def test_states_of_a_bent_family_meet_its_tangent():
     assert_allclose(x0[:, 0], q[:, 0], atol=1e-12)
 
 
-def test_inputs_about_any_level_are_moved_to_one():
+def test_inputs_about_one_level_are_moved_to_it():
     """What the experiments' means happen to be does not bend the interpolation."""
     rng = np.random.default_rng(0)
     stiffness = np.linspace(1.0, 4.0, 6)
     models = [StateSpace([[0, 1], [-k, -1.0]], [[0], [1]], [[1, 0]]) for k in stiffness]
     load = np.array([0.5, -1.0, 0.3, 2.0, 1.0, -0.2])  # an input that nobody measures
-    u0 = rng.normal(size=6)
+    u0 = 0.2 * rng.normal(size=6)
     y0 = (u0 + load) / stiffness
     columns = stiffness[:, None], u0[:, None], y0[:, None]
     values = points_of_work(models, *columns, ONE)
@@ -101,5 +101,4 @@ def test_models_that_are_not_square_rest_where_they_say(n_inputs, n_outputs):
         v = np.linalg.lstsq(B, -model.A @ x, rcond=None)[0]
         assert_allclose(model.A @ x + B @ v, 0.0, atol=1e-10)  # it is their answer
         assert_allclose(C @ x + D @ v, y, atol=1e-10)
-        assert_allclose(u, u0.mean(axis=0))
     assert_allclose(y - gains[1] @ u, y0[1] - gains[1] @ u0[1], atol=1e-10)
