@@ -11,7 +11,8 @@ not reach stays an offset of the sensors.) Which family do the points make?
   of one system that schedules itself, and ``A dx0 + B du0 = 0`` along them. So
   ``dx0 = S dy0``, from neighbour to neighbour, whatever basis these share.
 - They do not: inputs are free at every point. Constants ``c = y0 - G u0`` that are the
-  same everywhere are the sensors', ``x0 = S (y0 - c)``, unless w is as constant.
+  same everywhere are the sensors', ``x0 = S (y0 - c)``. Where w is the same, too, that
+  is taken by which there is less to hold.
 
 Where inputs stand about one level, all points are moved to one u0: what differs at
 random would bend the interpolation.
@@ -35,6 +36,9 @@ _STATIC = 0.01
 # Part of the steps from point to point, squared, that the models' gain may not explain
 # of equilibria of one system, and that equal constants may not of the constants.
 _UNEXPLAINED = 0.1
+
+# Misfit of constants of the inputs, in that of constants of the sensors, that decides.
+_CLEAR = 10.0
 
 # Variance of the levels of inputs over the points, in that of their motion: none.
 _STANDING = 0.1
@@ -90,16 +94,30 @@ def points_of_work(
         for k, j, step in zip(child, parent, dy, strict=True):
             x0[k] = x0[j] + 0.5 * (states[k] + states[j]) @ step
         return np.hstack([inputs, outputs, x0])
-    constants = outputs - np.einsum("kij,kj->ki", gains, inputs)
-    through = np.einsum("kij,kj->ki", inverse, constants) / u_scale
-    bias = constants.mean(axis=0)
-    rest = np.einsum("kij,kj->ki", inverse, constants - bias) / u_scale
-    varied = through - through.mean(axis=0)
-    equal = np.sum(rest**2) <= _UNEXPLAINED * np.sum(through**2)
-    if not equal or np.sum(rest**2) > np.sum(varied**2):
-        bias = np.zeros_like(bias)
+    bias = _constants_of_sensors(inputs, outputs, gains, inverse, u_scale)
     x0 = np.einsum("kij,kj->ki", states, outputs - bias)
     return np.hstack([inputs, outputs, x0])
+
+
+def _constants_of_sensors(
+    inputs: Array, outputs: Array, gains: Array, inverse: Array, u_scale: Array
+) -> Array:
+    """Constants (n_outputs,) that the outputs of all points have; zero for none."""
+
+    def size(values: Array, about: float = 0.0) -> float:
+        """Of outputs, by the inputs that they are worth."""
+        worth = np.einsum("kij,kj->ki", inverse, values) / u_scale
+        return float(np.sum((worth - np.mean(worth, axis=0) * about) ** 2))
+
+    constants = outputs - np.einsum("kij,kj->ki", gains, inputs)
+    bias = constants.mean(axis=0)
+    of_sensors, of_inputs = size(constants - bias), size(constants, about=1.0)
+    if min(of_sensors, of_inputs) > _UNEXPLAINED * size(constants):
+        return np.zeros_like(bias)
+    found = of_sensors < of_inputs / _CLEAR
+    if not found and of_sensors < of_inputs * _CLEAR:  # either: what has less to hold
+        found = size(outputs - bias) < size(outputs)
+    return bias if found else np.zeros_like(bias)
 
 
 def _inverse(gains: Array) -> Array:

@@ -63,19 +63,23 @@ def test_inputs_about_one_level_are_moved_to_it():
     assert_allclose(values[:, 2:], x0, atol=1e-12)
 
 
+@pytest.mark.parametrize("softer", [1.0, 4.0])
 @pytest.mark.parametrize("u_zero, y_zero", [(0.0, 3.0), (2.0, 0.0)])
-def test_zeros_of_sensors_move_no_state(u_zero, y_zero):
-    stiffness = np.linspace(1.0, 4.0, 6)[:, None]
+def test_zeros_of_sensors_move_no_state(u_zero, y_zero, softer):
+    """Also where the static gain is the same at all points, and the modes are not."""
+    rng, kappa = np.random.default_rng(0), np.linspace(1.0, 4.0, 6)[:, None]
+    gains = softer / (kappa if softer > 1 else 1.0 + 0.0 * kappa)
     models = [
-        StateSpace([[0, 1], [-k, -1.0]], [[0], [1]], [[1, 0]]) for k in stiffness[:, 0]
+        StateSpace([[0, 1], [-k, -1.0]], [[0], [k * g]], [[1, 0]])
+        for k, g in zip(kappa[:, 0], gains[:, 0], strict=True)
     ]
-    u0 = u_zero + np.array([[0.1], [-0.2], [0.05], [0.0], [0.1], [-0.05]])
-    y0 = y_zero + (u0 - u_zero) / stiffness
-    values = points_of_work(models, stiffness, u0, y0, ONE)
+    u0 = u_zero + 0.1 * rng.normal(size=(6, 1))
+    y0 = y_zero + gains * (u0 - u_zero) + 0.01 * rng.normal(size=(6, 1))
+    values = points_of_work(models, kappa, u0, y0, ONE)
     for row, model in zip(values, models, strict=True):
         u, y, x = row[0], row[1], row[2:]
-        assert_allclose(model.A @ x + model.B[:, 0] * (u - u_zero), 0.0, atol=1e-12)
-        assert_allclose(model.C @ x, y - y_zero, atol=1e-12)
+        assert_allclose(model.dc_gain()[0, 0] * (u - u_zero), x[0], atol=0.1)
+        assert_allclose(model.C @ x, y - y_zero, atol=0.1)
 
 
 def test_an_output_without_static_gain_has_an_offset_of_its_sensor():
