@@ -225,9 +225,8 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 #   and outputs before anything else. A mean is not where the system rests: what the
 #   transients at both ends add to it remains as an error, which ``offset`` does not
 #   have (with ``detrend`` set, "auto" means None; ``offset="constant"`` may follow it).
-# * In a :class:`~lpvlearn.LocalLPVPipeline` constants of the local experiments are
-#   allowed for in local models and scores. The LPV model has none, and its ``predict``
-#   says so.
+# * A :class:`~lpvlearn.LocalLPVPipeline` makes them points of work that follow the
+#   scheduling variable: :ref:`guide_points_of_work`.
 
 # %%
 # .. _guide_closed_loop:

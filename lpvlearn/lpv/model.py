@@ -79,7 +79,8 @@ class LPVStateSpace:
         Seconds, whole samples of every simulation. As attribute, an array.
     offsets : fitted regressor, default=None
         From scheduling values to ``[u0, y0, x0]``, (n_points, n_inputs + n_outputs +
-        order), x0 in the state of the structure. None: all are zero.
+        order), x0 in the state of the structure; see :ref:`guide_points_of_work`. None:
+        all are zero.
     input_names, output_names : sequence, default=None
         Names of the signals, for other programs; None is u1, u2, ... and y1, y2, ...
 

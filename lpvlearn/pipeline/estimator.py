@@ -237,7 +237,8 @@ list, default=None
     everywhere are those of the sensors, and so is that of an output which does not
     answer at rest, ``G(0) = 0``. `lpv_` is
     linear about these points: `LPVStateSpace.input_offset`, `output_offset`,
-    `state_offset`. `predict` begins at rest at that of the first sample.
+    `state_offset`. `predict` begins at rest at that of the first sample. See
+    :ref:`guide_points_of_work`.
 
     Examples
     --------

@@ -17,8 +17,10 @@ from lpvlearn import (
     PolynomialLPV,
     SubspaceLTI,
     bft_score,
+    compare_models,
     fit_report,
 )
+from lpvlearn.datasets import make_unbalanced_disc
 from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
 from lpvlearn.pipeline.estimator import Stopwatch
 
@@ -635,6 +637,35 @@ def test_detrend_of_the_local_step_is_honoured(spring, detrend):
     assert pipeline.report_["local_BFT"].min() > 95
     assert pipeline.score(X, y + 3.0) > 0.98
     assert pipeline.score(X_sweep, y_sweep + 3.0) > 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_structure, bar", [(True, 98.5), (False, 93.0)])
+def test_a_system_that_stands_about_offsets(with_structure, bar):
+    data = make_unbalanced_disc(5, duration=8.0, large_duration=20.0, random_state=3)
+    structure = GrayBoxRestructurer(data.structure) if with_structure else None
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(2, horizon=15, feedthrough=False),
+        structure,
+        scheduling="kappa",
+        experiment="experiment",
+        time="time",
+    ).fit(data.X, data.y)
+    X, y = data.X_large[data.X_large.columns[::-1]], data.y_large
+    simulated = pipeline.predict(X)
+    assert bft_score(y, simulated) > bar
+    assert bft_score(y, pipeline.predict_with_initial_state(X, y)) > bar
+    voltages = pipeline.report_["u0_voltage"]
+    np.testing.assert_allclose(voltages, data.holding_voltages, atol=0.02)
+    angles = pipeline.report_["y0_angle"]
+    np.testing.assert_allclose(angles, data.operating_points, atol=0.01)
+    assert "Points of work: voltage -4.4" in pipeline.summary()
+    models = {"pipeline": pipeline, "model": pipeline.lpv_}
+    fits = compare_models(models, X, y)["BFT"]
+    np.testing.assert_allclose(fits, bft_score(y, simulated))
+    turned = pipeline.lpv_.change_basis(lambda k: [[1.0, k[0]], [0.0, 2.0 + k[0]]])
+    again = turned.simulate(X[["voltage"]], X["kappa"], data.sampling_time)
+    np.testing.assert_allclose(again, simulated, atol=1e-9)
 
 
 def test_constants_that_differ_at_one_point_are_told():

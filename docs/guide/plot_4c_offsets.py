@@ -1,0 +1,148 @@
+r"""
+.. _guide_points_of_work:
+
+Systems that stand about offsets
+================================
+
+A disc with an eccentric mass on a motor: at every angle another voltage holds it there.
+A tank: every level has its own flow. Local models are linear *about* such points of
+work; the LPV model needs the points, too:
+
+.. math::
+
+   \dot x = A(\kappa)\,(x - x_0(\kappa)) + B(\kappa)\,(u - u_0(\kappa)), \qquad
+   y = y_0(\kappa) + C(\kappa)\,(x - x_0(\kappa)) + D(\kappa)\,(u - u_0(\kappa)).
+
+:class:`~lpvlearn.LocalLPVPipeline` finds them in the experiments as they were recorded,
+levels and all.
+"""
+
+# %%
+# The unbalanced disc
+# -------------------
+# Seven experiments, each about an angle at which a voltage holds the disc. The angle is
+# output and scheduling variable at once. Two of the records:
+
+import numpy as np
+import pandas as pd
+
+from lpvlearn import GrayBoxRestructurer, LocalLPVPipeline, SubspaceLTI, bft_score
+from lpvlearn.datasets import make_unbalanced_disc
+
+data = make_unbalanced_disc(random_state=0)
+data.X.groupby("experiment")[["voltage", "kappa"]].agg(["mean", "min", "max"]).round(3)
+
+# %%
+# Nothing has to be subtracted. Where the constants of the experiments are significant
+# (:ref:`guide_offsets`), the pipeline takes the equilibrium of each local model that is
+# nearest to the means of its experiments. ``report_`` and ``summary()`` tell them:
+
+roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+pipeline = LocalLPVPipeline(
+    SubspaceLTI(2, feedthrough=False), GrayBoxRestructurer(data.structure), **roles
+).fit(data.X, data.y)
+found = pipeline.report_[["u0_voltage", "y0_angle"]]
+found.assign(holds=data.holding_voltages).round(3)
+
+# %%
+# Between the points they are interpolated by a cubic spline. ``lpv_`` has them at any
+# angle:
+
+lpv = pipeline.lpv_
+angles = np.array([-1.0, 0.2, 0.8])
+pd.DataFrame(
+    {
+        "u0": lpv.input_offset(angles)[:, 0],
+        "true u0": data.disc.holding_voltage(angles),
+        "y0": lpv.output_offset(angles)[:, 0],
+        "x0, angle": lpv.state_offset(angles)[:, 0],
+        "x0, rate": lpv.state_offset(angles)[:, 1],
+    },
+    index=pd.Index(angles, name="angle"),
+).round(4)
+
+# %%
+# A run through the whole range, beside what a model of the same local models is without
+# offsets:
+
+import warnings
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # it says what it misses
+    without = LocalLPVPipeline(
+        SubspaceLTI(2, feedthrough=False),
+        GrayBoxRestructurer(data.structure),
+        offsets=None,
+        **roles,
+    ).fit(data.X, data.y)
+
+from lpvlearn.inspection import SimulationDisplay
+
+simulated = {
+    "offsets": pipeline.predict(data.X_large),
+    "none": without.predict(data.X_large),
+}
+display = SimulationDisplay.from_predictions(
+    data.X_large["time"], data.y_large, simulated, units="rad"
+)
+{name: round(bft_score(data.y_large, y), 1) for name, y in simulated.items()}
+
+# %%
+# What the experiments do not tell
+# --------------------------------
+# An experiment at one point tells an equilibrium :math:`(u_0, y_0)`. Where the *state*
+# rests there, it does not tell, and while :math:`\kappa` moves that matters: deviations
+# about :math:`(u_0, y_0)` with :math:`x_0` left out are another system.
+
+from dataclasses import replace
+
+from lpvlearn import SplineLPV
+
+points = pipeline.operating_points_
+levels = np.hstack([found, np.zeros((len(points), 2))])  # u0, y0, and a state of zero
+deviations = replace(lpv, offsets=SplineLPV("cubic").fit(points, levels))
+y = deviations.simulate(
+    data.X_large[["voltage"]], data.X_large["kappa"], data.sampling_time
+)
+round(bft_score(data.y_large, y), 1)
+
+# %%
+# So something is assumed:
+#
+# * **What holds the system comes through its inputs**, as gravity here acts where the
+#   motor does. With the static gain :math:`G(0)` of the local model and
+#   :math:`w = u_0 - G(0)^{-1} y_0`, the state at rest is that of the input
+#   :math:`u_0 - w`: :math:`x_0 = -A^{-1} B\,G(0)^{-1} y_0`. That is the same as an
+#   input offset, :math:`\dot x = A x + B (u - w)`, :math:`y = C x + D (u - w)`.
+# * **Where points of work follow one another by the models' own gain**,
+#   :math:`\mathrm d y_0 = G(0)\,\mathrm d u_0`, the system schedules itself, as this
+#   one. Then :math:`A\,\mathrm d x_0 + B\,\mathrm d u_0 = 0` from point to point. In a
+#   structure like this one both are the same; without a structure, states are
+#   comparable between neighbours only, and this is what counts.
+# * **Constants that are the same at all points** (of :math:`y - G(0)\,u`), where the
+#   gain is not, are those of the sensors, and leave the state alone. So is the constant
+#   of an output that does not answer at rest, :math:`G(0) = 0`: a rate, a
+#   high-pass. Where both would do, the state that is nearer to zero is taken.
+# * **More outputs than inputs:** the best :math:`u_0 - w` in the least-squares sense,
+#   the rest are offsets of sensors. **More inputs than outputs:** the smallest one.
+#
+# A rate alone does not tell where a system stands: if the scheduling variable is a
+# position, measure that as an output, too.
+#
+# If you know better, say it: ``LPVStateSpace(..., offsets=...)`` takes any fitted
+# regressor from scheduling values to ``[u0, y0, x0]``, as above.
+#
+# In practice
+# -----------
+# * ``predict`` begins at rest at the point of work of the first sample, and takes
+#   :math:`u_0` for the inputs before it; ``predict_with_initial_state`` estimates the
+#   state.
+# * ``lpv_.at(kappa)`` is a model of deviations. ``lpv_.to_mat`` takes the points of work
+#   along to MATLAB's ``ssInterpolant``.
+# * ``offsets=None`` is a model whose outputs are zero at rest at input zero; where the
+#   experiments speak against that, ``fit`` says so.
+# * Constants that *differ* between experiments at one point are averaged, with a
+#   warning: the model cannot know which one comes next. If they belong to levels of
+#   another quantity, make that a scheduling variable.
+# * ``SubspaceLTI(detrend="constant")`` takes the means of the experiments for points
+#   of work.
