@@ -72,7 +72,8 @@ class LocalModel:
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
     deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
     n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
-    rest: tuple[Array, Array] | None = None  # inputs and outputs, where it is known
+    # inputs and outputs at rest, near the experiments; None: not looked for
+    rest: tuple[Array, Array] | None = None
     # the model as identified (of every realization) with models to either side of it,
     # where the covariance is known; with "zoh" in discrete time
     estimates: list[Estimate] = field(default_factory=list)
@@ -202,8 +203,8 @@ def _from_closed_loop(fitted: Any) -> bool:
 
 def _n_trend(fitted: Any) -> int:
     """Trends of every output and experiment in a model, as `LocalModel` has them."""
-    trends = (getattr(fitted, name, None) for name in ("offset_", "detrend"))
-    return max(map(DETRENDS.index, trends))
+    trends = {getattr(fitted, name, None) for name in ("offset_", "detrend")}
+    return max(n for n, trend in enumerate(DETRENDS) if trend in trends or n == 0)
 
 
 def _equilibrium(
@@ -211,10 +212,12 @@ def _equilibrium(
 ) -> tuple[Array, Array] | None:
     """Inputs and outputs at which the model rests, nearest to the experiments' means.
 
-    In units of how far they move within the experiments. None where the estimator does
-    not tell its constants.
+    In units of how far they move within the experiments. None where the estimator has
+    not looked for constants, or does not tell.
     """
-    if not all(hasattr(own, "resting_point") for own in fitted):
+    first = fitted[0]
+    looked = getattr(first, "offset", None) or getattr(first, "detrend", None)
+    if not looked or not hasattr(first, "resting_point"):
         return None
     _tell_different_constants(lti, fitted, experiments)
     known = [own.resting_point() for own in fitted]

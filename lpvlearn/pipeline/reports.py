@@ -120,6 +120,8 @@ def _misses_constants(
     model: LocalModel, group: Sequence[Experiment], sampling_time: float
 ) -> bool:
     """Whether constants would explain more of the outputs of experiments at a point."""
+    if model.rest is not None and not model.n_trend:
+        return False  # they have been looked for
     constants = max(1, model.n_trend)
     best, without = (fit_of(model.lti, group, sampling_time, n) for n in (constants, 0))
     far = [(abs(mean) > _FAR * scale).any() for mean, scale in motions(group)]
