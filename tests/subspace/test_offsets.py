@@ -74,6 +74,19 @@ def test_offsets_tell_where_the_outputs_rest_at_the_mean_inputs(rng):
     assert not model.output_drift_.any()
 
 
+def test_the_resting_point_is_the_mean_over_the_samples(rng):
+    X, y = table(rng, u0=2.0)
+    kept = np.r_[0:100, 200:600]  # half of the first experiment
+    model = SubspaceLTI(3, horizon=6, **options()).fit(X[kept], y[kept])
+    u0, y0 = model.resting_point()
+    np.testing.assert_allclose(u0, X[kept, :2].mean(axis=0))
+    weighed = np.array([0.2, 0.4, 0.4]) @ model.output_offset_
+    np.testing.assert_allclose(y0, weighed)
+    assert model.offsets_differ_
+    same = SubspaceLTI(3, horizon=6, **options()).fit(*table(rng, levels=(3.0,)))
+    assert not same.offsets_differ_
+
+
 def test_drifts_are_exact_and_told_per_second(rng):
     X, y = table(rng, drift=4.0)
     settings = options(horizon=6, sampling_time=0.5)
