@@ -13,7 +13,6 @@ ESTIMATORS = [SubspaceLTI, GrayBoxRestructurer, PolynomialLPV, LocalLPVPipeline]
 
 # The checks fit tables of independent samples, which no dynamic model explains.
 @pytest.mark.filterwarnings("ignore:The model explains next to nothing")
-@pytest.mark.filterwarnings("ignore:The experiments at 1 of 1 operating point")
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 @parametrize_with_checks(
     [
