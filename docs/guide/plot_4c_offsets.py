@@ -137,8 +137,8 @@ round(bft_score(data.y_large, y), 1)
 # * ``predict`` begins at rest at the point of work of the first sample, and takes
 #   :math:`u_0` for the inputs before it; ``predict_with_initial_state`` estimates the
 #   state.
-# * ``lpv_.at(kappa)`` is a model of deviations. ``lpv_.to_mat`` takes the points of work
-#   along to MATLAB's ``ssInterpolant``.
+# * ``lpv_.at(kappa)`` is a model of deviations. ``lpv_.to_mat`` takes the points of
+#   work along to MATLAB's ``ssInterpolant``.
 # * ``offsets=None`` is a model whose outputs are zero at rest at input zero; where the
 #   experiments speak against that, ``fit`` says so.
 # * Constants that *differ* between experiments at one point are averaged, with a

@@ -75,10 +75,14 @@ def tables(
             row |= {f"delay_{u}": d for u, d in zip(inputs, samples, strict=True)}
         if lpv.offsets is not None:
             place = points.kappa[[k]]
-            levels = zip(lpv.input_names, lpv.input_offset(place)[0], strict=True)
-            row |= {f"u0_{name}": level for name, level in levels}
-            levels = zip(lpv.output_names, lpv.output_offset(place)[0], strict=True)
-            row |= {f"y0_{name}": level for name, level in levels}
+            for prefix, signals, levels in (
+                ("u0_", lpv.input_names, lpv.input_offset(place)[0]),
+                ("y0_", lpv.output_names, lpv.output_offset(place)[0]),
+            ):
+                row |= {
+                    f"{prefix}{n}": v
+                    for n, v in zip(signals or (), levels, strict=True)
+                }
         met = found.structure.model(interpolated[k])
         distance = (gray_box.with_input_delay(0) - met).hinf_norm()
         size = gray_box.hinf_norm()
