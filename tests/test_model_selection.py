@@ -51,22 +51,22 @@ EVEN = make_bft_scorer(average="experiment")
 
 
 class CountingSubspace(SubspaceLTI):
-    """Counts how often it is fitted."""
+    """Counts its fits, in private: a public value would tell results apart."""
 
-    fits = 0
+    _fits = 0
 
     def fit(self, X, y):
-        type(self).fits += 1
+        type(self)._fits += 1
         return super().fit(X, y)
 
 
 class CountingRestructurer(GrayBoxRestructurer):
     """Counts how often it is fitted to a model."""
 
-    fits = 0
+    _fits = 0
 
     def fit_model(self, *args, **options):
-        type(self).fits += 1
+        type(self)._fits += 1
         return super().fit_model(*args, **options)
 
 
@@ -86,7 +86,7 @@ def few(data):
 
 @pytest.fixture
 def counted():
-    CountingSubspace.fits = CountingRestructurer.fits = 0
+    CountingSubspace._fits = CountingRestructurer._fits = 0
     return {
         "local": CountingSubspace(order=2, horizon=10),
         "restructurer": CountingRestructurer(spring_structure(), norm="similarity"),
@@ -291,10 +291,10 @@ def test_a_search_over_the_degree_identifies_nothing_twice(few, counted, tmp_pat
     cv = ExperimentSplit(2, experiment="run", scheduling="kappa")
     search = GridSearchCV(pipeline, grid, cv=cv).fit(X, y)
     # Two folds and the refit, three operating points each.
-    assert CountingSubspace.fits == 3 * 3
-    assert CountingRestructurer.fits == 3 * 3
+    assert CountingSubspace._fits == 3 * 3
+    assert CountingRestructurer._fits == 3 * 3
     again = LocalLPVPipeline(**counted, memory=str(tmp_path), **ROLES).fit(X, y)
-    assert CountingSubspace.fits == CountingRestructurer.fits == 3 * 3
+    assert CountingSubspace._fits == CountingRestructurer._fits == 3 * 3
     pd.testing.assert_frame_equal(again.parameters_, search.best_estimator_.parameters_)
     plain = LocalLPVPipeline(**counted, **ROLES).fit(X, y)
     pd.testing.assert_frame_equal(again.parameters_, plain.parameters_)
@@ -307,19 +307,19 @@ def test_folds_share_the_operating_points_they_have_in_common(data, counted, tmp
         **counted, interpolator=PolynomialLPV(), memory=tmp_path, **ROLES
     )
     cross_val_score(pipeline, X, y, cv=points_held_out(), error_score="raise")
-    assert CountingSubspace.fits == CountingRestructurer.fits == 4
+    assert CountingSubspace._fits == CountingRestructurer._fits == 4
 
 
 def test_another_solver_restructures_anew_but_does_not_identify(few, counted, tmp_path):
     X, y = few
     pipeline = LocalLPVPipeline(**counted, memory=tmp_path, **ROLES).fit(X, y)
     pipeline.set_params(restructurer__tol=1e-9).fit(X, y)
-    assert CountingSubspace.fits == 3
-    assert CountingRestructurer.fits == 6
+    assert CountingSubspace._fits == 3
+    assert CountingRestructurer._fits == 6
     pipeline.set_params(local__horizon=12).fit(X, y)
-    assert CountingSubspace.fits == 6
+    assert CountingSubspace._fits == 6
     pipeline.fit(X, y + 1e-3)
-    assert CountingSubspace.fits == 9
+    assert CountingSubspace._fits == 9
 
 
 # -------------------------------------------------------------------------- splitters
