@@ -47,14 +47,16 @@ def align_outputs(X: Any, y: Any) -> Any:
         numbered = given.equals(pd.RangeIndex(len(y))) or own.dtype != given.dtype
         if numbered or own.names != given.names or not shared.any():
             return y
+        first = given[~shared].tolist()[0]
         raise ValueError(
             f"`y` must have the row labels of X. Got {(~shared).sum()} label(s) that X "
-            f"does not have, the first {given[~shared][0]!r}, and {shared.sum()} that "
+            f"does not have, the first {first!r}, and {shared.sum()} that "
             f"it has. Select the same rows of both, or give {_POSITIONS}."
         )
     if not same:
         return y
+    twice = own[own.duplicated()].tolist()[0]
     raise ValueError(
         "`y` must have the row labels of X in the same order, as some stand several "
-        f"times ({own[own.duplicated()][0]!r}). Sort both alike, or give {_POSITIONS}."
+        f"times ({twice!r}). Sort both alike, or give {_POSITIONS}."
     )

@@ -188,7 +188,7 @@ def _logarithm(A: Array) -> Array:
     for _ in range(_MOST_ROOTS):
         if not np.linalg.norm(T - eye, 1) > _NEAR_ONE:
             break
-        T, scale = sqrtm(T), 2.0 * scale
+        T, scale = sqrtm(T).astype(complex), 2.0 * scale
     X, (nodes, weights) = T - eye, np.polynomial.legendre.leggauss(_N_NODES)
     t = 0.5 * (nodes[:, None, None] + 1.0)
     L = scale * np.tensordot(0.5 * weights, np.linalg.solve(eye + t * X, X), 1)
