@@ -309,6 +309,13 @@ def domains(scheduling_range: Array) -> Array:
     )
 
 
+def grid_over(scheduling_range: Array, levels: int) -> Array:
+    """All combinations of levels of the variables, (levels^n_scheduling, n)."""
+    low, high = domains(scheduling_range)
+    axes = [np.linspace(a, b, levels) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
 def to_unit(kappa: Array, scheduling_range: Array) -> Array:
     """Scheduling values mapped linearly from their range to [-1, 1]."""
     low, high = domains(scheduling_range)
