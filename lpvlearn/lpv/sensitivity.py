@@ -37,7 +37,8 @@ Flags = NDArray[np.bool_]
 _LONGEST = 2.0  # norm of A h in one step of the series: 22 terms, no digit cancels
 _TRUNCATION = 1e-14  # of the series, relative to its first term
 
-_ENTRIES = 4_000_000  # of the largest array of a block of samples: 32 MB
+_ENTRIES = 1_000_000  # of the largest array of a block of samples: 8 MB
+_FEWEST = 16  # samples of a block, however many coefficients there are
 
 _LOOKED_AT = 200  # samples whose matrices choose the units of the states
 
@@ -97,15 +98,12 @@ def output_slopes(
     unit = _units(model, kappa, rates)
     x, X = x0 / unit, np.zeros((n, n + n_free))
     X[:, :n] = np.diag(1.0 / unit)
-    n_directions = model.structure.n_params
-    n_directions += n * n if model.rate_terms is not None else 0
-    widest = max(n_directions * len(free), n * (n + n_free), 1)
-    size = max(16, _ENTRIES // widest)
+    size = max(_FEWEST, _ENTRIES // ((n + model.n_outputs) * (n + len(free))))
     for start in range(0, len(u), size):
         rows = slice(start, min(start + size, len(u)))
-        A, B, C, D, E, G = _linearised(model, kappa[rows], rates[rows], unit, free)
+        A, B, C, _, E = _linearised(model, kappa[rows], rates[rows], unit)
         offset = model.state_offset(kappa[rows]) / unit
-        w, k = late[rows], np.arange(len(A))
+        w = late[rows]
         shortest = max(1, int(np.ceil(_norm(A) * dt / _LONGEST)))
         h = dt / shortest
         Ah, Bh = sample_zoh(A, B, h)
@@ -113,33 +111,33 @@ def output_slopes(
         moved = offset - (Ad @ offset[:, :, None])[:, :, 0]
         states = state_trajectory(Ad, moved + (Bd @ w[:, :, None])[:, :, 0], x)
         xi = states - offset
-        # derivatives of the outputs by the parameters, the state held
-        v = np.concatenate([xi, w], axis=1)
-        direct = _directed(E[..., n:, :], v) @ G
-        F = np.zeros((len(k), n, G.shape[1]))
+        direct = _directed(E[..., n:, :], np.concatenate([xi, w], axis=1))
+        F = np.zeros((len(w), n, direct.shape[2]))
         for _ in range(shortest):
             F = Ah @ F + _step_slopes(A, B, E[..., :n, :], xi, w, h)
             xi = (Ah @ xi[:, :, None] + Bh @ w[:, :, None])[:, :, 0]
-        forcing = np.concatenate([np.zeros((len(k), n, n)), F @ G], axis=2)
+        F = np.concatenate([F, direct], axis=1)
+        F = _by_coefficients(model, kappa[rows], rates[rows], F)[:, :, free]
+        forcing = np.zeros((len(w), n, n + n_free))
+        forcing[:, :, n:] = F[:, :n]
         X_all = state_trajectory(Ad, forcing, X)
         J = C @ X_all
-        J[:, :, n:] += direct
+        J[:, :, n:] += F[:, n:]
         yield rows, J
         x = Ad[-1] @ states[-1] + moved[-1] + Bd[-1] @ w[-1]
         X = Ad[-1] @ X_all[-1] + forcing[-1]
 
 
 def _linearised(
-    model: LPVStateSpace, kappa: Array, rates: Array, unit: Array, free: Flags
-) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Matrices in units of the states, directions of S and their coefficients' slopes.
+    model: LPVStateSpace, kappa: Array, rates: Array, unit: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Matrices in units of the states, and the directions of S.
 
-    Directions (..., n_directions, n + n_outputs, n + n_inputs): the parameters, and
-    the entries of A that rate terms change; slopes (n_samples, n_directions, n_free).
+    Directions (..., n_directions, n + n_outputs, n + n_inputs): those of the
+    parameters, and the entries of A where rate terms change them.
     """
     structure, n, n_rates = model.structure, model.order, model.n_scheduling
-    theta = model.parameters(kappa)
-    S = np.array(structure.system_matrix(theta))
+    S = np.array(structure.system_matrix(model.parameters(kappa)))
     E = structure.basis
     if E is None:
 
@@ -148,25 +146,31 @@ def _linearised(
             return np.array([structure.jacobian(row) for row in values])
 
         E = tabulate(jacobians, kappa[:, 0]) if n_rates == 1 else jacobians(kappa)
-    G = model.interpolator.sensitivities(kappa)
     if model.rate_terms is not None:
         S[:, :n, :n] += model.rate_part(kappa, rates)
         entries = np.zeros((n * n, *S.shape[1:]))
-        entries[np.arange(n * n), np.arange(n * n) // n, np.arange(n * n) % n] = 1.0
-        if E.ndim == 4:
-            entries = np.broadcast_to(entries, (len(kappa), *entries.shape))
+        row, column = np.divmod(np.arange(n * n), n)
+        entries[np.arange(n * n), row, column] = 1.0
+        entries = np.broadcast_to(entries, (*E.shape[:-3], *entries.shape))
         E = np.concatenate([E, entries], axis=-3)
-        slopes = model.rate_terms.sensitivities(kappa).reshape(
-            len(kappa), n_rates, n * n, -1
-        )
-        slopes = np.einsum("kj,kjec->kec", rates, slopes)
-        both = np.zeros((len(kappa), E.shape[-3], len(free)))
-        both[:, : G.shape[1], : G.shape[2]] = G
-        both[:, G.shape[1] :, G.shape[2] :] = slopes
-        G = both
     rows = np.concatenate([unit, np.ones(structure.n_outputs)])[:, None]
     columns = np.concatenate([unit, np.ones(structure.n_inputs)])
-    return *blocks(S / rows * columns, n), E / rows * columns, G[:, :, free]
+    return *blocks(S / rows * columns, n), E / rows * columns
+
+
+def _by_coefficients(
+    model: LPVStateSpace, kappa: Array, rates: Array, slopes: Array
+) -> Array:
+    """Derivatives along the directions (last axis), carried to all coefficients."""
+    n_params = model.structure.n_params
+    static = model.interpolator.sensitivities(kappa, slopes[:, :, :n_params])
+    if model.rate_terms is None:
+        return static
+    moving = rates[:, None, :, None] * slopes[:, :, None, n_params:]
+    moving = moving.reshape(*slopes.shape[:2], -1)
+    return np.concatenate(
+        [static, model.rate_terms.sensitivities(kappa, moving)], axis=2
+    )
 
 
 def _units(model: LPVStateSpace, kappa: Array, rates: Array) -> Array:
