@@ -33,6 +33,7 @@ from ..lpv.refinement import (
     Prior,
     Record,
     coefficients_of,
+    local_information,
     refine_with_rates,
     simulated,
 )
@@ -42,9 +43,14 @@ from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
-from .points import balanced_entries, identify_point
+from .points import StructuredModels, balanced_entries, identify_point
 
 Array = NDArray[np.float64]
+
+_NO_COEFFICIENTS = (
+    "`{}` needs an interpolator with coefficients to fit: AutoLPV, PolynomialLPV, "
+    "RationalLPV or SplineLPV. Got {}."
+)
 
 _LEVELS = 5  # of every scheduling variable, where a form begins as a constant
 
@@ -465,11 +471,8 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
                     f"a table with {sizes[0]}, {sizes[1]} and {len(names)}."
                 )
             if not isinstance(model.interpolator, Interpolator):
-                raise ValueError(
-                    "`start` must have an interpolator with coefficients to fit: "
-                    "PolynomialLPV, RationalLPV, SplineLPV or AutoLPV. Got "
-                    f"{type(model.interpolator).__name__}."
-                )
+                got = type(model.interpolator).__name__
+                raise ValueError(_NO_COEFFICIENTS.format("start", got))
             return model
         structure = self.start
         local = SubspaceLTI(stability="enforce") if self.local is None else self.local
@@ -534,6 +537,36 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tags = super().__sklearn_tags__()
         tags.regressor_tags.poor_score = True
         return tags
+
+
+def refine_model(
+    refiner: Any,
+    model: LPVStateSpace,
+    experiments: Sequence[Experiment],
+    sampling_time: float,
+    information: Array,
+) -> Any:
+    """A clone of the refiner, with the refined model."""
+    return clone(refiner).refine(model, experiments, sampling_time, information)
+
+
+def known_coefficients(
+    model: LPVStateSpace, found: StructuredModels, sampling_time: float
+) -> Array:
+    """Information of the coefficients from the operating points.
+
+    By the covariances of the parameters; without these, from the local experiments.
+    """
+    form = model.interpolator
+    if not isinstance(form, Interpolator):
+        raise ValueError(_NO_COEFFICIENTS.format("refiner", type(form).__name__))
+    points = found.points
+    known = form.information(points.kappa, found.covariance)
+    if known is not None:
+        return known
+    groups = [[_record(e, sampling_time) for e in g] for g in points.experiments]
+    own = Own(True, any(model.n_trend > 0 for model in found.local))
+    return local_information(model, points.kappa, found.theta, groups, own)
 
 
 def _record(e: Experiment, sampling_time: float) -> Record:
