@@ -25,6 +25,7 @@ from .interpolator import grid_over
 from .model import LPVStateSpace
 from .polynomial import PolynomialLPV
 from .sensitivity import coefficients_of, output_slopes, with_coefficients
+from .weighting import is_chance
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -37,11 +38,13 @@ _TOL = 1e-5  # relative decrease of the cost: a hundredth of a standard deviatio
 # weigh no more: those of exact data are rounding.
 _EXACT = 1e-9
 
-_HELD_OUT_STEPS = 10  # of a fit to a part of the records, from that to all of them
+_HELD_OUT_STEPS = 10  # of a fit to every second piece: near enough to tell
+_PIECES = 8  # of a record, not shorter than _PIECE samples a state
+_PIECE = 20
 
 _RATE_DEGREE = 2  # of the rate terms in the scheduling variables
 
-# Share by which rate terms must lower the errors of records they were not fitted to:
+# Share by which rate terms must lower the errors of pieces they were not fitted to:
 # what is gained by chance is less.
 _WORTH = 0.02
 
@@ -269,35 +272,40 @@ def refine_with_rates(
 ) -> Refined:
     """`refine` with rate terms: True, False, or "auto", where they prove their worth.
 
-    That is where they lower the errors of experiments (`groups` of the records) that
-    the coefficients were not fitted to: two halves, either tested by the other.
+    That is where they lower the errors of every second piece of the records, of which
+    they were fitted to the others. A single experiment (`groups` of the records)
+    cannot tell: what it says of one direction need not be true of the other.
     """
-    static = refine(start, records, own, prior, **options)
-    if rate is False or start.rate_terms is not None:
-        return static
-    moving, kinematic = with_rate_terms(static.model)
-    fixed = np.concatenate([~static.free, kinematic])
-    wider = None if prior is None else prior.widened(len(kinematic))
+    alone = rate == "auto" and len(set(groups)) < 2
+    if rate is False or alone or start.rate_terms is not None:
+        return refine(start, records, own, prior, **options)
+    moving, kinematic = with_rate_terms(start)
+    c0, more = coefficients_of(start), len(kinematic)
+    wider = None if prior is None else prior.widened(more)
+    fixed = np.concatenate([np.zeros(len(c0), bool), kinematic])
     if rate == "auto":
-        order = {group: k for k, group in enumerate(dict.fromkeys(groups))}
-        odd = np.array([order[group] % 2 for group in groups], bool)
-        if not odd.any():
-            return static
-        weight, lost = 1.0 / static.deviation, np.zeros(2)
-        options_there = options | {"max_iter": _HELD_OUT_STEPS}
-        for part in (odd, ~odd):
-            fitted, tested = (
-                [r for r, chosen in zip(records, which, strict=True) if chosen]
-                for which in (part, ~part)
-            )
-            forms = ((static.model, prior, None), (moving, wider, fixed))
-            for k, (model, known, held) in enumerate(forms):
-                found = refine(model, fitted, own, known, fixed=held, **options_there)
-                lost[k] += sum(_loss(found.model, r, own, weight) for r in tested)
+        pieces = [piece for r in records for piece in _pieces(r, start.order)]
+        there = own._replace(initial_state=True)
+        held_out = options | {"max_iter": _HELD_OUT_STEPS}
+        static = refine(start, pieces[::2], there, prior, **held_out)
+        start, weight = static.model, 1.0 / static.deviation
+        moving = replace(start, rate_terms=moving.rate_terms)
+        found = refine(moving, pieces[::2], there, wider, fixed=fixed, **held_out)
+        lost = [
+            sum(_loss(model, piece, there, weight) for piece in pieces[1::2])
+            for model in (static.model, found.model)
+        ]
         if not lost[1] < (1.0 - _WORTH) * lost[0]:
-            return static
-    refined = refine(moving, records, own, wider, fixed=fixed, **options)
-    return refined._replace(costs=static.costs + refined.costs)
+            return refine(start, records, own, prior, **options)
+        moving = found.model
+    return refine(moving, records, own, wider, fixed=fixed, **options)
+
+
+def _pieces(record: Record, order: int) -> list[Record]:
+    """Parts of a record, of which each tells its initial state."""
+    n = int(np.clip(len(record.u) // (_PIECE * max(order, 1)), 1, _PIECES))
+    parts = (np.array_split(x, n) for x in (record.u, record.y, record.kappa))
+    return [Record(u, y, kappa, record.dt) for u, y, kappa in zip(*parts, strict=True)]
 
 
 def _loss(model: LPVStateSpace, record: Record, own: Own, weight: Array) -> float:
@@ -318,11 +326,15 @@ def local_information(
     """What experiments at operating points tell of the coefficients of a model.
 
     That of the parameters `theta` (n_points, n_params) of the points' own models, from
-    the derivatives of their simulations, carried to the coefficients.
+    the derivatives of their simulations, carried to the coefficients. Where the form
+    misses the parameters by more than they are uncertain, divided by how much.
     """
-    q, total = theta.shape[1], 0.0
+    q, total, chi2, dof = theta.shape[1], np.zeros(0), 0.0, 0
+    missed = theta - model.parameters(kappa)
     every = np.ones(q, bool)
-    for place, own_theta, records in zip(kappa, theta, groups, strict=True):
+    for place, own_theta, miss, records in zip(
+        kappa, theta, missed, groups, strict=True
+    ):
         constant = PolynomialLPV(0).fit(place[None], own_theta[None])
         local = replace(model.silenced(), interpolator=constant, bases=())
         one = np.ones(model.n_outputs)
@@ -335,5 +347,8 @@ def local_information(
             for record, parts in zip(records, found, strict=True)
         )
         S = model.interpolator.sensitivities(place[None])[0]
-        total = total + S.T @ H @ S
-    return np.asarray(total)
+        total = S.T @ H @ S + (total if total.size else 0.0)
+        chi2 += float(miss @ H @ miss)
+        dof += np.linalg.matrix_rank(H, hermitian=True)
+    dof -= np.linalg.matrix_rank(total, hermitian=True)
+    return total if is_chance(chi2, dof) or dof < 1 else total * (dof / chi2)
