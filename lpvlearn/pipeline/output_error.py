@@ -25,6 +25,7 @@ from ..data.operating_points import check_outputs
 from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
+from ..exceptions import collected
 from ..lpv.interpolator import Interpolator, grid_over
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
@@ -322,7 +323,8 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             identified_range=wider,
         )
         self.scheduling_range_, self.sampling_time_ = wider, sampling_time
-        self.scheduling_names_ = as_list(start.scheduling_names)
+        names = as_list(self.scheduling) or as_list(start.scheduling_names)
+        self.scheduling_names_ = names or [*range(1, start.n_scheduling + 1)]
         self.rate_ = self.lpv_.rate_terms is not None
         self.coefficients_ = coefficients_of(self.lpv_)
         q = len(self.coefficients_)
@@ -478,17 +480,18 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         local = SubspaceLTI(stability="enforce") if self.local is None else self.local
         if structure is not None and local.get_params().get("order") == "auto":
             local = clone(local).set_params(order=structure.order)
-        lti = identify_point(
-            local,
-            experiments,
-            sampling_time=dt,
-            combine="pool",
-            discretization="zoh",
-        ).lti
-        if structure is None:
-            structure, (theta,) = balanced_entries([lti])
-        else:
-            theta = GrayBoxRestructurer(structure).fit_model(lti).params_
+        with collected():  # where a search begins, nobody needs to hear of
+            lti = identify_point(
+                local,
+                experiments,
+                sampling_time=dt,
+                combine="pool",
+                discretization="zoh",
+            ).lti
+            if structure is None:
+                structure, (theta,) = balanced_entries([lti])
+            else:
+                theta = GrayBoxRestructurer(structure).fit_model(lti).params_
         seen = np.zeros((1, 1))
         if names:
             seen = np.vstack([_record(e, dt).kappa for e in experiments])
