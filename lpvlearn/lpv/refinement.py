@@ -152,13 +152,14 @@ def refine(
     prior: Prior | None = None,
     *,
     fixed: Flags | None = None,
-    max_iter: int = 30,
+    max_iter: int = 40,
     n_jobs: int | None = None,
     tell: Callable[[float], None] = lambda cost: None,
 ) -> Refined:
     """Fit the coefficients of a model, which must not diverge on the records.
 
-    `fixed` coefficients stay; `prior` is one of all of them. `tell` hears the cost of
+    `fixed` coefficients stay; `prior` is one of all of them. `max_iter` counts the
+    steps that are tried, of all estimates of the variances. `tell` hears the cost of
     every step taken.
     """
     bases, start = start.bases, replace(start.silenced(), bases=())
@@ -171,6 +172,7 @@ def refine(
     run = Parallel(n_jobs=n_jobs)
     total = np.sqrt(np.mean(np.vstack([r.y for r in records]) ** 2, axis=0))
     costs: list[tuple[int, float]] = []
+    left = max_iter
 
     def model_of(c: Array) -> LPVStateSpace:
         full = c0.copy()
@@ -201,6 +203,8 @@ def refine(
     def minimise(c: Array, weight: Array, n_round: int) -> Array:
         def residuals(trial: Array, rows: NDArray[np.intp]) -> tuple[Array, Callable]:
             """In coordinates whose first axis is that of the residuals themselves."""
+            nonlocal left
+            left -= 1  # a step tried
             r = np.zeros((1, 1 + q))
             try:
                 errors = all_errors(model_of(trial[0]), weight)
@@ -227,7 +231,7 @@ def refine(
         c = minimise(c, weight, n_round)
         errors = all_errors(model_of(c), weight)
         before, weight = weight, 1.0 / deviation(errors)
-        if np.abs(before / weight - 1.0).max() <= _SETTLED:
+        if left < 1 or np.abs(before / weight - 1.0).max() <= _SETTLED:
             break
     model = model_of(c)
     G = gram(c, errors, weight)
@@ -316,26 +320,25 @@ def _loss(model: LPVStateSpace, record: Record, own: Own, weight: Array) -> floa
         return np.inf
 
 
-def local_information(
+def local_prior(
     model: LPVStateSpace,
     kappa: Array,
     theta: Array,
     groups: Sequence[Sequence[Record]],
     own: Own,
-) -> Array:
+) -> Prior:
     """What experiments at operating points tell of the coefficients of a model.
 
     That of the parameters `theta` (n_points, n_params) of the points' own models, from
     the derivatives of their simulations, carried to the coefficients. Where the form
-    misses the parameters by more than they are uncertain, divided by how much.
+    misses the parameters by more than they are uncertain, divided by the mean square
+    of that.
     """
-    q, total, chi2, dof = theta.shape[1], np.zeros(0), 0.0, 0
-    missed = theta - model.parameters(kappa)
-    every = np.ones(q, bool)
-    for place, own_theta, miss, records in zip(
-        kappa, theta, missed, groups, strict=True
-    ):
-        constant = PolynomialLPV(0).fit(place[None], own_theta[None])
+    form, every = model.interpolator, np.ones(theta.shape[1], bool)
+    missed, slopes = model.parameters(kappa) - theta, form.sensitivities(kappa)
+    rows, errors = [], []
+    for k, records in enumerate(groups):
+        constant = PolynomialLPV(0).fit(kappa[[k]], theta[[k]])
         local = replace(model.silenced(), interpolator=constant, bases=())
         one = np.ones(model.n_outputs)
         found = [simulated(local, record, own, one) for record in records]
@@ -346,9 +349,11 @@ def local_information(
             _gram(local, record, own, weight, every, *parts)[1:, 1:]
             for record, parts in zip(records, found, strict=True)
         )
-        S = model.interpolator.sensitivities(place[None])[0]
-        total = S.T @ H @ S + (total if total.size else 0.0)
-        chi2 += float(miss @ H @ miss)
-        dof += np.linalg.matrix_rank(H, hermitian=True)
-    dof -= np.linalg.matrix_rank(total, hermitian=True)
-    return total if is_chance(chi2, dof) or dof < 1 else total * (dof / chi2)
+        values, vectors = np.linalg.eigh(H)
+        known = values > RCOND * values[-1]  # but for changes of the state basis
+        root = np.sqrt(values[known])[:, None] * vectors[:, known].T
+        rows.append(root @ slopes[k])
+        errors.append(root @ missed[k])
+    R, e = np.vstack(rows), np.concatenate(errors)
+    inflation = 1.0 if is_chance(e @ e, len(e)) else e @ e / len(e)
+    return Prior(form.coefficients(), R.T @ R / inflation)

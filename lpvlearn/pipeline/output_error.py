@@ -34,7 +34,7 @@ from ..lpv.refinement import (
     Prior,
     Record,
     coefficients_of,
-    local_information,
+    local_prior,
     refine_with_rates,
     simulated,
 )
@@ -100,8 +100,8 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     missing : {"raise", "split"}, default="raise"
         What a missing value (NaN), or a hole in time, does: raise an error, or cut the
         experiment there into runs with initial states of their own.
-    max_iter : int, default=30
-        Largest number of steps tried, for every estimate of the variances.
+    max_iter : int, default=40
+        Largest number of steps tried.
     n_jobs : int, default=None
         Experiments simulated at the same time.
     verbose : int, default=0
@@ -198,7 +198,7 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         sampling_time: float | None = None,
         time_tol: float = TIME_TOL,
         missing: str = "raise",
-        max_iter: int = 30,
+        max_iter: int = 40,
         n_jobs: int | None = None,
         verbose: int = 0,
     ) -> None:
@@ -262,7 +262,7 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         start: LPVStateSpace,
         experiments: Sequence[Experiment],
         sampling_time: float,
-        information: Array | None = None,
+        known: Prior | None = None,
     ) -> OutputErrorLPV:
         """Fit the model to experiments that were read already.
 
@@ -273,8 +273,9 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Without missing values.
         sampling_time : float
             Seconds, of experiments that do not tell it.
-        information : ndarray of shape (n_coefficients, n_coefficients), default=None
-            What is known of the coefficients of the interpolator of the start.
+        known : Prior, default=None
+            What is known of the coefficients of the interpolator: `centre`
+            (n_coefficients,), and its `information`, an inverse covariance.
 
         Returns
         -------
@@ -289,10 +290,10 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         records = [_record(e, sampling_time) for e in experiments]
         own = Own(self.initial_state == "estimate", self.offset == "constant")
         prior, factor = None, 1.0 if self.prior == "local" else self.prior
-        if information is not None and factor is not None:
-            c0 = coefficients_of(start)
-            n_more = len(c0) - len(information)
-            prior = Prior(c0, factor * np.pad(information, (0, n_more)))
+        if known is not None and factor is not None:
+            n_more = len(coefficients_of(start)) - len(known.centre)
+            weighed = known._replace(information=factor * known.information)
+            prior = weighed.widened(n_more)
         labels = pd.factorize(pd.Series([e.label for e in experiments], dtype=object))
         equal = np.ones(start.n_outputs)
         before = []
@@ -547,16 +548,16 @@ def refine_model(
     model: LPVStateSpace,
     experiments: Sequence[Experiment],
     sampling_time: float,
-    information: Array,
+    known: Prior,
 ) -> Any:
     """A clone of the refiner, with the refined model."""
-    return clone(refiner).refine(model, experiments, sampling_time, information)
+    return clone(refiner).refine(model, experiments, sampling_time, known)
 
 
 def known_coefficients(
     model: LPVStateSpace, found: StructuredModels, sampling_time: float
-) -> Array:
-    """Information of the coefficients from the operating points.
+) -> Prior:
+    """What the operating points tell of the coefficients.
 
     By the covariances of the parameters; without these, from the local experiments.
     """
@@ -564,12 +565,12 @@ def known_coefficients(
     if not isinstance(form, Interpolator):
         raise ValueError(_NO_COEFFICIENTS.format("refiner", type(form).__name__))
     points = found.points
-    known = form.information(points.kappa, found.covariance)
-    if known is not None:
-        return known
+    information = form.information(points.kappa, found.covariance)
+    if information is not None:
+        return Prior(form.coefficients(), information)
     groups = [[_record(e, sampling_time) for e in g] for g in points.experiments]
     own = Own(True, any(model.n_trend > 0 for model in found.local))
-    return local_information(model, points.kappa, found.theta, groups, own)
+    return local_prior(model, points.kappa, found.theta, groups, own)
 
 
 def _record(e: Experiment, sampling_time: float) -> Record:

@@ -17,7 +17,7 @@ from lpvlearn.lpv.refinement import (
     Own,
     Prior,
     Record,
-    local_information,
+    local_prior,
     refine,
     refine_with_rates,
     with_rate_terms,
@@ -252,7 +252,7 @@ def test_local_experiments_tell_what_their_covariances_do():
         y = truth.simulate(u, path, STEP)
         groups.append([Record(u, y + 0.05 * rng.normal(size=y.shape), path, STEP)])
     theta = truth.parameters(kappa)
-    known = local_information(truth, kappa, theta, groups, MOVING)
+    known = local_prior(truth, kappa, theta, groups, MOVING).information
     joint = refine(truth, [g[0] for g in groups], MOVING)
     size = np.sqrt(np.diag(joint.information))
     np.testing.assert_allclose(
