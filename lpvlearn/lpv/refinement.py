@@ -93,6 +93,7 @@ class Refined(NamedTuple):
     deviation: Array  # (n_outputs,) standard deviations of what is left
     own: list[Array]  # unknowns of every record: initial state, constants
     costs: list[tuple[int, float]]  # round, and cost of every step taken
+    n_iter: int  # steps tried
 
 
 def simulated(
@@ -237,7 +238,8 @@ def refine(
     G = gram(c, errors, weight)
     own_parts = [found for _, found in errors]
     model = replace(model, bases=bases)
-    return Refined(model, G[1:, 1:], free, 1.0 / weight, own_parts, costs)
+    tried = max_iter - left
+    return Refined(model, G[1:, 1:], free, 1.0 / weight, own_parts, costs, tried)
 
 
 def _rotated(G: Array, size: float) -> Array:

@@ -126,6 +126,8 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     report_ : DataFrame
         One row per experiment: samples, BFT (percent, mean over the outputs) of the
         start and of the refined model, from the initial states that fit best.
+    n_iter_ : int
+        Number of steps tried, of the last search.
     history_ : DataFrame
         One row per step taken: round of the variances, cost.
     sampling_time_ : float
@@ -332,7 +334,7 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.coefficients_covariance_ = np.zeros((q, q))
         free = np.flatnonzero(found.free)
         self.coefficients_covariance_[np.ix_(free, free)] = _inverse(found.information)
-        self.deviation_ = found.deviation
+        self.deviation_, self.n_iter_ = found.deviation, found.n_iter
         n = start.order if own.initial_state else 0
         self.initial_states_ = np.zeros((len(records), start.order))
         self.offsets_ = np.zeros((len(records), start.n_outputs))
