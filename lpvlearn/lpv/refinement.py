@@ -32,13 +32,12 @@ Flags = NDArray[np.bool_]
 
 _ROUNDS = 5  # of variances, each with the fit that they weigh
 _SETTLED = 0.02  # relative change of standard deviations that needs no other round
-_TOL = 1e-5  # relative decrease of the cost: a hundredth of a standard deviation of one
+_TOL = 1e-4  # relative decrease of the cost in a step, which nothing is gained by
 
 # Standard deviation of an output's errors, relative to the output, below which they
 # weigh no more: those of exact data are rounding.
 _EXACT = 1e-9
 
-_HELD_OUT_STEPS = 10  # of a fit to every second piece: near enough to tell
 _PIECES = 8  # of a record, not shorter than _PIECE samples a state
 _PIECE = 20
 
@@ -153,7 +152,7 @@ def refine(
     prior: Prior | None = None,
     *,
     fixed: Flags | None = None,
-    max_iter: int = 40,
+    max_iter: int = 200,
     n_jobs: int | None = None,
     tell: Callable[[float], None] = lambda cost: None,
 ) -> Refined:
@@ -292,11 +291,10 @@ def refine_with_rates(
     if rate == "auto":
         pieces = [piece for r in records for piece in _pieces(r, start.order)]
         there = own._replace(initial_state=True)
-        held_out = options | {"max_iter": _HELD_OUT_STEPS}
-        static = refine(start, pieces[::2], there, prior, **held_out)
+        static = refine(start, pieces[::2], there, prior, **options)
         start, weight = static.model, 1.0 / static.deviation
         moving = replace(start, rate_terms=moving.rate_terms)
-        found = refine(moving, pieces[::2], there, wider, fixed=fixed, **held_out)
+        found = refine(moving, pieces[::2], there, wider, fixed=fixed, **options)
         lost = [
             sum(_loss(model, piece, there, weight) for piece in pieces[1::2])
             for model in (static.model, found.model)

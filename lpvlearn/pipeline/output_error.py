@@ -100,7 +100,7 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     missing : {"raise", "split"}, default="raise"
         What a missing value (NaN), or a hole in time, does: raise an error, or cut the
         experiment there into runs with initial states of their own.
-    max_iter : int, default=40
+    max_iter : int, default=200
         Largest number of steps tried.
     n_jobs : int, default=None
         Experiments simulated at the same time.
@@ -200,7 +200,7 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         sampling_time: float | None = None,
         time_tol: float = TIME_TOL,
         missing: str = "raise",
-        max_iter: int = 40,
+        max_iter: int = 200,
         n_jobs: int | None = None,
         verbose: int = 0,
     ) -> None:
