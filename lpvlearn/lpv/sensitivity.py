@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _LONGEST = 2.0  # norm of A h in one step of the series: 22 terms, no digit cancels
+_MOST_STEPS = 1000  # of the series in a sample: half a minute for 10,000 samples
 _TRUNCATION = 1e-14  # of the series, relative to its first term
 
 _ENTRIES = 1_000_000  # of the largest array of a block of samples: 8 MB
@@ -104,16 +105,16 @@ def output_slopes(
         A, B, C, _, E = _linearised(model, kappa[rows], rates[rows], unit)
         offset = model.state_offset(kappa[rows]) / unit
         w = late[rows]
-        shortest = max(1, int(np.ceil(_norm(A) * dt / _LONGEST)))
-        h = dt / shortest
+        n_steps = _steps_of(_norm(A) * dt)
+        h = dt / n_steps
         Ah, Bh = sample_zoh(A, B, h)
-        Ad, Bd = (Ah, Bh) if shortest == 1 else sample_zoh(A, B, dt)
+        Ad, Bd = (Ah, Bh) if n_steps == 1 else sample_zoh(A, B, dt)
         moved = offset - (Ad @ offset[:, :, None])[:, :, 0]
         states = state_trajectory(Ad, moved + (Bd @ w[:, :, None])[:, :, 0], x)
         xi = states - offset
         direct = _directed(E[..., n:, :], np.concatenate([xi, w], axis=1))
         F = np.zeros((len(w), n, direct.shape[2]))
-        for _ in range(shortest):
+        for _ in range(n_steps):
             F = Ah @ F + _step_slopes(A, B, E[..., :n, :], xi, w, h)
             xi = (Ah @ xi[:, :, None] + Bh @ w[:, :, None])[:, :, 0]
         F = np.concatenate([F, direct], axis=1)
@@ -183,6 +184,18 @@ def _units(model: LPVStateSpace, kappa: Array, rates: Array) -> Array:
 
 def _norm(A: Array) -> float:
     return float(np.abs(A).sum(axis=-2).max(initial=0.0))
+
+
+def _steps_of(norm: float) -> int:
+    """Number of steps of the series in a sample, over which A has this norm."""
+    if norm > _LONGEST * _MOST_STEPS:
+        raise ValueError(
+            f"`sampling_time` must not be {norm:.0f} times as long as the fastest "
+            "states of the model take: its derivatives would not come to an end. Leave "
+            "what is that fast out of the structure, as a feedthrough, or sample "
+            "faster."
+        )
+    return max(1, int(np.ceil(norm / _LONGEST)))
 
 
 def _directed(E: Array, v: Array) -> Array:

@@ -41,6 +41,7 @@ from ..lpv.auto import AutoLPV
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.spline import SplineLPV
+from ..metrics.reports import readable_report
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
@@ -529,7 +530,7 @@ list, default=None
     def summary(self) -> str:
         """What was identified and how well, as text: ``print(pipeline.summary())``."""
         check_is_fitted(self, "lpv_")
-        return summarise(
+        text = summarise(
             Tables(
                 self.parameters_,
                 self.parameters_std_,
@@ -541,6 +542,14 @@ list, default=None
             scheduling=self.scheduling_names_,
             local=_name_of_step(self.local, "local"),
             restructurer=_name_of_step(self.restructurer, "restructurer"),
+        )
+        if self.refiner_ is None:
+            return text
+        known = "with" if self.lpv_.rate_terms is not None else "without"
+        return (
+            f"{text}\n\nRefinement: {type(self.refiner_).__name__}, {known} rate "
+            "terms; simulation fit (BFT) on experiments that move:\n"
+            f"{readable_report(self.refiner_.report_).to_string()}"
         )
 
     def _simulate(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -122,7 +122,8 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Standard deviations of what is left of the outputs: the weights.
     initial_states_, offsets_ : ndarray of shape (n_runs, order) and \
 (n_runs, n_outputs)
-        Of every run, zero where not estimated; without gaps a run is an experiment.
+        Of every run (the state of the structure, about rest), zero where not estimated.
+        Without gaps a run is an experiment.
     report_ : DataFrame
         One row per experiment: samples, BFT (percent, mean over the outputs) of the
         start and of the refined model, from the initial states that fit best.
@@ -296,12 +297,12 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             n_more = len(coefficients_of(start)) - len(known.centre)
             weighed = known._replace(information=factor * known.information)
             prior = weighed.widened(n_more)
-        labels = pd.factorize(pd.Series([e.label for e in experiments], dtype=object))
-        equal = np.ones(start.n_outputs)
-        before = []
-        for e, record in zip(experiments, records, strict=True):
-            with naming(e):
-                before.append(simulated(start, record, own, equal)[0])
+        labels = [e.label for e in experiments]
+        groups = pd.factorize(pd.Series(labels, dtype=object))[0].tolist()
+        before = [
+            _errors(start, e, record, own)
+            for e, record in zip(experiments, records, strict=True)
+        ]
         with _Progress(self.verbose) as tell:
             found = refine_with_rates(
                 start,
@@ -309,29 +310,25 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 own,
                 prior,
                 rate=self.rate,
-                groups=labels[0].tolist(),
+                groups=groups,
                 max_iter=self.max_iter,
                 n_jobs=self.n_jobs,
                 tell=tell,
             )
         seen = np.vstack([record.kappa for record in records])
-        ranges = [start.scheduling_range, [seen.min(axis=0), seen.max(axis=0)]]
+        inner = _union(start.scheduling_range, seen)
+        identified = inner
         if start.identified_range is not None:
-            ranges.append(np.asarray(start.identified_range))
-        low, high = np.array(ranges).swapaxes(0, 1)
-        wider = np.array([low.min(axis=0), high.max(axis=0)])
+            identified = _union(inner, np.asarray(start.identified_range))
         self.lpv_ = replace(
-            found.model,
-            scheduling_range=np.array([low[:2].min(axis=0), high[:2].max(axis=0)]),
-            identified_range=wider,
+            found.model, scheduling_range=inner, identified_range=identified
         )
-        self.scheduling_range_, self.sampling_time_ = wider, sampling_time
+        self.scheduling_range_, self.sampling_time_ = identified, sampling_time
         names = as_list(self.scheduling) or as_list(start.scheduling_names)
         self.scheduling_names_ = names or [*range(1, start.n_scheduling + 1)]
         self.rate_ = self.lpv_.rate_terms is not None
         self.coefficients_ = coefficients_of(self.lpv_)
-        q = len(self.coefficients_)
-        self.coefficients_covariance_ = np.zeros((q, q))
+        self.coefficients_covariance_ = np.zeros((len(self.coefficients_),) * 2)
         free = np.flatnonzero(found.free)
         self.coefficients_covariance_[np.ix_(free, free)] = _inverse(found.information)
         self.deviation_, self.n_iter_ = found.deviation, found.n_iter
@@ -342,21 +339,11 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self.initial_states_[k, :n] = values[:n]
             if own.constant:
                 self.offsets_[k] = values[n:]
-        rows = {}
-        for code, label in enumerate(labels[1]):
-            runs = [k for k in range(len(records)) if labels[0][k] == code]
-            y = np.vstack([records[k].y for k in runs])
-            old = np.vstack([before[k] for k in runs])
-            new = np.vstack(
-                [simulated(self.lpv_, records[k], own, equal)[0] for k in runs]
-            )
-            rows[label] = {
-                "n_samples": len(y),
-                "start_BFT": float(bft_score(y, y + old)),
-                "BFT": float(bft_score(y, y + new)),
-            }
-        self.report_ = pd.DataFrame.from_dict(rows, orient="index")
-        self.report_.index.name = "experiment"
+        after = [
+            _errors(self.lpv_, e, record, own)
+            for e, record in zip(experiments, records, strict=True)
+        ]
+        self.report_ = _report(labels, records, before, after)
         self.history_ = pd.DataFrame(found.costs, columns=["round", "cost"])
         return self
 
@@ -579,6 +566,39 @@ def _record(e: Experiment, sampling_time: float) -> Record:
     assert e.outputs is not None
     kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
     return Record(e.inputs, e.outputs, kappa, e.sampling_time or sampling_time)
+
+
+def _errors(model: LPVStateSpace, e: Experiment, record: Record, own: Own) -> Array:
+    """Simulation errors of a run with the unknowns of its own that fit best."""
+    with naming(e):
+        return simulated(model, record, own, np.ones(model.n_outputs))[0]
+
+
+def _report(
+    labels: Sequence[Hashable],
+    records: Sequence[Record],
+    before: Sequence[Array],
+    after: Sequence[Array],
+) -> pd.DataFrame:
+    """BFT by experiment, before and after: errors of all of its runs."""
+    rows = {}
+    for label in dict.fromkeys(labels):
+        runs = [k for k, other in enumerate(labels) if other == label]
+        y = np.vstack([records[k].y for k in runs])
+        old, new = (np.vstack([errors[k] for k in runs]) for errors in (before, after))
+        rows[label] = {
+            "n_samples": len(y),
+            "start_BFT": float(bft_score(y, y + old)),
+            "BFT": float(bft_score(y, y + new)),
+        }
+    report = pd.DataFrame.from_dict(rows, orient="index")
+    return report.rename_axis("experiment")
+
+
+def _union(bounds: Any, values: Array) -> Array:
+    """Smallest and largest values of a range and of rows of others."""
+    stacked = np.vstack([bounds, values])
+    return np.array([stacked.min(axis=0), stacked.max(axis=0)])
 
 
 def _inverse(information: Array) -> Array:

@@ -118,6 +118,15 @@ def test_fast_poles_take_shorter_steps(dt):
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
 
 
+def test_poles_beyond_all_sampling_are_refused():
+    structure = GrayBoxStructure.from_template([["-a"]], [["a"]], [[1]])
+    kappa = np.array([[0.0], [1.0]])
+    model = LPVStateSpace(structure, PolynomialLPV(0).fit(kappa, [[1e6]] * 2), kappa)
+    u, path = trajectory(model)
+    with pytest.raises(ValueError, match="`sampling_time` must not be 50000 times"):
+        list(output_slopes(model, u, path, STEP, np.zeros(1), np.ones(1, bool)))
+
+
 def test_units_of_states_do_not_matter():
     """Positions in micrometres."""
     structure = GrayBoxStructure.from_template(

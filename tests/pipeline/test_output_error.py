@@ -73,6 +73,9 @@ def test_moving_experiments_refine_and_local_ones_identify(refined, both, memory
     assert list(refined.refiner_.report_.index) == ["sweep 0", "sweep 1"]
     assert (refined.refiner_.report_["BFT"] > 96.5).all()
     assert "refinement" in refined.step_times_
+    text = refined.summary()
+    assert "Refinement: OutputErrorLPV, without rate terms" in text
+    assert "sweep 1" in text
     assert plain.refiner_ is None
     np.testing.assert_array_equal(
         refined.interpolator_.predict(FINE[:, None]), refined.lpv_.parameters(FINE)
