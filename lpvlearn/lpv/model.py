@@ -88,7 +88,8 @@ class LPVStateSpace:
     rate_terms : fitted regressor, default=None
         From scheduling values to the entries of ``N_1, N_2, ...``, row by row,
         (n_points, n_scheduling * order * order), in the state of the structure. Rates
-        along a trajectory are differences between its samples.
+        along a trajectory are differences between its samples. Frozen models, and all
+        that other programs take, are those at rest: without.
 
     Attributes
     ----------
