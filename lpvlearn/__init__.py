@@ -16,7 +16,7 @@ from .metrics import (
 )
 from .model_selection import BlockedTimeSeriesSplit, ExperimentSplit
 from .models import InnovationModel, StateSpace, gap, peak_gains
-from .pipeline import LocalLPVPipeline, suggest_operating_point
+from .pipeline import LocalLPVPipeline, OutputErrorLPV, suggest_operating_point
 from .restructuring import GrayBoxRestructurer
 from .structures import GrayBoxStructure
 from .subspace import SubspaceLTI
@@ -30,6 +30,7 @@ __all__ = [
     "InnovationModel",
     "LPVStateSpace",
     "LocalLPVPipeline",
+    "OutputErrorLPV",
     "PolynomialLPV",
     "RationalLPV",
     "SplineLPV",

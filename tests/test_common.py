@@ -6,9 +6,21 @@ from sklearn.base import clone, is_regressor
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 import lpvlearn
-from lpvlearn import GrayBoxRestructurer, LocalLPVPipeline, PolynomialLPV, SubspaceLTI
+from lpvlearn import (
+    GrayBoxRestructurer,
+    LocalLPVPipeline,
+    OutputErrorLPV,
+    PolynomialLPV,
+    SubspaceLTI,
+)
 
-ESTIMATORS = [SubspaceLTI, GrayBoxRestructurer, PolynomialLPV, LocalLPVPipeline]
+ESTIMATORS = [
+    SubspaceLTI,
+    GrayBoxRestructurer,
+    PolynomialLPV,
+    LocalLPVPipeline,
+    OutputErrorLPV,
+]
 
 
 # The checks fit tables of independent samples, which no dynamic model explains.
@@ -19,6 +31,7 @@ ESTIMATORS = [SubspaceLTI, GrayBoxRestructurer, PolynomialLPV, LocalLPVPipeline]
         LocalLPVPipeline(),
         LocalLPVPipeline(restructurer="passthrough"),
         LocalLPVPipeline(combine="average", on_error="skip"),
+        OutputErrorLPV(sampling_time=1.0, max_iter=3),
     ]
 )
 def test_common_checks(estimator, check):

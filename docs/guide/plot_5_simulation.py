@@ -84,8 +84,9 @@ float(np.abs(constant - linear).max())
 # --------------------------
 # Local experiments reveal how the system behaves *at* a scheduling value, not how a
 # *change* of it acts: a term with :math:`\dot\kappa` is zero in all of them. If such
-# terms matter in your system, no local method will find them. The analytic LPV model,
-# made of the exact linearisations and the same parabola, shows how much that is here:
+# terms matter in your system, no local method will find them (data that move do, see
+# :ref:`guide_refinement`). The analytic LPV model, made of the exact linearisations and
+# the same parabola, shows how much that is here:
 
 from lpvlearn import LPVStateSpace, PolynomialLPV, bft_score
 

@@ -126,8 +126,31 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
                 f"Experiment {run.label!r} must be local. Its scheduling variable "
                 f"{worst + 1} spreads over {spread[worst]:.4g}, more than "
                 f"{_MAX_SPREAD:g} times the {compared} ({scale[worst]:.4g}). Keep such "
-                f"a record for validation, or cut it into local experiments.{several}"
+                "a record for validation, cut it into local experiments, or refine the "
+                f"model with it: refiner=OutputErrorLPV().{several}"
             )
+
+
+def moving_experiments(
+    experiments: Sequence[Experiment],
+) -> tuple[list[Experiment], list[Experiment]]:
+    """The local experiments of a table, and those that move between their places.
+
+    Moving is a spread beyond that of a local experiment, relative to all that a
+    scheduling variable ran through, if it travels or its means differ by more than the
+    noise: noise and oscillations about one point are no motion.
+    """
+    if any(run.scheduling is None for run in experiments):
+        return list(experiments), []
+    signals = [run.scheduling for run in experiments if run.scheduling is not None]
+    spread = np.array([np.ptp(signal, axis=0) for signal in signals])
+    between = np.ptp([signal.mean(axis=0) for signal in signals], axis=0)
+    travel = np.array([_travel(signal) for signal in signals])
+    far = spread > _MAX_SPREAD * np.ptp(np.vstack(signals), axis=0)
+    apart = between > spread.min(axis=0)
+    moves = (far & (apart | (travel > _SWEEP * spread))).any(axis=1)
+    local = [run for run, away in zip(experiments, moves, strict=True) if not away]
+    return local, [run for run, away in zip(experiments, moves, strict=True) if away]
 
 
 def _motion(experiments: Sequence[Experiment]) -> Array:

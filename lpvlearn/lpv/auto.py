@@ -164,8 +164,8 @@ class AutoLPV(Interpolator):
     def _set(self, coefficients: Array) -> None:
         self.best_estimator_ = self.best_estimator_.with_coefficients(coefficients)
 
-    def _slopes(self, kappa: Array) -> Array:
-        return self.best_estimator_._slopes(kappa)
+    def _carried(self, outer: Array, kappa: Array) -> Array:
+        return self.best_estimator_._carried(outer, kappa)
 
     def _excess(self) -> float:
         return self.best_estimator_._excess()

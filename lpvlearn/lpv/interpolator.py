@@ -39,7 +39,7 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     moves, and whose covariance is that of all it predicts. `coefficients` has them as a
     vector, `with_coefficients` the same form with others, and `sensitivities` the
     derivatives of what it predicts. An heir tells them in `_coefficients`, `_set` and
-    `_slopes`.
+    `_carried`.
     """
 
     extrapolation: str
@@ -152,21 +152,25 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         changed._set(vector)
         return changed
 
-    def sensitivities(self, X: ArrayLike) -> Array:
+    def sensitivities(self, X: ArrayLike, outer: Array | None = None) -> Array:
         """Derivatives of what `predict` says by the coefficients.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_scheduling)
             Scheduling values; out of range as `predict` has them.
+        outer : ndarray of shape (n_samples, n_rows, n_params), default=None
+            Derivatives of something else by the parameters; None is the identity.
 
         Returns
         -------
         ndarray of shape (n_samples, n_params, n_coefficients)
             With the covariance P of the coefficients, the parameters at sample i have
-            the covariance ``S[i] @ P @ S[i].T`` to first order.
+            the covariance ``S[i] @ P @ S[i].T`` to first order. With `outer`, the
+            derivatives ``outer[i] @ S[i]`` of that, for less.
         """
-        return self._slopes(self._place(X))
+        kappa = self._place(X)
+        return self._carried(self._identity(kappa) if outer is None else outer, kappa)
 
     def information(self, X: ArrayLike, covariance: ArrayLike) -> Array | None:
         """What operating points tell of the coefficients.
@@ -190,9 +194,13 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         points = weighted_points(self._evaluate(kappa), np.ones(len(kappa)), covariance)
         if points.whitening is None:
             return None
-        S = self._slopes(kappa)
-        rows = (points.whitening @ S).reshape(-1, S.shape[2])
+        rows = self._carried(points.whitening, kappa)
+        rows = rows.reshape(-1, rows.shape[2])
         return rows.T @ rows / self._excess()
+
+    def _identity(self, kappa: Array) -> Array:
+        q = self._evaluate(kappa[:1]).shape[1]
+        return np.broadcast_to(np.eye(q), (len(kappa), q, q))
 
     def _excess(self) -> float:
         """Variance of points about the form, in units of what is known; 1 at least."""
@@ -233,8 +241,9 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         """Take others, and leave alone what a copy shares."""
 
     @abstractmethod
-    def _slopes(self, kappa: Array) -> Array:
-        """Derivatives (n_samples, n_params, n_coefficients) at checked values."""
+    def _carried(self, outer: Array, kappa: Array) -> Array:
+        """Derivatives by the parameters, (n_samples, n_rows, n_params) at checked
+        values, carried to the coefficients."""
 
     def _check_options(self) -> None:
         one_of("extrapolation", self.extrapolation, _EXTRAPOLATIONS)
@@ -270,15 +279,15 @@ class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         )
 
 
-def slopes_of_terms(terms: Array, n_params: int) -> Array:
-    """Derivatives of ``terms @ N`` by the entries of N, of shape (n_terms, n_params).
+def carried_by_terms(outer: Array, terms: Array) -> Array:
+    """Derivatives ``outer`` by ``terms @ N`` carried to the entries of N, row by row.
 
-    `terms` (n_samples, n_terms), or (n_samples, n_terms, n_params) where those of the
-    parameters differ.
+    `outer` (n_samples, n_rows, n_params); `terms` (n_samples, n_terms), or (n_samples,
+    n_terms, n_params) where those of the parameters differ.
     """
     each = terms[:, :, None] if terms.ndim == 2 else terms
-    slopes = each.swapaxes(1, 2)[:, :, :, None] * np.eye(n_params)[:, None, :]
-    return slopes.reshape(len(terms), n_params, -1)
+    carried = outer[:, :, None, :] * each[:, None]
+    return carried.reshape(*outer.shape[:2], -1)
 
 
 def _check_weight(sample_weight: ArrayLike | None, X: Array) -> Array:
@@ -307,6 +316,13 @@ def domains(scheduling_range: Array) -> Array:
     return np.array(
         [np.where(constant, low - 1.0, low), np.where(constant, low + 1.0, high)]
     )
+
+
+def grid_over(scheduling_range: Array, levels: int) -> Array:
+    """All combinations of levels of the variables, (levels^n_scheduling, n)."""
+    low, high = domains(scheduling_range)
+    axes = [np.linspace(a, b, levels) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
 def to_unit(kappa: Array, scheduling_range: Array) -> Array:

@@ -55,7 +55,9 @@ class LPVStateSpace:
     dependence on the scheduling variables kappa, which act at once; an input may act
     late, ``u_j(t - input_delay[j])`` in the place of ``u_j(t)``. With `offsets` the
     signals stand about a point of work that follows kappa:
-    ``dx/dt = A (x - x0) + B (u - u0)``, ``y = y0 + C (x - x0) + D (u - u0)``.
+    ``dx/dt = A (x - x0) + B (u - u0)``, ``y = y0 + C (x - x0) + D (u - u0)``. With
+    `rate_terms` A follows the rates of change too, ``A(kappa) + sum_j N_j(kappa)
+    dkappa_j/dt``.
 
     Parameters
     ----------
@@ -83,6 +85,11 @@ class LPVStateSpace:
         all are zero.
     input_names, output_names : sequence, default=None
         Names of the signals, for other programs; None is u1, u2, ... and y1, y2, ...
+    rate_terms : fitted regressor, default=None
+        From scheduling values to the entries of ``N_1, N_2, ...``, row by row,
+        (n_points, n_scheduling * order * order), in the state of the structure. Rates
+        along a trajectory are differences between its samples. Frozen models, and all
+        that other programs take, are those at rest: without.
 
     Attributes
     ----------
@@ -143,6 +150,7 @@ class LPVStateSpace:
     offsets: Any = None
     input_names: Sequence[Hashable] | None = None
     output_names: Sequence[Hashable] | None = None
+    rate_terms: Any = None
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -154,7 +162,7 @@ class LPVStateSpace:
                 "`structure` must be a GrayBoxStructure. Got "
                 f"{type(self.structure).__name__}."
             )
-        for name in ("interpolator", "offsets"):
+        for name in ("interpolator", "offsets", "rate_terms"):
             regressor = getattr(self, name)
             wanted = name == "interpolator" or regressor is not None
             if wanted and not hasattr(regressor, "predict"):
@@ -194,7 +202,8 @@ class LPVStateSpace:
             f"LPVStateSpace(order={self.order}, n_inputs={self.n_inputs}, "
             f"n_outputs={self.n_outputs}, n_scheduling={self.n_scheduling}"
             f"{f', input_delay=[{each}] s' if self.input_delay.any() else ''}"
-            f"{', with offsets' if self.offsets is not None else ''})"
+            f"{', with offsets' if self.offsets is not None else ''}"
+            f"{', with rate terms' if self.rate_terms is not None else ''})"
         )
 
     def parameters(self, kappa: ArrayLike) -> Array:
@@ -304,8 +313,8 @@ class LPVStateSpace:
             By position, or by the names of the variables:
             ``{"mass": 150, "speed": 25}``.
         rate : float, array-like of shape (n_scheduling,) or mapping, default=None
-            Rate of change of `kappa` (1/s), which A depends on after a change of basis
-            that follows kappa; None is rest.
+            Rate of change of `kappa` (1/s), which A depends on by rate terms, or after
+            a change of basis that follows kappa; None is rest.
 
         Returns
         -------
@@ -328,14 +337,17 @@ class LPVStateSpace:
 
     def _at(self, place: Array, rate: Any = None) -> StateSpace:
         model = self.structure.model(self.parameters(place[None])[0])
+        speed = None if rate is None else self._place(rate)
+        if speed is not None and self.rate_terms is not None:
+            A = model.A + self.rate_part(place[None], speed[None])[0]
+            model = StateSpace(A, model.B, model.C, model.D)
         model = model.with_input_delay(self.input_delay)
         if not self.bases:
             return model
         T = self._basis_at(place)
         model = model.transform(T)
-        if rate is None:
+        if speed is None:
             return model
-        speed = self._place(rate)
         slopes = numerical_jacobian(self._basis_at, place, self.scheduling_range[1])
         term = np.tensordot(speed, slopes, 1) @ np.linalg.inv(T)
         A, delay = model.A + term, self.input_delay
@@ -371,6 +383,25 @@ class LPVStateSpace:
         changed = replace(self, bases=(*self.bases, T))
         changed._at(self.scheduling_range.mean(axis=0))  # refuses what is no basis
         return changed
+
+    def rate_part(self, kappa: Array, rate: Array) -> Array:
+        """What the rate terms add to A, in the state of the structure.
+
+        Parameters
+        ----------
+        kappa, rate : ndarray of shape (n_points, n_scheduling)
+            Values and their rates of change (1/s).
+
+        Returns
+        -------
+        ndarray of shape (n_points, order, order)
+        """
+        n, n_rates = self.order, self.n_scheduling
+        if self.rate_terms is None:
+            return np.zeros((len(kappa), n, n))
+        wanted = f"`rate_terms` must predict the {n_rates} matrices of order {n}"
+        terms = _predicted(self.rate_terms, kappa, n_rates * n * n, wanted)
+        return np.einsum("kj,kjab->kab", rate, terms.reshape(-1, n_rates, n, n))
 
     def _basis_at(self, kappa: Array) -> Array:
         """T from the structure's state to this one's."""
@@ -712,8 +743,11 @@ class LPVStateSpace:
 
     def silenced(self) -> LPVStateSpace:
         """The model that extrapolates without a warning."""
-        quiet, offsets = _quiet(self.interpolator), _quiet(self.offsets)
-        return replace(self, interpolator=quiet, offsets=offsets, identified_range=None)
+        regressors = {
+            name: _quiet(getattr(self, name))
+            for name in ("interpolator", "offsets", "rate_terms")
+        }
+        return replace(self, **regressors, identified_range=None)
 
     def _tell_extrapolation(self, kappa: Array) -> None:
         """Warn of values out of the range, or have the interpolator tell of them."""
@@ -741,10 +775,13 @@ class LPVStateSpace:
             )
         self._tell_extrapolation(kappa)
         model = self.silenced()  # not once more, of the nodes of the table
+        path = kappa
+        if self.rate_terms is not None:
+            path = np.hstack([kappa, rates_of_change(kappa, dt)])
         y = np.empty((len(u), self.n_outputs, u.shape[2]))
         for start in range(0, len(u), _BLOCK):
             rows = slice(start, start + _BLOCK)
-            S = model._held_matrices(kappa[rows], dt)
+            S = model._held_matrices(path[rows], dt)
             A, B, C, D = blocks(S[:, :, : self.order + u.shape[1]], self.order)
             forcing = B @ u[rows]
             with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
@@ -774,15 +811,18 @@ class LPVStateSpace:
             f"unstable: a pole has real part {poles[worst]:.4g} 1/s. {cause}"
         )
 
-    def _held_matrices(self, kappa: Array, dt: float) -> Array:
-        """``[[Ad, Bd], [C, D]]`` at every row of `kappa`.
+    def _held_matrices(self, path: Array, dt: float) -> Array:
+        """``[[Ad, Bd], [C, D]]`` at scheduling values and, with rate terms, rates.
 
         Offsets are an input that is one: ``f = -A x0 - B u0``, ``y0 - C x0 - D u0``.
         """
 
         def held(points: Array) -> Array:
-            points = points.reshape(-1, self.n_scheduling)
+            points = points.reshape(-1, path.shape[1])
+            points, rates = np.split(points, [self.n_scheduling], axis=1)
             A, B, C, D = self.structure.matrices(self.parameters(points))
+            if rates.size:
+                A = A + self.rate_part(points, rates)
             finite = np.isfinite(A).all((1, 2)) & np.isfinite(B).all((1, 2))
             if not finite.all():
                 raise ValueError(
@@ -805,12 +845,12 @@ class LPVStateSpace:
             upper, lower = np.concatenate([Ad, Bd], 2), np.concatenate([C, D], 2)
             return np.concatenate([upper, lower], 1)
 
-        if self.n_scheduling == 1:
-            return tabulate(held, kappa[:, 0])
-        if (kappa == kappa[0]).all():
-            S = held(kappa[:1])
-            return np.broadcast_to(S[0], (len(kappa), *S.shape[1:]))
-        return held(kappa)
+        if path.shape[1] == 1:
+            return tabulate(held, path[:, 0])
+        if (path == path[0]).all():
+            S = held(path[:1])
+            return np.broadcast_to(S[0], (len(path), *S.shape[1:]))
+        return held(path)
 
     def _place(self, kappa: Any) -> Array:
         """One value of every scheduling variable."""
@@ -855,6 +895,11 @@ class LPVStateSpace:
                 f"`scheduling` must be finite. Got {values[k]} in row {k}."
             )
         return values
+
+
+def rates_of_change(kappa: Array, dt: float) -> Array:
+    """Rates (1/s) of a trajectory (n_samples, n_scheduling), by central differences."""
+    return np.gradient(kappa, dt, axis=0) if len(kappa) > 1 else np.zeros_like(kappa)
 
 
 def _predicted(regressor: Any, kappa: Array, n_values: int, wanted: str) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..exceptions import RankWarning, warn
 from ..validation import one_of, whole_number
-from .interpolator import Interpolator, domains, slopes_of_terms, to_unit
+from .interpolator import Interpolator, carried_by_terms, domains, to_unit
 from .weighting import WeightedPoints
 
 Array = NDArray[np.float64]
@@ -181,8 +181,8 @@ class PolynomialLPV(Interpolator):
         self._chebyshev_coef = coefficients.reshape(self._chebyshev_coef.shape)
         self._publish()
 
-    def _slopes(self, kappa: Array) -> Array:
-        return slopes_of_terms(self._terms(kappa), self._chebyshev_coef.shape[1])
+    def _carried(self, outer: Array, kappa: Array) -> Array:
+        return carried_by_terms(outer, self._terms(kappa))
 
     def _terms(self, kappa: Array) -> Array:
         return chebyshev_terms(kappa, self.powers_, self.scheduling_range_)

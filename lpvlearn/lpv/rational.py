@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import orth, solve_triangular
 
 from ..validation import one_of, whole_number
-from .interpolator import Interpolator, slopes_of_terms
+from .interpolator import Interpolator, carried_by_terms
 from .polynomial import chebyshev_terms, resolvable_powers
 from .weighting import WeightedPoints
 
@@ -172,12 +172,13 @@ class RationalLPV(Interpolator):
         self.numerator_ = numerator.reshape(self.numerator_.shape)
         self.denominator_ = np.concatenate([[1.0], d])
 
-    def _slopes(self, kappa: Array) -> Array:
+    def _carried(self, outer: Array, kappa: Array) -> Array:
         psi = self._terms(kappa, self.denominator_powers_)
         below = (psi @ self.denominator_)[:, None]
-        phi, q = self._terms(kappa, self.powers_) / below, self.numerator_.shape[1]
-        by_denominator = -(phi @ self.numerator_ / below)[:, :, None] * psi[:, None, 1:]
-        return np.concatenate([slopes_of_terms(phi, q), by_denominator], axis=2)
+        phi = self._terms(kappa, self.powers_) / below
+        lowered = -(outer @ (phi @ self.numerator_ / below)[:, :, None])
+        parts = [carried_by_terms(outer, phi), lowered * psi[:, None, 1:]]
+        return np.concatenate(parts, axis=2)
 
     def _terms(self, kappa: Array, powers: NDArray[np.intp]) -> Array:
         return chebyshev_terms(kappa, powers, self.scheduling_range_)

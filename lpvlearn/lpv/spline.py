@@ -15,7 +15,7 @@ from scipy.interpolate import (
 )
 
 from ..validation import one_of
-from .interpolator import Interpolator, slopes_of_terms, to_unit
+from .interpolator import Interpolator, carried_by_terms, to_unit
 from .weighting import WeightedPoints
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ class SplineLPV(Interpolator):
     def _set(self, coefficients: Array) -> None:
         self._draw(coefficients.reshape(self._theta.shape))
 
-    def _slopes(self, kappa: Array) -> Array:
+    def _carried(self, outer: Array, kappa: Array) -> Array:
         x, (n, q) = to_unit(kappa, self.scheduling_range_), self._theta.shape
         if isinstance(self._curve, PchipInterpolator):  # its slopes follow the values
             nodes, units = self._nodes[:, 0], np.eye(n)[:, :, None].repeat(q, axis=2)
@@ -116,7 +116,7 @@ class SplineLPV(Interpolator):
             curve = CubicHermiteSpline(nodes, units, changes)
         else:
             curve = self._through(np.eye(n))
-        return slopes_of_terms(_along(curve, x), q)
+        return carried_by_terms(outer, _along(curve, x))
 
     def _check_options(self) -> None:
         super()._check_options()

@@ -1,6 +1,7 @@
 """The whole method on one table: the steps in order, over all operating points."""
 
 from .estimator import LocalLPVPipeline
+from .output_error import OutputErrorLPV
 from .suggestion import suggest_operating_point
 
-__all__ = ["LocalLPVPipeline", "suggest_operating_point"]
+__all__ = ["LocalLPVPipeline", "OutputErrorLPV", "suggest_operating_point"]

@@ -29,19 +29,26 @@ from ..data.experiments import (
     read_experiments,
     read_outputs,
 )
-from ..data.operating_points import check_outputs, local_experiments
+from ..data.operating_points import (
+    check_outputs,
+    local_experiments,
+    moving_experiments,
+)
 from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
+from ..exceptions import warn
 from ..lpv.auto import AutoLPV
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.spline import SplineLPV
+from ..metrics.reports import readable_report
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
+from .output_error import known_coefficients, refine_model
 from .points import (
     PointRunner,
     StructuredModels,
@@ -68,6 +75,7 @@ _STEPS = {
     "local": (("fit",), "SubspaceLTI()", ()),
     "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", _WITHOUT),
     "interpolator": (("fit", "predict"), "AutoLPV() or PolynomialLPV()", ()),
+    "refiner": (("refine",), "OutputErrorLPV()", ()),
 }
 
 
@@ -114,6 +122,10 @@ class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
         of the parameters. Any scikit-learn regressor with several outputs serves; one
         whose `fit` takes a `covariance` gets these (n_points, n_params, n_params). One
         operating point makes a constant, whatever the interpolator.
+    refiner : OutputErrorLPV, default=None
+        A fourth step, which fits the coefficients of the interpolation to experiments
+        of the table along which the scheduling variables move, with what is known from
+        the local ones. None: all experiments must be local.
     inputs, scheduling, experiment, time, operating_point : column name, position or \
 list, default=None
         Roles of the columns of X. Inputs None: every column without another role.
@@ -187,6 +199,9 @@ list, default=None
         minimise the simulation error (``refine=False``, a stability that had to be
         enforced), collinear inputs, or no structure.
     interpolator_ : fitted regressor
+        Of `lpv_`: with a `refiner`, that with the refined coefficients.
+    refiner_ : fitted refiner or None
+        Its `report_` tells of the experiments that move.
     lpv_ : LPVStateSpace
         Knows the names of the scheduling variables: ``lpv_.at({"kappa": 0.5})``.
     input_delay_ : ndarray of shape (n_inputs,)
@@ -270,6 +285,7 @@ list, default=None
         local: Any = None,
         restructurer: Any = None,
         interpolator: Any = None,
+        refiner: Any = None,
         *,
         inputs: Any = None,
         scheduling: Any = None,
@@ -291,6 +307,7 @@ list, default=None
         self.local = local
         self.restructurer = restructurer
         self.interpolator = interpolator
+        self.refiner = refiner
         self.inputs = inputs
         self.scheduling = scheduling
         self.experiment = experiment
@@ -334,8 +351,8 @@ list, default=None
         Raises
         ------
         ValueError
-            If a role names no column, an experiment is not local, or a step fails at
-            an operating point (which the message names).
+            If a role names no column, an experiment is not local (with a `refiner`:
+            none is), or a step fails at an operating point (which the message names).
 
         Warns
         -----
@@ -343,6 +360,7 @@ list, default=None
             If the delays of the inputs (``local=SubspaceLTI(input_delay=...)``) differ
             between operating points: `lpv_` has their median, the models of the points
             their own. If `lpv_` is unstable at values between the points. The warnings
+            their own. If there is a `refiner`, and no experiment moves. The warnings
             of the steps name the point.
         """
         self._check_options()
@@ -363,6 +381,9 @@ list, default=None
             _check_channels(
                 structure, experiments[0].input_names, self.output_names_, self.inputs
             )
+            moving: list[Experiment] = []
+            if self.refiner is not None:
+                experiments, moving = _told_apart(experiments)
             points = local_experiments(experiments, self.scheduling_tol)
             self.sampling_time_ = self._sampling_time(experiments, structure)
 
@@ -407,6 +428,13 @@ list, default=None
             late = self.lpv_.input_delay / self.sampling_time_
             self.input_delay_ = np.round(late).astype(int)
             self.parameters_covariance_ = found.covariance
+
+        self.refiner_ = None
+        if moving:
+            with watch.step("refinement"):  # on data that moves
+                self._refine(moving, found, runner)
+
+        with watch.step("interpolation and report"):
             growth = growth_rates(self.lpv_, kappa)
             report = tables(found, self.lpv_, self.sampling_time_, growth)
             self.parameters_, self.parameters_std_ = (
@@ -503,7 +531,7 @@ list, default=None
     def summary(self) -> str:
         """What was identified and how well, as text: ``print(pipeline.summary())``."""
         check_is_fitted(self, "lpv_")
-        return summarise(
+        text = summarise(
             Tables(
                 self.parameters_,
                 self.parameters_std_,
@@ -515,6 +543,14 @@ list, default=None
             scheduling=self.scheduling_names_,
             local=_name_of_step(self.local, "local"),
             restructurer=_name_of_step(self.restructurer, "restructurer"),
+        )
+        if self.refiner_ is None:
+            return text
+        known = "with" if self.lpv_.rate_terms is not None else "without"
+        return (
+            f"{text}\n\nRefinement: {type(self.refiner_).__name__}, {known} rate "
+            "terms; simulation fit (BFT) on experiments that move:\n"
+            f"{readable_report(self.refiner_.report_).to_string()}"
         )
 
     def _simulate(
@@ -564,6 +600,17 @@ list, default=None
         needed = "an LPV model is" if structure is None else "the structure is"
         raise ValueError(NO_TIME.format(needed))
 
+    def _refine(
+        self, moving: list[Experiment], found: StructuredModels, runner: PointRunner
+    ) -> None:
+        """Fit the coefficients of `lpv_` to experiments that move."""
+        dt = self.sampling_time_
+        known = known_coefficients(self.lpv_, found, dt)
+        arguments = (self.refiner, self.lpv_, moving, dt, known)
+        refined = self.refiner_ = runner.call(refine_model, *arguments)
+        self.lpv_, self.interpolator_ = refined.lpv_, refined.lpv_.interpolator
+        self.scheduling_range_ = np.asarray(self.lpv_.identified_range)
+
     def _restructurer(self) -> Any:
         """The restructurer to clone, or the way without one."""
         return _WITHOUT[0] if self.restructurer is None else self.restructurer
@@ -588,6 +635,10 @@ list, default=None
         one_of("on_error", self.on_error, ("raise", "skip"))
         one_of("offsets", self.offsets, ("auto", None))
         one_of("efficient", self.efficient, (True, False))
+        if self.refiner is not None and self.scheduling is None:
+            raise ValueError(
+                "`refiner` needs `scheduling`, the columns that move. Got None."
+            )
         if not isinstance(self.verbose, bool):
             whole_number("verbose", self.verbose, 0)
         if self.n_jobs is not None and (
@@ -604,6 +655,25 @@ list, default=None
         tags = super().__sklearn_tags__()
         tags.regressor_tags.poor_score = True
         return tags
+
+
+def _told_apart(
+    experiments: list[Experiment],
+) -> tuple[list[Experiment], list[Experiment]]:
+    """Local experiments, and those that a refiner takes."""
+    local, moving = moving_experiments(experiments)
+    if not local:
+        raise ValueError(
+            "`refiner` refines what local experiments tell: some must stay at an "
+            f"operating point each. Got {len(moving)} that move. Of such data alone: "
+            "OutputErrorLPV().fit(X, y)."
+        )
+    if not moving:
+        warn(
+            "`refiner` has nothing to do: no experiment moves between operating "
+            "points. The model is that of the local experiments."
+        )
+    return local, moving
 
 
 def _checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:

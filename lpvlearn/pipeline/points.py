@@ -659,8 +659,11 @@ def balanced_entries(
     else:
         models = list(accumulate(models, with_signs_of))
     first = models[0]
-    structure = GrayBoxStructure.full(orders[0], first.n_inputs, first.n_outputs)
-    rows = [np.concatenate([getattr(m, M).ravel() for M in "ABCD"]) for m in models]
+    direct = any(model.D.any() for model in models)
+    sizes = (orders[0], first.n_inputs, first.n_outputs)
+    structure = GrayBoxStructure.full(*sizes, feedthrough=direct)
+    names = "ABCD" if direct else "ABC"
+    rows = [np.concatenate([getattr(m, M).ravel() for M in names]) for m in models]
     return structure, np.array(rows)
 
 

@@ -18,6 +18,10 @@ Array = NDArray[np.float64]
 # may not exceed, and still 1,100 samples a solve for 30 states.
 _CHUNK_ENTRIES = 2_000_000
 
+# Runs that share a matrix for every sample, from which a product a sample is faster
+# than the banded solve, run by run: for 6 states, 16 runs 2 times, 96 runs 15 times.
+_MANY_RUNS = 12
+
 
 def _band(A: Array, n_samples: int) -> Array:
     """Banded storage of the unit lower-triangular matrix of the recursion."""
@@ -47,6 +51,11 @@ def state_trajectory(A: Array, f: Array, x0: Array | None = None) -> Array:
     if x0 is not None:
         state[:] = np.reshape(x0, (n, -1))
     out = np.empty_like(runs)
+    if A.ndim == 3 and runs.shape[2] >= _MANY_RUNS:
+        out[0], out[1:] = state, runs[:-1]
+        for matrix, x, following in zip(A, out[:-1], out[1:], strict=False):
+            following += matrix @ x
+        return out.reshape(f.shape)
     size = max(2, min(n_samples, _CHUNK_ENTRIES // (2 * n * n)))
     band = None
     for start in range(0, n_samples, size):

@@ -1,6 +1,6 @@
 """How good an LPV model of local experiments is, by state and by interpolation.
 
-    python tests/benchmarks/bench_lpv.py [--runs 10] [--first 5000]
+    python tests/benchmarks/bench_lpv.py [--runs 10] [--first 5000] [--part refined]
 
 The flexible arm, local experiments of 3 s at 30 dB: BFT of both outputs on a sweep of
 theta2 up and one down, simulated from rest, mean and worst over the seeds; the forms
@@ -9,15 +9,23 @@ that AutoLPV chose.
 A spring of quadratic stiffness, seven points, two of 100 samples and five of 3000, at
 20 dB: the error of the parameters over the range relative to the Cramer-Rao bound of
 quadratic parameters, of AutoLPV and of a parabola without weights.
+
+The arm's models refined on two sweeps at 30 dB, one in either direction, and models of
+these sweeps alone: BFT on new noise-free ones, at full, half and double speed.
+
+Time and memory of a step of the refinement, by the number of samples.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
+import time
 from collections import Counter, defaultdict
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from lpvlearn import (
     AutoLPV,
@@ -25,12 +33,15 @@ from lpvlearn import (
     GrayBoxStructure,
     LocalLPVPipeline,
     LPVStateSpace,
+    OutputErrorLPV,
     PolynomialLPV,
+    RationalLPV,
     SplineLPV,
     SubspaceLTI,
+    bft_score,
     from_trajectories,
 )
-from lpvlearn.datasets import make_flexible_arm
+from lpvlearn.datasets import FlexibleArm, make_flexible_arm, prbs
 from lpvlearn.paper.tables import both_sweeps, sweeps_table
 
 INTERPOLATORS = {
@@ -150,12 +161,130 @@ def bench_spring(seeds: range) -> None:
     print("AutoLPV chose", dict(Counter(run.form for run in found)))
 
 
+ROLES = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+SPEEDS = (1.0, 0.5, 2.0)
+LOCAL = SubspaceLTI(6, feedthrough=False, stability="enforce")
+REFINED = {
+    "momentum": (GrayBoxRestructurer(FlexibleArm().structure("momentum")), None),
+    "rates": (GrayBoxRestructurer(FlexibleArm().structure()), None),
+    "aligned, cubic": ("aligned", PolynomialLPV(3)),
+}
+ALONE = {
+    "sweeps alone, momentum": (
+        FlexibleArm().structure("momentum"),
+        RationalLPV(2, 2),
+    ),
+    "sweeps alone, no structure": (None, PolynomialLPV(3)),
+}
+
+
+def sweeps(arm: FlexibleArm, speed: float, rng: np.random.Generator) -> list:
+    """Trajectories of a sweep up and one down, noise-free, 1 ms."""
+    n = round(3000 / speed)
+    references = np.empty((2, n, 2))
+    for u, direction in zip(references, (1, -1), strict=True):
+        u[:] = prbs(n, 2, amplitude=1.87, clock=5, balance=100, random_state=rng)
+        u[:, 1] += direction * speed * np.pi / 4
+    found = arm.simulate(references, [np.pi / 8, 7 * np.pi / 8], 1e-3)
+    return list(zip(references, found.kappa, found.y, strict=True))
+
+
+def scores(model: LPVStateSpace, runs: list) -> np.ndarray:
+    """BFT of both outputs on every trajectory."""
+    simulated = [model.silenced().simulate(u, k, 1e-3) for u, k, _ in runs]
+    return np.array(
+        [
+            bft_score(y, found, multioutput="raw_values")
+            for (_, _, y), found in zip(runs, simulated, strict=True)
+        ]
+    )
+
+
+def bench_refined(seeds: range) -> None:
+    """Print rows of the local models, refined, and of the sweeps alone."""
+    fits: dict[str, list[np.ndarray]] = defaultdict(list)
+    seconds: dict[str, list[float]] = defaultdict(list)
+    rates: Counter[str] = Counter()
+    for seed in seeds:
+        data, rng = make_flexible_arm(7, random_state=seed), np.random.default_rng(seed)
+        moving = [
+            (u, kappa, y + 10**-1.5 * y.std(axis=0) * rng.standard_normal(y.shape))
+            for u, kappa, y in sweeps(data.arm, 1.0, rng)
+        ]
+        new = [run for speed in SPEEDS for run in sweeps(data.arm, speed, rng)]
+        X, y = from_trajectories(moving, sampling_time=1e-3)
+        X["experiment"] += 1000
+        both = [
+            pd.concat(tables, ignore_index=True)
+            for tables in ((data.X, X), (data.y, y))
+        ]
+
+        for name, (restructurer, interpolator) in REFINED.items():
+            pipeline = LocalLPVPipeline(
+                LOCAL, restructurer, interpolator, OutputErrorLPV(), **ROLES
+            ).fit(*both)
+            seconds[name].append(pipeline.step_times_["refinement"])
+            rates[name] += pipeline.refiner_.rate_
+            fits[name].append(scores(pipeline.lpv_, new))
+        for name, (start, form) in ALONE.items():
+            begin = time.process_time()
+            model = OutputErrorLPV(start, interpolator=form, local=LOCAL, **ROLES)
+            model.fit(X, y)
+            seconds[name].append(time.process_time() - begin)
+            rates[name] += model.rate_
+            fits[name].append(scores(model.lpv_, new))
+    print("\nTwo sweeps: BFT up (y1, y2), down (y1, y2); at half and at double speed")
+    for name, values in fits.items():
+        mean, worst = (
+            "  ".join(f"{value:5.1f}" for value in rows.ravel())
+            for rows in (np.mean(values, axis=0), np.min(values, axis=0))
+        )
+        print(f"{name:27} mean  {mean}\n{'':27} worst {worst}")
+        print(
+            f"{'':27} {np.median(seconds[name]):.1f} s, rate terms in {rates[name]} of "
+            f"{len(values)}"
+        )
+
+
+def bench_growth() -> None:
+    """Print time and memory of a few steps by the number of samples."""
+    arm, kappa = FlexibleArm(), np.cos(np.linspace(0.4, 2.7, 7))[:, None]
+    theta = [arm.linearize(np.arccos(k)) for k in kappa[:, 0]]
+    rows = [np.concatenate([M.ravel() for M in (G.A, G.B, G.C)]) for G in theta]
+    structure = GrayBoxStructure.full(6, 2, 2, feedthrough=False)
+    form = PolynomialLPV(2).fit(kappa, np.array(rows))
+    model = LPVStateSpace(structure, form, kappa[[-1, 0]])
+    print("\nA fit of three steps, 6 states, 180 coefficients")
+    for n in (10_000, 100_000, 1_000_000):
+        rng = np.random.default_rng(0)
+        u = rng.standard_normal((n, 2))
+        path = 0.8 * np.cos(np.arange(n) / 500)
+        y = model.simulate(u, path, 1e-3)
+        X, y = from_trajectories(
+            [(u, path, y + 0.01 * rng.standard_normal(y.shape))], sampling_time=1e-3
+        )
+        fit = OutputErrorLPV(model, rate=False, max_iter=3, **ROLES)
+        begin = time.process_time()
+        fit.fit(X, y)
+        spent = time.process_time() - begin
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        print(f"{n:9,} samples: {spent:7.1f} s, {peak:7.0f} MB at most", flush=True)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--first", type=int, default=5000)
+    parts = ("local", "refined", "growth")
+    parser.add_argument("--part", choices=parts, action="append")
     options = parser.parse_args()
     chosen = range(options.first, options.first + options.runs)
-    bench_spring(chosen)
-    for count in (7, 4):
-        bench_arm(count, chosen)
+    wanted = options.part or parts
+    if "local" in wanted:
+        bench_spring(chosen)
+        for count in (7, 4):
+            bench_arm(count, chosen)
+    if "refined" in wanted:
+        bench_refined(chosen)
+    if "growth" in wanted:
+        bench_growth()

@@ -674,3 +674,49 @@ def test_wrong_offsets_are_explained():
     wrong = replace(model, offsets=model.interpolator)
     with pytest.raises(ValueError, match="`offsets` must predict the 6 values"):
         wrong.simulate(inputs(5), sweep(5), DT)
+
+
+def with_rates(model, N):
+    """The model with the rate term N(kappa), a polynomial of degree 2."""
+    kappa = np.linspace(0, 2, 3)[:, None]
+    entries = np.array([np.ravel(N(k)) for k in kappa[:, 0]])
+    return replace(model, rate_terms=PolynomialLPV(2).fit(kappa, entries))
+
+
+def test_rate_terms_are_those_of_a_change_of_basis():
+    """``T' T^-1`` of T = diag(1, exp(kappa)) in A is the constant diag(0, kappa')."""
+    model = spring()
+    moved = with_rates(model, lambda k: np.diag([0.0, 1.0]))
+    assert_allclose(moved.at(0.7).A, model.at(0.7).A)
+    difference = moved.at(0.7, rate=3.0).A - model.at(0.7).A
+    assert_allclose(difference, np.diag([0.0, 3.0]))
+    T = [[0.0, 1.0], [2.0, 0.0]]
+    turned = moved.change_basis(T).at(0.7, rate=3.0).A
+    assert_allclose(turned, T @ moved.at(0.7, rate=3.0).A @ np.linalg.inv(T))
+    assert "with rate terms" in repr(moved)
+
+
+def test_rate_terms_follow_the_trajectory():
+    model, kappa, u = spring(), sweep(300), inputs(300)
+    moved = with_rates(model, lambda k: [[0.1 * k, 0], [-k, 0.2 * k**2]])
+    rates = np.gradient(kappa, DT)
+    x, expected = np.array([0.5, -1.0]), []
+    for k, rate, uk in zip(kappa, rates, u, strict=True):
+        local = moved.at(k, rate=rate)
+        expected.append(local.C @ x + local.D @ uk)
+        step = local.to_discrete(DT)
+        x = step.A @ x + step.B @ uk
+    found = moved.simulate(u, kappa, DT, [0.5, -1.0])
+    assert_allclose(found, expected, atol=1e-11)
+    constant = np.full(300, 0.4)
+    assert_allclose(moved.simulate(u, constant, DT), model.simulate(u, constant, DT))
+    assert moved.simulate(u[:1], kappa[:1], DT).shape == (1, 2)
+
+
+def test_wrong_rate_terms_are_explained():
+    with pytest.raises(ValueError, match="`rate_terms` must be a fitted regressor"):
+        replace(spring(), rate_terms=1.0)
+    model = spring()
+    wrong = replace(model, rate_terms=model.interpolator)
+    with pytest.raises(ValueError, match="`rate_terms` must predict the 1 matrices"):
+        wrong.simulate(inputs(5), sweep(5), DT)

@@ -108,7 +108,7 @@ def test_without_a_structure_black_boxes_are_aligned(fitted, spring):
     X, y, X_sweep, y_sweep = spring
     pipeline = LocalLPVPipeline(SubspaceLTI(2, feedthrough=False), **ROLES).fit(X, y)
     assert pipeline.restructurers_ == []
-    assert pipeline.parameters_.shape == (4, 4 + 2 + 2 + 1)
+    assert pipeline.parameters_.shape == (4, 4 + 2 + 2)  # no feedthrough
     for turned, true in zip(
         pipeline.structured_models_, fitted.structured_models_, strict=True
     ):

@@ -1,6 +1,7 @@
 """Recursions without a loop per sample, and initial states."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -78,6 +79,16 @@ def test_unstable_response_is_the_loop():
     assert np.abs(expected).max() > 1e10
     size = np.linalg.norm(expected, axis=1, keepdims=True)
     assert (np.linalg.norm(x - expected, axis=1)[1:] <= 1e-11 * size[1:, 0]).all()
+
+
+@pytest.mark.parametrize("n_runs", [1, 11, 12, 40])
+def test_many_runs_share_the_matrices_of_all_samples(n_runs):
+    rng = np.random.default_rng(5)
+    A = np.array([stable(rng, 3) for _ in range(70)])
+    f, x0 = rng.normal(size=(70, 3, n_runs)), rng.normal(size=(3, n_runs))
+    x = state_trajectory(A, f, x0)
+    assert_array_equal(x[0], x0)
+    assert_allclose(x[1:], A[:-1] @ x[:-1] + f[:-1], atol=1e-12)
 
 
 def test_time_reversal_returns_to_the_start():

@@ -1,0 +1,363 @@
+"""Coefficients of an LPV model that fit records along which kappa moves.
+
+    min_c  sum_k |y_k - y_k(c)|^2_W + (c - c_0)^T L (c - c_0)
+
+with W the inverse variances of what is left of every output, estimated anew, and L what
+is known of the coefficients before. The initial state of every record, and a constant
+of every output, enter linearly and are projected out (variable projection).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from joblib import Parallel
+from joblib import delayed as later
+from numpy.typing import NDArray
+
+from ..exceptions import DivergenceError
+from ..systems.least_squares import RCOND, column_scale, levenberg_marquardt
+from ..systems.simulation import estimate_initial_state
+from .interpolator import grid_over
+from .model import LPVStateSpace
+from .polynomial import PolynomialLPV
+from .sensitivity import coefficients_of, output_slopes, with_coefficients
+from .weighting import is_chance
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_ROUNDS = 5  # of variances, each with the fit that they weigh
+_SETTLED = 0.02  # relative change of standard deviations that needs no other round
+
+# Relative decrease of the cost, twice in a row, that ends a search: near a minimum the
+# steps are Newton's, and leave far less. In a valley of changes of the state basis,
+# which a model without a structure has, many steps more would fit the noise alone.
+_TOL = 1e-3
+
+# Standard deviation of an output's errors, relative to the output, below which they
+# weigh no more: those of exact data are rounding.
+_EXACT = 1e-9
+
+_PIECES = 8  # of a record, not shorter than _PIECE samples a state
+_PIECE = 20
+
+_RATE_DEGREE = 2  # of the rate terms in the scheduling variables
+
+# Share by which rate terms must lower the errors of pieces they were not fitted to:
+# what is gained by chance is less.
+_WORTH = 0.02
+
+
+class Record(NamedTuple):
+    """Samples of one run."""
+
+    u: Array  # (n_samples, n_inputs)
+    y: Array  # (n_samples, n_outputs)
+    kappa: Array  # (n_samples, n_scheduling)
+    dt: float
+
+
+class Own(NamedTuple):
+    """Unknowns of every record."""
+
+    initial_state: bool  # else at rest
+    constant: bool  # of every output
+
+    def columns(self, free: Array) -> Array:
+        """Their effects on the outputs, (n_samples, n_outputs, n_own)."""
+        parts = [free] if self.initial_state else []
+        if self.constant:
+            eye = np.eye(free.shape[1])
+            parts.append(np.broadcast_to(eye, (len(free), *eye.shape)))
+        return np.concatenate([free[:, :, :0], *parts], axis=2)
+
+
+class Prior(NamedTuple):
+    """What is known of the coefficients: their information about a centre."""
+
+    centre: Array
+    information: Array
+
+    def widened(self, n: int) -> Prior:
+        """The same, with n more coefficients of which nothing is known, about zero."""
+        return Prior(np.pad(self.centre, (0, n)), np.pad(self.information, (0, n)))
+
+
+class Refined(NamedTuple):
+    """A model fitted to records."""
+
+    model: LPVStateSpace
+    information: Array  # of the free coefficients, records and prior together
+    free: Flags  # of the coefficients of interpolator and rate terms
+    deviation: Array  # (n_outputs,) standard deviations of what is left
+    own: list[Array]  # unknowns of every record: initial state, constants
+    costs: list[tuple[int, float]]  # round, and cost of every step taken
+    n_iter: int  # steps tried
+
+
+def simulated(
+    model: LPVStateSpace, record: Record, own: Own, weight: Array
+) -> tuple[Array, Array]:
+    """Errors (n_samples, n_outputs) of a model, and the own unknowns behind them.
+
+    These make the least of the weighted errors. Raises a DivergenceError.
+    """
+    y = model.simulate(record.u, record.kappa, record.dt)
+    error = record.y - y
+    if not (own.initial_state or own.constant):
+        return -error, np.zeros(0)
+    free = np.zeros((*y.shape, 0))
+    if own.initial_state:
+        free = model.free_responses(record.kappa, record.dt)[:, :, : model.order]
+    columns = own.columns(free)
+    found = estimate_initial_state(columns * weight[:, None], error * weight)
+    return columns @ found - error, found
+
+
+def _gram(
+    model: LPVStateSpace,
+    record: Record,
+    own: Own,
+    weight: Array,
+    free: Flags,
+    errors: Array,
+    found: Array,
+) -> Array:
+    """``[r J]^T [r J]`` of weighted errors and slopes, own unknowns projected out."""
+    n = model.order
+    x0 = model.state_offset(record.kappa[:1])[0]
+    if own.initial_state:
+        x0 = x0 + found[:n]
+    total: Any = 0.0
+    slopes = output_slopes(model, record.u, record.kappa, record.dt, x0, free)
+    for rows, J in slopes:
+        parts = [own.columns(J[:, :, :n]), errors[rows, :, None], J[:, :, n:]]
+        Z = np.concatenate(parts, axis=2) * weight[:, None]
+        Z = Z.reshape(-1, Z.shape[2])
+        total = total + Z.T @ Z
+    G, k = np.asarray(total), len(found)
+    if k == 0:
+        return G
+    size = np.sqrt(np.diag(G)[:k])
+    size[size == 0] = 1.0
+    inner = np.linalg.pinv(G[:k, :k] / size[:, None] / size, RCOND, hermitian=True)
+    across = G[:k, k:] / size[:, None]
+    return G[k:, k:] - across.T @ inner @ across
+
+
+def refine(
+    start: LPVStateSpace,
+    records: Sequence[Record],
+    own: Own,
+    prior: Prior | None = None,
+    *,
+    fixed: Flags | None = None,
+    max_iter: int = 200,
+    n_jobs: int | None = None,
+    tell: Callable[[float], None] = lambda cost: None,
+) -> Refined:
+    """Fit the coefficients of a model, which must not diverge on the records.
+
+    `fixed` coefficients stay; `prior` is one of all of them. `max_iter` counts the
+    steps that are tried, of all estimates of the variances. `tell` hears the cost of
+    every step taken.
+    """
+    bases, start = start.bases, replace(start.silenced(), bases=())
+    c0 = coefficients_of(start)
+    free = np.ones(len(c0), bool) if fixed is None else ~fixed
+    q = int(free.sum())
+    centre, information = np.zeros(q), np.zeros((q, q))
+    if prior is not None:
+        centre, information = prior.centre[free], prior.information[np.ix_(free, free)]
+    run = Parallel(n_jobs=n_jobs)
+    total = np.sqrt(np.mean(np.vstack([r.y for r in records]) ** 2, axis=0))
+    costs: list[tuple[int, float]] = []
+    left = max_iter
+
+    def model_of(c: Array) -> LPVStateSpace:
+        full = c0.copy()
+        full[free] = c
+        return with_coefficients(start, full)
+
+    def all_errors(model: LPVStateSpace, weight: Array) -> list[tuple[Array, Array]]:
+        return list(run(later(simulated)(model, r, own, weight) for r in records))
+
+    def deviation(errors: list[tuple[Array, Array]]) -> Array:
+        rms = np.sqrt(np.mean(np.vstack([e for e, _ in errors]) ** 2, axis=0))
+        return np.maximum(rms, _EXACT * np.where(total > 0, total, 1.0))
+
+    def gram(c: Array, errors: list[tuple[Array, Array]], weight: Array) -> Array:
+        model = model_of(c)
+        parts = run(
+            later(_gram)(model, r, own, weight, free, *e)
+            for r, e in zip(records, errors, strict=True)
+        )
+        G, d = np.sum(list(parts), axis=0), c - centre
+        pulled = information @ d
+        G[0, 0] += d @ pulled
+        G[0, 1:] += pulled
+        G[1:, 0] += pulled
+        G[1:, 1:] += information
+        return G
+
+    def minimise(c: Array, weight: Array, n_round: int) -> Array:
+        def residuals(trial: Array, rows: NDArray[np.intp]) -> tuple[Array, Callable]:
+            """In coordinates whose first axis is that of the residuals themselves."""
+            nonlocal left
+            left -= 1  # a step tried
+            r = np.zeros((1, 1 + q))
+            try:
+                errors = all_errors(model_of(trial[0]), weight)
+            except ValueError:  # it diverges, or there is no such model
+                return np.full_like(r, np.inf), lambda kept: np.zeros((0, 1 + q, q))
+            d = trial[0] - centre
+            cost = sum(float(np.sum((e * weight) ** 2)) for e, _ in errors)
+            cost += d @ information @ d
+            r[0, 0] = np.sqrt(cost)
+
+            def jacobian(kept: NDArray[np.intp]) -> Array:
+                costs.append((n_round, cost))
+                tell(cost)
+                G = gram(trial[0], errors, weight)
+                return _rotated(G, r[0, 0])[None]
+
+            return r, jacobian
+
+        return levenberg_marquardt(residuals, c[None], max_iter=max_iter, tol=_TOL).x[0]
+
+    c, weight = c0[free], 1.0 / total
+    weight = 1.0 / deviation(all_errors(start, np.where(total > 0, weight, 1.0)))
+    for n_round in range(_ROUNDS):
+        c = minimise(c, weight, n_round)
+        errors = all_errors(model_of(c), weight)
+        before, weight = weight, 1.0 / deviation(errors)
+        if left < 1 or np.abs(before / weight - 1.0).max() <= _SETTLED:
+            break
+    model = model_of(c)
+    G = gram(c, errors, weight)
+    own_parts = [found for _, found in errors]
+    model = replace(model, bases=bases)
+    tried = max_iter - left
+    return Refined(model, G[1:, 1:], free, 1.0 / weight, own_parts, costs, tried)
+
+
+def _rotated(G: Array, size: float) -> Array:
+    """J of residuals ``(size, 0, ..., 0)`` from the Gram matrix of residuals and J."""
+    along = G[0, 1:] / size if size > 0 else np.zeros(len(G) - 1)
+    H = G[1:, 1:] - np.outer(along, along)
+    scale = column_scale(np.diag(np.sqrt(np.maximum(np.diag(G)[1:], 0.0))))
+    values, vectors = np.linalg.eigh(H / scale[:, None] / scale)
+    across = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * scale
+    return np.vstack([along, across])
+
+
+def with_rate_terms(model: LPVStateSpace) -> tuple[LPVStateSpace, Flags]:
+    """The model with rate terms that are zero yet, and which of these are to stay so.
+
+    Rows of A that the parameters do not change are kinematics, without such terms.
+    """
+    grid, n = grid_over(model.scheduling_range, _RATE_DEGREE + 1), model.order
+    theta = model.parameters(grid[:1])[0]
+    kinematic = (model.structure.jacobian(theta)[:, :n, :n] == 0).all(axis=(0, 2))
+    entries = np.tile(np.repeat(kinematic, n), model.n_scheduling)
+    terms = PolynomialLPV(_RATE_DEGREE).fit(grid, np.zeros((len(grid), len(entries))))
+    n_terms = len(terms.coefficients()) // len(entries)
+    return replace(model, rate_terms=terms), np.tile(entries, n_terms)
+
+
+def refine_with_rates(
+    start: LPVStateSpace,
+    records: Sequence[Record],
+    own: Own,
+    prior: Prior | None,
+    *,
+    rate: bool | str,
+    groups: Sequence[int],
+    **options: Any,
+) -> Refined:
+    """`refine` with rate terms: True, False, or "auto", where they prove their worth.
+
+    That is where they lower the errors of every second piece of the records, of which
+    they were fitted to the others. A single experiment (`groups` of the records)
+    cannot tell: what it says of one direction need not be true of the other.
+    """
+    alone = rate == "auto" and len(set(groups)) < 2
+    if rate is False or alone or start.rate_terms is not None:
+        return refine(start, records, own, prior, **options)
+    moving, kinematic = with_rate_terms(start)
+    c0, more = coefficients_of(start), len(kinematic)
+    wider = None if prior is None else prior.widened(more)
+    fixed = np.concatenate([np.zeros(len(c0), bool), kinematic])
+    if rate == "auto":
+        pieces = [piece for r in records for piece in _pieces(r, start.order)]
+        there = own._replace(initial_state=True)
+        static = refine(start, pieces[::2], there, prior, **options)
+        start, weight = static.model, 1.0 / static.deviation
+        moving = replace(start, rate_terms=moving.rate_terms)
+        found = refine(moving, pieces[::2], there, wider, fixed=fixed, **options)
+        lost = [
+            sum(_loss(model, piece, there, weight) for piece in pieces[1::2])
+            for model in (static.model, found.model)
+        ]
+        if not lost[1] < (1.0 - _WORTH) * lost[0]:
+            return refine(start, records, own, prior, **options)
+        moving = found.model
+    return refine(moving, records, own, wider, fixed=fixed, **options)
+
+
+def _pieces(record: Record, order: int) -> list[Record]:
+    """Parts of a record, of which each tells its initial state."""
+    n = int(np.clip(len(record.u) // (_PIECE * max(order, 1)), 1, _PIECES))
+    parts = (np.array_split(x, n) for x in (record.u, record.y, record.kappa))
+    return [Record(u, y, kappa, record.dt) for u, y, kappa in zip(*parts, strict=True)]
+
+
+def _loss(model: LPVStateSpace, record: Record, own: Own, weight: Array) -> float:
+    """Weighted sum of squares of the errors; infinite where the model diverges."""
+    try:
+        return float(np.sum((simulated(model, record, own, weight)[0] * weight) ** 2))
+    except DivergenceError:
+        return np.inf
+
+
+def local_prior(
+    model: LPVStateSpace,
+    kappa: Array,
+    theta: Array,
+    groups: Sequence[Sequence[Record]],
+    own: Own,
+) -> Prior:
+    """What experiments at operating points tell of the coefficients of a model.
+
+    That of the parameters `theta` (n_points, n_params) of the points' own models, from
+    the derivatives of their simulations, carried to the coefficients. Where the form
+    misses the parameters by more than they are uncertain, divided by the mean square
+    of that.
+    """
+    form, every = model.interpolator, np.ones(theta.shape[1], bool)
+    missed, slopes = model.parameters(kappa) - theta, form.sensitivities(kappa)
+    rows, errors = [], []
+    for k, records in enumerate(groups):
+        constant = PolynomialLPV(0).fit(kappa[[k]], theta[[k]])
+        local = replace(model.silenced(), interpolator=constant, bases=())
+        one = np.ones(model.n_outputs)
+        found = [simulated(local, record, own, one) for record in records]
+        rms = np.sqrt(np.mean(np.vstack([e for e, _ in found]) ** 2, axis=0))
+        size = np.sqrt(np.mean(np.vstack([r.y for r in records]) ** 2, axis=0))
+        weight = 1.0 / np.maximum(rms, _EXACT * size)
+        H = sum(
+            _gram(local, record, own, weight, every, *parts)[1:, 1:]
+            for record, parts in zip(records, found, strict=True)
+        )
+        values, vectors = np.linalg.eigh(H)
+        known = values > RCOND * values[-1]  # but for changes of the state basis
+        root = np.sqrt(values[known])[:, None] * vectors[:, known].T
+        rows.append(root @ slopes[k])
+        errors.append(root @ missed[k])
+    R, e = np.vstack(rows), np.concatenate(errors)
+    inflation = 1.0 if is_chance(e @ e, len(e)) else e @ e / len(e)
+    return Prior(form.coefficients(), R.T @ R / inflation)

@@ -1,0 +1,227 @@
+"""Derivatives of the outputs of an LPV model by its coefficients.
+
+Coefficients c of the interpolators make parameters ``theta(kappa, c)``, these matrices,
+and these the recursion ``x[k+1] = Ad(kappa_k) x[k] + Bd(kappa_k) u[k]``. Its derivative
+is the same recursion, for all coefficients at once,
+
+    X[k+1] = Ad(kappa_k) X[k] + F[k] dtheta/dc(kappa_k),
+
+where F[k] holds, for every parameter, the derivative of one step from x[k]. With the
+direction E of a parameter and ``v = [x; u]`` that is the one of ``exp(M h) v``,
+
+    sum_j A^j E sum_k h^(j+k+1) / (j+k+1)! M^k v,    M = [A, B; 0, 0],
+
+a series on vectors, summed by Horner's rule; steps h are as short as it needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import matrix_balance
+from scipy.special import factorial
+
+from ..models.statespace import split_delay
+from ..models.system_matrix import blocks
+from ..systems.sampling import sample_zoh
+from ..systems.simulation import delayed, state_trajectory
+from ..systems.tabulation import tabulate
+from .model import LPVStateSpace, rates_of_change
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_LONGEST = 2.0  # norm of A h in one step of the series: 22 terms, no digit cancels
+_MOST_STEPS = 1000  # of the series in a sample: half a minute for 10,000 samples
+_TRUNCATION = 1e-14  # of the series, relative to its first term
+
+_ENTRIES = 1_000_000  # of the largest array of a block of samples: 8 MB
+_FEWEST = 16  # samples of a block, however many coefficients there are
+
+_LOOKED_AT = 200  # samples whose matrices choose the units of the states
+
+
+def coefficients_of(model: LPVStateSpace) -> Array:
+    """Coefficients of the interpolator, then of the rate terms."""
+    parts = [p for p in (model.interpolator, model.rate_terms) if p is not None]
+    return np.concatenate([part.coefficients() for part in parts])
+
+
+def with_coefficients(model: LPVStateSpace, c: Array) -> LPVStateSpace:
+    """The model with others, in the order of `coefficients_of`.
+
+    Raises a ValueError where there is no such model.
+    """
+    size = len(model.interpolator.coefficients())
+    rates = model.rate_terms
+    return replace(
+        model,
+        interpolator=model.interpolator.with_coefficients(c[:size]),
+        rate_terms=None if rates is None else rates.with_coefficients(c[size:]),
+    )
+
+
+def output_slopes(
+    model: LPVStateSpace,
+    u: Array,
+    kappa: Array,
+    dt: float,
+    x0: Array,
+    free: Flags,
+) -> Iterator[tuple[slice, Array]]:
+    """Derivatives of simulated outputs, a block of samples at a time.
+
+    Parameters
+    ----------
+    model : LPVStateSpace
+        In the state of its structure, silenced.
+    u, kappa : ndarray of shape (n_samples, n_inputs) and (n_samples, n_scheduling)
+    dt : float
+        Seconds.
+    x0 : ndarray of shape (order,)
+        Initial state.
+    free : ndarray of bool, shape (n_coefficients,)
+        Coefficients to differentiate by.
+
+    Yields
+    ------
+    slice, ndarray of shape (n_block, n_outputs, order + n_free)
+        Samples, and derivatives by the initial state and the free coefficients.
+    """
+    n, n_free = model.order, int(free.sum())
+    delay = split_delay(model.input_delay, dt)[0]
+    u0 = model.input_offset(kappa)
+    late = delayed(u, delay, np.repeat(u0[0], delay)) - u0
+    rates = rates_of_change(kappa, dt)
+    unit = _units(model, kappa, rates)
+    x, X = x0 / unit, np.zeros((n, n + n_free))
+    X[:, :n] = np.diag(1.0 / unit)
+    size = max(_FEWEST, _ENTRIES // ((n + model.n_outputs) * (n + len(free))))
+    for start in range(0, len(u), size):
+        rows = slice(start, min(start + size, len(u)))
+        A, B, C, _, E = _linearised(model, kappa[rows], rates[rows], unit)
+        offset = model.state_offset(kappa[rows]) / unit
+        w = late[rows]
+        n_steps = _steps_of(_norm(A) * dt)
+        h = dt / n_steps
+        Ah, Bh = sample_zoh(A, B, h)
+        Ad, Bd = (Ah, Bh) if n_steps == 1 else sample_zoh(A, B, dt)
+        moved = offset - (Ad @ offset[:, :, None])[:, :, 0]
+        states = state_trajectory(Ad, moved + (Bd @ w[:, :, None])[:, :, 0], x)
+        xi = states - offset
+        direct = _directed(E[..., n:, :], np.concatenate([xi, w], axis=1))
+        F = np.zeros((len(w), n, direct.shape[2]))
+        for _ in range(n_steps):
+            F = Ah @ F + _step_slopes(A, B, E[..., :n, :], xi, w, h)
+            xi = (Ah @ xi[:, :, None] + Bh @ w[:, :, None])[:, :, 0]
+        F = np.concatenate([F, direct], axis=1)
+        F = _by_coefficients(model, kappa[rows], rates[rows], F)[:, :, free]
+        forcing = np.zeros((len(w), n, n + n_free))
+        forcing[:, :, n:] = F[:, :n]
+        X_all = state_trajectory(Ad, forcing, X)
+        J = C @ X_all
+        J[:, :, n:] += F[:, n:]
+        yield rows, J
+        x = Ad[-1] @ states[-1] + moved[-1] + Bd[-1] @ w[-1]
+        X = Ad[-1] @ X_all[-1] + forcing[-1]
+
+
+def _linearised(
+    model: LPVStateSpace, kappa: Array, rates: Array, unit: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Matrices in units of the states, and the directions of S.
+
+    Directions (..., n_directions, n + n_outputs, n + n_inputs): those of the
+    parameters, and the entries of A where rate terms change them.
+    """
+    structure, n, n_rates = model.structure, model.order, model.n_scheduling
+    S = np.array(structure.system_matrix(model.parameters(kappa)))
+    E = structure.basis
+    if E is None:
+
+        def jacobians(points: Array) -> Array:
+            values = model.parameters(points.reshape(-1, n_rates))
+            return np.array([structure.jacobian(row) for row in values])
+
+        E = tabulate(jacobians, kappa[:, 0]) if n_rates == 1 else jacobians(kappa)
+    if model.rate_terms is not None:
+        S[:, :n, :n] += model.rate_part(kappa, rates)
+        entries = np.zeros((n * n, *S.shape[1:]))
+        row, column = np.divmod(np.arange(n * n), n)
+        entries[np.arange(n * n), row, column] = 1.0
+        entries = np.broadcast_to(entries, (*E.shape[:-3], *entries.shape))
+        E = np.concatenate([E, entries], axis=-3)
+    rows = np.concatenate([unit, np.ones(structure.n_outputs)])[:, None]
+    columns = np.concatenate([unit, np.ones(structure.n_inputs)])
+    return *blocks(S / rows * columns, n), E / rows * columns
+
+
+def _by_coefficients(
+    model: LPVStateSpace, kappa: Array, rates: Array, slopes: Array
+) -> Array:
+    """Derivatives along the directions (last axis), carried to all coefficients."""
+    n_params = model.structure.n_params
+    static = model.interpolator.sensitivities(kappa, slopes[:, :, :n_params])
+    if model.rate_terms is None:
+        return static
+    moving = rates[:, None, :, None] * slopes[:, :, None, n_params:]
+    moving = moving.reshape(*slopes.shape[:2], -1)
+    return np.concatenate(
+        [static, model.rate_terms.sensitivities(kappa, moving)], axis=2
+    )
+
+
+def _units(model: LPVStateSpace, kappa: Array, rates: Array) -> Array:
+    """Units of the states in which rows and columns of A are alike."""
+    some = slice(None, None, max(1, len(kappa) // _LOOKED_AT))
+    A = model.structure.matrices(model.parameters(kappa[some]))[0]
+    A = np.abs(A + model.rate_part(kappa[some], rates[some])).mean(axis=0)
+    return np.asarray(matrix_balance(A, permute=False, separate=True)[1][0])
+
+
+def _norm(A: Array) -> float:
+    return float(np.abs(A).sum(axis=-2).max(initial=0.0))
+
+
+def _steps_of(norm: float) -> int:
+    """Number of steps of the series in a sample, over which A has this norm."""
+    if norm > _LONGEST * _MOST_STEPS:
+        raise ValueError(
+            f"`sampling_time` must not be {norm:.0f} times as long as the fastest "
+            "states of the model take: its derivatives would not come to an end. Leave "
+            "what is that fast out of the structure, as a feedthrough, or sample "
+            "faster."
+        )
+    return max(1, int(np.ceil(norm / _LONGEST)))
+
+
+def _directed(E: Array, v: Array) -> Array:
+    """``E_p v`` for every direction p and sample, (n_samples, n_rows, n_directions)."""
+    if E.ndim == 4:
+        return np.einsum("kpij,kj->kip", E, v)
+    n_directions, n_rows, width = E.shape
+    flat = E.transpose(2, 1, 0).reshape(width, n_rows * n_directions)
+    return (v @ flat).reshape(len(v), n_rows, n_directions)
+
+
+def _step_slopes(A: Array, B: Array, E: Array, x: Array, u: Array, h: float) -> Array:
+    """Derivatives of the state after h by the directions E, (n_samples, n, n_dir)."""
+    norm, order = _norm(A) * h, 2
+    while norm**order / factorial(order) > _TRUNCATION:
+        order += 1
+    z = (A @ x[:, :, None] + B @ u[:, :, None])[:, :, 0]
+    powers = [np.concatenate([x, u], axis=1)]
+    for _ in range(order - 1):  # M^k v
+        powers.append(np.concatenate([z, np.zeros_like(u)], axis=1))
+        z = (A @ z[:, :, None])[:, :, 0]
+    stacked = np.array(powers)
+    k = np.arange(1, order + 1)
+    weight = h**k / factorial(k)
+    F = _directed(E, weight[-1] * stacked[0])
+    for j in range(order - 2, -1, -1):
+        inner = np.tensordot(weight[j:], stacked[: order - j], 1)
+        F = A @ F + _directed(E, inner)
+    return F

@@ -1,0 +1,632 @@
+"""Refinement of an LPV model on data whose scheduling variables move."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
+from sklearn.utils.validation import check_is_fitted
+
+from ..data.experiments import (
+    NO_TIME,
+    Experiment,
+    as_list,
+    n_rows_of,
+    naming,
+    read_experiments,
+    read_outputs,
+)
+from ..data.operating_points import check_outputs
+from ..data.preparation import read_runs
+from ..data.scoring import score_from_rest
+from ..data.timestamps import TIME_TOL, check_unit
+from ..exceptions import collected
+from ..lpv.interpolator import Interpolator, grid_over
+from ..lpv.model import LPVStateSpace, warn_extrapolation
+from ..lpv.polynomial import PolynomialLPV
+from ..lpv.refinement import (
+    Own,
+    Prior,
+    Record,
+    coefficients_of,
+    local_prior,
+    refine_with_rates,
+    simulated,
+)
+from ..metrics.scores import bft_score
+from ..metrics.table_simulation import simulate_experiments
+from ..restructuring.estimator import GrayBoxRestructurer
+from ..structures.structure import GrayBoxStructure
+from ..subspace.estimator import SubspaceLTI
+from ..validation import one_of, positive_time, whole_number
+from .points import StructuredModels, balanced_entries, identify_point
+
+Array = NDArray[np.float64]
+
+_NO_COEFFICIENTS = (
+    "`{}` needs an interpolator with coefficients to fit: AutoLPV, PolynomialLPV, "
+    "RationalLPV or SplineLPV. Got {}."
+)
+
+_LEVELS = 5  # of every scheduling variable, where a form begins as a constant
+
+
+class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """An LPV model fitted to experiments along which the scheduling variables move.
+
+    Minimises the simulation error over the coefficients of the interpolation, from a
+    model that is known, or from a time-invariant one of the table. As the `refiner` of
+    a `LocalLPVPipeline` it refines the model of the local experiments. A row of the
+    table is a time instant.
+
+    Parameters
+    ----------
+    start : LPVStateSpace, GrayBoxStructure or None, default=None
+        Where the search begins: an LPV model, or one with constant matrices, identified
+        from the table as if it were time-invariant: in a structure, or without one
+        (None) balanced, every entry of its matrices free. A pipeline gives its own.
+    rate : {"auto", True, False}, default="auto"
+        Whether A follows the rates of change of the scheduling variables too, by terms
+        ``N_j(kappa) dkappa_j/dt`` in every row of A that holds parameters, quadratic
+        polynomials. "auto": where they lower the errors of experiments that they were
+        not fitted to; not where a single experiment moves.
+    prior : {"local"}, float or None, default="local"
+        What a pipeline knows of the coefficients, from the covariances of the local
+        parameters (without these, from the local experiments), pulls to the start:
+        with its own weight, times a factor, or not at all. Alone there is none.
+    interpolator : PolynomialLPV, RationalLPV or SplineLPV, default=None
+        The form of the parameters where `start` is no LPV model. None is
+        ``PolynomialLPV(2)``, without a structure ``PolynomialLPV(1)``.
+    local : estimator, default=None
+        The time-invariant model to start from; None is
+        ``SubspaceLTI(stability="enforce")``. ``order="auto"`` becomes the order of the
+        structure.
+    initial_state : {"estimate", "rest"}, default="estimate"
+        Whether the initial state of every experiment is unknown.
+    offset : {None, "constant"}, default=None
+        "constant": every output of every experiment has an unknown constant, which
+        predictions leave out.
+    inputs, scheduling, experiment, time : column name, position or list, default=None
+        Roles of the columns of X, as in `LocalLPVPipeline`.
+    sampling_time : float, default=None
+        Seconds between samples; None reads it from the time column.
+    time_tol : float, default=0.01
+        Largest deviation of a time stamp from an even grid, relative to the step.
+    missing : {"raise", "split"}, default="raise"
+        What a missing value (NaN), or a hole in time, does: raise an error, or cut the
+        experiment there into runs with initial states of their own.
+    max_iter : int, default=200
+        Largest number of steps tried.
+    n_jobs : int, default=None
+        Experiments simulated at the same time.
+    verbose : int, default=0
+        1 shows a progress bar.
+
+    Attributes
+    ----------
+    lpv_ : LPVStateSpace
+        The refined model.
+    rate_ : bool
+        Whether it has rate terms.
+    coefficients_ : ndarray of shape (n_coefficients,)
+        Of ``lpv_.interpolator``, then of ``lpv_.rate_terms``.
+    coefficients_covariance_ : ndarray of shape (n_coefficients, n_coefficients)
+        To first order, for errors that are white: inverse of the information of
+        records and prior. Zero for coefficients that were held.
+    deviation_ : ndarray of shape (n_outputs,)
+        Standard deviations of what is left of the outputs: the weights.
+    initial_states_, offsets_ : ndarray of shape (n_runs, order) and \
+(n_runs, n_outputs)
+        Of every run (the state of the structure, about rest), zero where not estimated.
+        Without gaps a run is an experiment.
+    report_ : DataFrame
+        One row per experiment: samples, BFT (percent, mean over the outputs) of the
+        start and of the refined model, from the initial states that fit best.
+    n_iter_ : int
+        Number of steps tried, of the last search.
+    history_ : DataFrame
+        One row per step taken: round of the variances, cost.
+    sampling_time_ : float
+    output_names_, scheduling_names_ : list
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+
+    See Also
+    --------
+    LocalLPVPipeline : From local experiments, with this estimator as `refiner`.
+
+    Notes
+    -----
+    With the coefficients c, and the inverse variances W of what is left, estimated
+    anew until they settle,
+
+    .. math:: \\min_c \\sum_k \\|y_k - y_k(c)\\|_W^2
+              + (c - c_0)^T \\Lambda (c - c_0)
+
+    by Levenberg and Marquardt's method; the derivatives follow the recursion of the
+    simulation, and are exact. Initial states and constants are projected out. The
+    effort, and the memory for the outputs, are linear in the number of samples.
+
+    Local experiments say nothing of the rates of change of the scheduling variables;
+    data that move do. One record in one direction fits as well with coefficients that
+    fail in the other: keep the prior, and record both.
+
+    References
+    ----------
+    L. H. Lee, K. Poolla, Identification of linear parameter-varying systems using
+    nonlinear programming. Journal of Dynamic Systems, Measurement, and Control 121,
+    1999.
+
+    Examples
+    --------
+    A spring that stiffens, along one sweep of the scheduling variable:
+
+    >>> import numpy as np
+    >>> from lpvlearn import GrayBoxStructure, LPVStateSpace, OutputErrorLPV
+    >>> from lpvlearn import PolynomialLPV, from_trajectories
+    >>> spring = GrayBoxStructure.from_template(
+    ...     A=[[0, 1], ["-k", -1]], B=[[0], [1]], C=[[1, 0]])
+    >>> kappa = np.linspace(0, 1, 500)
+    >>> ends = np.array([[0.0], [1.0]])
+    >>> truth = LPVStateSpace(spring, PolynomialLPV(1).fit(ends, [[4.0], [9.0]]), ends)
+    >>> u = np.sign(np.random.default_rng(0).standard_normal(500))
+    >>> X, y = from_trajectories([(u, kappa, truth.simulate(u, kappa, 0.1))],
+    ...                          sampling_time=0.1)
+    >>> rough = LPVStateSpace(spring, PolynomialLPV(1).fit(ends, [[5.0], [7.0]]), ends)
+    >>> model = OutputErrorLPV(rough, scheduling="kappa", experiment="experiment",
+    ...                        time="time").fit(X, y)
+    >>> model.lpv_.parameters([0.0, 1.0]).round(4).ravel()
+    array([4., 9.])
+    """
+
+    def __init__(
+        self,
+        start: Any = None,
+        *,
+        rate: bool | str = "auto",
+        prior: Any = "local",
+        interpolator: Any = None,
+        local: Any = None,
+        initial_state: str = "estimate",
+        offset: str | None = None,
+        inputs: Any = None,
+        scheduling: Any = None,
+        experiment: Any = None,
+        time: Any = None,
+        sampling_time: float | None = None,
+        time_tol: float = TIME_TOL,
+        missing: str = "raise",
+        max_iter: int = 200,
+        n_jobs: int | None = None,
+        verbose: int = 0,
+    ) -> None:
+        self.start = start
+        self.rate = rate
+        self.prior = prior
+        self.interpolator = interpolator
+        self.local = local
+        self.initial_state = initial_state
+        self.offset = offset
+        self.inputs = inputs
+        self.scheduling = scheduling
+        self.experiment = experiment
+        self.time = time
+        self.sampling_time = sampling_time
+        self.time_tol = time_tol
+        self.missing = missing
+        self.max_iter = max_iter
+        self.n_jobs = n_jobs
+        self.verbose = verbose
+
+    def fit(self, X: Any, y: Any) -> OutputErrorLPV:
+        """Fit the model to the experiments of a table.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+            Inputs, scheduling variables and columns with other roles.
+        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            If a role names no column, the table does not fit the start, or an option
+            is not one of those above.
+        DivergenceError
+            If the start diverges on an experiment.
+        """
+        self._check_options()
+        experiments = read_runs(
+            self,
+            X,
+            y,
+            split=self.missing == "split",
+            reset=True,
+            sampling_time=self.sampling_time,
+        )
+        names = read_outputs(y)[1]
+        check_outputs(experiments, names)
+        self._single_output = np.asarray(y).ndim == 1
+        self.output_names_, self.n_outputs_ = names, len(names)
+        dt = self._sampling_time(experiments)
+        return self.refine(self._start(experiments, dt), experiments, dt)
+
+    def refine(
+        self,
+        start: LPVStateSpace,
+        experiments: Sequence[Experiment],
+        sampling_time: float,
+        known: Prior | None = None,
+    ) -> OutputErrorLPV:
+        """Fit the model to experiments that were read already.
+
+        Parameters
+        ----------
+        start : LPVStateSpace
+        experiments : list of Experiment
+            Without missing values.
+        sampling_time : float
+            Seconds, of experiments that do not tell it.
+        known : Prior, default=None
+            What is known of the coefficients of the interpolator: `centre`
+            (n_coefficients,), and its `information`, an inverse covariance.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        DivergenceError
+            If the start diverges on an experiment.
+        """
+        self._check_options()
+        records = [_record(e, sampling_time) for e in experiments]
+        own = Own(self.initial_state == "estimate", self.offset == "constant")
+        prior, factor = None, 1.0 if self.prior == "local" else self.prior
+        if known is not None and factor is not None:
+            n_more = len(coefficients_of(start)) - len(known.centre)
+            weighed = known._replace(information=factor * known.information)
+            prior = weighed.widened(n_more)
+        labels = [e.label for e in experiments]
+        groups = pd.factorize(pd.Series(labels, dtype=object))[0].tolist()
+        before = [
+            _errors(start, e, record, own)
+            for e, record in zip(experiments, records, strict=True)
+        ]
+        with _Progress(self.verbose) as tell:
+            found = refine_with_rates(
+                start,
+                records,
+                own,
+                prior,
+                rate=self.rate,
+                groups=groups,
+                max_iter=self.max_iter,
+                n_jobs=self.n_jobs,
+                tell=tell,
+            )
+        seen = np.vstack([record.kappa for record in records])
+        inner = _union(start.scheduling_range, seen)
+        identified = inner
+        if start.identified_range is not None:
+            identified = _union(inner, np.asarray(start.identified_range))
+        self.lpv_ = replace(
+            found.model, scheduling_range=inner, identified_range=identified
+        )
+        self.scheduling_range_, self.sampling_time_ = identified, sampling_time
+        names = as_list(self.scheduling) or as_list(start.scheduling_names)
+        self.scheduling_names_ = names or [*range(1, start.n_scheduling + 1)]
+        self.rate_ = self.lpv_.rate_terms is not None
+        self.coefficients_ = coefficients_of(self.lpv_)
+        self.coefficients_covariance_ = np.zeros((len(self.coefficients_),) * 2)
+        free = np.flatnonzero(found.free)
+        self.coefficients_covariance_[np.ix_(free, free)] = _inverse(found.information)
+        self.deviation_, self.n_iter_ = found.deviation, found.n_iter
+        n = start.order if own.initial_state else 0
+        self.initial_states_ = np.zeros((len(records), start.order))
+        self.offsets_ = np.zeros((len(records), start.n_outputs))
+        for k, values in enumerate(found.own):
+            self.initial_states_[k, :n] = values[:n]
+            if own.constant:
+                self.offsets_[k] = values[n:]
+        after = [
+            _errors(self.lpv_, e, record, own)
+            for e, record in zip(experiments, records, strict=True)
+        ]
+        self.report_ = _report(labels, records, before, after)
+        self.history_ = pd.DataFrame(found.costs, columns=["round", "cost"])
+        return self
+
+    # -- use -----------------------------------------------------------------------
+
+    def predict(self, X: Any) -> Array:
+        """Simulate the model along every experiment of a table, from rest.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+
+        Raises
+        ------
+        DivergenceError
+            If the outputs overflow.
+
+        Warns
+        -----
+        ExtrapolationWarning
+            Where a scheduling variable leaves ``lpv_.identified_range``.
+        """
+        check_is_fitted(self, "lpv_")
+        return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
+
+    def predict_with_initial_state(self, X: Any, y: Any) -> Array:
+        """Simulate from initial states estimated on the measured outputs.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+            Missing outputs (NaN) are left out.
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+        """
+        check_is_fitted(self, "lpv_")
+        found = self._read(X, y, outputs=False)
+        return self._simulate(found, n_rows_of(X), estimate=True)
+
+    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
+        """Coefficient of determination of the simulation from rest.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
+            Samples of which an output is missing (NaN) are left out.
+        sample_weight : array-like of shape (n_samples,), default=None
+
+        Returns
+        -------
+        float
+            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
+        """
+        return score_from_rest(self, X, y, sample_weight)
+
+    def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
+        """Rows of every experiment of a table, in the order of time."""
+        check_is_fitted(self, "lpv_")
+        gaps = "Xy" if self.missing == "split" else ""
+        found = read_experiments(self, X, reset=False, allow_missing=gaps)
+        return [e.rows for e in found]
+
+    # -- helpers -------------------------------------------------------------------
+
+    def _read(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
+        options |= {"split": self.missing == "split", "reset": False}
+        experiments = read_runs(self, X, y, **options)
+        for e in experiments:
+            check_unit(e.sampling_time, self.sampling_time_, self.time)
+        return experiments
+
+    def _simulate(
+        self, experiments: list[Experiment], n_samples: int, *, estimate: bool
+    ) -> Array:
+        signals = [e.scheduling for e in experiments if e.scheduling is not None]
+        clips = getattr(self.lpv_.interpolator, "extrapolation", None) == "clip"
+        if signals and not clips:
+            warn_extrapolation(
+                np.vstack(signals), self.scheduling_range_, self.scheduling_names_
+            )
+        model = self.lpv_.silenced()  # said above, of all experiments at once
+        out = simulate_experiments(
+            model, experiments, self.sampling_time_, n_samples, estimate=estimate
+        )
+        return out[:, 0] if self._single_output else out
+
+    def _sampling_time(self, experiments: Sequence[Experiment]) -> float:
+        steps = [e.sampling_time for e in experiments if e.sampling_time is not None]
+        if steps:
+            return float(np.median(steps))
+        if self.sampling_time is None:
+            raise ValueError(NO_TIME.format("an LPV model is"))
+        return positive_time("sampling_time", self.sampling_time)
+
+    def _start(self, experiments: Sequence[Experiment], dt: float) -> LPVStateSpace:
+        """The model given, or a time-invariant one in the form of an LPV model."""
+        names = as_list(self.scheduling)
+        if isinstance(self.start, LPVStateSpace):
+            model = self.start
+            sizes = (
+                len(experiments[0].input_names),
+                self.n_outputs_,
+                max(len(names), 1),
+            )
+            if sizes != (model.n_inputs, model.n_outputs, model.n_scheduling):
+                raise ValueError(
+                    f"`start` has {model.n_inputs} input(s), {model.n_outputs} "
+                    f"output(s) and {model.n_scheduling} scheduling variable(s). Got "
+                    f"a table with {sizes[0]}, {sizes[1]} and {len(names)}."
+                )
+            if not isinstance(model.interpolator, Interpolator):
+                got = type(model.interpolator).__name__
+                raise ValueError(_NO_COEFFICIENTS.format("start", got))
+            return model
+        structure = self.start
+        local = SubspaceLTI(stability="enforce") if self.local is None else self.local
+        if structure is not None and local.get_params().get("order") == "auto":
+            local = clone(local).set_params(order=structure.order)
+        with collected():  # where a search begins, nobody needs to hear of
+            lti = identify_point(
+                local,
+                experiments,
+                sampling_time=dt,
+                combine="pool",
+                discretization="zoh",
+            ).lti
+            if structure is None:
+                structure, (theta,) = balanced_entries([lti])
+            else:
+                theta = GrayBoxRestructurer(structure).fit_model(lti).params_
+        seen = np.zeros((1, 1))
+        if names:
+            seen = np.vstack([_record(e, dt).kappa for e in experiments])
+        bounds = np.array([seen.min(axis=0), seen.max(axis=0)])
+        form = self.interpolator
+        if form is None:
+            form = PolynomialLPV(1 if self.start is None else 2)
+        if not names:
+            form = PolynomialLPV(0)
+        grid = grid_over(bounds, _LEVELS)
+        constant = clone(form).fit(grid, np.tile(theta, (len(grid), 1)))
+        return LPVStateSpace(
+            structure,
+            constant,
+            bounds,
+            scheduling_names=names or None,
+            input_delay=lti.input_delay,
+        )
+
+    def _check_options(self) -> None:
+        one_of("rate", self.rate, ("auto", True, False))
+        one_of("initial_state", self.initial_state, ("estimate", "rest"))
+        one_of("offset", self.offset, (None, "constant"))
+        one_of("missing", self.missing, ("raise", "split"))
+        whole_number("max_iter", self.max_iter, 1)
+        number = isinstance(self.prior, int | float) and not isinstance(
+            self.prior, bool
+        )
+        if not (self.prior is None or self.prior == "local" or number) or (
+            number and not self.prior >= 0
+        ):
+            raise ValueError(
+                "`prior` must be 'local', a factor of 0 or more, or None. Got "
+                f"{self.prior!r}."
+            )
+        if not (
+            self.start is None
+            or isinstance(self.start, LPVStateSpace | GrayBoxStructure)
+        ):
+            raise ValueError(
+                "`start` must be an LPVStateSpace (of a fitted pipeline, its `lpv_`), "
+                f"a GrayBoxStructure, or None. Got {type(self.start).__name__}."
+            )
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.regressor_tags.poor_score = True
+        return tags
+
+
+def refine_model(
+    refiner: Any,
+    model: LPVStateSpace,
+    experiments: Sequence[Experiment],
+    sampling_time: float,
+    known: Prior,
+) -> Any:
+    """A clone of the refiner, with the refined model."""
+    return clone(refiner).refine(model, experiments, sampling_time, known)
+
+
+def known_coefficients(
+    model: LPVStateSpace, found: StructuredModels, sampling_time: float
+) -> Prior:
+    """What the operating points tell of the coefficients.
+
+    By the covariances of the parameters; without these, from the local experiments.
+    """
+    form = model.interpolator
+    if not isinstance(form, Interpolator):
+        raise ValueError(_NO_COEFFICIENTS.format("refiner", type(form).__name__))
+    points = found.points
+    information = form.information(points.kappa, found.covariance)
+    if information is not None:
+        return Prior(form.coefficients(), information)
+    groups = [[_record(e, sampling_time) for e in g] for g in points.experiments]
+    own = Own(True, any(model.n_trend > 0 for model in found.local))
+    return local_prior(model, points.kappa, found.theta, groups, own)
+
+
+def _record(e: Experiment, sampling_time: float) -> Record:
+    assert e.outputs is not None
+    kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
+    return Record(e.inputs, e.outputs, kappa, e.sampling_time or sampling_time)
+
+
+def _errors(model: LPVStateSpace, e: Experiment, record: Record, own: Own) -> Array:
+    """Simulation errors of a run with the unknowns of its own that fit best."""
+    with naming(e):
+        return simulated(model, record, own, np.ones(model.n_outputs))[0]
+
+
+def _report(
+    labels: Sequence[Hashable],
+    records: Sequence[Record],
+    before: Sequence[Array],
+    after: Sequence[Array],
+) -> pd.DataFrame:
+    """BFT by experiment, before and after: errors of all of its runs."""
+    rows = {}
+    for label in dict.fromkeys(labels):
+        runs = [k for k, other in enumerate(labels) if other == label]
+        y = np.vstack([records[k].y for k in runs])
+        old, new = (np.vstack([errors[k] for k in runs]) for errors in (before, after))
+        rows[label] = {
+            "n_samples": len(y),
+            "start_BFT": float(bft_score(y, y + old)),
+            "BFT": float(bft_score(y, y + new)),
+        }
+    report = pd.DataFrame.from_dict(rows, orient="index")
+    return report.rename_axis("experiment")
+
+
+def _union(bounds: Any, values: Array) -> Array:
+    """Smallest and largest values of a range and of rows of others."""
+    stacked = np.vstack([bounds, values])
+    return np.array([stacked.min(axis=0), stacked.max(axis=0)])
+
+
+def _inverse(information: Array) -> Array:
+    """Covariance; directions that nothing is known of count as known (minimum norm)."""
+    size = np.sqrt(np.maximum(np.diag(information), 0.0))
+    size[size == 0] = 1.0
+    scaled = information / size[:, None] / size
+    return np.linalg.pinv(scaled, hermitian=True) / size[:, None] / size
+
+
+class _Progress:
+    """A progress bar that tells the cost, where wanted."""
+
+    def __init__(self, verbose: int) -> None:
+        self.bar: Any = None
+        if verbose:
+            from tqdm import tqdm  # slow to import
+
+            self.bar = tqdm(desc="refinement", unit=" steps")
+
+    def __enter__(self) -> Any:
+        return self._tell
+
+    def _tell(self, cost: float) -> None:
+        if self.bar is not None:
+            self.bar.set_postfix(cost=f"{cost:.6g}")
+            self.bar.update()
+
+    def __exit__(self, *exception: object) -> None:
+        if self.bar is not None:
+            self.bar.close()

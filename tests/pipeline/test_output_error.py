@@ -1,0 +1,283 @@
+"""OutputErrorLPV: alone, and as the fourth step of a pipeline."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.base import clone
+from sklearn.linear_model import LinearRegression
+from sklearn.model_selection import GridSearchCV, cross_validate
+
+from lpvlearn import (
+    OutputErrorLPV,
+    PolynomialLPV,
+    RationalLPV,
+    SplineLPV,
+    SubspaceLTI,
+    bft_score,
+)
+from lpvlearn.exceptions import ExtrapolationWarning
+
+from ..conftest import (
+    ROLES,
+    spring_lpv,
+    spring_pipeline,
+    spring_structure,
+    spring_sweep,
+    spring_tables,
+    spring_truth,
+)
+from .conftest import N_SAMPLES
+
+FINE = np.linspace(0, 1.5, 7)
+
+
+def sweeps(noise=0.03, n=2, n_samples=400):
+    """Experiments through the whole range, with noise."""
+    tables, outputs = [], []
+    rng = np.random.default_rng(1)
+    for k in range(n):
+        X, y = spring_sweep(n_samples, seed=20 + k)
+        tables.append(X.assign(run=f"sweep {k}"))
+        outputs.append(y + noise * y["position"].std() * rng.normal(size=y.shape))
+    return pd.concat(tables, ignore_index=True), pd.concat(outputs, ignore_index=True)
+
+
+@pytest.fixture(scope="module")
+def both():
+    """Noisy local experiments, and all of them with two sweeps."""
+    local = spring_tables(noise=0.05, n_samples=N_SAMPLES)
+    moving = sweeps()
+    return local, [
+        pd.concat(p, ignore_index=True) for p in zip(local, moving, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def refined(both, memory):
+    return spring_pipeline(memory=memory, refiner=OutputErrorLPV()).fit(*both[1])
+
+
+def error(model):
+    """Of the parameters over the range, relative."""
+    return np.sqrt(np.mean((model.lpv_.parameters(FINE) / spring_truth(FINE) - 1) ** 2))
+
+
+def test_moving_experiments_refine_and_local_ones_identify(refined, both, memory):
+    plain = spring_pipeline(memory=memory).fit(*both[0])
+    np.testing.assert_array_equal(refined.operating_points_, plain.operating_points_)
+    pd.testing.assert_frame_equal(refined.parameters_, plain.parameters_)
+    assert error(refined) < error(plain)
+    assert list(refined.refiner_.report_.index) == ["sweep 0", "sweep 1"]
+    assert (refined.refiner_.report_["BFT"] > 96.5).all()
+    assert "refinement" in refined.step_times_
+    text = refined.summary()
+    assert "Refinement: OutputErrorLPV, without rate terms" in text
+    assert "sweep 1" in text
+    assert plain.refiner_ is None
+    np.testing.assert_array_equal(
+        refined.interpolator_.predict(FINE[:, None]), refined.lpv_.parameters(FINE)
+    )
+
+
+def test_without_a_refiner_moving_experiments_are_refused_with_the_remedy(both):
+    with pytest.raises(ValueError, match=r"refiner=OutputErrorLPV\(\)"):
+        spring_pipeline().fit(*both[1])
+
+
+def test_only_moving_experiments_need_no_pipeline():
+    with pytest.raises(ValueError, match=r"OutputErrorLPV\(\)\.fit"):
+        spring_pipeline(refiner=OutputErrorLPV()).fit(*sweeps(n_samples=100))
+
+
+def test_no_moving_experiment_is_told(both, memory):
+    with pytest.warns(UserWarning, match="nothing to do"):
+        model = spring_pipeline(memory=memory, refiner=OutputErrorLPV()).fit(*both[0])
+    assert model.refiner_ is None
+
+
+def test_a_refiner_needs_coefficients(both, memory):
+    pipeline = spring_pipeline(
+        memory=memory, interpolator=LinearRegression(), refiner=OutputErrorLPV()
+    )
+    with pytest.raises(ValueError, match="Got LinearRegression"):
+        pipeline.fit(*both[1])
+
+
+def test_the_prior_may_be_certain(both, memory):
+    plain = spring_pipeline(memory=memory).fit(*both[0])
+    held = spring_pipeline(memory=memory, refiner=OutputErrorLPV(prior=1e12))
+    held.fit(*both[1])
+    np.testing.assert_allclose(
+        held.lpv_.parameters(FINE), plain.lpv_.parameters(FINE), rtol=1e-5
+    )
+
+
+def test_without_a_structure_local_experiments_are_the_prior(both, memory):
+    pipeline = spring_pipeline(
+        memory=memory,
+        restructurer=None,
+        interpolator=PolynomialLPV(2),
+        refiner=OutputErrorLPV(rate=False, max_iter=10),
+    ).set_params(local__order=2, local__feedthrough=False)
+    pipeline.fit(*both[1])
+    assert (pipeline.refiner_.report_["BFT"] > 96.5).all()
+
+
+@pytest.mark.slow
+def test_searches_and_splits_work(both, memory):
+    X, y = both[1]
+    pipeline = spring_pipeline(memory=memory, refiner=OutputErrorLPV(max_iter=5))
+    groups = X["run"].isin(["sweep 1"]).astype(int)
+    split = [(np.flatnonzero(groups == 0), np.flatnonzero(groups == 1))]
+    found = cross_validate(pipeline, X, y, cv=split)
+    assert found["test_score"][0] > 0.99
+    grid = {"refiner__rate": [False, True], "refiner__prior": ["local", None]}
+    search = GridSearchCV(pipeline, grid, cv=split).fit(X, y)
+    assert search.best_score_ > 0.99
+    copy = pickle.loads(pickle.dumps(search.best_estimator_))
+    np.testing.assert_array_equal(copy.predict(X), search.predict(X))
+
+
+# -- alone -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", [None, RationalLPV(2, 1), SplineLPV("cubic")])
+def test_from_a_time_invariant_model_of_the_table(form):
+    X, y = sweeps(noise=0.0, n_samples=600)
+    model = OutputErrorLPV(spring_structure(), interpolator=form, rate=False, **ROLES)
+    model.fit(X, y)
+    assert (model.report_["start_BFT"] < 60).all()
+    assert (model.report_["BFT"] > 99.5).all()
+    if form is None:
+        np.testing.assert_allclose(
+            model.lpv_.parameters(FINE), spring_truth(FINE), rtol=1e-4
+        )
+
+
+def test_without_a_structure_matrices_are_affine_in_the_scheduling():
+    truth = spring_lpv()
+    X, _ = sweeps()
+    bounds = np.array([[0.0], [1.5]])
+    line = PolynomialLPV(1).fit(bounds, [[30, 1.2, 40], [30, 1.2, 80]])
+    truth = replace(truth, interpolator=line)
+    y = np.concatenate(
+        [
+            truth.simulate(run[["force"]], run["kappa"], 0.02)
+            for _, run in X.groupby("run")
+        ]
+    )
+    local = SubspaceLTI(2, feedthrough=False, stability="enforce")
+    model = OutputErrorLPV(rate=False, local=local, **ROLES).fit(X, y)
+    assert model.lpv_.interpolator.degree == 1
+    assert (model.report_["BFT"] > 99).all()
+    assert model.predict(X).shape == y.shape
+
+
+def test_without_scheduling_it_is_an_output_error_model():
+    X, y = spring_tables(noise=0.05, kappas=[1.0], n_samples=300)
+    roles = {"inputs": "force", "time": "time"}
+    model = OutputErrorLPV(spring_structure(), **roles).fit(X, y)
+    np.testing.assert_allclose(
+        model.lpv_.parameters([0.0])[0], spring_truth(1.0)[0], rtol=0.02
+    )
+
+
+@pytest.fixture(scope="module")
+def alone():
+    X, y = sweeps()
+    return OutputErrorLPV(spring_lpv(), rate=False, **ROLES).fit(X, y)
+
+
+def test_another_table_is_predicted_by_names_of_columns(alone):
+    X, y = spring_sweep(300, seed=77)
+    shuffled = X[["time", "kappa", "run", "force"]]
+    simulated = alone.predict(shuffled)
+    np.testing.assert_array_equal(simulated, alone.predict(X))
+    direct = alone.lpv_.simulate(X["force"], X["kappa"], 0.02)
+    np.testing.assert_array_equal(simulated, direct)
+    assert bft_score(y, simulated) > 98
+    assert alone.score(X, y) > 0.999
+
+
+def test_arrays_and_series_do_as_tables(alone):
+    X, y = sweeps()
+    numbers = X.assign(run=(X["run"] == "sweep 1").astype(float)).to_numpy()
+    positions = {"scheduling": 1, "experiment": 2, "time": 3}
+    model = OutputErrorLPV(spring_lpv(), rate=False, **positions)
+    model.fit(numbers, y.to_numpy()[:, 0])
+    np.testing.assert_allclose(model.coefficients_, alone.coefficients_, rtol=1e-9)
+    assert model.predict(numbers).shape == (len(X),)
+
+
+def test_missing_rows_cut_experiments(alone):
+    X, y = sweeps()
+    with_gaps = y.copy()
+    with_gaps.iloc[100:110] = np.nan
+    options = {"rate": False, **ROLES}
+    with pytest.raises(ValueError, match="NaN"):
+        OutputErrorLPV(spring_lpv(), **options).fit(X, with_gaps)
+    model = OutputErrorLPV(spring_lpv(), missing="split", **options).fit(X, with_gaps)
+    assert model.initial_states_.shape == (3, 2)
+    assert list(model.report_["n_samples"]) == [390, 400]
+    deviation = np.sqrt(np.diag(alone.coefficients_covariance_))
+    assert np.abs((model.coefficients_ - alone.coefficients_) / deviation).max() < 1.5
+
+
+def test_constants_of_the_outputs_are_found():
+    X, y = sweeps()
+    level = np.where(X["run"] == "sweep 1", 0.7, -0.2)
+    moved = y.add(level, axis=0)
+    model = OutputErrorLPV(spring_lpv(), rate=False, offset="constant", **ROLES)
+    model.fit(X, moved)
+    np.testing.assert_allclose(model.offsets_[:, 0], [-0.2, 0.7], atol=0.05)
+
+
+def test_what_it_knows_of_itself(alone):
+    q = len(alone.coefficients_)
+    assert alone.coefficients_covariance_.shape == (q, q)
+    assert not alone.rate_
+    assert alone.history_.columns.tolist() == ["round", "cost"]
+    assert alone.report_.columns.tolist() == ["n_samples", "start_BFT", "BFT"]
+    copy = pickle.loads(pickle.dumps(alone))
+    X, _ = sweeps()
+    np.testing.assert_array_equal(copy.predict(X), alone.predict(X))
+    assert not hasattr(clone(alone), "lpv_")
+
+
+def test_leaving_the_range_is_told(alone):
+    X, _ = spring_sweep(100)
+    with pytest.warns(ExtrapolationWarning, match="'kappa'.*farthest at 2"):
+        alone.predict(X.assign(kappa=np.linspace(0, 2, 100)))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rate": "yes"}, "`rate` must be"),
+        ({"prior": "global"}, "`prior` must be"),
+        ({"prior": -1.0}, "`prior` must be"),
+        ({"start": "arx"}, "`start` must be"),
+        ({"initial_state": "zero"}, "`initial_state` must be"),
+        ({"offset": "auto"}, "`offset` must be"),
+        ({"missing": "drop"}, "`missing` must be"),
+        ({"max_iter": 0}, "`max_iter` must be"),
+    ],
+)
+def test_wrong_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        OutputErrorLPV(**options, **ROLES).fit(*sweeps(n_samples=50))
+
+
+def test_a_start_of_other_channels_is_refused():
+    X, y = sweeps(n_samples=50)
+    with pytest.raises(ValueError, match="`start` has 1 input"):
+        OutputErrorLPV(spring_lpv(), **ROLES).fit(X.assign(torque=X["force"]), y)
+
+
+def test_the_progress_bar_tells_the_cost(capsys):
+    X, y = sweeps(n_samples=100)
+    OutputErrorLPV(spring_lpv(), rate=False, verbose=1, **ROLES).fit(X, y)
+    assert "cost=" in capsys.readouterr().err
