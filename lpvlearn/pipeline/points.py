@@ -32,6 +32,7 @@ from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..structures.structure import GrayBoxStructure
+from .branches import tied_branches
 from .memory import Remembered
 
 Array = NDArray[np.float64]
@@ -484,19 +485,26 @@ def restructure_points(
     _tell(found, points.kappa)
     helped = [done.result for done in found if done is not None]
     points, local = points.keep(kept), [local[k] for k in kept]
+    covariances = [
+        _covariance(*pair, runner) for pair in zip(helped, local, strict=True)
+    ]
+    tied = runner.call(
+        _tie_branches,
+        helped,
+        covariances,
+        [tasks[k] for k in kept],
+        points.kappa,
+        restructurer,
+        ignore=["fitted", "covariances"],
+    )
+    _tell(tied, points.kappa)
+    for k, other in enumerate(tied):
+        if other is not None:
+            helped[k] = other.result
+            covariances[k] = _covariance(helped[k], local[k], runner)
     theta = np.array([fitted.params_ for fitted in helped])
     covariance = _unknown_covariance(theta)
-    for P, fitted, model in zip(covariance, helped, local, strict=True):
-        known = getattr(fitted, "params_covariance_", None)  # where it tells its own
-        if known is None and model.deviated:
-            known = runner.call(
-                covariance_of_parameters,
-                fitted.structure_,
-                fitted.params_,
-                getattr(fitted, "frequency_weight", None),
-                _plain(model.lti),
-                model.deviated,
-            )
+    for P, known in zip(covariance, covariances, strict=True):
         if known is not None:
             P[:] = known
     models = [fitted.lti_ for fitted in helped]
@@ -515,6 +523,21 @@ def offsets_of_points(found: StructuredModels) -> Array | None:
     inputs, outputs = (np.array(values) for values in zip(*rest, strict=True))
     scales = (u_scale, y_scale)
     return points_of_work(found.models, found.points.kappa, inputs, outputs, scales)
+
+
+def _covariance(fitted: Any, model: LocalModel, runner: PointRunner) -> Array | None:
+    """Covariance of the parameters at a point, None where it is not known."""
+    known = getattr(fitted, "params_covariance_", None)  # where it tells its own
+    if known is None and model.deviated:
+        known = runner.call(
+            covariance_of_parameters,
+            fitted.structure_,
+            fitted.params_,
+            getattr(fitted, "frequency_weight", None),
+            _plain(model.lti),
+            model.deviated,
+        )
+    return known
 
 
 def _unknown_covariance(theta: Array) -> Array:
@@ -608,6 +631,48 @@ def _help_neighbours(
         if not improved:
             break
     return better
+
+
+def _tie_branches(
+    fitted: Sequence[Any],
+    covariances: Sequence[Array | None],
+    tasks: Sequence[_Task],
+    kappa: Array,
+    restructurer: Any,
+) -> list[Done | None]:
+    """Among equally good parameters of the points, those of one smooth family.
+
+    None where it is what was found. `fitted` and `covariances` follow from the other
+    arguments. Warns where families are nearly as plausible.
+    """
+    structure = fitted[0].structure_
+    weight = getattr(restructurer, "frequency_weight", None)
+    problems = [problem_from_models(structure, [task[0]], weight) for task in tasks]
+    branches, doubts = tied_branches(problems, fitted, covariances, kappa)
+    tied: list[Done | None] = [None] * len(fitted)
+    for k, branch in enumerate(branches):
+        with collected() as told:
+            if branch.start is not None:
+                fitted_there = _restructure_point(
+                    *tasks[k],
+                    restructurer=restructurer,
+                    starts=[branch.start],
+                    search=False,
+                )
+                tied[k] = Done(fitted_there, told)
+            elif branch.places is not None:
+                tied[k] = Done(fitted[k].interchanged(branch.places), told)
+    for doubt in doubts:
+        names = ", ".join(structure.parameter_names[j] for j in doubt.params)
+        warn(
+            f"the parameters {names} may have changed places at "
+            f"{_place(doubt.point, kappa)}: several values give the same response, and "
+            "those that continue the other points most smoothly are only "
+            f"{100 * doubt.probability:.0f} % likely to be the right ones. Between the "
+            "points the LPV model may be wrong. Add operating points near it, or tell "
+            "the parts apart by structure.with_bounds()."
+        )
+    return tied
 
 
 def covariance_of_parameters(

@@ -8,6 +8,7 @@ differ.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from numbers import Real
 from typing import Any
@@ -37,7 +38,7 @@ from .problem import (
     problem_from_response,
 )
 from .similarity import minimise_bilinear
-from .starts import search
+from .starts import search as starts_of
 
 Array = NDArray[np.float64]
 
@@ -214,6 +215,7 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         starts: Sequence[ArrayLike] = (),
         realizations: Sequence[StateSpace] = (),
         estimates: Sequence[Estimate] = (),
+        search: bool = True,
     ) -> GrayBoxRestructurer:
         """Restructure a black-box state-space model with the exact H-infinity norm.
 
@@ -235,6 +237,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
             models 0.01 standard deviations to either side of it, along independent
             directions. In the time domain of `model`, or in discrete time with inputs
             that are held.
+        search : bool, default=True
+            False begins from the given `starts` alone, and so stays in their basins.
 
         Raises
         ------
@@ -263,7 +267,12 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 )
         problem = self._problem(model)
         given = [problem.structure.check_params(s) for s in starts]
-        self._restructure(problem, given, estimates)
+        if not search and not given:
+            raise ValueError(
+                "`starts` must hold parameters where `search` is False: nothing else "
+                "is begun from. Got none."
+            )
+        self._restructure(problem, given, estimates, only_given=not search)
         if len(realizations) and not hasattr(self, "params_covariance_"):
             spread = problem.spread_covariance(self.params_, realizations)
             self.params_covariance_ = spread
@@ -324,6 +333,49 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         problem = self._problem(model)
         fit = problem.fit(problem.structure.check_params(params))
         return np.inf if fit is None else fit.relative_error
+
+    def interchanged(self, places: ArrayLike) -> GrayBoxRestructurer:
+        """The same fit with its parameters in other places.
+
+        Parameters
+        ----------
+        places : array-like of shape (n_params,)
+            Parameter j becomes the one that is at ``places[j]``: an interchange of
+            parts, as of two modes, that leaves the response as it is.
+
+        Returns
+        -------
+        GrayBoxRestructurer
+            A new one; its errors, bounds and certificates are the same.
+
+        Raises
+        ------
+        ValueError
+            If `places` is no permutation.
+        """
+        check_is_fitted(self, "params_")
+        names = self.structure_.parameter_names
+        pi = np.asarray(places)
+        if pi.shape != (len(names),) or sorted(pi.tolist()) != list(range(len(names))):
+            raise ValueError(
+                f"`places` must hold every index from 0 to {len(names) - 1} once. Got "
+                f"{places!r}."
+            )
+        other = copy(self)
+        for name in ("params_", "hinf_params_", "start_params_"):
+            if hasattr(self, name):
+                setattr(other, name, getattr(self, name)[pi])
+        if hasattr(self, "params_covariance_"):
+            other.params_covariance_ = self.params_covariance_[np.ix_(pi, pi)]
+        model = self.structure_.model(other.params_, self.lti_.sampling_time)
+        other.lti_ = model.with_input_delay(self.lti_.input_delay)
+        now = {names[j]: names[i] for i, j in enumerate(pi)}
+        directions = tuple(
+            {now[name]: value for name, value in direction.items()}
+            for direction in self.identifiability_.directions
+        )
+        other.identifiability_ = replace(self.identifiability_, directions=directions)
+        return other
 
     def perturbation_check(
         self, model: StateSpace, n_restarts: int = 10, size: float = 0.05
@@ -392,12 +444,15 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         problem: RestructuringProblem,
         given: list[Array],
         estimates: Sequence[Estimate] = (),
+        only_given: bool = False,
     ) -> None:
         """Starts and their least-squares fits, minimisation, certificates, warnings."""
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
         seed = check_random_state(self.random_state).randint(2**31)
-        problem, fits = search(problem, self.init, self.n_starts, given, seed)
+        problem, fits = starts_of(
+            problem, self.init, self.n_starts, given, seed, only_given
+        )
         errors = [fit.relative_error for fit in fits]
         self.starts_ = pd.DataFrame({"relative_error": errors})
         self.fit_error_, self.start_params_ = errors[0], fits[0].x

@@ -67,17 +67,23 @@ def search(
     n_starts: int,
     given: list[Array],
     seed: int,
+    only_given: bool = False,
 ) -> tuple[RestructuringProblem, list[LeastSquaresResult]]:
     """Least-squares fits, by ascending cost, and the problem that they solve.
 
     Where no model of the structure decays as fast as the black box lets expect, its
     stability margin is given up. The options are those of `GrayBoxRestructurer`;
-    further candidates may be `given`.
+    further candidates may be `given`, or all of them.
     """
     guess = None if isinstance(init, str) else problem.structure.check_params(init)
     for share in (1.0, _LEAST_MARGIN):
         problem = replace(problem, margin=share * problem.margin)
-        fits = _rounds(problem, guess, n_starts, given, np.random.default_rng(seed))
+        if only_given:
+            found = problem.best_fits(np.array(given), len(given))
+            fits = sorted(found, key=_COST)
+        else:
+            rng = np.random.default_rng(seed)
+            fits = _rounds(problem, guess, n_starts, given, rng)
         if fits:
             return problem, fits
     raise ValueError(

@@ -1,0 +1,305 @@
+"""Which of equally good parameters at every operating point belong together.
+
+Where parts of a structure may change places, or several parameters give one response,
+every operating point has several optima, and the error cannot choose. What can is that
+the parameters are smooth functions of the scheduling variable: of all families that
+take one candidate at each point, the one of the highest evidence is chosen, with every
+parameter a Gaussian process over the scheduling variable,
+
+    theta_j(kappa) = line + a smooth function of unknown size and length + noise,
+
+the noise that of the estimate and a little more. Branches that cross, cross with their
+slopes. Families are built point after point along the minimum spanning tree, the best
+ones of every length kept; their evidences also tell how certain the choice is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.spatial.distance import cdist
+
+from ..restructuring.problem import RestructuringProblem
+from ..structures.interchanges import interchanges
+from ..structures.structure import GrayBoxStructure
+
+Array = NDArray[np.float64]
+Choices = NDArray[np.intp]
+
+# A fit is another optimum where its error exceeds that of the point's own by no more
+# than a part, or rounding, and a parameter differs by more than a part (those below
+# _TINY of the largest by that of it).
+_EQUAL, _EXACT, _OTHER, _TINY = 1.02, 1e-9, 1e-2, 1e-6
+_OPTIMA = 6  # of a point at most, apart from interchanges
+_SWEEPS = 4  # over the points: optima travel that far
+
+# Prior of a parameter over the scheduling range, in units of its spread: the level, the
+# change of its line, and what bends: its sizes, its lengths, and noise beside the known
+_LEVEL, _LINE = 1.0, 2.0
+_BENDS, _LENGTHS, _ROUGH = (0.03, 0.3, 1.0), (0.4, 1.0), (1e-4, 1e-3, 1e-2, 1e-1)
+_QUICK = ((0.1, 0.5, 0.02), (0.5, 0.5, 0.05))  # of the search: bend, length, noise
+
+_KEPT = 200  # families of every length
+_WEIGHED = 24  # of them whose evidence is computed, for each prior of the search
+_APART = 1e-9  # of points at one place: a graph takes a distance of zero for none
+_CERTAIN = 0.95  # probability of the choice from which no more is said
+_TELLS = 0.05  # difference of two choices, in the spread of a parameter, that matters
+_DEVIATIONS = 3.0  # and in its standard deviations
+
+
+class Branch(NamedTuple):
+    """What becomes of the fit of a point."""
+
+    start: Array | None  # another optimum, to begin from
+    places: Choices | None  # else its own parameters, put in these places; None: stays
+
+
+class Doubt(NamedTuple):
+    """Where another family is nearly as plausible."""
+
+    point: int
+    params: Choices  # which would change
+    probability: float  # of the choice
+
+
+class Family(NamedTuple):
+    """One candidate at every point."""
+
+    chosen: Choices  # (n_points,)
+    doubts: list[Doubt]
+
+
+def tied_branches(
+    problems: Sequence[RestructuringProblem],
+    fitted: Sequence[Any],
+    covariances: Sequence[Array | None],
+    kappa: Array,
+) -> tuple[list[Branch], list[Doubt]]:
+    """Which of the equally good parameters of every point make one smooth family.
+
+    `problems` are those of the points, `fitted` their restructurers, `covariances` of
+    the parameters None where not known.
+    """
+    structure = problems[0].structure
+    places = interchanges(structure)
+    optima = _equal_optima(problems, fitted, kappa, places)
+    if len(places) == 1 and all(len(found) == 1 for found in optima):
+        return [Branch(None, None)] * len(fitted), []
+    lower, upper = structure.lower, structure.upper
+    candidates, variances, origins = [], [], []
+    for found, P in zip(optima, covariances, strict=True):
+        spread = np.zeros(structure.n_params) if P is None else np.diag(P)
+        spread = np.where(np.isfinite(spread), spread, 0.0)
+        # the optima first, then those with interchanged parts
+        origin = [(i, pi) for pi in places for i in range(len(found))]
+        rows = np.array([found[i][pi] for i, pi in origin])
+        inside = np.asarray(((rows >= lower) & (rows <= upper)).all(1), dtype=bool)
+        inside[0] = True
+        candidates.append(rows[inside])
+        variances.append(np.array([spread[pi] for _, pi in origin])[inside])
+        origins.append([origin[i] for i in np.flatnonzero(inside)])
+    # without bounds the parts of a whole family may be numbered in any way
+    n_first = None if structure.is_bounded else len(optima[int(_tree_order(kappa)[0])])
+    chosen, doubts = smoothest_family(kappa, candidates, variances, n_first)
+    family = np.array([c[i] for c, i in zip(candidates, chosen, strict=True)])
+    own = np.array([found[0] for found in optima])
+    number = places[_numbering(structure, family[:, places].swapaxes(0, 1), own)]
+    branches = []
+    for found, origin, i in zip(optima, origins, chosen, strict=True):
+        optimum, pi = origin[i]
+        pi = pi[number]
+        stays = np.array_equal(pi, places[0])
+        branches.append(
+            Branch(
+                found[optimum][pi] if optimum else None,
+                None if optimum or stays else pi,
+            )
+        )
+    back = np.argsort(number)
+    return branches, [d._replace(params=np.sort(back[d.params])) for d in doubts]
+
+
+def _equal_optima(
+    problems: Sequence[RestructuringProblem],
+    fitted: Sequence[Any],
+    kappa: Array,
+    places: Choices,
+) -> list[list[Array]]:
+    """Parameters of every point that fit it as well as its own, which are the first.
+
+    Least-squares fits from those of the neighbours, apart from permutations `places`.
+    """
+    optima = [[own.params_] for own in fitted]
+    if any(f.identifiability_.rank < f.structure_.n_params for f in fitted):
+        return optima  # whole valleys of them
+    starts = [own.start_params_ for own in fitted]
+    known = [[x[places]] for x in starts]
+    tree = _tree(_scaled(kappa)).toarray()
+    beside = [np.flatnonzero(row).tolist() for row in tree + tree.T]
+    waiting = [(i, starts[j]) for i, near in enumerate(beside) for j in near]
+    for _ in range(_SWEEPS):
+        new = []
+        for i, start in waiting:
+            fit = problems[i].fit(start)
+            if fit is None or len(optima[i]) == _OPTIMA:
+                continue
+            if fit.relative_error > _EQUAL * max(fitted[i].fit_error_, _EXACT):
+                continue
+            size = np.maximum(np.abs(fit.x), _TINY * np.abs(fit.x).max())
+            gaps = np.abs(np.vstack(known[i]) - fit.x) / np.where(size > 0, size, 1.0)
+            if (gaps.max(1) > _OTHER).all():
+                optima[i].append(fit.x)
+                known[i].append(fit.x[places])
+                new += [(k, fit.x) for k in beside[i]]
+        waiting = new
+    return optima
+
+
+def _numbering(structure: GrayBoxStructure, images: Array, own: Array) -> int:
+    """Which image of the whole family to keep: nearest to what is known of the parts.
+
+    Else the one that leaves most points as they are.
+    """
+    inside = ((images >= structure.lower) & (images <= structure.upper)).all((1, 2))
+    merit = (images == own).all(2).sum(1)
+    ranged = ~np.isnan(structure.ranges[0])
+    known = ranged | (structure.initial is not None)
+    if known.any():
+        guess = np.where(ranged, structure.ranges.mean(0), structure.reference)[known]
+        size = np.where(guess != 0, np.abs(guess), 1.0)
+        merit = -(np.abs(images[..., known] - guess) / size).sum((1, 2))
+    return int(np.argmax(np.where(inside, merit, -np.inf)))
+
+
+def smoothest_family(
+    kappa: Array,
+    candidates: Sequence[Array],
+    variances: Sequence[Array],
+    n_first: int | None = None,
+) -> Family:
+    """The most plausible choice of one candidate at every point.
+
+    `candidates` hold parameters (n_candidates, n_params) for every row of `kappa`,
+    `variances` those of their errors (zero where not known). At the first point of the
+    tree only the first `n_first` are taken, where the others would but number the parts
+    of the whole family anew.
+    """
+    x, order = _scaled(kappa), _tree_order(kappa)
+    columns = np.flatnonzero(
+        np.any([np.ptp(rows, axis=0) > 0 for rows in candidates], axis=0)
+    )
+    chosen = np.zeros(len(kappa), dtype=np.intp)
+    if columns.size == 0 or len(kappa) < 2:
+        return Family(chosen, [])
+    center, unit = _units(candidates, columns)
+    Y = [(rows[:, columns] - center) / unit for rows in candidates]
+    V = [rows[:, columns] / unit**2 for rows in variances]
+    families = np.unique(
+        np.vstack([_search(x, Y, V, order, prior, n_first) for prior in _QUICK]), axis=0
+    )
+    evidence = _evidence(x, Y, V, families)
+    chosen = families[int(np.argmax(evidence))]
+    weight = np.exp(evidence - evidence.max())
+    weight /= weight.sum()
+    doubts = []
+    for k in range(len(kappa)):
+        own = Y[k][chosen[k]]
+        gap = np.abs(Y[k][families[:, k]] - own)
+        noise = np.sqrt(V[k][families[:, k]] + V[k][chosen[k]])
+        differs = gap > np.maximum(_TELLS, _DEVIATIONS * noise)
+        certain = 1.0 - float(weight[differs.any(1)].sum())
+        if certain < _CERTAIN:
+            rival = int(np.argmax(np.where(differs.any(1), weight, -1.0)))
+            doubts.append(Doubt(k, columns[differs[rival]], certain))
+    return Family(chosen, doubts)
+
+
+def _scaled(kappa: Array) -> Array:
+    """The points in units of their range, which is from -1/2 to 1/2."""
+    span = np.ptp(kappa, axis=0)
+    return np.asarray((kappa - kappa.min(axis=0)) / np.where(span > 0, span, 1.0) - 0.5)
+
+
+def _tree(x: Array) -> Any:
+    return minimum_spanning_tree(cdist(x, x) + _APART)
+
+
+def _tree_order(kappa: Array) -> Choices:
+    """The points along the minimum spanning tree, from the one farthest outside."""
+    x = _scaled(kappa)
+    first = int(np.argmax(np.linalg.norm(x - x.mean(axis=0), axis=1)))
+    return np.asarray(breadth_first_order(_tree(x), first, directed=False)[0], np.intp)
+
+
+def _units(candidates: Sequence[Array], columns: Choices) -> tuple[Array, Array]:
+    """Mean and spread of every parameter over all candidates, points alike."""
+    rows = [c[:, columns] for c in candidates]
+    center = np.mean([c.mean(0) for c in rows], axis=0)
+    square = np.mean([((c - center) ** 2).mean(0) for c in rows], axis=0)
+    return center, np.sqrt(np.where(square > 0, square, 1.0))
+
+
+def _prior(x: Array, bend: float, length: float) -> Array:
+    """Covariance of a parameter at the points."""
+    smooth = np.exp(-0.5 * (cdist(x, x) / length) ** 2)
+    return np.asarray(_LEVEL**2 + _LINE**2 * (x @ x.T) + bend**2 * smooth)
+
+
+def _search(
+    x: Array,
+    Y: Sequence[Array],
+    V: Sequence[Array],
+    order: Choices,
+    prior: tuple[float, float, float],
+    n_first: int | None,
+) -> Choices:
+    """Families of the least sum of squared surprises, (n_families, n_points)."""
+    bend, length, rough = prior
+    K = _prior(x, bend, length)
+    # one noise for all candidates of a parameter: the weights are those of all families
+    noise = np.mean([v.mean() for v in V]) + rough**2
+    first = int(order[0])
+    families = np.arange(len(Y[first]) if n_first is None else n_first)[:, None]
+    values, cost = Y[first][families[:, 0]][:, None], np.zeros(len(families))
+    for i, k in enumerate(order[1:], start=1):
+        known = order[:i]
+        weights = np.linalg.solve(
+            K[np.ix_(known, known)] + noise * np.eye(i), K[known, k]
+        )
+        variance = K[k, k] + noise - weights @ K[known, k]
+        expected = np.einsum("i,fij->fj", weights, values)
+        surprise = ((Y[k][None] - expected[:, None]) ** 2).sum(2) / variance
+        total = (cost[:, None] + surprise).ravel()
+        best = np.argsort(total, kind="stable")[:_KEPT]
+        parent, child = np.divmod(best, len(Y[k]))
+        families = np.column_stack([families[parent], child])
+        values = np.concatenate([values[parent], Y[k][child][:, None]], axis=1)
+        cost = total[best]
+    found = np.empty_like(families[:_WEIGHED])
+    found[:, order] = families[:_WEIGHED]
+    return found
+
+
+def _evidence(
+    x: Array, Y: Sequence[Array], V: Sequence[Array], families: Choices
+) -> Array:
+    """Logarithm of the evidence of every family: priors alike, parameters apart."""
+    n = len(x)
+    priors = np.array([_prior(x, b, L) for b in _BENDS for L in _LENGTHS])
+    K = priors[:, None] + np.array([r**2 * np.eye(n) for r in _ROUGH])
+    K = K.reshape(-1, n, n)
+    evidence = np.empty(len(families))
+    for f, family in enumerate(families):
+        y = np.array([rows[c] for rows, c in zip(Y, family, strict=True)]).T  # (q, n)
+        v = np.array([rows[c] for rows, c in zip(V, family, strict=True)]).T
+        L = np.linalg.cholesky(K + (v[:, None, :, None] * np.eye(n)))  # (q, g, n, n)
+        z = np.linalg.solve(L, np.broadcast_to(y[:, None, :, None], (*L.shape[:3], 1)))
+        size = np.log(np.diagonal(L, axis1=2, axis2=3)).sum(2)
+        each = -0.5 * (z[..., 0] ** 2).sum(2) - size
+        top = each.max(1, keepdims=True)
+        evidence[f] = np.sum(top[:, 0] + np.log(np.exp(each - top).mean(1)))
+    return evidence

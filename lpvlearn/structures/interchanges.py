@@ -1,0 +1,161 @@
+"""Which parameters of a structure may change places, for no response tells them apart.
+
+The modes of a modal form, lags in series, an actuator and a sensor: a permutation pi of
+the parameters with ``G(pi theta) = G(theta)`` for all theta. Where all parameters are
+equal every such permutation keeps the point, and so it keeps the derivatives of the
+response there,
+
+    dG_pi(i) = dG_i,    d2G_pi(i)pi(j) = d2G_ij.
+
+It is an automorphism of the graph whose vertices and edges have these values for
+colours. A search with backtracking finds them all; which of them hold elsewhere, too,
+random parameters tell.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from .structure import GrayBoxStructure
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Places = NDArray[np.intp]
+
+_EQUALS = (1.0, 0.5, 2.0)  # common values of all parameters, until one gives a model
+_STEP = 1e-4  # of the first derivatives' central differences
+_COLOUR = 1e-5  # relative difference of equal second derivatives: their truncation
+_SAME = 1e-8  # relative difference of equal responses: rounding
+_MOST = 720  # permutations that are found at most: those of six parts
+_STEPS = 50_000  # of the search, after which the rest is left out
+_AWAY = np.array([0.7 + 0.4j, 1.9 - 1.1j, 0.3 + 2.3j])  # where, times the rate of A
+
+
+def interchanges(structure: GrayBoxStructure) -> Places:
+    """Permutations of the parameters that change no response, shape (k, n_params).
+
+    The identity is the first. ``theta[interchanges(structure)]`` are the parameters of
+    one model. Where there are more than 720 they are not all found.
+
+    Examples
+    --------
+    Two lags in series, whose order no response shows:
+
+    >>> from lpvlearn import GrayBoxStructure
+    >>> lags = GrayBoxStructure.from_template(
+    ...     A=[["-a", 0], [1, "-b"]], B=[["g"], [0]], C=[[0, 1]])
+    >>> interchanges(lags)
+    array([[0, 1, 2],
+           [1, 0, 2]])
+    """
+    q = structure.n_params
+    nothing = np.arange(q)[None]
+    found = _automorphisms(structure)
+    if len(found) < 2:
+        return nothing
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        theta = np.exp(0.5 * rng.normal(size=q))
+        here = _response(structure, theta)
+        if not np.isfinite(here).all():
+            continue
+        most = _SAME * np.abs(here).max()
+        found = [
+            pi
+            for pi in found
+            if (np.abs(_response(structure, theta[pi]) - here) <= most).all()
+        ]
+    return np.array(found) if found else nothing
+
+
+def _frequencies(S: Array, order: int) -> Complex:
+    """Complex frequencies about as large as the rates of a model, off its poles."""
+    size = np.linalg.norm(S[:order, :order]) / max(np.sqrt(order), 1.0)
+    return np.asarray(_AWAY * (size if size > 0 else 1.0))
+
+
+def _response(structure: GrayBoxStructure, theta: Array) -> Complex:
+    """G at complex frequencies that depend on what no permutation changes."""
+    n, (rows, columns) = structure.order, structure.map.shape
+    S = structure.system_matrix(theta)
+    nothing = np.full((len(_AWAY), rows - n, columns - n), np.nan + 0j)
+    if not np.isfinite(S).all():
+        return nothing
+    level = structure.system_matrix(np.full(len(theta), float(np.mean(theta))))
+    if not np.isfinite(level).all():
+        return nothing
+    s = _frequencies(level, n)
+    M = s[:, None, None] * np.eye(n) - S[:n, :n]
+    G = S[n:, :n] @ np.linalg.solve(M, S[:n, n:] + 0j) + S[n:, n:]
+    return np.asarray(G)
+
+
+def _slopes(structure: GrayBoxStructure, theta: Array, s: Complex) -> Complex:
+    """Derivatives of the response at complex frequencies, shape (n_params, ...)."""
+    n, q = structure.order, structure.n_params
+    S, dS = structure.system_matrix(theta), structure.jacobian(theta)
+    Phi = np.linalg.inv(s[:, None, None] * np.eye(n) - S[:n, :n])
+    rows, columns = (np.tile(np.eye(k - n), (len(s), 1, 1)) for k in S.shape)
+    L = np.concatenate([S[n:, :n] @ Phi, rows], 2)
+    R = np.concatenate([Phi @ S[:n, n:], columns], 1)
+    dG = L[:, None] @ dS @ R[:, None]  # (k, q, n_outputs, n_inputs)
+    return np.asarray(dG.swapaxes(0, 1).reshape(q, -1))
+
+
+def _automorphisms(structure: GrayBoxStructure) -> list[Places]:
+    """Permutations that keep both derivatives where all parameters are equal.
+
+    The identity is the first; nothing where no such point gives a model.
+    """
+    q = structure.n_params
+    for value in _EQUALS:
+        theta = np.full(q, value)
+        S = structure.system_matrix(theta)
+        if np.isfinite(S).all():
+            break
+    else:
+        return []
+    s = _frequencies(S, structure.order)
+    first = _slopes(structure, theta, s)
+    alike = _equal(first[:, None], first[None])
+    if not alike.sum() > q:  # every parameter has a colour of its own
+        return []
+    second = np.array(
+        [
+            _slopes(structure, theta + d, s) - _slopes(structure, theta - d, s)
+            for d in _STEP * value * np.eye(q)
+        ]
+    )
+    second = (second + second.swapaxes(0, 1)) / np.abs(second).max(initial=1e-300)
+    own = second[np.arange(q), np.arange(q)]
+    alike &= np.abs(own[:, None] - own[None]).max(2) <= _COLOUR
+    found: list[Places] = []
+    left = _STEPS
+
+    def extend(pi: list[int]) -> None:
+        nonlocal left
+        i = len(pi)
+        if i == q:
+            found.append(np.array(pi, dtype=np.intp))
+            return
+        for j in np.flatnonzero(alike[i]).tolist():
+            if j in pi:
+                continue
+            left -= 1
+            if left < 0 or len(found) == _MOST:
+                return
+            gaps = np.abs(second[i, :i] - second[j, pi])
+            if gaps.max(initial=0.0) <= _COLOUR:
+                extend([*pi, j])
+
+    extend([])  # in ascending order: the identity comes first
+    return found
+
+
+def _equal(a: Complex, b: Complex) -> NDArray[np.bool_]:
+    size = max(float(np.abs(a).max()), 1e-300)
+    return np.asarray(np.abs(a - b).max(-1) <= _COLOUR * size)
