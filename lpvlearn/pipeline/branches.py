@@ -39,9 +39,11 @@ _SWEEPS = 4  # over the points: optima travel that far
 
 # Prior of a parameter over the scheduling range, in units of its spread: the level, the
 # change of its line, and what bends: its sizes, its lengths, and noise beside the known
-_LEVEL, _LINE = 1.0, 2.0
-_BENDS, _LENGTHS, _ROUGH = (0.03, 0.3, 1.0), (0.4, 1.0), (1e-4, 1e-3, 1e-2, 1e-1)
+_LEVEL, _LINE = 1.0, 1.0
+_BENDS, _LENGTHS, _ROUGH = (0.03, 0.3, 1.0), (0.4, 1.0), (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 _QUICK = ((0.1, 0.5, 0.02), (0.5, 0.5, 0.05))  # of the search: bend, length, noise
+
+_UNKNOWN = 1e6  # variance, in squares of the spread, from which a value says nothing
 
 _KEPT = 200  # families of every length
 _WEIGHED = 24  # of them whose evidence is computed, for each prior of the search
@@ -92,8 +94,8 @@ def tied_branches(
     lower, upper = structure.lower, structure.upper
     candidates, variances, origins = [], [], []
     for found, P in zip(optima, covariances, strict=True):
-        spread = np.zeros(structure.n_params) if P is None else np.diag(P)
-        spread = np.where(np.isfinite(spread), spread, 0.0)
+        known = np.zeros((structure.n_params,) * 2) if P is None else P
+        spread = np.where(np.isnan(np.diag(known)), 0.0, np.diag(known))
         # the optima first, then those with interchanged parts
         origin = [(i, pi) for pi in places for i in range(len(found))]
         rows = np.array([found[i][pi] for i, pi in origin])
@@ -197,7 +199,7 @@ def smoothest_family(
         return Family(chosen, [])
     center, unit = _units(candidates, columns)
     Y = [(rows[:, columns] - center) / unit for rows in candidates]
-    V = [rows[:, columns] / unit**2 for rows in variances]
+    V = [np.minimum(rows[:, columns] / unit**2, _UNKNOWN) for rows in variances]
     families = np.unique(
         np.vstack([_search(x, Y, V, order, prior, n_first) for prior in _QUICK]), axis=0
     )
@@ -236,11 +238,12 @@ def _tree_order(kappa: Array) -> Choices:
 
 
 def _units(candidates: Sequence[Array], columns: Choices) -> tuple[Array, Array]:
-    """Mean and spread of every parameter over all candidates, points alike."""
+    """Level and spread of every parameter over all candidates of the usual point."""
     rows = [c[:, columns] for c in candidates]
-    center = np.mean([c.mean(0) for c in rows], axis=0)
-    square = np.mean([((c - center) ** 2).mean(0) for c in rows], axis=0)
-    return center, np.sqrt(np.where(square > 0, square, 1.0))
+    center = np.median([c.mean(0) for c in rows], axis=0)
+    squares = np.array([((c - center) ** 2).mean(0) for c in rows])
+    usual, mean = np.median(squares, axis=0), squares.mean(0)
+    return center, np.sqrt(np.where(usual > _TINY**2 * mean, usual, mean))
 
 
 def _prior(x: Array, bend: float, length: float) -> Array:
@@ -261,18 +264,17 @@ def _search(
     bend, length, rough = prior
     K = _prior(x, bend, length)
     # one noise for all candidates of a parameter: the weights are those of all families
-    noise = np.mean([v.mean() for v in V]) + rough**2
+    noise = np.array([v.mean(0) for v in V]).T + rough**2  # (q, n)
     first = int(order[0])
     families = np.arange(len(Y[first]) if n_first is None else n_first)[:, None]
     values, cost = Y[first][families[:, 0]][:, None], np.zeros(len(families))
     for i, k in enumerate(order[1:], start=1):
         known = order[:i]
-        weights = np.linalg.solve(
-            K[np.ix_(known, known)] + noise * np.eye(i), K[known, k]
-        )
-        variance = K[k, k] + noise - weights @ K[known, k]
-        expected = np.einsum("i,fij->fj", weights, values)
-        surprise = ((Y[k][None] - expected[:, None]) ** 2).sum(2) / variance
+        inner = K[np.ix_(known, known)] + noise[:, known, None] * np.eye(i)
+        weights = np.linalg.solve(inner, K[known, k][:, None])[..., 0]  # (q, i)
+        variance = K[k, k] + noise[:, k] - weights @ K[known, k]
+        expected = np.einsum("ji,fij->fj", weights, values)
+        surprise = ((Y[k][None] - expected[:, None]) ** 2 / variance).sum(2)
         total = (cost[:, None] + surprise).ravel()
         best = np.argsort(total, kind="stable")[:_KEPT]
         parent, child = np.divmod(best, len(Y[k]))

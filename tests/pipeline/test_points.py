@@ -218,7 +218,7 @@ TWO_LAGS = GrayBoxStructure.from_template(
 )
 
 
-@pytest.mark.filterwarnings("ignore:the (structure|search for)")
+@pytest.mark.filterwarnings("ignore:the (structure|search for|parameters)")
 @pytest.mark.parametrize(
     "restructurer",
     [None, GrayBoxRestructurer(), "passthrough", GrayBoxRestructurer(TWO_LAGS)],

@@ -709,3 +709,39 @@ def test_a_delay_is_left_out_and_put_back():
     with pytest.raises(ValueError, match="`frequency_weight` must be without delay"):
         weight = StateSpace(-1, 1, 1, input_delay=0.1)
         GrayBoxRestructurer(structure, frequency_weight=weight).fit_model(box)
+
+
+# -- interchangeable parts -------------------------------------------------------------
+
+
+def test_parts_of_a_fit_can_change_places():
+    modes = GrayBoxStructure.modal(2)
+    box = modes.model([1.0, 0.2, 2.0, 0.3, 0.4, 1.0, 4.0, 30.0])
+    near = StateSpace(box.A, 1.01 * box.B, box.C)
+    fitted = GrayBoxRestructurer(modes).fit_model(box, realizations=[box, near])
+    places = [2, 3, 0, 1, 5, 4, 7, 6]
+    other = fitted.interchanged(places)
+    np.testing.assert_array_equal(other.params_, fitted.params_[places])
+    np.testing.assert_array_equal(
+        other.params_covariance_, fitted.params_covariance_[np.ix_(places, places)]
+    )
+    assert (other.lti_ - fitted.lti_).hinf_norm() < 1e-12
+    assert other.error_ == fitted.error_
+    np.testing.assert_array_equal(other.interchanged(places).params_, fitted.params_)
+    with pytest.raises(ValueError, match="`places` must hold every index from 0 to 7"):
+        fitted.interchanged([0, 0, 1, 2, 3, 4, 5, 6])
+
+
+def test_a_fit_without_search_stays_in_the_basin_of_its_start():
+    modes = GrayBoxStructure.modal(2)
+    truth = np.array([1.0, 0.2, 2.0, 0.3, 0.4, 1.0, 4.0, 30.0])
+    box = modes.model(truth)
+    for start in (truth, truth[[2, 3, 0, 1, 5, 4, 7, 6]]):
+        found = GrayBoxRestructurer(modes).fit_model(
+            box, starts=[1.05 * start], search=False
+        )
+        np.testing.assert_allclose(found.params_, start, rtol=1e-6)
+    with pytest.raises(
+        ValueError, match="`starts` must hold parameters where `search`"
+    ):
+        GrayBoxRestructurer(modes).fit_model(box, search=False)

@@ -1,0 +1,209 @@
+"""One smooth family out of equally good parameters at the operating points."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    SubspaceLTI,
+    from_trajectories,
+)
+from lpvlearn.pipeline.branches import smoothest_family
+
+NOISE = 0.01
+
+
+def shuffled(theta, rng, n_first=1):
+    """Candidates of points (n_points, n_parts, n_each), every part anywhere."""
+    orders = [list(pi) for pi in permutations(range(theta.shape[1]))]
+    rows = []
+    for k, row in enumerate(theta):
+        own = row if k < n_first else row[rng.permutation(len(row))]
+        rows.append(np.array([own[pi].ravel() for pi in orders]))
+    return rows
+
+
+def chosen_parts(kappa, candidates, shape, noise=NOISE):
+    variances = [np.full_like(rows, noise**2) for rows in candidates]
+    found = smoothest_family(kappa, candidates, variances, 1)
+    picked = [rows[i] for rows, i in zip(candidates, found.chosen, strict=True)]
+    return np.reshape(picked, shape), found.doubts
+
+
+def smooth_parts(rng, x, n_parts, n_each):
+    a, b, c = (
+        rng.normal(size=(3, n_parts, n_each)) * np.array([1, 0.7, 0.3])[:, None, None]
+    )
+    x = x[:, None, None]
+    return a + b * x + c * x**2
+
+
+def test_families_stay_whole_or_are_doubted():
+    wrong = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        kappa = np.linspace(0.0, 2.0, int(rng.integers(5, 10)))[:, None]
+        shape = len(kappa), int(rng.integers(2, 5)), 2
+        theta = smooth_parts(rng, kappa[:, 0] - 1.0, *shape[1:])
+        theta = theta + NOISE * rng.normal(size=shape)
+        found, doubts = chosen_parts(kappa, shuffled(theta, rng), shape)
+        good = any(
+            np.allclose(found[:, list(pi)], theta, atol=0.1)
+            for pi in permutations(range(shape[1]))
+        )
+        wrong += not good
+        assert good or doubts
+    assert wrong <= 2
+
+
+def test_branches_cross_with_their_slopes():
+    kappa = np.linspace(0.0, 1.0, 6)[:, None]
+    rising = np.stack([kappa + 1.0, 2.0 - kappa], 1)  # they cross at 1/2
+    found, doubts = chosen_parts(
+        kappa, shuffled(rising, np.random.default_rng(0)), (6, 2)
+    )
+    np.testing.assert_allclose(found, rising[..., 0])
+    assert not doubts
+
+
+def test_what_is_the_same_in_all_parts_does_not_hide_what_differs():
+    rng = np.random.default_rng(1)
+    kappa = np.linspace(0.0, 1.0, 5)[:, None]
+    theta = np.stack([[[400.0, 1.0]] * 5, [[400.0, 1.2]] * 5, [[4.0, 7.0]] * 5], 1)
+    theta = theta + NOISE * rng.normal(size=theta.shape)
+    found, doubts = chosen_parts(kappa, shuffled(theta, rng), theta.shape)
+    np.testing.assert_array_equal(found, theta)
+    assert not doubts
+
+
+def test_units_of_parameters_and_of_the_scheduling_variables_do_not_matter():
+    rng = np.random.default_rng(2)
+    x = rng.uniform(size=(8, 2))
+    theta = np.stack([x + [1.0, 0.0], 1.5 - 0.5 * x], 1)
+    candidates = shuffled(theta, rng)
+    plain, _ = chosen_parts(x, candidates, theta.shape)
+    unit = np.array([1e-9, 1e12])
+    scaled = [rows * np.tile(unit, 2) for rows in candidates]
+    other, _ = chosen_parts(x * [1e6, 1e-6] + 5.0, scaled, theta.shape, 0.0)
+    np.testing.assert_allclose(other / unit, plain, rtol=1e-12)
+    assert any(np.array_equal(plain[:, list(pi)], theta) for pi in ((0, 1), (1, 0)))
+
+
+def test_a_value_that_is_not_determined_does_not_pull_the_others():
+    rng = np.random.default_rng(3)
+    kappa = np.linspace(0.0, 1.0, 7)[:, None]
+    theta = np.stack([kappa + 1.0, 3.0 - kappa], 1) + NOISE * rng.normal(size=(7, 2, 1))
+    theta[3] = [[500.0], [-490.0]]
+    candidates = shuffled(theta, rng)
+    variances = [np.full_like(rows, NOISE**2) for rows in candidates]
+    variances[3][:] = np.inf
+    found = smoothest_family(kappa, candidates, variances, 1)
+    picked = [rows[i] for rows, i in zip(candidates, found.chosen, strict=True)]
+    keep = np.arange(7) != 3
+    expected = theta[keep, :, 0]
+    np.testing.assert_allclose(np.array(picked)[keep], expected, atol=5 * NOISE)
+
+
+def test_two_ways_as_smooth_are_doubted():
+    """Bends away or crosses: three points cannot tell."""
+    kappa = np.array([[0.0], [1.0], [2.0]])
+    theta = np.stack([[[0.0], [0.9], [1.2]], [[2.0], [1.1], [0.8]]], 1)
+    _, doubts = chosen_parts(kappa, shuffled(theta, np.random.default_rng(4)), (3, 2))
+    assert doubts and all(0.0 < doubt.probability < 0.95 for doubt in doubts)
+    assert doubts[0].params.tolist() == [0, 1]
+
+
+def test_one_point_and_one_candidate_leave_nothing_to_choose():
+    rows = np.array([[1.0, 2.0], [2.0, 1.0]])
+    assert smoothest_family(np.zeros((1, 1)), [rows], [0 * rows]).chosen.tolist() == [0]
+    single = [rows[:1], rows[1:]]
+    found = smoothest_family(np.array([[0.0], [1.0]]), single, [0 * r for r in single])
+    assert found.chosen.tolist() == [0, 0] and not found.doubts
+
+
+# -- from data to the LPV model --------------------------------------------------------
+
+STEP = 0.1
+MODES = GrayBoxStructure.modal(2)
+
+
+def modes_at(kappa):
+    values = {
+        "c1_1": 1.0,
+        "c1_2": 0.1,
+        "c1_3": 2.0,
+        "c1_4": 0.3,
+        "d_1": 0.4,
+        "d_2": 1.0,
+    }
+    return values | {"w2_1": 4.0 + 2.0 * kappa, "w2_2": 30.0 + 10.0 * kappa}
+
+
+def modes_tables(kappas, noise=0.01, seed=0):
+    rng = np.random.default_rng(seed)
+    runs = []
+    for kappa in kappas:
+        u = rng.choice([-1.0, 1.0], (200, 1)).repeat(2, axis=0)
+        y = MODES.model(modes_at(kappa)).simulate(u, sampling_time=STEP)
+        runs.append((u, kappa, y + noise * y.std() * rng.standard_normal(y.shape)))
+    return from_trajectories(runs, sampling_time=STEP)
+
+
+def modes_pipeline(structure=MODES, seed=0, **options):
+    return LocalLPVPipeline(
+        SubspaceLTI(4, feedthrough=False, horizon=12),
+        GrayBoxRestructurer(structure, random_state=seed),
+        scheduling="kappa",
+        experiment="experiment",
+        time="time",
+        **options,
+    )
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("efficient", [True, False])
+def test_modes_keep_their_places_between_points(seed, efficient):
+    kappas = np.linspace(0.0, 2.0, 4)
+    pipeline = modes_pipeline(seed=seed, efficient=efficient).fit(*modes_tables(kappas))
+    for kappa in (kappas[1:] + kappas[:-1]) / 2:
+        truth = MODES.model(modes_at(kappa))
+        assert (pipeline.lpv_.at(kappa) - truth).hinf_norm() < 0.02 * truth.hinf_norm()
+    # what describes a point follows the choice
+    report, table = pipeline.report_, pipeline.parameters_
+    for k, fitted in enumerate(pipeline.restructurers_):
+        np.testing.assert_array_equal(fitted.params_, table.iloc[k])
+        np.testing.assert_array_equal(
+            report.filter(like="param_").iloc[k], table.iloc[k]
+        )
+        model = fitted.structure_.model(fitted.params_)
+        assert (model - pipeline.structured_models_[k]).hinf_norm() == 0.0
+        P = pipeline.parameters_covariance_[k]
+        np.testing.assert_allclose(np.diag(P), pipeline.parameters_std_.iloc[k] ** 2)
+    order = pipeline.parameters_[["w2_1", "w2_2"]].to_numpy().argsort(1)
+    assert (order == order[0]).all()
+    slow, fast = order[0] + 1
+    ratio = (
+        pipeline.parameters_std_[f"w2_{fast}"] / pipeline.parameters_std_[f"w2_{slow}"]
+    )
+    assert (ratio > 1.0).all()  # standard deviations stay with their modes
+
+
+@pytest.mark.parametrize(("slow", "fast"), ["12", "21"])
+def test_what_is_known_of_the_parts_numbers_them(slow, fast):
+    X, y = modes_tables((0.0, 1.0))
+    ranged = MODES.with_ranges({f"w2_{slow}": (3, 10), f"w2_{fast}": (20, 60)})
+    bounded = MODES.with_bounds({f"w2_{slow}": (None, 15), f"w2_{fast}": (15, None)})
+    for structure in (ranged, bounded):
+        found = modes_pipeline(structure).fit(X, y).parameters_
+        assert (found[f"w2_{slow}"] < found[f"w2_{fast}"]).all()
+
+
+def test_choices_are_kept_in_a_memory(tmp_path):
+    X, y = modes_tables((0.0, 2.0))
+    first = modes_pipeline(memory=tmp_path).fit(X, y).parameters_
+    again = modes_pipeline(memory=tmp_path).fit(X, y).parameters_
+    np.testing.assert_array_equal(first, again)

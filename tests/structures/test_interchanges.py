@@ -1,0 +1,72 @@
+"""Which parts of a structure may change places."""
+
+from math import factorial
+
+import numpy as np
+import pytest
+
+from lpvlearn import GrayBoxStructure
+from lpvlearn.structures.interchanges import interchanges
+
+LAGS = GrayBoxStructure.from_template(
+    [["-a", 0, 0], ["b", "-b", 0], [0, "c", "-c"]], [["a"], [0], [0]], [[0, 0, 1]]
+)
+SERVO = GrayBoxStructure.from_template(  # an actuator, a mode and a sensor
+    [["-a", 0, 0, 0], [0, 0, 1, 0], ["k", "-k", "-c", 0], [0, "s", 0, "-s"]],
+    [["a"], [0], [0], [0]],
+    [[0, 0, 0, 1]],
+)
+TWINS = (
+    GrayBoxStructure.mechanical(  # two masses side by side, of which the sum is seen
+        [["m1", 0], [0, "m2"]],
+        [["d1", 0], [0, "d2"]],
+        [["k1", 0], [0, "k2"]],
+        [[1], [1]],
+        sensors=[[1, 1]],
+    )
+)
+
+
+def time_constants(theta):
+    one, two, gain = theta
+    return [[-1 / one, 0], [1 / two, -1 / two]], [[gain / one], [0]], [[0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("structure", "count"),
+    [
+        (GrayBoxStructure.modal(2), 2),
+        (GrayBoxStructure.modal(3, 2, 2, n_real=2), factorial(3) * 2),
+        (GrayBoxStructure.modal(2, 2, 3, normalize="output", feedthrough=True), 2),
+        (GrayBoxStructure.modal(0, n_real=5), factorial(5)),
+        (LAGS, factorial(3)),
+        (SERVO, 2),
+        (TWINS, 2),
+        (GrayBoxStructure.from_function(time_constants, [1e-3, 1e-2, 5.0]), 2),
+        (GrayBoxStructure.observable_canonical(4, 2, 2), 1),
+        (GrayBoxStructure.full(2, 1, 1), 4),  # states, and the transposed system
+    ],
+)
+def test_all_are_found_and_none_changes_the_response(structure, count):
+    places = interchanges(structure)
+    assert len(places) == count
+    np.testing.assert_array_equal(places[0], np.arange(structure.n_params))
+    known = {tuple(pi) for pi in places.tolist()}
+    assert len(known) == count
+    assert all(tuple(pi[rho]) in known for pi in places for rho in places[:6])
+    theta = np.exp(np.random.default_rng(1).normal(size=structure.n_params))
+    omega = np.array([0.3, 1.0, 4.0])
+    G = structure.model(theta).frequency_response(omega)
+    for pi in places:
+        other = structure.model(theta[pi]).frequency_response(omega)
+        np.testing.assert_allclose(other, G, rtol=1e-8)
+
+
+def test_a_structure_that_exists_nowhere_in_the_middle_has_none_to_tell():
+    def pole(theta):
+        if abs(theta[0] - theta[1]) < 0.1:
+            raise ValueError("the lags must differ")
+        return np.diag(-theta), [[1], [1]], [[1, 1]]
+
+    structure = GrayBoxStructure.from_function(pole, [1.0, 2.0])
+    assert interchanges(structure).tolist() == [[0, 1]]
