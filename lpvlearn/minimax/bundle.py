@@ -119,11 +119,10 @@ def proximal_bundle(
             tau *= _TIGHTER if still >= _UNEXPLAINED * promised else 1.0
             model = model.refined(cuts, d)
         converged = tau > _STIFFEST  # no step, however short, lowers the objective
-    stationarity, second_order = certificate(
-        problem, y, peaks, problem.constraints(y), negligible
-    )
+    constraints = problem.constraints(y)
+    slope, bend, valley = certificate(problem, y, peaks, constraints, negligible)
     return MinimaxResult(
-        y, peaks, stationarity, second_order, converged, n_iter, history, cause
+        y, peaks, slope, bend, converged, n_iter, history, cause, valley
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import daqp
 import numpy as np
@@ -164,9 +164,10 @@ class MinimaxResult:
     `second_order` is the smallest eigenvalue of the Hessian of the Lagrangian on the
     subspace along which all active peaks stay equal, relative to the objective:
     positive for a strict local minimum, NaN where the solver has no second-order model.
-    `history` has a row per iteration: objective, predicted decrease, radius, active
-    peaks. `cause` says what ended the search short of an optimum; empty where it
-    converged or ran out of iterations.
+    `valley` is its eigenvector, along which a saddle can be left. `history` has a row
+    per iteration: objective, predicted decrease, radius, active peaks. `cause` says
+    what ended the search short of an optimum; empty where it converged or ran out of
+    iterations.
     """
 
     y: Array
@@ -177,6 +178,7 @@ class MinimaxResult:
     n_iter: int
     history: list[dict[str, float]] = field(default_factory=list)
     cause: str = ""
+    valley: Array | None = None
 
 
 def tangent_spaces(G: Array, dc: Array) -> tuple[Array, Array]:
@@ -216,17 +218,25 @@ def convexified(L: Array, G: Array, dc: Array) -> Array:
     return 0.5 * (H + H.T) + _EVERYWHERE * scale * np.eye(len(H))
 
 
+class Certificate(NamedTuple):
+    """What is known of a point, see `MinimaxResult`."""
+
+    stationarity: float
+    second_order: float
+    valley: Array | None = None
+
+
 def certificate(
     problem: MinimaxProblem,
     y: Array,
     peaks: Peaks,
     constraints: tuple[Array, Array],
     negligible: float,
-) -> tuple[float, float]:
-    """Stationarity and second-order measure at a point, see `MinimaxResult`."""
+) -> Certificate:
+    """Stationarity and second-order measure at a point."""
     f = peaks.top
     if f <= negligible:
-        return 0.0, np.inf
+        return Certificate(0.0, np.inf)
     active = peaks.values >= f * (1.0 - ACTIVE_PEAK)
     G = peaks.gradients[active] / f
     c, dc = constraints
@@ -236,5 +246,6 @@ def certificate(
     L = np.tensordot(weights, hessians, axes=1) / f
     Z = tangent_spaces(G[weights > ACTIVE_MULTIPLIER], binding)[1]
     if Z.shape[1] == 0:
-        return distance, np.inf
-    return distance, float(np.linalg.eigvalsh(Z.T @ L @ Z).min())
+        return Certificate(distance, np.inf)
+    curvatures, directions = np.linalg.eigh(Z.T @ L @ Z)
+    return Certificate(distance, float(curvatures[0]), Z @ directions[:, 0])

@@ -129,10 +129,8 @@ def minimax_sqp(
         else:
             radius = _FAILED * min(radius, float(np.abs(d).max()))
     constraints = problem.constraints(y)
-    stationarity, second_order = certificate(problem, y, own, constraints, negligible)
-    return MinimaxResult(
-        y, own, stationarity, second_order, converged, n_iter, history, cause
-    )
+    slope, bend, valley = certificate(problem, y, own, constraints, negligible)
+    return MinimaxResult(y, own, slope, bend, converged, n_iter, history, cause, valley)
 
 
 def _stalled(history: list[dict[str, float]], f: float) -> bool:

@@ -30,7 +30,7 @@ from .least_squares import LeastSquaresResult
 from .measured import stack_response
 from .minimise_covariance import Estimate, efficient_parameters
 from .minimise_h2 import minimise_h2
-from .minimise_hinf import SOLVERS, minimise_hinf, promising
+from .minimise_hinf import SOLVERS, is_saddle, minimise_hinf, promising
 from .problem import (
     FrequencyWeight,
     RestructuringProblem,
@@ -42,6 +42,7 @@ from .starts import search as starts_of
 
 Array = NDArray[np.float64]
 
+_OPTIMAL = 1e-5  # stationarity from which an optimum is known nearly only
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows in plots
 
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
@@ -142,6 +143,10 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         proven optimal by `lower_bound_`), and smallest eigenvalue of the reduced
         Hessian (positive: a strict local minimum), relative to the error, in the metric
         of the response.
+    convergence_ : {"optimal", "nearly", "saddle", "no"}
+        What the certificates make of the result: stationary to 1e-5, or to 1e-3 only; a
+        saddle that no step along its negative curvature led out of; or neither, and the
+        best point met was kept. The last two are warned of.
     identifiability_ : Identifiability
         Rank and condition of the derivative of the response to the parameters.
     dropped_feedthrough_ : ndarray of shape (n_outputs, n_inputs)
@@ -505,6 +510,13 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         self.lower_bound_ = max(floor, problem.lower_bound)
         self.stationarity_ = result.stationarity
         self.second_order_ = result.second_order
+        self.convergence_ = "optimal"
+        if not result.converged:
+            self.convergence_ = "no"
+        elif is_saddle(result):
+            self.convergence_ = "saddle"
+        elif result.stationarity > _OPTIMAL:
+            self.convergence_ = "nearly"
         self.n_iter_ = result.n_iter
         self.history_ = pd.DataFrame(result.history)
         minimax = self.norm in ("hinf", "covariance")
@@ -567,6 +579,13 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 "The best point is kept. "
                 + ("Raise `max_iter`" if spent else "Try another `random_state`")
                 + ", or take a structure of fewer parameters.",
+                ConvergenceWarning,
+            )
+        if self.convergence_ == "saddle":
+            warn(
+                "the search ended at a saddle (`second_order_` "
+                f"{self.second_order_:.2g}): a lower norm is near, and no step found "
+                "it. Try another `random_state`, or give `init`.",
                 ConvergenceWarning,
             )
         floor = self.structural_floor_ / max(problem.reference, 1e-300)

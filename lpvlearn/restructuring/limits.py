@@ -13,6 +13,7 @@ Complex = NDArray[np.complex128]
 # Poles that much faster than the black box are those of a mass that went to zero:
 # they change nothing any more, and take the digits of all others.
 _FASTEST = 1e6
+_STANDING = 1e-12  # size of a pole, relative to the fastest, that is none
 _MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
 _LEEWAY = 0.2  # part of the margin that a step may use
 
@@ -96,7 +97,8 @@ class Limits:
             size = size / system.dt
         dc, sizes = [np.real(d)], [np.maximum(size, self.margin)]
         if np.isfinite(self.speed):
-            unit, safe = self.speed / _FASTEST, np.maximum(size, 1e-300)
+            unit = self.speed / _FASTEST
+            safe = np.maximum(size, _STANDING * unit)
             turn = np.real(poles.conj()[:, None] * d) / safe[:, None]
             dc.append(unit / safe[:, None] ** 2 * turn)
             sizes.append(np.ones(n))
@@ -111,8 +113,9 @@ class Limits:
         structure = self.system.structure
         c = [growth(poles, self.system.dt) + self.margin]
         if np.isfinite(self.speed):
-            size = np.maximum(np.abs(poles), 1e-300)
-            c.append(1.0 / _FASTEST - self.speed / _FASTEST / size)
+            unit = self.speed / _FASTEST
+            size = np.maximum(np.abs(poles), _STANDING * unit)
+            c.append(1.0 / _FASTEST - unit / size)
         c.append((structure.lower - theta)[self._low])
         c.append((theta - structure.upper)[self._high])
         return np.concatenate(c)

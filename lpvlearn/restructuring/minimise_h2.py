@@ -7,16 +7,29 @@ discrete counterparts) the squared norm is ``J = tr(C P C^T)`` and its derivativ
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 from scipy.optimize import minimize
 
-from ..minimax.problem import MinimaxResult, Peaks
+from ..minimax.problem import MinimaxResult, Peaks, shortest_in_hull
 from .coordinates import metric_coordinates
-from .error_system import ErrorSystem
+from .error_system import ErrorSystem, Target
 from .least_squares import LeastSquaresResult
-from .limits import Limits, keeps_margin, within_bounds
+from .limits import Limits, within_bounds
+from .minimise_hinf import NEARLY
+
+_ROUNDS = 12  # of the quasi-Newton method
+_PROGRESS = 1e-9  # relative decrease of the squared norm that is worth another round
+
+_FINEST = 1e-16  # decrease, relative to the start of a round, that ends it
+_BINDING = -1e-6  # relative value from which a limit binds
+
+# Squared error, relative to the squared norm of the model, that is rounding: the norm
+# of a difference of Gramians keeps half of the digits.
+_RELATIVE_ROUNDING = 1e-12
 
 Array = NDArray[np.float64]
 
@@ -65,61 +78,126 @@ def minimise_h2(
 ) -> tuple[Array, MinimaxResult]:
     """Minimise the H2 norm by a quasi-Newton method from a least-squares fit.
 
-    A ValueError where the error has a feedthrough in continuous time: its H2 norm is
+    In rounds, each in coordinates of the response's metric where it begins. A
+    ValueError where the error has a feedthrough in continuous time: its H2 norm is
     infinite.
     """
-    theta0, active = _matched_feedthrough(system, fit.x)
-    J0, _ = squared_h2(system, theta0)
-    scale = np.sqrt(J0) if J0 > 0 else 1.0
-    J = system.linearised_error(theta0, system.grid)[1]()[..., active]
-    T = metric_coordinates(J, max(np.sqrt(fit.cost), negligible, 1e-300))
-    bounded = np.isfinite([system.structure.lower, system.structure.upper]).any()
-    if bounded:  # coordinates in which the bounds stay bounds
-        T = np.diag(Limits(system, margin).sizes(theta0)[active])
+    theta, active = _matched_feedthrough(system, fit.x)
+    limits = Limits(system, margin)
+    J, gradient = squared_h2(system, theta)
     history: list[dict[str, float]] = []
+    n_iter, slope = 0, 0.0
+    for _ in range(_ROUNDS):
+        if negligible**2 >= J:
+            slope = 0.0
+            break
+        T = _metric(system, theta, active, negligible)
+        slope = _slope(
+            gradient[active] @ T / J, *_scaled_limits(limits, theta, active, T)
+        )
+        if slope <= tol or n_iter >= max_iter:
+            break
+        known, start = J, theta
+        theta, steps = _quasi_newton(
+            system, limits, theta, J, active, T, max_iter - n_iter, history
+        )
+        n_iter += steps
+        J, gradient = squared_h2(system, theta)
+        if not J < known:
+            theta, (J, gradient) = start, squared_h2(system, start)
+        if J >= known * (1.0 - _PROGRESS):
+            break
+    peaks = Peaks(
+        np.array([np.sqrt(J)]), np.zeros(0), gradient[None], np.zeros(1, bool)
+    )
+    done = slope <= NEARLY or J <= _rounding(system, theta)
+    cause = "" if done else "no step of the quasi-Newton method lowers the norm"
+    return theta, MinimaxResult(
+        theta, peaks, slope, np.nan, done, n_iter, history, cause
+    )
+
+
+def _metric(
+    system: ErrorSystem, theta: Array, active: NDArray[np.bool_], negligible: float
+) -> Array:
+    """Coordinates in which a unit step changes the response by its error."""
+    E, slopes = system.linearised_error(theta, system.grid)
+    size = float(np.linalg.norm(E)) / np.sqrt(len(system.grid))
+    return metric_coordinates(slopes()[..., active], max(size, negligible, 1e-300))
+
+
+def _scaled_limits(
+    limits: Limits, theta: Array, active: NDArray[np.bool_], T: Array
+) -> tuple[Array, Array]:
+    """The limits ``c <= 0`` relative to their sizes, and their gradients in y."""
+    c, dc, size = limits.rows(theta)
+    return c / size, dc[:, active] @ T / size[:, None]
+
+
+def _slope(gradient: Array, c: Array, dc: Array) -> float:
+    """Length of a gradient without what binding limits hold back."""
+    return shortest_in_hull(gradient[None], dc[c >= _BINDING])[0]
+
+
+def _quasi_newton(
+    system: ErrorSystem,
+    limits: Limits,
+    theta: Array,
+    J: float,
+    active: NDArray[np.bool_],
+    T: Array,
+    max_iter: int,
+    history: list[dict[str, float]],
+) -> tuple[Array, int]:
+    """End of a round, and its iterations."""
 
     def theta_of(y: Array) -> Array:
-        theta = theta0.copy()
-        theta[active] += T @ y
-        return within_bounds(system, theta)
+        end = theta.copy()
+        end[active] += T @ y
+        return end
 
     def objective(y: Array) -> tuple[float, Array]:
-        theta = theta_of(y)
-        if not keeps_margin(system, theta, margin):
+        end = theta_of(y)
+        if not limits.admissible(end):
             return _REFUSED, np.zeros_like(y)
-        J, gradient = squared_h2(system, theta)
-        return J / scale**2, (gradient[active] @ T) / scale**2
+        value, gradient = squared_h2(system, end)
+        return value / J, (gradient[active] @ T) / J
 
-    y, found = np.zeros(len(T)), None
-    low, high = np.full((2, len(y)), [[-np.inf], [np.inf]])
-    if bounded:
-        low = (system.structure.lower - theta0)[active] / np.diag(T)
-        high = (system.structure.upper - theta0)[active] / np.diag(T)
-    if J0 > negligible**2:
-        found = minimize(
-            objective,
-            y,
-            jac=True,
-            method="L-BFGS-B" if bounded else "BFGS",
-            bounds=np.transpose([low, high]) if bounded else None,
-            options={"maxiter": max_iter, "gtol": max(tol, 1e-12) ** 0.75},
-            callback=lambda z: history.append(
-                {"objective": scale * np.sqrt(max(objective(z)[0], 0.0))}
-            ),
-        )
-        y = found.x if found.fun <= 1.0 else y
-    theta = theta_of(y)
-    value, gradient = objective(y)
-    size = scale * np.sqrt(value)
-    peaks = Peaks(np.array([size]), np.zeros(0), gradient[None], np.zeros(1, bool))
-    held = ((y <= low) & (gradient > 0)) | ((y >= high) & (gradient < 0))
-    slope = (
-        float(np.linalg.norm(gradient[~held])) / max(value, 1e-300) if J0 > 0 else 0.0
+    def kept(y: Array) -> tuple[Array, Array]:
+        end = theta_of(y)
+        if not np.isfinite(system.poles(end)).all():
+            return np.full(1, -1.0), np.zeros((1, len(y)))
+        return _scaled_limits(limits, end, active, T)
+
+    found = minimize(
+        objective,
+        np.zeros(T.shape[1]),
+        jac=True,
+        method="SLSQP",
+        constraints={
+            "type": "ineq",
+            "fun": lambda y: -kept(y)[0],
+            "jac": lambda y: -kept(y)[1],
+        },
+        options={"maxiter": max_iter, "ftol": _FINEST},
+        callback=lambda z: history.append(
+            {"objective": np.sqrt(J * max(objective(z)[0], 0.0))}
+        ),
     )
-    done = found is None or found.nit < max_iter
-    n_iter = 0 if found is None else int(found.nit)
-    result = MinimaxResult(theta, peaks, slope, np.nan, done, n_iter, history)
-    return theta, result
+    end = within_bounds(system, theta_of(found.x))
+    return end if limits.admissible(end) else theta, int(found.nit)
+
+
+def _rounding(system: ErrorSystem, theta: Array) -> float:
+    """Squared norm of an error that is rounding beside what it is the difference of."""
+    t, nothing = system.target, np.zeros_like
+    alone = Target(
+        nothing(t.A) - np.eye(len(t.A)), nothing(t.B), t.C, nothing(t.D), t.dt
+    )
+    if t.dt is not None:
+        alone = replace(alone, A=nothing(t.A))
+    whole = ErrorSystem(system.structure, alone, system.weight)
+    return _RELATIVE_ROUNDING * squared_h2(whole, theta)[0]
 
 
 def _matched_feedthrough(

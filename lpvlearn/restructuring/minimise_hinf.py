@@ -32,7 +32,11 @@ _MAX_CAPS = 12  # frequencies at which the cap is a constraint: the last ones me
 # depths at which peaks that move are looked for below high constant ones
 _HARD_STEPS = (0.99, 0.9999)
 _STATIONARY = 1e-8  # shortest subgradient of an optimum, relative to the objective
-_NEARLY = 1e-3  # stationarity up to which no more is said
+NEARLY = 1e-3  # stationarity up to which no more is said
+SADDLE = -1e-4  # second-order measure below which a stationary point is a saddle
+_ESCAPES = 4  # from one saddle to the next
+_LEAPS = 10.0 ** np.arange(0.0, -4.5, -0.5)  # steps along the valley of a saddle
+_LOWER = 1e-9  # relative decrease that leaves a saddle
 
 # mu at the end of a round on the central path, and iterations of the solver from there;
 # the next round if these do not converge
@@ -281,8 +285,8 @@ def _from_least_squares(
     assert best is not None
     exact = best[1].peaks.top <= options["negligible"]
     # the end of a solver that failed needs the better proof
-    enough = _STATIONARY if best[1].cause else _NEARLY
-    converged = exact or idle or best[1].stationarity <= enough
+    enough = _STATIONARY if best[1].cause else NEARLY
+    converged = exact or best[1].stationarity <= enough
     result = replace(best[1], n_iter=used, history=history, converged=converged)
     return best[0], result, floor
 
@@ -370,10 +374,49 @@ def _ended(
     result = solver(
         objective.problem(), np.zeros(len(view.theta)), radius=_RADIUS, **options
     )
+    for _ in range(_ESCAPES):
+        lower = _left_saddle(objective, result, solver, **options)
+        if lower is None:
+            break
+        result = lower
     end = view.back(within_bounds(view.system, objective.theta(result.y)))
     if end is None:
         return _ended(system, theta, limits, None, solver, **options)
     return end, result, objective.floor
+
+
+def is_saddle(result: MinimaxResult) -> bool:
+    """Whether a lower norm lies along the negative curvature of a stationary point."""
+    return result.stationarity <= NEARLY and result.second_order < SADDLE
+
+
+def _left_saddle(
+    objective: HinfObjective, result: MinimaxResult, solver: Solver, **options: Any
+) -> MinimaxResult | None:
+    """The end of the solver on the lower side of a saddle; None where there is none.
+
+    The gradient does not lead out of a saddle; one step along the most negative
+    curvature, to either side, does.
+    """
+    if not is_saddle(result) or result.valley is None:
+        return None
+    problem, best, start = objective.problem(), np.inf, None
+    for leap in _LEAPS:
+        for side in (leap, -leap):
+            y = result.y + side * result.valley
+            found = problem.peaks(y)
+            if found is not None and found.top < best:
+                best, start = found.top, y
+    if start is None:
+        return None
+    again = solver(problem, start, radius=_RADIUS, **options)
+    if not again.peaks.top < (1.0 - _LOWER) * result.peaks.top:
+        return None
+    return replace(
+        again,
+        n_iter=result.n_iter + again.n_iter,
+        history=result.history + again.history,
+    )
 
 
 def _minimise_remainder(
