@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 # search for the local parameters does not go on beyond it.
 _RESOLUTION = 1e-7
 
+_OPEN = 1e6  # standard deviation of a parameter that is not determined, in its sizes
+
 _ROUNDING = 1e-13  # of parameters that are zero, relative to the largest one
 
 _SINGULAR = 1e-12  # eigenvalue of a correlation matrix that is zero up to rounding
@@ -99,8 +101,8 @@ def weighted_points(
 ) -> WeightedPoints:
     """Points with weights (n_points,) and covariances (n_points, n_params, n_params).
 
-    Points of weight zero are left out. Where a covariance is not finite or singular,
-    none is used.
+    Points of weight zero are left out, and so are parameters of an infinite variance.
+    Where a covariance is not known (NaN) or singular, none is used.
     """
     used = weight > 0
     P = None
@@ -126,8 +128,13 @@ def weighted_points(
 def _whitening(P: Array, size: Array) -> Array | None:
     """``R_i`` of every point; None if one is not known. `size` of the parameters."""
     variance = np.diagonal(P, axis1=1, axis2=2)
-    if not np.isfinite(P).all() or (variance < 0).any():
+    if np.isnan(P).any() or (variance < 0).any():
         return None
+    # an infinite variance, of a parameter that its point does not determine: no weight
+    open_ = np.isinf(variance)
+    P = np.where(open_[:, :, None] | open_[:, None, :], 0.0, P)
+    P = P + np.where(open_, (_OPEN * size) ** 2, 0.0)[:, :, None] * np.eye(len(size))
+    variance = np.diagonal(P, axis1=1, axis2=2)
     least = _RESOLUTION * size
     if np.median(np.sqrt(variance) / size) < _RESOLUTION:  # no noise, but rounding
         least = np.maximum(least, _ROUNDING * size.max())

@@ -495,7 +495,7 @@ def restructure_points(
         [tasks[k] for k in kept],
         points.kappa,
         restructurer,
-        ignore=["fitted", "covariances"],
+        ignore=["fitted"],
     )
     _tell(tied, points.kappa)
     for k, other in enumerate(tied):
@@ -642,8 +642,8 @@ def _tie_branches(
 ) -> list[Done | None]:
     """Among equally good parameters of the points, those of one smooth family.
 
-    None where it is what was found. `fitted` and `covariances` follow from the other
-    arguments. Warns where families are nearly as plausible.
+    None where it is what was found. `fitted` follows from the other arguments. Warns
+    where families are nearly as plausible.
     """
     structure = fitted[0].structure_
     weight = getattr(restructurer, "frequency_weight", None)

@@ -106,3 +106,14 @@ def test_points_without_noise_are_compared_to_rounding():
     theta = np.column_stack([40 + 3 * KAPPA, 1e-14 * rng.normal(size=6)])
     model = PolynomialLPV(1).fit(KAPPA[:, None], theta, covariance=np.zeros((6, 2, 2)))
     assert model.weighted_
+
+
+def test_a_parameter_that_its_point_does_not_determine_has_no_weight():
+    kappa = np.arange(5.0)[:, None]
+    theta = np.column_stack([2.0 + kappa[:, 0], 5.0 - kappa[:, 0]])
+    wrong = theta.copy()
+    wrong[2, 0] = 1e3
+    P = np.tile(1e-4 * np.eye(2), (5, 1, 1))
+    P[2, 0, 0] = np.inf
+    found = PolynomialLPV(1).fit(kappa, wrong, covariance=P)
+    np.testing.assert_allclose(found.predict(kappa), theta, rtol=1e-6)
