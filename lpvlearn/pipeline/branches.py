@@ -88,10 +88,11 @@ def tied_branches(
     """
     structure = problems[0].structure
     places = interchanges(structure)
-    optima = _equal_optima(problems, fitted, kappa, places)
-    if len(places) == 1 and all(len(found) == 1 for found in optima):
+    optima, lower_fit = _equal_optima(problems, fitted, kappa, places)
+    alone = len(places) == 1 and all(len(found) == 1 for found in optima)
+    if alone and not lower_fit.any():
         return [Branch(None, None)] * len(fitted), []
-    lower, upper = structure.lower, structure.upper
+    low, high = structure.lower, structure.upper
     candidates, variances, origins = [], [], []
     for found, P in zip(optima, covariances, strict=True):
         known = np.zeros((structure.n_params,) * 2) if P is None else P
@@ -99,7 +100,7 @@ def tied_branches(
         # the optima first, then those with interchanged parts
         origin = [(i, pi) for pi in places for i in range(len(found))]
         rows = np.array([found[i][pi] for i, pi in origin])
-        inside = np.asarray(((rows >= lower) & (rows <= upper)).all(1), dtype=bool)
+        inside = np.asarray(((rows >= low) & (rows <= high)).all(1), dtype=bool)
         inside[0] = True
         candidates.append(rows[inside])
         variances.append(np.array([spread[pi] for _, pi in origin])[inside])
@@ -111,16 +112,13 @@ def tied_branches(
     own = np.array([found[0] for found in optima])
     number = places[_numbering(structure, family[:, places].swapaxes(0, 1), own)]
     branches = []
-    for found, origin, i in zip(optima, origins, chosen, strict=True):
+    for found, origin, i, lower in zip(optima, origins, chosen, lower_fit, strict=True):
         optimum, pi = origin[i]
         pi = pi[number]
-        stays = np.array_equal(pi, places[0])
-        branches.append(
-            Branch(
-                found[optimum][pi] if optimum else None,
-                None if optimum or stays else pi,
-            )
-        )
+        if optimum or lower:
+            branches.append(Branch(found[optimum][pi], None))
+        else:
+            branches.append(Branch(None, None if (pi == places[0]).all() else pi))
     back = np.argsort(number)
     return branches, [d._replace(params=np.sort(back[d.params])) for d in doubts]
 
@@ -130,15 +128,18 @@ def _equal_optima(
     fitted: Sequence[Any],
     kappa: Array,
     places: Choices,
-) -> list[list[Array]]:
+) -> tuple[list[list[Array]], NDArray[np.bool_]]:
     """Parameters of every point that fit it as well as its own, which are the first.
 
     Least-squares fits from those of the neighbours, apart from permutations `places`.
+    And where these fit better, and take the place of its own.
     """
     optima = [[own.params_] for own in fitted]
+    lower = np.zeros(len(fitted), bool)
     if any(f.identifiability_.rank < f.structure_.n_params for f in fitted):
-        return optima  # whole valleys of them
+        return optima, lower  # whole valleys of them
     starts = [own.start_params_ for own in fitted]
+    least = [max(own.fit_error_, _EXACT) for own in fitted]
     known = [[x[places]] for x in starts]
     tree = _tree(_scaled(kappa)).toarray()
     beside = [np.flatnonzero(row).tolist() for row in tree + tree.T]
@@ -149,7 +150,12 @@ def _equal_optima(
             fit = problems[i].fit(start)
             if fit is None or len(optima[i]) == _OPTIMA:
                 continue
-            if fit.relative_error > _EQUAL * max(fitted[i].fit_error_, _EXACT):
+            if fit.relative_error > _EQUAL * least[i]:
+                continue
+            if _EQUAL * fit.relative_error < least[i] > _EXACT:
+                least[i], lower[i] = max(fit.relative_error, _EXACT), True
+                optima[i], known[i] = [fit.x], [fit.x[places]]
+                new += [(k, fit.x) for k in beside[i]]
                 continue
             size = np.maximum(np.abs(fit.x), _TINY * np.abs(fit.x).max())
             gaps = np.abs(np.vstack(known[i]) - fit.x) / np.where(size > 0, size, 1.0)
@@ -158,7 +164,7 @@ def _equal_optima(
                 known[i].append(fit.x[places])
                 new += [(k, fit.x) for k in beside[i]]
         waiting = new
-    return optima
+    return optima, lower
 
 
 def _numbering(structure: GrayBoxStructure, images: Array, own: Array) -> int:

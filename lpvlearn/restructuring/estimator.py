@@ -32,6 +32,7 @@ from .minimise_covariance import Estimate, efficient_parameters
 from .minimise_h2 import minimise_h2
 from .minimise_hinf import SOLVERS, is_saddle, minimise_hinf, promising
 from .problem import (
+    EXACT_FIT,
     FrequencyWeight,
     RestructuringProblem,
     problem_from_models,
@@ -41,6 +42,10 @@ from .similarity import minimise_bilinear
 from .starts import search as starts_of
 
 Array = NDArray[np.float64]
+
+# A fit of an error up to that multiple of the black box's standard deviation is as good
+# as the true parameters' own.
+_NOISY = 1.5
 
 _OPTIMAL = 1e-5  # stationarity from which an optimum is known nearly only
 _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows in plots
@@ -277,7 +282,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 "`starts` must hold parameters where `search` is False: nothing else "
                 "is begun from. Got none."
             )
-        self._restructure(problem, given, estimates, only_given=not search)
+        known = problem.uncertainty(realizations, estimates)
+        self._restructure(problem, given, estimates, known, only_given=not search)
         if len(realizations) and not hasattr(self, "params_covariance_"):
             spread = problem.spread_covariance(self.params_, realizations)
             self.params_covariance_ = spread
@@ -449,14 +455,16 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         problem: RestructuringProblem,
         given: list[Array],
         estimates: Sequence[Estimate] = (),
+        uncertainty: float = 0.0,
         only_given: bool = False,
     ) -> None:
         """Starts and their least-squares fits, minimisation, certificates, warnings."""
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
         seed = check_random_state(self.random_state).randint(2**31)
+        enough = max(EXACT_FIT, _NOISY * uncertainty)
         problem, fits = starts_of(
-            problem, self.init, self.n_starts, given, seed, only_given
+            problem, self.init, self.n_starts, given, seed, only_given, enough
         )
         errors = [fit.relative_error for fit in fits]
         self.starts_ = pd.DataFrame({"relative_error": errors})
@@ -465,7 +473,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         self._describe(problem, result, floor)
         if self.norm == "covariance":
             self._weigh(problem, estimates)
-        self._warn(problem, result)
+        searched = isinstance(self.init, str) and not only_given
+        self._warn(problem, result, enough, searched)
 
     def _minimise(
         self, problem: RestructuringProblem, fits: list[LeastSquaresResult]
@@ -491,7 +500,10 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         if result.peaks.top <= problem.lower_bound * (1.0 + _PROVEN):
             # no model is nearer; where the error is equally high everywhere, its peaks
             # could not tell
-            result = replace(result, stationarity=0.0, converged=True)
+            bend = max(result.second_order, 0.0)
+            result = replace(
+                result, stationarity=0.0, second_order=bend, converged=True
+            )
         return theta, result, floor
 
     def _describe(
@@ -567,8 +579,18 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 "by norm='hinf' (in a pipeline, efficient=False)."
             )
 
-    def _warn(self, problem: RestructuringProblem, result: MinimaxResult) -> None:
-        """Warn of a search that did not converge, a poor fit, and open parameters."""
+    def _warn(
+        self,
+        problem: RestructuringProblem,
+        result: MinimaxResult,
+        enough: float,
+        searched: bool,
+    ) -> None:
+        """Warn of a search that did not converge, a poor fit, and open parameters.
+
+        And of one fit that no other confirms, where starts were `searched` for and its
+        error is not `enough`.
+        """
         if not result.converged:
             spent = self.n_iter_ >= self.max_iter
             warn(
@@ -579,6 +601,16 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 "The best point is kept. "
                 + ("Raise `max_iter`" if spent else "Try another `random_state`")
                 + ", or take a structure of fewer parameters.",
+                ConvergenceWarning,
+            )
+        errors = self.starts_["relative_error"].to_numpy()
+        together = int((errors <= errors[0] * (1.0 + _AGREE)).sum())
+        if searched and len(errors) > 1 == together and errors[0] > enough:
+            warn(
+                f"one of {len(errors)} fits from different starts alone ended at the "
+                f"best one, of the relative error {errors[0]:.2g} (the next one "
+                f"{errors[1]:.2g}): it may not be the best there is. Raise `n_starts`, "
+                "or give `init`, to confirm it.",
                 ConvergenceWarning,
             )
         if self.convergence_ == "saddle":

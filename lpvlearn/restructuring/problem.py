@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag, qr
 
-from ..models.statespace import StateSpace
+from ..models.statespace import DEVIATION, StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
 from ..validation import real_array
@@ -35,7 +35,11 @@ Complex = NDArray[np.complex128]
 
 FrequencyWeight = StateSpace | Sequence[float | None] | None
 
-GOOD_FIT = 3e-3  # relative least-squares error that no wrong basin comes down to
+GOOD_FIT = 3e-3  # relative least-squares error that a wrong basin seldom comes down to
+EXACT_FIT = 1e-8  # and one that is rounding: nothing is better
+AGREEING = 2  # starts that end at the best fit: it is taken for the best there is
+_LONGER = 3  # times as many fits where the best one is good, but no other ends there
+_SAME_COST = 1e-4  # relative difference of the costs of fits in one basin: it is 1e-6
 _DISTINCT = 1e-6  # relative distance of candidates that would end in the same fit
 
 # A measured response does not tell how slowly modes may decay: they must be stable, by
@@ -103,10 +107,14 @@ class RestructuringProblem:
         error = float(np.sqrt(fit.cost)) / self._weighted[2]
         return fit._replace(relative_error=error)
 
-    def best_fits(self, candidates: Array, n_fits: int) -> list[LeastSquaresResult]:
-        """Least-squares fits from the best distinct candidates, until one is good.
+    def best_fits(
+        self, candidates: Array, n_fits: int, enough: float = EXACT_FIT
+    ) -> list[LeastSquaresResult]:
+        """Least-squares fits from the best distinct candidates, until one is certain.
 
-        They are ranked by the error of their response, not of their parameters.
+        That is one of a relative error of at most `enough`, or a good one at which
+        several end, which as many more may look for. They are ranked by the error of
+        their response, not of their parameters.
         """
         system, structure = self.system, self.structure
         candidates = np.clip(candidates, structure.lower, structure.upper)
@@ -119,17 +127,20 @@ class RestructuringProblem:
         differences = [system.response(x, self.omega) - self.response for x in usable]
         errors = [np.linalg.norm(scale * (W @ dG)) for dG in differences]
         thetas = _distinct(np.array(usable)[np.argsort(errors, kind="stable")])
-        fits = []
-        for theta in thetas[:n_fits]:
+        fits: list[LeastSquaresResult] = []
+        for number, theta in enumerate(thetas[: _LONGER * n_fits]):
+            best = min((f.relative_error for f in fits), default=np.inf)
+            together = agreeing(fits)
+            if best <= enough or best <= GOOD_FIT and together >= AGREEING:
+                break
+            if best > GOOD_FIT and number >= n_fits:
+                break
             if scaling is not None:  # all channels alike first, then as they are
                 first = self.fit(theta, scaling)
                 theta = theta if first is None else first.x
             fit = self.fit(theta)
-            if fit is None:
-                continue
-            fits.append(fit)
-            if fit.relative_error <= GOOD_FIT:
-                break
+            if fit is not None:
+                fits.append(fit)
         return fits
 
     def identifiability(self, theta: Array) -> Identifiability:
@@ -159,6 +170,33 @@ class RestructuringProblem:
             K = K.reshape(*K.shape[:2], -1, *dG.shape[2:]).sum(2)
         return np.asarray(np.einsum("jkpm,rkpm->rj", K.conj(), dG).real)
 
+    def uncertainty(
+        self, realizations: Sequence[StateSpace], estimates: Sequence[Any]
+    ) -> float:
+        """Standard deviation of the response, relative, as errors of `fit` are.
+
+        From the spread of realizations that it is the mean of, or of models at either
+        side of independent estimates; zero where neither tells.
+        """
+        squares = 0.0
+        if estimates:
+            count = len(estimates)
+            pairs = [pair for _, both in estimates for pair in both]
+            steps = [self._weighted_response(a) - self._weighted_response(b)
+                     for a, b in pairs]  # fmt: skip
+            scale = 2.0 * DEVIATION * count
+            squares = sum(float(np.sum(np.abs(d / scale) ** 2)) for d in steps)
+        elif len(realizations) > 1:
+            G = np.array([self._weighted_response(model) for model in realizations])
+            variance = np.sum(np.abs(G - G.mean(0)) ** 2) / (len(G) - 1)
+            squares = float(variance) / len(G)
+        return float(np.sqrt(squares / len(self.omega))) / self._weighted[2]
+
+    def _weighted_response(self, model: StateSpace) -> Complex:
+        G = model.with_input_delay(0).frequency_response(self.omega)
+        W = self._weighted[0]
+        return W @ np.tile(G, (1, W.shape[2] // G.shape[1], 1))
+
     def spread_covariance(self, theta: Array, models: Sequence[StateSpace]) -> Array:
         """Covariance of the parameters of an averaged model from single realizations.
 
@@ -175,6 +213,12 @@ class RestructuringProblem:
         G = np.array([model.frequency_response(self.omega) for model in undelayed])
         changes = self.parameter_changes(theta, G - G.mean(0))
         return np.cov(changes.T, ddof=1).reshape(len(theta), -1) / len(G)
+
+
+def agreeing(fits: Sequence[LeastSquaresResult]) -> int:
+    """How many of the fits end at the best one, told by their costs."""
+    least = min((fit.cost for fit in fits), default=0.0)
+    return sum(fit.cost <= least * (1.0 + _SAME_COST) for fit in fits)
 
 
 def _distinct(thetas: Array) -> Array:

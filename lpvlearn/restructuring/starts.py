@@ -23,7 +23,7 @@ from .continuation import continued_fits
 from .error_system import Target, frequency_grid, model_derivatives
 from .least_squares import LeastSquaresResult, channel_scaling
 from .limits import growth
-from .problem import GOOD_FIT, RestructuringProblem
+from .problem import EXACT_FIT, GOOD_FIT, RestructuringProblem, agreeing
 from .similarity import scaled_problem, similarity_starts
 
 Array = NDArray[np.float64]
@@ -68,12 +68,14 @@ def search(
     given: list[Array],
     seed: int,
     only_given: bool = False,
+    enough: float = EXACT_FIT,
 ) -> tuple[RestructuringProblem, list[LeastSquaresResult]]:
     """Least-squares fits, by ascending cost, and the problem that they solve.
 
     Where no model of the structure decays as fast as the black box lets expect, its
     stability margin is given up. The options are those of `GrayBoxRestructurer`;
-    further candidates may be `given`, or all of them.
+    further candidates may be `given`, or all of them. A relative error of at most
+    `enough` is the black box's own.
     """
     guess = None if isinstance(init, str) else problem.structure.check_params(init)
     for share in (1.0, _LEAST_MARGIN):
@@ -83,7 +85,7 @@ def search(
             fits = sorted(found, key=_COST)
         else:
             rng = np.random.default_rng(seed)
-            fits = _rounds(problem, guess, n_starts, given, rng)
+            fits = _rounds(problem, guess, n_starts, given, rng, enough)
         if fits:
             return problem, fits
     raise ValueError(
@@ -98,8 +100,9 @@ def _rounds(
     n_starts: int,
     given: list[Array],
     rng: np.random.Generator,
+    enough: float,
 ) -> list[LeastSquaresResult]:
-    """Rounds of candidates and fits, until one is good; by ascending cost."""
+    """Rounds of candidates and fits, until one is certain; by ascending cost."""
     n_fits = _N_FITS + len(given)
     fits: list[LeastSquaresResult] = []
     for number in range(_ROUNDS):
@@ -108,13 +111,14 @@ def _rounds(
             candidates = np.vstack([*given, candidates])
         elif len(candidates) == 0:
             break
-        fits = sorted(fits + problem.best_fits(candidates, n_fits), key=_COST)
+        more = problem.best_fits(candidates, n_fits, enough)
+        fits = sorted(fits + more, key=_COST)
         best = fits[0].relative_error if fits else np.inf
-        if best <= GOOD_FIT:
+        if best <= enough:
             break
         # the structure comes no nearer: different starts end at the same best cost
-        agreeing = sum(fit.cost <= fits[0].cost * (1 + _SAME) for fit in fits)
-        if best <= _FAR_FIT and agreeing >= (2 if number else n_fits):
+        least = 2 if number or best <= GOOD_FIT else n_fits
+        if best <= _FAR_FIT and agreeing(fits) >= least:
             break
     return hopped_fits(problem, fits, rng) if fits and best > _HOP_FIT else fits
 
