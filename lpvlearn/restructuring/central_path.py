@@ -39,6 +39,7 @@ _TAKEN = 1e-2  # part of the promised decrease that a step must bring
 # of the trust region: longer after steps as good as promised, shorter after poor ones,
 # and shorter still after those that failed
 _GOOD, _LONGER, _POOR, _SHORTER, _FAILED = 0.7, 3.0, 0.25, 0.5, 0.3
+_NOTHING = 1e-300  # square of the level of no error
 _WORSE = 1.05  # end above the least norm met by more: that point is kept instead
 _DEPTH = 0.5  # local maxima down to there join the frequencies
 _BENT = 1.5  # a step whose geodesic bends more than that is too long
@@ -51,6 +52,8 @@ def level_of(squares: Array, mu: float) -> float:
     `squares` are the squared singular values s of all frequencies.
     """
     top = float(squares.max())
+    if not top > 0:  # no error, or one whose square no number holds
+        return _NOTHING
     gap, low = squares - top, 2.0 * mu * top
     high = 2.0 * mu * float(squares.sum())
     x = low

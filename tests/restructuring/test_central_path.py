@@ -64,6 +64,10 @@ def test_level_solves_its_equation(mu):
     assert tau > s.max()
 
 
+def test_no_error_has_a_level_that_is_next_to_nothing():
+    assert 0.0 < level_of(np.zeros(5), 0.1) < 1e-200
+
+
 def test_for_a_large_mu_psi_is_the_sum_of_squares():
     system, theta = system_of((2, 2))
     limits, omega, mu = Limits(system, 0.01), system.grid, 1e6

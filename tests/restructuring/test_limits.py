@@ -84,3 +84,9 @@ def test_inside_moves_off_the_bounds_only():
     assert 1 < moved[0] < 2 and 0 < moved[1] < 0.01
     kept = np.array([1.5, 3.0])
     assert (limits.inside(kept) == kept).all()
+
+
+def test_a_pole_at_rest_has_finite_constraints():
+    system, theta, _ = system_of()
+    c, dc, _ = Limits(system, 0.05).rows(np.zeros_like(theta))
+    assert np.isfinite(c).all() and np.isfinite(dc).all()

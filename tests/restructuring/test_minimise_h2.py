@@ -7,6 +7,7 @@ from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.restructuring.error_system import ErrorSystem, Target
 from lpvlearn.restructuring.minimise_h2 import squared_h2
 
+from ..conftest import stable_model
 from .test_error_system import error_system
 
 ONE = np.ones((1, 1))
@@ -90,3 +91,39 @@ def test_infinite_h2_norm_is_refused():
     box = StateSpace([[-2.0]], [[1.0]], [[1.0]], [[5.0]])
     with pytest.raises(ValueError, match="without feedthrough"):
         GrayBoxRestructurer(structure, norm="h2").fit_model(box)
+
+
+@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
+@pytest.mark.filterwarnings("ignore:the response determines")
+@pytest.mark.parametrize("bounded", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_what_ends_without_a_warning_is_stationary(seed, bounded):
+    chain = GrayBoxStructure.from_template(
+        [["-a", 0, 0], ["b", "-b", 0], [0, "c", "-c"]], [["g"], [0], [0]], [[0, 0, 1]]
+    )
+    if bounded:
+        chain = chain.with_bounds({name: (0, None) for name in chain.parameter_names})
+    truth = chain.model(np.exp(np.random.default_rng(seed).normal(size=4)))
+    rate, gain = np.abs(truth.poles()).mean(), truth.hinf_norm()
+    rest = stable_model(seed, 3, 1, 1, rate=rate)
+    box = truth - StateSpace(rest.A, 0.05 * gain / rest.hinf_norm() * rest.B, rest.C)
+    fitted = GrayBoxRestructurer(chain, norm="h2").fit_model(box)
+    assert fitted.stationarity_ <= 1e-3  # a warning would be an error
+    assert fitted.convergence_ in ("optimal", "nearly")
+    system = ErrorSystem(chain, Target(box.A, box.B, box.C, box.D))
+    for size in (1e-3, 1e-2):  # nothing near is lower
+        for step in size * np.random.default_rng(0).normal(size=(10, 4)):
+            near = fitted.params_ * (1 + step)
+            if system.poles(near).real.max() < -1e-3 * rate:
+                J = squared_h2(system, near)[0]
+                assert J >= fitted.objective_**2 * (1 - 1e-7)
+
+
+def test_an_optimum_at_a_bound_is_stationary():
+    lag = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+    box = lag.model([2.0, 3.0])
+    held = lag.with_bounds({"b": (None, 2.5)})
+    with pytest.warns(UserWarning, match="comes no nearer"):
+        fitted = GrayBoxRestructurer(held, norm="h2").fit_model(box)
+    assert np.isclose(fitted.params_[1], 2.5, rtol=1e-9)
+    assert fitted.stationarity_ < 1e-5

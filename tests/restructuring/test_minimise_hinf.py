@@ -2,14 +2,22 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 from sklearn.exceptions import ConvergenceWarning
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.minimax import problem as minimax_problem
+from lpvlearn.minimax.sqp import minimax_sqp
 from lpvlearn.restructuring.coordinates import ResponseGeometry
 from lpvlearn.restructuring.error_system import ErrorSystem, Target
 from lpvlearn.restructuring.limits import Limits
-from lpvlearn.restructuring.minimise_hinf import HinfObjective
+from lpvlearn.restructuring.minimise_hinf import (
+    SOLVERS,
+    HinfObjective,
+    _left_saddle,
+    is_saddle,
+)
+from lpvlearn.restructuring.problem import problem_from_models
 
 TRUTH = {"k1": 20.0, "k2": 10.0, "c1": 0.4, "c2": 0.2, "m1": 2.0, "m2": 0.5}
 
@@ -92,3 +100,37 @@ def test_a_failed_quadratic_program_is_warned_about(solver, monkeypatch):
     with pytest.warns(ConvergenceWarning) as caught:
         GrayBoxRestructurer(lag, solver=solver).fit_model(box)
     assert any("quadratic program of a step had no" in str(w.message) for w in caught)
+
+
+@pytest.mark.parametrize("solver", list(SOLVERS))
+def test_a_saddle_is_left_along_its_negative_curvature(solver):
+    """Of two lags that are equal, no gradient tells which shall be the fast one."""
+    lags = GrayBoxStructure.from_template([["-a", 0], [0, "-b"]], [[1], [1]], [[1, 1]])
+    problem = problem_from_models(lags, [lags.model([1.0, 4.0])], None)
+    system = problem.system
+    x = minimize_scalar(lambda x: system.peaks(np.full(2, x)).norm, bounds=(1.0, 4.0),
+                        options={"xatol": 1e-13}).x  # fmt: skip
+    theta = np.full(2, x)
+    T = ResponseGeometry(system, theta, system.grid, system.peaks(theta).norm).T
+    objective = HinfObjective(system, theta, T, Limits(system, problem.margin))
+    saddle = minimax_sqp(objective.problem(), np.zeros(2), max_iter=0)
+    assert is_saddle(saddle) and saddle.second_order < -0.01
+    valley = T @ saddle.valley
+    np.testing.assert_allclose(valley[0], -valley[1], rtol=1e-3)
+    found = _left_saddle(objective, saddle, SOLVERS[solver], max_iter=200, tol=1e-12)
+    exact = 1e-5 if solver == "sqp" else 1e-2  # a first-order method takes its time
+    assert found.peaks.top < exact * saddle.peaks.top
+    rates = np.sort(objective.theta(found.y))
+    np.testing.assert_allclose(rates, [1.0, 4.0], rtol=10 * exact)
+    assert _left_saddle(objective, found, SOLVERS[solver]) is None
+
+
+@pytest.mark.filterwarnings("ignore:the structure comes no nearer")
+def test_how_far_a_search_converged_is_said():
+    lag = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+    box = StateSpace([[-1, 0], [0, -30]], [[1], [3]], [[1, 1]])
+    fitted = GrayBoxRestructurer(lag).fit_model(box)
+    assert fitted.convergence_ == "optimal" and fitted.stationarity_ <= 1e-5
+    with pytest.warns(ConvergenceWarning, match="ended at `max_iter`=0"):
+        fitted = GrayBoxRestructurer(lag, max_iter=0).fit_model(box)
+    assert fitted.convergence_ == "no"

@@ -3,9 +3,16 @@
 import numpy as np
 import pytest
 from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.problem import Identifiability
+from lpvlearn.models.statespace import DEVIATION
+from lpvlearn.restructuring import estimator as estimator_module
+from lpvlearn.restructuring.problem import (
+    Identifiability,
+    agreeing,
+    problem_from_models,
+)
 
 from ..conftest import spring_structure
 from .conftest import CASES, disguised, far_fit, off_structure
@@ -207,3 +214,54 @@ def test_units_of_the_parameters_do_not_matter():
     other = Identifiability.from_jacobian(J * 10.0 ** np.array([-9, 0, 9, 3]), names)
     assert one.rank == other.rank == 4
     assert other.condition == pytest.approx(one.condition)
+
+
+# -- how far the black box itself is known --------------------------------------------
+
+
+def test_the_uncertainty_is_the_spread_of_the_response():
+    gain = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+    box, std = gain.model([2.0, 3.0]), 0.05
+    step = DEVIATION * std
+    pairs = [(gain.model([2.0, 3.0 + step]), gain.model([2.0, 3.0 - step]))]
+    problem = problem_from_models(gain, [box], None)
+    assert np.isclose(problem.uncertainty([], [(box, pairs)]), std / 3.0)
+    half = problem.uncertainty([], [(box, pairs)] * 4)
+    assert np.isclose(half, std / 3.0 / 2.0)
+    runs = [gain.model([2.0, 3.0 + d]) for d in (-0.1, 0.0, 0.1)]
+    assert np.isclose(problem.uncertainty(runs, []), 0.1 / np.sqrt(3) / 3.0)
+    assert problem.uncertainty([box], []) == 0.0
+
+
+def test_fits_end_where_two_agree_or_the_error_is_the_black_boxs_own():
+    structure = spring_structure()
+    box = structure.model([30.0, 1.2, 50.0])
+    scale = np.linspace(0.9, 1.1, 9)[:, None]
+    starts = structure.check_params({"b": 30.0, "c": 1.2, "k": 50.0}) * scale
+    exact = problem_from_models(structure, [box], None)
+    assert len(exact.best_fits(starts, 3)) == 1
+    rng = np.random.default_rng(0)
+    problem = problem_from_models(structure, [off_structure(box, rng, 3e-4)], None)
+    fits = problem.best_fits(starts, 3)
+    assert 1e-8 < fits[0].relative_error < 3e-3
+    assert len(fits) == agreeing(fits) == 2
+    assert len(problem.best_fits(starts, 3, enough=3e-3)) == 1
+
+
+def test_one_fit_that_no_other_confirms_is_told(monkeypatch):
+    structure = spring_structure()
+    box = off_structure(
+        structure.model([30.0, 1.2, 50.0]), np.random.default_rng(0), 1e-3
+    )
+
+    def lonely(problem, *_):
+        fit = problem.fit(structure.check_params({"b": 30.0, "c": 1.2, "k": 50.0}))
+        other = fit._replace(cost=4 * fit.cost, relative_error=2 * fit.relative_error)
+        return problem, [fit, other]
+
+    monkeypatch.setattr(estimator_module, "starts_of", lonely)
+    with pytest.warns(ConvergenceWarning, match="one of 2 fits .* alone"):
+        GrayBoxRestructurer(structure).fit_model(box)
+    GrayBoxRestructurer(structure).fit_model(  # known to be no better: nothing is told
+        box, realizations=[box, truth]
+    )
