@@ -250,9 +250,8 @@ def test_fits_end_where_two_agree_or_the_error_is_the_black_boxs_own():
 
 def test_one_fit_that_no_other_confirms_is_told(monkeypatch):
     structure = spring_structure()
-    box = off_structure(
-        structure.model([30.0, 1.2, 50.0]), np.random.default_rng(0), 1e-3
-    )
+    truth = structure.model([30.0, 1.2, 50.0])
+    box = off_structure(truth, np.random.default_rng(0), 3e-4)
 
     def lonely(problem, *_):
         fit = problem.fit(structure.check_params({"b": 30.0, "c": 1.2, "k": 50.0}))
