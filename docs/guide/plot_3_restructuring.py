@@ -94,10 +94,24 @@ restructurer = GrayBoxRestructurer(structure).fit_model(black_box)
 restructurer.starts_
 
 # %%
-# Relative errors of the fits, best first: a good one ends the search. Wrong basins
-# exist, and their fits end ten times as far from the black box; that is why there are
-# many starts. A pipeline has one more means against them: every point is fitted also
-# from its neighbours' parameters, until nothing improves.
+# Relative errors of the fits, best first. The search ends where two starts agree on a
+# good fit, or where its error is the black box's own: rounding, or the noise that
+# `realizations` or `estimates` tell of. Wrong basins exist, and their fits end further
+# from the black box; that is why there are many starts, and a best fit that only one of
+# several reached is warned of. A pipeline has one more means against them: every point
+# is fitted also from its neighbours' parameters, until nothing improves.
+#
+# Parts that may change places
+# ----------------------------
+# No response tells the first mode of a modal form from the second, nor one lag in
+# series from the other: such structures have several optima of the same error, and
+# every operating point would end in any of them. The LPV model needs one family. A
+# pipeline finds the permutations of the parameters that leave all responses as they are
+# (and further optima from the neighbours' parameters), and takes of all families the one
+# of the highest evidence as smooth functions of the scheduling variable: branches that
+# cross keep their slopes. Where another family is nearly as plausible, it warns with the
+# names of the parameters. ``with_ranges``, ``with_bounds`` or a first guess decide which
+# part has which number.
 #
 # The norm, and all of its peaks
 # ------------------------------
@@ -239,7 +253,9 @@ pd.DataFrame(
 # How do we know that this is an optimum? The shortest vector in the convex hull of the
 # active gradients, relative to the error, is ``stationarity_``: zero means that no
 # direction lowers all active peaks. A positive ``second_order_`` (smallest
-# eigenvalue of the reduced Hessian) makes it a strict local minimum. That there is no
+# eigenvalue of the reduced Hessian) makes it a strict local minimum; a saddle is left
+# along its negative curvature. ``convergence_`` sums it up in a word: "optimal",
+# "nearly" (stationary to 1e-3 only), "saddle" or "no". That there is no
 # better one far away is not certified; ``lower_bound_`` is what no model of this order
 # can do better than (a Hankel singular value of the black box).
 
