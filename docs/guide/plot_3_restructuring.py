@@ -106,12 +106,12 @@ restructurer.starts_
 # No response tells the first mode of a modal form from the second, nor one lag in
 # series from the other: such structures have several optima of the same error, and
 # every operating point would end in any of them. The LPV model needs one family. A
-# pipeline finds the permutations of the parameters that leave all responses as they are
-# (and further optima from the neighbours' parameters), and takes of all families the one
-# of the highest evidence as smooth functions of the scheduling variable: branches that
-# cross keep their slopes. Where another family is nearly as plausible, it warns with the
-# names of the parameters. ``with_ranges``, ``with_bounds`` or a first guess decide which
-# part has which number.
+# pipeline finds the permutations of the parameters that leave all responses as they
+# are (and further optima from the neighbours' parameters), and takes of all families
+# the one of the highest evidence as smooth functions of the scheduling variable:
+# branches that cross keep their slopes. Where another family is nearly as plausible, it
+# warns with the names of the parameters. ``with_ranges``, ``with_bounds`` or a first
+# guess decide which part has which number.
 #
 # The norm, and all of its peaks
 # ------------------------------

@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from ..systems.hinf_norm import PeakSet
 from ..systems.sampling import d2c_tustin
 from ..validation import real_array
-from .error_system import ErrorSystem, Structure, Target, model_derivatives
+from .error_system import (
+    ErrorSystem,
+    Structure,
+    Target,
+    laplace_variable,
+    model_derivatives,
+    resolvent,
+)
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -21,6 +28,9 @@ Complex = NDArray[np.complex128]
 # Relative difference of measured neighbours that count as equally high: at an optimum
 # two of them often are, up to what the search has still to gain.
 _BESIDE = 1e-3
+
+# Least decay of a realised pole, relative to its size and to the highest frequency
+_LEAST_DAMPING, _LEAST_RATE = 1e-4, 1e-9
 
 
 class MeasuredErrorSystem(ErrorSystem):
@@ -194,3 +204,35 @@ def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
         return Target(*d2c_tustin(A, BD[:order], C, BD[order:], 2.0 / centre))
     except ValueError:  # a pole on a data point or at infinity
         return None
+
+
+def stable_realization(omega: Array, G: Complex, order: int) -> Target | None:
+    """Stable model near a response, as `realize_response` finds it where it is one.
+
+    Else with unstable poles reflected, and B and D fitted to the response anew, as in
+    vector fitting: noise, or an order that the system does not have, puts poles of a
+    realisation to the right. None where that leaves no stable model.
+    """
+    model = realize_response(omega, G, order)
+    if model is None:
+        return None
+    poles, V = np.linalg.eig(model.A)
+    least = _LEAST_DAMPING * np.abs(poles) + _LEAST_RATE * float(omega.max())
+    if (poles.real <= -least).all():
+        return model
+    decay = np.maximum(np.abs(poles.real), least)
+    try:
+        A = np.real((V * (1j * poles.imag - decay)) @ np.linalg.inv(V))
+    except np.linalg.LinAlgError:  # poles that coincide
+        return None
+    if not (np.linalg.eigvals(A).real < 0).all():
+        return None
+    (k, p, m), n = G.shape, len(A)
+    X = resolvent(A, laplace_variable(omega, None)[0])
+    left = np.concatenate([model.C @ X, np.broadcast_to(np.eye(p), (k, p, p))], axis=2)
+    flat, rhs = left.reshape(k * p, n + p), G.reshape(k * p, m)
+    rows, target = np.vstack([flat.real, flat.imag]), np.vstack([rhs.real, rhs.imag])
+    size = np.linalg.norm(rows, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    BD = np.linalg.lstsq(rows / size, target, rcond=None)[0] / size[:, None]
+    return Target(A, BD[:n], model.C, BD[n:])

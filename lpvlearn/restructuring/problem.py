@@ -28,7 +28,7 @@ from .least_squares import (
     fit_frequency_response,
 )
 from .limits import growth, keeps_margin, natural_margin
-from .measured import MeasuredErrorSystem, read_frequency_data, realize_response
+from .measured import MeasuredErrorSystem, read_frequency_data, stable_realization
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -386,7 +386,7 @@ def problem_from_response(
     return RestructuringProblem(
         structure,
         system,
-        realize_response(system.omega, system.G, structure.order),
+        stable_realization(system.omega, system.G, structure.order),
         system.omega,
         _LEAST_DECAY * float(system.omega[system.omega > 0][0]),
         float(np.linalg.norm(system.W @ system.G, 2, axis=(1, 2)).max()),

@@ -1,15 +1,19 @@
 """Tables of frequency responses, and models realised from them."""
 
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.exceptions import ConvergenceWarning
 
-from lpvlearn import StateSpace
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.restructuring.measured import (
     read_frequency_data,
     realize_response,
+    stable_realization,
     stack_response,
 )
 
@@ -132,3 +136,49 @@ def test_few_points_give_no_model():
 def test_order_zero_gives_no_model():
     omega = np.linspace(0.5, 5, 8)
     assert realize_response(omega, np.ones((8, 1, 1), complex), 0) is None
+
+
+# -- noisy responses -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_noisy_response_is_realised_by_a_stable_model(seed):
+    rng = np.random.default_rng(seed)
+    model = stable_model(seed, 4, 2, 2)
+    omega = np.geomspace(0.05, 20.0, 50)
+    G = model.frequency_response(omega)
+    noise = 0.2 * np.abs(G).max() * (rng.normal(size=(2, *G.shape)))
+    found = stable_realization(omega, G + noise[0] + 1j * noise[1], 8)
+    assert found is None or np.linalg.eigvals(found.A).real.max() < 0
+    exact, plain = (f(omega, G, 4) for f in (stable_realization, realize_response))
+    np.testing.assert_array_equal(exact.A, plain.A)
+
+
+def test_reflected_poles_meet_the_response_as_well_as_they_can():
+    """All-pass: behind a zero of its own, the reflected pole has nothing left to do."""
+    omega = np.linspace(0.1, 10.0, 40)
+    G = (1 / (1j * omega - 2) + 3 / (1j * omega + 5))[:, None, None]
+    found = stable_realization(omega, G, 2)
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(found.A).real), [-5, -2])
+    X = np.stack([1 / (1j * omega + 2), 1 / (1j * omega + 5), 1 + 0j * omega], 1)
+    rows = np.vstack([X.real, X.imag])
+    y = np.concatenate([G.real, G.imag])[:, 0, 0]
+    least = np.linalg.norm(y - rows @ np.linalg.lstsq(rows, y, rcond=None)[0])
+    s = 1j * omega[:, None, None]
+    own = found.C @ np.linalg.solve(s * np.eye(2) - found.A, found.B + 0j) + found.D
+    assert np.isclose(np.linalg.norm(own - G), least, rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:the response determines")
+@pytest.mark.parametrize("seed", range(5))
+def test_orders_beyond_the_systems_and_noise_raise_nothing(seed):
+    rng = np.random.default_rng(seed)
+    box = stable_model(seed, 2, 1, 1)
+    omega = np.geomspace(0.05, 20.0, 40)
+    G = box.frequency_response(omega)
+    noise = 0.1 * (seed % 2) * np.abs(G).max() * rng.normal(size=(2, *G.shape))
+    fitted = GrayBoxRestructurer(GrayBoxStructure.modal(2), n_starts=2, max_iter=60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fitted.fit(omega, G + noise[0] + 1j * noise[1])
+    assert fitted.lti_.is_stable
