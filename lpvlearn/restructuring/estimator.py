@@ -282,6 +282,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
                 "`starts` must hold parameters where `search` is False: nothing else "
                 "is begun from. Got none."
             )
+        if len(realizations):
+            problem.check_realizations(realizations)
         known = problem.uncertainty(realizations, estimates)
         self._restructure(problem, given, estimates, known, only_given=not search)
         if len(realizations) and not hasattr(self, "params_covariance_"):
@@ -323,8 +325,8 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         problem = problem_from_response(
             self.structure, omega, frf, self.frequency_weight, sample_weight
         )
-        self.n_features_in_ = 1
         self._restructure(problem, [])
+        self.n_features_in_ = 1
         return self
 
     def start_error(self, model: StateSpace, params: ArrayLike) -> float:
@@ -458,9 +460,28 @@ class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
         uncertainty: float = 0.0,
         only_given: bool = False,
     ) -> None:
-        """Starts and their least-squares fits, minimisation, certificates, warnings."""
+        """Starts and their least-squares fits, minimisation, certificates, warnings.
+
+        All attributes are those of this fit, or, where it fails, of the one before.
+        """
+        before = self.__dict__.copy()
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
+        try:
+            self._searched(problem, given, estimates, uncertainty, only_given)
+        except BaseException:  # an interruption, too
+            self.__dict__.clear()
+            self.__dict__.update(before)
+            raise
+
+    def _searched(
+        self,
+        problem: RestructuringProblem,
+        given: list[Array],
+        estimates: Sequence[Estimate],
+        uncertainty: float,
+        only_given: bool,
+    ) -> None:
         seed = check_random_state(self.random_state).randint(2**31)
         enough = max(EXACT_FIT, _NOISY * uncertainty)
         problem, fits = starts_of(

@@ -170,6 +170,23 @@ class RestructuringProblem:
             K = K.reshape(*K.shape[:2], -1, *dG.shape[2:]).sum(2)
         return np.asarray(np.einsum("jkpm,rkpm->rj", K.conj(), dG).real)
 
+    def check_realizations(self, models: Sequence[Any]) -> None:
+        """Refuse what cannot be the realizations that the black box is the mean of."""
+        if len(models) < 2 or not all(isinstance(m, StateSpace) for m in models):
+            raise ValueError(
+                "`realizations` must be at least 2 models, each a StateSpace, to have "
+                f"a spread. Got {len(models)} of "
+                f"{', '.join(sorted({type(m).__name__ for m in models}))}."
+            )
+        shape = self.structure.n_outputs, self.structure.n_inputs
+        for number, model in enumerate(models):
+            if model.D.shape != shape or model.sampling_time != self.system.dt:
+                raise ValueError(
+                    f"`realizations` must have {shape[0]} outputs, {shape[1]} inputs "
+                    f"and sampling time {self.system.dt}, as `model` has. Got "
+                    f"{model} at place {number}."
+                )
+
     def uncertainty(
         self, realizations: Sequence[StateSpace], estimates: Sequence[Any]
     ) -> float:
@@ -203,12 +220,6 @@ class RestructuringProblem:
         Every realization's response is carried to the parameters to first order; the
         covariance of their mean is that of one divided by their number.
         """
-        if len(models) < 2 or not all(isinstance(m, StateSpace) for m in models):
-            raise ValueError(
-                "`realizations` must be at least 2 models, each a StateSpace, to have "
-                f"a spread. Got {len(models)} of "
-                f"{', '.join(sorted({type(m).__name__ for m in models}))}."
-            )
         undelayed = [model.with_input_delay(0) for model in models]
         G = np.array([model.frequency_response(self.omega) for model in undelayed])
         changes = self.parameter_changes(theta, G - G.mean(0))
@@ -328,6 +339,14 @@ def _check_time(structure: Any, sampling_time: float | None) -> None:
         )
 
 
+def _check_structure(structure: GrayBoxStructure) -> None:
+    if structure.n_params == 0:
+        raise ValueError(
+            "`structure` must have a parameter to be found. Got one without, which is "
+            "a model: structure.model([])."
+        )
+
+
 def _structure_for(
     structure: GrayBoxStructure | None, model: StateSpace
 ) -> GrayBoxStructure:
@@ -341,6 +360,7 @@ def _structure_for(
             "`structure` must be a GrayBoxStructure or None. Got "
             f"{type(structure).__name__}."
         )
+    _check_structure(structure)
     return structure
 
 
@@ -365,6 +385,7 @@ def problem_from_response(
             f"tell the order. Got {structure!r}. Use a GrayBoxStructure, or "
             "fit_model()."
         )
+    _check_structure(structure)
     p = structure.n_outputs
     grid, G = read_frequency_data(omega, frf, p, structure.n_inputs)
     W = np.broadcast_to(np.eye(p), (len(grid), p, p)).astype(complex)

@@ -745,3 +745,30 @@ def test_a_fit_without_search_stays_in_the_basin_of_its_start():
         ValueError, match="`starts` must hold parameters where `search`"
     ):
         GrayBoxRestructurer(modes).fit_model(box, search=False)
+
+
+# -- what cannot be fitted -------------------------------------------------------------
+
+
+def test_a_structure_without_parameters_is_a_model():
+    nothing = GrayBoxStructure.from_template([[-1]], [[1]], [[1]])
+    box = StateSpace(-1.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match="`structure` must have a parameter"):
+        GrayBoxRestructurer(nothing).fit_model(box)
+    with pytest.raises(ValueError, match="`structure` must have a parameter"):
+        GrayBoxRestructurer(nothing).fit([1.0, 2.0], np.ones((2, 2)))
+
+
+def test_a_fit_that_fails_leaves_no_attribute():
+    lag = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]], [["a"]])
+    good, bad = lag.model([2.0, 3.0]), StateSpace(-2.0, 1.0, 1.0, 5.0)
+    fitted = GrayBoxRestructurer(lag, norm="h2")
+    with pytest.raises(ValueError, match="without feedthrough"):
+        fitted.fit_model(bad)
+    assert not [name for name in vars(fitted) if name.endswith("_")]
+    before = dict(vars(fitted.fit_model(good)))
+    with pytest.raises(ValueError, match="without feedthrough"):
+        fitted.fit_model(bad)
+    after = vars(fitted)
+    assert after.keys() == before.keys()
+    assert all(after[name] is value for name, value in before.items())

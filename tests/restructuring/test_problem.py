@@ -264,3 +264,20 @@ def test_one_fit_that_no_other_confirms_is_told(monkeypatch):
     GrayBoxRestructurer(structure).fit_model(  # known to be no better: nothing is told
         box, realizations=[box, truth]
     )
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        StateSpace(-1.0, np.ones((1, 2)), 1.0),
+        StateSpace(0.5, 1.0, 1.0, sampling_time=0.1),
+    ],
+)
+def test_realizations_are_models_of_the_same_channels_and_time(other):
+    box = spring_structure().model([30.0, 1.2, 50.0])
+    with pytest.raises(
+        ValueError, match="`realizations` must have 1 outputs, 1 inputs"
+    ):
+        GrayBoxRestructurer(spring_structure()).fit_model(
+            box, realizations=[box, other]
+        )
