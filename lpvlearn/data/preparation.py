@@ -102,7 +102,7 @@ def complete_runs(
     edges = np.flatnonzero(np.diff(complete)) + 1
     cuts = np.unique([0, *edges, *experiment.breaks, len(complete)])
     return [
-        _rows(experiment, slice(start, stop))
+        part_of(experiment, slice(start, stop))
         for start, stop in pairwise(cuts)
         if complete[start] and stop - start >= shortest
     ]
@@ -113,10 +113,10 @@ def unbroken_runs(experiment: Experiment) -> list[Experiment]:
     if not experiment.breaks:
         return [experiment]
     edges = [0, *experiment.breaks, len(experiment.rows)]
-    return [_rows(experiment, slice(*part)) for part in pairwise(edges)]
+    return [part_of(experiment, slice(*part)) for part in pairwise(edges)]
 
 
-def _rows(experiment: Experiment, part: slice) -> Experiment:
+def part_of(experiment: Experiment, part: slice) -> Experiment:
     def cut(values: Array | None) -> Array | None:
         return None if values is None else values[part]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from ..data.experiments import (
     read_outputs,
 )
 from ..data.operating_points import check_outputs
-from ..data.preparation import read_runs
+from ..data.preparation import part_of, read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
 from ..exceptions import collected
@@ -35,6 +36,7 @@ from ..lpv.refinement import (
     Record,
     coefficients_of,
     local_prior,
+    refine,
     refine_with_rates,
     simulated,
 )
@@ -53,6 +55,10 @@ _NO_COEFFICIENTS = (
     "RationalLPV or SplineLPV. Got {}."
 )
 
+# Parts of an experiment, each nearer to an operating point than the whole, of which
+# time-invariant models are made, too; how many of these are tried, by so many steps.
+_PARTS, _N_STARTS, _FIRST_STEPS = 5, 3, 15
+
 _LEVELS = 5  # of every scheduling variable, where a form begins as a constant
 
 
@@ -68,8 +74,9 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ----------
     start : LPVStateSpace, GrayBoxStructure or None, default=None
         Where the search begins: an LPV model, or one with constant matrices, identified
-        from the table as if it were time-invariant: in a structure, or without one
-        (None) balanced, every entry of its matrices free. A pipeline gives its own.
+        from the table, or a part of an experiment, as if it were time-invariant: in a
+        structure, or without one (None) balanced, every entry of its matrices free; the
+        one whose first steps come farthest. A pipeline gives its own.
     rate : {"auto", True, False}, default="auto"
         Whether A follows the rates of change of the scheduling variables too, by terms
         ``N_j(kappa) dkappa_j/dt`` in every row of A that holds parameters, quadratic
@@ -466,26 +473,44 @@ class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 got = type(model.interpolator).__name__
                 raise ValueError(_NO_COEFFICIENTS.format("start", got))
             return model
-        structure = self.start
-        local = SubspaceLTI(stability="enforce") if self.local is None else self.local
-        if structure is not None and local.get_params().get("order") == "auto":
-            local = clone(local).set_params(order=structure.order)
-        with collected():  # where a search begins, nobody needs to hear of
-            lti = identify_point(
-                local,
-                experiments,
-                sampling_time=dt,
-                combine="pool",
-                discretization="zoh",
-            ).lti
-            if structure is None:
-                structure, (theta,) = balanced_entries([lti])
-            else:
-                theta = GrayBoxRestructurer(structure).fit_model(lti).params_
         seen = np.zeros((1, 1))
         if names:
             seen = np.vstack([_record(e, dt).kappa for e in experiments])
         bounds = np.array([seen.min(axis=0), seen.max(axis=0)])
+        groups = [experiments, *([part] for e in experiments for part in _parts_of(e))]
+        models: list[LPVStateSpace] = []
+        with collected():  # where a search begins, nobody needs to hear of
+            for group in groups:
+                try:
+                    models.append(self._constant_model(group, experiments, dt, bounds))
+                except ValueError:  # a part that tells too little
+                    if group is experiments:
+                        raise
+        return _promising(models, [_record(e, dt) for e in experiments])
+
+    def _constant_model(
+        self,
+        identified: Sequence[Experiment],
+        experiments: Sequence[Experiment],
+        dt: float,
+        bounds: Array,
+    ) -> LPVStateSpace:
+        """One time-invariant model of some experiments, in the form of an LPV model."""
+        structure, names = self.start, as_list(self.scheduling)
+        local = SubspaceLTI(stability="enforce") if self.local is None else self.local
+        if structure is not None and local.get_params().get("order") == "auto":
+            local = clone(local).set_params(order=structure.order)
+        lti = identify_point(
+            local,
+            identified,
+            sampling_time=dt,
+            combine="pool",
+            discretization="zoh",
+        ).lti
+        if structure is None:
+            structure, (theta,) = balanced_entries([lti])
+        else:
+            theta = GrayBoxRestructurer(structure).fit_model(lti).params_
         form = self.interpolator
         if form is None:
             form = PolynomialLPV(1 if self.start is None else 2)
@@ -560,6 +585,35 @@ def known_coefficients(
     groups = [[_record(e, sampling_time) for e in g] for g in points.experiments]
     own = Own(True, any(model.n_trend > 0 for model in found.local))
     return local_prior(model, points.kappa, found.theta, groups, own)
+
+
+def _parts_of(e: Experiment) -> list[Experiment]:
+    """Parts of an experiment, along which the scheduling variables move less."""
+    ends = np.linspace(0, len(e.rows), _PARTS + 1).astype(int)
+    return [part_of(e, slice(*pair)) for pair in pairwise(ends)]
+
+
+def _promising(
+    models: Sequence[LPVStateSpace], records: Sequence[Record]
+) -> LPVStateSpace:
+    """The start of a search whose first steps come farthest."""
+    own, one = Own(True, False), np.ones(models[0].n_outputs)
+
+    def loss(model: LPVStateSpace) -> float:
+        try:
+            errors = [simulated(model, record, own, one)[0] for record in records]
+        except ValueError:
+            return np.inf
+        return float(sum(np.sum(error**2) for error in errors))
+
+    def soon(model: LPVStateSpace) -> float:
+        try:
+            return loss(refine(model, records, own, max_iter=_FIRST_STEPS).model)
+        except ValueError:  # it diverges
+            return np.inf
+
+    best = sorted(models, key=loss)[:_N_STARTS]
+    return min(best, key=soon) if len(best) > 1 else best[0]
 
 
 def _record(e: Experiment, sampling_time: float) -> Record:
