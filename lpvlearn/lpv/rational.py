@@ -9,12 +9,13 @@ numerators are a linear least-squares problem, so that a search has only d to fi
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import orth, solve_triangular
 
+from ..systems.least_squares import levenberg_marquardt
 from ..validation import one_of, whole_number
 from .interpolator import Interpolator, carried_by_terms
 from .polynomial import chebyshev_terms, resolvable_powers
@@ -38,8 +39,6 @@ _MAX_ITERATIONS = 50
 _SAME = (
     1e-8  # relative change of the misfit, or of the coefficients, that ends a search
 )
-_DAMPING, _LESS, _MORE = 1e-3, 0.2, 8.0  # of Levenberg and Marquardt
-_MAX_DAMPING = 1e12
 
 
 class RationalLPV(Interpolator):
@@ -207,18 +206,14 @@ def fit_rational(
     constant (n_points, n_denominator_terms - 1), and these at places where it must
     stay positive.
     """
-    search = _Search(orth(phi), psi, places, points)
-    found = [search.descend(start) for start in search.starts()]
-    d = min(found, key=lambda state: state.misfit).denominator
+    d = _Search(orth(phi), psi, places, points).least()
     numerator, rank = points.coefficients(phi / (1.0 + psi @ d)[:, None])
     return Rational(numerator, d, rank)
 
 
 class _State(NamedTuple):
-    """Where a search stands."""
+    """What a denominator leaves."""
 
-    denominator: Array  # coefficients but for the constant
-    misfit: float
     errors: Array
     slopes: Array  # derivatives of the errors (Kaufman's approximation)
 
@@ -274,30 +269,27 @@ class _Search(NamedTuple):
             numerator = numerator * self.points.scale
         fitted = terms @ numerator
         columns = [-fitted * column[:, None] / below for column in self.psi.T]
-        slopes = self._unexplained(basis, columns) if columns else np.zeros((0, 0))
-        return _State(d, float(errors @ errors), errors, slopes)
+        none = np.zeros((errors.size, 0))
+        slopes = self._unexplained(basis, columns) if columns else none
+        return _State(errors, slopes)
 
-    def descend(self, d: Array) -> _State:
-        """To a local minimum, by Levenberg and Marquardt's steps that are allowed."""
-        state, damping = self._at(d), _DAMPING
-        for _ in range(_MAX_ITERATIONS if len(d) else 0):
-            size = np.linalg.norm(state.slopes, axis=0)
-            target = np.concatenate([-state.errors, np.zeros(len(d))])
-            while damping < _MAX_DAMPING:
-                rows = np.vstack([state.slopes, np.diag(np.sqrt(damping) * size)])
-                step = np.linalg.lstsq(rows, target, rcond=None)[0]
-                if _is_allowed(self.places, state.denominator + step):
-                    trial = self._at(state.denominator + step)
-                    if trial.misfit < state.misfit:
-                        break
-                damping *= _MORE
-            else:
-                return state
-            gain, state = state.misfit - trial.misfit, trial
-            damping *= _LESS
-            if gain <= _SAME * state.misfit:
-                return state
-        return state
+    def least(self) -> Array:
+        """The denominator of the least misfit, without its constant."""
+
+        def residuals(trial: Array, rows: NDArray[np.intp]) -> tuple[Array, Any]:
+            none = np.full(self.points.theta.size, np.inf)
+            refused = _State(none, np.zeros((len(none), len(trial[0]))))
+            states = [
+                self._at(d) if _is_allowed(self.places, d) else refused for d in trial
+            ]
+            errors = np.array([state.errors for state in states])
+            return errors, lambda kept: np.array([states[k].slopes for k in kept])
+
+        starts = np.array(list(self.starts()))
+        found = levenberg_marquardt(
+            residuals, starts, max_iter=_MAX_ITERATIONS, tol=_SAME, patience=1
+        )
+        return found.x[np.argmin(found.cost)]
 
 
 def _is_allowed(places: Array, d: Array) -> bool:
