@@ -16,10 +16,18 @@ from .metrics import (
 )
 from .model_selection import BlockedTimeSeriesSplit, ExperimentSplit
 from .models import InnovationModel, StateSpace, gap, peak_gains
-from .pipeline import LocalLPVPipeline, OutputErrorLPV, suggest_operating_point
+from .pipeline import (
+    LocalLPVPipeline,
+    OutputErrorLPV,
+    load,
+    save,
+    suggest_operating_point,
+)
 from .restructuring import GrayBoxRestructurer
 from .structures import GrayBoxStructure
 from .subspace import SubspaceLTI
+
+__version__ = "0.1.0"
 
 __all__ = [
     "AutoLPV",
@@ -42,12 +50,14 @@ __all__ = [
     "fit_report",
     "from_trajectories",
     "gap",
+    "load",
     "make_bft_scorer",
     "make_vaf_scorer",
     "parameter_fit",
     "peak_gains",
     "readable_report",
     "resample",
+    "save",
     "suggest_operating_point",
     "vaf_score",
     "vaf_scorer",

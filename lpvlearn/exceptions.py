@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,10 @@ class ExtrapolationWarning(UserWarning):
 
 class RankWarning(UserWarning):
     """The data do not determine the model: a minimum-norm solution was taken."""
+
+
+class VersionWarning(UserWarning):
+    """A pickle is of another version of this library, and may not fit this one."""
 
 
 class DivergenceError(ValueError):
@@ -85,3 +89,30 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
             outermost = level
         level, frame = level + 1, frame.f_back
     warnings.warn(message, category, stacklevel=outermost + 2)
+
+
+def version() -> str:
+    """That of this library, which stands on its public face."""
+    return str(sys.modules[__name__.split(".")[0]].__version__)
+
+
+class VersionedPickle:
+    """What an estimator's pickle tells: the version of this library that wrote it.
+
+    Scikit-learn's estimators tell theirs; what others inherit from it does not.
+    """
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_lpvlearn_version": version()}  # type: ignore[dict-item]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        own = {k: v for k, v in state.items() if k != "_lpvlearn_version"}
+        written = state.get("_lpvlearn_version", "0.1.0 or before")
+        if written != version():
+            warn(
+                f"A pickled {type(self).__name__} was written by lpvlearn {written}, "
+                f"this is {version()}: what it tells may be wrong. Fit it anew, or "
+                "keep models by lpvlearn.save(), whose files later versions read.",
+                VersionWarning,
+            )
+        super().__setstate__(own)  # type: ignore[misc]

@@ -16,7 +16,7 @@ from sklearn.utils.validation import (
     validate_data,
 )
 
-from ..exceptions import ExtrapolationWarning, warn
+from ..exceptions import ExtrapolationWarning, VersionedPickle, warn
 from ..validation import one_of, real_array
 from .weighting import WeightedPoints, is_chance, weighted_points
 
@@ -29,7 +29,9 @@ _EXTRAPOLATIONS = ("ignore", "warn", "clip", "error")
 _RANGE_RTOL = 1e-6
 
 
-class Interpolator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
+class Interpolator(
+    VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator, ABC
+):
     """A regressor from scheduling values to parameters of local models.
 
     A sample is an operating point. An heir has the option `extrapolation`, tells in

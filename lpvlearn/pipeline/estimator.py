@@ -37,7 +37,7 @@ from ..data.operating_points import (
 from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
-from ..exceptions import warn
+from ..exceptions import VersionedPickle, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
@@ -98,7 +98,9 @@ class Stopwatch:
         return pd.DataFrame(rows, columns=["step", "seconds"])
 
 
-class LocalLPVPipeline(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class LocalLPVPipeline(
+    VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator
+):
     """Local LPV identification: experiments at operating points to one LPV model.
 
     Identifies a black-box model at every operating point, brings each into the

@@ -21,7 +21,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
-from ..exceptions import RankWarning, warn
+from ..exceptions import RankWarning, VersionedPickle, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
@@ -69,7 +69,7 @@ _ABSENT_ELSEWHERE = (  # attributes that not every fit has
 _ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
 
 
-class GrayBoxRestructurer(RegressorMixin, BaseEstimator):
+class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     r"""Find the gray-box parameters whose model is closest to a black box.
 
     Minimises :math:`\|G(\vartheta) - \mathfrak{G}\|_\infty`, Eq. (6), over the

@@ -60,11 +60,9 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..models.innovation import (
-    InnovationModel,
     NoiseModel,
     prediction_responses,
 )
-from ..models.statespace import StateSpace
 from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import estimate_initial_state, state_trajectory
 from .hankel import hankel_factor
@@ -320,13 +318,8 @@ class ClosedLoopEvidence(Evidence):
             levels,
         )
 
-    def predictor(self, lti: StateSpace, n_noise_states: int | None) -> InnovationModel:
-        """Innovation model of `lti`; the fit has chosen the states of the noise."""
-        noise, sy = self.noise, self.output_scale
-        C, K = sy[:, None] * noise.C, noise.K / sy
-        covariance = noise.covariance * np.outer(sy, sy)
-        gain = self.joint.K[self.kept] / sy
-        return InnovationModel(lti, NoiseModel(noise.A, C, K, covariance), gain)
+    def _gain(self) -> Array:
+        return self.joint.K[self.kept]
 
 
 def identify_closed_loop(

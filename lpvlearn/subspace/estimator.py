@@ -25,7 +25,7 @@ from ..data.experiments import (
 from ..data.preparation import DETRENDS, read_runs, remove_trends, split_at_gaps
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL
-from ..exceptions import warn
+from ..exceptions import VersionedPickle, warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
 from ..systems.simulation import (
@@ -58,7 +58,7 @@ from .stream import SampleStream, fit_as_stream
 Array = NDArray[np.float64]
 
 
-class SubspaceLTI(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator):
     """Linear time-invariant state-space model by subspace identification.
 
     The observability matrix is estimated from compressed block-Hankel data by one of

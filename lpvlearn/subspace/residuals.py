@@ -204,7 +204,7 @@ def model_residuals(
         )
         errors = [np.where(rounding, 0.0, part) for part in errors]
     records, scale = evidence.records, evidence.output_scale
-    head = min(_HEAD, min(record.y.shape[1] for record in records))
+    head = min([_HEAD, *(record.y.shape[1] for record in records)])
     known = {record.y[:, :head].tobytes() for record in records}
     fitted = None
     if any((y[:head] / scale).T.tobytes() in known for _, y in pairs):

@@ -60,6 +60,59 @@ class StaticGain(NamedTuple):
     size: Array  # root mean square of the response over all frequencies
 
 
+class Known(NamedTuple):
+    """What is known of a model without the samples: all but tests of residuals."""
+
+    A: Array  # of the model of scaled and whitened records, in section form
+    B: Array
+    C: Array
+    D: Array
+    sizes: NDArray[np.intp] | None  # of the sections; None without them
+    noise: NoiseModel  # in the scale of the records
+    gain: Array | None  # of the deterministic states; None: not moved by innovations
+    covariance: Array | None  # of the parameters
+    input_scale: Array
+    output_scale: Array
+    basis: Array
+    direct: NDArray[np.bool_]
+    initial_states: bool
+    n_trend: int
+    filter: Array
+    weight: Array
+    input_delay: NDArray[np.intp]
+
+    def evidence(self) -> Evidence:
+        """What answers as the evidence that it was told by."""
+        blocks: list[Array] | None = None
+        if self.sizes is not None:
+            n_unknowns = self.B.size + int(self.direct.sum()) + self.C.size
+            n_unknowns += int((self.sizes**2).sum())
+            if self.sizes.sum() != len(self.A) or self.sizes.min(initial=1) < 1:
+                raise ValueError(f"sections of {self.sizes} states")
+            if self.covariance is not None and len(self.covariance) != n_unknowns:
+                raise ValueError(f"a covariance not of {n_unknowns} parameters")
+            ends = np.cumsum(self.sizes).tolist()
+            rows = [slice(k - n, k) for k, n in zip(ends, self.sizes, strict=True)]
+            blocks = [self.A[part, part] for part in rows]
+        sections = Realization(
+            *(self.A, self.B, self.C, self.D, np.zeros((0, len(self.A))), np.nan),
+            blocks=None if blocks is None else tuple(blocks),
+        )
+        return Evidence(
+            sections,
+            [],
+            self.input_scale,
+            self.output_scale,
+            self.basis,
+            Freedom(self.direct, self.initial_states, self.n_trend),
+            Whitening(self.filter, self.weight),
+            self.covariance is not None,
+            1.0,
+            input_delay=self.input_delay,
+            told=self,
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """A model of scaled samples, and samples that its statistics are computed from.
@@ -78,10 +131,41 @@ class Evidence:
     share: float  # samples in `records` by all samples that were used
     levels: Array | None = None  # (n_experiments, n_outputs): constants less trends
     input_delay: ArrayLike = 0  # samples, which the records' inputs have already
+    told: Known | None = None  # in the place of the records
+
+    def known(self) -> Known:
+        """What is left without the records."""
+        try:
+            covariance = self.covariance
+        except ValueError:
+            covariance = None
+        sections, m = self.sections, len(self.basis)
+        blocks, gain = sections.blocks, self._gain()
+        return Known(
+            *sections[:4],
+            None if blocks is None else np.array([len(b) for b in blocks], dtype=int),
+            self.noise,
+            gain,
+            covariance,
+            np.asarray(self.input_scale, dtype=float),
+            np.asarray(self.output_scale, dtype=float),
+            self.basis,
+            self.free.direct,
+            bool(self.free.initial_states),
+            int(self.free.n_trend),
+            *self.whitening,
+            np.broadcast_to(self.input_delay, (m,)).astype(int),
+        )
+
+    def _gain(self) -> Array | None:
+        """Innovation gain of the deterministic states, in the scale of the records."""
+        return None if self.told is None else self.told.gain
 
     @cached_property
     def noise(self) -> NoiseModel:
         """Autoregression of the simulation errors, in the scale of the records."""
+        if self.told is not None:
+            return self.told.noise
         weight = self.whitening.weight
         model = with_initial_states(self.model, self.records, self.free, weight)
         return autoregression(simulation_errors(model, self.records))
@@ -98,6 +182,8 @@ class Evidence:
             raise ValueError(
                 "The covariance needs poles of multiplicity two at most. Lower `order`."
             )
+        if self.told is not None and self.told.covariance is not None:
+            return self.told.covariance
         records = self.whitening.records(self.records, self.free)
         model = with_initial_states(self.sections, records, self.free)
         noise = autoregression(simulation_errors(model, records))
@@ -110,6 +196,8 @@ class Evidence:
 
         Its initial states are those of the records themselves.
         """
+        if self.told is not None:
+            return self.model
         return in_sections(self.whitening.model(self.model))
 
     @property
@@ -132,13 +220,17 @@ class Evidence:
         )
 
     def predictor(self, lti: StateSpace, n_noise_states: int | None) -> InnovationModel:
-        """Innovation model of `lti`; None keeps all states of the noise model."""
-        noise, sy = self.noise, self.output_scale
-        if n_noise_states is not None:
+        """Innovation model of `lti`; None keeps all states of the noise model.
+
+        With a gain the fit has chosen them.
+        """
+        noise, sy, gain = self.noise, self.output_scale, self._gain()
+        if n_noise_states is not None and gain is None:
             noise = reduced_noise_model(noise, n_noise_states)
         C, K = sy[:, None] * noise.C, noise.K / sy
         covariance = noise.covariance * np.outer(sy, sy)
-        return InnovationModel(lti, NoiseModel(noise.A, C, K, covariance))
+        gain = None if gain is None else gain / sy
+        return InnovationModel(lti, NoiseModel(noise.A, C, K, covariance), gain)
 
     def deviated_models(self, lti: StateSpace) -> list[ModelPair]:
         """Models to either side of an estimate, along its directions of uncertainty.
