@@ -17,6 +17,8 @@ from lpvlearn import (
     LocalLPVPipeline,
     SubspaceLTI,
     gap,
+    load,
+    save,
     suggest_operating_point,
 )
 from lpvlearn.datasets import FlexibleArm, load_flexible_arm
@@ -110,3 +112,24 @@ print(len(models), models[0])
 # rectangular grid. Offsets go along in ``m.offsets``. Coefficients, the
 # linear-fractional form and ``to_control`` leave them out, to be taken from
 # ``lpv.input_offset``, ``output_offset`` and ``state_offset``.
+#
+# Keeping it
+# ----------
+# :func:`~lpvlearn.save` writes a model or a fitted estimator to a file without code,
+# :func:`~lpvlearn.load` builds it anew: equal to the bit, in later versions of the
+# library, and from files of strangers. A file is whole or not there: the old one is
+# replaced when the new one is on the disk.
+
+import tempfile
+from pathlib import Path
+
+path = Path(tempfile.mkdtemp()) / "arm.zip"
+save(pipeline, path)
+same = load(path)
+print(same.summary() == pipeline.summary())
+print((same.predict(data.X) == pipeline.predict(data.X)).all())
+
+# %%
+# What a file holds, how other programs read it, and what it leaves out:
+# :ref:`guide_files`. A structure that is a function of the user's is kept by its name;
+# who loads it gives the function, ``load(path, function=...)``.

@@ -88,7 +88,8 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     Notes
     -----
     A zip of JSON and ``.npy``, as :ref:`guide_files` describes it field by field.
-    Numbers are exact to the bit. Not kept are samples: a `SubspaceLTI` goes on to
+    Numbers are exact to the bit; an estimator whose `fit` did not end is kept unfitted.
+    Not kept are samples: a `SubspaceLTI` goes on to
     tell its uncertainty and its noise model, but not whether a table is the one that it
     was fitted to (`residual_tests` takes every table for a new one), and `partial_fit`
     begins a new stream. Nor is `memory` of a pipeline, a folder on one machine. Of the
@@ -173,14 +174,12 @@ def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
     """
     data = Path(path).read_bytes()
     try:
-        return _Reader(_members(data), function).model()
+        members = _members(data)
+        del data
+        return _Reader(members, function).model()
     except _Told as error:
         raise ValueError(str(error)) from None
-    except (
-        *(ValueError, TypeError, ArithmeticError, LookupError, AttributeError),
-        *(RecursionError, MemoryError, zipfile.BadZipFile, NotImplementedError),
-        *(EOFError, SyntaxError, RuntimeError, OSError),
-    ) as error:
+    except Exception as error:  # whatever damage may lead to
         raise ValueError(f"{_NOT_OURS}{Path(path).name!r}: {error}") from error
 
 
@@ -249,15 +248,17 @@ class _Writer:
             return {"function": f"{value.__module__}.{value.__qualname__}"}
         raise ValueError(
             f"`{place}` must be something that a file without code can hold. Got "
-            f"{type(value).__module__}.{type(value).__qualname__}: give a model of "
-            "this library, or an integer in the place of a random state; otherwise "
-            "use pickle, among those you trust."
+            f"{type(value).__module__}.{type(value).__qualname__}. Give numbers, text, "
+            "lists, arrays, models of this library, and an integer in the place of a "
+            "RandomState; otherwise use pickle, among those you trust."
         )
 
     def _object(self, value: Any, place: str) -> dict[str, Any]:
         node: dict[str, Any] = {"class": type(value).__name__}
-        for name, form in forms_of(value).items():
-            if form.kept and hasattr(value, name):
+        forms = {name: form for name, form in forms_of(value).items() if form.kept}
+        ended = all(hasattr(value, n) for n, form in forms.items() if form.needed)
+        for name, form in forms.items():
+            if hasattr(value, name) and (ended or not form.fitted):
                 field = name.lstrip("_")
                 node[field] = self.node(getattr(value, name), f"{place}.{field}")
         return node
@@ -265,13 +266,14 @@ class _Writer:
     def _array(self, array: NDArray[Any], place: str) -> dict[str, Any]:
         if array.dtype.kind in "OUT" and array.ndim == 1:
             return {"labels": [self.node(v, place) for v in array.tolist()]}
-        same = [d for d in _DTYPES if d[1] == array.dtype.kind]
-        if array.dtype.kind not in "fibc" or not same:
+        kinds = {dtype[1]: dtype for dtype in _DTYPES}
+        dtype = kinds.get(array.dtype.kind.replace("u", "i"))
+        if dtype is None or not np.can_cast(array.dtype, dtype):
             raise ValueError(
                 f"`{place}` must be an array of numbers. Got {array.dtype}."
             )
         name = f"{place.removeprefix('model.')}.npy"
-        self.arrays[name] = array.astype(same[0], casting="safe", copy=False)
+        self.arrays[name] = array.astype(dtype, copy=False)
         return {"array": name}
 
     def _table(self, table: pd.DataFrame, place: str) -> dict[str, Any]:
@@ -478,7 +480,7 @@ class _Reader:
 
     def _table(self, columns: list[Any], index: Any, place: str) -> pd.DataFrame:
         found = [self._series(column, place) for column in columns]
-        if type(index) is int and 0 <= index:
+        if type(index) is int and 0 <= index and (found or not index):
             rows: pd.Index = pd.RangeIndex(index)
         else:
             name, values, dtype = self._series(index, place)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
@@ -41,9 +41,10 @@ from ..subspace.offsets import Offsets
 from ..subspace.statistics import Evidence, Known
 from .estimator import LocalLPVPipeline
 
-# Entries of dS/dtheta, to which a structure that solves equations is put when loaded:
-# 30 MB; the largest that a search ends with has a hundredth of that.
-_MOST_ENTRIES = 4_000_000
+# Numbers that a loaded object may be put to, beyond those in the file: the derivatives
+# of a structure that solves equations, the distances of a spline's nodes. 70 MB; 3000
+# operating points, or 90 parameters of 300 states.
+_MOST_ENTRIES = 9_000_000
 
 _POINTS = {  # of all interpolators
     "scheduling_range_": "float[2, n_scheduling]",
@@ -63,6 +64,8 @@ FORMS: dict[type, dict[str, str]] = {
         "B": "float[order, n_inputs]",
         "C": "float[n_outputs, order]",
         "D": "float[n_outputs, n_inputs]",
+        "sampling_time": "any?",
+        "input_delay": "any",
     },
     NoiseModel: {
         "A": "float[n_states, n_states]",
@@ -111,7 +114,13 @@ FORMS: dict[type, dict[str, str]] = {
         "structure": "GrayBoxStructure",
         "interpolator": "interpolator[n_scheduling]",
         "scheduling_range": "float[2, n_scheduling]",
+        "scheduling_names": "any?",
+        "identified_range": "any?",
+        "bases": "any?",
+        "input_delay": "any?",
         "offsets": "interpolator[n_scheduling]?",
+        "input_names": "any?",
+        "output_names": "any?",
     },
     PolynomialLPV: _POINTS
     | _MISFIT
@@ -170,6 +179,7 @@ FORMS: dict[type, dict[str, str]] = {
     SubspaceLTI: {
         "lti_": "StateSpace[order, n_inputs, n_outputs]",
         "method_": "text",
+        "offset_": "text?",
         "order_": "whole",
         "horizon_": "whole",
         "singular_values_": "float[n_values]",
@@ -184,11 +194,17 @@ FORMS: dict[type, dict[str, str]] = {
         "time_jitter_": "number",
         "n_outputs_": "size[n_outputs]",
         "n_features_in_": "whole",
+        "_single_output": "flag",
         "_offsets": "Offsets[n_experiments, n_inputs, n_outputs]",
         "_evidence": "Known[n_inputs, n_outputs]",
         "_stream": "-",
     },
-    Identifiability: {"rank": "whole", "n_params": "whole", "condition": "number"},
+    Identifiability: {
+        "rank": "whole",
+        "n_params": "whole",
+        "condition": "number",
+        "directions": "any",
+    },
     GrayBoxRestructurer: {
         "structure": "GrayBoxStructure?",
         "structure_": "GrayBoxStructure[n_params]",
@@ -212,6 +228,10 @@ FORMS: dict[type, dict[str, str]] = {
         "history_": "table",
         "params_covariance_": "float[n_params, n_params]?",
         "hinf_params_": "float[n_params]?",
+        "hinf_error_": "number?",
+        "chi2_": "number?",
+        "degrees_of_freedom_": "any?",
+        "p_value_": "number?",
     },
     LocalLPVPipeline: {
         "memory": "-",
@@ -231,9 +251,13 @@ FORMS: dict[type, dict[str, str]] = {
         "scheduling_range_": "float[2, n_scheduling]",
         "sampling_time_": "number",
         "time_jitter_": "number",
+        "step_times_": "any",
+        "scheduling_names_": "any",
+        "output_names_": "any",
         "n_outputs_": "size[n_outputs]",
         "n_features_in_": "whole",
         "_n_with_offset": "whole",
+        "_single_output": "flag",
     },
 }
 
@@ -342,8 +366,6 @@ class Form:
 def _forms_of_class(kind: type) -> dict[str, Form]:
     arguments = inspect.signature(kind).parameters
     told = FORMS[kind]
-    if issubclass(kind, BaseEstimator):
-        told = {"_single_output": "flag?"} | told
     names = [*arguments, *(name for name in told if name not in arguments)]
     return {
         name: Form(told.get(name, "any?"), fitted=name not in arguments)
@@ -364,7 +386,8 @@ def forms_of(kind: Any) -> dict[str, Form]:
 
 
 def before_saving(value: Any) -> Any:
-    """What stands for a value in a file."""
+    """What stands for a value in a file; refuses what `load` would."""
+    _limit(value)
     return value.known() if isinstance(value, Evidence) else value
 
 
@@ -373,6 +396,7 @@ def after_loading(value: Any) -> Any:
 
     Nothing here takes much more memory than the value has.
     """
+    _limit(value)
     if isinstance(value, Known):
         return value.evidence()
     if isinstance(value, GrayBoxStructure):
@@ -385,6 +409,20 @@ def after_loading(value: Any) -> Any:
     elif isinstance(value, LPVStateSpace):
         _try_lpv(value)
     return value
+
+
+def _limit(value: Any) -> None:
+    """Refuse what would take much more memory to build anew than its fields do."""
+    entries = 0
+    if isinstance(value, GrayBoxStructure) and value.basis is None:
+        entries = value.n_params * math.prod(value.map.shape)
+    elif isinstance(value, SplineLPV) and hasattr(value, "n_points_"):
+        entries = value.n_points_**2 if value.n_features_in_ > 1 else 0
+    if entries > _MOST_ENTRIES:
+        raise ValueError(
+            f"a {type(value).__name__} in a file must take {_MOST_ENTRIES} numbers to "
+            f"build at most. Got {entries}."
+        )
 
 
 def _check_powers(powers: Any) -> None:
@@ -402,12 +440,10 @@ def _try_structure(structure: GrayBoxStructure) -> None:
     if structure.implicit is not None and structure.implicit.order != n:
         raise ValueError("its equations are of another order")
     shape = (structure.n_params, *structure.map.shape)
-    if structure.basis is None:
-        if math.prod(shape) > _MOST_ENTRIES:
-            raise ValueError("it is larger than a structure that solves equations")
-        found = structure.jacobian(structure.reference).shape
-    else:
-        found = structure.basis.shape
+    known = structure.basis
+    if known is None:
+        known = structure.jacobian(structure.reference)
+    found = known.shape
     if found != shape:
         raise ValueError(f"its derivatives have shape {found}, its parameters {shape}")
 
@@ -422,10 +458,3 @@ def _try_lpv(model: LPVStateSpace) -> None:
         raise ValueError(f"`identified_range` has shape {np.shape(limits)}")
     if any(shape != (model.order, model.order) for shape in constant):
         raise ValueError(f"`bases` have the shapes {constant}")
-
-
-def described() -> Iterable[tuple[str, str, str]]:
-    """Class, field and form of all that a file may have, but for free arguments."""
-    for kind, fields in FORMS.items():
-        for name, text in fields.items():
-            yield kind.__name__, name.lstrip("_"), text
