@@ -122,6 +122,12 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
         for name, array in writer.arrays.items():
             with archive.open(zipfile.ZipInfo(name, _EPOCH), "w") as member:
                 npy.write_array(member, array, (1, 0), allow_pickle=False)
+    try:
+        _Reader(_members(buffer.getvalue()), writer.functions).model()
+    except ValueError as error:
+        raise ValueError(
+            f"`model` must be one that `load` can build anew. Got {error}."
+        ) from error
     _replace(Path(os.path.realpath(path)), buffer.getbuffer())
 
 
@@ -214,6 +220,7 @@ class _Writer:
 
     def __init__(self) -> None:
         self.arrays: dict[str, NDArray[Any]] = {}
+        self.functions: dict[str, Callable[..., Any]] = {}
 
     def node(self, value: Any, place: str) -> Any:
         """What stands in the text for a value; `place` is where it stands."""
@@ -245,7 +252,9 @@ class _Writer:
             items = [self.node(v, f"{place}.{i}") for i, v in enumerate(value)]
             return items if isinstance(value, list) else {"tuple": items}
         if callable(value) and hasattr(value, "__qualname__"):
-            return {"function": f"{value.__module__}.{value.__qualname__}"}
+            name = f"{value.__module__}.{value.__qualname__}"
+            self.functions[name] = value
+            return {"function": name}
         raise ValueError(
             f"`{place}` must be something that a file without code can hold. Got "
             f"{type(value).__module__}.{type(value).__qualname__}. Give numbers, text, "

@@ -166,7 +166,7 @@ FORMS: dict[type, dict[str, str]] = {
         "noise": "NoiseModel[n_outputs]",
         "gain": "float[n_states, n_outputs]?",
         "covariance": "float[n_unknowns, n_unknowns]?",
-        "input_scale": "float[n_inputs]",
+        "input_scale": "float[n_free]",
         "output_scale": "float[n_outputs]",
         "basis": "float[n_inputs, n_free]",
         "direct": "bool[n_outputs, n_free]",
@@ -386,8 +386,7 @@ def forms_of(kind: Any) -> dict[str, Form]:
 
 
 def before_saving(value: Any) -> Any:
-    """What stands for a value in a file; refuses what `load` would."""
-    _limit(value)
+    """What stands for a value in a file."""
     return value.known() if isinstance(value, Evidence) else value
 
 

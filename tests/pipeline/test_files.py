@@ -34,7 +34,7 @@ from lpvlearn import (
     load,
     save,
 )
-from lpvlearn.exceptions import VersionWarning
+from lpvlearn.exceptions import VersionWarning, collected
 from lpvlearn.models.innovation import NoiseModel
 from lpvlearn.pipeline.files import _TEXT, SCHEMA
 from lpvlearn.pipeline.schema import CLASSES, FORMS, before_saving
@@ -262,17 +262,20 @@ def pendulum_basis(kappa):
 @pytest.mark.parametrize(
     "options",
     [
-        {"order": "auto"},
-        {"method": "pbsid", "horizon": 10},
-        {"refine": False, "n_noise_states": 2},
-        {"offset": "linear", "input_delay": 1},
+        {"order": "auto", "inputs": ["force"]},
+        {"method": "pbsid", "horizon": 10, "inputs": "force"},
+        {"refine": False, "n_noise_states": 2, "inputs": "force"},
+        {"offset": "linear", "input_delay": 1, "inputs": "force"},
         {"feedthrough": np.array([[False]]), "inputs": ["force"]},
+        {"inputs": ("force", "twice")},
     ],
     ids=str,
 )
 def test_local_models_come_back_to_the_bit(options, fitted, tmp_path):
     model, X, y = fitted
-    model = clone(model).set_params(**options).fit(X, y)
+    X = X.assign(twice=2.0 * X["force"])
+    with collected():  # of collinear inputs
+        model = clone(model).set_params(**options).fit(X, y)
     other = there_and_back(model, tmp_path / "model.zip")
     assert_same(model, other)
     for name in ("predict_with_initial_state", "predict_ahead", "score"):
@@ -380,6 +383,16 @@ def test_every_class_has_a_form_of_all_it_needs(pipeline, fitted):
         told = {*FORMS[type(model)], "_single_output", *model.get_params(deep=False)}
         private = {name for name in vars(model) if name.startswith("_")}
         assert private - told <= {"_curve"}, type(model)
+
+
+def test_what_load_would_refuse_is_not_written(tmp_path):
+    lti = StateSpace(0.5, 1, 1, sampling_time=1.0)
+    unfit = InnovationModel(lti, NoiseModel(*np.ones((4, 2, 2))))
+    nodes = np.random.default_rng(0).normal(size=(3001, 2))
+    for model in (unfit, SplineLPV("linear").fit(nodes, nodes)):
+        with pytest.raises(ValueError, match="`model` must be one that `load` can"):
+            save(model, tmp_path / "model.zip")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
