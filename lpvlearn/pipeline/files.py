@@ -17,6 +17,7 @@ import re
 import secrets
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -206,10 +207,9 @@ def _replace(target: Path, content: memoryview) -> None:
         part.unlink(missing_ok=True)
     if hasattr(os, "O_DIRECTORY"):  # the name, too, shall survive a loss of power
         folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
+        with suppress(OSError):  # not every file system can
             os.fsync(folder)
-        finally:
-            os.close(folder)
+        os.close(folder)
 
 
 # -- writing ---------------------------------------------------------------------------
@@ -225,10 +225,10 @@ class _Writer:
     def node(self, value: Any, place: str) -> Any:
         """What stands in the text for a value; `place` is where it stands."""
         value = before_saving(value)
-        if value is None or isinstance(value, bool | int):
-            return value if not isinstance(value, int) else _whole(value)
         if isinstance(value, np.bool_ | np.integer):
-            return value.item()
+            value = value.item()
+        if value is None or isinstance(value, int):
+            return None if value is None else _whole(value)
         if isinstance(value, float | np.floating):
             number = float(value)
             return number if math.isfinite(number) else {"float": repr(number)}
@@ -241,13 +241,11 @@ class _Writer:
         if type(value) in CLASSES.values():
             return self._object(value, place)
         if isinstance(value, Mapping):
-            pairs = enumerate(value.items())
-            return {
-                "dict": [
-                    [self.node(k, place), self.node(v, f"{place}.{i}")]
-                    for i, (k, v) in pairs
-                ]
-            }
+            pairs = [
+                [self.node(k, place), self.node(v, f"{place}.{i}")]
+                for i, (k, v) in enumerate(value.items())
+            ]
+            return {"dict": pairs}
         if type(value) in (list, tuple):
             items = [self.node(v, f"{place}.{i}") for i, v in enumerate(value)]
             return items if isinstance(value, list) else {"tuple": items}
@@ -439,7 +437,7 @@ class _Reader:
             if field == "class":
                 continue
             name, where = known.get(field), f"{place}.{field}"
-            form = Form("any") if name is None else forms[name]
+            form = Form("any", fitted=True) if name is None else forms[name]
             if name is None:
                 name = field
                 own = issubclass(kind, BaseEstimator) and field.endswith("_")
@@ -454,9 +452,9 @@ class _Reader:
         arguments = inspect.signature(kind).parameters
         try:
             built = kind(**{k: v for k, v in fields.items() if k in arguments})
-            vars_ = {k: v for k, v in fields.items() if k not in arguments}
-            if vars_:
-                vars(built).update(vars_)
+            if fitted:
+                rest = {k: v for k, v in fields.items() if k not in arguments}
+                vars(built).update(rest)
             return _Built(after_loading(built), kind, sizes)
         except (ValueError, TypeError, ArithmeticError, LookupError) as error:
             raise ValueError(f"`{place}` fits not together: {error}") from error
