@@ -26,7 +26,7 @@ from ..data.operating_points import check_outputs
 from ..data.preparation import part_of, read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
-from ..exceptions import collected
+from ..exceptions import VersionedPickle, collected
 from ..lpv.interpolator import Interpolator, grid_over
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
@@ -62,7 +62,7 @@ _PARTS, _N_STARTS, _FIRST_STEPS = 5, 3, 15
 _LEVELS = 5  # of every scheduling variable, where a form begins as a constant
 
 
-class OutputErrorLPV(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator):
     """An LPV model fitted to experiments along which the scheduling variables move.
 
     Minimises the simulation error over the coefficients of the interpolation, from a

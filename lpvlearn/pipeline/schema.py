@@ -40,6 +40,7 @@ from ..subspace.estimator import SubspaceLTI
 from ..subspace.offsets import Offsets
 from ..subspace.statistics import Evidence, Known
 from .estimator import LocalLPVPipeline
+from .output_error import OutputErrorLPV
 
 # Numbers that a loaded object may be put to, beyond those in the file: the derivatives
 # of a structure that solves equations, the distances of a spline's nodes. 70 MB; 3000
@@ -119,6 +120,7 @@ FORMS: dict[type, dict[str, str]] = {
         "bases": "any?",
         "input_delay": "any?",
         "offsets": "interpolator[n_scheduling]?",
+        "rate_terms": "interpolator[n_scheduling]?",
         "input_names": "any?",
         "output_names": "any?",
     },
@@ -223,6 +225,7 @@ FORMS: dict[type, dict[str, str]] = {
         "active_frequencies_": "float[n_active]",
         "start_params_": "float[n_params]",
         "dropped_feedthrough_": "float[n_outputs, n_inputs]",
+        "convergence_": "text",
         "identifiability_": "Identifiability",
         "starts_": "table",
         "history_": "table",
@@ -232,6 +235,25 @@ FORMS: dict[type, dict[str, str]] = {
         "chi2_": "number?",
         "degrees_of_freedom_": "any?",
         "p_value_": "number?",
+    },
+    OutputErrorLPV: {
+        "lpv_": "LPVStateSpace[n_scheduling]",
+        "scheduling_range_": "float[2, n_scheduling]",
+        "sampling_time_": "number",
+        "scheduling_names_": "any",
+        "output_names_": "any?",
+        "n_outputs_": "size[n_outputs]?",
+        "n_features_in_": "whole?",
+        "rate_": "flag",
+        "coefficients_": "float[n_coefficients]",
+        "coefficients_covariance_": "float[n_coefficients, n_coefficients]",
+        "deviation_": "float[n_outputs]",
+        "n_iter_": "whole",
+        "initial_states_": "float[n_experiments, order]",
+        "offsets_": "float[n_experiments, n_outputs]",
+        "report_": "table",
+        "history_": "table",
+        "_single_output": "flag?",
     },
     LocalLPVPipeline: {
         "memory": "-",
@@ -256,7 +278,7 @@ FORMS: dict[type, dict[str, str]] = {
         "output_names_": "any",
         "n_outputs_": "size[n_outputs]",
         "n_features_in_": "whole",
-        "_n_with_offset": "whole",
+        "refiner_": "OutputErrorLPV?",
         "_single_output": "flag",
     },
 }
@@ -448,9 +470,22 @@ def _try_structure(structure: GrayBoxStructure) -> None:
 
 
 def _try_lpv(model: LPVStateSpace) -> None:
-    middle = model.scheduling_range.mean(axis=0)[None]
-    model.parameters(middle)
-    model.output_offset(middle)
+    n, n_signals = model.order, model.n_inputs + model.n_outputs
+    predicted = {
+        "interpolator": model.structure.n_params,
+        "offsets": n_signals + n,
+        "rate_terms": model.n_scheduling * n**2,
+    }
+    for name, size in predicted.items():
+        regressor = getattr(model, name)
+        if regressor is None:
+            continue
+        place = regressor.scheduling_range_[:1]
+        if hasattr(regressor, "feature_names_in_"):
+            place = pd.DataFrame(place, columns=regressor.feature_names_in_)
+        found = np.size(regressor.predict(place))
+        if found != size:
+            raise ValueError(f"`{name}` must predict {size} values. Got {found}")
     constant = [np.shape(T) for T in model.bases if not callable(T)]
     limits = model.identified_range
     if limits is not None and np.shape(limits) != model.scheduling_range.shape:

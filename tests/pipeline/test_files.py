@@ -26,6 +26,7 @@ from lpvlearn import (
     InnovationModel,
     LocalLPVPipeline,
     LPVStateSpace,
+    OutputErrorLPV,
     PolynomialLPV,
     RationalLPV,
     SplineLPV,
@@ -39,7 +40,14 @@ from lpvlearn.models.innovation import NoiseModel
 from lpvlearn.pipeline.files import _TEXT, SCHEMA
 from lpvlearn.pipeline.schema import CLASSES, FORMS, before_saving
 
-from ..conftest import ROLES, spring_lpv, spring_structure, spring_tables, stable_model
+from ..conftest import (
+    ROLES,
+    spring_lpv,
+    spring_structure,
+    spring_sweep,
+    spring_tables,
+    stable_model,
+)
 
 GOLDEN = Path(__file__).parent / "files"
 DOCUMENTATION = Path(__file__).parents[2] / "docs" / "files.rst"
@@ -351,6 +359,44 @@ def test_pipelines_come_back_to_the_bit(pipeline, tmp_path):
     )
 
 
+@pytest.fixture(scope="module")
+def refined():
+    """A pipeline with a refiner, rate terms, and inputs and outputs off zero."""
+    X, y = spring_tables(noise=0.01, n_samples=200, kappas=(0.0, 0.7, 1.5))
+    moving = [part.iloc[:300] for part in spring_sweep()]
+    X, y = (pd.concat(p, ignore_index=True) for p in zip((X, y), moving, strict=True))
+    return LocalLPVPipeline(
+        SubspaceLTI(2, horizon=8, offset="constant"),
+        GrayBoxRestructurer(spring_structure(), n_starts=2),
+        PolynomialLPV(2),
+        refiner=OutputErrorLPV(rate=True, initial_state="rest"),
+        **ROLES,
+    ).fit(X, y + 3.0)
+
+
+def test_refined_models_come_back_to_the_bit(refined, tmp_path):
+    X, y = (part.iloc[:150] for part in spring_sweep(seed=3))
+    assert refined.lpv_.rate_terms is not None and refined.lpv_.offsets is not None
+    other = there_and_back(refined, tmp_path / "model.zip")
+    assert_same(refined, other)
+    assert_same(refined.predict(X), other.predict(X))
+    assert_same(refined.refiner_.report_, other.refiner_.report_)
+    assert refined.summary() == other.summary()
+    alone = OutputErrorLPV(refined.lpv_, rate=False, **ROLES).fit(X, y + 3.0)
+    again = there_and_back(alone, tmp_path / "model.zip")
+    assert_same(alone, again)
+    assert_same(alone.predict(X), again.predict(X))
+    assert alone.score(X, y) == again.score(X, y)
+
+
+def test_names_of_scheduling_variables_do_no_harm(tmp_path):
+    """An interpolator that knows names, in a model that gives it arrays."""
+    table = pd.DataFrame({"kappa": [0.0, 1.5]})
+    named = PolynomialLPV(1).fit(table, [[30, 1.2, 40], [30, 1.2, 100]])
+    model = LPVStateSpace(spring_structure(), named, [[0.0], [1.5]])
+    assert_same(model, there_and_back(model, tmp_path / "model.zip"))
+
+
 def test_what_is_saved_again_is_the_same_file(pipeline, fitted, tmp_path):
     first, second = tmp_path / "first.zip", tmp_path / "second.zip"
     for model in (pipeline, fitted[0]):
@@ -376,9 +422,10 @@ def test_memory_is_not_kept(tmp_path):
     assert there_and_back(pipeline, tmp_path / "pipeline.zip").memory is None
 
 
-def test_every_class_has_a_form_of_all_it_needs(pipeline, fitted):
+def test_every_class_has_a_form_of_all_it_needs(pipeline, refined, fitted):
     """A private attribute that is not told of would be lost."""
-    models = [pipeline, fitted[0], *pipeline.restructurers_, *interpolators()]
+    models = [pipeline, refined, refined.refiner_, fitted[0], *interpolators()]
+    models += pipeline.restructurers_
     for model in models:
         told = {*FORMS[type(model)], "_single_output", *model.get_params(deep=False)}
         private = {name for name in vars(model) if name.startswith("_")}
