@@ -382,7 +382,7 @@ def test_refined_models_come_back_to_the_bit(refined, tmp_path):
     assert_same(refined.predict(X), other.predict(X))
     assert_same(refined.refiner_.report_, other.refiner_.report_)
     assert refined.summary() == other.summary()
-    alone = OutputErrorLPV(refined.lpv_, rate=False, **ROLES).fit(X, y + 3.0)
+    alone = OutputErrorLPV(spring_lpv(), rate=False, **ROLES).fit(X, y)
     again = there_and_back(alone, tmp_path / "model.zip")
     assert_same(alone, again)
     assert_same(alone.predict(X), again.predict(X))
