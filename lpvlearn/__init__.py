@@ -1,6 +1,11 @@
 """Local linear parameter-varying (LPV) identification."""
 
-from .data import from_trajectories, resample
+from .data import (
+    BlockedTimeSeriesSplit,
+    ExperimentSplit,
+    from_trajectories,
+    resample,
+)
 from .lpv import AutoLPV, LPVStateSpace, PolynomialLPV, RationalLPV, SplineLPV
 from .metrics import (
     bft_score,
@@ -14,7 +19,6 @@ from .metrics import (
     vaf_score,
     vaf_scorer,
 )
-from .model_selection import BlockedTimeSeriesSplit, ExperimentSplit
 from .models import InnovationModel, StateSpace, gap, peak_gains
 from .pipeline import (
     LocalLPVPipeline,

@@ -1,4 +1,4 @@
-"""``python -m lpvlearn``: the paper's experiment, its tables and figures."""
+"""The command ``lpvlearn``, or ``python -m lpvlearn``: own tables, and the paper's."""
 
 from __future__ import annotations
 
@@ -9,18 +9,38 @@ from pathlib import Path
 
 import joblib
 
+from .command import add_commands
 from .paper import run_paper_experiment, save_figures, tables_text
 
 _MAX_JOBS = 7  # one for each operating point of the paper
 
+_PAPER = (
+    "The flexible-arm experiment of the paper: Tables 1-4 beside the published ones, "
+    "and Figures 2-10."
+)
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not given or (given[0].startswith("-") and given[0] not in ("-h", "--help")):
+        given.insert(0, "paper")
     parser = argparse.ArgumentParser(
-        prog="python -m lpvlearn",
-        description="The flexible-arm experiment of the paper: Tables 1-4 beside the "
-        "published ones, and Figures 2-10.",
+        prog="lpvlearn",
+        description="Local linear parameter-varying (LPV) identification.",
+        epilog="Without a word it is paper. 'lpvlearn fit --help' shows examples.",
     )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    add_commands(commands)
+    _add_paper(
+        commands.add_parser("paper", help="the paper's experiment", description=_PAPER)
+    )
+    options = parser.parse_args(given)
+    status: int = options.run(options)
+    return status
+
+
+def _add_paper(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--realizations",
         type=_positive,
@@ -58,7 +78,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="DIR",
         help="directory for the tables and figures (default results/)",
     )
-    options = parser.parse_args(arguments)
+    parser.set_defaults(run=_paper)
+
+
+def _paper(options: argparse.Namespace) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     experiment = run_paper_experiment(
         options.realizations,

@@ -72,6 +72,18 @@ def collected() -> Iterator[list[Told]]:
         _COLLECTING.reset(token)
 
 
+@contextmanager
+def retold() -> Iterator[list[Told]]:
+    """Collect what the block warns of, and give it when the block ends, or fails."""
+    told: list[Told] = []
+    try:
+        with collected() as told:
+            yield told
+    finally:
+        for message, category in told:
+            warn(message, category)
+
+
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Give a warning that points to the user's line, however deep it arises.
 

@@ -14,12 +14,11 @@ ROOT = Path(lpvlearn.__file__).parent
 FLOORS = (
     ("exceptions", "minimax", "systems", "validation"),
     ("data", "models"),
-    ("model_selection", "structures", "subspace"),
-    ("datasets", "lpv", "restructuring"),
-    ("metrics",),
-    ("inspection", "pipeline"),
+    ("metrics", "structures", "subspace"),
+    ("datasets", "inspection", "lpv", "restructuring"),
+    ("pipeline",),
     ("__init__",),
-    ("paper",),
+    ("command", "paper"),
     ("__main__",),
 )
 
@@ -30,7 +29,6 @@ SPEAKS_SKLEARN = (
     "lpv/interpolator.py",
     "metrics/*",
     "pipeline/*",
-    "model_selection.py",
     "inspection/parameters.py",
     "datasets/*",
     "paper/*",

@@ -207,6 +207,8 @@ pd.DataFrame(
 ).round(3)
 
 # %%
+# All of this without Python, from a file to a report: :ref:`command`.
+#
 # **Next.** The :ref:`user guide <user_guide>` explains each step;
 # :ref:`coming_from_sklearn` tells how to cross-validate such a model,
 # :ref:`coming_from_matlab` which function replaces which.

@@ -1,6 +1,12 @@
-"""Tables of experiments: columns and their roles, time, operating points, gaps."""
+"""Tables of experiments: roles of columns, time, operating points, gaps, splits."""
 
 from .experiments import from_trajectories
 from .resampling import resample
+from .splits import BlockedTimeSeriesSplit, ExperimentSplit
 
-__all__ = ["from_trajectories", "resample"]
+__all__ = [
+    "BlockedTimeSeriesSplit",
+    "ExperimentSplit",
+    "from_trajectories",
+    "resample",
+]

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..models.frequencies import frequency_axis
 from ..models.statespace import StateSpace
 from .drawing import axes_grid, figure_legend, line_style, named, names_of, tidy
 from .fitted import check_model, models_of, unwrapped, with_others
 from .frequency import (
     check_frequencies,
-    frequency_axis,
     frequency_label,
     response_up_to_nyquist,
 )

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..models.frequencies import frequency_axis, nyquist_frequency
 from ..models.statespace import StateSpace
 from .drawing import ACCENT, INK, MUTED, legend_above, single_axes, tidy
 from .fitted import check_model
 from .frequency import (
     check_frequencies,
-    frequency_axis,
     frequency_label,
-    nyquist_frequency,
     response_up_to_nyquist,
 )
 

@@ -10,7 +10,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..data.experiments import OPTIONAL_ROLES, ROLES, Table, fitted_roles
-from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..validation import one_of
 from .scorers import (
@@ -23,7 +22,7 @@ from .scorers import (
     unwrap,
 )
 from .scores import bft_score, r2_ratio, vaf_score
-from .table_simulation import TableSimulator
+from .table_simulation import ScheduledModel, TableSimulator
 
 
 def fit_report(
@@ -301,7 +300,7 @@ def compare_models(
         known["sampling_time"] = None  # every experiment tells its own
     parts = []
     for name, model in models.items():
-        if isinstance(model, (LPVStateSpace, StateSpace)):
+        if isinstance(model, (ScheduledModel, StateSpace)):
             model = TableSimulator(model, **known)
         elif not hasattr(model, "predict"):
             raise ValueError(

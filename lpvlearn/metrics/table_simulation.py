@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from ..data.experiments import (
 )
 from ..data.preparation import read_runs
 from ..data.timestamps import TIME_TOL
-from ..lpv.model import LPVStateSpace
 from ..models.statespace import StateSpace
 from ..systems.simulation import (
     delayed,
@@ -31,6 +30,29 @@ from ..systems.simulation import (
 from .scores import bft_score
 
 Array = NDArray[np.float64]
+
+
+@runtime_checkable
+class ScheduledModel(Protocol):
+    """What a table asks of a model that follows scheduling variables: LPVStateSpace."""
+
+    @property
+    def n_inputs(self) -> int: ...
+
+    @property
+    def n_outputs(self) -> int: ...
+
+    @property
+    def n_scheduling(self) -> int: ...
+
+    @property
+    def scheduling_range(self) -> Array: ...
+
+    def simulate(
+        self, inputs: Any, scheduling: Any, sampling_time: float, /
+    ) -> Array: ...
+
+    def free_responses(self, scheduling: Any, sampling_time: float) -> Array: ...
 
 
 def fit_of(
@@ -69,7 +91,7 @@ def fit_of(
 
 
 def simulate_experiments(
-    model: StateSpace | LPVStateSpace,
+    model: StateSpace | ScheduledModel,
     experiments: Sequence[Experiment],
     sampling_time: float | None,
     n_samples: int,
@@ -91,7 +113,7 @@ def simulate_experiments(
 
 
 def _simulate(
-    model: StateSpace | LPVStateSpace, e: Experiment, dt: float | None, estimate: bool
+    model: StateSpace | ScheduledModel, e: Experiment, dt: float | None, estimate: bool
 ) -> Array:
     x0 = None
     if isinstance(model, StateSpace) and not model.is_continuous:
@@ -101,7 +123,7 @@ def _simulate(
         return model.simulate(e.inputs, initial_state=x0)
     if dt is None:
         raise ValueError(NO_TIME.format("the model is"))
-    if isinstance(model, LPVStateSpace):
+    if isinstance(model, ScheduledModel):
         kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
         rest = model.simulate(e.inputs, kappa, dt)
         if not estimate:
@@ -159,7 +181,7 @@ class TableSimulator(BaseEstimator):
         return [e.rows for e in read_experiments(self, X, allow_missing="Xy")]
 
     def _read(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
-        is_lpv = isinstance(self.model, LPVStateSpace)
+        is_lpv = isinstance(self.model, ScheduledModel)
         if is_lpv and self.scheduling is None and self.model.scheduling_range.any():
             raise ValueError(
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "

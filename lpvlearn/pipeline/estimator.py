@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from numbers import Integral
+from os import PathLike
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -37,17 +39,19 @@ from ..data.operating_points import (
 from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
-from ..exceptions import VersionedPickle, warn
+from ..exceptions import VersionedPickle, retold, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.spline import SplineLPV
 from ..metrics.reports import readable_report
+from ..metrics.scorers import InitialState
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
+from .html_report import html_report
 from .output_error import known_coefficients, refine_model
 from .points import (
     PointRunner,
@@ -57,7 +61,7 @@ from .points import (
     offsets_of_points,
     restructure_points,
 )
-from .reports import Tables, summarise, tables
+from .reports import Summary, Tables, summarise, tables
 from .stability import growth_rates
 
 Array = NDArray[np.float64]
@@ -229,6 +233,8 @@ list, default=None
         standard deviation, RMSE and FIT (percent) of the interpolation.
     step_times_ : dict of str to float
         Seconds that each step took.
+    warnings_ : list of str
+        What the fit warned of, with the remedies.
     scheduling_range_ : ndarray of shape (2, n_scheduling)
         Beyond which `predict` warns: the operating points, widened by how far the
         scheduling variables moved within an experiment.
@@ -361,10 +367,16 @@ list, default=None
         UserWarning
             If the delays of the inputs (``local=SubspaceLTI(input_delay=...)``) differ
             between operating points: `lpv_` has their median, the models of the points
-            their own. If `lpv_` is unstable at values between the points. The warnings
-            their own. If there is a `refiner`, and no experiment moves. The warnings
-            of the steps name the point.
+            their own. If `lpv_` is unstable at values between the points. If there is a
+            `refiner`, and no experiment moves. The warnings of the steps name the
+            point. They come when the fit ends, and stay in `warnings_`.
         """
+        with retold() as told:
+            self._fit(X, y)
+        self.warnings_ = [warning.message for warning in told]
+        return self
+
+    def _fit(self, X: Any, y: Any) -> None:
         self._check_options()
         steps = {"local": self.local, "restructurer": self.restructurer}
         memory = _checked_memory(self.memory, steps)
@@ -450,7 +462,6 @@ list, default=None
                     fitted, "hinf_params_", fitted.params_
                 )
         self.step_times_ = watch.seconds
-        return self
 
     # -- use -----------------------------------------------------------------------
 
@@ -532,8 +543,70 @@ list, default=None
 
     def summary(self) -> str:
         """What was identified and how well, as text: ``print(pipeline.summary())``."""
+        return self._summarised().text
+
+    def to_html_report(
+        self,
+        path: str | PathLike[str],
+        X: Any = None,
+        y: Any = None,
+        *,
+        initial_state: InitialState = "rest",
+        title: str | None = None,
+        units: Mapping[str, str] | None = None,
+        figures: str | PathLike[str] | None = None,
+    ) -> None:
+        """Write what was identified and how good it is as one HTML page.
+
+        The page needs no other file, no network and no script: tables, pictures (SVG),
+        the warnings of the fit, versions, and the code that makes the model again.
+
+        Parameters
+        ----------
+        path : str or path
+            Replaced, when the page is complete.
+        X, y : as for `fit`, default=None
+            A table to simulate: measured against simulated outputs, their fit and tests
+            of the errors join the page. Best one that was not in the fit.
+        initial_state : {"rest", "estimate"}, default="rest"
+            Of the simulation, as in `fit_report`; "estimate" for records that start in
+            mid-motion.
+        title : str, default=None
+        units : dict of str to str, default=None
+            Units of outputs and parameters, by name.
+        figures : str or path, default=None
+            A folder, made where there is none, that gets every figure as an SVG file.
+
+        Raises
+        ------
+        ValueError
+            If the pipeline is not fitted, X comes without y, or they do not fit it.
+        OSError
+            If the file cannot be written.
+
+        Notes
+        -----
+        What the simulation of X warns of stands on the page and is not warned of here.
+        The figures of parameters and poles need one scheduling variable.
+        """
+        page = html_report(
+            self,
+            self._summarised(),
+            X,
+            y,
+            initial_state=initial_state,
+            title=title,
+            units=units or {},
+            figures=None if figures is None else Path(figures),
+        )
+        place = Path(path)
+        part = place.with_name(f".{place.name}.part")
+        part.write_text(page, encoding="utf-8")
+        part.replace(place)
+
+    def _summarised(self) -> Summary:
         check_is_fitted(self, "lpv_")
-        text = summarise(
+        found = summarise(
             Tables(
                 self.parameters_,
                 self.parameters_std_,
@@ -547,10 +620,10 @@ list, default=None
             restructurer=_name_of_step(self.restructurer, "restructurer"),
         )
         if self.refiner_ is None:
-            return text
+            return found
         known = "with" if self.lpv_.rate_terms is not None else "without"
-        return (
-            f"{text}\n\nRefinement: {type(self.refiner_).__name__}, {known} rate "
+        return found._replace(
+            refinement=f"Refinement: {type(self.refiner_).__name__}, {known} rate "
             "terms; simulation fit (BFT) on experiments that move:\n"
             f"{readable_report(self.refiner_.report_).to_string()}"
         )

@@ -36,6 +36,25 @@ class Tables(NamedTuple):
     by_parameter: pd.DataFrame  # `parameter_report_`: a row per parameter
 
 
+class Summary(NamedTuple):
+    """What a pipeline found, for people."""
+
+    lines: list[str]
+    points: pd.DataFrame  # of texts, a row per operating point
+    parameters: pd.DataFrame | None  # of a structure: a row per parameter
+    refinement: str = ""  # of a refiner, and its table
+
+    @property
+    def text(self) -> str:
+        """All of it."""
+        tables = [
+            t.to_string() for t in (self.points, self.parameters) if t is not None
+        ]
+        return "\n\n".join(
+            filter(None, ["\n".join(self.lines), *tables, self.refinement])
+        )
+
+
 def tables(
     found: StructuredModels, lpv: LPVStateSpace, sampling_time: float, growth: Array
 ) -> Tables:
@@ -163,8 +182,8 @@ def summarise(
     scheduling: Sequence[Hashable],
     local: str,
     restructurer: str,
-) -> str:
-    """What a fitted pipeline found, as text.
+) -> Summary:
+    """What a fitted pipeline found, for people.
 
     `scheduling` names the variables (none: a time-invariant model), `local` and
     `restructurer` the classes of steps 3 and 4.
@@ -260,11 +279,10 @@ def summarise(
     if len(kappa) == 1:
         lines.append("One operating point: the model is time-invariant.")
     shown = [name for name in report.columns if not name.startswith(tuple(hidden))]
-    lines += ["", readable_report(report[shown]).to_string()]
+    parameters = None
     if restructured:
-        table = found.by_parameter.dropna(axis=1, how="all")
-        lines += ["", readable_report(table).to_string()]
-    return "\n".join(lines)
+        parameters = readable_report(found.by_parameter.dropna(axis=1, how="all"))
+    return Summary(lines, readable_report(report[shown]), parameters)
 
 
 def _span(values: pd.Series) -> str:

@@ -60,7 +60,8 @@ from sklearn.model_selection import BaseCrossValidator
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_consistent_length
 
-from .data.experiments import (
+from ..validation import one_of, whole_number
+from .experiments import (
     Column,
     Experiment,
     Table,
@@ -68,8 +69,7 @@ from .data.experiments import (
     operating_point_of,
     roles_of,
 )
-from .data.operating_points import group_operating_points
-from .validation import one_of, whole_number
+from .operating_points import group_operating_points
 
 __all__ = ["BlockedTimeSeriesSplit", "ExperimentSplit"]
 
@@ -210,7 +210,7 @@ class ExperimentSplit(_SplitOfExperiments):
     Examples
     --------
     >>> import pandas as pd
-    >>> from lpvlearn.model_selection import ExperimentSplit
+    >>> from lpvlearn import ExperimentSplit
     >>> X = pd.DataFrame({"u": 0.0, "kappa": [0.1] * 4 + [0.9] * 4,
     ...                   "run": [1, 1, 2, 2, 3, 3, 4, 4]})
     >>> cv = ExperimentSplit(2, experiment="run", scheduling="kappa")
@@ -338,7 +338,7 @@ class BlockedTimeSeriesSplit(_SplitOfExperiments):
     Examples
     --------
     >>> import numpy as np
-    >>> from lpvlearn.model_selection import BlockedTimeSeriesSplit
+    >>> from lpvlearn import BlockedTimeSeriesSplit
     >>> X = np.column_stack([np.zeros(12), np.repeat([0, 1], 6)])
     >>> for train, test in BlockedTimeSeriesSplit(2, experiment=1).split(X):
     ...     print(train, test)

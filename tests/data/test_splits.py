@@ -35,7 +35,7 @@ from lpvlearn import (
 )
 from lpvlearn.datasets import make_flexible_arm
 
-from .conftest import (
+from ..conftest import (
     ROLES,
     spring_pipeline,
     spring_structure,

@@ -1,0 +1,146 @@
+"""``lpvlearn fit``: a table to a model, a report, tables and figures."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import pandas as pd
+
+from .. import (
+    AutoLPV,
+    GrayBoxRestructurer,
+    LocalLPVPipeline,
+    PolynomialLPV,
+    RationalLPV,
+    SplineLPV,
+    SubspaceLTI,
+    fit_report,
+    save,
+)
+from .judgement import measured_signals, simulation_text, told_warnings, warnings_text
+from .output import whole_folder
+from .structure_file import read_structure
+from .tables import check_table, columns_of, read_table, with_times
+
+INTERPOLATIONS = {
+    "auto": AutoLPV,
+    "polynomial": PolynomialLPV,
+    "rational": RationalLPV,
+    "spline": SplineLPV,
+}
+
+_SEVERAL = ("inputs", "scheduling")  # roles of several columns
+_SINGLE = ("experiment", "time", "operating_point")
+
+
+def fit(options: argparse.Namespace) -> None:
+    """Run the command."""
+    if options.degree is not None and options.interpolation != "polynomial":
+        raise ValueError("--degree is that of --interpolation polynomial.")
+    judged = options.validation or options.table
+    check_table(judged)
+    with whole_folder(options.output, options.overwrite) as folder:
+        with told_warnings() as warned:
+            table = read_table(options.table, options.format)
+            outputs = columns_of("--outputs", options.outputs, table)
+            roles = _roles(options, table, outputs)
+            features = _features(table, roles, outputs)
+            structure, units = None, dict[str, str]()
+            if options.structure is not None:
+                given = _all_of(roles, but="inputs")
+                inputs = roles["inputs"] or [f for f in features if f not in given]
+                structure, units = read_structure(
+                    options.structure, len(inputs), len(outputs)
+                )
+            pipeline = _pipeline(options, roles, structure)
+            table = with_times(table, roles["time"])
+            pipeline.fit(table[features], table[outputs])
+            if options.validation is not None:
+                table = read_table(judged, options.format)
+                table = with_times(table, roles["time"])
+            X, y = measured_signals(pipeline, table, judged.name)
+            report = fit_report(pipeline, X, y, initial_state=options.initial_state)
+        text = "\n\n".join(
+            [
+                pipeline.summary(),
+                simulation_text(report, judged.name, options.initial_state),
+                warnings_text(warned),
+            ]
+        )
+        (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
+        pipeline.report_.to_csv(folder / "points.csv")
+        pipeline.parameter_report_.to_csv(folder / "parameters.csv")
+        report.to_csv(folder / "fit.csv", index=False)
+        pipeline.to_html_report(
+            folder / "report.html",
+            X,
+            y,
+            initial_state=options.initial_state,
+            title=f"LPV model of {options.table.name}",
+            units=units,
+            figures=folder / "figures",
+        )
+        save(pipeline, folder / "model.zip")
+    if not options.quiet:
+        print(
+            f"{text}\n\nThe report, tables, figures and model are in {options.output}"
+        )
+
+
+def _roles(
+    options: argparse.Namespace, table: pd.DataFrame, outputs: list[str]
+) -> dict[str, Any]:
+    """Columns by role, each of one role; None where a role has none."""
+    roles: dict[str, Any] = {}
+    taken = dict.fromkeys(outputs, "--outputs")
+    for role in (*_SEVERAL, *_SINGLE):
+        option = "--" + role.replace("_", "-")
+        names = columns_of(option, getattr(options, role), table)
+        if role in _SINGLE and len(names) > 1:
+            raise ValueError(f"{option} must name one column. Got {len(names)}.")
+        for name in names:
+            # one column may be the experiment, the scheduling variable and the point
+            if role in ("inputs", "time") and name in taken or name in outputs:
+                raise ValueError(f"{option}: column {name!r} is in {taken[name]}, too.")
+            taken[name] = option
+        roles[role] = None if not names else names if role in _SEVERAL else names[0]
+    return roles
+
+
+def _all_of(roles: dict[str, Any], but: str = "") -> list[str]:
+    """The columns of all roles."""
+    found: list[str] = []
+    for role, names in roles.items():
+        if names is not None and role != but:
+            found += names if role in _SEVERAL else [names]
+    return found
+
+
+def _features(
+    table: pd.DataFrame, roles: dict[str, Any], outputs: list[str]
+) -> list[str]:
+    """Columns of X: those with a role; where no inputs are named, the others, too."""
+    named = _all_of(roles)
+    return [
+        name
+        for name in table.columns
+        if name not in outputs and (roles["inputs"] is None or name in named)
+    ]
+
+
+def _pipeline(
+    options: argparse.Namespace, roles: dict[str, Any], structure: Any
+) -> LocalLPVPipeline:
+    form = INTERPOLATIONS[options.interpolation]
+    order = "auto" if options.order is None else options.order
+    return LocalLPVPipeline(
+        SubspaceLTI(order, missing=options.missing),
+        None if structure is None else GrayBoxRestructurer(structure),
+        form() if options.degree is None else PolynomialLPV(options.degree),
+        sampling_time=options.sampling_time,
+        efficient=not options.hinf,
+        n_jobs=options.jobs,
+        verbose=0 if options.quiet else 1,
+        **roles,
+    )

@@ -1,0 +1,64 @@
+"""Results whole or not at all: written aside, and put in their place at the end."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def whole_folder(target: Path, overwrite: bool) -> Iterator[Path]:
+    """A new folder that becomes `target` when the block ends well.
+
+    Into a `target` that is there and not empty, files go one by one, if `overwrite`
+    allows; others in it stay.
+    """
+    if target.exists() and not target.is_dir():
+        raise ValueError(f"--output {target}: there is a file of that name.")
+    filled = target.is_dir() and any(target.iterdir())
+    if filled and not overwrite:
+        raise ValueError(
+            f"--output {target}: the folder is not empty. Take another one, or allow "
+            "by --overwrite that files of the same names are replaced."
+        )
+    # that nothing can be written there is told now, not after the fit
+    target.parent.mkdir(parents=True, exist_ok=True)
+    aside = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    try:
+        yield aside
+        aside.chmod(0o777 & ~_umask())  # mkdtemp's is for the owner alone
+        if target.is_dir() and not filled:
+            target.rmdir()
+        if not filled:
+            aside.replace(target)
+            return
+        for file in sorted(aside.rglob("*")):
+            place = target / file.relative_to(aside)
+            if file.is_dir():
+                place.mkdir(exist_ok=True)
+            else:
+                file.replace(place)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+@contextmanager
+def whole_file(target: Path) -> Iterator[Path]:
+    """A new file's path, which becomes `target` when the block ends well."""
+    if target.is_dir():
+        raise ValueError(f"--output {target}: there is a folder of that name.")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".lpvlearn.", dir=target.parent) as aside:
+        part = Path(aside) / target.name
+        yield part
+        part.replace(target)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

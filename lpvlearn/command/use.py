@@ -1,0 +1,91 @@
+"""``lpvlearn predict`` and ``lpvlearn report``: what a model's file serves for."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from .. import LocalLPVPipeline, fit_report, load
+from .judgement import (
+    measured_signals,
+    signals_of,
+    simulation_text,
+    told_warnings,
+    warnings_text,
+)
+from .output import whole_file
+from .tables import check_table, read_table, with_times, write_table
+
+
+def predict(options: argparse.Namespace) -> None:
+    """Run the command: the table of the simulation, and its fit where it is known."""
+    estimate = options.initial_state == "estimate"
+    if options.output is not None:
+        check_table(options.output)
+    with told_warnings() as warned:
+        pipeline, table = _model_and_table(options)
+        X, y = signals_of(pipeline, table, options.table.name)
+        if estimate:
+            X, y = measured_signals(pipeline, table, options.table.name)
+            found = pipeline.predict_with_initial_state(X, y)
+        else:
+            found = pipeline.predict(X)
+        text = []
+        if y is not None:
+            report = fit_report(pipeline, X, y, initial_state=options.initial_state)
+            text = [simulation_text(report, options.table.name, options.initial_state)]
+    kept = [n for n in (pipeline.experiment, pipeline.time) if n is not None]
+    simulated = pd.DataFrame(
+        np.reshape(found, (len(X), -1)), X.index, list(pipeline.output_names_)
+    )
+    simulated = pd.concat([X[list(dict.fromkeys(kept))], simulated], axis=1)
+    if options.output is None:
+        form = {"sep": options.format.separator or ",", "decimal": options.decimal}
+        simulated.to_csv(sys.stdout, index=False, **form)
+    else:
+        with whole_file(options.output) as part:
+            write_table(simulated, part, options.format)
+    if warned:
+        text.append(warnings_text(warned))
+    if text:  # beside the table, not in it
+        print("\n\n".join(text), file=sys.stderr)
+
+
+def report(options: argparse.Namespace) -> None:
+    """Run the command: what the fit found, and the simulation of a table."""
+    with told_warnings() as warned:
+        pipeline, table = _model_and_table(options)
+        text, X, y = [pipeline.summary()], None, None
+        if table is not None:
+            name = options.table.name
+            X, y = measured_signals(pipeline, table, name)
+            found = fit_report(pipeline, X, y, initial_state=options.initial_state)
+            text.append(simulation_text(found, name, options.initial_state))
+        if options.output is not None:
+            with whole_file(options.output) as part:
+                pipeline.to_html_report(part, X, y, initial_state=options.initial_state)
+    text.append(warnings_text([*pipeline.warnings_, *warned]))
+    print("\n\n".join(text))
+
+
+def _model_and_table(
+    options: argparse.Namespace,
+) -> tuple[LocalLPVPipeline, pd.DataFrame | None]:
+    if options.table is not None:
+        check_table(options.table)
+    if not Path(options.model).is_file():
+        raise ValueError(f"{options.model}: there is no such file.")
+    pipeline = load(options.model)
+    if not isinstance(pipeline, LocalLPVPipeline) or not hasattr(pipeline, "lpv_"):
+        raise ValueError(
+            f"{options.model.name} must hold a fitted LocalLPVPipeline, as lpvlearn "
+            f"fit writes. It holds a {type(pipeline).__name__}."
+        )
+    if options.table is None:
+        return pipeline, None
+    table = read_table(options.table, options.format)
+    return pipeline, with_times(table, pipeline.time)

@@ -1,0 +1,136 @@
+"""``lpvlearn fit``: from a table to a folder that is whole, or not there."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_allclose
+
+from ..conftest import KAPPA, spring_truth
+from .conftest import ROLES, run
+
+
+def test_results_are_those_of_the_spring(folder):
+    found = {path.name for path in (folder / "spring").iterdir()}
+    assert found == {
+        *("report.html", "report.txt", "model.zip", "figures"),
+        *("points.csv", "parameters.csv", "fit.csv"),
+    }
+    points = pd.read_csv(folder / "spring" / "points.csv", index_col=0)
+    assert_allclose(points.index, KAPPA)
+    assert_allclose(points[["param_b", "param_c", "param_k"]], spring_truth(KAPPA))
+    fit = pd.read_csv(folder / "spring" / "fit.csv")
+    assert list(fit["experiment"]) == ["sweep"]
+    assert fit["BFT"].iloc[0] > 99.9
+    text = (folder / "spring" / "report.txt").read_text()
+    assert "kappa from 0 to 1.5" in text
+    assert "Simulation of sweep.csv, from rest" in text
+    page = (folder / "spring" / "report.html").read_text()
+    assert "position (m)" in page and "k (1/s2)" in page
+    assert len(list((folder / "spring" / "figures").glob("*.svg"))) == 9
+    assert [path for path in folder.iterdir() if path.name.startswith(".")] == []
+
+
+def test_a_folder_is_not_written_over_unasked(folder):
+    before = (folder / "spring" / "report.txt").stat().st_mtime_ns
+    status, _, error = run("fit", folder / "runs.csv", *ROLES, "--output", folder)
+    assert status == 1
+    assert "the folder is not empty" in error and "--overwrite" in error
+    assert (folder / "spring" / "report.txt").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--inputs", "torque"], "--inputs: the table has no column 'torque'"),
+        (["--inputs", "force,position"], "'position' is in --outputs, too"),
+        (["--time", "time,run"], "--time must name one column. Got 2."),
+        (["--structure", "none.toml"], "none.toml: there is no such file."),
+        (["--scheduling", "run"], "lpvlearn fit: "),
+        (["--validation", "a.dat"], "a.dat: the end of the name must be one of .csv"),
+        (["--degree", "2"], "--degree is that of --interpolation polynomial."),
+        (["--validation", "none.csv"], "none.csv: there is no such file."),
+    ],
+)
+def test_failures_tell_why_and_leave_nothing(folder, tmp_path, options, words):
+    target = tmp_path / "deep" / "results"
+    status, out, error = run(
+        "fit", folder / "runs.csv", *ROLES, "--output", target, *options
+    )
+    assert (status, out) == (1, "")
+    assert words in error
+    assert not target.exists()
+    assert not target.parent.exists() or list(target.parent.iterdir()) == []
+
+
+def test_what_was_warned_of_is_told_where_the_fit_fails(folder, tmp_path):
+    options = ["--outputs", "position", "--experiment", "run", "--scheduling", "kappa"]
+    status, _, error = run(
+        "fit", folder / "runs.csv", *options, "--output", tmp_path / "a"
+    )
+    assert status == 1  # the time is taken for an input, and so not known
+    assert "Input column 'time' rises by the same 0.02" in error
+    assert "sampling_time" in error
+
+
+@pytest.mark.parametrize("missing", ["--outputs", "--output"])
+def test_usage_is_another_status(folder, missing):
+    place = ROLES.index("--outputs")
+    options = {"--outputs": ROLES[:place] + ROLES[place + 2 :], "--output": ROLES}
+    output = [] if missing == "--output" else ["--output", "x"]
+    status, _, error = run("fit", folder / "runs.csv", *options[missing], *output)
+    assert status == 2
+    assert f"required: {missing}" in error
+
+
+def test_json_gaps_other_csv_and_an_own_folder(folder, tmp_path):
+    table = pd.read_csv(folder / "runs.csv")
+    table.loc[100:105, "position"] = np.nan
+    path = tmp_path / "runs.csv"
+    table.to_csv(path, index=False, sep=";", decimal=",")
+    form = tmp_path / "spring.json"
+    form.write_text(json.dumps({"form": "observable_canonical", "order": 2}))
+    target = tmp_path / "out"
+    target.mkdir()
+    (target / "notes.txt").write_text("mine")
+    status, _, error = run(
+        *("fit", path, *ROLES, "--structure", form, "--output", target),
+        *("--overwrite", "--separator", ";", "--decimal", ",", "--missing", "split"),
+        *("--interpolation", "polynomial", "--degree", "2"),
+    )
+    assert (status, error) == (0, "")
+    assert (target / "notes.txt").read_text() == "mine"
+    points = pd.read_csv(target / "points.csv", index_col=0)
+    truth = spring_truth(points.index)
+    assert_allclose(points["param_a2_1"], -truth[:, 2], rtol=1e-6)
+    assert points["n_samples"].tolist() == [294, 300, 300, 300]
+    arguments = ["fit", path, *ROLES, "--output", tmp_path / "b"]
+    status, _, error = run(*arguments)
+    assert status == 1 and "tell --separator" in error
+    status, _, error = run(*arguments, "--separator", ";", "--decimal", ",")
+    assert status == 1 and "missing='split'" in error
+
+
+@pytest.mark.parametrize("end", ["parquet", "xlsx"])
+def test_other_kinds_of_tables(folder, tmp_path, end, monkeypatch):
+    package = {"parquet": "pyarrow", "xlsx": "openpyxl"}[end]
+    path = tmp_path / f"sweep.{end}"
+    with monkeypatch.context() as patch:
+        patch.setitem(__import__("sys").modules, package, None)
+        status, _, error = run("predict", folder / "spring" / "model.zip", path)
+        assert status == 1
+        assert f"pip install {package}" in error
+    pytest.importorskip(package)
+    table = pd.read_csv(folder / "sweep.csv")
+    getattr(table, {"parquet": "to_parquet", "xlsx": "to_excel"}[end])(
+        path, index=False
+    )
+    out = tmp_path / f"out.{end}"
+    status, _, error = run(
+        "predict", folder / "spring" / "model.zip", path, "--output", out
+    )
+    assert status == 0
+    read = {"parquet": pd.read_parquet, "xlsx": pd.read_excel}[end]
+    assert_allclose(read(out)["position"], table["position"], atol=0.01)
+    assert np.isfinite(read(out)["time"]).all()
