@@ -161,7 +161,7 @@ def covariance_of(information: Array) -> Array:
 
     Directions that nothing is known of count as known (minimum norm).
     """
-    size = _sizes(information)
+    size = sizes_of(information)
     scaled = information / size[:, None] / size
     inverse = np.linalg.pinv(scaled, hermitian=True)
     return np.asarray(inverse / size[:, None] / size)
@@ -169,12 +169,13 @@ def covariance_of(information: Array) -> Array:
 
 def covariance_factor(covariance: Array) -> Array:
     """F of as few columns as a covariance has directions, ``F F^T`` the covariance."""
-    size = _sizes(covariance)
+    size = sizes_of(covariance)
     values, vectors = np.linalg.eigh(covariance / size[:, None] / size)
     kept = values > _NO_DIRECTION * values.max(initial=0.0)
     return np.asarray(size[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
 
 
-def _sizes(matrix: Array) -> Array:
+def sizes_of(matrix: Array) -> Array:
+    """Square roots of the diagonal of an information or a covariance; 1 for zeros."""
     size = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
     return np.where(size > 0, size, 1.0)

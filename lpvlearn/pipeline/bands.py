@@ -16,10 +16,12 @@ from ..lpv.model import LPVStateSpace
 Array = NDArray[np.float64]
 
 
-def output_errors(errors: Sequence[Array], names: Sequence[Hashable]) -> pd.DataFrame:
-    """Columns model_error and noise, a row per output, of simulation errors."""
+def output_errors(
+    names: Sequence[Hashable], errors: Sequence[Array], left_out: Sequence[Array] = ()
+) -> pd.DataFrame:
+    """Columns model_error and noise, a row per output, as `levels_of` has them."""
     index = pd.Index(list(names), name="output")
-    return pd.DataFrame(levels_of(errors)._asdict(), index)
+    return pd.DataFrame(levels_of(errors, left_out)._asdict(), index)
 
 
 def prediction_std(

@@ -27,6 +27,7 @@ from ..data.preparation import part_of, read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
 from ..exceptions import DivergenceError, VersionedPickle, collected
+from ..lpv.bands import left_out_errors
 from ..lpv.interpolator import Interpolator, grid_over
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
@@ -334,6 +335,8 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
         if start.identified_range is not None:
             identified = _union(inner, np.asarray(start.identified_range))
         self.coefficients_ = coefficients_of(found.model)
+        if prior is not None:  # now with rate terms
+            prior = prior.widened(len(self.coefficients_) - len(prior.centre))
         self.coefficients_covariance_ = np.zeros((len(self.coefficients_),) * 2)
         free = np.flatnonzero(found.free)
         covariance = covariance_of(found.information)
@@ -363,7 +366,9 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
         self.report_ = _report(labels, records, before, after)
         outputs = start.output_names or getattr(self, "output_names_", None)
         self.output_errors_ = output_errors(
-            after, outputs or range(1, start.n_outputs + 1)
+            outputs or range(1, start.n_outputs + 1),
+            after,
+            left_out_errors(found, records, own, prior, n_jobs=self.n_jobs),
         )
         self.history_ = pd.DataFrame(found.costs, columns=["round", "cost"])
         return self
@@ -698,7 +703,7 @@ def local_output_errors(
         errors = [_errors(quiet, e, _record(e, sampling_time), own) for e in runs]
     except DivergenceError:
         errors = [np.full((1, model.n_outputs), np.nan)]
-    return output_errors(errors, model.output_names or range(1, model.n_outputs + 1))
+    return output_errors(model.output_names or range(1, model.n_outputs + 1), errors)
 
 
 def _own_of_local(found: StructuredModels) -> Own:
