@@ -302,7 +302,9 @@ class SimulationDisplay:
             known = f"measured, {lost} missing" if lost else "measured"
             signals = {"measured": (self.y_true, known)}
             for name, y_pred in self.predictions.items():
-                signals[name] = (y_pred, f"{name}: BFT {self.bft_[name][i]:.1f} %")
+                wide = f" ± {n_std:g} std" if name in self.std else ""
+                fit = f"{name}{wide}: BFT {self.bft_[name][i]:.1f} %"
+                signals[name] = (y_pred, fit)
             for k, (name, (signal, label)) in enumerate(signals.items()):
                 style = _style(k, int(shown.sum()))
                 (line,) = one.plot(
@@ -317,7 +319,7 @@ class SimulationDisplay:
                         low[shown],
                         high[shown],
                         color=line.get_color(),
-                        alpha=0.25,
+                        alpha=0.35,
                         lw=0,
                     )
             tidy(one)
