@@ -39,16 +39,17 @@ def prediction_std(
         dt = e.sampling_time or sampling_time
         with naming(e):
             by_parameters[e.rows] = simulation_std(model, e.inputs, kappa, dt)
-    found: dict[tuple[Hashable, str], Array] = {}
-    for name, own in zip(levels.index, by_parameters.T, strict=True):
-        model_error, noise = levels.loc[name, ["model_error", "noise"]].to_numpy()
+    names = ("parameters", "model_error", "total", "measurement")
+    found = np.empty((n_samples, model.n_outputs, len(names)))
+    for k, (model_error, noise) in enumerate(levels.to_numpy()):
+        own = by_parameters[:, k]
         total = np.hypot(own, model_error)
-        parts = {
-            "parameters": own,
-            "model_error": np.where(np.isnan(own), np.nan, model_error),
-            "total": total,
-            "measurement": np.hypot(total, noise),
-        }
-        found |= {(name, part): values for part, values in parts.items()}
-    table = pd.DataFrame(found, getattr(X, "index", None))
-    return table.rename_axis(columns=["output", "part"])
+        found[:, k, 0], found[:, k, 1], found[:, k, 2] = own, model_error, total
+        found[:, k, 3] = np.hypot(total, noise)
+    found[np.isnan(by_parameters)] = np.nan
+    columns = pd.MultiIndex.from_product(
+        [levels.index, names], names=["output", "part"]
+    )
+    return pd.DataFrame(
+        found.reshape(n_samples, -1), getattr(X, "index", None), columns
+    )

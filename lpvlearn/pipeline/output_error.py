@@ -701,7 +701,7 @@ def local_output_errors(
     quiet, own = model.silenced(), _own_of_local(found)
     try:
         errors = [_errors(quiet, e, _record(e, sampling_time), own) for e in runs]
-    except DivergenceError:
+    except ValueError:  # it diverges, or has no matrices there
         errors = [np.full((1, model.n_outputs), np.nan)]
     return output_errors(model.output_names or range(1, model.n_outputs + 1), errors)
 

@@ -60,7 +60,7 @@ def test_the_noise_is_found_and_a_true_model_has_no_error(name, request):
     assert (error < 3 * model.predict(X, return_std=True)[1]).mean() > 0.95
 
 
-def test_arrays_and_single_outputs_and_gaps(memory):
+def test_single_outputs(memory):
     X, y = spring_tables(noise=0.05, n_samples=N_SAMPLES)
     model = spring_pipeline(memory=memory).fit(X, y["position"])
     new, _ = spring_sweep(100)
