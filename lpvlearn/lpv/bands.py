@@ -23,7 +23,6 @@ from joblib import Parallel
 from joblib import delayed as later
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.signal import periodogram
 
 from .model import LPVStateSpace
 from .refinement import Own, Prior, Record, Refined, initial_state, weighted_slopes
@@ -79,8 +78,10 @@ def levels_of(errors: Sequence[Array], left_out: Sequence[Array] = ()) -> Levels
     total = np.mean(np.vstack(errors) ** 2, axis=0)
     powers: list[list[Array]] = [[] for _ in range(_BANDS)]
     for e in errors:
-        ordinates = periodogram(e, window="hann", detrend=False, axis=0)[1][1:-1] / 2
+        window = np.hanning(len(e) + 1)[:-1, None]
+        ordinates = np.abs(np.fft.rfft(window * e, axis=0)[1:-1]) ** 2
         if len(ordinates) >= _BANDS:
+            ordinates /= np.sum(window**2)
             parts = np.array_split(ordinates, _BANDS)
             for band, part in zip(powers, parts, strict=True):
                 band.append(part)
