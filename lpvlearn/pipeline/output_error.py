@@ -26,7 +26,7 @@ from ..data.operating_points import check_outputs
 from ..data.preparation import part_of, read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
-from ..exceptions import DivergenceError, VersionedPickle, collected
+from ..exceptions import VersionedPickle, collected
 from ..lpv.bands import left_out_errors
 from ..lpv.interpolator import Interpolator, grid_over
 from ..lpv.model import LPVStateSpace, warn_extrapolation
