@@ -33,7 +33,7 @@ def predict(options: argparse.Namespace) -> None:
             X, y = measured_signals(pipeline, table, options.table.name)
             found = pipeline.predict_with_initial_state(X, y)
         else:
-            found = pipeline.predict(X)
+            found = np.asarray(pipeline.predict(X))
         text = []
         if y is not None:
             report = fit_report(pipeline, X, y, initial_state=options.initial_state)

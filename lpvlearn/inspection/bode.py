@@ -218,7 +218,8 @@ class BodeDisplay:
         omega : array-like of shape (n_freq,), default=None
         uncertainty : bool, default=False
             Whether to draw the band of two standard deviations, which `SubspaceLTI`
-            knows of its model.
+            knows of its model, and a pipeline of the interpolated one: that of the
+            coefficients (``lpv_.covariance``), without the model's own error.
         phase : bool, default=False
         ax : Axes or array of Axes, default=None
 
@@ -237,15 +238,8 @@ class BodeDisplay:
         models = {name: both[name] for name in [*(others or {}), *both]}
         std = None
         if uncertainty:
-            owner = unwrapped(estimator)
-            if not hasattr(owner, "frequency_response_std"):
-                raise ValueError(
-                    "`uncertainty` must be False for an estimator that does not know "
-                    f"it, as SubspaceLTI does. Got True with {type(owner).__name__}; "
-                    "BodeDisplay.from_models takes standard deviations as `std`."
-                )
             omega = frequency_axis(list(models.values())) if omega is None else omega
-            std = {name: owner.frequency_response_std(omega) for name in own}
+            std = _uncertainty_of(unwrapped(estimator), own, kappa, omega)
         return cls.from_models(models, omega=omega, std=std, phase=phase, ax=ax)
 
     def plot(
@@ -332,6 +326,22 @@ class BodeDisplay:
                 # Fractions of a turn as ticks, five of them at most.
                 step = next((s for s in (45, 90, 180, 360) if span <= 5 * s), 720)
                 row[0].yaxis.set_major_locator(MultipleLocator(step))
+
+
+def _uncertainty_of(
+    owner: Any, own: Mapping[str, StateSpace], kappa: Any, omega: ArrayLike
+) -> dict[str, NDArray[np.complex128]]:
+    """Standard deviations of the responses of an estimator's models, where known."""
+    if hasattr(owner, "lpv_"):
+        std = owner.lpv_.frequency_response_std(kappa, omega)
+        return {name: std for name in own if name == "interpolated"}
+    if not hasattr(owner, "frequency_response_std"):
+        raise ValueError(
+            "`uncertainty` must be False for an estimator that does not know "
+            f"it, as SubspaceLTI does. Got True with {type(owner).__name__}; "
+            "BodeDisplay.from_models takes standard deviations as `std`."
+        )
+    return {name: owner.frequency_response_std(omega) for name in own}
 
 
 def _magnitudes(

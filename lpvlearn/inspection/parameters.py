@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,11 @@ class ParameterDisplay:
     interpolators : dict from str to fitted regressor, default=None
         Curves for some of the sets: regressors that predict all parameters from
         scheduling values of shape (n, 1).
+    std : dict from str to array-like of shape (n_points, n_params), default=None
+        Standard deviations of some of the sets, drawn as bars at the points.
+    curve_std : dict from str to callable, default=None
+        Functions from scheduling values (n, 1) to standard deviations (n, n_params) of
+        some of the curves, drawn as bands.
     scheduling_label : str, default="κ"
         Label of the horizontal axes.
 
@@ -74,6 +80,8 @@ class ParameterDisplay:
         *,
         names: Sequence[Hashable] | None = None,
         interpolators: Mapping[str, Any] | None = None,
+        std: Mapping[str, ArrayLike] | None = None,
+        curve_std: Mapping[str, Callable[[Array], ArrayLike]] | None = None,
         scheduling_label: str = "κ",
     ) -> None:
         points = np.asarray(kappa, dtype=float)
@@ -83,21 +91,28 @@ class ParameterDisplay:
         self.kappa = points
         sets = named("parameters", parameters, "tables of parameters")
         self.all_names, self.chosen = _names_and_choice(sets, names)
-        self.parameters = {}
-        shape = (len(points), len(self.all_names))
-        for name, table in sets.items():
-            if hasattr(table, "columns"):
-                table = _in_order(name, table, self.all_names)
-            values = np.asarray(table, dtype=float)
-            if values.shape != shape:
-                raise ValueError(
-                    f"`parameters[{name!r}]` must have shape {shape}: a row for each "
-                    "scheduling value in `kappa`, a column for each parameter. Got "
-                    f"{values.shape}."
-                )
-            self.parameters[name] = values
+        self.parameters, self.std = (
+            {
+                name: self._table(f"{argument}[{name!r}]", table)
+                for name, table in tables.items()
+            }
+            for argument, tables in (("parameters", sets), ("std", dict(std or {})))
+        )
         self.interpolators = dict(interpolators or {})
+        self.curve_std = dict(curve_std or {})
         self.scheduling_label = scheduling_label
+
+    def _table(self, argument: str, table: Any) -> Array:
+        if hasattr(table, "columns"):
+            table = _in_order(argument, table, self.all_names)
+        values, shape = np.asarray(table, float), (len(self.kappa), len(self.all_names))
+        if values.shape != shape:
+            raise ValueError(
+                f"`{argument}` must have shape {shape}: a row for each scheduling "
+                "value in `kappa`, a column for each parameter. Got "
+                f"{values.shape}."
+            )
+        return values
 
     @property
     def names(self) -> list[str]:
@@ -157,6 +172,7 @@ class ParameterDisplay:
         others: Mapping[str, ArrayLike] | None = None,
         names: Sequence[Hashable] | None = None,
         name: str | None = None,
+        uncertainty: bool = False,
         scheduling_label: str | None = None,
         n_columns: int = 4,
         ax: Any = None,
@@ -175,6 +191,11 @@ class ParameterDisplay:
         name : str, default=None
             Of the pipeline's parameters in the legend. None is "restructured", or
             "balanced" without a restructurer.
+        uncertainty : bool, default=False
+            Whether to draw two standard deviations, where they are known: of the local
+            parameters as bars, of their interpolation as a band. Of the parameters,
+            that is: what the model's own error does to outputs is another thing, see
+            `SimulationDisplay`.
         scheduling_label : str, default=None
             None is the name of the scheduling column.
         n_columns : int, default=4
@@ -187,24 +208,33 @@ class ParameterDisplay:
         Raises
         ------
         ValueError
-            If the pipeline is not fitted or has several scheduling variables, or
-            `others` has other shapes.
+            If the pipeline is not fitted or has several scheduling variables, `others`
+            has other shapes, or the uncertainty is not known.
         """
         pipeline = fitted_pipeline(pipeline, "parameters_")
         check_one_scheduling(pipeline.operating_points_.shape[1], "ParameterDisplay")
         if name is None:
             name = "restructured" if pipeline.restructurers_ else "balanced"
         table = pipeline.parameters_
+        known: dict[str, Any] = {}
+        if uncertainty:
+            pipeline.lpv_.covariance_root()  # refuses where there is none
+            known = {"curve_std": {name: partial(_curve_std, pipeline.lpv_)}}
+            if np.isfinite(pipeline.parameters_std_).all(axis=None):
+                known["std"] = {name: pipeline.parameters_std_}
         display = cls(
             pipeline.operating_points_[:, 0],
             with_others({name: table}, others or {}),
             names=names,
             interpolators={name: pipeline.interpolator_},
+            **known,
             scheduling_label=scheduling_label or scheduling_name(pipeline),
         )
         return display.plot(ax, n_columns=n_columns)
 
-    def plot(self, ax: Any = None, *, n_columns: int = 4) -> ParameterDisplay:
+    def plot(
+        self, ax: Any = None, *, n_columns: int = 4, n_std: float = 2.0
+    ) -> ParameterDisplay:
         """Draw a panel for each parameter.
 
         Parameters
@@ -213,6 +243,8 @@ class ParameterDisplay:
             None makes a figure. Of an array, as many as there are places in the grid.
         n_columns : int, default=4
             Panels in a row.
+        n_std : float, default=2.0
+            Half-width of bars and bands, in standard deviations.
 
         Returns
         -------
@@ -233,6 +265,10 @@ class ParameterDisplay:
             name: np.reshape(model.predict(fine[:, None]), (_N_CURVE, -1))
             for name, model in self.interpolators.items()
         }
+        bands = {
+            name: n_std * np.reshape(std(fine[:, None]), (_N_CURVE, -1))
+            for name, std in self.curve_std.items()
+        }
         for k, (name, theta) in enumerate(self.parameters.items()):
             style = point_style(k)
             for one, column in zip(self.axes_, self.chosen, strict=True):
@@ -240,6 +276,26 @@ class ParameterDisplay:
                     self.kappa, theta[:, column], label=name, zorder=3 + k, **style
                 )
                 self.lines_[name].append(points)
+                if name in self.std:
+                    one.errorbar(
+                        self.kappa,
+                        theta[:, column],
+                        n_std * self.std[name][:, column],
+                        fmt="none",
+                        ecolor=style["color"],
+                        elinewidth=1.0,
+                        zorder=2 + k,
+                    )
+                if name in bands:
+                    middle, width = curves[name][:, column], bands[name][:, column]
+                    one.fill_between(
+                        fine,
+                        middle - width,
+                        middle + width,
+                        color=style["color"],
+                        alpha=0.2,
+                        lw=0,
+                    )
                 if name in curves:
                     (curve,) = one.plot(
                         fine,
@@ -281,6 +337,10 @@ class ParameterDisplay:
             ax.set_ylim(low - 0.1 * size, high + 0.1 * size)
 
 
+def _curve_std(lpv: Any, kappa: Array) -> Array:
+    return np.asarray(lpv.parameters(kappa, return_std=True)[1])
+
+
 def _names_and_choice(
     sets: Mapping[str, Any], names: Sequence[Hashable] | None
 ) -> tuple[list[str], list[int]]:
@@ -306,7 +366,7 @@ def _in_order(name: str, table: Any, names: list[str]) -> Any:
     missing = [one for one in names if one not in columns]
     if missing:
         raise ValueError(
-            f"`parameters[{name!r}]` must have the columns of the first set. Got none "
+            f"`{name}` must have the columns of the first set. Got none "
             f"named {missing[0]!r}."
         )
     return table.iloc[:, [columns.index(one) for one in names]]

@@ -53,6 +53,8 @@ class SimulationDisplay:
         Measured outputs; missing ones (NaN) leave a gap, and do not count.
     predictions : dict from str to ndarray of shape (n_samples, n_outputs)
         Simulated outputs, by name of the model.
+    std : dict from str to ndarray of shape (n_samples, n_outputs), default=None
+        Standard deviations of some of the simulated outputs, drawn as bands.
     output_names : sequence of str, default=None
         None is y1, y2, ...
     units : str or sequence of str, default=None
@@ -88,6 +90,7 @@ class SimulationDisplay:
         y_true: ArrayLike,
         predictions: Mapping[str, ArrayLike],
         *,
+        std: Mapping[str, ArrayLike] | None = None,
         output_names: Sequence[Hashable] | None = None,
         units: str | Sequence[str] | None = None,
         time_label: str = "Time (s)",
@@ -115,6 +118,16 @@ class SimulationDisplay:
                     f"{self.y_true.shape}. Got {y_pred.shape}."
                 )
             self.bft_[name] = bft_score(self.y_true, y_pred, multioutput="raw_values")
+        self.std = {
+            str(name): read_outputs(own)[0] for name, own in (std or {}).items()
+        }
+        for name, own in self.std.items():
+            if name not in self.predictions or own.shape != self.y_true.shape:
+                raise ValueError(
+                    "`std` must have names of simulations, and standard deviations of "
+                    f"the shape of `y_true`, {self.y_true.shape}. Got {name!r} with "
+                    f"shape {own.shape}."
+                )
         given = names if output_names is None else output_names
         self.output_names = names_of("output_names", given, n_outputs, "y")
         if units is None or isinstance(units, str):
@@ -174,6 +187,7 @@ class SimulationDisplay:
         experiment: Hashable = None,
         initial_state: str = "rest",
         name: str = "simulated",
+        uncertainty: bool = False,
         units: str | Sequence[str] | None = None,
         zoom: tuple[float, float] | None = None,
         ax: Any = None,
@@ -193,6 +207,10 @@ class SimulationDisplay:
             start in the middle of an experiment.
         name : str, default="simulated"
             Of the model, in the legend.
+        uncertainty : bool, default=False
+            Whether to draw the band of two standard deviations of the outputs without
+            noise: those of ``predict(X, return_std=True)``, as `LocalLPVPipeline` and
+            `OutputErrorLPV` have it.
         units : str or sequence of str, default=None
             Of the outputs.
         zoom : tuple (t_start, t_stop), default=None
@@ -206,10 +224,19 @@ class SimulationDisplay:
         Raises
         ------
         ValueError
-            If there is no such experiment, or an option is unknown.
+            If there is no such experiment, an option is unknown, or the uncertainty
+            is not known.
         """
         check_options(initial_state)
         estimator = unwrapped(estimator)
+        if uncertainty and (
+            initial_state != "rest" or not hasattr(estimator, "prediction_std")
+        ):
+            raise ValueError(
+                "`uncertainty` must be False but for simulations from rest of an "
+                "estimator that knows it, as LocalLPVPipeline does. Got True with "
+                f"{type(estimator).__name__} and initial_state={initial_state!r}."
+            )
         if not hasattr(estimator, "split_experiments"):
             raise ValueError(
                 "`estimator` must tell the experiments of a table by "
@@ -222,11 +249,16 @@ class SimulationDisplay:
         part = X.iloc[rows] if hasattr(X, "iloc") else X[rows]
         found = simulate(estimator, part, outputs[rows], initial_state)
         found.warn_of_motion(estimator, part)
+        std = None
+        if uncertainty:
+            known = estimator.prediction_std(part)
+            std = {name: known.xs("total", axis=1, level="part")}
         time, label = _time_of(estimator, Table(part))
         display = cls(
             time,
             found.measured,
             {name: found.simulated},
+            std=std,
             output_names=names,
             units=units,
             time_label=label,
@@ -234,7 +266,11 @@ class SimulationDisplay:
         return display.plot(ax, zoom=zoom)
 
     def plot(
-        self, ax: Any = None, *, zoom: tuple[float, float] | None = None
+        self,
+        ax: Any = None,
+        *,
+        zoom: tuple[float, float] | None = None,
+        n_std: float = 2.0,
     ) -> SimulationDisplay:
         """Draw the outputs, one below the other.
 
@@ -244,6 +280,8 @@ class SimulationDisplay:
             None makes a figure.
         zoom : tuple (t_start, t_stop), default=None
             Part of the record to draw, in seconds.
+        n_std : float, default=2.0
+            Half-width of the bands, in standard deviations.
 
         Returns
         -------
@@ -264,13 +302,26 @@ class SimulationDisplay:
             known = f"measured, {lost} missing" if lost else "measured"
             signals = {"measured": (self.y_true, known)}
             for name, y_pred in self.predictions.items():
-                signals[name] = (y_pred, f"{name}: BFT {self.bft_[name][i]:.1f} %")
+                wide = f" ± {n_std:g} std" if name in self.std else ""
+                fit = f"{name}{wide}: BFT {self.bft_[name][i]:.1f} %"
+                signals[name] = (y_pred, fit)
             for k, (name, (signal, label)) in enumerate(signals.items()):
                 style = _style(k, int(shown.sum()))
                 (line,) = one.plot(
                     self.time[shown], signal[shown, i], label=label, **style
                 )
                 self.lines_[name].append(line)
+                if name in self.std:
+                    width = n_std * self.std[name][:, i]
+                    low, high = signal[:, i] - width, signal[:, i] + width
+                    one.fill_between(
+                        self.time[shown],
+                        low[shown],
+                        high[shown],
+                        color=line.get_color(),
+                        alpha=0.35,
+                        lw=0,
+                    )
             tidy(one)
             one.set_ylabel(with_unit(self.output_names[i], self.units[i]))
             one.set_xlim(self.time[shown][0], self.time[shown][-1])

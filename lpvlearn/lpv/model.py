@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral
-from typing import Any
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,7 @@ from ..systems.simulation import delayed, state_trajectory
 from ..systems.tabulation import tabulate
 from ..validation import (
     finite_samples,
+    frequencies,
     input_delays,
     matrix,
     positive_time,
@@ -36,6 +37,7 @@ from ..validation import (
 from .coefficients import MatrixCoefficients, matrix_coefficients
 from .export import Grid, control_models, write_mat
 from .lfr import LinearFractionalModel, linear_fractional
+from .weighting import covariance_factor
 
 Array = NDArray[np.float64]
 
@@ -45,6 +47,8 @@ _DIGITS = 3  # of a range that a message shows
 
 # Samples whose matrices are held at once: for 6 states, 2 inputs and outputs 17 MB.
 _BLOCK = 32_768
+
+_ENTRIES = 1_000_000  # of derivatives that are held at once: 8 MB
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,6 +94,9 @@ class LPVStateSpace:
         (n_points, n_scheduling * order * order), in the state of the structure. Rates
         along a trajectory are differences between its samples. Frozen models, and all
         that other programs take, are those at rest: without.
+    covariance : array-like of shape (n_coefficients, n_coefficients), default=None
+        Of the coefficients of `interpolator`, then of `rate_terms`, which both have
+        them (`AutoLPV` and its like). None: not known.
 
     Attributes
     ----------
@@ -151,6 +158,7 @@ class LPVStateSpace:
     input_names: Sequence[Hashable] | None = None
     output_names: Sequence[Hashable] | None = None
     rate_terms: Any = None
+    covariance: ArrayLike | None = None
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -195,6 +203,26 @@ class LPVStateSpace:
                 )
         delay = input_delays(self.input_delay, self.n_inputs, samples=False)
         object.__setattr__(self, "input_delay", delay)
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", self._checked_covariance())
+
+    def _checked_covariance(self) -> Array:
+        found = real_array("covariance", self.covariance)
+        parts = [r for r in (self.interpolator, self.rate_terms) if r is not None]
+        for part in parts:
+            if not hasattr(part, "sensitivities"):
+                raise ValueError(
+                    "`covariance` needs regressors with coefficients, such as AutoLPV. "
+                    f"Got {type(part).__name__}."
+                )
+        n = sum(len(part.coefficients()) for part in parts)
+        if found.shape != (n, n) or not np.isfinite(found).all():
+            raise ValueError(
+                f"`covariance` must be a finite matrix of shape {(n, n)}, of the "
+                f"coefficients. Got shape {found.shape}."
+            )
+        found.setflags(write=False)
+        return found
 
     def __repr__(self) -> str:
         each = ", ".join(f"{d:g}" for d in self.input_delay)
@@ -206,26 +234,135 @@ class LPVStateSpace:
             f"{', with rate terms' if self.rate_terms is not None else ''})"
         )
 
-    def parameters(self, kappa: ArrayLike) -> Array:
+    @overload
+    def parameters(
+        self, kappa: ArrayLike, *, return_std: Literal[False] = ...
+    ) -> Array: ...
+
+    @overload
+    def parameters(
+        self, kappa: ArrayLike, *, return_std: Literal[True]
+    ) -> tuple[Array, Array]: ...
+
+    def parameters(
+        self, kappa: ArrayLike, *, return_std: bool = False
+    ) -> Array | tuple[Array, Array]:
         """Parameters at scheduling values.
 
         Parameters
         ----------
         kappa : array-like of shape (n_points, n_scheduling), or (n_points,) for one
             scheduling variable
+        return_std : bool, default=False
+            Whether to return their standard deviations too, to first order.
 
         Returns
         -------
         ndarray of shape (n_points, n_params)
+        std : ndarray of shape (n_points, n_params)
+            With `return_std`.
 
         Raises
         ------
         ValueError
-            If `kappa` has another shape or is not finite.
+            If `kappa` has another shape or is not finite, or `return_std` asks for what
+            is not known: `covariance` is None.
         """
         n_params, kappa = self.structure.n_params, self._scheduling(kappa)
         wanted = f"`interpolator` must predict the {n_params} parameters"
-        return _predicted(self.interpolator, kappa, n_params, wanted)
+        values = _predicted(self.interpolator, kappa, n_params, wanted)
+        if not return_std:
+            return values
+        return values, np.linalg.norm(self.parameter_deviations(kappa), axis=2)
+
+    def parameter_deviations(self, kappa: ArrayLike) -> Array:
+        """Standard deviations of the parameters along independent directions.
+
+        Parameters
+        ----------
+        kappa : array-like of shape (n_points, n_scheduling) or (n_points,)
+
+        Returns
+        -------
+        ndarray of shape (n_points, n_params, n_directions)
+            ``F[i] @ F[j].T`` is the covariance of the parameters at points i and j, to
+            first order.
+
+        Raises
+        ------
+        ValueError
+            If `covariance` is None.
+        """
+        root, kappa = self.covariance_root(), self._scheduling(kappa)
+        form = _quiet(self.interpolator)
+        root = root[: len(form.coefficients())]
+        found = np.empty((len(kappa), self.structure.n_params, root.shape[1]))
+        size = max(1, _ENTRIES // (len(root) * self.structure.n_params))
+        for start in range(0, len(kappa), size):
+            rows = slice(start, start + size)
+            found[rows] = form.sensitivities(kappa[rows]) @ root
+        return found
+
+    def covariance_root(self) -> Array:
+        """F with ``F F^T = covariance``, of as few columns as this has directions."""
+        if self.covariance is None:
+            raise ValueError(
+                "The uncertainty of this model is not known: `covariance` is None. A "
+                "pipeline knows it of an interpolation with coefficients (AutoLPV, "
+                "PolynomialLPV, RationalLPV, SplineLPV), where the covariances of the "
+                "local parameters are known, which needs a structure, or where "
+                "refiner=OutputErrorLPV() has data that move."
+            )
+        return covariance_factor(np.asarray(self.covariance))
+
+    def frequency_response_std(
+        self, kappa: ArrayLike | Mapping[Any, float], omega: ArrayLike
+    ) -> NDArray[np.complex128]:
+        """Standard deviation of the frequency response of a frozen model.
+
+        That of the coefficients alone, to first order.
+
+        Parameters
+        ----------
+        kappa : float, array-like of shape (n_scheduling,) or mapping
+            As `at` takes it.
+        omega : array-like of shape (n_freq,)
+            Angular frequencies, rad/s.
+
+        Returns
+        -------
+        ndarray of complex, shape (n_freq, n_outputs, n_inputs)
+            The real part is the standard deviation of the real part of the response,
+            the imaginary part that of the imaginary part, as
+            `SubspaceLTI.frequency_response_std` has them.
+
+        Raises
+        ------
+        ValueError
+            If `covariance` is None, or `kappa` is not one finite value of every
+            scheduling variable.
+        """
+        place, w = self._place(kappa), frequencies(omega)
+        model, n = self.silenced(), self.order
+        theta = model.parameters(place[None])[0]
+        A, B, C, _ = (M[0] for M in self.structure.matrices(theta[None]))
+        resolvent = 1j * w[:, None, None] * np.eye(n) - A
+        eye_y = np.broadcast_to(np.eye(self.n_outputs), (len(w), *[self.n_outputs] * 2))
+        eye_u = np.broadcast_to(np.eye(self.n_inputs), (len(w), *[self.n_inputs] * 2))
+        states = np.linalg.solve(resolvent, np.broadcast_to(B, (len(w), *B.shape)))
+        left = np.linalg.solve(resolvent.mT, np.broadcast_to(C.T, (len(w), *C.T.shape)))
+        left = np.concatenate([left.mT, eye_y], axis=2)  # [C (jw - A)^-1, I]
+        late = np.exp(-1j * np.outer(w, self.input_delay))
+        right = np.concatenate([states, eye_u], axis=1) * late[:, None, :]
+        deviations = model.parameter_deviations(place[None])[0]
+        directions = np.tensordot(
+            deviations.T, np.asarray(self.structure.jacobian(theta)), 1
+        )
+        slopes = left[:, None] @ directions @ right[:, None]
+        std = np.linalg.norm(slopes.real, axis=1) + 1j * np.linalg.norm(
+            slopes.imag, axis=1
+        )
+        return np.asarray(std)
 
     def input_offset(self, kappa: ArrayLike) -> Array:
         """Inputs u0 of the point of work at scheduling values.

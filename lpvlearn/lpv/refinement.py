@@ -9,7 +9,7 @@ of every output, enter linearly and are projected out (variable projection).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -118,6 +118,34 @@ def simulated(
     return columns @ found - error, found
 
 
+def initial_state(
+    model: LPVStateSpace, record: Record, own: Own, found: Array
+) -> Array:
+    """State at the first sample, by the unknowns of the record."""
+    x0 = model.state_offset(record.kappa[:1])[0]
+    return x0 + found[: model.order] if own.initial_state else x0
+
+
+def weighted_slopes(
+    model: LPVStateSpace,
+    record: Record,
+    own: Own,
+    weight: Array,
+    free: Flags,
+    errors: Array,
+    found: Array,
+) -> Iterator[tuple[slice, Array]]:
+    """Derivatives by the own unknowns, errors, and derivatives by the coefficients.
+
+    A block of samples at a time, weighted: (n_block, n_outputs, n_own + 1 + n_free).
+    """
+    n, x0 = model.order, initial_state(model, record, own, found)
+    slopes = output_slopes(model, record.u, record.kappa, record.dt, x0, free)
+    for rows, J in slopes:
+        parts = [own.columns(J[:, :, :n]), errors[rows, :, None], J[:, :, n:]]
+        yield rows, np.concatenate(parts, axis=2) * weight[:, None]
+
+
 def _gram(
     model: LPVStateSpace,
     record: Record,
@@ -128,17 +156,10 @@ def _gram(
     found: Array,
 ) -> Array:
     """``[r J]^T [r J]`` of weighted errors and slopes, own unknowns projected out."""
-    n = model.order
-    x0 = model.state_offset(record.kappa[:1])[0]
-    if own.initial_state:
-        x0 = x0 + found[:n]
     total: Any = 0.0
-    slopes = output_slopes(model, record.u, record.kappa, record.dt, x0, free)
-    for rows, J in slopes:
-        parts = [own.columns(J[:, :, :n]), errors[rows, :, None], J[:, :, n:]]
-        Z = np.concatenate(parts, axis=2) * weight[:, None]
-        Z = Z.reshape(-1, Z.shape[2])
-        total = total + Z.T @ Z
+    for _, Z in weighted_slopes(model, record, own, weight, free, errors, found):
+        flat = Z.reshape(-1, Z.shape[2])
+        total = total + flat.T @ flat
     G, k = np.asarray(total), len(found)
     if k == 0:
         return G

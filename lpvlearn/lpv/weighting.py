@@ -37,6 +37,8 @@ _PLAUSIBLE = 4.0
 # polynomial of degree 4 2e-3.)
 _NEGLIGIBLE = 1e-4
 
+_NO_DIRECTION = 1e-12  # of a covariance, relative to its largest: rounding
+
 _SURPRISE = 1e-3  # probability of a chi-square, of few degrees of freedom, that is one
 
 
@@ -152,3 +154,28 @@ def is_chance(chi2: float, degrees_of_freedom: int) -> bool:
         return True
     surprise = chi_square.isf(_SURPRISE, degrees_of_freedom)
     return bool(chi2 <= max(_PLAUSIBLE * degrees_of_freedom, surprise))
+
+
+def covariance_of(information: Array) -> Array:
+    """Inverse of an information matrix, whatever the units of its coefficients.
+
+    Directions that nothing is known of count as known (minimum norm).
+    """
+    size = sizes_of(information)
+    scaled = information / size[:, None] / size
+    inverse = np.linalg.pinv(scaled, hermitian=True)
+    return np.asarray(inverse / size[:, None] / size)
+
+
+def covariance_factor(covariance: Array) -> Array:
+    """F of as few columns as a covariance has directions, ``F F^T`` the covariance."""
+    size = sizes_of(covariance)
+    values, vectors = np.linalg.eigh(covariance / size[:, None] / size)
+    kept = values > _NO_DIRECTION * values.max(initial=0.0)
+    return np.asarray(size[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def sizes_of(matrix: Array) -> Array:
+    """Square roots of the diagonal of an information or a covariance; 1 for zeros."""
+    size = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
+    return np.where(size > 0, size, 1.0)

@@ -51,8 +51,14 @@ from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
+from .bands import prediction_std
 from .html_report import html_report
-from .output_error import known_coefficients, refine_model
+from .output_error import (
+    known_coefficients,
+    local_covariance,
+    local_output_errors,
+    refine_model,
+)
 from .points import (
     PointRunner,
     StructuredModels,
@@ -231,6 +237,11 @@ list, default=None
     parameter_report_ : DataFrame
         One row per parameter: lowest and highest value over the points, median
         standard deviation, RMSE and FIT (percent) of the interpolation.
+    output_errors_ : DataFrame
+        One row per output: standard deviations of the "model_error" and of the "noise"
+        in what `lpv_` leaves of the outputs of the local experiments, or with a
+        `refiner` of those that move. Noise is what is white of it. NaN where `lpv_`
+        diverges.
     step_times_ : dict of str to float
         Seconds that each step took.
     warnings_ : list of str
@@ -432,6 +443,7 @@ list, default=None
                 found.structure,
                 self.interpolator_,
                 span,
+                covariance=local_covariance(self.interpolator_, found),
                 scheduling_names=self.scheduling_names_ or None,
                 identified_range=self.scheduling_range_,
                 input_delay=common_delay(found.local, kappa, self.sampling_time_),
@@ -449,6 +461,11 @@ list, default=None
                 self._refine(moving, found, runner)
 
         with watch.step("interpolation and report"):
+            self.output_errors_ = (
+                local_output_errors(self.lpv_, found, self.sampling_time_)
+                if self.refiner_ is None
+                else self.refiner_.output_errors_
+            )
             growth = growth_rates(self.lpv_, kappa)
             report = tables(found, self.lpv_, self.sampling_time_, growth)
             self.parameters_, self.parameters_std_ = (
@@ -465,19 +482,26 @@ list, default=None
 
     # -- use -----------------------------------------------------------------------
 
-    def predict(self, X: Any) -> Array:
+    def predict(self, X: Any, return_std: bool = False) -> Array | tuple[Array, Array]:
         """Simulate the LPV model along every experiment of a table, from rest.
 
         Parameters
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
+        return_std : bool, default=False
+            Whether to return standard deviations of the outputs too: the column "total"
+            of `prediction_std`.
 
         Returns
         -------
         ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+        std : ndarray of the same shape
+            With `return_std`. A band of 95 % is 1.96 of them to both sides.
 
         Raises
         ------
+        ValueError
+            If `return_std` asks for what is not known.
         DivergenceError
             If the outputs overflow, for the model is unstable along an experiment.
 
@@ -487,7 +511,54 @@ list, default=None
             Where a scheduling variable leaves `scheduling_range_`.
         """
         check_is_fitted(self, "lpv_")
-        return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
+        y = self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
+        if not return_std:
+            return y
+        total = self.prediction_std(X).xs("total", axis=1, level="part")
+        return y, total.to_numpy().reshape(y.shape)
+
+    def prediction_std(self, X: Any) -> pd.DataFrame:
+        """Standard deviations of the outputs that `predict` gives, part by part.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+
+        Returns
+        -------
+        DataFrame of shape (n_samples, 4 n_outputs)
+            For every output the columns
+
+            - "parameters": by the covariance of the coefficients, ``lpv_.covariance``,
+              to first order;
+            - "model_error": of the model's own, "model_error" of `output_errors_`, the
+              same at all times;
+            - "total": of the output without noise, the root of the sum of their
+              squares;
+            - "measurement": of an output that is measured, with the "noise" too.
+
+        Raises
+        ------
+        ValueError
+            If ``lpv_.covariance`` is not known.
+
+        Notes
+        -----
+        Local experiments do not show what the model misses while the scheduling
+        variables move; a `refiner` sees that on experiments that do. Without one the
+        bands are those of a model that is true in motion, and may be far too narrow.
+        Where no form of the interpolation meets the points but for their noise, the
+        covariance is multiplied by chi-square per degree of freedom. Offsets count as
+        known. See :ref:`guide_bands`.
+        """
+        check_is_fitted(self, "lpv_")
+        return prediction_std(
+            self.lpv_,
+            self.output_errors_,
+            self._read(X, None),
+            self.sampling_time_,
+            X,
+        )
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate from initial states estimated on the measured outputs.

@@ -27,6 +27,7 @@ from ..data.preparation import part_of, read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL, check_unit
 from ..exceptions import VersionedPickle, collected
+from ..lpv.bands import left_out_errors
 from ..lpv.interpolator import Interpolator, grid_over
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..lpv.polynomial import PolynomialLPV
@@ -40,12 +41,14 @@ from ..lpv.refinement import (
     refine_with_rates,
     simulated,
 )
+from ..lpv.weighting import covariance_of
 from ..metrics.scores import bft_score
 from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
+from .bands import output_errors, prediction_std
 from .points import StructuredModels, balanced_entries, identify_point
 
 Array = NDArray[np.float64]
@@ -138,6 +141,9 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
         Number of steps tried, of the last search.
     history_ : DataFrame
         One row per step taken: round of the variances, cost.
+    output_errors_ : DataFrame
+        One row per output: standard deviations of the "model_error" and of the "noise"
+        in what the refined model leaves of the outputs, as `prediction_std` has them.
     sampling_time_ : float
     output_names_, scheduling_names_ : list
     n_features_in_ : int
@@ -297,6 +303,7 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
             If the start diverges on an experiment.
         """
         self._check_options()
+        start = replace(start, covariance=None)  # of coefficients that will be others
         records = [_record(e, sampling_time) for e in experiments]
         own = Own(self.initial_state == "estimate", self.offset == "constant")
         prior, factor = None, 1.0 if self.prior == "local" else self.prior
@@ -327,17 +334,23 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
         identified = inner
         if start.identified_range is not None:
             identified = _union(inner, np.asarray(start.identified_range))
+        self.coefficients_ = coefficients_of(found.model)
+        if prior is not None:  # now with rate terms
+            prior = prior.widened(len(self.coefficients_) - len(prior.centre))
+        self.coefficients_covariance_ = np.zeros((len(self.coefficients_),) * 2)
+        free = np.flatnonzero(found.free)
+        covariance = covariance_of(found.information)
+        self.coefficients_covariance_[np.ix_(free, free)] = covariance
         self.lpv_ = replace(
-            found.model, scheduling_range=inner, identified_range=identified
+            found.model,
+            scheduling_range=inner,
+            identified_range=identified,
+            covariance=self.coefficients_covariance_,
         )
         self.scheduling_range_, self.sampling_time_ = identified, sampling_time
         names = as_list(self.scheduling) or as_list(start.scheduling_names)
         self.scheduling_names_ = names or [*range(1, start.n_scheduling + 1)]
         self.rate_ = self.lpv_.rate_terms is not None
-        self.coefficients_ = coefficients_of(self.lpv_)
-        self.coefficients_covariance_ = np.zeros((len(self.coefficients_),) * 2)
-        free = np.flatnonzero(found.free)
-        self.coefficients_covariance_[np.ix_(free, free)] = _inverse(found.information)
         self.deviation_, self.n_iter_ = found.deviation, found.n_iter
         n = start.order if own.initial_state else 0
         self.initial_states_ = np.zeros((len(records), start.order))
@@ -351,24 +364,37 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
             for e, record in zip(experiments, records, strict=True)
         ]
         self.report_ = _report(labels, records, before, after)
+        outputs = start.output_names or getattr(self, "output_names_", None)
+        self.output_errors_ = output_errors(
+            outputs or range(1, start.n_outputs + 1),
+            after,
+            left_out_errors(found, records, own, prior, n_jobs=self.n_jobs),
+        )
         self.history_ = pd.DataFrame(found.costs, columns=["round", "cost"])
         return self
 
     # -- use -----------------------------------------------------------------------
 
-    def predict(self, X: Any) -> Array:
+    def predict(self, X: Any, return_std: bool = False) -> Array | tuple[Array, Array]:
         """Simulate the model along every experiment of a table, from rest.
 
         Parameters
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
+        return_std : bool, default=False
+            Whether to return standard deviations of the outputs too: the column "total"
+            of `prediction_std`.
 
         Returns
         -------
         ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+        std : ndarray of the same shape
+            With `return_std`. A band of 95 % is 1.96 of them to both sides.
 
         Raises
         ------
+        ValueError
+            If `return_std` asks for what is not known.
         DivergenceError
             If the outputs overflow.
 
@@ -378,7 +404,50 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
             Where a scheduling variable leaves ``lpv_.identified_range``.
         """
         check_is_fitted(self, "lpv_")
-        return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
+        y = self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
+        if not return_std:
+            return y
+        total = self.prediction_std(X).xs("total", axis=1, level="part")
+        return y, total.to_numpy().reshape(y.shape)
+
+    def prediction_std(self, X: Any) -> pd.DataFrame:
+        """Standard deviations of the outputs that `predict` gives, part by part.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+
+        Returns
+        -------
+        DataFrame of shape (n_samples, 4 n_outputs)
+            For every output the columns
+
+            - "parameters": by the covariance of the coefficients, ``lpv_.covariance``,
+              to first order;
+            - "model_error": of the model's own, "model_error" of `output_errors_`, the
+              same at all times;
+            - "total": of the output without noise, the root of the sum of their
+              squares;
+            - "measurement": of an output that is measured, with the "noise" too.
+
+        Raises
+        ------
+        ValueError
+            If ``lpv_.covariance`` is not known.
+
+        Notes
+        -----
+        The model's own error is what it leaves of the outputs it was fitted to, but for
+        white noise: about as large on experiments that move alike, not on others.
+        """
+        check_is_fitted(self, "lpv_")
+        return prediction_std(
+            self.lpv_,
+            self.output_errors_,
+            self._read(X, None),
+            self.sampling_time_,
+            X,
+        )
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate from initial states estimated on the measured outputs.
@@ -583,7 +652,7 @@ def known_coefficients(
     if information is not None:
         return Prior(form.coefficients(), information)
     groups = [[_record(e, sampling_time) for e in g] for g in points.experiments]
-    own = Own(True, any(model.n_trend > 0 for model in found.local))
+    own = _own_of_local(found)
     return local_prior(model, points.kappa, found.theta, groups, own)
 
 
@@ -614,6 +683,31 @@ def _promising(
 
     best = sorted(models, key=loss)[:_N_STARTS]
     return min(best, key=soon) if len(best) > 1 else best[0]
+
+
+def local_covariance(form: Any, found: StructuredModels) -> Array | None:
+    """Of the coefficients of a form through operating points; None: not known."""
+    if not isinstance(form, Interpolator):
+        return None
+    information = form.information(found.points.kappa, found.covariance)
+    return None if information is None else covariance_of(information)
+
+
+def local_output_errors(
+    model: LPVStateSpace, found: StructuredModels, sampling_time: float
+) -> pd.DataFrame:
+    """`output_errors` of an LPV model along the local experiments."""
+    runs = [e for group in found.points.experiments for e in group]
+    quiet, own = model.silenced(), _own_of_local(found)
+    try:
+        errors = [_errors(quiet, e, _record(e, sampling_time), own) for e in runs]
+    except ValueError:  # it diverges, or has no matrices there
+        errors = [np.full((1, model.n_outputs), np.nan)]
+    return output_errors(model.output_names or range(1, model.n_outputs + 1), errors)
+
+
+def _own_of_local(found: StructuredModels) -> Own:
+    return Own(True, any(model.n_trend > 0 for model in found.local))
 
 
 def _record(e: Experiment, sampling_time: float) -> Record:
@@ -653,14 +747,6 @@ def _union(bounds: Any, values: Array) -> Array:
     """Smallest and largest values of a range and of rows of others."""
     stacked = np.vstack([bounds, values])
     return np.array([stacked.min(axis=0), stacked.max(axis=0)])
-
-
-def _inverse(information: Array) -> Array:
-    """Covariance; directions that nothing is known of count as known (minimum norm)."""
-    size = np.sqrt(np.maximum(np.diag(information), 0.0))
-    size[size == 0] = 1.0
-    scaled = information / size[:, None] / size
-    return np.linalg.pinv(scaled, hermitian=True) / size[:, None] / size
 
 
 class _Progress:

@@ -15,6 +15,7 @@ from ..data.operating_points import neighbours
 from ..exceptions import collected
 from ..lpv.lfr import scales
 from ..lpv.polynomial import PolynomialLPV
+from ..lpv.weighting import covariance_factor
 from ..models.gap import gap
 from ..models.statespace import DEVIATION, StateSpace
 from ..validation import one_of
@@ -23,8 +24,6 @@ from .estimator import LocalLPVPipeline
 Array = NDArray[np.float64]
 
 _CRITERIA = ("uncertainty", "neighbour_gap")
-
-_NO_DIRECTION = 1e-12  # of a covariance, relative to its largest: rounding
 
 
 def suggest_operating_point(
@@ -124,9 +123,12 @@ def suggest_operating_point(
         for k, values in enumerate([] if without is None else without):
             left_out[i, k] = distance(structure.model(values), frozen[k])
     noise = np.full(len(places), np.nan)
-    for k, covariance in enumerate(_covariances(pipeline, places)):
+    known = pipeline.lpv_.covariance is not None
+    none: Any = []
+    deviations = pipeline.lpv_.parameter_deviations(places) if known else none
+    for k, root in enumerate(deviations):
         squares = 0.0
-        for direction in _factor(covariance).T:
+        for direction in covariance_factor(root @ root.T).T:
             moved = structure.model(theta[k] + DEVIATION * direction)
             squares += (distance(moved, frozen[k]) / DEVIATION) ** 2
         noise[k] = np.sqrt(squares)
@@ -184,29 +186,3 @@ def _interpolated_without(
             return np.reshape(values, (len(places), theta.shape[1]))
     except ValueError:
         return None
-
-
-def _covariances(pipeline: LocalLPVPipeline, places: Array) -> Sequence[Array]:
-    """Covariances of the interpolated parameters at places; none where not known."""
-    form = pipeline.interpolator_
-    if not hasattr(form, "information"):
-        return []
-    found = form.information(
-        pipeline.operating_points_, pipeline.parameters_covariance_
-    )
-    if found is None:
-        return []
-    size = np.sqrt(np.diagonal(found))
-    size = np.where(size > 0, size, 1.0)
-    root = _factor(np.linalg.pinv(found / size[:, None] / size, hermitian=True))
-    slopes = form.sensitivities(places) @ (root / size[:, None])
-    return [S @ S.T for S in slopes]
-
-
-def _factor(covariance: Array) -> Array:
-    """F of as few columns as it has directions, ``F F^T`` the covariance."""
-    size = np.sqrt(np.diagonal(covariance))
-    size = np.where(size > 0, size, 1.0)
-    values, vectors = np.linalg.eigh(covariance / size[:, None] / size)
-    kept = values > _NO_DIRECTION * values.max(initial=0.0)
-    return size[:, None] * vectors[:, kept] * np.sqrt(values[kept])

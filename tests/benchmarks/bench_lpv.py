@@ -11,7 +11,9 @@ A spring of quadratic stiffness, seven points, two of 100 samples and five of 30
 quadratic parameters, of AutoLPV and of a parabola without weights.
 
 The arm's models refined on two sweeps at 30 dB, one in either direction, and models of
-these sweeps alone: BFT on new noise-free ones, at full, half and double speed.
+these sweeps alone: BFT on new noise-free ones, at full, half and double speed; of the
+bands of 95 %, the share of outputs that are within (of those of the parameters alone,
+too), with the refinement and with the local experiments alone.
 
 Time and memory of a step of the refinement, by the number of samples.
 """
@@ -21,6 +23,7 @@ from __future__ import annotations
 import argparse
 import resource
 import time
+import warnings
 from collections import Counter, defaultdict
 from typing import NamedTuple
 
@@ -42,6 +45,7 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.datasets import FlexibleArm, make_flexible_arm, prbs
+from lpvlearn.exceptions import ExtrapolationWarning
 from lpvlearn.paper.tables import both_sweeps, sweeps_table
 
 INTERPOLATORS = {
@@ -200,9 +204,27 @@ def scores(model: LPVStateSpace, runs: list) -> np.ndarray:
     )
 
 
+def coverage(model: LocalLPVPipeline | OutputErrorLPV, runs: list) -> np.ndarray:
+    """Percent of the outputs of runs, two at each speed, within the bands of 95 %.
+
+    Of the whole bands, and of those of the parameters alone.
+    """
+    X, y = from_trajectories(runs, sampling_time=1e-3)
+    with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):
+        error = np.abs(model.predict(X) - y.to_numpy())
+    std = model.prediction_std(X)
+    parts = (std.xs(part, axis=1, level="part") for part in ("total", "parameters"))
+    inside = [(error <= 1.96 * part.to_numpy()).mean(axis=1) for part in parts]
+    speed = X["experiment"].to_numpy() // 2
+    return 100 * np.array(
+        [[part[speed == k].mean() for k in range(len(SPEEDS))] for part in inside]
+    )
+
+
 def bench_refined(seeds: range) -> None:
     """Print rows of the local models, refined, and of the sweeps alone."""
     fits: dict[str, list[np.ndarray]] = defaultdict(list)
+    inside: dict[str, list[np.ndarray]] = defaultdict(list)
     seconds: dict[str, list[float]] = defaultdict(list)
     rates: Counter[str] = Counter()
     for seed in seeds:
@@ -220,9 +242,12 @@ def bench_refined(seeds: range) -> None:
         ]
 
         for name, (restructurer, interpolator) in REFINED.items():
-            pipeline = LocalLPVPipeline(
-                LOCAL, restructurer, interpolator, OutputErrorLPV(), **ROLES
-            ).fit(*both)
+            steps = (LOCAL, restructurer, interpolator)
+            pipeline = LocalLPVPipeline(*steps, OutputErrorLPV(), **ROLES).fit(*both)
+            inside[name].append(coverage(pipeline, new))
+            if restructurer != "aligned":
+                local = LocalLPVPipeline(*steps, **ROLES).fit(data.X, data.y)
+                inside[f"{name}, local"].append(coverage(local, new))
             seconds[name].append(pipeline.step_times_["refinement"])
             rates[name] += pipeline.refiner_.rate_
             fits[name].append(scores(pipeline.lpv_, new))
@@ -230,6 +255,7 @@ def bench_refined(seeds: range) -> None:
             begin = time.process_time()
             model = OutputErrorLPV(start, interpolator=form, local=LOCAL, **ROLES)
             model.fit(X, y)
+            inside[name].append(coverage(model, new))
             seconds[name].append(time.process_time() - begin)
             rates[name] += model.rate_
             fits[name].append(scores(model.lpv_, new))
@@ -244,6 +270,18 @@ def bench_refined(seeds: range) -> None:
             f"{'':27} {np.median(seconds[name]):.1f} s, rate terms in {rates[name]} of "
             f"{len(values)}"
         )
+    print("\nWithin the bands of 95 %, at full, half and double speed (%)")
+    for name, shares in inside.items():
+        (mean, alone), worst = np.mean(shares, axis=0), np.min(shares, axis=0)[0]
+        row = (
+            f"{label} " + "  ".join(f"{value:5.1f}" for value in values)
+            for label, values in (
+                ("mean", mean),
+                ("worst", worst),
+                ("parameters alone", alone),
+            )
+        )
+        print(f"{name:27} {'   '.join(row)}")
 
 
 def bench_growth() -> None:

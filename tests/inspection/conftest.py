@@ -72,6 +72,20 @@ def pipeline(tables):
     ).fit(*tables)
 
 
+@pytest.fixture(scope="session")
+def noisy(tables):
+    """A pipeline on outputs with noise, which knows how uncertain it is."""
+    X, y = tables
+    noise = 0.05 * y["angle"].std() * np.random.default_rng(1).normal(size=y.shape)
+    return LocalLPVPipeline(
+        local=SubspaceLTI(order=2, horizon=8),
+        restructurer=GrayBoxRestructurer(SPRING),
+        scheduling="kappa",
+        experiment="run",
+        time="time",
+    ).fit(X, y + noise)
+
+
 def random_model(seed, order=4, n_outputs=2, n_inputs=3, sampling_time=None):
     return stable_model(
         seed, order, n_inputs, n_outputs, sampling_time=sampling_time, feedthrough=True

@@ -121,6 +121,21 @@ def test_bode_of_an_identified_model_shows_what_it_knows_of_its_error(tables, ph
     assert (error < 4 * display.std["SubspaceLTI"])[known].mean() > 0.9
 
 
+def test_bode_draws_the_band_of_an_interpolated_model(noisy):
+    display = BodeDisplay.from_estimator(noisy, kappa=0.4, uncertainty=True)
+    assert list(display.std) == ["interpolated"]
+    std = noisy.lpv_.frequency_response_std(0.4, display.omega)
+    assert_allclose(
+        display.std["interpolated"] ** 2, (std.real**2 + std.imag**2) / 2, rtol=1e-12
+    )
+    assert len(display.axes_[0, 0].collections) == 1
+    error = np.abs(
+        display.responses["interpolated"]
+        - spring(0.4).frequency_response(display.omega)
+    )
+    assert (error < 4 * display.std["interpolated"]).mean() > 0.9
+
+
 def test_bode_divides_a_subplot_into_its_grid(plt):
     figure, (left, right) = plt.subplots(1, 2)
     display = BodeDisplay.from_models({"a": random_model(0)}, ax=right)

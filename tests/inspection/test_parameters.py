@@ -104,3 +104,22 @@ def test_a_constant_parameter_is_drawn_flat():
 def test_parameter_errors_teach(kappa, parameters, names, message):
     with pytest.raises(ValueError, match=message):
         ParameterDisplay.from_parameters(kappa, parameters, names=names)
+
+
+def test_bands_are_those_of_the_interpolation(noisy):
+    display = ParameterDisplay.from_estimator(noisy, uncertainty=True)
+    for k, name in enumerate(display.names):
+        bars, band = display.axes_[k].collections
+        low, high = np.array([segment[:, 1] for segment in bars.get_segments()]).T
+        assert_allclose(high - low, 4 * noisy.parameters_std_[name])
+        fine = display.curves_["restructured"][k].get_xdata()
+        mean, std = noisy.lpv_.parameters(fine, return_std=True)
+        edges = band.get_paths()[0].vertices[:, 1]
+        assert_allclose(edges.max(), (mean + 2 * std)[:, k].max())
+        assert_allclose(edges.min(), (mean - 2 * std)[:, k].min())
+
+
+def test_bars_need_the_shape_of_the_parameters():
+    theta = {"local": np.ones((4, 2))}
+    with pytest.raises(ValueError, match=r"`std\['local'\]` must have shape \(4, 2\)"):
+        ParameterDisplay(KAPPA, theta, std={"local": np.ones((3, 2))})

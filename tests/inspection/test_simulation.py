@@ -128,3 +128,33 @@ def test_missing_measurements_leave_a_gap_and_do_not_count(pipeline, tables):
     assert_allclose(display.bft_["simulated"], expected)
     with pytest.raises(ValueError, match="`y_pred` must be finite"):
         SimulationDisplay.from_predictions([0, 1], [1.0, np.nan], [np.nan, 1.0])
+
+
+def test_bands_are_those_of_outputs_without_noise(noisy, tables):
+    X, y = tables
+    display = SimulationDisplay.from_estimator(
+        noisy, X, y, experiment="b", uncertainty=True, zoom=(2.0, 5.0)
+    )
+    rows = (X["run"] == "b").to_numpy()
+    mean, std = noisy.predict(X[rows], return_std=True)
+    assert_allclose(display.std["simulated"], std)
+    (band,) = display.axes_[0].collections
+    shown = (display.time >= 2.0) & (display.time <= 5.0)
+    edges = band.get_paths()[0].vertices[:, 1]
+    assert_allclose(edges.max(), (mean + 2 * std)[shown].max())
+    assert "simulated ± 2 std: BFT" in legend_texts(display.axes_[0])[1]
+
+
+def test_bands_that_are_not_known_are_refused(noisy, tables):
+    options = {"uncertainty": True}
+    with pytest.raises(ValueError, match="`uncertainty` must be False.*'estimate'"):
+        SimulationDisplay.from_estimator(
+            noisy, *tables, initial_state="estimate", **options
+        )
+    black_box = SubspaceLTI(2, inputs="u", experiment="run", time="time")
+    with pytest.raises(ValueError, match="Got True with SubspaceLTI"):
+        SimulationDisplay.from_estimator(black_box.fit(*tables), *tables, **options)
+    time, y = np.arange(3.0), np.ones(3)
+    for std in ({"other": y}, {"model": np.ones(2)}):
+        with pytest.raises(ValueError, match="`std` must have names of simulations"):
+            SimulationDisplay(time, y, {"model": y}, std=std)

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.polynomial.chebyshev import chebvander
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -720,3 +721,57 @@ def test_wrong_rate_terms_are_explained():
     wrong = replace(model, rate_terms=model.interpolator)
     with pytest.raises(ValueError, match="`rate_terms` must predict the 1 matrices"):
         wrong.simulate(inputs(5), sweep(5), DT)
+
+
+def uncertain_spring():
+    F = 1e-2 * np.random.default_rng(0).normal(size=(9, 9))
+    return replace(spring_lpv(), covariance=F @ F.T)
+
+
+def test_deviations_of_parameters_are_those_of_the_terms():
+    """Of a polynomial, ``phi^T P phi`` for every parameter."""
+    lpv = uncertain_spring()
+    kappa = np.linspace(-0.2, 1.7, 9)
+    phi = chebvander(kappa / 0.75 - 1.0, 2)
+    values, std = lpv.parameters(kappa, return_std=True)
+    P = lpv.covariance.reshape(3, 3, 3, 3)
+    expected = np.einsum("kt,tpsp,ks->kp", phi, P, phi)
+    np.testing.assert_allclose(std**2, expected)
+    np.testing.assert_array_equal(values, lpv.parameters(kappa))
+    each = lpv.parameter_deviations(kappa)
+    np.testing.assert_allclose(np.linalg.norm(each, axis=2), std)
+
+
+@pytest.mark.parametrize("delay", [0, 0.3])
+def test_deviations_of_responses_equal_differences(delay):
+    lpv = replace(uncertain_spring(), input_delay=delay)
+    omega, h = np.array([0.1, 5.0, 7.0, 40.0]), 1e-4
+    c, squares = lpv.interpolator.coefficients(), 0.0
+    for step in lpv.covariance_root().T:
+        above, below = (
+            replace(lpv, interpolator=lpv.interpolator.with_coefficients(c + s * step))
+            .at(0.4)
+            .frequency_response(omega)
+            for s in (h, -h)
+        )
+        slope = (above - below) / (2 * h)
+        squares = squares + slope.real**2 + 1j * slope.imag**2
+    std = lpv.frequency_response_std(0.4, omega)
+    np.testing.assert_allclose(std.real**2 + 1j * std.imag**2, squares, rtol=1e-6)
+    moved = lpv.change_basis(lambda kappa: np.diag([1, 1 + kappa[0]]))
+    np.testing.assert_allclose(moved.frequency_response_std(0.4, omega), std)
+
+
+def test_a_covariance_is_one_of_the_coefficients():
+    lpv = spring_lpv()
+    with pytest.raises(ValueError, match=r"`covariance` must be a finite.*\(9, 9\)"):
+        replace(lpv, covariance=np.eye(3))
+    foreign = KNeighborsRegressor(1).fit([[0.0], [1.0]], np.ones((2, 3)))
+    with pytest.raises(ValueError, match="`covariance` needs regressors with coef"):
+        replace(lpv, interpolator=foreign, covariance=np.eye(3))
+    for call in (
+        lambda: lpv.parameters([0.1], return_std=True),
+        lambda: lpv.frequency_response_std(0.1, [1.0]),
+    ):
+        with pytest.raises(ValueError, match="`covariance` is None.*AutoLPV"):
+            call()
