@@ -23,6 +23,7 @@ from .. import (
     SubspaceLTI,
 )
 from ..datasets import make_flexible_arm
+from ..exceptions import collected
 from ..pipeline.estimator import Stopwatch
 from ..pipeline.points import balanced_entries
 from .tables import (
@@ -129,7 +130,8 @@ def run_paper_experiment(
     ).fit(data.X, data.y)
     watch.seconds |= pipeline.step_times_
     other = "pi-moesp" if method == "po-moesp" else "po-moesp"
-    with watch.step(f"local models by {other}, for comparison"):
+    # whose interpolation is of no interest, nor is what is told of it
+    with watch.step(f"local models by {other}, for comparison"), collected():
         comparison = LocalLPVPipeline(
             SubspaceLTI(data.structure.order, method=other, **_LOCAL),
             "passthrough",

@@ -501,6 +501,7 @@ def test_models_that_lack_a_point_are_scored_on_all_experiments(table):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`lpv_` is unstable")
 def test_a_gap_of_few_points_misjudges_the_degree(tmp_path):
     """A resonance between the points: only the whole range tells what it costs."""
     kappas = np.linspace(0, 1.5, 7)
