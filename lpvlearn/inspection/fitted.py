@@ -20,33 +20,40 @@ def unwrapped(estimator: Any) -> Any:
 def models_of(
     estimator: Any, kappa: float | ArrayLike | None = None
 ) -> dict[str, StateSpace]:
-    """State-space models of a fitted estimator, by name; a pipeline's at `kappa`."""
+    """State-space models of a fitted estimator, by name; those of an LPV at `kappa`.
+
+    Of a pipeline the local models of the nearest operating point too.
+    """
     estimator = unwrapped(estimator)
     if hasattr(estimator, "lti_"):
         return {type(estimator).__name__: estimator.lti_}
     if not hasattr(estimator, "lpv_"):
         raise ValueError(
-            "`estimator` must be a fitted SubspaceLTI, GrayBoxRestructurer or "
-            f"LocalLPVPipeline. Got {type(estimator).__name__} without `lti_` or "
-            "`lpv_`; call fit() first."
+            "`estimator` must be a fitted SubspaceLTI, GrayBoxRestructurer, "
+            f"LocalLPVPipeline or OutputErrorLPV. Got {type(estimator).__name__} "
+            "without `lti_` or `lpv_`; call fit() first."
         )
-    points = estimator.operating_points_
+    lpv, points = estimator.lpv_, getattr(estimator, "operating_points_", None)
     if kappa is None:
-        shown = ", ".join(np.array2string(k, precision=4) for k in points)
+        known = "range is" if points is None else "operating points are"
+        places = lpv.scheduling_range if points is None else points
+        shown = ", ".join(np.array2string(k, precision=4) for k in places)
         raise ValueError(
-            "`kappa` must tell at which scheduling value to draw the pipeline's "
-            f"models. Got None; its operating points are {shown}."
+            "`kappa` must tell at which scheduling value to draw the LPV model's "
+            f"frozen models. Got None; its {known} {shown}."
         )
     place = as_numbers("kappa", kappa).reshape(-1)
-    if place.shape != points.shape[1:]:
+    if len(place) != lpv.n_scheduling:
         raise ValueError(
-            f"`kappa` must hold {points.shape[1]} scheduling value(s). Got {kappa!r}."
+            f"`kappa` must hold {lpv.n_scheduling} scheduling value(s). Got {kappa!r}."
         )
-    nearest = int(np.argmin(np.linalg.norm(points - place, axis=1)))
-    found = {"local": estimator.local_models_[nearest]}
-    if estimator.restructurers_:
-        found["gray-box"] = estimator.structured_models_[nearest]
-    return found | {"interpolated": estimator.lpv_.at(place)}
+    found = {}
+    if points is not None:
+        nearest = int(np.argmin(np.linalg.norm(points - place, axis=1)))
+        found["local"] = estimator.local_models_[nearest]
+        if estimator.restructurers_:
+            found["gray-box"] = estimator.structured_models_[nearest]
+    return found | {"interpolated": lpv.at(place)}
 
 
 def fitted_pipeline(pipeline: Any, attribute: str) -> Any:

@@ -137,8 +137,9 @@ class PoleDisplay:
 
         Parameters
         ----------
-        pipeline : fitted LocalLPVPipeline
-            With one scheduling variable. Its black-box local models are drawn as rings.
+        pipeline : fitted LocalLPVPipeline or OutputErrorLPV
+            With one scheduling variable. The black-box local models of a pipeline are
+            drawn as rings.
         kappa : array-like of shape (n_points,), default=None
             Scheduling values; None is 101 over the identified range.
         damping : bool, default=False
@@ -157,12 +158,17 @@ class PoleDisplay:
         """
         pipeline = fitted_pipeline(pipeline, "lpv_")
         grid = _grid(pipeline.lpv_, kappa)
-        points, models = pipeline.operating_points_[:, 0], pipeline.local_models_
+        local: dict[str, Any] = {}
+        if hasattr(pipeline, "local_models_"):
+            points, models = pipeline.operating_points_[:, 0], pipeline.local_models_
+            local = {
+                "local_kappa": np.repeat(points, [model.order for model in models]),
+                "local_poles": np.concatenate([m.poles() for m in models])[:, None],
+            }
         display = cls(
             grid,
             pipeline.lpv_.frozen_poles(grid),
-            local_kappa=np.repeat(points, [model.order for model in models]),
-            local_poles=np.concatenate([model.poles() for model in models])[:, None],
+            **local,
             scheduling_label=scheduling_label or scheduling_name(pipeline),
         )
         return display.plot(ax, damping=damping)

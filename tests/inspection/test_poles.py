@@ -6,11 +6,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lpvlearn import (
     LPVStateSpace,
+    OutputErrorLPV,
     PolynomialLPV,
+    from_trajectories,
 )
-from lpvlearn.inspection import (
-    PoleDisplay,
-)
+from lpvlearn.inspection import BodeDisplay, PoleDisplay
 
 from .conftest import SPRING, spring
 
@@ -33,6 +33,24 @@ def test_pole_points_are_the_frozen_poles_coloured_by_scheduling():
     assert display.local_points_ is None
     right = display.ax_.get_xlim()[1]
     assert right > 0  # the border of stability is seen
+
+
+def test_a_model_of_moving_data_is_drawn_without_local_ones():
+    """The refined model of a table, at any value of its range."""
+    lpv = lpv_of(1)
+    kappa = np.linspace(0, 1, 120)
+    u = np.sign(np.random.default_rng(0).standard_normal(120))
+    X, y = from_trajectories(
+        [(u, kappa, lpv.simulate(u, kappa, 0.2))], sampling_time=0.2
+    )
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    fitted = OutputErrorLPV(lpv, rate=False, **roles).fit(X, y)
+    display = PoleDisplay.from_estimator(fitted)
+    assert display.local_points_ is None
+    bode = BodeDisplay.from_estimator(fitted, kappa=0.5)
+    assert list(bode.responses) == ["interpolated"]
+    with pytest.raises(ValueError, match="`kappa` must tell.*its range is"):
+        BodeDisplay.from_estimator(fitted)
 
 
 def test_damping_lines_go_through_poles_of_that_damping():
