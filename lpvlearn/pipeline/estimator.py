@@ -239,9 +239,9 @@ list, default=None
         standard deviation, RMSE and FIT (percent) of the interpolation.
     output_errors_ : DataFrame
         One row per output: standard deviations of the "model_error" and of the "noise"
-        in what `lpv_` leaves of the outputs of the local experiments, or with a
-        `refiner` of those that move. Noise is what is white of it. NaN where `lpv_`
-        diverges.
+        in what `lpv_` leaves of the outputs of the local experiments (four of each
+        operating point), or with a `refiner` of those that move. Noise is what is white
+        of it. NaN where `lpv_` diverges.
     step_times_ : dict of str to float
         Seconds that each step took.
     warnings_ : list of str

@@ -62,6 +62,8 @@ _NO_COEFFICIENTS = (
 # time-invariant models are made, too; how many of these are tried, by so many steps.
 _PARTS, _N_STARTS, _FIRST_STEPS = 5, 3, 15
 
+_LOOKED_AT = 4  # experiments of an operating point: more tell the same of the errors
+
 _LEVELS = 5  # of every scheduling variable, where a form begins as a constant
 
 
@@ -696,8 +698,8 @@ def local_covariance(form: Any, found: StructuredModels) -> Array | None:
 def local_output_errors(
     model: LPVStateSpace, found: StructuredModels, sampling_time: float
 ) -> pd.DataFrame:
-    """`output_errors` of an LPV model along the local experiments."""
-    runs = [e for group in found.points.experiments for e in group]
+    """`output_errors` of an LPV model along some local experiments of each point."""
+    runs = [e for group in found.points.experiments for e in group[:_LOOKED_AT]]
     quiet, own = model.silenced(), _own_of_local(found)
     try:
         errors = [_errors(quiet, e, _record(e, sampling_time), own) for e in runs]
