@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from joblib import Memory, hash
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
+from sklearn.base import clone
 from sklearn.utils.validation import (
     check_is_fitted,
     check_memory,
@@ -27,8 +27,6 @@ from ..data.experiments import (
     NO_TIME,
     Experiment,
     as_list,
-    n_rows_of,
-    read_experiments,
     read_outputs,
 )
 from ..data.operating_points import (
@@ -36,22 +34,18 @@ from ..data.operating_points import (
     local_experiments,
     moving_experiments,
 )
-from ..data.preparation import read_runs
-from ..data.scoring import score_from_rest
-from ..data.timestamps import TIME_TOL, check_unit
-from ..exceptions import VersionedPickle, retold, warn
+from ..data.timestamps import TIME_TOL
+from ..exceptions import retold, warn
 from ..lpv.auto import AutoLPV
-from ..lpv.model import LPVStateSpace, warn_extrapolation
+from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.spline import SplineLPV
 from ..metrics.reports import readable_report
 from ..metrics.scorers import InitialState
-from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
-from .bands import prediction_std
 from .html_report import html_report
 from .output_error import (
     known_coefficients,
@@ -68,6 +62,7 @@ from .points import (
     restructure_points,
 )
 from .reports import Summary, Tables, summarise, tables
+from .scheduled import ScheduledEstimator
 from .stability import growth_rates
 
 Array = NDArray[np.float64]
@@ -108,9 +103,7 @@ class Stopwatch:
         return pd.DataFrame(rows, columns=["step", "seconds"])
 
 
-class LocalLPVPipeline(
-    VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator
-):
+class LocalLPVPipeline(ScheduledEstimator):
     """Local LPV identification: experiments at operating points to one LPV model.
 
     Identifies a black-box model at every operating point, brings each into the
@@ -480,138 +473,6 @@ list, default=None
                 )
         self.step_times_ = watch.seconds
 
-    # -- use -----------------------------------------------------------------------
-
-    def predict(self, X: Any, return_std: bool = False) -> Array | tuple[Array, Array]:
-        """Simulate the LPV model along every experiment of a table, from rest.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        return_std : bool, default=False
-            Whether to return standard deviations of the outputs too: the column "total"
-            of `prediction_std`.
-
-        Returns
-        -------
-        ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
-        std : ndarray of the same shape
-            With `return_std`. A band of 95 % is 1.96 of them to both sides.
-
-        Raises
-        ------
-        ValueError
-            If `return_std` asks for what is not known.
-        DivergenceError
-            If the outputs overflow, for the model is unstable along an experiment.
-
-        Warns
-        -----
-        ExtrapolationWarning
-            Where a scheduling variable leaves `scheduling_range_`.
-        """
-        check_is_fitted(self, "lpv_")
-        y = self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
-        if not return_std:
-            return y
-        total = self.prediction_std(X).xs("total", axis=1, level="part")
-        return y, total.to_numpy().reshape(y.shape)
-
-    def prediction_std(self, X: Any) -> pd.DataFrame:
-        """Standard deviations of the outputs that `predict` gives, part by part.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-
-        Returns
-        -------
-        DataFrame of shape (n_samples, 4 n_outputs)
-            For every output the columns
-
-            - "parameters": by the covariance of the coefficients, ``lpv_.covariance``,
-              to first order;
-            - "model_error": of the model's own, "model_error" of `output_errors_`, the
-              same at all times;
-            - "total": of the output without noise, the root of the sum of their
-              squares;
-            - "measurement": of an output that is measured, with the "noise" too.
-
-        Raises
-        ------
-        ValueError
-            If ``lpv_.covariance`` is not known.
-
-        Notes
-        -----
-        Local experiments do not show what the model misses while the scheduling
-        variables move; a `refiner` sees that on experiments that do. Without one the
-        bands are those of a model that is true in motion, and may be far too narrow.
-        Where no form of the interpolation meets the points but for their noise, the
-        covariance is multiplied by chi-square per degree of freedom. Offsets count as
-        known. See :ref:`guide_bands`.
-        """
-        check_is_fitted(self, "lpv_")
-        return prediction_std(
-            self.lpv_,
-            self.output_errors_,
-            self._read(X, None),
-            self.sampling_time_,
-            X,
-        )
-
-    def predict_with_initial_state(self, X: Any, y: Any) -> Array:
-        """Simulate from initial states estimated on the measured outputs.
-
-        For tables that start in the middle of an experiment: `y` serves for the initial
-        state of every experiment only (least squares over the whole experiment).
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
-            Missing outputs (NaN) are left out.
-
-        Returns
-        -------
-        ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
-            Where `local` has ``missing="split"``, NaN at missing inputs or scheduling
-            values; the simulation begins anew after them.
-        """
-        check_is_fitted(self, "lpv_")
-        return self._simulate(
-            self._read(X, y, outputs=False), n_rows_of(X), estimate=True
-        )
-
-    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
-        """Coefficient of determination of the simulation from rest.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
-            Samples of which an output is missing (NaN) are left out.
-        sample_weight : array-like of shape (n_samples,), default=None
-
-        Returns
-        -------
-        float
-            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
-
-        Warns
-        -----
-        UserWarning
-            If an experiment starts in mid-motion, which a simulation from rest misses.
-        """
-        return score_from_rest(self, X, y, sample_weight)
-
-    def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
-        """Rows of every experiment of a table, in the order of time."""
-        check_is_fitted(self, "lpv_")
-        gaps = "Xy" if self._splits else ""
-        found = read_experiments(self, X, reset=False, allow_missing=gaps)
-        return [e.rows for e in found]
-
     def summary(self) -> str:
         """What was identified and how well, as text: ``print(pipeline.summary())``."""
         return self._summarised().text
@@ -699,37 +560,11 @@ list, default=None
             f"{readable_report(self.refiner_.report_).to_string()}"
         )
 
-    def _simulate(
-        self, experiments: list[Experiment], n_samples: int, *, estimate: bool
-    ) -> Array:
-        signals = [e.scheduling for e in experiments if e.scheduling is not None]
-        if signals and getattr(self.interpolator_, "extrapolation", None) != "clip":
-            warn_extrapolation(
-                np.vstack(signals), self.scheduling_range_, self.scheduling_names_
-            )
-        model = self.lpv_.silenced()  # said above, of all experiments at once
-        out = simulate_experiments(
-            model, experiments, self.sampling_time_, n_samples, estimate=estimate
-        )
-        return out[:, 0] if self._single_output else out
-
     # -- helpers -------------------------------------------------------------------
 
     @property
     def _splits(self) -> bool:
         return getattr(self.local, "missing", None) == "split"
-
-    def _read(
-        self, X: Any, y: Any, *, reset: bool = False, **options: Any
-    ) -> list[Experiment]:
-        """Experiments of a table; options as in `read_runs`."""
-        declared = self.sampling_time if reset else None
-        options |= {"split": self._splits, "reset": reset, "sampling_time": declared}
-        experiments = read_runs(self, X, y, **options)
-        if not reset:  # another step will do, but hardly another unit
-            for e in experiments:
-                check_unit(e.sampling_time, self.sampling_time_, self.time)
-        return experiments
 
     def _sampling_time(self, experiments: list[Experiment], structure: Any) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]
@@ -796,11 +631,6 @@ list, default=None
             )
         for name in _STEPS:
             _check_step(name, getattr(self, name))
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.regressor_tags.poor_score = True
-        return tags
 
 
 def _told_apart(

@@ -10,26 +10,22 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
-from sklearn.utils.validation import check_is_fitted
+from sklearn.base import clone
 
 from ..data.experiments import (
     NO_TIME,
     Experiment,
     as_list,
-    n_rows_of,
     naming,
-    read_experiments,
     read_outputs,
 )
 from ..data.operating_points import check_outputs
-from ..data.preparation import part_of, read_runs
-from ..data.scoring import score_from_rest
-from ..data.timestamps import TIME_TOL, check_unit
-from ..exceptions import VersionedPickle, collected
+from ..data.preparation import part_of
+from ..data.timestamps import TIME_TOL
+from ..exceptions import collected
 from ..lpv.bands import left_out_errors
 from ..lpv.interpolator import Interpolator, grid_over
-from ..lpv.model import LPVStateSpace, warn_extrapolation
+from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.refinement import (
     Own,
@@ -43,13 +39,13 @@ from ..lpv.refinement import (
 )
 from ..lpv.weighting import covariance_of
 from ..metrics.scores import bft_score
-from ..metrics.table_simulation import simulate_experiments
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import one_of, positive_time, whole_number
-from .bands import output_errors, prediction_std
+from .bands import output_errors
 from .points import StructuredModels, balanced_entries, identify_point
+from .scheduled import ScheduledEstimator
 
 Array = NDArray[np.float64]
 
@@ -67,7 +63,7 @@ _LOOKED_AT = 4  # experiments of an operating point: more tell the same of the e
 _LEVELS = 5  # of every scheduling variable, where a form begins as a constant
 
 
-class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator):
+class OutputErrorLPV(ScheduledEstimator):
     """An LPV model fitted to experiments along which the scheduling variables move.
 
     Minimises the simulation error over the coefficients of the interpolation, from a
@@ -260,14 +256,7 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
             If the start diverges on an experiment.
         """
         self._check_options()
-        experiments = read_runs(
-            self,
-            X,
-            y,
-            split=self.missing == "split",
-            reset=True,
-            sampling_time=self.sampling_time,
-        )
+        experiments = self._read(X, y, reset=True)
         names = read_outputs(y)[1]
         check_outputs(experiments, names)
         self._single_output = np.asarray(y).ndim == 1
@@ -375,146 +364,11 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
         self.history_ = pd.DataFrame(found.costs, columns=["round", "cost"])
         return self
 
-    # -- use -----------------------------------------------------------------------
-
-    def predict(self, X: Any, return_std: bool = False) -> Array | tuple[Array, Array]:
-        """Simulate the model along every experiment of a table, from rest.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        return_std : bool, default=False
-            Whether to return standard deviations of the outputs too: the column "total"
-            of `prediction_std`.
-
-        Returns
-        -------
-        ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
-        std : ndarray of the same shape
-            With `return_std`. A band of 95 % is 1.96 of them to both sides.
-
-        Raises
-        ------
-        ValueError
-            If `return_std` asks for what is not known.
-        DivergenceError
-            If the outputs overflow.
-
-        Warns
-        -----
-        ExtrapolationWarning
-            Where a scheduling variable leaves ``lpv_.identified_range``.
-        """
-        check_is_fitted(self, "lpv_")
-        y = self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
-        if not return_std:
-            return y
-        total = self.prediction_std(X).xs("total", axis=1, level="part")
-        return y, total.to_numpy().reshape(y.shape)
-
-    def prediction_std(self, X: Any) -> pd.DataFrame:
-        """Standard deviations of the outputs that `predict` gives, part by part.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-
-        Returns
-        -------
-        DataFrame of shape (n_samples, 4 n_outputs)
-            For every output the columns
-
-            - "parameters": by the covariance of the coefficients, ``lpv_.covariance``,
-              to first order;
-            - "model_error": of the model's own, "model_error" of `output_errors_`, the
-              same at all times;
-            - "total": of the output without noise, the root of the sum of their
-              squares;
-            - "measurement": of an output that is measured, with the "noise" too.
-
-        Raises
-        ------
-        ValueError
-            If ``lpv_.covariance`` is not known.
-
-        Notes
-        -----
-        The model's own error is what it leaves of the outputs it was fitted to, but for
-        white noise: about as large on experiments that move alike, not on others.
-        """
-        check_is_fitted(self, "lpv_")
-        return prediction_std(
-            self.lpv_,
-            self.output_errors_,
-            self._read(X, None),
-            self.sampling_time_,
-            X,
-        )
-
-    def predict_with_initial_state(self, X: Any, y: Any) -> Array:
-        """Simulate from initial states estimated on the measured outputs.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
-            Missing outputs (NaN) are left out.
-
-        Returns
-        -------
-        ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
-        """
-        check_is_fitted(self, "lpv_")
-        found = self._read(X, y, outputs=False)
-        return self._simulate(found, n_rows_of(X), estimate=True)
-
-    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
-        """Coefficient of determination of the simulation from rest.
-
-        Parameters
-        ----------
-        X : DataFrame or array-like of shape (n_samples, n_features)
-        y : DataFrame or array-like of shape (n_samples, n_outputs) or (n_samples,)
-            Samples of which an output is missing (NaN) are left out.
-        sample_weight : array-like of shape (n_samples,), default=None
-
-        Returns
-        -------
-        float
-            Mean over the outputs, as :func:`sklearn.metrics.r2_score`.
-        """
-        return score_from_rest(self, X, y, sample_weight)
-
-    def split_experiments(self, X: Any) -> list[NDArray[np.intp]]:
-        """Rows of every experiment of a table, in the order of time."""
-        check_is_fitted(self, "lpv_")
-        gaps = "Xy" if self.missing == "split" else ""
-        found = read_experiments(self, X, reset=False, allow_missing=gaps)
-        return [e.rows for e in found]
-
     # -- helpers -------------------------------------------------------------------
 
-    def _read(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
-        options |= {"split": self.missing == "split", "reset": False}
-        experiments = read_runs(self, X, y, **options)
-        for e in experiments:
-            check_unit(e.sampling_time, self.sampling_time_, self.time)
-        return experiments
-
-    def _simulate(
-        self, experiments: list[Experiment], n_samples: int, *, estimate: bool
-    ) -> Array:
-        signals = [e.scheduling for e in experiments if e.scheduling is not None]
-        clips = getattr(self.lpv_.interpolator, "extrapolation", None) == "clip"
-        if signals and not clips:
-            warn_extrapolation(
-                np.vstack(signals), self.scheduling_range_, self.scheduling_names_
-            )
-        model = self.lpv_.silenced()  # said above, of all experiments at once
-        out = simulate_experiments(
-            model, experiments, self.sampling_time_, n_samples, estimate=estimate
-        )
-        return out[:, 0] if self._single_output else out
+    @property
+    def _splits(self) -> bool:
+        return self.missing == "split"
 
     def _sampling_time(self, experiments: Sequence[Experiment]) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]
@@ -621,11 +475,6 @@ class OutputErrorLPV(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEsti
                 "`start` must be an LPVStateSpace (of a fitted pipeline, its `lpv_`), "
                 f"a GrayBoxStructure, or None. Got {type(self.start).__name__}."
             )
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.regressor_tags.poor_score = True
-        return tags
 
 
 def refine_model(
