@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from .model import LPVStateSpace
-from .refinement import Own, Prior, Record, Refined, initial_state, weighted_slopes
+from .refinement import Own, Record, Refined, initial_state, weighted_slopes
 from .sensitivity import coefficients_of, output_slopes, with_coefficients
 from .weighting import sizes_of
 
@@ -100,21 +100,20 @@ def left_out_errors(
     found: Refined,
     records: Sequence[Record],
     own: Own,
-    prior: Prior | None = None,
     *,
     n_jobs: int | None = None,
 ) -> list[Array]:
     """Errors (n_samples, n_outputs) of records without which the model was fitted.
 
     `found` on all of the records, with unknowns of their own as they are there.
-    `prior` is one of all coefficients.
     """
     model = replace(found.model.silenced(), bases=())
     c, free, weight = coefficients_of(model), found.free, 1.0 / found.deviation
     q = int(free.sum())
     centre, information = c, np.zeros((q, q))
-    if prior is not None:
-        centre, information = prior.centre, prior.information[np.ix_(free, free)]
+    if found.prior is not None:
+        centre, information = found.prior.centre, found.prior.information
+        information = information[np.ix_(free, free)]
     run = Parallel(n_jobs=n_jobs, return_as="generator")
     folds = [_folds_of(k, len(r.u)) for k, r in enumerate(records)]
 

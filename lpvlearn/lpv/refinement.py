@@ -17,6 +17,7 @@ import numpy as np
 from joblib import Parallel
 from joblib import delayed as later
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from ..exceptions import DivergenceError
 from ..systems.least_squares import RCOND, column_scale, levenberg_marquardt
@@ -46,6 +47,10 @@ _PIECES = 8  # of a record, not shorter than _PIECE samples a state
 _PIECE = 20
 
 _RATE_DEGREE = 2  # of the rate terms in the scheduling variables
+
+# Information on every rate term, that it is zero but for chance, in that of the records
+# on it alone; from strong to weak, and none.
+_SHRINKAGE = (0.1, 1e-2, 1e-3, 1e-4, 0.0)
 
 # Share by which rate terms must lower the errors of pieces they were not fitted to:
 # what is gained by chance is less.
@@ -82,9 +87,10 @@ class Prior(NamedTuple):
     centre: Array
     information: Array
 
-    def widened(self, n: int) -> Prior:
-        """The same, with n more coefficients of which nothing is known, about zero."""
-        return Prior(np.pad(self.centre, (0, n)), np.pad(self.information, (0, n)))
+    def widened(self, information: Array) -> Prior:
+        """The same, with more coefficients, each known to be about zero."""
+        centre = np.pad(self.centre, (0, len(information)))
+        return Prior(centre, block_diag(self.information, np.diag(information)))
 
 
 class Refined(NamedTuple):
@@ -95,6 +101,7 @@ class Refined(NamedTuple):
     free: Flags  # of the coefficients of interpolator and rate terms
     deviation: Array  # (n_outputs,) standard deviations of what is left
     own: list[Array]  # unknowns of every record: initial state, constants
+    prior: Prior | None  # that it was fitted with
     costs: list[tuple[int, float]]  # round, and cost of every step taken
     n_iter: int  # steps tried
 
@@ -263,7 +270,7 @@ def refine(
     own_parts = [found for _, found in errors]
     model = replace(model, bases=bases)
     tried = max_iter - left
-    return Refined(model, G[1:, 1:], free, 1.0 / weight, own_parts, costs, tried)
+    return Refined(model, G[1:, 1:], free, 1.0 / weight, own_parts, prior, costs, tried)
 
 
 def _rotated(G: Array, size: float) -> Array:
@@ -302,32 +309,47 @@ def refine_with_rates(
 ) -> Refined:
     """`refine` with rate terms: True, False, or "auto", where they prove their worth.
 
-    That is where they lower the errors of every second piece of the records, of which
-    they were fitted to the others. A single experiment (`groups` of the records)
-    cannot tell: what it says of one direction need not be true of the other.
+    Every second piece of the records tells of terms that were fitted to the others:
+    how strongly these are to be drawn to zero, and whether they lower the errors at
+    all. A single experiment (`groups` of the records) cannot tell that: what it says
+    of one direction need not be true of the other.
     """
     alone = rate == "auto" and len(set(groups)) < 2
     if rate is False or alone or start.rate_terms is not None:
         return refine(start, records, own, prior, **options)
-    moving, kinematic = with_rate_terms(start)
-    c0, more = coefficients_of(start), len(kinematic)
-    wider = None if prior is None else prior.widened(more)
+    c0, (moving, kinematic) = coefficients_of(start), with_rate_terms(start)
     fixed = np.concatenate([np.zeros(len(c0), bool), kinematic])
-    if rate == "auto":
-        pieces = [piece for r in records for piece in _pieces(r, start.order)]
-        there = own._replace(initial_state=True)
-        static = refine(start, pieces[::2], there, prior, **options)
-        start, weight = static.model, 1.0 / static.deviation
-        moving = replace(start, rate_terms=moving.rate_terms)
-        found = refine(moving, pieces[::2], there, wider, fixed=fixed, **options)
-        lost = [
-            sum(_loss(model, piece, there, weight) for piece in pieces[1::2])
-            for model in (static.model, found.model)
-        ]
-        if not lost[1] < (1.0 - _WORTH) * lost[0]:
-            return refine(start, records, own, prior, **options)
+    known = Prior(c0, np.zeros((len(c0),) * 2)) if prior is None else prior
+    pieces = [piece for r in records for piece in _pieces(r, start.order)]
+    seen, unseen = pieces[::2], pieces[1::2] or pieces
+    there = own._replace(initial_state=True)
+    static = refine(start, seen, there, prior, **options)
+
+    def loss(model: LPVStateSpace) -> float:
+        return sum(_loss(model, r, there, 1.0 / static.deviation) for r in unseen)
+
+    def length(records: Sequence[Record]) -> int:
+        return sum(len(r.u) for r in records)
+
+    moving = replace(static.model, rate_terms=moving.rate_terms)
+    at_zero = refine(moving, seen, there, fixed=fixed, **options | {"max_iter": 0})
+    told = np.zeros(len(fixed))  # by the pieces, of every coefficient alone
+    told[~fixed] = np.diag(at_zero.information)
+    tried = []
+    for share in _SHRINKAGE:
+        drawn = share * told[len(c0) :]
+        found = refine(
+            moving, seen, there, known.widened(drawn), fixed=fixed, **options
+        )
         moving = found.model
-    return refine(moving, records, own, wider, fixed=fixed, **options)
+        tried.append((loss(moving), drawn, moving))
+        if tried[-1][0] > tried[-2:][0][0]:  # and weaker ones are worse
+            break
+    least, drawn, moving = min(tried, key=lambda one: one[0])
+    if rate == "auto" and not least < (1.0 - _WORTH) * loss(static.model):
+        return refine(start, records, own, prior, **options)
+    drawn = drawn * (length(records) / length(seen))
+    return refine(moving, records, own, known.widened(drawn), fixed=fixed, **options)
 
 
 def _pieces(record: Record, order: int) -> list[Record]:

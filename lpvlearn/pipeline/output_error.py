@@ -81,8 +81,9 @@ class OutputErrorLPV(ScheduledEstimator):
     rate : {"auto", True, False}, default="auto"
         Whether A follows the rates of change of the scheduling variables too, by terms
         ``N_j(kappa) dkappa_j/dt`` in every row of A that holds parameters, quadratic
-        polynomials. "auto": where they lower the errors of experiments that they were
-        not fitted to; not where a single experiment moves.
+        polynomials, drawn to zero as strongly as is best for pieces of the experiments
+        that they were not fitted to. "auto": where they lower the errors of these; not
+        where a single experiment moves.
     prior : {"local"}, float or None, default="local"
         What a pipeline knows of the coefficients, from the covariances of the local
         parameters (without these, from the local experiments), pulls to the start:
@@ -299,9 +300,9 @@ class OutputErrorLPV(ScheduledEstimator):
         own = Own(self.initial_state == "estimate", self.offset == "constant")
         prior, factor = None, 1.0 if self.prior == "local" else self.prior
         if known is not None and factor is not None:
-            n_more = len(coefficients_of(start)) - len(known.centre)
+            more = np.zeros(len(coefficients_of(start)) - len(known.centre))
             weighed = known._replace(information=factor * known.information)
-            prior = weighed.widened(n_more)
+            prior = weighed.widened(more)
         labels = [e.label for e in experiments]
         groups = pd.factorize(pd.Series(labels, dtype=object))[0].tolist()
         before = [
@@ -326,8 +327,6 @@ class OutputErrorLPV(ScheduledEstimator):
         if start.identified_range is not None:
             identified = _union(inner, np.asarray(start.identified_range))
         self.coefficients_ = coefficients_of(found.model)
-        if prior is not None:  # now with rate terms
-            prior = prior.widened(len(self.coefficients_) - len(prior.centre))
         self.coefficients_covariance_ = np.zeros((len(self.coefficients_),) * 2)
         free = np.flatnonzero(found.free)
         covariance = covariance_of(found.information)
@@ -359,7 +358,7 @@ class OutputErrorLPV(ScheduledEstimator):
         self.output_errors_ = output_errors(
             outputs or range(1, start.n_outputs + 1),
             after,
-            left_out_errors(found, records, own, prior, n_jobs=self.n_jobs),
+            left_out_errors(found, records, own, n_jobs=self.n_jobs),
         )
         self.history_ = pd.DataFrame(found.costs, columns=["round", "cost"])
         return self

@@ -170,10 +170,9 @@ def test_left_out_stretches_count_the_prior_and_the_own_unknowns():
     own = Own(initial_state=True, constant=True)
     prior = Prior(coefficients_of(model), 1e12 * np.eye(9))
     found = refine(model, [record], own, prior)
-    (left_out,) = left_out_errors(found, [record], own, prior)
-    (in_sample,) = left_out_errors(
-        found, [record], own, prior._replace(information=1e20 * np.eye(9))
-    )
+    (left_out,) = left_out_errors(found, [record], own)
+    surer = prior._replace(information=1e20 * np.eye(9))
+    (in_sample,) = left_out_errors(found._replace(prior=surer), [record], own)
     np.testing.assert_allclose(left_out, in_sample, atol=1e-8)
     assert left_out.std() < 1.1e-3
     free = refine(model, [record], own)
