@@ -294,7 +294,7 @@ class FlexibleArm:
         theta2: ArrayLike,
         sampling_time: float,
         *,
-        integration_step: float = 1e-4,
+        integration_step: float = 5e-4,
     ) -> ArmResponse:
         """Integrate the non-linear equations in closed loop, from rest.
 
@@ -308,7 +308,7 @@ class FlexibleArm:
             Initial elbow angle in rad; theta1 starts at 0, the links unbent.
         sampling_time : float
             Sampling period of reference and response in s.
-        integration_step : float, default=1e-4
+        integration_step : float, default=5e-4
             Largest integration step in s; the sampling period is divided into equal
             steps of at most this length.
 
