@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import joblib
 
 from .command import add_commands
+from .command.ending import status_of
+from .command.output import whole_folder
 from .paper import run_paper_experiment, save_figures, tables_text
 
 _MAX_JOBS = 7  # one for each operating point of the paper
@@ -78,33 +82,62 @@ def _add_paper(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="directory for the tables and figures (default results/)",
     )
-    parser.set_defaults(run=_paper)
-
-
-def _paper(options: argparse.Namespace) -> int:
-    options.output.mkdir(parents=True, exist_ok=True)
-    experiment = run_paper_experiment(
-        options.realizations,
-        options.degree,
-        method=options.method,
-        random_state=options.seed,
-        n_jobs=options.jobs or min(_MAX_JOBS, joblib.cpu_count()),
-        verbose=1,
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with a run into that directory which did not end: the operating "
+        "points that it had done are not done again",
     )
-    with experiment.watch.step("figures"):
-        import matplotlib
+    parser.set_defaults(run=lambda options: status_of("paper", lambda: _paper(options)))
 
-        matplotlib.use("agg")  # there may be no screen
-        figures = save_figures(experiment, options.output)
-    tables = experiment.tables | {"timing": experiment.watch.table()}
-    for name, table in tables.items():
-        table.to_csv(options.output / f"{name}.csv", index=False)
+
+def _paper(options: argparse.Namespace) -> None:
+    with (
+        whole_folder(options.output, overwrite=True) as folder,
+        _points_done(options.output, options.resume) as memory,
+    ):
+        experiment = run_paper_experiment(
+            options.realizations,
+            options.degree,
+            method=options.method,
+            random_state=options.seed,
+            n_jobs=options.jobs or min(_MAX_JOBS, joblib.cpu_count()),
+            memory=memory,
+            verbose=1,
+        )
+        for name, table in experiment.tables.items():
+            table.to_csv(folder / f"{name}.csv", index=False)
+        with experiment.watch.step("figures"):
+            import matplotlib
+
+            matplotlib.use("agg")  # there may be no screen
+            figures = save_figures(experiment, folder)
+        tables = experiment.tables | {"timing": experiment.watch.table()}
+        tables["timing"].to_csv(folder / "timing.csv", index=False)
     print(tables_text(experiment, tables))
     print(
         f"\n{len(tables)} tables (csv) and {len(figures)} figures (png) are in "
         f"{options.output}/"
     )
-    return 0
+
+
+@contextmanager
+def _points_done(output: Path, resume: bool) -> Iterator[Path]:
+    """A folder beside the output for the operating points done, until all are."""
+    folder = output.with_name(f".{output.name}.done")
+    if not resume:
+        shutil.rmtree(folder, ignore_errors=True)
+    try:
+        yield folder
+    except BaseException:
+        if folder.is_dir():
+            print(
+                f"The operating points done are in {folder}: go on by the same command "
+                "with --resume.",
+                file=sys.stderr,
+            )
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _positive(text: str) -> int:

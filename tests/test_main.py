@@ -19,7 +19,7 @@ def test_counts_below_one_are_refused(
 @pytest.mark.parametrize("arguments", [[], ["--seed", "3"], ["paper", "--seed", "3"]])
 def test_without_a_word_it_is_the_paper(arguments, monkeypatch):
     asked = []
-    monkeypatch.setattr(command, "_paper", lambda options: asked.append(options) or 0)
+    monkeypatch.setattr(command, "_paper", asked.append)
     assert main(arguments) == 0
     assert asked[0].seed == (3 if arguments else 0)
     assert (asked[0].realizations, asked[0].method) == (100, "po-moesp")

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_PROBE = 2**16  # bytes that must find room before the work begins
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
@@ -26,10 +31,16 @@ def whole_folder(target: Path, overwrite: bool) -> Iterator[Path]:
             "by --overwrite that files of the same names are replaced."
         )
     # that nothing can be written there is told now, not after the fit
-    target.parent.mkdir(parents=True, exist_ok=True)
-    aside = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    around = target if filled else target.parent
+    with _told(target):
+        around.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=around))
     try:
-        yield aside
+        with _told(target, aside):
+            probe = aside / "probe"
+            probe.write_bytes(bytes(_PROBE))
+            probe.unlink()
+            yield aside
         aside.chmod(0o777 & ~_umask())  # mkdtemp's is for the owner alone
         if target.is_dir() and not filled:
             target.rmdir()
@@ -51,11 +62,34 @@ def whole_file(target: Path) -> Iterator[Path]:
     """A new file's path, which becomes `target` when the block ends well."""
     if target.is_dir():
         raise ValueError(f"--output {target}: there is a folder of that name.")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".lpvlearn.", dir=target.parent) as aside:
-        part = Path(aside) / target.name
+    with _told(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        aside = tempfile.TemporaryDirectory(prefix=".lpvlearn.", dir=target.parent)
+    with aside as name, _told(target, Path(name)):
+        part = Path(name) / target.name
         yield part
         part.replace(target)
+
+
+@contextmanager
+def _told(target: Path, folder: Path | None = None) -> Iterator[None]:
+    """Say of `target` what the system says of writing, or of writing in a folder."""
+    try:
+        yield
+    except OSError as error:
+        where = error.filename
+        if folder and where is not None and not str(where).startswith(str(folder)):
+            raise  # another file's
+        if error.errno == errno.ENOENT:
+            advice = "The folder has vanished: do not move or clear it meanwhile."
+        elif error.errno in _FULL:
+            advice = "Free space there, or take another place."
+        else:
+            advice = "Take a place where you may write."
+        raise OSError(
+            f"--output {target}: it cannot be written ({error.strerror}), and nothing "
+            f"of it is there. {advice}"
+        ) from error
 
 
 def _umask() -> int:

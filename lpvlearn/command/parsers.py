@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from .ending import status_of
 from .fit import INTERPOLATIONS, fit
 from .tables import Format
 from .use import predict, report
-
-_INTERRUPTED = 130  # a shell's status of a program that Ctrl-C ended
 
 _FIT = """\
 examples:
@@ -110,19 +107,8 @@ def _command(
 
 
 def _run(command: Callable[..., None], options: argparse.Namespace) -> int:
-    """Exit status: 0, or 1 after an error, of which the message is shown."""
     options.format = Format(options.separator, options.decimal)
-    try:
-        command(options)
-    except BrokenPipeError:  # a reader such as head has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except KeyboardInterrupt:
-        return _INTERRUPTED
-    except (ValueError, TypeError, OSError, RuntimeError, MemoryError) as error:
-        print(f"lpvlearn {options.command}: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return status_of(options.command, lambda: command(options))
 
 
 def _add_fit(parser: argparse.ArgumentParser) -> None:

@@ -19,13 +19,20 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from joblib import Parallel
 from joblib import delayed as later
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from .model import LPVStateSpace
-from .refinement import Own, Record, Refined, initial_state, weighted_slopes
+from .refinement import (
+    Own,
+    Record,
+    Refined,
+    Run,
+    in_turn,
+    initial_state,
+    weighted_slopes,
+)
 from .sensitivity import coefficients_of, output_slopes, with_coefficients
 from .weighting import sizes_of
 
@@ -101,7 +108,7 @@ def left_out_errors(
     records: Sequence[Record],
     own: Own,
     *,
-    n_jobs: int | None = None,
+    run: Run = in_turn,
 ) -> list[Array]:
     """Errors (n_samples, n_outputs) of records without which the model was fitted.
 
@@ -114,7 +121,6 @@ def left_out_errors(
     if found.prior is not None:
         centre, information = found.prior.centre, found.prior.information
         information = information[np.ix_(free, free)]
-    run = Parallel(n_jobs=n_jobs, return_as="generator")
     folds = [_folds_of(k, len(r.u)) for k, r in enumerate(records)]
 
     def errors_of(changed: LPVStateSpace) -> list[Array]:

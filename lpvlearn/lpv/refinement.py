@@ -9,12 +9,11 @@ of every output, enter linearly and are projected out (variable projection).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from joblib import Parallel
 from joblib import delayed as later
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
@@ -55,6 +54,15 @@ _SHRINKAGE = (0.1, 1e-2, 1e-3, 1e-4, 0.0)
 # Share by which rate terms must lower the errors of pieces they were not fitted to:
 # what is gained by chance is less.
 _WORTH = 0.02
+
+
+# From calls as `joblib.delayed` writes them down to their results, in their order.
+Run = Callable[[Iterable[Any]], Iterable[Any]]
+
+
+def in_turn(tasks: Iterable[Any]) -> Iterator[Any]:
+    """Results of tasks, one after another."""
+    return (function(*args, **kwargs) for function, args, kwargs in tasks)
 
 
 class Record(NamedTuple):
@@ -185,14 +193,14 @@ def refine(
     *,
     fixed: Flags | None = None,
     max_iter: int = 200,
-    n_jobs: int | None = None,
+    run: Run = in_turn,
     tell: Callable[[float], None] = lambda cost: None,
 ) -> Refined:
     """Fit the coefficients of a model, which must not diverge on the records.
 
     `fixed` coefficients stay; `prior` is one of all of them. `max_iter` counts the
-    steps that are tried, of all estimates of the variances. `tell` hears the cost of
-    every step taken.
+    steps that are tried, of all estimates of the variances. `run` gives the results of
+    tasks, a record each; `tell` hears the cost of every step taken.
     """
     bases, start = start.bases, replace(start.silenced(), bases=())
     c0 = coefficients_of(start)
@@ -201,7 +209,6 @@ def refine(
     centre, information = np.zeros(q), np.zeros((q, q))
     if prior is not None:
         centre, information = prior.centre[free], prior.information[np.ix_(free, free)]
-    run = Parallel(n_jobs=n_jobs)
     total = np.sqrt(np.mean(np.vstack([r.y for r in records]) ** 2, axis=0))
     costs: list[tuple[int, float]] = []
     left = max_iter

@@ -87,6 +87,7 @@ def run_paper_experiment(
     method: str = "po-moesp",
     random_state: int = 0,
     n_jobs: int | None = None,
+    memory: Any = None,
     verbose: int = 0,
 ) -> PaperExperiment:
     """Run the protocol of Section 3 and tabulate it beside the published figures.
@@ -101,6 +102,8 @@ def run_paper_experiment(
         Subspace method of the local models; the other one is tabulated as well.
     random_state : int, default=0
     n_jobs : int, default=None
+    memory : path, default=None
+        Folder that keeps the operating points done, as of `LocalLPVPipeline`.
     verbose : int, default=0
         1 shows progress bars.
 
@@ -120,6 +123,7 @@ def run_paper_experiment(
         "combine": "average",
         "efficient": False,  # the paper's H-infinity optimum
         "n_jobs": n_jobs,
+        "memory": memory,
         "verbose": verbose,
     }
     pipeline = LocalLPVPipeline(

@@ -69,6 +69,11 @@ class Remembered:
             )
         result = self.function(*args, **kwargs)
         self.store.dump_item(item, _Kept(key, result), verbose=0)
+        if not self.store.contains_item(item):  # joblib told why
+            warn(
+                f"`memory` could not keep a result in {self.store.location}: is there "
+                "room, and may you write there? The work goes on without."
+            )
         return result
 
     def _kept(self, item: list[str]) -> _Kept | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -46,6 +47,7 @@ from ..validation import one_of, positive_time, whole_number
 from .bands import output_errors
 from .points import StructuredModels, balanced_entries, identify_point
 from .scheduled import ScheduledEstimator
+from .workers import results_of
 
 Array = NDArray[np.float64]
 
@@ -309,6 +311,7 @@ class OutputErrorLPV(ScheduledEstimator):
             _errors(start, e, record, own)
             for e, record in zip(experiments, records, strict=True)
         ]
+        run = partial(results_of, n_jobs=self.n_jobs)
         with _Progress(self.verbose) as tell:
             found = refine_with_rates(
                 start,
@@ -318,7 +321,7 @@ class OutputErrorLPV(ScheduledEstimator):
                 rate=self.rate,
                 groups=groups,
                 max_iter=self.max_iter,
-                n_jobs=self.n_jobs,
+                run=run,
                 tell=tell,
             )
         seen = np.vstack([record.kappa for record in records])
@@ -358,7 +361,7 @@ class OutputErrorLPV(ScheduledEstimator):
         self.output_errors_ = output_errors(
             outputs or range(1, start.n_outputs + 1),
             after,
-            left_out_errors(found, records, own, n_jobs=self.n_jobs),
+            left_out_errors(found, records, own, run=run),
         )
         self.history_ = pd.DataFrame(found.costs, columns=["round", "cost"])
         return self

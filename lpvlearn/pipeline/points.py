@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from joblib import Memory, Parallel, delayed
+from joblib import Memory, delayed
 from numpy.typing import NDArray
 from sklearn.base import clone
 from threadpoolctl import ThreadpoolController
@@ -34,6 +34,7 @@ from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..structures.structure import GrayBoxStructure
 from .branches import tied_branches
 from .memory import Remembered
+from .workers import results_of
 
 Array = NDArray[np.float64]
 
@@ -768,7 +769,7 @@ class PointRunner:
             delayed(_attempt)(kept, args, shared, k if stop else None)
             for k, args in enumerate(arguments)
         )
-        results = Parallel(n_jobs=self.n_jobs, return_as="generator")(tasks)
+        results: Any = results_of(tasks, self.n_jobs)
         if self.verbose:
             from tqdm import tqdm  # slow to import
 

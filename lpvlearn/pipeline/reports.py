@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 # this poor, and was fitted to signals with means so many times their motion.
 _WORTH, _POOR, _FAR = 5.0, 50.0, 2.0
 
+_LOOKED_AT = 10  # experiments of an operating point: more tell the same of constants
+
 _NO_FLOOR = 1e-8  # share of the black box's norm below which a floor is rounding
 
 
@@ -145,7 +147,7 @@ def _misses_constants(
     """Whether constants would explain more of the outputs of experiments at a point."""
     if model.rest is not None and not model.n_trend:
         return False  # they have been looked for
-    constants = max(1, model.n_trend)
+    group, constants = group[:_LOOKED_AT], max(1, model.n_trend)
     best, without = (fit_of(model.lti, group, sampling_time, n) for n in (constants, 0))
     far = [(abs(mean) > _FAR * scale).any() for mean, scale in motions(group)]
     return best - without > _WORTH or (without < _POOR and any(far))

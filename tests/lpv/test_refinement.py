@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from joblib import Parallel
 
 from lpvlearn import (
     GrayBoxStructure,
@@ -264,8 +265,9 @@ def test_local_experiments_tell_what_their_covariances_do():
 def test_experiments_in_parallel_are_the_same():
     truth = spring_lpv()
     rows = [record(truth, 150, seed, noise=0.05) for seed in range(3)]
+    two_at_once = Parallel(n_jobs=2)
     one = refine(perturbed(truth), rows, MOVING, max_iter=4)
-    two = refine(perturbed(truth), rows, MOVING, max_iter=4, n_jobs=2)
+    two = refine(perturbed(truth), rows, MOVING, max_iter=4, run=two_at_once)
     np.testing.assert_array_equal(
         coefficients_of(one.model), coefficients_of(two.model)
     )

@@ -1,0 +1,50 @@
+"""How a command ends: its exit status, after an error, Ctrl-C or a signal too."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+_INTERRUPTED = 130  # a shell's status of a program that Ctrl-C ended
+_SIGNALLED = 128  # a shell's status of a program that a signal ended, and its number
+
+_ENDING = ("SIGTERM", "SIGHUP")  # where a system has them
+
+
+def status_of(name: str, command: Callable[[], None]) -> int:
+    """Run a command: 0, or 1 after an error, of which the message is shown."""
+    try:
+        with _signals_raise():
+            command()
+    except BrokenPipeError:  # a reader such as head has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except (ValueError, TypeError, OSError, RuntimeError, MemoryError) as error:
+        print(f"lpvlearn {name}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+@contextmanager
+def _signals_raise() -> Iterator[None]:
+    """Have signals end the block as an exception does: what is open is closed."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():  # no other one may
+        numbers = [getattr(signal, s) for s in _ENDING if hasattr(signal, s)]
+        before = {number: signal.signal(number, _end) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end(number: int, frame: Any) -> NoReturn:
+    raise SystemExit(_SIGNALLED + number)

@@ -1,0 +1,65 @@
+"""Work shared between processes, none of which outlives the one that waits for it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures.process import BrokenProcessPool
+from functools import cache
+from typing import Any
+
+from joblib import Parallel, delayed
+
+# A call as `joblib.delayed` writes it down: function, arguments, keywords.
+Task = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+
+_WATCH = 0.5  # seconds between two looks at the process that started a worker
+
+_KILLED = (
+    "A worker process was killed before its work was done, most often for want of "
+    "memory. Take fewer `n_jobs` (each holds its own copy of what it works on), or "
+    "n_jobs=1. What was finished before is not lost where `memory` is a folder."
+)
+
+
+def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
+    """Results of tasks in their order, as they come, from `n_jobs` processes.
+
+    Raises a RuntimeError where one of them is killed from outside.
+    """
+    watched = (delayed(_in_worker)(os.getpid(), *task) for task in tasks)
+    try:
+        yield from Parallel(n_jobs=n_jobs, return_as="generator")(watched)
+    except BrokenProcessPool as error:
+        raise RuntimeError(_KILLED) from error
+
+
+def _in_worker(
+    asked_by: int,
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
+    kwargs: dict[str, Any],
+) -> Any:
+    if multiprocessing.current_process().name.startswith("LokyProcess"):
+        within = asked_by == os.getpid()  # a fit of a search, say
+        _end_with_parent(os.getppid() if within else asked_by)
+    return function(*args, **kwargs)
+
+
+@cache
+def _end_with_parent(parent: int) -> None:
+    """Have this process end when the one that started it, and asks, has.
+
+    Loky's wait for more work for minutes when that one was killed, and what they share
+    with it stays in memory.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

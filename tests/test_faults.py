@@ -1,0 +1,194 @@
+"""What is left when work is killed, or cannot write: nothing half done or lost."""
+
+import contextlib
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lpvlearn.__main__ import main
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc/self").exists(), reason="reads /proc"),
+]
+
+PATIENCE = 60  # seconds for what takes a few: the machine may be busy
+
+PAPER = [sys.executable, "-m", "lpvlearn", "--realizations", "1", "--jobs", "2"]
+
+FIT = """
+import sys
+from sklearn.model_selection import GridSearchCV
+from lpvlearn import GrayBoxRestructurer, LocalLPVPipeline, SubspaceLTI
+from tests.conftest import spring_structure, spring_tables
+
+if __name__ == "__main__":
+    X, y = spring_tables(n_samples=4000)
+    model = LocalLPVPipeline(
+        SubspaceLTI(), GrayBoxRestructurer(spring_structure()), inputs="force",
+        scheduling="kappa", experiment="run", time="time", **{options})
+    print("begun", flush=True)
+    {fit}
+    print(model.parameters_.to_json(double_precision=15))
+"""
+ALONE = "model.fit(X, y)"
+SEARCH = """
+    folds = [(X.index, X.index)]
+    GridSearchCV(model, {'local__order': [2] * 8}, cv=folds, n_jobs=2).fit(X, y)
+"""
+
+
+def begun(command, **options):
+    """A process in a session of its own."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, start_new_session=True, **pipes, **options)
+
+
+def script(fit=ALONE, **options):
+    text = FIT.replace("{options}", repr(options)).replace("{fit}", fit)
+    return [sys.executable, "-c", text]
+
+
+def session(process):
+    """Processes alive in the session of a process, itself left out."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            fields = stat.read_text().rpartition(")")[2].split()
+            pid = int(stat.parent.name)
+            if int(fields[3]) == process.pid != pid and fields[0] != "Z":
+                found.append(pid)
+    return found
+
+
+def until(true, what):
+    end = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < end, what
+        time.sleep(0.05)
+
+
+def wait_for_points(folder, n_points=1):
+    """Until so many points are in the folder of those done."""
+    until(lambda: len(list(folder.rglob("output.pkl"))) >= n_points, "no point is done")
+
+
+def written(folder):
+    return {f: f.stat().st_mtime_ns for f in folder.rglob("output.pkl")}
+
+
+def nothing_left(process):
+    until(lambda: not session(process), "processes are left")
+    shared = Path("/dev/shm")
+    until(
+        lambda: not [f for f in shared.glob("*") if f"{process.pid}" in f.name],
+        "shared memory is left",
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The tables of an undisturbed run."""
+    folder = tmp_path_factory.mktemp("whole")
+    subprocess.run([*PAPER, "--output", folder / "results"], check=True, text=True)
+    assert [f.name for f in folder.iterdir()] == ["results"]
+    return tables(folder / "results")
+
+
+def tables(folder):
+    names = {f.name for f in folder.glob("*.csv")} - {"timing.csv"}
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_an_ended_command_leaves_points_to_go_on_with(name, tmp_path, whole):
+    output, done = tmp_path / "results", tmp_path / ".results.done"
+    process = begun([*PAPER, "--output", output])
+    wait_for_points(done, 2)
+    process.send_signal(getattr(signal, name))
+    _, told = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 128 + getattr(signal, name)
+    assert "--resume" in told and "Traceback" not in told
+    nothing_left(process)
+    assert [f.name for f in tmp_path.iterdir()] == [done.name]
+    if name != "SIGTERM":
+        return  # the rest is the same
+    before = written(done)
+    process = begun([*PAPER, "--output", output, "--resume"])
+    wait_for_points(done, len(before) + 1)
+    assert before.items() <= written(done).items()
+    _, told = process.communicate(timeout=5 * PATIENCE)
+    assert process.returncode == 0, told
+    assert tables(output) == whole
+    assert not done.exists()
+
+
+@pytest.mark.parametrize("fit", [ALONE, SEARCH])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_the_process_that_started_them(fit, number, tmp_path):
+    jobs = 2 if fit == ALONE else None
+    process = begun(script(fit, n_jobs=jobs, memory=str(tmp_path)))
+    wait_for_points(tmp_path)
+    process.send_signal(number)
+    process.communicate(timeout=PATIENCE)
+    nothing_left(process)
+
+
+def test_a_killed_worker_is_told(tmp_path):
+    process = begun(script(n_jobs=2, memory=str(tmp_path)))
+    wait_for_points(tmp_path)
+    os.kill(max(session(process)), signal.SIGKILL)
+    _, told = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    assert "RuntimeError: A worker process was killed" in told
+    nothing_left(process)
+
+
+def test_two_processes_share_one_memory(tmp_path):
+    both = [begun(script(n_jobs=1, memory=str(tmp_path))) for _ in range(2)]
+    (one, told), (two, _) = (p.communicate(timeout=2 * PATIENCE) for p in both)
+    assert [p.returncode for p in both] == [0, 0], told
+    assert one == two
+    alone = begun(script(n_jobs=1)).communicate(timeout=2 * PATIENCE)[0]
+    assert alone == one
+
+
+def test_a_place_that_cannot_be_written_is_told_at_the_start(capsys):
+    assert main(["--output", "/proc/nowhere/results"]) == 1
+    told = capsys.readouterr().err
+    assert "--output /proc/nowhere/results: it cannot be written" in told
+    assert "local models" not in told
+
+
+@pytest.mark.parametrize("size", [2**14, 2**17])
+def test_a_full_disk_is_told_and_nothing_half_written_stays(size, tmp_path):
+    def limited():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    command = [*PAPER[:3], "--realizations", "1", "--jobs", "1", "--output", "results"]
+    home = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    process = begun(command, preexec_fn=limited, cwd=tmp_path, env=home)
+    _, told = process.communicate(timeout=2 * PATIENCE)
+    assert process.returncode == 1
+    assert "--output results: it cannot be written (File too large)" in told
+    assert "Free space there" in told and "Traceback" not in told
+    assert not (tmp_path / "results").exists()
+    assert ("local models" in told) == (size > 2**16)
+
+
+def test_a_folder_that_vanishes_is_told(tmp_path):
+    process = begun([*PAPER, "--output", tmp_path / "results"])
+    wait_for_points(tmp_path / ".results.done", 14)
+    for folder in tmp_path.glob(".results.*"):
+        subprocess.run(["rm", "-rf", folder], check=True)
+    _, told = process.communicate(timeout=2 * PATIENCE)
+    assert process.returncode == 1
+    assert "The folder has vanished" in told
+    nothing_left(process)
