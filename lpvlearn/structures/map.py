@@ -23,6 +23,7 @@ from ..models.system_matrix import stack_system
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 
 # All steps are relative to the sizes of the parameters.
 _COMPLEX_STEP = 1e-30  # nothing is subtracted: its square is below any rounding
@@ -65,6 +66,10 @@ class StructureMap(ABC):
     def fix(self, values: Array, free: Flags) -> StructureMap:
         """The map of the `free` parameters, the others at their `values`."""
         return FixedMap(self, values, free)
+
+    def select(self, rows: Rows) -> StructureMap:
+        """The map to some rows of S; one may stand several times."""
+        return RowsMap(self, rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +189,7 @@ class RowsMap(StructureMap):
     """Some rows of the S of another map; one may stand several times."""
 
     parent: StructureMap
-    rows: NDArray[np.intp]
+    rows: Rows
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..models.statespace import StateSpace
 from ..models.system_matrix import Blocks, blocks
 from ..validation import named_values, real_array
-from .map import AffineMap, FunctionMap, RowsMap, StructureMap
+from .map import AffineMap, FunctionMap, StructureMap
 from .mechanical import FluxMap, ImplicitMap, descriptor_map, mechanical_map
 from .templates import (
     Entry,
@@ -615,7 +615,7 @@ class GrayBoxStructure:
         """The structure with all of its outputs several times, below each other."""
         states, outputs = np.split(np.arange(self.map.shape[0]), [self.order])
         rows = np.concatenate([states, np.tile(outputs, copies)])
-        return self._changed(map=RowsMap(self.map, rows))
+        return self._changed(map=self.map.select(rows))
 
     def draw(self, n: int, rng: np.random.Generator) -> Array | None:
         """Random parameter vectors from the ranges, or around the first guess.
