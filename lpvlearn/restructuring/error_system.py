@@ -25,7 +25,11 @@ Complex = NDArray[np.complex128]
 
 _CONSTANT = 1e-7  # relative change of an error that no parameter changes
 _MOVE = 0.1  # of the parameters that tells: far beyond rounding, the same model still
-_TINY_PART = 1e-3  # of the largest parameter: smaller ones move as if they were that
+
+# Parts of the largest parameter: smaller ones move as if they were that. In units that
+# fit, zeros may stand for either.
+_LEAST_SIZES = (1e-3, 1.0)
+
 _RESPONSE_ROUNDING = 1e-12  # of a response, whose digits the error has lost
 
 # singular values are told apart down to that fraction of the largest: their gap divides
@@ -348,22 +352,26 @@ class ErrorSystem:
     def constant_at(self, theta: Array, omega: Array) -> NDArray[np.bool_]:
         """Whether the error at these frequencies is one that no parameter changes.
 
-        Told from two other points: a gradient that vanishes may be that of a minimum.
+        Told from other points, within the bounds: a gradient that vanishes may be that
+        of a minimum, or of a square at zero.
         """
         structure = self.structure
-        size = np.abs(theta)
-        size = np.maximum(size, _TINY_PART * size.max(initial=0.0))
-        size = np.where(size > 0, size, 1.0)
         G0, here = self.target_response(omega), self.response(theta, omega)
         noise = _RESPONSE_ROUNDING * np.abs(G0).max((1, 2))
         most = _CONSTANT * np.abs(here - G0).max((1, 2)) + noise
         same = np.ones(len(omega), bool)
-        for turn in (1.0, 2.0):  # two moves in directions that no structure prefers
-            step = _MOVE * size * np.cos(turn + np.arange(len(theta)) ** 2)
-            other = np.clip(theta + step, structure.lower, structure.upper)
-            if not np.isfinite(self.poles(other)).all():
-                continue
-            same &= np.abs(self.response(other, omega) - here).max((1, 2)) <= most
+        top = float(np.abs(theta).max(initial=0.0)) or 1.0
+        for least in _LEAST_SIZES:
+            size = np.maximum(np.abs(theta), least * top)
+            for turn in (1.0, 2.0):  # two directions that no structure prefers
+                step = _MOVE * size * np.cos(turn + np.arange(len(theta)) ** 2)
+                end = theta + step
+                out = (end < structure.lower) | (end > structure.upper)
+                other = np.where(out, theta - step, end)
+                other = np.clip(other, structure.lower, structure.upper)
+                if np.isfinite(self.poles(other)).all():
+                    moved = np.abs(self.response(other, omega) - here).max((1, 2))
+                    same &= moved <= most
         return same
 
     def hessians(self, theta: Array, omega: Array, moving: NDArray[np.bool_]) -> Array:

@@ -141,8 +141,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         structure); 0 where there is none. It is set aside, and the remaining peaks are
         minimised.
     remaining_error_ : float
-        Highest peak of the error apart from the floor; equal to `error_` where there is
-        no floor, or a lower one.
+        Highest peak, a local maximum over frequency, of the error apart from the floor:
+        what is minimised where the floor is above it, and 0 where none is left; equal
+        to `error_` where there is no floor, or a lower one.
     stationarity_, second_order_ : float
         Shortest vector in the convex hull of the active gradients (0: stationary, or
         proven optimal by `lower_bound_`), and smallest eigenvalue of the reduced
@@ -643,7 +644,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             )
         floor = self.structural_floor_ / max(problem.reference, 1e-300)
         explained = getattr(self, "p_value_", 0.0) > _IMPLAUSIBLE  # by the noise
-        if self.fit_error_ - floor > _POOR_FIT and not explained:
+        poor = min(self.fit_error_, self.relative_error_) - floor > _POOR_FIT
+        if poor and not explained:
             costs = self.starts_["relative_error"].to_numpy()
             agreeing = int((costs <= costs.min() * (1.0 + _AGREE)).sum())
             warn(

@@ -34,6 +34,8 @@ Interval = Sequence[float | None]
 
 _SPREAD = 0.3  # standard deviation of log-parameters: a guess is right to a third
 
+_ASIDE = 0.1  # relative distance of a point at which another derivative is taken
+
 _DECADE = 10.0  # a range that spans more tells an order of magnitude, not a value
 _LISTED = 8  # names that a message lists
 
@@ -711,8 +713,12 @@ class GrayBoxStructure:
     @property
     def free_feedthrough(self) -> NDArray[np.bool_]:
         """Which entries of D hold a parameter, shape (n_outputs, n_inputs)."""
-        n = self.order
-        return (self.jacobian(self.reference)[:, n:, n:] != 0).any(0)
+        n, points = self.order, [self.reference]
+        if not self.is_affine:  # a derivative may vanish at one point
+            move = _ASIDE * np.where(points[0] == 0, 1.0, points[0])
+            points.append(np.clip(points[0] + move, self.lower, self.upper))
+        slopes = np.nan_to_num([self.jacobian(point) for point in points])
+        return (slopes[:, :, n:, n:] != 0).any((0, 1))
 
     def feedthrough_of(self, D: Array) -> Array:
         """`D` where the structure has a parameter in it, else the structure's own D."""

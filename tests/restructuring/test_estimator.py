@@ -6,10 +6,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import block_diag
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 
-from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace, peak_gains
 from lpvlearn.datasets import FlexibleArm
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.restructuring.problem import problem_from_models
@@ -500,6 +502,45 @@ def test_the_minimum_of_a_peak_is_no_floor():
     assert fitted.structural_floor_ == 0 and fitted.lower_bound_ == 0
     assert np.isclose(fitted.error_, fitted.remaining_error_, rtol=1e-9)
     assert fitted.stationarity_ < 1e-6
+
+
+def squared_gain(theta):
+    return [[-theta[0]]], [[theta[0]]], [[1 + theta[1] ** 2]]
+
+
+@pytest.mark.parametrize("interval", [(0, None), (None, 0), (None, None)])
+def test_a_gain_at_its_turning_point_is_no_floor(interval):
+    """1 + q^2 begun at q = 0, where its derivative vanishes, at a bound or not."""
+    squared = GrayBoxStructure.from_function(squared_gain, {"a": 1.0, "q": 0.0})
+    squared = squared.with_bounds({"q": interval})
+    fitted = GrayBoxRestructurer(squared).fit_model(StateSpace(-2, 2, 3))
+    assert_allclose(np.abs(fitted.params_), [2, np.sqrt(2)], rtol=1e-6)
+    assert fitted.lower_bound_ == fitted.structural_floor_ == 0
+
+
+def test_the_peaks_below_a_floor_are_equally_high(rough):
+    """What is left below the floor is minimised, and told, without any weight."""
+    unit = GrayBoxStructure.from_template(
+        [[0, 1, 0, 0], ["-k", "-c", 0, 0], [0, 0, 0, 1], ["h", 0, "-h", "-d"]],
+        [[0], ["k"], [0], [0]],
+        [[0, 0, 1, 0]],
+    )
+    model = unit.model({"k": 4.0, "c": 4.0, "h": 100.0, "d": 15.0})
+    rough_A = model.A * (1 + 0.02 * np.random.default_rng(0).normal(size=(4, 4)))
+    off = StateSpace(rough_A, model.B, model.C)
+    off = StateSpace(rough_A, 1.05 * model.B / off.dc_gain(), model.C)
+    fitted = GrayBoxRestructurer(unit).fit_model(off)
+    error = StateSpace(
+        block_diag(fitted.lti_.A, off.A),
+        np.vstack([fitted.lti_.B, off.B]),
+        np.hstack([fitted.lti_.C, -off.C]),
+    )
+    peaks = peak_gains(error, within=0.9999)
+    moving = peaks.values[peaks.frequencies > 0]
+    assert_allclose(fitted.structural_floor_, peaks.norm, rtol=1e-9)
+    assert_allclose(fitted.remaining_error_, moving.max(), rtol=1e-6)
+    assert_allclose(moving, moving[0], rtol=1e-4)
+    assert len(moving) == 2
 
 
 def test_a_gain_that_the_structure_fixes_is_a_floor():

@@ -473,3 +473,11 @@ def test_draws_repeat_with_the_generator():
     structure = GrayBoxStructure.from_function(pendulum, GUESS)
     draws = [structure.draw(5, np.random.default_rng(7)) for _ in range(2)]
     assert_array_equal(*draws)
+
+
+def test_a_feedthrough_is_free_where_its_derivative_vanishes_at_the_guess():
+    structure = GrayBoxStructure.from_function(
+        lambda t: ([[-t[0]]], [[t[0]]], [[1]], [[1 + t[1] ** 2]]),
+        {"a": 1.0, "q": 0.0},
+    )
+    assert structure.free_feedthrough.all()
