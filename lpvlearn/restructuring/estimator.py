@@ -141,9 +141,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         structure); 0 where there is none. It is set aside, and the remaining peaks are
         minimised.
     remaining_error_ : float
-        Highest peak, a local maximum over frequency, of the error apart from the floor:
-        what is minimised where the floor is above it, and 0 where none is left; equal
-        to `error_` where there is no floor, or a lower one.
+        Highest peak of the error apart from the floor: what is minimised where the
+        floor is above it. A local maximum over frequency that the error dips before,
+        coming from the floor, by 1 % at least; 0 where the error only falls from the
+        floor; equal to `error_` where there is no floor, or a lower one.
     stationarity_, second_order_ : float
         Shortest vector in the convex hull of the active gradients (0: stationary, or
         proven optimal by `lower_bound_`), and smallest eigenvalue of the reduced

@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 _DEPTH = 0.6  # peaks down to that fraction below the objective enter the local model
 _FLAT = 1e-7  # a peak with a smaller relative gradient does not depend on theta
 _CAP_TOLERANCE = 1e-7  # relative excess over the cap that rounding may make
+_RIPPLE = 1e-6  # relative height above the floor that a peak beside it may have
+_DIP = 1e-2  # part of a peak by which it stands out from the floor's shoulder
 _MAX_CAPS = 12  # frequencies at which the cap is a constraint: the last ones met
 
 # depths at which peaks that move are looked for below high constant ones
@@ -111,13 +113,15 @@ class HinfObjective:
             if not steep.all():
                 flat = found.frequencies[~steep]
                 steep[~steep] = ~self.system.constant_at(theta, flat)
+            if not steep.all():
+                high = int(np.argmax(np.where(steep, -np.inf, found.values)))
+                if found.values[high] > self.floor:
+                    self.floor = float(found.values[high])
+                    self.floor_frequency = float(found.frequencies[high])
+            if self.floor > 0:
+                steep &= self._apart(theta, found.frequencies, found.values)
             if found.norm == 0.0 or steep.any():
                 break
-        if not steep.all():
-            high = int(np.argmax(np.where(steep, -np.inf, found.values)))
-            if found.values[high] > self.floor:
-                self.floor = float(found.values[high])
-                self.floor_frequency = float(found.frequencies[high])
         if not steep.any():  # nothing is left that the parameters could lower
             none = np.zeros(1)
             return Peaks(none, none, np.zeros((1, len(y))), np.zeros(1, bool))
@@ -129,6 +133,17 @@ class HinfObjective:
         )
         self._top = peaks.top
         return peaks
+
+    def _apart(self, theta: Array, omega: Array, values: Array) -> Flags:
+        """Whether peaks are above the floor, or the error dips between it and them."""
+        apart, grid = values > self.floor * (1.0 + _RIPPLE), self.system.grid
+        low, high = np.sort([omega, np.full(len(omega), self.floor_frequency)], axis=0)
+        for k in np.flatnonzero(~apart):
+            between = grid[(grid > low[k]) & (grid < high[k])]
+            if between.size:
+                dip = float(self.system.values(theta, between).min())
+                apart[k] = dip < (1.0 - _DIP) * values[k]
+        return apart
 
     def samples(self, y: Array, omega: Array) -> Peaks:
         """Singular values at fixed frequencies, and their gradients."""
