@@ -207,6 +207,7 @@ FORMS: dict[type, dict[str, str]] = {
         "n_params": "whole",
         "condition": "number",
         "directions": "any",
+        "sensitivities": "any?",
     },
     GrayBoxRestructurer: {
         "structure": "GrayBoxStructure?",

@@ -155,7 +155,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         saddle that no step along its negative curvature led out of; or neither, and the
         best point met was kept. The last two are warned of.
     identifiability_ : Identifiability
-        Rank and condition of the derivative of the response to the parameters.
+        Which parameters the response determines, and how far its errors grow into
+        them.
     dropped_feedthrough_ : ndarray of shape (n_outputs, n_inputs)
         What the black box has in D where the structure has no parameter: left out of
         the comparison, as in Eq. (4).
@@ -389,7 +390,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             {now[name]: value for name, value in direction.items()}
             for direction in self.identifiability_.directions
         )
-        other.identifiability_ = replace(self.identifiability_, directions=directions)
+        gains = self.identifiability_.sensitivities
+        other.identifiability_ = replace(
+            self.identifiability_,
+            directions=directions,
+            sensitivities={now[name]: gain for name, gain in gains.items()},
+        )
         return other
 
     def perturbation_check(
