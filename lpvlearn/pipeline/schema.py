@@ -232,6 +232,7 @@ FORMS: dict[type, dict[str, str]] = {
         "starts_": "table",
         "history_": "table",
         "params_covariance_": "float[n_params, n_params]?",
+        "covariance_degrees_of_freedom_": "number?",
         "hinf_params_": "float[n_params]?",
         "hinf_error_": "number?",
         "chi2_": "number?",

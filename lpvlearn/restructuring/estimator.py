@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import t as student
 from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
@@ -59,6 +60,7 @@ _IMPLAUSIBLE, _MISFIT = 1e-3, 4.0
 
 _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "params_covariance_",
+    "covariance_degrees_of_freedom_",
     "hinf_params_",
     "hinf_error_",
     "chi2_",
@@ -163,9 +165,13 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     fit_error_ : float
         Relative root-mean-square error over frequency of the best least-squares fit.
     params_covariance_ : ndarray of shape (n_params, n_params)
-        Covariance of the parameters from the spread of the `realizations`, or that of
-        the `estimates`, given to `fit_model`; absent without them. Infinite variances
-        where the estimates do not determine a parameter, none at its bound.
+        Covariance of `params_`, the parameters that minimise `norm`, from the spread of
+        the `realizations`, or that of the `estimates`, given to `fit_model`; absent
+        without them. Infinite variances where the estimates do not determine a
+        parameter, none at its bound.
+    covariance_degrees_of_freedom_ : float
+        What the covariance is known from: one less than the realizations, infinite for
+        `estimates`; see :meth:`confidence_intervals`.
     start_params_ : ndarray of shape (n_params,)
         Least-squares fit that the search started from.
     starts_ : DataFrame
@@ -289,9 +295,13 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             problem.check_realizations(realizations)
         known = problem.uncertainty(realizations, estimates)
         self._restructure(problem, given, estimates, known, only_given=not search)
-        if len(realizations) and not hasattr(self, "params_covariance_"):
-            spread = problem.spread_covariance(self.params_, realizations)
-            self.params_covariance_ = spread
+        if hasattr(self, "params_covariance_"):
+            self.covariance_degrees_of_freedom_ = np.inf
+        elif len(realizations):
+            self.params_covariance_ = problem.spread_covariance(
+                self.params_, realizations, self.norm
+            )
+            self.covariance_degrees_of_freedom_ = len(realizations) - 1.0
         return self
 
     def fit(
@@ -397,6 +407,53 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             sensitivities={now[name]: gain for name, gain in gains.items()},
         )
         return other
+
+    def confidence_intervals(self, confidence: float = 0.95) -> pd.DataFrame:
+        """Where the parameters are, by their covariance and Student's distribution.
+
+        Parameters
+        ----------
+        confidence : float, default=0.95
+            Probability that an interval holds the true value of its parameter, where
+            the structure is true.
+
+        Returns
+        -------
+        DataFrame of shape (n_params, 3)
+            ``value``, ``lower`` and ``upper`` of every parameter.
+
+        Raises
+        ------
+        ValueError
+            If `confidence` is not between 0 and 1, or no covariance is known.
+
+        Examples
+        --------
+        >>> lag = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+        >>> runs = [StateSpace(-2, 3 + error, 1) for error in (-0.1, 0.0, 0.1)]
+        >>> fitted = GrayBoxRestructurer(lag).fit_model(runs[1], realizations=runs)
+        >>> fitted.confidence_intervals().round(3)
+           value  lower  upper
+        a    2.0  2.000  2.000
+        b    3.0  2.752  3.248
+        """
+        check_is_fitted(self, "params_")
+        if not 0 < confidence < 1:
+            raise ValueError(
+                f"`confidence` must be between 0 and 1. Got {confidence!r}."
+            )
+        if not hasattr(self, "params_covariance_"):
+            raise ValueError(
+                "confidence intervals need the covariance of the parameters. Got a fit "
+                "without: give fit_model() `realizations` or `estimates`, or fit() the "
+                "`noise`."
+            )
+        std = np.sqrt(np.diag(self.params_covariance_))
+        freedom = self.covariance_degrees_of_freedom_
+        reach = std * student.ppf(0.5 + 0.5 * confidence, freedom)
+        value, names = self.params_, list(self.structure_.parameter_names)
+        columns = {"value": value, "lower": value - reach, "upper": value + reach}
+        return pd.DataFrame(columns, index=names)
 
     def perturbation_check(
         self, model: StateSpace, n_restarts: int = 10, size: float = 0.05

@@ -26,6 +26,7 @@ from .least_squares import (
     LeastSquaresResult,
     channel_scaling,
     fit_frequency_response,
+    least_maximum,
 )
 from .limits import growth, keeps_margin, natural_margin
 from .measured import MeasuredErrorSystem, read_frequency_data, stable_realization
@@ -173,14 +174,19 @@ class RestructuringProblem:
         names = self.structure.parameter_names
         return Identifiability.from_jacobian(J * sizes, names, level)
 
-    def parameter_changes(self, theta: Array, dG: Complex) -> Array:
+    def parameter_changes(
+        self, theta: Array, dG: Complex, counts: Array | None = None
+    ) -> Array:
         """First-order changes of the parameters with the black box's response.
 
         Minimising the weighted mean square error, ``d theta = Re(K dG)`` with
         ``K = (J^T J)^-1 J^H W`` in real arithmetic. `dG` (r, k, n_outputs, n_inputs)
-        are changes of the response; several black boxes change alike.
+        are changes of the response; several black boxes change alike. A frequency
+        counts `counts` (k,) times.
         """
         W = self._weighted[0]
+        if counts is not None:
+            W = np.sqrt(counts)[:, None, None] * W
         J = self.system.response_jacobian(theta, self.omega)[1]
         WJ = np.einsum("kpq,kqmj->kpmj", W, J)
         flat = WJ.reshape(-1, J.shape[-1])
@@ -236,16 +242,35 @@ class RestructuringProblem:
         W = self._weighted[0]
         return W @ np.tile(G, (1, W.shape[2] // G.shape[1], 1))
 
-    def spread_covariance(self, theta: Array, models: Sequence[StateSpace]) -> Array:
+    def spread_covariance(
+        self, theta: Array, models: Sequence[StateSpace], norm: str
+    ) -> Array:
         """Covariance of the parameters of an averaged model from single realizations.
 
-        Every realization's response is carried to the parameters to first order; the
-        covariance of their mean is that of one divided by their number.
+        Every realization's response is carried to the parameters that minimise `norm`
+        in the linearised structure: the least maximum for "hinf", which is not linear
+        in the noise, else least squares, for "h2" over frequencies as its integral
+        counts them. The covariance of their mean is that of one divided by their
+        number.
         """
         undelayed = [model.with_input_delay(0) for model in models]
         G = np.array([model.frequency_response(self.omega) for model in undelayed])
-        changes = self.parameter_changes(theta, G - G.mean(0))
-        return np.cov(changes.T, ddof=1).reshape(len(theta), -1) / len(G)
+        noise = (G - G.mean(0)) / np.sqrt(len(G))
+        if norm == "hinf":
+            W = self._weighted[0]
+            J = self.system.response_jacobian(theta, self.omega)[1]
+            WJ = np.einsum("kpq,kqmj->kpmj", W, J)
+            copies = W.shape[2] // G.shape[2]  # of several black boxes
+            dE = W @ np.tile(noise, (1, 1, copies, 1))
+            # what the noise does not explain of the error is there with any noise
+            E = self.system.weighted_error(theta, self.omega)
+            explained = np.sum(np.abs(dE) ** 2) / max(np.sum(np.abs(E) ** 2), 1e-300)
+            E = E * np.sqrt(max(1.0 - float(explained), 0.0))
+            changes = np.array([least_maximum(E - part, WJ) for part in dE])
+        else:
+            counts = np.gradient(self.omega) if norm == "h2" else None
+            changes = self.parameter_changes(theta, noise, counts)
+        return np.cov(changes.T, ddof=1).reshape(len(theta), -1)
 
 
 def agreeing(fits: Sequence[LeastSquaresResult]) -> int:

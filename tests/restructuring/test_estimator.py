@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
+from scipy.stats import t as student
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 
@@ -272,6 +273,48 @@ def test_covariance_of_the_parameters_predicts_their_spread():
     )
     spread = estimates.std(0)
     np.testing.assert_allclose(np.sqrt(np.diag(single)), spread, rtol=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+def test_the_covariance_is_that_of_the_norm_that_was_minimised(norm):
+    structure, params = CASES["heat_exchanger"]
+    theta = structure.check_params(params)
+    exact, rng, n = structure.model(theta), np.random.default_rng(0), 40
+    parts = (exact.A, exact.B, exact.C)
+
+    def noisy():
+        return StateSpace(
+            *(M * (1 + 1e-3 * rng.normal(size=M.shape)) for M in parts), exact.D
+        )
+
+    restructurer = GrayBoxRestructurer(structure, norm=norm)
+    models = [noisy() for _ in range(n)]
+    found = np.array(
+        [
+            restructurer.fit_model(model, starts=[theta], search=False).params_
+            for model in models
+        ]
+    )
+    fitted = restructurer.fit_model(exact, realizations=models)
+    single = np.sqrt(np.diag(fitted.params_covariance_) * n)
+    # all but D, which is exact
+    assert_allclose(single[:3], found.std(0, ddof=1)[:3], rtol=0.35)
+
+
+def test_confidence_intervals_are_those_of_student():
+    """Of a gain the mean is the optimum in any norm."""
+    d = np.array([2.9, 3.0, 3.3])
+    runs = [StateSpace([], [], [], [[x]]) for x in d]
+    mean = StateSpace([], [], [], [[d.mean()]])
+    fitted = GrayBoxRestructurer(GAIN).fit_model(mean, realizations=runs)
+    table = fitted.confidence_intervals(0.9)
+    low, high = student.interval(0.9, 2, d.mean(), d.std(ddof=1) / np.sqrt(3))
+    assert_allclose(table.loc["d"], [d.mean(), low, high], rtol=1e-6)
+    with pytest.raises(ValueError, match="`confidence` must be between"):
+        fitted.confidence_intervals(95)
+    with pytest.raises(ValueError, match="need the covariance"):
+        fitted.fit_model(mean).confidence_intervals()
 
 
 def test_restarts_from_perturbations_agree():
