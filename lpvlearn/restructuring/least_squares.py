@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.least_squares import levenberg_marquardt
+from .deadline import time_is_up
 from .error_system import ErrorSystem
 
 Array = NDArray[np.float64]
@@ -62,6 +63,7 @@ def fit_frequency_response(
         lower=structure.lower,
         upper=structure.upper,
         max_iter=max_iter,
+        stop=time_is_up,
     )
     return LeastSquaresResult(x[0], float(cost[0])) if np.isfinite(cost[0]) else None
 

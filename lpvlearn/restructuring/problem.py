@@ -21,6 +21,7 @@ from ..models.statespace import DEVIATION, StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
 from ..validation import real_array
+from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, series
 from .least_squares import (
     LeastSquaresResult,
@@ -134,6 +135,8 @@ class RestructuringProblem:
             if best <= enough or best <= GOOD_FIT and together >= AGREEING:
                 break
             if best > GOOD_FIT and number >= n_fits:
+                break
+            if fits and time_is_up():
                 break
             if scaling is not None:  # all channels alike first, then as they are
                 first = self.fit(theta, scaling)

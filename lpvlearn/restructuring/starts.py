@@ -20,6 +20,7 @@ from ..structures.mechanical import ImplicitMap
 from ..structures.structure import GrayBoxStructure, drawn_around
 from ..systems.balancing import balancing_transformation
 from .continuation import continued_fits
+from .deadline import time_is_up
 from .error_system import Target, frequency_grid, model_derivatives
 from .least_squares import LeastSquaresResult, channel_scaling
 from .limits import growth
@@ -114,7 +115,7 @@ def _rounds(
         more = problem.best_fits(candidates, n_fits, enough)
         fits = sorted(fits + more, key=_COST)
         best = fits[0].relative_error if fits else np.inf
-        if best <= enough:
+        if best <= enough or (fits and time_is_up()):
             break
         # the structure comes no nearer: different starts end at the same best cost
         least = 2 if number or best <= GOOD_FIT else n_fits
@@ -136,7 +137,7 @@ def hopped_fits(
     for _ in range(_HOP_ROUNDS):
         best, returned = fits[0], 0
         for size in _HOPS:
-            if returned == _HOP_RETURNS:
+            if returned == _HOP_RETURNS or time_is_up():
                 break
             theta = best.x * np.exp(size * rng.normal(size=len(best.x)))
             fit = problem.fit(np.clip(theta, lower, upper))
@@ -144,7 +145,7 @@ def hopped_fits(
                 fits = [*fits, fit]
                 returned += abs(fit.cost - best.cost) <= _SAME * best.cost
         fits = sorted(fits, key=_COST)
-        if fits[0].cost > best.cost * (1.0 - _HOP_GAIN):
+        if time_is_up() or fits[0].cost > best.cost * (1.0 - _HOP_GAIN):
             break
     return fits
 

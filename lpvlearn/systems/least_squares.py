@@ -53,6 +53,11 @@ def column_scale(M: Array) -> Array:
 Residuals = Callable[[Array, Rows], tuple[Array, Callable[[Rows], Array]]]
 
 
+def never() -> bool:
+    """The answer of a search that nothing stops."""
+    return False
+
+
 class Minima(NamedTuple):
     """Where the starts ended: minimisers (k, n_unknowns) and costs ``|r|^2`` (k,).
 
@@ -75,6 +80,7 @@ def levenberg_marquardt(
     patience: int = 2,
     exact: float = 0.0,
     enough: int | None = None,
+    stop: Callable[[], bool] = never,
 ) -> Minima:
     r"""Minimise ``|r(x)|^2`` from every row of a stack of starts, all in one batch.
 
@@ -87,7 +93,8 @@ def levenberg_marquardt(
     `longest` is the largest change of a variable in a step; `max_iter` counts the steps
     that are tried. A start ends when its cost falls by less than `tol` (relative)
     `patience` times in a row, when no step lowers it, or at a cost not above `exact`;
-    all end when `enough` of them are that low.
+    all end when `enough` of them are that low, or where `stop`, asked before every
+    step, says so.
     """
     x = np.clip(starts, lower, upper)
     k, q = x.shape
@@ -123,6 +130,8 @@ def levenberg_marquardt(
     for _ in range(max_iter):
         rows = np.flatnonzero(active)
         if len(rows) == 0 or (enough is not None and (cost <= exact).sum() >= enough):
+            break
+        if stop():
             break
         D = unit[rows]
         damped = H[rows] * D[:, :, None] * D[:, None]
