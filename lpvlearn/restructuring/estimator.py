@@ -69,7 +69,10 @@ _ABSENT_ELSEWHERE = (  # attributes that not every fit has
 
 _SEARCH_SHARE = 0.7  # of `max_time`, for the starts: the rest is the minimisation's
 
-_ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
+# An error is exact that is rounding: of that size, relative to the black box (responses
+# are known to 1e-13: no certificate of a thousandth stands on less), or of so many
+# units in the last place of all entries (at most what counts as an exact fit).
+_ROUNDING, _UNITS = 1e-10, 3.0
 
 
 class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
@@ -521,10 +524,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 problem.structure, problem.box, fits[0].x, self.max_iter
             )
             return *found, 0.0
+        units = _UNITS * system.rounding(fits[0].x) / max(problem.reference, 1e-300)
         options: dict[str, Any] = {
             "max_iter": self.max_iter,
             "tol": self.tol,
-            "negligible": _ROUNDING * problem.reference,
+            "negligible": problem.reference * max(_ROUNDING, min(units, EXACT_FIT)),
         }
         if self.norm == "h2":
             runs = [minimise_h2(system, f, margin, **options) for f in promising(fits)]

@@ -34,6 +34,7 @@ def fit_frequency_response(
     admissible: Callable[[Array], bool],
     scaling: Array | float = 1.0,
     max_iter: int = 100,
+    geodesic: bool = False,
 ) -> LeastSquaresResult | None:
     """Least-squares fit of ``G(theta)`` to the black box at the frequencies `omega`.
 
@@ -64,6 +65,7 @@ def fit_frequency_response(
         upper=structure.upper,
         max_iter=max_iter,
         stop=time_is_up,
+        geodesic=geodesic,
     )
     return LeastSquaresResult(x[0], float(cost[0])) if np.isfinite(cost[0]) else None
 

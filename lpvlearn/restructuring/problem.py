@@ -96,12 +96,22 @@ class RestructuringProblem:
         self, theta: Array, scaling: Array | float = 1.0
     ) -> LeastSquaresResult | None:
         """Least-squares fit of the response from given parameters; None if unstable."""
+        fit = self._fit(theta, scaling, False)
+        if fit is None or not EXACT_FIT < fit.relative_error <= GOOD_FIT:
+            return fit
+        # it may have stopped on the way along a curved valley
+        return self._fit(fit.x, scaling, True)
+
+    def _fit(
+        self, theta: Array, scaling: Array | float, geodesic: bool
+    ) -> LeastSquaresResult | None:
         fit = fit_frequency_response(
             self.system,
             theta,
             self.omega,
             admissible=self.is_stable,
             scaling=scaling,
+            geodesic=geodesic,
         )
         if fit is None:
             return None

@@ -24,6 +24,7 @@ from .deadline import time_is_up
 from .error_system import Target, frequency_grid, model_derivatives
 from .least_squares import LeastSquaresResult, channel_scaling
 from .limits import growth
+from .parts import start_by_parts
 from .problem import EXACT_FIT, GOOD_FIT, RestructuringProblem, agreeing
 from .similarity import scaled_problem, similarity_starts
 
@@ -49,6 +50,7 @@ _HOP_ROUNDS = 4  # from ever better fits
 _HOP_GAIN = 1e-3  # relative decrease of the cost that is worth another round
 _FAINT = 0.03  # size of modes that only fill the order: seen, but hardly disturbing
 _FAST = 3.0  # decay of these modes, relative to the fastest: they are out of the way
+_EXACT_PARTS = 1e-6  # distance of a start by parts that the black box itself is
 _SLOWEST = 1e-9  # poles smaller than that part of the largest are integrators
 
 # Starts at each time scale that are carried through a continuation: its steps cost as
@@ -220,15 +222,23 @@ def _similar_candidates(
     """Parameters of an affine structure from random similarities, shape (k, n_params).
 
     Where states are missing, modes fill the order that are faint, or that no input
-    moves, or that no output shows.
+    moves, or that no output shows. A sum of parts has a start of its own, by modes; no
+    others are needed where the black box is one of its models.
     """
     core = _reduced(box, order)
+    by_parts = []
     faint = [(_FAINT, _FAINT), (0.0, 1.0), (1.0, 0.0)]
     found = []
     for sizes in faint if len(core.A) < order else faint[:1]:
         full = _padded(core, order, rng, sizes)
+        start = start_by_parts(full, affine.offset, affine.basis, rng)
+        if start is not None:
+            theta, distance = start
+            by_parts.append(theta[None])
+            if distance <= _EXACT_PARTS and len(box.A) <= order:
+                break
         found.append(_random_similarities(full, affine, n_starts, rng))
-    return np.vstack(found)
+    return np.vstack(by_parts + found)
 
 
 def _random_similarities(
