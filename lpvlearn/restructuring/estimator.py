@@ -26,7 +26,8 @@ from ..exceptions import RankWarning, VersionedPickle, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..validation import one_of, real_array, whole_number
+from ..validation import one_of, positive_time, real_array, whole_number
+from .deadline import bounded, time_is_up
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
 from .minimise_covariance import Estimate, efficient_parameters
@@ -68,7 +69,12 @@ _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "p_value_",
 )
 
-_ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
+_SEARCH_SHARE = 0.7  # of `max_time`, for the starts: the rest is the minimisation's
+
+# An error is exact that is rounding: of that size, relative to the black box (responses
+# are known to 1e-13: no certificate of a thousandth stands on less), or of so many
+# units in the last place of all entries (at most what counts as an exact fit).
+_ROUNDING, _UNITS = 1e-10, 3.0
 
 
 class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
@@ -105,6 +111,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         outputs alike, or a square one; or a band in rad/s, None leaving a side open.
     max_iter : int, default=1000
         Newton steps on the central path and iterations of the solver, in all.
+    max_time : float, default=None
+        Seconds after which a fit ends at the best point it has, with a warning where
+        more time might have brought a better one. None takes the time it needs.
     tol : float, default=1e-10
         Relative decrease of the norm below which the solver stops.
     random_state : int, RandomState instance or None, default=0
@@ -212,6 +221,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         n_starts: int = 16,
         frequency_weight: FrequencyWeight = None,
         max_iter: int = 1000,
+        max_time: float | None = None,
         tol: float = 1e-10,
         random_state: Any = 0,
     ) -> None:
@@ -222,6 +232,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self.n_starts = n_starts
         self.frequency_weight = frequency_weight
         self.max_iter = max_iter
+        self.max_time = max_time
         self.tol = tol
         self.random_state = random_state
 
@@ -503,6 +514,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             )
         whole_number("n_starts", self.n_starts, 1)
         whole_number("max_iter", self.max_iter, 0)
+        if self.max_time is not None:
+            positive_time("max_time", self.max_time)
         if not isinstance(self.tol, Real) or not 0.0 <= float(self.tol) < 1.0:
             raise ValueError(
                 "`tol` must be a relative decrease, at least 0 and below 1. Got "
@@ -533,7 +546,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
         try:
-            self._searched(problem, given, estimates, uncertainty, only_given)
+            with bounded(self.max_time):
+                self._searched(problem, given, estimates, uncertainty, only_given)
         except BaseException:  # an interruption, too
             self.__dict__.clear()
             self.__dict__.update(before)
@@ -549,9 +563,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     ) -> None:
         seed = check_random_state(self.random_state).randint(2**31)
         enough = max(EXACT_FIT, _NOISY * uncertainty)
-        problem, fits = starts_of(
-            problem, self.init, self.n_starts, given, seed, only_given, enough
-        )
+        share = None if self.max_time is None else _SEARCH_SHARE * self.max_time
+        with bounded(share):
+            problem, fits = starts_of(
+                problem, self.init, self.n_starts, given, seed, only_given, enough
+            )
+            hurried = time_is_up()
         errors = [fit.relative_error for fit in fits]
         self.starts_ = pd.DataFrame({"relative_error": errors})
         self.fit_error_, self.start_params_ = errors[0], fits[0].x
@@ -560,7 +577,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         if self.norm == "covariance":
             self._weigh(problem, estimates)
         searched = isinstance(self.init, str) and not only_given
-        self._warn(problem, result, enough, searched)
+        self._warn(problem, result, enough, searched, hurried)
 
     def _minimise(
         self, problem: RestructuringProblem, fits: list[LeastSquaresResult]
@@ -572,10 +589,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 problem.structure, problem.box, fits[0].x, self.max_iter
             )
             return *found, 0.0
+        units = _UNITS * system.rounding(fits[0].x) / max(problem.reference, 1e-300)
         options: dict[str, Any] = {
             "max_iter": self.max_iter,
             "tol": self.tol,
-            "negligible": _ROUNDING * problem.reference,
+            "negligible": problem.reference * max(_ROUNDING, min(units, EXACT_FIT)),
         }
         if self.norm == "h2":
             runs = [minimise_h2(system, f, margin, **options) for f in promising(fits)]
@@ -671,13 +689,26 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         result: MinimaxResult,
         enough: float,
         searched: bool,
+        hurried: bool,
     ) -> None:
         """Warn of a search that did not converge, a poor fit, and open parameters.
 
         And of one fit that no other confirms, where starts were `searched` for and its
-        error is not `enough`.
+        error is not `enough`, or of a search that was `hurried`.
         """
-        if not result.converged:
+        errors = self.starts_["relative_error"].to_numpy()
+        timed_out = hurried and errors[0] > enough
+        if timed_out or (time_is_up() and not result.converged):
+            warn(
+                f"the search ended at `max_time`={self.max_time} s, with a relative "
+                f"error of {self.relative_error_:.2g} and `stationarity_` "
+                f"{self.stationarity_:.1g} (0 at an optimum): it did not look at all "
+                "starts, or not to the end. The best point is kept. Raise `max_time`, "
+                "or give `init`.",
+                ConvergenceWarning,
+            )
+            searched = False  # no more can be said of the starts
+        elif not result.converged:
             spent = self.n_iter_ >= self.max_iter
             warn(
                 f"the search {'ended at' if spent else 'stalled before'} "
@@ -689,7 +720,6 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 + ", or take a structure of fewer parameters.",
                 ConvergenceWarning,
             )
-        errors = self.starts_["relative_error"].to_numpy()
         together = int((errors <= errors[0] * (1.0 + _AGREE)).sum())
         if searched and len(errors) > 1 == together and errors[0] > enough:
             warn(

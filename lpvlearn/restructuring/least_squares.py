@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.least_squares import levenberg_marquardt, scaled_lstsq
+from .deadline import time_is_up
 from .error_system import ErrorSystem
 
 Array = NDArray[np.float64]
@@ -37,6 +38,7 @@ def fit_frequency_response(
     admissible: Callable[[Array], bool],
     scaling: Array | float = 1.0,
     max_iter: int = 100,
+    geodesic: bool = False,
 ) -> LeastSquaresResult | None:
     """Least-squares fit of ``G(theta)`` to the black box at the frequencies `omega`.
 
@@ -66,6 +68,8 @@ def fit_frequency_response(
         lower=structure.lower,
         upper=structure.upper,
         max_iter=max_iter,
+        stop=time_is_up,
+        geodesic=geodesic,
     )
     return LeastSquaresResult(x[0], float(cost[0])) if np.isfinite(cost[0]) else None
 

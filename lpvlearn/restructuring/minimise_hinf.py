@@ -18,6 +18,7 @@ from ..minimax.problem import Flags, MinimaxProblem, MinimaxResult, Peaks
 from ..minimax.sqp import minimax_sqp
 from .central_path import PathPoint, central_path
 from .coordinates import CanonicalForm, Geodesics, ResponseGeometry, view_at
+from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, vanishing_weight
 from .least_squares import LeastSquaresResult, fit_frequency_response
 from .limits import Limits, within_bounds
@@ -189,6 +190,7 @@ class HinfObjective:
             self.constraints,
             self.system.grid,
             self.curve,
+            time_is_up,
         )
 
 
@@ -291,7 +293,7 @@ def _from_least_squares(
         settled = result.stationarity <= _STATIONARY and result.converged
         settled |= best[1].peaks.top <= options["negligible"]
         idle = result.converged and best[1].peaks.top >= (1.0 - _PROGRESS) * top
-        if settled or idle or used >= max_iter:
+        if settled or idle or used >= max_iter or time_is_up():
             break
         ahead = best[1].peaks.top < _AHEAD * size and limits.strict(best[0])
         inner = best[0] if ahead else path.theta

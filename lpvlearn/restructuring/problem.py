@@ -21,6 +21,7 @@ from ..models.statespace import DEVIATION, StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
 from ..validation import real_array
+from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, series
 from .least_squares import (
     LeastSquaresResult,
@@ -101,12 +102,22 @@ class RestructuringProblem:
         self, theta: Array, scaling: Array | float = 1.0
     ) -> LeastSquaresResult | None:
         """Least-squares fit of the response from given parameters; None if unstable."""
+        fit = self._fit(theta, scaling, False)
+        if fit is None or not EXACT_FIT < fit.relative_error <= GOOD_FIT:
+            return fit
+        # it may have stopped on the way along a curved valley
+        return self._fit(fit.x, scaling, True)
+
+    def _fit(
+        self, theta: Array, scaling: Array | float, geodesic: bool
+    ) -> LeastSquaresResult | None:
         fit = fit_frequency_response(
             self.system,
             theta,
             self.omega,
             admissible=self.is_stable,
             scaling=scaling,
+            geodesic=geodesic,
         )
         if fit is None:
             return None
@@ -140,6 +151,8 @@ class RestructuringProblem:
             if best <= enough or best <= GOOD_FIT and together >= AGREEING:
                 break
             if best > GOOD_FIT and number >= n_fits:
+                break
+            if fits and time_is_up():
                 break
             if scaling is not None:  # all channels alike first, then as they are
                 first = self.fit(theta, scaling)
