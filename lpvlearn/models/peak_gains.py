@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.hinf_norm import hinf_norm, linf_norm
-from ..validation import one_of
+from ..validation import one_of, share
 from .statespace import StateSpace
 
 Array = NDArray[np.float64]
@@ -75,8 +75,7 @@ def peak_gains(
     one_of("norm", norm, ("hinf", "linf"))
     if not isinstance(model, StateSpace):
         raise ValueError(f"`model` must be a StateSpace. Got {type(model).__name__}.")
-    if not 0 < within < 1:
-        raise ValueError(f"`within` must be between 0 and 1. Got {within}.")
+    within = share("within", within)
     compute = hinf_norm if norm == "hinf" else linf_norm
     parts, dt = (model.A, model.B, model.C, model.D), model.sampling_time
     size = compute(*parts, dt=dt).norm

@@ -434,6 +434,13 @@ def after_loading(value: Any) -> Any:
         return value.with_coefficients(value.coefficients())  # the curve laid anew
     elif isinstance(value, LPVStateSpace):
         _try_lpv(value)
+    elif isinstance(value, LocalLPVPipeline) and hasattr(value, "lpv_"):
+        try:
+            value.summary()
+        except (KeyError, IndexError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"its tables do not tell what those of a pipeline do ({error!r})"
+            ) from error
     return value
 
 

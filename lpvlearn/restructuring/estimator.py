@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,15 @@ from ..exceptions import RankWarning, VersionedPickle, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..validation import one_of, positive_time, real_array, whole_number
+from ..validation import (
+    naming_argument,
+    number,
+    one_of,
+    positive_time,
+    real_array,
+    shown,
+    whole_number,
+)
 from .deadline import bounded, time_is_up
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
@@ -47,6 +54,8 @@ Array = NDArray[np.float64]
 
 # A fit of an error up to that multiple of the black box's standard deviation is as good
 # as the true parameters' own.
+_MOST_STARTS = 100_000  # all are drawn at once
+
 _NOISY = 1.5
 
 _OPTIMAL = 1e-5  # stationarity from which an optimum is known nearly only
@@ -392,12 +401,15 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "params_")
         names = self.structure_.parameter_names
-        pi = np.asarray(places)
-        if pi.shape != (len(names),) or sorted(pi.tolist()) != list(range(len(names))):
+        given = real_array("places", places)
+        if not np.array_equal(np.sort(given, axis=None), np.arange(given.size)) or (
+            given.shape != (len(names),)
+        ):
             raise ValueError(
                 f"`places` must hold every index from 0 to {len(names) - 1} once. Got "
-                f"{places!r}."
+                f"{shown(places)}."
             )
+        pi = given.astype(np.intp)
         other = copy(self)
         for name in ("params_", "hinf_params_", "start_params_"):
             if hasattr(self, name):
@@ -486,7 +498,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "params_")
         whole_number("n_restarts", n_restarts, 1)
-        size = float(real_array("size", size))
+        size = number("size", size, "from 0 to 1", low=0.0, high=1.0)
         rng = np.random.default_rng(0)
         rows, norm, params = [], self.norm, self.params_
         if norm == "covariance":
@@ -512,15 +524,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "`init` must be 'similarity' or a vector of parameters. Got "
                 f"{self.init!r}."
             )
-        whole_number("n_starts", self.n_starts, 1)
+        whole_number("n_starts", self.n_starts, 1, _MOST_STARTS)
         whole_number("max_iter", self.max_iter, 0)
         if self.max_time is not None:
             positive_time("max_time", self.max_time)
-        if not isinstance(self.tol, Real) or not 0.0 <= float(self.tol) < 1.0:
-            raise ValueError(
-                "`tol` must be a relative decrease, at least 0 and below 1. Got "
-                f"{self.tol!r}."
-            )
+        rule = "a relative decrease, at least 0 and below 1"
+        number("tol", self.tol, rule, low=0.0, high=float(np.nextafter(1.0, 0.0)))
 
     def _problem(
         self, model: StateSpace | Sequence[StateSpace]
@@ -561,7 +570,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         uncertainty: float,
         only_given: bool,
     ) -> None:
-        seed = check_random_state(self.random_state).randint(2**31)
+        rule = "be a whole number from 0 to 2**32 - 1, or None"
+        with naming_argument("random_state", rule, self.random_state):
+            seed = check_random_state(self.random_state).randint(2**31)
         enough = max(EXACT_FIT, _NOISY * uncertainty)
         share = None if self.max_time is None else _SEARCH_SHARE * self.max_time
         with bounded(share):

@@ -38,6 +38,7 @@ _AGREEMENT = 1e-4
 # function may lose two digits of its own.
 _ROUNDING = 1e-8
 
+_NO_SIZE = 1e-200  # a parameter smaller than that is zero: no step could be
 _LEAST_SIZE = 1e-3  # of a parameter near zero, relative to its usual size
 
 _FILTERS = threading.RLock()  # the warning filters are those of all threads
@@ -286,4 +287,5 @@ def _central(f: Callable[[Any], Any], theta: Array, steps: Array) -> Array:
 def _parameter_scale(theta: Array, typical: Array) -> Array:
     """Size of every parameter; 0 stands for a usual value of 1."""
     usual = np.abs(typical)
-    return np.maximum(np.abs(theta), _LEAST_SIZE * np.where(usual > 0, usual, 1.0))
+    usual = np.where(usual > _NO_SIZE, usual, 1.0)
+    return np.maximum(np.abs(theta), _LEAST_SIZE * usual)
