@@ -2,35 +2,122 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from numbers import Integral
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from decimal import Decimal
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+
+_SHOWN = 80  # characters of a value in a message, lest a table fills the screen
+
+_LATEST = 1e9  # samples of an input's delay: more are no record's
 
 
 def real_array(name: str, value: Any) -> Array:
     """`value` as a new array of floats, or a ValueError that names the argument.
 
-    Strings that look like numbers and complex numbers are refused: converting them
-    silently hides a mistake.
+    This is the door for numbers: text that looks like them, dates, complex numbers and
+    integers beyond floats are refused, as converting them silently hides a mistake.
+    What is missing (None or NA in an array, masked) becomes NaN.
     """
+    return _numbers(name, value, np.dtype(np.float64), "real")
+
+
+def complex_array(name: str, value: Any) -> NDArray[np.complex128]:
+    """`value` as a new array of complex numbers, see `real_array`."""
+    return _numbers(name, value, np.dtype(np.complex128), "real or complex")
+
+
+def _numbers(name: str, value: Any, dtype: np.dtype[Any], kinds: str) -> NDArray[Any]:
     try:
         array = np.asarray(value)
-        if array.dtype.kind in "biufO":
-            return np.array(array, dtype=np.float64)
-    except (TypeError, ValueError):
+        fits = array.dtype.kind in ("biufc" if dtype.kind == "c" else "biuf")
+        if array.dtype.kind == "O" and array.ndim:
+            fits = all(_is_number(x) or x is None or x is pd.NA for x in array.flat)
+            array = np.where(pd.isna(array), np.nan, array)
+        elif array.dtype.kind == "O":
+            fits = _is_number(array.item())
+        if fits:
+            with np.errstate(over="ignore"):  # infinity is told where it may not be
+                found = np.array(array, dtype)
+            if np.ma.isMaskedArray(value):
+                found[np.ma.getmaskarray(value)] = np.nan
+            return found
+    except (TypeError, ValueError, OverflowError):
         pass
-    raise ValueError(f"`{name}` must hold real numbers only. Got {shown(value)}.")
+    raise ValueError(f"`{name}` must hold {kinds} numbers only. Got {shown(value)}.")
+
+
+def _is_number(value: Any) -> bool:
+    """Whether one value is a real number; a time difference is none, whatever NumPy
+    calls it."""
+    real = isinstance(value, Real | Decimal | np.bool_)
+    return real and not isinstance(value, np.timedelta64)
+
+
+def number(
+    name: str,
+    value: Any,
+    rule: str = "a finite number",
+    *,
+    above: float = -np.inf,
+    low: float = -np.inf,
+    high: float = np.inf,
+) -> float:
+    """`value` as a finite float greater than `above` and from `low` to `high`.
+
+    Else a ValueError that names it and says the `rule`.
+    """
+    found = np.nan
+    if not isinstance(value, bool | np.bool_):
+        try:
+            array = real_array(name, value)
+            found = float(array) if array.ndim == 0 else np.nan
+        except ValueError:
+            pass
+    if not (np.isfinite(found) and above < found and low <= found <= high):
+        raise ValueError(f"`{name}` must be {rule}. Got {shown(value)}.")
+    return found
+
+
+def share(name: str, value: Any) -> float:
+    """`value` as a float between 0 and 1, neither of them."""
+    below = float(np.nextafter(1.0, 0.0))
+    return number(name, value, "between 0 and 1", above=0.0, high=below)
+
+
+def flag(name: str, value: Any) -> bool:
+    """`value` as True or False, or a ValueError that names it."""
+    if isinstance(value, Integral | np.bool_) and value in (0, 1):
+        return bool(value)
+    raise ValueError(f"`{name}` must be True or False. Got {shown(value)}.")
+
+
+@contextmanager
+def naming_argument(name: str, rule: str, value: Any) -> Iterator[None]:
+    """Tell the argument, its rule and the value where another library refuses it."""
+    try:
+        yield
+    except (TypeError, ValueError, ArithmeticError) as error:
+        if f"`{name}`" in str(error):
+            raise
+        kind = ValueError if isinstance(error, ArithmeticError) else type(error)
+        raise kind(f"`{name}` must {rule}. Got {shown(value)}: {error}") from error
 
 
 def shown(value: Any) -> str:
     """A value in a message, of which a table shows its beginning only."""
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+    try:
+        text = repr(value)
+    except Exception:  # of a foreign object, or an integer of too many digits
+        text = f"a value of type {type(value).__name__}"
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
 
 def matrix(name: str, value: ArrayLike) -> Array:
@@ -54,21 +141,17 @@ def _finite(name: str, array: Array, place: str) -> Array:
 
 def positive_time(name: str, value: Any) -> float:
     """`value` as a positive finite float, or a ValueError that names it."""
-    try:
-        time = np.nan if isinstance(value, bool | str) else float(value)
-    except (TypeError, ValueError):
-        time = np.nan
-    if not 0.0 < time < np.inf:
-        raise ValueError(
-            f"`{name}` must be a positive number of seconds. Got {shown(value)}."
-        )
-    return time
+    return number(name, value, "a positive number of seconds", above=0.0)
+
+
+def is_whole(value: Any) -> bool:
+    """Whether a value is an integer: no bool, and no time, whatever NumPy calls it."""
+    return isinstance(value, Integral) and not isinstance(value, bool | np.timedelta64)
 
 
 def whole_number(name: str, value: Any, low: int, high: int | None = None) -> int:
     """`value` as an int from `low` to `high`, or a ValueError that names it."""
-    whole = isinstance(value, Integral) and not isinstance(value, bool)
-    if not whole or value < low or (high is not None and value > high):
+    if not is_whole(value) or value < low or (high is not None and value > high):
         limits = f"at least {low}" if high is None else f"{low} to {high}"
         raise ValueError(f"`{name}` must be an integer, {limits}. Got {shown(value)}.")
     return int(value)
@@ -102,6 +185,17 @@ def frequencies(omega: ArrayLike) -> Array:
     return omega
 
 
+def place(name: str, value: Any, n: int) -> Array:
+    """`value` as a finite vector of `n` values; a number may stand for one."""
+    found = real_array(name, value).reshape(-1)
+    if found.shape != (n,) or not np.isfinite(found).all():
+        raise ValueError(
+            f"`{name}` must be one finite value of every scheduling variable, {n}. Got "
+            f"{shown(value)}."
+        )
+    return found
+
+
 def finite_samples(name: str, value: ArrayLike, width: int) -> Array:
     """Inputs `u` or outputs `y` as a finite array of shape (n_samples, width)."""
     array = real_array(name, value)
@@ -113,6 +207,20 @@ def finite_samples(name: str, value: ArrayLike, width: int) -> Array:
         )
     channel = "input" if name == "u" else "output"
     return _finite(name, array, f"sample {{}}, {channel} {{}}")
+
+
+def measured_samples(y: ArrayLike, n_samples: int, width: int) -> Array:
+    """Outputs `y` of the samples of `u`, (n_samples, width); NaN where missing."""
+    measured = real_array("y", y)
+    missing = np.isnan(measured)
+    y = finite_samples("y", np.where(missing, 0.0, measured), width)
+    if n_samples == 0 or n_samples != len(y):
+        raise ValueError(
+            "`u` and `y` must have one row for each of the same samples, at least one. "
+            f"Got {n_samples} and {len(y)}."
+        )
+    y[missing.reshape(y.shape)] = np.nan
+    return y
 
 
 def state_vector(x0: ArrayLike, order: int, n_more: int = 0) -> Array:
@@ -140,7 +248,7 @@ def input_delays(value: ArrayLike, n_inputs: int, *, samples: bool) -> NDArray[A
     shape_fits = delay.shape in ((), (n_inputs,))
     if shape_fits and np.isfinite(delay).all() and (delay >= 0).all():
         delay = np.broadcast_to(delay, (n_inputs,)).copy()
-        if samples and (delay == np.floor(delay)).all():
+        if samples and (delay == np.floor(delay)).all() and (delay <= _LATEST).all():
             delay = delay.astype(np.intp)
         if not samples or delay.dtype == np.intp:
             delay.setflags(write=False)
@@ -148,8 +256,25 @@ def input_delays(value: ArrayLike, n_inputs: int, *, samples: bool) -> NDArray[A
     unit = "a whole number of samples" if samples else "a number of seconds"
     raise ValueError(
         f"`input_delay` must be {unit}, 0 or more, for all inputs or one for each of "
-        f"the {n_inputs}. Got {value!r}."
+        f"the {n_inputs}. Got {shown(value)}."
     )
+
+
+def names_of(argument: str, names: Any, n: int | None = None) -> list[Any]:
+    """`names` as a list of different ones, `n` of them or any number above zero."""
+    listed: list[Any] = []
+    if not isinstance(names, str | bytes | Mapping) and np.ndim(names) == 1:
+        listed = list(names)
+    try:
+        distinct = len({*listed}) == len(listed)
+    except TypeError:  # a list or a table, which is no name
+        distinct = False
+    if not listed or not distinct or n not in (None, len(listed)):
+        many = "" if n is None else f"{n} "
+        raise ValueError(
+            f"`{argument}` must be a list of {many}distinct names. Got {shown(names)}."
+        )
+    return listed
 
 
 def named_values(
@@ -159,7 +284,7 @@ def named_values(
 ) -> tuple[Array, list[str]]:
     """Finite values of parameters, and their names (p1, p2, ... if not given)."""
     if isinstance(values, Mapping):
-        names = list(values) if names is None else list(names)
+        names = names_of("parameter_names", list(values) if names is None else names)
         if set(names) != set(values):
             raise ValueError(
                 f"`{argument}` must have a value for each of {names}. Got values for "
@@ -167,9 +292,9 @@ def named_values(
             )
         values = [values[name] for name in names]
     start = np.atleast_1d(real_array(argument, values))
-    names = [f"p{i + 1}" for i in range(len(start))] if names is None else list(names)
-    if not names or len(set(names)) != len(names):
-        raise ValueError(f"`parameter_names` must be distinct names. Got {names}.")
+    if names is None:
+        names = [f"p{i + 1}" for i in range(start.size)]
+    names = names_of("parameter_names", names)
     if start.shape != (len(names),) or not np.isfinite(start).all():
         raise ValueError(
             f"`{argument}` must hold one finite value for each of the {len(names)} "

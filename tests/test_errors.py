@@ -796,7 +796,7 @@ USES = {
     ),
     "two scheduling values for one variable": (
         lambda model: model.lpv_.at([1, 2]),
-        ["`scheduling` must have 1 columns", "(1, 2)"],
+        ["`kappa` must be one finite value", "1. Got [1, 2]"],
     ),
     "a scheduling value that is missing": (
         lambda model: model.predict(put(np.nan, 5, "kappa")),

@@ -8,6 +8,7 @@ import pandas as pd
 from sklearn.utils.validation import check_consistent_length
 
 from ..exceptions import warn
+from ..validation import naming_argument
 
 _POSITIONS = "y.to_numpy() if the rows belong together as they stand"
 
@@ -28,7 +29,8 @@ def align_outputs(X: Any, y: Any) -> Any:
     """
     if y is None or not hasattr(y, "__len__"):
         return y  # where outputs are read, it is said what they must be
-    check_consistent_length(X, y)
+    with naming_argument("y", "have as many rows as X", y):
+        check_consistent_length(X, y)
     own, given = getattr(X, "index", None), getattr(y, "index", None)
     if not isinstance(own, pd.Index) or not isinstance(given, pd.Index):
         return y

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_array, check_consistent_length, validate_data
 
 from ..exceptions import DivergenceError
+from ..validation import complex_array, is_whole, positive_time, real_array, shown
 from .alignment import align_outputs
 from .forgotten_roles import warn_of_disorder, warn_of_forgotten_roles
 from .timestamps import (
@@ -91,7 +92,7 @@ class Column:
         if kind not in "mM":  # which numpy would turn into nanoseconds
             try:
                 return series.to_numpy(dtype=np.float64, na_value=np.nan)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 pass
         first = 0 if kind in "mM" else _first_not_a_number(series) or 0
         remedy = "Mend the value, or leave the column out."
@@ -122,7 +123,7 @@ def _did_you_mean(key: Any, names: Sequence[Any]) -> str:
     return f" Did you mean {lower[close[0]]!r}?" if close else ""
 
 
-def _shown(names: Sequence[Any]) -> str:
+def _listed(names: Sequence[Any]) -> str:
     """The first of the names, for a message."""
     return ", ".join(map(repr, names[:_N_SHOWN])) + ", ..." * (len(names) > _N_SHOWN)
 
@@ -131,7 +132,7 @@ def _first_not_a_number(values: Iterable[Any]) -> int | None:
     for row, value in enumerate(values):
         try:
             float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             if value is not pd.NA and value is not None:
                 return row
     return None
@@ -178,7 +179,8 @@ class Table:
         self.n_rows: int = X.shape[0]
         self.named = is_table(X)
         self.names: list[Any] = list(X.columns if self.named else range(X.shape[1]))
-        if len(set(self.names)) < len(self.names):
+        self._positions = {name: k for k, name in enumerate(self.names)}
+        if len(self._positions) < len(self.names):
             name = max(self.names, key=self.names.count)
             raise ValueError(
                 f"{argument} must have distinct column names. Got {name!r} "
@@ -200,12 +202,18 @@ class Table:
 
         Raises a ValueError about the argument `role` when `key` is none of these.
         """
-        if self.named and key in self.names:
-            return self.at(self.names.index(key))
+        try:
+            position = self._positions.get(key)
+        except TypeError:  # an array or a table, which is no name
+            raise ValueError(
+                f"`{role}` must name a column of X. Got {shown(key)}."
+            ) from None
+        if self.named and position is not None:
+            return self.at(position)
         if key is not None and key in self.levels:
             return Column(key, self.X.index.get_level_values(key))
         n_columns = len(self.names)
-        is_position = isinstance(key, Integral) and not isinstance(key, bool)
+        is_position = is_whole(key)
         if is_position and -n_columns <= key < n_columns:
             return self.at(int(key) % n_columns)
         if is_position:
@@ -213,12 +221,12 @@ class Table:
         elif not self.named:
             rule = "be an integer position, as X is an array without column names"
         else:
-            shown = _shown(self.names)
+            known = _listed(self.names)
             named = [repr(level) for level in self.levels if level is not None]
-            shown += f"; index levels: {', '.join(named)}" if named else ""
-            rule = f"name a column or an index level of X ({shown})"
+            known += f"; index levels: {', '.join(named)}" if named else ""
+            rule = f"name a column or an index level of X ({known})"
         hint = _did_you_mean(key, [*self.names, *self.levels])
-        raise ValueError(f"`{role}` must {rule}. Got {key!r}.{hint}")
+        raise ValueError(f"`{role}` must {rule}. Got {shown(key)}.{hint}")
 
     def one(self, key: Any, role: str) -> Column | None:
         """The column that has a role; None for `key=None`."""
@@ -307,6 +315,8 @@ def read_experiments(
     within an experiment.
     """
     roles = roles_of(estimator) | roles
+    if sampling_time is not None:
+        sampling_time = positive_time("sampling_time", sampling_time)
     if not is_table(X):
         numeric = all(role is None for role in roles.values())
         X = _as_matrix(estimator, X, numeric=numeric)
@@ -431,7 +441,7 @@ def fitted_roles(
     if lacking:
         raise ValueError(
             "X must have the columns that the fit read. Got none of name "
-            f"{', '.join(lacking)} among {_shown(table.names)}.{hint}"
+            f"{', '.join(lacking)} among {_listed(table.names)}.{hint}"
         )
     return found
 
@@ -450,10 +460,10 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
         values, "shape"
     )
     if other or not array:
-        shown = repr(values) if isinstance(values, str) else type(values).__name__
+        got = repr(values) if isinstance(values, str) else type(values).__name__
         raise ValueError(
             f"`{argument}` must be a table (a pandas.DataFrame) or an array of "
-            f"numbers. Got {shown}."
+            f"numbers. Got {got}."
         )
     kind = getattr(getattr(values, "dtype", None), "kind", "")
     if kind in ("m", "M") and options.get("dtype") is not None:
@@ -467,7 +477,7 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
         return check_array(
             values, ensure_all_finite=False, input_name=argument, **options
         )
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         try:
             entries = np.asarray(values)
         except ValueError:
@@ -484,23 +494,21 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
                 f"`{argument}` must hold numbers. Got {as_scalar(flat[k])!r} at "
                 f"{', '.join(f'{axis} {i}' for axis, i in at)}: {error}."
             ) from error
-        raise
+        kind = ValueError if isinstance(error, OverflowError) else type(error)
+        raise kind(
+            f"`{argument}` must be a table of real numbers. Got {shown(values)}: "
+            f"{error}"
+        ) from error
 
 
-def as_numbers(argument: str, values: Any) -> Array:
+def as_numbers(argument: str, values: Any, *, imaginary: bool = False) -> NDArray[Any]:
     """Numbers in an array of any shape, a single one in a vector.
 
-    Raises a ValueError about the `argument` where one is not a real number.
+    Raises a ValueError about the `argument` where one is not a real number, or where it
+    may be `imaginary`, no number.
     """
-    many = hasattr(values, "__len__") and np.shape(values) != ()
-    return _checked(
-        argument,
-        values if many or isinstance(values, str) else [values],
-        dtype=np.float64,
-        ensure_2d=False,
-        allow_nd=True,
-        ensure_min_samples=0,
-    )
+    read = complex_array if imaginary else real_array
+    return np.atleast_1d(read(argument, values))
 
 
 def _numbers(columns: Sequence[Column], n_rows: int, argument: str) -> Array:
@@ -566,6 +574,8 @@ def group_rows(
     column: Column | None, n_rows: int
 ) -> tuple[list[Hashable], list[Indices]]:
     """Labels of experiments in the order of first appearance, and the rows of each."""
+    if n_rows == 0:
+        raise ValueError("X must hold at least one sample. Got 0.")
     if column is None:
         return [0], [np.arange(n_rows)]
     codes, uniques = pd.factorize(pd.Series(column.values))
@@ -607,6 +617,10 @@ def read_outputs(y: Any, argument: str = "y") -> tuple[Array, list[Hashable]]:
     if is_table(y):
         table = Table(y, argument)
         columns = [table.at(position) for position in range(len(table.names))]
+        if not columns:
+            raise ValueError(
+                f"`{argument}` must have at least one column. Got shape {y.shape}."
+            )
         return _numbers(columns, table.n_rows, argument), table.names
     name = getattr(y, "name", None)
     Y = _checked(argument, y, dtype=np.float64, ensure_2d=False)
@@ -657,12 +671,8 @@ def from_trajectories(
             "`trajectories` must be a list of tuples (u, kappa, y) or (u, y). Got "
             f"{type(trajectories).__name__}."
         )
-    step = 1.0 if sampling_time is None else sampling_time
-    if not 0 < as_numbers("sampling_time", step).min() < np.inf:
-        raise ValueError(
-            "`sampling_time` must be a positive number of seconds. Got "
-            f"{sampling_time}."
-        )
+    if sampling_time is not None:
+        sampling_time = positive_time("sampling_time", sampling_time)
     if len(trajectories) == 0:
         raise ValueError("`trajectories` must hold at least one tuple. Got 0.")
     parts = [_trajectory(k, item) for k, item in enumerate(trajectories)]

@@ -15,6 +15,7 @@ from scipy.spatial import Delaunay, QhullError
 from scipy.spatial.distance import cdist
 
 from ..exceptions import warn
+from ..validation import shown
 from .experiments import Experiment, as_numbers
 
 Array = NDArray[np.float64]
@@ -209,7 +210,7 @@ def _tolerance(signals: Sequence[Array], means: Array, tol: ArrayLike | None) ->
     if given.shape not in ((1,), (means.shape[1],)) or not (given >= 0).all():
         raise ValueError(
             "`scheduling_tol` must be a non-negative number, or one per scheduling "
-            f"variable ({means.shape[1]}). Got {tol!r}."
+            f"variable ({means.shape[1]}). Got {shown(tol)}."
         )
     return np.broadcast_to(given, means.shape[1:])
 

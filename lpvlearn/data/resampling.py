@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import convolve1d
 
-from ..validation import one_of, positive_time
+from ..validation import flag, number, one_of, positive_time
 from .alignment import align_outputs
 from .experiments import Column, Table, as_list, group_rows, is_table
 from .timestamps import missing_after, time_in_seconds
@@ -26,6 +26,8 @@ _HELD = 0.25
 
 _DIGITS = 3  # of a step that is taken from the data
 _SAME = 1e-6  # of a step: stamps closer than that are one
+_FINEST = 1000  # points of a grid for each sample: more is a mistake of units
+
 _AS_FINE = 1.05  # steps of the grid per mean step of the record that need no smoothing
 
 
@@ -117,8 +119,8 @@ def resample(
     9  0.9  0.0  0.9
     """
     one_of("method", method, ("linear", "cubic"))
-    if not max_gap >= 1:
-        raise ValueError(f"`max_gap` must be at least 1 step. Got {max_gap!r}.")
+    max_gap = number("max_gap", max_gap, "at least 1 step", low=1.0)
+    antialias = flag("antialias", antialias)
     y = align_outputs(X, y)
     table = Table(_as_frame(X))
     stamps, by_label = table.one(time, "time"), table.one(experiment, "experiment")
@@ -134,6 +136,11 @@ def resample(
     step = float(f"{own:.{_DIGITS}g}")
     if sampling_time is not None:
         step = positive_time("sampling_time", sampling_time)
+        if step < own / _FINEST:
+            raise ValueError(
+                f"`sampling_time` must be at least {own / _FINEST:.3g} s, {_FINEST} "
+                f"points for each sample. Got {step} s."
+            )
     # As many points of a finer grid to each point as the record has samples.
     n_fine = int(np.ceil(step / (_AS_FINE * own))) if antialias else 1
     gap = max_gap * max(step, float(own))
@@ -308,6 +315,11 @@ def _as_frame(X: Any) -> pd.DataFrame:
         return X.to_frame(0 if X.name is None else X.name)
     if is_table(X):
         return pd.DataFrame({name: np.asarray(X[name]) for name in X.columns})
+    if np.ndim(X) not in (1, 2):
+        raise ValueError(
+            "X and `y` must be tables or arrays, (n_samples, n_columns). Got "
+            f"{type(X).__name__}."
+        )
     return pd.DataFrame(X if hasattr(X, "dtype") else list(X)).infer_objects()
 
 

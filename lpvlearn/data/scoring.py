@@ -10,6 +10,7 @@ from scipy.special import fdtrc
 from sklearn.metrics import r2_score
 
 from ..exceptions import collected, warn
+from ..validation import real_array, shown
 from .alignment import align_outputs
 from .experiments import read_outputs
 
@@ -28,6 +29,8 @@ _GAIN = 2.0
 # starts in motion that cost more than 10 points were found.)
 _MODE, _CHANCE = 2, 1e-3
 
+_SQUARED = 1e150  # outputs of which the squares are numbers
+
 _SETTLED = 0.99  # share of its energy within which a transient is over
 _WINDOWS = 8  # of that length in a record; of a longer transient the start will do
 
@@ -38,13 +41,34 @@ def score_from_rest(
     """R2 of ``estimator.predict(X)``, missing outputs left out; warns of motion."""
     y = align_outputs(X, y)
     measured, simulated = read_outputs(y)[0], read_outputs(estimator.predict(X))[0]
+    if measured.shape != simulated.shape:
+        raise ValueError(
+            f"`y` must have shape {simulated.shape}, as what the model simulates. Got "
+            f"{measured.shape}."
+        )
     known = ~np.isnan(measured).any(axis=1)
     if not known.any():
         raise ValueError(
             "`y` must hold at least 1 measured sample of all outputs. Got none in "
             f"{len(measured)} rows."
         )
-    weight = None if sample_weight is None else np.asarray(sample_weight)[known]
+    weight = None
+    if sample_weight is not None:
+        weight = real_array("sample_weight", sample_weight)
+        if (
+            weight.shape != known.shape
+            or not (np.isfinite(weight) & (weight >= 0)).all()
+        ):
+            raise ValueError(
+                f"`sample_weight` must hold {len(measured)} finite numbers, 0 or more, "
+                f"one for each row. Got {shown(sample_weight)}."
+            )
+        weight = weight[known]
+    largest = np.abs(measured[known]).max()
+    if not largest < _SQUARED:
+        raise ValueError(
+            f"`y` must be finite and below {_SQUARED:g}: it is squared. Got {largest}."
+        )
     score = r2_score(measured[known], simulated[known], sample_weight=weight)
     warn_of_motion(estimator, X, y, simulated)
     return float(score)

@@ -58,9 +58,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.model_selection import BaseCrossValidator
 from sklearn.utils import check_random_state
-from sklearn.utils.validation import check_consistent_length
+from sklearn.utils.validation import check_consistent_length, column_or_1d
 
-from ..validation import one_of, whole_number
+from ..validation import flag, naming_argument, one_of, whole_number
 from .experiments import (
     Column,
     Experiment,
@@ -140,7 +140,10 @@ class _SplitOfExperiments(BaseCrossValidator):
         table, roles = Table(X), roles_of(self)
         by_label = table.one(roles["experiment"], "experiment")
         if by_label is None and groups is not None:
-            check_consistent_length(X, groups)
+            rule = "hold one label for each row of X"
+            with naming_argument("groups", rule, groups):
+                check_consistent_length(X, groups)
+                groups = column_or_1d(groups)
             by_label = Column("groups", groups)
         by_point = table.one(roles["operating_point"], "operating_point")
         by_kappa = table.several(roles["scheduling"], "scheduling")
@@ -244,7 +247,7 @@ class ExperimentSplit(_SplitOfExperiments):
         self.random_state = random_state
 
     def _count(self, X: Any, groups: Any) -> int:
-        if self.n_splits != "all":
+        if not self._wants_all:
             return whole_number("n_splits", self.n_splits, 2)
         if X is None:
             raise ValueError("`X` must be given to count the folds of n_splits='all'.")
@@ -272,6 +275,10 @@ class ExperimentSplit(_SplitOfExperiments):
         return super()._read(X, groups)
 
     @property
+    def _wants_all(self) -> bool:
+        return isinstance(self.n_splits, str) and self.n_splits == "all"
+
+    @property
     def _knows_points(self) -> bool:
         return self.scheduling is not None or self.operating_point is not None
 
@@ -284,22 +291,29 @@ class ExperimentSplit(_SplitOfExperiments):
     def _folds(self, point: Indices) -> list[set[int]]:
         """Numbers of the experiments that every fold holds out."""
         # Neighbours go to different folds: the experiments of one point.
+        interior, shuffle = (
+            flag("interior", self.interior),
+            flag("shuffle", self.shuffle),
+        )
         units = [[k] for k in np.argsort(point, kind="stable")]
         if self.hold_out == "operating_point":
             units = [np.flatnonzero(point == k).tolist() for k in range(max(point) + 1)]
-            units = units[1:-1] if self.interior else units
+            units = units[1:-1] if interior else units
         n_units = len(units)
-        if self.shuffle:
-            order = check_random_state(self.random_state).permutation(n_units)
+        if shuffle:
+            rule = "be a whole number from 0 to 2**32 - 1, or None"
+            with naming_argument("random_state", rule, self.random_state):
+                rng = check_random_state(self.random_state)
+            order = rng.permutation(n_units)
             units = [units[k] for k in order]
             if self.hold_out == "experiment":
                 units.sort(key=lambda unit: point[unit[0]])
         n_splits = n_units
-        if self.n_splits != "all":
+        if not self._wants_all:
             n_splits = whole_number("n_splits", self.n_splits, 2)
         if not 0 < n_splits <= n_units or len(point) == 1:
             what = self.hold_out.replace("_", " ")
-            inside = " inside the range of the others" if self.interior else ""
+            inside = " inside the range of the others" if interior else ""
             raise ValueError(
                 f"`n_splits` must be at most the number of {what}s{inside}. Got "
                 f"{self.n_splits!r} for {n_units}. The column `experiment` (or the "

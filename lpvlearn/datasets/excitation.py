@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator, RandomState
 from numpy.typing import NDArray
 from sklearn.utils import check_random_state
 
+from ..validation import naming_argument, number, real_array, shown, whole_number
+
 Array = NDArray[np.float64]
+
+_MOST_STEPS = 10_000  # of integration in a sampling period, 1 s with the defaults
+
+_MOST = 1e8  # samples, experiments or bits of a built-in data set: more is a mistake
 
 
 def prbs(
@@ -59,15 +65,15 @@ def prbs(
     >>> prbs(8, clock=2, balance=2, random_state=0).ravel().tolist()
     [1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, -1.0]
     """
-    check_count("n_samples", n_samples)
-    check_count("n_channels", n_channels)
-    check_count("clock", clock)
-    check_size("amplitude", amplitude)
-    if balance is not None and (balance < 2 or balance % 2):
-        raise ValueError(
-            "`balance` must be None or an even number of bits, at least 2. "
-            f"Got {balance}."
-        )
+    n_samples, n_channels = (
+        check_count("n_samples", n_samples),
+        check_count("n_channels", n_channels),
+    )
+    clock, amplitude = check_count("clock", clock), check_size("amplitude", amplitude)
+    if balance is not None:
+        balance = whole_number("balance", balance, 2)
+        if balance % 2:
+            raise ValueError(f"`balance` must be even, or None. Got {balance}.")
     rng = (
         random_state
         if isinstance(random_state, Generator)
@@ -100,31 +106,57 @@ def spawn_generators(
     random_state: int | RandomState | None, n_generators: int
 ) -> list[Generator]:
     """Independent generators, so that one draw never shifts another one."""
-    seeds = check_random_state(random_state).randint(2**31 - 1, size=n_generators)
+    with naming_argument(
+        "random_state", "be a whole number from 0 to 2**32 - 1, or None", random_state
+    ):
+        rng = check_random_state(random_state)
+    seeds = rng.randint(2**31 - 1, size=n_generators)
     return [np.random.default_rng(seed) for seed in seeds]
 
 
 def samples_of(name: str, duration: float, sampling_time: float) -> int:
     """Number of samples in a duration."""
-    check_size("sampling_time", sampling_time)
-    if not (np.isfinite(duration) and duration >= sampling_time):
+    dt = check_size("sampling_time", sampling_time)
+    rule = f"finite and at least `sampling_time` ({dt} s)"
+    return check_count(name, round(number(name, duration, rule, low=dt) / dt))
+
+
+def check_count(name: str, value: Any) -> int:
+    """`value` as a whole number of at least 1 that memory may hold."""
+    whole = number(name, value, "an integer of at least 1", low=1.0)
+    if whole != np.rint(whole) or whole > _MOST:
         raise ValueError(
-            f"`{name}` must be finite and at least `sampling_time` "
-            f"({sampling_time} s). Got {duration}."
+            f"`{name}` must be an integer of at least 1, at most {_MOST:g}. Got "
+            f"{shown(value)}."
         )
-    return round(duration / sampling_time)
+    return int(whole)
 
 
-def check_count(name: str, value: float) -> None:
-    """Refuse what is no whole number of at least 1."""
-    whole = isinstance(value, Real) and value == np.rint(value)
-    if not whole or value < 1 or not np.isfinite(value):
-        raise ValueError(f"`{name}` must be an integer of at least 1. Got {value!r}.")
+def check_size(name: str, value: Any, may_be_zero: bool = False) -> float:
+    """`value` as a finite positive number (or zero, where that may be)."""
+    if may_be_zero:
+        return number(name, value, "finite and non-negative", low=0.0)
+    return number(name, value, "finite and positive", above=0.0)
 
 
-def check_size(name: str, value: float, may_be_zero: bool = False) -> None:
-    """Refuse what is not finite and positive (or zero, where that may be)."""
-    finite = isinstance(value, Real) and np.isfinite(value)
-    if not finite or not (value > 0 or (may_be_zero and value == 0)):
-        rule = "non-negative" if may_be_zero else "positive"
-        raise ValueError(f"`{name}` must be finite and {rule}. Got {value!r}.")
+def decibels(name: str, value: Any) -> float:
+    """`value` as a ratio in decibels, which may be infinite."""
+    ratio = real_array(name, value)
+    if ratio.ndim or np.isnan(ratio):
+        raise ValueError(
+            f"`{name}` must be a number of decibels or infinity. Got {shown(value)}."
+        )
+    return float(ratio)
+
+
+def steps_of(sampling_time: Any, integration_step: Any, longest: float = np.inf) -> int:
+    """Equal steps of a sampling period, each at most that and the `longest`."""
+    dt = check_size("sampling_time", sampling_time)
+    step = min(check_size("integration_step", integration_step), longest)
+    if dt > _MOST_STEPS * step:
+        raise ValueError(
+            f"`sampling_time` must be at most {_MOST_STEPS} integration steps of "
+            f"{step:.3g} s. Got {dt} s."
+        )
+    # A quotient that is a hair above a whole number is that number.
+    return max(1, int(np.ceil(dt / step - 1e-9)))

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from .excitation import check_size
+from ..validation import number, one_of, real_array
+from .excitation import check_size, steps_of
 from .mechanics import (
     arm_tables,
     check_coordinates,
@@ -92,7 +93,7 @@ class FlexibleArm:
             if field.name != "gains":
                 may_be_zero = field.name.endswith("mass")
                 check_size(field.name, getattr(self, field.name), may_be_zero)
-        gains = np.asarray(self.gains, dtype=float)
+        gains = real_array("gains", self.gains)
         if gains.shape != (2,) or not np.all(np.isfinite(gains) & (gains >= 0)):
             raise ValueError(
                 "`gains` must be two finite non-negative numbers, one a joint. "
@@ -236,8 +237,7 @@ class FlexibleArm:
         >>> bool((momentum - arm.linearize(1.0)).hinf_norm() < 1e-9)
         True
         """
-        if form not in ("rate", "momentum"):
-            raise ValueError(f"`form` must be 'rate' or 'momentum'. Got {form!r}.")
+        one_of("form", form, ("rate", "momentum"))
         p = np.array([f"p{i}" for i in range(1, 17)]).reshape(4, 4).T
         A: list[list[float | str]]
         B: list[list[float | str]]
@@ -280,8 +280,7 @@ class FlexibleArm:
         return self.linearize(theta2).A[2:, :4].T.ravel()
 
     def _rest_mass(self, theta2: float) -> Array:
-        if np.ndim(theta2) != 0 or not np.isfinite(theta2):
-            raise ValueError(f"`theta2` must be one finite angle in rad. Got {theta2}.")
+        theta2 = number("theta2", theta2, "one finite angle in rad")
         return self.mass_matrix([0.0, theta2, 0.0, 0.0])
 
     def _output_matrix(self) -> Array:
@@ -351,10 +350,7 @@ class FlexibleArm:
     def _substeps(
         self, angles: Array, sampling_time: float, integration_step: float
     ) -> int:
-        check_size("sampling_time", sampling_time)
-        check_size("integration_step", integration_step)
-        # A quotient that is a hair above a whole number is that number.
-        n_substeps = max(1, int(np.ceil(sampling_time / integration_step - 1e-9)))
+        n_substeps = steps_of(sampling_time, integration_step)
         fastest = max(
             np.abs(self.linearize(a).poles()).max() for a in np.unique(angles)
         )
@@ -444,7 +440,7 @@ def _pair_experiments(
 
     One reference serves several angles and one angle several references.
     """
-    reference = np.asarray(velocity_reference, dtype=float)
+    reference = real_array("velocity_reference", velocity_reference)
     if reference.ndim not in (2, 3) or reference.shape[-1] != 2:
         raise ValueError(
             "`velocity_reference` must have shape (n_samples, 2) or "
@@ -452,7 +448,7 @@ def _pair_experiments(
         )
     if not np.isfinite(reference).all():
         raise ValueError("`velocity_reference` must be finite. Got NaN or infinity.")
-    angles = np.asarray(theta2, dtype=float)
+    angles = real_array("theta2", theta2)
     if angles.ndim > 1 or not np.isfinite(angles).all():
         raise ValueError(
             "`theta2` must be one finite angle in rad or one for each experiment. "

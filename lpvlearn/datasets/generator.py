@@ -10,8 +10,10 @@ from numpy.random import Generator, RandomState
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import Bunch
 
+from ..validation import number, real_array, shown
 from .excitation import (
     check_count,
+    decibels,
     measurement_noise,
     prbs,
     samples_of,
@@ -164,20 +166,20 @@ def make_flexible_arm(
     >>> list(data.X.columns)
     ['u1', 'u2', 'kappa', 'experiment', 'time']
     """
-    check_count("n_operating_points", n_operating_points)
-    check_count("n_realizations", n_realizations)
-    if np.isnan(snr_db):
-        raise ValueError("`snr_db` must be a number of decibels or infinity. Got nan.")
+    n_points = check_count("n_operating_points", n_operating_points)
+    n_repeats = check_count("n_realizations", n_realizations)
+    snr_db = decibels("snr_db", snr_db)
     arm = FlexibleArm() if arm is None else arm
-    n_points = int(n_operating_points)
+    if not isinstance(arm, FlexibleArm):
+        raise ValueError(f"`arm` must be a FlexibleArm or None. Got {shown(arm)}.")
     theta2 = np.pi * np.arange(1, n_points + 1) / (n_points + 1)
     n_samples = samples_of("duration", duration, sampling_time)
     n_sweep = samples_of("sweep_duration", sweep_duration, sampling_time)
     clocks = _clock_samples("clock", clock, sampling_time)
     sweep_clocks = _clock_samples("sweep_clock", sweep_clock, sampling_time)
-    if balance_time is not None and not balance_time > 0:
-        raise ValueError(
-            f"`balance_time` must be positive or None. Got {balance_time}."
+    if balance_time is not None:
+        balance_time = number(
+            "balance_time", balance_time, "positive or None", above=0.0
         )
 
     input_rng, noise_rng, local_rng, sweep_rng = spawn_generators(random_state, 4)
@@ -229,7 +231,7 @@ def make_flexible_arm(
         X = _input_table(references[rows, :length], kappa, n_repeats, sampling_time)
         return X, pd.DataFrame(y.reshape(-1, 2), columns=OUTPUTS)
 
-    X, y = tables(slice(0, n_points), n_samples, int(n_realizations), snr_db)
+    X, y = tables(slice(0, n_points), n_samples, n_repeats, snr_db)
     X_local, y_local = tables(slice(n_points, 2 * n_points), n_samples)
     X_sweep, y_sweep = tables(slice(2 * n_points, None), n_sweep)
     return Bunch(
@@ -285,7 +287,7 @@ def _clock_samples(
     name: str, clock: ArrayLike, sampling_time: float
 ) -> tuple[int, int]:
     """Bit times of both joints in samples."""
-    seconds = np.asarray(clock, dtype=float)
+    seconds = real_array(name, clock)
     if seconds.shape not in ((), (2,)):
         raise ValueError(
             f"`{name}` must be one time in s or one a joint. Got {seconds}."

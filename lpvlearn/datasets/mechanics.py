@@ -27,6 +27,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..validation import real_array
+
 Array = NDArray[np.float64]
 
 ComplexArray = NDArray[np.complexfloating]
@@ -39,6 +41,9 @@ _SHORTENING = 2.0 / 3.0
 _N_POWERS = 5
 
 _ONE, _TURNING2, _CORIOLIS, _BENDING2 = 0, 1, 2, 3
+
+
+_BEYOND = 1e30  # of a coordinate or rate: fifth powers are still numbers
 
 
 def _link_moments(length: float, density: float, end_mass: float) -> Array:
@@ -209,14 +214,17 @@ def integrate(
 
 def check_coordinates(name: str, value: ArrayLike) -> Array:
     """`value` as a finite array of shape (..., 4)."""
-    array = np.asarray(value, dtype=float)
+    array = real_array(name, value)
     if array.ndim == 0 or array.shape[-1] != 4:
         raise ValueError(
             f"`{name}` must have shape (..., 4): theta1, theta2, v1, v2. "
             f"Got {array.shape}."
         )
-    if not np.isfinite(array).all():
-        raise ValueError(f"`{name}` must be finite. Got NaN or infinity.")
+    if not (np.abs(array) < _BEYOND).all():
+        raise ValueError(
+            f"`{name}` must be finite, smaller than {_BEYOND:g}. Got "
+            f"{array.ravel()[~(np.abs(array.ravel()) < _BEYOND)][0]}."
+        )
     return array
 
 

@@ -12,13 +12,16 @@ from sklearn.utils import Bunch
 
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
+from ..validation import naming_argument, number, real_array, shown
 from .excitation import (
     check_count,
     check_size,
+    decibels,
     measurement_noise,
     prbs,
     samples_of,
     spawn_generators,
+    steps_of,
 )
 
 Array = NDArray[np.float64]
@@ -104,7 +107,13 @@ class UnbalancedDisc:
 
     def acceleration(self, theta: ArrayLike, rate: ArrayLike, u: ArrayLike) -> Array:
         """The right-hand side of the equation, rad/s2; arguments are broadcast."""
-        theta, rate, u = np.asarray(theta), np.asarray(rate), np.asarray(u)
+        given = {"theta": theta, "rate": rate, "u": u}
+        x, v, voltage = (_finite(name, value) for name, value in given.items())
+        with naming_argument("theta", "have a shape that `rate` and `u` fit", theta):
+            np.broadcast_shapes(x.shape, v.shape, voltage.shape)
+        return self._acceleration(x, v, voltage)
+
+    def _acceleration(self, theta: Array, rate: Array, u: Array) -> Array:
         friction = self.gamma * rate
         if self.Fc:
             friction = friction + self.Fc * np.tanh(rate / _SLIDING)
@@ -112,7 +121,7 @@ class UnbalancedDisc:
 
     def holding_voltage(self, theta: ArrayLike) -> Array:
         """Voltage (V) of the equilibrium at an angle (rad), of any shape."""
-        return np.asarray(self.omega0**2 * np.sin(theta) / self.Ku)
+        return np.asarray(self.omega0**2 * np.sin(_finite("theta", theta)) / self.Ku)
 
     def linearize(self, theta: float) -> StateSpace:
         """Linear model about the equilibrium at an angle.
@@ -144,8 +153,7 @@ class UnbalancedDisc:
         >>> UnbalancedDisc(Fc=0).parameters(0.0).round(2)
         array([  1.33,  28.14, 128.59])
         """
-        if np.ndim(theta) != 0 or not np.isfinite(theta):
-            raise ValueError(f"`theta` must be one finite angle in rad. Got {theta}.")
+        theta = number("theta", theta, "one finite angle in rad")
         damping = self.gamma + self.Fc / _SLIDING
         return np.array([damping, self.Ku, self.omega0**2 * np.cos(theta)])
 
@@ -182,9 +190,7 @@ class UnbalancedDisc:
         ValueError
             If shapes do not fit or a number is out of its range.
         """
-        check_size("sampling_time", sampling_time)
-        check_size("integration_step", integration_step)
-        u, start = np.asarray(voltage, dtype=float), np.asarray(theta, dtype=float)
+        u, start = real_array("voltage", voltage), _finite("theta", theta)
         if u.ndim not in (1, 2) or start.ndim > 1 or not np.isfinite(u).all():
             raise ValueError(
                 "`voltage` must be finite, of shape (n_samples,) or (n_experiments, "
@@ -199,8 +205,7 @@ class UnbalancedDisc:
                 f"{start.shape} for {u.shape}."
             ) from None
         fastest = self.omega0 + self.gamma + self.Fc / _SLIDING
-        step = min(integration_step, _LONGEST_STEP / fastest)
-        n_steps = max(1, int(np.ceil(sampling_time / step - 1e-9)))
+        n_steps = steps_of(sampling_time, integration_step, _LONGEST_STEP / fastest)
         h = sampling_time / n_steps
         x, v = np.broadcast_to(start, shape).astype(float), np.zeros(shape)
         angle, rate = np.empty((2, *shape, u.shape[-1]))
@@ -208,16 +213,23 @@ class UnbalancedDisc:
             angle[..., k], rate[..., k] = x, v
             held = u[..., k]
             for _ in range(n_steps):
-                a1 = self.acceleration(x, v, held)
+                a1 = self._acceleration(x, v, held)
                 v2 = v + h / 2 * a1
-                a2 = self.acceleration(x + h / 2 * v, v2, held)
+                a2 = self._acceleration(x + h / 2 * v, v2, held)
                 v3 = v + h / 2 * a2
-                a3 = self.acceleration(x + h / 2 * v2, v3, held)
+                a3 = self._acceleration(x + h / 2 * v2, v3, held)
                 v4 = v + h * a3
-                a4 = self.acceleration(x + h * v3, v4, held)
+                a4 = self._acceleration(x + h * v3, v4, held)
                 x = x + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
                 v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
         return angle, rate
+
+
+def _finite(name: str, value: ArrayLike) -> Array:
+    array = real_array(name, value)
+    if not np.isfinite(array).all():
+        raise ValueError(f"`{name}` must be finite. Got {shown(value)}.")
+    return array
 
 
 def make_unbalanced_disc(
@@ -308,18 +320,17 @@ def make_unbalanced_disc(
     >>> data.holding_voltages.round(2)
     array([-4.4,  0. ,  4.4])
     """
-    check_count("n_operating_points", n_operating_points)
-    check_count("n_realizations", n_realizations)
+    n_points = check_count("n_operating_points", n_operating_points)
+    n_repeats = check_count("n_realizations", n_realizations)
     check_size("amplitude", amplitude)
-    if np.isnan(snr_db):
-        raise ValueError("`snr_db` must be a number of decibels or infinity. Got nan.")
-    if not 0 < reach < np.pi / 2:
-        raise ValueError(
-            "`reach` must be positive and less than pi / 2: the disc is unstable "
-            f"beyond. Got {reach}."
-        )
+    snr_db = decibels("snr_db", snr_db)
+    rule = "positive and less than pi / 2: the disc is unstable beyond"
+    reach = number("reach", reach, rule, above=0.0, high=np.nextafter(np.pi / 2, 0))
     disc = UnbalancedDisc(Fc=0.0) if disc is None else disc
-    n_points, n_repeats = int(n_operating_points), int(n_realizations)
+    if not isinstance(disc, UnbalancedDisc):
+        raise ValueError(
+            f"`disc` must be an UnbalancedDisc or None. Got {shown(disc)}."
+        )
     n_samples = samples_of("duration", duration, sampling_time)
     n_large = samples_of("large_duration", large_duration, sampling_time)
     bit = samples_of("clock", clock, sampling_time)

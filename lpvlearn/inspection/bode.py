@@ -8,9 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..data.experiments import as_numbers
 from ..models.frequencies import frequency_axis
 from ..models.statespace import StateSpace
-from .drawing import axes_grid, figure_legend, line_style, named, names_of, tidy
+from .drawing import (
+    axes_grid,
+    by_name,
+    drawable,
+    figure_legend,
+    line_style,
+    named,
+    names_of,
+    tidy,
+    whole,
+)
 from .fitted import check_model, models_of, unwrapped, with_others
 from .frequency import (
     check_frequencies,
@@ -81,7 +92,7 @@ class BodeDisplay:
         self.frequency_label = frequency_label
         self.omega = check_frequencies(omega)
         self.responses = {
-            name: np.asarray(response, dtype=complex)
+            name: as_numbers(f"responses[{name!r}]", response, imaginary=True)
             for name, response in named("responses", responses, "responses").items()
         }
         first = next(iter(self.responses.values())).shape
@@ -104,16 +115,16 @@ class BodeDisplay:
 
     def _check_std(self, std: Mapping[str, ArrayLike] | None) -> dict[str, Array]:
         found = {}
-        for name, value in (std or {}).items():
+        for name, value in by_name("std", std).items():
             if name not in self.responses:
                 raise ValueError(
                     f"`std` must be a dict with names among {list(self.responses)}. "
                     f"Got {name!r}."
                 )
-            array = np.asarray(value)
-            if np.iscomplexobj(array):
+            array = as_numbers(f"std[{name!r}]", value, imaginary=True)
+            if np.iscomplexobj(value):
                 array = np.abs(array) / np.sqrt(2.0)
-            array = array.astype(float)
+            array = array.real
             shape = self.responses[name].shape
             if array.shape != shape or not (array >= 0).all():
                 raise ValueError(
@@ -234,10 +245,11 @@ class BodeDisplay:
             `kappa`, or the uncertainty is not known.
         """
         own = models_of(estimator, kappa)
-        both = with_others(own, others or {})
-        models = {name: both[name] for name in [*(others or {}), *both]}
+        others = by_name("others", others)
+        both = with_others(own, others)
+        models = {name: both[name] for name in [*others, *both]}
         std = None
-        if uncertainty:
+        if whole("uncertainty", uncertainty, range(2)):
             omega = frequency_axis(list(models.values())) if omega is None else omega
             std = _uncertainty_of(unwrapped(estimator), own, kappa, omega)
         return cls.from_models(models, omega=omega, std=std, phase=phase, ax=ax)
@@ -261,6 +273,7 @@ class BodeDisplay:
         BodeDisplay
         """
         n_outputs, n_inputs = len(self.output_names), len(self.input_names)
+        phase = bool(whole("phase", phase, range(2)))
         kinds = 2 if phase else 1
         self.figure_, axes = axes_grid(
             ax,
@@ -281,6 +294,7 @@ class BodeDisplay:
         handles = [lines[0, 0] for lines in self.lines_.values()]
         self.figure_.align_ylabels(axes[:, 0])
         figure_legend(self.figure_, axes[0, 0], handles, own=ax is None)
+        drawable(self.figure_)
         return self
 
     def _draw(self, axes: Any, curves: Any, n_std: float) -> dict[str, Any]:

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ..data.experiments import as_numbers
+
 WIDTH = 8.0  # inches: 800 pixels at matplotlib's 100 dots per inch
 
 LABEL_SIZE, TEXT_SIZE = 9.0, 8.5  # points: read at the width of a column
@@ -165,17 +167,54 @@ def named(argument: str, values: Any, what: str) -> dict[str, Any]:
     return {str(name): value for name, value in values.items()}
 
 
+def by_name(argument: str, values: Any) -> dict[str, Any]:
+    """`values` as a dict from names, empty for None, or a ValueError."""
+    if values is not None and not isinstance(values, Mapping):
+        raise ValueError(
+            f"`{argument}` must be a dict from names, or None. Got "
+            f"{type(values).__name__}."
+        )
+    return {str(name): value for name, value in (values or {}).items()}
+
+
+def whole(argument: str, value: Any, allowed: range) -> int:
+    """A whole number among those `allowed`, or a ValueError."""
+    number = as_numbers(argument, value)
+    if number.shape != (1,) or number[0] not in allowed:
+        raise ValueError(
+            f"`{argument}` must be a whole number from {allowed[0]} to {allowed[-1]}. "
+            f"Got {value!r}."
+        )
+    return int(number[0])
+
+
 def with_unit(name: Hashable, unit: str | None) -> str:
     """A quantity's label with its unit in parentheses."""
     return f"{name} ({unit})" if unit else str(name)
 
 
-def names_of(
-    argument: str, names: Sequence[Hashable] | None, n: int, letter: str
-) -> list[str]:
+def names_of(argument: str, names: Any, n: int, letter: str) -> list[str]:
     """Given names, else the letter with numbers from 1."""
     if names is None:
         return [f"{letter}{k + 1}" for k in range(n)]
-    if isinstance(names, str) or len(names) != n:
+    if isinstance(names, str) or np.ndim(names) != 1 or len(names) != n:
         raise ValueError(f"`{argument}` must hold {n} names. Got {names!r}.")
     return [str(name) for name in names]
+
+
+def drawable(figure: Any) -> None:
+    """Show labels as they are written where they are no formulas, as "$x_".
+
+    Matplotlib takes what stands between two dollars for a formula, and fails at the
+    first look at the figure where it is none.
+    """
+    from matplotlib.mathtext import MathTextParser
+    from matplotlib.text import Text
+
+    parser: Any = MathTextParser("path")
+    for text in figure.findobj(Text):
+        if text.get_text().count("$") > 1 and text.get_parse_math():
+            try:
+                parser.parse(text.get_text())
+            except ValueError:
+                text.set_parse_math(False)

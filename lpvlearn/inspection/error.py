@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..data.experiments import as_numbers
 from ..models.frequencies import frequency_axis, nyquist_frequency
 from ..models.statespace import StateSpace
-from .drawing import ACCENT, INK, MUTED, legend_above, single_axes, tidy
+from .drawing import ACCENT, INK, MUTED, drawable, legend_above, single_axes, tidy
 from .fitted import check_model
 from .frequency import (
     check_frequencies,
@@ -82,23 +83,24 @@ class ErrorDisplay:
         self.omega = check_frequencies(omega)
         self.error = self._curve("error", error)
         self.start = None if start is None else self._curve("start", start)
-        self.active_frequencies = _vector(active_frequencies)
-        self.active_values = _vector(active_values)
+        self.active_frequencies = _vector("active_frequencies", active_frequencies)
+        self.active_values = _vector("active_values", active_values)
         if self.active_values.shape != self.active_frequencies.shape:
             raise ValueError(
                 "`active_values` must hold a value for each of "
                 f"{len(self.active_frequencies)} `active_frequencies`. Got "
                 f"{len(self.active_values)}."
             )
-        if not np.isfinite(floor) or floor < 0:
+        level = as_numbers("floor", floor)
+        if level.shape != (1,) or not 0 <= level[0] < np.inf:
             raise ValueError(
                 f"`floor` must be a finite number of at least 0. Got {floor}."
             )
-        self.floor = float(floor)
+        self.floor = float(level[0])
         self.norms = dict(norms or {})
 
     def _curve(self, name: str, values: ArrayLike) -> Array:
-        curve = np.asarray(values, dtype=float)
+        curve = as_numbers(name, values)
         if curve.shape != self.omega.shape:
             raise ValueError(
                 f"`{name}` must have shape {self.omega.shape}, a value for each "
@@ -146,7 +148,7 @@ class ErrorDisplay:
         check_model("gray_box", gray_box)
         check_model("black_box", black_box)
         difference = gray_box - black_box
-        active = _vector(active_frequencies)
+        active = _vector("active_frequencies", active_frequencies)
         marked = np.minimum(active, nyquist_frequency(difference))
         if omega is None:
             grid = frequency_axis([gray_box, black_box])
@@ -296,6 +298,7 @@ class ErrorDisplay:
         one.set_ylabel("Largest singular value of the error")
         handles = [*self.lines_.values(), *self.active_points_[:1]]
         legend_above(one, handles, n_columns=4 if len(handles) < 4 else 2)
+        drawable(self.figure_)
         return self
 
     def _mark_active(self, ax: Any) -> None:
@@ -340,5 +343,5 @@ def _sigma(model: StateSpace, omega: Array) -> Array:
     return values
 
 
-def _vector(values: ArrayLike | None) -> Array:
-    return np.zeros(0) if values is None else np.asarray(values, float).reshape(-1)
+def _vector(name: str, values: ArrayLike | None) -> Array:
+    return np.zeros(0) if values is None else as_numbers(name, values).reshape(-1)

@@ -10,7 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
-from .drawing import axes_grid, figure_legend, named, names_of, point_style, tidy
+from ..data.experiments import as_numbers
+from .drawing import (
+    axes_grid,
+    by_name,
+    drawable,
+    figure_legend,
+    named,
+    names_of,
+    point_style,
+    tidy,
+    whole,
+)
 from .fitted import (
     check_one_scheduling,
     fitted_pipeline,
@@ -84,7 +95,7 @@ class ParameterDisplay:
         curve_std: Mapping[str, Callable[[Array], ArrayLike]] | None = None,
         scheduling_label: str = "κ",
     ) -> None:
-        points = np.asarray(kappa, dtype=float)
+        points = as_numbers("kappa", kappa)
         if points.ndim == 2:
             check_one_scheduling(points.shape[1], "ParameterDisplay")
             points = points[:, 0]
@@ -96,16 +107,17 @@ class ParameterDisplay:
                 name: self._table(f"{argument}[{name!r}]", table)
                 for name, table in tables.items()
             }
-            for argument, tables in (("parameters", sets), ("std", dict(std or {})))
+            for argument, tables in (("parameters", sets), ("std", by_name("std", std)))
         )
-        self.interpolators = dict(interpolators or {})
-        self.curve_std = dict(curve_std or {})
+        self.interpolators = by_name("interpolators", interpolators)
+        self.curve_std = by_name("curve_std", curve_std)
         self.scheduling_label = scheduling_label
 
     def _table(self, argument: str, table: Any) -> Array:
         if hasattr(table, "columns"):
             table = _in_order(argument, table, self.all_names)
-        values, shape = np.asarray(table, float), (len(self.kappa), len(self.all_names))
+        values = as_numbers(argument, table)
+        shape = len(self.kappa), len(self.all_names)
         if values.shape != shape:
             raise ValueError(
                 f"`{argument}` must have shape {shape}: a row for each scheduling "
@@ -156,6 +168,11 @@ class ParameterDisplay:
             If shapes do not fit, or there are several scheduling variables.
         """
         display = cls(kappa, parameters, names=names, scheduling_label=scheduling_label)
+        if interpolator is not None and not hasattr(interpolator, "get_params"):
+            raise ValueError(
+                "`interpolator` must be a regressor, such as PolynomialLPV(), or None. "
+                f"Got {type(interpolator).__name__}."
+            )
         if interpolator is not None:
             X = display.kappa[:, None]
             display.interpolators = {
@@ -213,18 +230,20 @@ class ParameterDisplay:
         """
         pipeline = fitted_pipeline(pipeline, "parameters_")
         check_one_scheduling(pipeline.operating_points_.shape[1], "ParameterDisplay")
-        if name is None:
+        if name is not None:
+            name = str(name)
+        else:
             name = "restructured" if pipeline.restructurers_ else "balanced"
         table = pipeline.parameters_
         known: dict[str, Any] = {}
-        if uncertainty:
+        if whole("uncertainty", uncertainty, range(2)):
             pipeline.lpv_.covariance_root()  # refuses where there is none
             known = {"curve_std": {name: partial(_curve_std, pipeline.lpv_)}}
             if np.isfinite(pipeline.parameters_std_).all(axis=None):
                 known["std"] = {name: pipeline.parameters_std_}
         display = cls(
             pipeline.operating_points_[:, 0],
-            with_others({name: table}, others or {}),
+            with_others({name: table}, by_name("others", others)),
             names=names,
             interpolators={name: pipeline.interpolator_},
             **known,
@@ -251,7 +270,7 @@ class ParameterDisplay:
         ParameterDisplay
         """
         names = self.names
-        n_columns = min(n_columns, len(names))
+        n_columns = min(whole("n_columns", n_columns, range(1, 100)), len(names))
         n_rows = -(-len(names) // n_columns)
         height = 0.6 + (1.45 if n_rows > 1 else 2.4) * n_rows
         self.figure_, axes = axes_grid(ax, n_rows, n_columns, height=height)
@@ -315,6 +334,7 @@ class ParameterDisplay:
             if name in lines
         ]
         figure_legend(self.figure_, self.axes_[0], handles, own=ax is None)
+        drawable(self.figure_)
         return self
 
     def _dress(self, ax: Any, name: str, lowest: bool) -> None:
@@ -347,7 +367,9 @@ def _names_and_choice(
     """Names of all parameters, and the positions of those to draw."""
     tables = [table for table in sets.values() if hasattr(table, "columns")]
     if not tables:
-        n_params = np.shape(next(iter(sets.values())))[-1]
+        argument, table = next(iter(sets.items()))
+        shape = as_numbers(f"parameters[{argument!r}]", table).shape
+        n_params = shape[-1] if len(shape) == 2 else 0
         return names_of("names", names, n_params, "p"), list(range(n_params))
     known = [str(column) for column in tables[0].columns]
     wanted = known if names is None else [str(name) for name in names]

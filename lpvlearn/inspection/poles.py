@@ -8,7 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import as_numbers
-from .drawing import LABEL_SIZE, MUTED, TEXT_SIZE, legend_above, single_axes, tidy
+from .drawing import (
+    LABEL_SIZE,
+    MUTED,
+    TEXT_SIZE,
+    drawable,
+    legend_above,
+    single_axes,
+    tidy,
+    whole,
+)
 from .fitted import (
     check_one_scheduling,
     fitted_pipeline,
@@ -222,7 +231,7 @@ class PoleDisplay:
         one.set_ylabel("Imaginary part (rad/s)")
         one.axvline(0.0, color="0.35", linewidth=0.9, zorder=1)
         one.axhline(0.0, color="0.7", linewidth=0.7, zorder=1)
-        if damping:
+        if whole("damping", damping, range(2)):
             _draw_damping(one)
         self.colorbar_ = self.figure_.colorbar(
             self.points_, ax=one, pad=0.02, aspect=30
@@ -230,6 +239,7 @@ class PoleDisplay:
         self.colorbar_.ax.set_title(self.scheduling_label, fontsize=LABEL_SIZE)
         self.colorbar_.ax.tick_params(labelsize=TEXT_SIZE)
         self.colorbar_.outline.set_visible(False)
+        drawable(self.figure_)
         return self
 
 
@@ -274,8 +284,8 @@ def _grid(model: Any, kappa: ArrayLike | None) -> Array:
 
 
 def _pair(prefix: str, kappa: ArrayLike, poles: ArrayLike) -> tuple[Array, Complex]:
-    points = np.asarray(kappa, dtype=float).reshape(-1)
-    table = np.asarray(poles, dtype=complex)
+    points = as_numbers(f"{prefix}kappa", kappa).reshape(-1)
+    table = as_numbers(f"{prefix}poles", poles, imaginary=True)
     if table.ndim != 2 or len(table) != len(points) or table.size == 0:
         raise ValueError(
             f"`{prefix}poles` must have shape ({len(points)}, order), a row for each "

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from ..data.alignment import align_outputs
-from ..data.experiments import is_table, read_outputs
+from ..data.experiments import as_numbers, is_table, read_outputs
 from ..data.preparation import read_runs
 from ..subspace import SubspaceLTI
 from ..subspace.residuals import (
@@ -29,6 +29,7 @@ from .drawing import (
     MUTED,
     TEXT_SIZE,
     axes_grid,
+    drawable,
     figure_legend,
     names_of,
     tidy,
@@ -122,11 +123,12 @@ class ResidualDisplay:
     def _examine(
         self, residuals: Residuals, n_lags: int | None, confidence: float, what: str
     ) -> None:
-        if not 0.0 < confidence < 1.0:
+        level = as_numbers("confidence", confidence)
+        if level.shape != (1,) or not 0.0 < level[0] < 1.0:
             raise ValueError(
                 f"`confidence` must lie between 0 and 1. Got {confidence}."
             )
-        self.confidence, self.what = float(confidence), what
+        self.confidence, self.what = float(level[0]), what
         residuals, n_lags = with_windows(residuals, n_lags)
         errors, u, outputs, inputs, _ = residuals
         self.output_names = [str(name) for name in outputs]
@@ -136,8 +138,8 @@ class ResidualDisplay:
         self.autocorrelation_band = quantile / np.sqrt(sum(map(len, errors)))
         self.cross_correlations = cross_correlations(errors, u, n_lags)
         self.cross_correlation_band = quantile * self.cross_correlations.deviation
-        level = 1.0 - self.confidence
-        self.tests = residual_tests(residuals, n_lags=n_lags, level=level)
+        beyond = 1.0 - self.confidence
+        self.tests = residual_tests(residuals, n_lags=n_lags, level=beyond)
 
     @classmethod
     def from_residuals(
@@ -277,6 +279,7 @@ class ResidualDisplay:
             legend = figure_legend(self.figure_, self.ax_, handles, own=True)
             legend.set_title(f"Correlations of {self.what}", {"size": LABEL_SIZE})
             legend.set_alignment("left")
+        drawable(self.figure_)
         return self
 
     def _panel(
@@ -318,10 +321,16 @@ class ResidualDisplay:
 
 def _as_parts(argument: str, values: Any) -> list[Array]:
     """One finite matrix per experiment."""
-    several = isinstance(values, (list, tuple)) and np.ndim([*values, 0.0][0]) > 0
-    parts = [np.asarray(x, dtype=float) for x in (values if several else [values])]
+    several = isinstance(values, list | tuple) and (
+        all(np.ndim(x) > 0 for x in values) and len(values) > 0
+    )
+    parts = [as_numbers(argument, x) for x in (values if several else [values])]
     parts = [part[:, None] if part.ndim == 1 else part for part in parts]
-    if len({part.shape[1:] for part in parts}) > 1 or parts[0].ndim != 2:
+    if (
+        len({part.shape[1:] for part in parts}) > 1
+        or parts[0].ndim != 2
+        or (0 in parts[0].shape)
+    ):
         raise ValueError(
             f"`{argument}` must be one array of shape (n_samples, n_channels) for each "
             f"experiment. Got shapes {[part.shape for part in parts]}."

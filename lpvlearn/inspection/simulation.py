@@ -23,10 +23,13 @@ from ..metrics.scores import bft_score
 from .drawing import (
     ACCENT,
     axes_grid,
+    by_name,
+    drawable,
     legend_above,
     line_style,
     names_of,
     tidy,
+    whole,
     with_unit,
 )
 from .fitted import unwrapped
@@ -104,7 +107,8 @@ class SimulationDisplay:
                 f"of `y_true`. Got {self.time.shape}."
             )
         self.predictions = {
-            str(name): read_outputs(y)[0] for name, y in predictions.items()
+            name: read_outputs(y)[0]
+            for name, y in by_name("predictions", predictions).items()
         }
         if "measured" in self.predictions:
             raise ValueError(
@@ -119,7 +123,7 @@ class SimulationDisplay:
                 )
             self.bft_[name] = bft_score(self.y_true, y_pred, multioutput="raw_values")
         self.std = {
-            str(name): read_outputs(own)[0] for name, own in (std or {}).items()
+            name: read_outputs(own)[0] for name, own in by_name("std", std).items()
         }
         for name, own in self.std.items():
             if name not in self.predictions or own.shape != self.y_true.shape:
@@ -229,6 +233,7 @@ class SimulationDisplay:
         """
         check_options(initial_state)
         estimator = unwrapped(estimator)
+        uncertainty = bool(whole("uncertainty", uncertainty, range(2)))
         if uncertainty and (
             initial_state != "rest" or not hasattr(estimator, "prediction_std")
         ):
@@ -252,12 +257,12 @@ class SimulationDisplay:
         std = None
         if uncertainty:
             known = estimator.prediction_std(part)
-            std = {name: known.xs("total", axis=1, level="part")}
+            std = {str(name): known.xs("total", axis=1, level="part")}
         time, label = _time_of(estimator, Table(part))
         display = cls(
             time,
             found.measured,
-            {name: found.simulated},
+            {str(name): found.simulated},
             std=std,
             output_names=names,
             units=units,
@@ -328,6 +333,7 @@ class SimulationDisplay:
             legend_above(one, [lines[i] for lines in self.lines_.values()], title=title)
             title = None
         self.axes_[-1].set_xlabel(self.time_label)
+        drawable(self.figure_)
         return self
 
     def _window(self, zoom: tuple[float, float] | None) -> NDArray[np.bool_]:

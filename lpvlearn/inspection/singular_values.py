@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .drawing import ACCENT, INK, MUTED, TEXT_SIZE, single_axes, tidy
+from ..data.experiments import as_numbers
+from .drawing import ACCENT, INK, MUTED, TEXT_SIZE, drawable, single_axes, tidy, whole
 from .fitted import unwrapped
+
+_MOST_SHOWN = 10**6  # no picture shows more
 
 _N_SHOWN = 30  # values that are told apart in a figure of 8 inches
 
@@ -43,19 +46,19 @@ class SingularValueDisplay:
     """
 
     def __init__(self, singular_values: ArrayLike, order: int | None = None) -> None:
-        values = np.asarray(singular_values, dtype=float)
+        values = as_numbers("singular_values", singular_values)
         if values.ndim != 1 or not values.size or not (values >= 0).all():
             raise ValueError(
                 "`singular_values` must be a vector of non-negative numbers. Got "
                 f"shape {values.shape}."
             )
-        if values[0] == 0:
-            raise ValueError("`singular_values` must not all be zero.")
-        if order is not None and not 0 <= order <= len(values):
+        if not 0 < values[0] < np.inf:
             raise ValueError(
-                f"`order` must be 0 to {len(values)}, the number of singular values. "
-                f"Got {order}."
+                "`singular_values` must begin with the largest, finite and not zero. "
+                f"Got {values[0]}."
             )
+        if order is not None:
+            order = whole("order", order, range(len(values) + 1))
         self.singular_values = values
         self.order = order
 
@@ -128,7 +131,8 @@ class SingularValueDisplay:
         self.figure_, self.axes_ = single_axes(ax, height=3.4)
         self.ax_ = one = self.axes_[0]
         order = 0 if self.order is None else self.order
-        values = self.singular_values[: max(n_shown, 2 * order)]
+        most = whole("n_shown", n_shown, range(1, _MOST_SHOWN))
+        values = self.singular_values[: max(most, 2 * order)]
         # Rounding leaves zeros, which a logarithmic axis cannot show.
         values = np.maximum(values, np.finfo(float).eps * values[0])
         bottom = values.min() / 3.0
@@ -168,4 +172,5 @@ class SingularValueDisplay:
         one.xaxis.set_major_locator(MaxNLocator(integer=True))
         one.set_xlabel("Index")
         one.set_ylabel("Singular value")
+        drawable(self.figure_)
         return self

@@ -18,6 +18,7 @@ from ..exceptions import warn
 from ..models.statespace import StateSpace
 from ..models.system_matrix import blocks
 from ..structures.structure import GrayBoxStructure
+from ..validation import flag, place
 from .interpolator import domains
 from .polynomial import PolynomialLPV, conversion_to
 from .rational import RationalLPV
@@ -74,8 +75,8 @@ class MatrixCoefficients:
 
     def at(self, kappa: ArrayLike) -> StateSpace:
         """The frozen model at one scheduling value, shape (n_scheduling,)."""
-        place = (np.ravel(kappa) - self.centre) / self.half_width
-        terms = np.prod(place**self.powers, axis=1)
+        unit = place("kappa", kappa, len(self.centre)) - self.centre
+        terms = np.prod((unit / self.half_width) ** self.powers, axis=1)
         terms = terms / (terms @ self.denominator)
         A, B, C, D = (np.tensordot(terms, M, 1) for M in self._matrices)
         return StateSpace(A, B, C, D, input_delay=self.input_delay)
@@ -157,6 +158,7 @@ def matrix_coefficients(
             "piece, or keeps its form to itself. Interpolate by PolynomialLPV() or "
             f"RationalLPV(). {_GRID}"
         )
+    normalized = flag("normalized", normalized)
     if isinstance(form, PolynomialLPV):
         numerator = form.coefficients().reshape(len(form.powers_), -1)
         below, below_powers = np.ones(1), np.zeros_like(form.powers_[:1])

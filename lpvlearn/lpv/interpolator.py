@@ -17,12 +17,14 @@ from sklearn.utils.validation import (
 )
 
 from ..exceptions import ExtrapolationWarning, VersionedPickle, warn
-from ..validation import one_of, real_array
+from ..validation import naming_argument, one_of, real_array
 from .weighting import WeightedPoints, is_chance, weighted_points
 
 Array = NDArray[np.float64]
 
 _EXTRAPOLATIONS = ("ignore", "warn", "clip", "error")
+
+_POINTS = "be a table of finite numbers, shape (n_points, n_scheduling)"
 
 # Values this close to the identified range, relative to its width, are in it: a
 # measured mean and a range read from a report differ by rounding.
@@ -99,7 +101,7 @@ class Interpolator(
         ExtrapolationWarning
             When a value is outside of it and `extrapolation="warn"`.
         """
-        values = self._evaluate(self._place(X))
+        values = self._values(self._place(X))
         return values[:, 0] if self._single_parameter else values
 
     def coefficients(self) -> Array:
@@ -151,7 +153,12 @@ class Interpolator(
                 f"Got shape {vector.shape}."
             )
         changed = copy.copy(self)
-        changed._set(vector)
+        rule = "be numbers that make finite curves"
+        with (
+            np.errstate(over="raise", invalid="raise"),
+            naming_argument("coefficients", rule, coefficients),
+        ):
+            changed._set(vector)
         return changed
 
     def sensitivities(self, X: ArrayLike, outer: Array | None = None) -> Array:
@@ -172,7 +179,9 @@ class Interpolator(
             derivatives ``outer[i] @ S[i]`` of that, for less.
         """
         kappa = self._place(X)
-        return self._carried(self._identity(kappa) if outer is None else outer, kappa)
+        with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
+            outer = self._identity(kappa) if outer is None else outer
+            return self._finite(kappa, self._carried(outer, kappa))
 
     def information(self, X: ArrayLike, covariance: ArrayLike) -> Array | None:
         """What operating points tell of the coefficients.
@@ -200,6 +209,21 @@ class Interpolator(
         rows = rows.reshape(-1, rows.shape[2])
         return rows.T @ rows / self._excess()
 
+    def _values(self, kappa: Array) -> Array:
+        with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
+            return self._finite(kappa, self._evaluate(kappa))
+
+    def _finite(self, kappa: Array, values: Array) -> Array:
+        finite = np.isfinite(values).reshape(len(kappa), -1).all(axis=1)
+        if not finite.all():
+            raise ValueError(
+                "`X` must hold scheduling values near the range of the fit, where "
+                f"parameters are finite. Got {kappa[finite.argmin()]} in row "
+                f"{finite.argmin()}, for a range from {self.scheduling_range_[0]} to "
+                f"{self.scheduling_range_[1]}."
+            )
+        return values
+
     def _identity(self, kappa: Array) -> Array:
         q = self._evaluate(kappa[:1]).shape[1]
         return np.broadcast_to(np.eye(q), (len(kappa), q, q))
@@ -215,7 +239,8 @@ class Interpolator(
         """Checked scheduling values; what is out of range is told or clipped."""
         check_is_fitted(self)
         self._check_options()
-        kappa = validate_data(self, X, dtype=np.float64, reset=False)
+        with naming_argument("X", _POINTS, X):
+            kappa = validate_data(self, X, dtype=np.float64, reset=False)
         if self.extrapolation == "clip":
             kappa = np.clip(kappa, *self.scheduling_range_)
         elif self.extrapolation != "ignore":
@@ -258,9 +283,10 @@ class Interpolator(
         covariance: ArrayLike | None,
     ) -> tuple[Array, WeightedPoints]:
         """Scheduling values and points, without those of weight zero."""
-        kappa, params = validate_data(
-            self, X, y, dtype=np.float64, multi_output=True, y_numeric=True
-        )
+        with naming_argument("X", f"{_POINTS}, beside `y`", X):
+            kappa, params = validate_data(
+                self, X, y, dtype=np.float64, multi_output=True, y_numeric=True
+            )
         weight = _check_weight(sample_weight, kappa)
         self._single_parameter = params.ndim == 1
         theta = params.astype(np.float64).reshape(len(params), -1)

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.statespace import StateSpace
 from ..models.system_matrix import blocks
+from ..validation import flag, place
 from .coefficients import MatrixCoefficients
 
 Array = NDArray[np.float64]
@@ -93,8 +94,8 @@ class LinearFractionalModel:
 
     def delta(self, kappa: ArrayLike) -> Array:
         """Delta at one scheduling value, shape (size, size), diagonal."""
-        place = (np.ravel(kappa) - self.centre) / self.half_width
-        return np.diag(np.repeat(place, self.repetitions))
+        unit = place("kappa", kappa, len(self.centre)) - self.centre
+        return np.diag(np.repeat(unit / self.half_width, self.repetitions))
 
     def at(self, kappa: ArrayLike) -> StateSpace:
         """The frozen model at one scheduling value, shape (n_scheduling,)."""
@@ -109,7 +110,7 @@ def linear_fractional(
     coefficients: MatrixCoefficients, *, normalized: bool
 ) -> LinearFractionalModel:
     """The smallest form found, of coefficients in normalized variables."""
-    c = coefficients
+    c, normalized = coefficients, flag("normalized", normalized)
     upper, lower = np.concatenate([c.A, c.B], 2), np.concatenate([c.C, c.D], 2)
     S, d = np.concatenate([upper, lower], 1), c.denominator
     S, d = S / d[0], d / d[0]

@@ -27,11 +27,15 @@ from ..systems.simulation import delayed, state_trajectory
 from ..systems.tabulation import tabulate
 from ..validation import (
     finite_samples,
+    flag,
     frequencies,
     input_delays,
     matrix,
+    names_of,
+    place,
     positive_time,
     real_array,
+    shown,
     state_vector,
 )
 from .coefficients import MatrixCoefficients, matrix_coefficients
@@ -188,19 +192,14 @@ class LPVStateSpace:
         object.__setattr__(self, "scheduling_range", bounds)
         object.__setattr__(self, "n_scheduling", bounds.shape[1])
         names = self.scheduling_names
-        if names is not None and len(names) != bounds.shape[1]:
-            raise ValueError(
-                f"`scheduling_names` must name the {bounds.shape[1]} scheduling "
-                f"variables. Got {list(names)}."
-            )
+        if names is not None:
+            names_of("scheduling_names", names, bounds.shape[1])
         for name in ("order", "n_inputs", "n_outputs"):
             object.__setattr__(self, name, getattr(self.structure, name))
         for signal in ("input", "output"):
             names, n = getattr(self, f"{signal}_names"), getattr(self, f"n_{signal}s")
-            if names is not None and len(names) != n:
-                raise ValueError(
-                    f"`{signal}_names` must name the {n} {signal}s. Got {list(names)}."
-                )
+            if names is not None:
+                names_of(f"{signal}_names", names, n)
         delay = input_delays(self.input_delay, self.n_inputs, samples=False)
         object.__setattr__(self, "input_delay", delay)
         if self.covariance is not None:
@@ -268,6 +267,7 @@ class LPVStateSpace:
             If `kappa` has another shape or is not finite, or `return_std` asks for what
             is not known: `covariance` is None.
         """
+        return_std = flag("return_std", return_std)
         n_params, kappa = self.structure.n_params, self._scheduling(kappa)
         wanted = f"`interpolator` must predict the {n_params} parameters"
         values = _predicted(self.interpolator, kappa, n_params, wanted)
@@ -343,6 +343,8 @@ class LPVStateSpace:
             scheduling variable.
         """
         place, w = self._place(kappa), frequencies(omega)
+        if not np.isfinite(w).all():
+            raise ValueError(f"`omega` must be finite. Got {shown(omega)}.")
         model, n = self.silenced(), self.order
         theta = model.parameters(place[None])[0]
         A, B, C, _ = (M[0] for M in self.structure.matrices(theta[None]))
@@ -544,7 +546,10 @@ class LPVStateSpace:
         """T from the structure's state to this one's."""
         T = np.eye(self.order)
         for basis in self.bases:
-            T = matrix("T", basis(kappa) if callable(basis) else basis) @ T
+            own = matrix("T", basis(kappa) if callable(basis) else basis)
+            if own.shape != T.shape:
+                raise ValueError(f"`T` must have shape {T.shape}. Got {own.shape}.")
+            T = own @ T
         return T
 
     def frozen_poles(self, kappa: ArrayLike) -> NDArray[np.complex128]:
@@ -991,8 +996,9 @@ class LPVStateSpace:
 
     def _place(self, kappa: Any) -> Array:
         """One value of every scheduling variable."""
-        by_name = isinstance(kappa, Mapping)
-        values = self._scheduling(kappa if by_name else np.reshape(kappa, (1, -1)))
+        if not isinstance(kappa, Mapping):
+            return place("kappa", kappa, self.n_scheduling)
+        values = self._scheduling(kappa)
         if len(values) != 1:
             raise ValueError(
                 "`kappa` must be one value of every scheduling variable. Got "
@@ -1009,14 +1015,14 @@ class LPVStateSpace:
                     "`scheduling` by name must have a value for each scheduling "
                     f"variable; the model knows {known}. Got {list(kappa)}."
                 )
-            columns = [np.ravel(kappa[name]) for name in names]
+            columns = [real_array(str(name), kappa[name]).ravel() for name in names]
             if len({len(column) for column in columns}) > 1:
                 raise ValueError(
                     "`scheduling` must have as many values of each variable. Got "
                     f"{[len(column) for column in columns]}."
                 )
             kappa = np.column_stack(columns)
-        elif names is not None and set(names) <= set(getattr(kappa, "columns", ())):
+        elif names and set(names) <= set(getattr(kappa, "columns", ())):
             kappa = kappa[list(names)]
         values = real_array("scheduling", kappa)
         if values.ndim < 2:
@@ -1041,7 +1047,14 @@ def rates_of_change(kappa: Array, dt: float) -> Array:
 
 def _predicted(regressor: Any, kappa: Array, n_values: int, wanted: str) -> Array:
     """Values (n_points, n_values) of a regressor; `wanted` says which they must be."""
-    values = np.asarray(regressor.predict(kappa), dtype=float)
+    with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
+        values = np.asarray(regressor.predict(kappa), dtype=float)
+    if not np.isfinite(values).all():
+        far = kappa[np.argwhere(~np.isfinite(values))[0][0]]
+        raise ValueError(
+            f"{wanted} by finite values. Got none at scheduling {far}, where they are "
+            "beyond all numbers."
+        )
     if values.size != len(kappa) * n_values:
         raise ValueError(
             f"{wanted}. Got shape {values.shape} for {len(kappa)} point(s)."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations_with_replacement
 from typing import Any, Self
 
 import numpy as np
@@ -16,6 +15,8 @@ from .interpolator import Interpolator, carried_by_terms, domains, to_unit
 from .weighting import WeightedPoints
 
 Array = NDArray[np.float64]
+
+_MOST_TERMS = 10_000  # a dense regression: 0.8 GB for as many points
 
 _BASES = ("power", "chebyshev", "legendre")
 
@@ -209,19 +210,23 @@ class PolynomialLPV(Interpolator):
         one_of("basis", self.basis, _BASES)
 
 
-def total_degree_powers(degree: int, n_variables: int) -> NDArray[np.intp]:
-    """Exponents (n_terms, n_variables) of all monomials up to a total degree.
+def powers_up_to(degree: int, highest: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Exponents (n_terms, n_variables) of monomials up to a total degree.
 
-    By increasing total degree, lexicographic within one.
+    Those of every variable up to its `highest`; by increasing total degree,
+    lexicographic within one. Only what is kept is listed.
     """
-    factors = (
-        product
-        for total in range(degree + 1)
-        for product in combinations_with_replacement(range(n_variables), total)
-    )
-    return np.array(
-        [np.bincount(np.array(f, int), minlength=n_variables) for f in factors]
-    )
+    powers = np.zeros((1, 0), np.intp)
+    for most in np.minimum(highest, degree):
+        own = np.tile(np.arange(most + 1), len(powers))
+        powers = np.column_stack([np.repeat(powers, most + 1, axis=0), own])
+        powers = powers[powers.sum(axis=1) <= degree]
+        if len(powers) > _MOST_TERMS:
+            raise ValueError(
+                f"`degree` must make at most {_MOST_TERMS} terms of all variables. Got "
+                f"{degree} for {len(highest)} variables; interpolate by a lower degree."
+            )
+    return powers[np.lexsort([*-powers.T[::-1], powers.sum(axis=1)])]
 
 
 def chebyshev_terms(
@@ -268,7 +273,7 @@ def resolvable_powers(
             f"point{'s' if n_points > 1 else ' (1 sample)'}. Got {degree}."
         )
     if tensor:
-        powers = np.indices(np.minimum(degree, highest) + 1).reshape(len(highest), -1).T
-        return powers[np.argsort(powers.sum(axis=1), kind="stable")]
-    powers = total_degree_powers(degree, len(highest))
-    return powers[(powers <= highest).all(axis=1)]
+        highest = np.minimum(degree, highest)
+        powers = powers_up_to(int(highest.sum()), highest)
+        return powers[np.lexsort([*powers.T[::-1], powers.sum(axis=1)])]
+    return powers_up_to(degree, highest)

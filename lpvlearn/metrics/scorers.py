@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..data.alignment import align_outputs
 from ..data.experiments import ROLES, Table, fitted_roles, read_outputs
 from ..data.scoring import warn_of_motion
-from ..validation import one_of, whole_number
+from ..validation import one_of, real_array, whole_number
 from .scores import Multioutput, bft_score, vaf_score
 
 InitialState = Literal["rest", "estimate"]
@@ -162,7 +162,7 @@ def _make_scorer(
     check_options(initial_state, burn_in)
     one_of("average", average, ("pool", "experiment"))
     if not isinstance(multioutput, str):
-        multioutput = tuple(np.asarray(multioutput, dtype=np.float64).tolist())
+        multioutput = tuple(real_array("multioutput", multioutput).ravel().tolist())
     elif multioutput not in ("uniform_average", "raw_values"):
         raise ValueError(
             "`multioutput` of a scorer must be 'uniform_average', 'raw_values' or "

@@ -75,7 +75,7 @@ def proximal_bundle(
     tau = steepest / max(_FIRST_STEP * radius, 1e-300)
     history: list[dict[str, float]] = []
     converged, cause, n_iter = False, "", 0
-    while n_iter < max_iter and not converged:
+    while n_iter < max_iter and not (converged or problem.stop()):
         if peaks.top <= negligible:
             converged = True
             break

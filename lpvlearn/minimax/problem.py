@@ -153,6 +153,7 @@ class MinimaxProblem:
     constraints: Callable[[Array], tuple[Array, Array]]  # c(y) <= 0 and gradients
     grid: Array = field(default_factory=lambda: np.zeros(0))  # watched beside the peaks
     curve: Callable[[Array], Curve] | None = None  # of y; by default straight steps
+    stop: Callable[[], bool] = lambda: False  # whether to end at the best point so far
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def minimax_sqp(
     local: _Local | None = None
     history: list[dict[str, float]] = []
     converged, cause, n_iter = False, "", 0
-    while n_iter < max_iter and not converged:
+    while n_iter < max_iter and not (converged or problem.stop()):
         f = own.top
         if f <= negligible:
             converged = True

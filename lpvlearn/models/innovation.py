@@ -17,7 +17,14 @@ from ..systems.simulation import (
     state_trajectory,
     with_transit,
 )
-from ..validation import finite_samples, whole_number
+from ..validation import (
+    finite_samples,
+    matrix,
+    measured_samples,
+    shown,
+    state_vector,
+    whole_number,
+)
 from .statespace import StateSpace
 
 Array = NDArray[np.float64]
@@ -71,6 +78,40 @@ class InnovationModel:
     lti: StateSpace
     noise: NoiseModel
     gain: Array | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.lti, StateSpace) or self.lti.is_continuous:
+            raise ValueError(
+                "`lti` must be a StateSpace in discrete time. Got "
+                f"{shown(self.lti)}. Sample it with to_discrete(sampling_time)."
+            )
+        if not isinstance(self.noise, tuple) or len(self.noise) != 4:
+            raise ValueError(
+                "`noise` must be a NoiseModel(A, C, K, covariance). Got "
+                f"{shown(self.noise)}."
+            )
+        ny = self.lti.n_outputs
+        A, C, K, covariance = map(matrix, NoiseModel._fields, self.noise)
+        n = len(A)
+        if n == 0 and C.size == K.size == 0:  # `[]`
+            C, K = C.reshape(ny, 0), K.reshape(0, ny)
+        shapes = [M.shape for M in (A, C, K, covariance)]
+        if shapes != [(n, n), (ny, n), (n, ny), (ny, ny)]:
+            raise ValueError(
+                f"`noise` must have A ({n}, {n}), C ({ny}, {n}), K ({n}, {ny}) and "
+                f"covariance ({ny}, {ny}). Got {shapes}."
+            )
+        object.__setattr__(self, "noise", NoiseModel(A, C, K, covariance))
+        if self.gain is not None:
+            gain = matrix("gain", self.gain)
+            if gain.size == self.lti.order * ny == 0:
+                gain = gain.reshape(self.lti.order, ny)
+            if gain.shape != (self.lti.order, ny):
+                raise ValueError(
+                    f"`gain` must have shape ({self.lti.order}, {ny}). Got "
+                    f"{gain.shape}."
+                )
+            object.__setattr__(self, "gain", gain)
 
     def __repr__(self) -> str:
         return (
@@ -149,10 +190,11 @@ class InnovationModel:
         if self.gain is not None:
             return self._predict_jointly(u, y, delay, initial_state)
         simulated = self.lti.simulate(u, initial_state=initial_state)
+        y = measured_samples(y, *simulated.shape)
         if self.n_noise_states == 0:
             return simulated
         A, C, K, _ = self.noise
-        error = np.asarray(y, dtype=float).reshape(simulated.shape) - simulated
+        error = y - simulated
         known = ~np.isnan(error)
         if known.all():
             ahead = state_trajectory(A - K @ C, error @ K.T)
@@ -169,15 +211,15 @@ class InnovationModel:
     ) -> Array:
         """By the predictor of all states, which is stable where the plant is not."""
         u = finite_samples("u", u, self.lti.n_inputs)
-        y = np.asarray(y, dtype=float).reshape(len(u), -1)
+        y = measured_samples(y, len(u), self.lti.n_outputs)
         A, B, C, D = self.A, self.B, self.C, self.D
         gains, known = self._filter_gains(y)
         late = self.lti.input_delay
-        x0 = np.zeros(len(A) + int(late.sum()))
-        if initial_state is not None:
-            given = np.ravel(np.asarray(initial_state, dtype=float))
-            x0[: len(given)] = given
-        x0, before = np.split(x0, [len(A)])
+        n_late, n = int(late.sum()), self.lti.order
+        x0 = np.zeros(len(A)) if initial_state is None else initial_state
+        if np.size(x0) == n:  # the noise begins at rest
+            x0 = np.append(state_vector(x0, n), np.zeros(self.n_noise_states))
+        x0, before = np.split(state_vector(x0, len(A), n_late), [len(A)])
         u = delayed(u, late, before)
         corrected = np.where(known, y - u @ D.T, 0.0)
         driven = u @ B.T + (gains @ corrected[:, :, None])[:, :, 0]
@@ -207,7 +249,15 @@ class InnovationModel:
             behind the errors of one-step prediction. The inputs in transit follow, and
             the multiples of the trends: signal by signal, output by output.
         """
-        y = np.asarray(y, dtype=float).reshape(-1, self.lti.n_outputs)
+        u = finite_samples("u", u, self.lti.n_inputs)
+        y = measured_samples(y, len(u), self.lti.n_outputs)
+        if trend is not None:
+            trend = matrix("trend", trend)
+            if trend.shape[1] != len(u):
+                raise ValueError(
+                    f"`trend` must have shape (n_trend, {len(u)}), a value for each "
+                    f"sample. Got {trend.shape}."
+                )
         if self.gain is None:
             lti, error = self.lti, y - self.lti.simulate(u)
             responses = free_responses(lti.A, lti.C, len(y), trend)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.hinf_norm import hinf_norm, linf_norm
-from ..validation import one_of
+from ..validation import one_of, share
 from .statespace import StateSpace
 
 Array = NDArray[np.float64]
@@ -75,14 +75,15 @@ def peak_gains(
     one_of("norm", norm, ("hinf", "linf"))
     if not isinstance(model, StateSpace):
         raise ValueError(f"`model` must be a StateSpace. Got {type(model).__name__}.")
-    if not 0 < within < 1:
-        raise ValueError(f"`within` must be between 0 and 1. Got {within}.")
+    within = share("within", within)
     compute = hinf_norm if norm == "hinf" else linf_norm
-    found = compute(
-        model.A, model.B, model.C, model.D, dt=model.sampling_time, within=within
-    )
-    omega, sigma = found.frequencies, found.values
-    if not np.isfinite(found.norm):  # at a pole on the axis no direction exists
+    parts, dt = (model.A, model.B, model.C, model.D), model.sampling_time
+    size = compute(*parts, dt=dt).norm
+    found = compute(*parts, dt=dt, within=within)
+    # the highest peak to the last digit as hinf_norm() has it
+    omega, sigma = found.frequencies, np.minimum(found.values, size)
+    sigma[:1] = size
+    if not np.isfinite(size):  # at a pole on the axis no direction exists
         omega, sigma = omega[:0], sigma[:0]
     U, _, Vh = np.linalg.svd(model.frequency_response(omega))
-    return PeakGains(found.norm, omega, sigma, U[:, :, 0], Vh[:, 0].conj())
+    return PeakGains(size, omega, sigma, U[:, :, 0], Vh[:, 0].conj())

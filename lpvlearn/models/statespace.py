@@ -25,9 +25,9 @@ from ..validation import (
     frequencies,
     input_delays,
     matrix,
+    measured_samples,
     one_of,
     positive_time,
-    real_array,
     state_vector,
     whole_number,
 )
@@ -220,7 +220,8 @@ class StateSpace:
         array([1. +0.j , 0.5-0.5j])
         """
         omega, dt = frequencies(omega), self.sampling_time
-        G = frequency_response(self.A, self.B, self.C, self.D, omega, dt=dt)
+        with np.errstate(over="ignore", invalid="ignore"):  # of no number: infinite
+            G = frequency_response(self.A, self.B, self.C, self.D, omega, dt=dt)
         if self.input_delay.any():
             turn = np.where(np.isfinite(omega), omega, 0.0)[:, None, None]
             late = np.exp(-1j * turn * self.input_delay * (dt or 1.0))
@@ -249,7 +250,8 @@ class StateSpace:
         0.5
         """
         dt = self.sampling_time
-        return hinf_norm(self.A, self.B, self.C, self.D, dt=dt).norm
+        with np.errstate(over="ignore", invalid="ignore"):
+            return hinf_norm(self.A, self.B, self.C, self.D, dt=dt).norm
 
     def simulate(
         self,
@@ -358,15 +360,7 @@ class StateSpace:
                 f"{self}. Convert with to_discrete(sampling_time) first."
             )
         u = finite_samples("u", u, self.n_inputs)
-        measured = real_array("y", y)
-        missing = np.isnan(measured)
-        y = finite_samples("y", np.where(missing, 0.0, measured), self.n_outputs)
-        y[missing.reshape(y.shape)] = np.nan
-        if len(u) == 0 or len(u) != len(y):
-            raise ValueError(
-                "`u` and `y` must have one row for each of the same samples, at least "
-                f"one. Got {len(u)} and {len(y)}."
-            )
+        y = measured_samples(y, len(u), self.n_outputs)
         error = y - self.simulate(u)
         with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
             free = free_responses(self.A, self.C, len(y))

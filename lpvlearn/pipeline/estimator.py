@@ -170,6 +170,10 @@ list, default=None
     on_error : {"raise", "skip"}, default="raise"
         What a failure at one operating point does: raise an error that names it, or
         leave the point out with a warning.
+    max_time : float, default=None
+        Seconds that step 4 may take, in equal shares for the operating points: where
+        one is up, the best parameters so far are kept, with a warning. None takes the
+        time it needs (``restructurer__max_time`` bounds every point by itself).
     memory : str, path or joblib.Memory, default=None
         Where local and gray-box models are kept, as in scikit-learn's ``Pipeline``: a
         search over the interpolator then identifies and restructures nothing twice,
@@ -312,6 +316,7 @@ list, default=None
         offsets: str | None = "auto",
         efficient: bool = True,
         on_error: str = "raise",
+        max_time: float | None = None,
         memory: Any = None,
         n_jobs: int | None = None,
         verbose: int = 0,
@@ -333,6 +338,7 @@ list, default=None
         self.offsets = offsets
         self.efficient = efficient
         self.on_error = on_error
+        self.max_time = max_time
         self.memory = memory
         self.n_jobs = n_jobs
         self.verbose = verbose
@@ -418,7 +424,9 @@ list, default=None
             )
 
         with watch.step("restructuring"):  # step 4: all of them in one structure
-            found = restructure_points(restructurer, local, points, runner)
+            found = restructure_points(
+                restructurer, local, points, runner, self.max_time
+            )
             self.local_models_ = [model.lti for model in found.local]
             self.structured_models_ = found.models
             self.restructurers_ = found.restructurers
@@ -620,6 +628,8 @@ list, default=None
             raise ValueError(
                 "`refiner` needs `scheduling`, the columns that move. Got None."
             )
+        if self.max_time is not None:
+            positive_time("max_time", self.max_time)
         if not isinstance(self.verbose, bool):
             whole_number("verbose", self.verbose, 0)
         if self.n_jobs is not None and (

@@ -129,7 +129,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
         raise ValueError(
             f"`model` must be one that `load` can build anew. Got {error}."
         ) from error
-    _replace(Path(os.path.realpath(path)), buffer.getbuffer())
+    _replace(Path(os.path.realpath(_path(path))), buffer.getbuffer())
 
 
 def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
@@ -179,7 +179,7 @@ def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
     >>> load(path, function=decay).model([4.0]).A
     array([[-0.25]])
     """
-    data = Path(path).read_bytes()
+    data = _path(path).read_bytes()
     try:
         members = _members(data)
         del data
@@ -188,6 +188,12 @@ def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
         raise ValueError(str(error)) from None
     except Exception as error:  # whatever damage may lead to
         raise ValueError(f"{_NOT_OURS}{Path(path).name!r}: {error}") from error
+
+
+def _path(path: Any) -> Path:
+    if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
+        raise ValueError(f"`path` must be the name of a file. Got {shown(path)}.")
+    return Path(path)
 
 
 class _Told(Exception):

@@ -43,7 +43,7 @@ from ..metrics.scores import bft_score
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
-from ..validation import one_of, positive_time, whole_number
+from ..validation import number, one_of, positive_time, whole_number
 from .bands import output_errors
 from .points import StructuredModels, balanced_entries, identify_point
 from .scheduled import ScheduledEstimator
@@ -459,16 +459,12 @@ class OutputErrorLPV(ScheduledEstimator):
         one_of("offset", self.offset, (None, "constant"))
         one_of("missing", self.missing, ("raise", "split"))
         whole_number("max_iter", self.max_iter, 1)
-        number = isinstance(self.prior, int | float) and not isinstance(
-            self.prior, bool
-        )
-        if not (self.prior is None or self.prior == "local" or number) or (
-            number and not self.prior >= 0
-        ):
-            raise ValueError(
-                "`prior` must be 'local', a factor of 0 or more, or None. Got "
-                f"{self.prior!r}."
+        if not (self.prior is None or isinstance(self.prior, str)):
+            number(
+                "prior", self.prior, "'local', a factor of 0 or more, or None", low=0
             )
+        elif self.prior is not None:
+            one_of("prior", self.prior, ("local", None))
         if not (
             self.start is None
             or isinstance(self.start, LPVStateSpace | GrayBoxStructure)

@@ -13,11 +13,12 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import accumulate
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from joblib import Memory, delayed
+from joblib import Memory, delayed, effective_n_jobs
 from numpy.typing import NDArray
 from sklearn.base import clone
 from threadpoolctl import ThreadpoolController
@@ -29,6 +30,7 @@ from ..exceptions import Told, collected, warn
 from ..lpv.alignment import aligned_models
 from ..lpv.equilibria import points_of_work
 from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
+from ..restructuring.deadline import bounded, time_is_up
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..structures.structure import GrayBoxStructure
@@ -51,6 +53,8 @@ _Task = tuple[StateSpace, list[StateSpace], list[Estimate]]
 _SWEEPS = 4  # passes over the points: help travels that far from a good one
 
 _NEIGHBOURS = 2  # points that help one: those to either side along one variable
+
+_FIRST_SHARE = 0.75  # of `max_time`, before the points help one another
 
 _BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
 
@@ -430,11 +434,15 @@ def restructure_points(
     local: list[LocalModel],
     points: OperatingPoints,
     runner: PointRunner,
+    max_time: float | None = None,
 ) -> StructuredModels:
     """Bring the local models of all operating points into one structure.
 
     "aligned" or "passthrough": the entries of the balanced models are parameters.
+    `max_time` bounds the seconds of all points: equal shares, known in advance, and
+    what is left of it for the help of neighbours.
     """
+    began = perf_counter()
     if isinstance(restructurer, str):
         # poles on the negative real axis make the order grow in continuous time
         models = [
@@ -449,6 +457,11 @@ def restructure_points(
         unknown = _unknown_covariance(theta)
         return StructuredModels(points, local, structure, theta, unknown, balanced, [])
     restructurer = _with_structure(restructurer, local)
+    if max_time is not None:
+        at_once = min(effective_n_jobs(runner.n_jobs), len(local))
+        restructurer = _with_time(
+            restructurer, _FIRST_SHARE * max_time * at_once / len(local)
+        )
     # What a fit is about: the model, and where they are known its realizations and
     # estimates. Another norm or a weight is what the user wants minimised.
     weighed = getattr(restructurer, "norm", None) in ("hinf", "covariance")
@@ -473,14 +486,16 @@ def restructure_points(
         restructurer=restructurer,
     )
     kept = [k for k, done in enumerate(found) if done is not None]
-    better = runner.call(
-        _help_neighbours,
-        [done.result for done in found if done is not None],
-        [tasks[k] for k in kept],
-        points.kappa[kept],
-        restructurer,
-        ignore=["fitted"],
-    )
+    first = [done.result for done in found if done is not None]
+    with bounded(None if max_time is None else began + max_time - perf_counter()):
+        better = runner.call(
+            _help_neighbours,
+            first,
+            [tasks[k] for k in kept],
+            points.kappa[kept],
+            restructurer,
+            ignore=["fitted"],
+        )
     for k, other in zip(kept, better, strict=True):
         found[k] = other or found[k]
     _tell(found, points.kappa)
@@ -572,6 +587,14 @@ def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
     return clone(restructurer).set_params(structure=form)
 
 
+def _with_time(restructurer: Any, seconds: float) -> Any:
+    """The restructurer with a time for every point, where it has no shorter one."""
+    own = restructurer.get_params().get("max_time", 0.0)  # unknown: untouched
+    if own is not None and own <= seconds:
+        return restructurer
+    return clone(restructurer).set_params(max_time=seconds)
+
+
 def _restructure_point(
     model: StateSpace,
     realizations: Sequence[StateSpace],
@@ -618,17 +641,18 @@ def _help_neighbours(
             for j in np.argsort(distance[i], kind="stable")[1 : 1 + _NEIGHBOURS]:
                 start = fitted[j].params_
                 key = (i, start.tobytes())
-                if key in tried:
+                if key in tried or time_is_up():
                     continue
                 tried.add(key)
                 own = fitted[i].fit_error_
                 if fitted[i].start_error(task[0], start) < _BETTER * own:
                     with collected() as told:
-                        fitted[i] = _restructure_point(
+                        other = _restructure_point(
                             *task, restructurer=restructurer, starts=[start]
                         )
-                    better[i] = Done(fitted[i], told)
-                    improved = True
+                    if other.fit_error_ < own:  # if its time was enough
+                        fitted[i], better[i] = other, Done(other, told)
+                        improved = True
         if not improved:
             break
     return better

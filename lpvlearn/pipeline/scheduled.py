@@ -18,6 +18,7 @@ from ..data.timestamps import check_unit
 from ..exceptions import VersionedPickle
 from ..lpv.model import LPVStateSpace, warn_extrapolation
 from ..metrics.table_simulation import simulate_experiments
+from ..validation import flag
 from .bands import prediction_std
 
 Array = NDArray[np.float64]
@@ -71,6 +72,7 @@ class ScheduledEstimator(
             Where a scheduling variable leaves `scheduling_range_`.
         """
         check_is_fitted(self, "lpv_")
+        return_std = flag("return_std", return_std)
         y = self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
         if not return_std:
             return y

@@ -207,6 +207,7 @@ FORMS: dict[type, dict[str, str]] = {
         "n_params": "whole",
         "condition": "number",
         "directions": "any",
+        "sensitivities": "any?",
     },
     GrayBoxRestructurer: {
         "structure": "GrayBoxStructure?",
@@ -231,6 +232,7 @@ FORMS: dict[type, dict[str, str]] = {
         "starts_": "table",
         "history_": "table",
         "params_covariance_": "float[n_params, n_params]?",
+        "covariance_degrees_of_freedom_": "number?",
         "hinf_params_": "float[n_params]?",
         "hinf_error_": "number?",
         "chi2_": "number?",
@@ -432,6 +434,13 @@ def after_loading(value: Any) -> Any:
         return value.with_coefficients(value.coefficients())  # the curve laid anew
     elif isinstance(value, LPVStateSpace):
         _try_lpv(value)
+    elif isinstance(value, LocalLPVPipeline) and hasattr(value, "lpv_"):
+        try:
+            value.summary()
+        except (KeyError, IndexError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"its tables do not tell what those of a pipeline do ({error!r})"
+            ) from error
     return value
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .coordinates import ResponseGeometry
+from .deadline import time_is_up
 from .error_system import ErrorSystem
 from .limits import Limits
 
@@ -221,7 +222,7 @@ def central_path(
     seen = np.zeros(0) if frequencies is None else frequencies
     history: list[dict[str, float]] = []
     n_iter = 0
-    while n_iter < max_iter:
+    while n_iter < max_iter and not time_is_up():
         if system.peaks_move:
             seen = np.union1d(seen, found.frequencies)
         barrier = Barrier(system, limits, np.union1d(system.grid, seen), found.norm)
@@ -257,7 +258,7 @@ def _stage(
     Returns the end and the number of steps.
     """
     radius, n_iter = 1.0, 0
-    while n_iter < max_iter:
+    while n_iter < max_iter and not time_is_up():
         model = barrier.quadratic(theta, mu)
         n_iter += 1
         if not (np.isfinite(model.gradient).all() and np.isfinite(model.hessian).all()):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..systems.least_squares import levenberg_marquardt
 from ..systems.response import pole_grid, pole_rates
+from .deadline import time_is_up
 from .error_system import Structure, Target, derivatives, resolvent
 
 Array = NDArray[np.float64]
@@ -75,6 +76,7 @@ def continued_fits(
             max_iter=max_iter,
             tol=_SMALL,
             exact=_ROUNDING,
+            stop=time_is_up,
         )
     found = search.thetas(X, np.arange(len(X)))
     good = np.isfinite(cost) & np.isfinite(found).all(1)

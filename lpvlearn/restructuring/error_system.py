@@ -25,7 +25,11 @@ Complex = NDArray[np.complex128]
 
 _CONSTANT = 1e-7  # relative change of an error that no parameter changes
 _MOVE = 0.1  # of the parameters that tells: far beyond rounding, the same model still
-_TINY_PART = 1e-3  # of the largest parameter: smaller ones move as if they were that
+
+# Parts of the largest parameter: smaller ones move as if they were that. In units that
+# fit, zeros may stand for either.
+_LEAST_SIZES = (1e-3, 1.0)
+
 _RESPONSE_ROUNDING = 1e-12  # of a response, whose digits the error has lost
 
 # singular values are told apart down to that fraction of the largest: their gap divides
@@ -190,6 +194,18 @@ class _Remembered:
         self.curvature = remembering(structure.curvature)
 
 
+def response_point(model: Target, omega: Array) -> ResponsePoint:
+    """The response of a model, and what its derivatives are made of."""
+    Phi = resolvent(model.A, laplace_variable(omega, model.dt)[0])
+    n, (p, m), k = len(model.A), model.D.shape, len(omega)
+    L = np.empty((k, p, n + p), complex)
+    L[:, :, :n], L[:, :, n:] = model.C @ Phi, np.eye(p)
+    R = np.empty((k, n + m, m), complex)
+    R[:, :n], R[:, n:] = Phi @ model.B, np.eye(m)
+    G = np.asarray(model.C @ R[:, :n] + model.D, dtype=complex)
+    return ResponsePoint(L, R, G, Phi)
+
+
 class ErrorSystem:
     """``W (G(theta) - G0)`` for a structure, a black-box model and a weight.
 
@@ -298,14 +314,22 @@ class ErrorSystem:
     def point(self, theta: Array, omega: Array) -> ResponsePoint:
         """The response, and what its derivatives are made of."""
         A, B, C, D = self.split(self.structure.system_matrix(theta))
-        Phi = resolvent(A, laplace_variable(omega, self.dt)[0])
-        k, p, m = len(omega), self.n_outputs, self.n_inputs
-        L = np.empty((k, p, self.n + p), complex)
-        L[:, :, : self.n], L[:, :, self.n :] = C @ Phi, np.eye(p)
-        R = np.empty((k, self.n + m, m), complex)
-        R[:, : self.n], R[:, self.n :] = Phi @ B, np.eye(m)
-        G = np.asarray(C @ R[:, : self.n] + D, dtype=complex)
-        return ResponsePoint(L, R, G, Phi)
+        return response_point(Target(A, B, C, D, self.dt), omega)
+
+    def rounding(self, theta: Array) -> float:
+        """The error that a unit in the last place of every entry makes, of both models.
+
+        Its largest root mean square over the grid, with units of random signs: no
+        parameters are found more exactly.
+        """
+        A, B, C, D = self.split(self.structure.system_matrix(theta))
+        W = self.weight_response(self.grid)[0]
+        squares = np.zeros(len(self.grid))
+        for model in (Target(A, B, C, D, self.dt), self.target):
+            at = response_point(model, self.grid)
+            S = np.block([[model.A, model.B], [model.C, model.D]])
+            squares += np.sum(np.abs(W @ at.L) ** 2 @ S**2 @ np.abs(at.R) ** 2, (1, 2))
+        return float(np.finfo(float).eps * np.sqrt(squares.max()))
 
     def weighted_error(self, theta: Array, omega: Array) -> Complex:
         """``W (G(theta) - G0)``, shape (k, n_outputs, n_inputs)."""
@@ -348,22 +372,26 @@ class ErrorSystem:
     def constant_at(self, theta: Array, omega: Array) -> NDArray[np.bool_]:
         """Whether the error at these frequencies is one that no parameter changes.
 
-        Told from two other points: a gradient that vanishes may be that of a minimum.
+        Told from other points, within the bounds: a gradient that vanishes may be that
+        of a minimum, or of a square at zero.
         """
         structure = self.structure
-        size = np.abs(theta)
-        size = np.maximum(size, _TINY_PART * size.max(initial=0.0))
-        size = np.where(size > 0, size, 1.0)
         G0, here = self.target_response(omega), self.response(theta, omega)
         noise = _RESPONSE_ROUNDING * np.abs(G0).max((1, 2))
         most = _CONSTANT * np.abs(here - G0).max((1, 2)) + noise
         same = np.ones(len(omega), bool)
-        for turn in (1.0, 2.0):  # two moves in directions that no structure prefers
-            step = _MOVE * size * np.cos(turn + np.arange(len(theta)) ** 2)
-            other = np.clip(theta + step, structure.lower, structure.upper)
-            if not np.isfinite(self.poles(other)).all():
-                continue
-            same &= np.abs(self.response(other, omega) - here).max((1, 2)) <= most
+        top = float(np.abs(theta).max(initial=0.0)) or 1.0
+        for least in _LEAST_SIZES:
+            size = np.maximum(np.abs(theta), least * top)
+            for turn in (1.0, 2.0):  # two directions that no structure prefers
+                step = _MOVE * size * np.cos(turn + np.arange(len(theta)) ** 2)
+                end = theta + step
+                out = (end < structure.lower) | (end > structure.upper)
+                other = np.where(out, theta - step, end)
+                other = np.clip(other, structure.lower, structure.upper)
+                if np.isfinite(self.poles(other)).all():
+                    moved = np.abs(self.response(other, omega) - here).max((1, 2))
+                    same &= moved <= most
         return same
 
     def hessians(self, theta: Array, omega: Array, moving: NDArray[np.bool_]) -> Array:

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from numbers import Real
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import t as student
 from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
@@ -25,7 +25,16 @@ from ..exceptions import RankWarning, VersionedPickle, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..validation import one_of, real_array, whole_number
+from ..validation import (
+    naming_argument,
+    number,
+    one_of,
+    positive_time,
+    real_array,
+    shown,
+    whole_number,
+)
+from .deadline import bounded, time_is_up
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
 from .minimise_covariance import Estimate, efficient_parameters
@@ -45,6 +54,8 @@ Array = NDArray[np.float64]
 
 # A fit of an error up to that multiple of the black box's standard deviation is as good
 # as the true parameters' own.
+_MOST_STARTS = 100_000  # all are drawn at once
+
 _NOISY = 1.5
 
 _OPTIMAL = 1e-5  # stationarity from which an optimum is known nearly only
@@ -59,6 +70,7 @@ _IMPLAUSIBLE, _MISFIT = 1e-3, 4.0
 
 _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "params_covariance_",
+    "covariance_degrees_of_freedom_",
     "hinf_params_",
     "hinf_error_",
     "chi2_",
@@ -66,7 +78,12 @@ _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "p_value_",
 )
 
-_ROUNDING = 1e-11  # an error of that size, relative to the black box, is exact
+_SEARCH_SHARE = 0.7  # of `max_time`, for the starts: the rest is the minimisation's
+
+# An error is exact that is rounding: of that size, relative to the black box (responses
+# are known to 1e-13: no certificate of a thousandth stands on less), or of so many
+# units in the last place of all entries (at most what counts as an exact fit).
+_ROUNDING, _UNITS = 1e-10, 3.0
 
 
 class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
@@ -103,6 +120,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         outputs alike, or a square one; or a band in rad/s, None leaving a side open.
     max_iter : int, default=1000
         Newton steps on the central path and iterations of the solver, in all.
+    max_time : float, default=None
+        Seconds after which a fit ends at the best point it has, with a warning where
+        more time might have brought a better one. None takes the time it needs.
     tol : float, default=1e-10
         Relative decrease of the norm below which the solver stops.
     random_state : int, RandomState instance or None, default=0
@@ -141,8 +161,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         structure); 0 where there is none. It is set aside, and the remaining peaks are
         minimised.
     remaining_error_ : float
-        Highest peak of the error apart from the floor; equal to `error_` where there is
-        no floor, or a lower one.
+        Highest peak of the error apart from the floor: what is minimised where the
+        floor is above it. A local maximum over frequency that the error dips before,
+        coming from the floor, by 1 % at least; 0 where the error only falls from the
+        floor; equal to `error_` where there is no floor, or a lower one.
     stationarity_, second_order_ : float
         Shortest vector in the convex hull of the active gradients (0: stationary, or
         proven optimal by `lower_bound_`), and smallest eigenvalue of the reduced
@@ -153,16 +175,21 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         saddle that no step along its negative curvature led out of; or neither, and the
         best point met was kept. The last two are warned of.
     identifiability_ : Identifiability
-        Rank and condition of the derivative of the response to the parameters.
+        Which parameters the response determines, and how far its errors grow into
+        them.
     dropped_feedthrough_ : ndarray of shape (n_outputs, n_inputs)
         What the black box has in D where the structure has no parameter: left out of
         the comparison, as in Eq. (4).
     fit_error_ : float
         Relative root-mean-square error over frequency of the best least-squares fit.
     params_covariance_ : ndarray of shape (n_params, n_params)
-        Covariance of the parameters from the spread of the `realizations`, or that of
-        the `estimates`, given to `fit_model`; absent without them. Infinite variances
-        where the estimates do not determine a parameter, none at its bound.
+        Covariance of `params_`, the parameters that minimise `norm`, from the spread of
+        the `realizations`, or that of the `estimates`, given to `fit_model`; absent
+        without them. Infinite variances where the estimates do not determine a
+        parameter, none at its bound.
+    covariance_degrees_of_freedom_ : float
+        What the covariance is known from: one less than the realizations, infinite for
+        `estimates`; see :meth:`confidence_intervals`.
     start_params_ : ndarray of shape (n_params,)
         Least-squares fit that the search started from.
     starts_ : DataFrame
@@ -203,6 +230,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         n_starts: int = 16,
         frequency_weight: FrequencyWeight = None,
         max_iter: int = 1000,
+        max_time: float | None = None,
         tol: float = 1e-10,
         random_state: Any = 0,
     ) -> None:
@@ -213,6 +241,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self.n_starts = n_starts
         self.frequency_weight = frequency_weight
         self.max_iter = max_iter
+        self.max_time = max_time
         self.tol = tol
         self.random_state = random_state
 
@@ -286,9 +315,13 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             problem.check_realizations(realizations)
         known = problem.uncertainty(realizations, estimates)
         self._restructure(problem, given, estimates, known, only_given=not search)
-        if len(realizations) and not hasattr(self, "params_covariance_"):
-            spread = problem.spread_covariance(self.params_, realizations)
-            self.params_covariance_ = spread
+        if hasattr(self, "params_covariance_"):
+            self.covariance_degrees_of_freedom_ = np.inf
+        elif len(realizations):
+            self.params_covariance_ = problem.spread_covariance(
+                self.params_, realizations, self.norm
+            )
+            self.covariance_degrees_of_freedom_ = len(realizations) - 1.0
         return self
 
     def fit(
@@ -368,12 +401,15 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "params_")
         names = self.structure_.parameter_names
-        pi = np.asarray(places)
-        if pi.shape != (len(names),) or sorted(pi.tolist()) != list(range(len(names))):
+        given = real_array("places", places)
+        if not np.array_equal(np.sort(given, axis=None), np.arange(given.size)) or (
+            given.shape != (len(names),)
+        ):
             raise ValueError(
                 f"`places` must hold every index from 0 to {len(names) - 1} once. Got "
-                f"{places!r}."
+                f"{shown(places)}."
             )
+        pi = given.astype(np.intp)
         other = copy(self)
         for name in ("params_", "hinf_params_", "start_params_"):
             if hasattr(self, name):
@@ -387,8 +423,60 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             {now[name]: value for name, value in direction.items()}
             for direction in self.identifiability_.directions
         )
-        other.identifiability_ = replace(self.identifiability_, directions=directions)
+        gains = self.identifiability_.sensitivities
+        other.identifiability_ = replace(
+            self.identifiability_,
+            directions=directions,
+            sensitivities={now[name]: gain for name, gain in gains.items()},
+        )
         return other
+
+    def confidence_intervals(self, confidence: float = 0.95) -> pd.DataFrame:
+        """Where the parameters are, by their covariance and Student's distribution.
+
+        Parameters
+        ----------
+        confidence : float, default=0.95
+            Probability that an interval holds the true value of its parameter, where
+            the structure is true.
+
+        Returns
+        -------
+        DataFrame of shape (n_params, 3)
+            ``value``, ``lower`` and ``upper`` of every parameter.
+
+        Raises
+        ------
+        ValueError
+            If `confidence` is not between 0 and 1, or no covariance is known.
+
+        Examples
+        --------
+        >>> lag = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+        >>> runs = [StateSpace(-2, 3 + error, 1) for error in (-0.1, 0.0, 0.1)]
+        >>> fitted = GrayBoxRestructurer(lag).fit_model(runs[1], realizations=runs)
+        >>> fitted.confidence_intervals().round(3)
+           value  lower  upper
+        a    2.0  2.000  2.000
+        b    3.0  2.752  3.248
+        """
+        check_is_fitted(self, "params_")
+        if not 0 < confidence < 1:
+            raise ValueError(
+                f"`confidence` must be between 0 and 1. Got {confidence!r}."
+            )
+        if not hasattr(self, "params_covariance_"):
+            raise ValueError(
+                "confidence intervals need the covariance of the parameters. Got a fit "
+                "without: give fit_model() `realizations` or `estimates`, or fit() the "
+                "`noise`."
+            )
+        std = np.sqrt(np.diag(self.params_covariance_))
+        freedom = self.covariance_degrees_of_freedom_
+        reach = std * student.ppf(0.5 + 0.5 * confidence, freedom)
+        value, names = self.params_, list(self.structure_.parameter_names)
+        columns = {"value": value, "lower": value - reach, "upper": value + reach}
+        return pd.DataFrame(columns, index=names)
 
     def perturbation_check(
         self, model: StateSpace, n_restarts: int = 10, size: float = 0.05
@@ -410,7 +498,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self, "params_")
         whole_number("n_restarts", n_restarts, 1)
-        size = float(real_array("size", size))
+        size = number("size", size, "from 0 to 1", low=0.0, high=1.0)
         rng = np.random.default_rng(0)
         rows, norm, params = [], self.norm, self.params_
         if norm == "covariance":
@@ -436,13 +524,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "`init` must be 'similarity' or a vector of parameters. Got "
                 f"{self.init!r}."
             )
-        whole_number("n_starts", self.n_starts, 1)
+        whole_number("n_starts", self.n_starts, 1, _MOST_STARTS)
         whole_number("max_iter", self.max_iter, 0)
-        if not isinstance(self.tol, Real) or not 0.0 <= float(self.tol) < 1.0:
-            raise ValueError(
-                "`tol` must be a relative decrease, at least 0 and below 1. Got "
-                f"{self.tol!r}."
-            )
+        if self.max_time is not None:
+            positive_time("max_time", self.max_time)
+        rule = "a relative decrease, at least 0 and below 1"
+        number("tol", self.tol, rule, low=0.0, high=float(np.nextafter(1.0, 0.0)))
 
     def _problem(
         self, model: StateSpace | Sequence[StateSpace]
@@ -468,7 +555,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
         try:
-            self._searched(problem, given, estimates, uncertainty, only_given)
+            with bounded(self.max_time):
+                self._searched(problem, given, estimates, uncertainty, only_given)
         except BaseException:  # an interruption, too
             self.__dict__.clear()
             self.__dict__.update(before)
@@ -482,11 +570,16 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         uncertainty: float,
         only_given: bool,
     ) -> None:
-        seed = check_random_state(self.random_state).randint(2**31)
+        rule = "be a whole number from 0 to 2**32 - 1, or None"
+        with naming_argument("random_state", rule, self.random_state):
+            seed = check_random_state(self.random_state).randint(2**31)
         enough = max(EXACT_FIT, _NOISY * uncertainty)
-        problem, fits = starts_of(
-            problem, self.init, self.n_starts, given, seed, only_given, enough
-        )
+        share = None if self.max_time is None else _SEARCH_SHARE * self.max_time
+        with bounded(share):
+            problem, fits = starts_of(
+                problem, self.init, self.n_starts, given, seed, only_given, enough
+            )
+            hurried = time_is_up()
         errors = [fit.relative_error for fit in fits]
         self.starts_ = pd.DataFrame({"relative_error": errors})
         self.fit_error_, self.start_params_ = errors[0], fits[0].x
@@ -495,7 +588,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         if self.norm == "covariance":
             self._weigh(problem, estimates)
         searched = isinstance(self.init, str) and not only_given
-        self._warn(problem, result, enough, searched)
+        self._warn(problem, result, enough, searched, hurried)
 
     def _minimise(
         self, problem: RestructuringProblem, fits: list[LeastSquaresResult]
@@ -507,10 +600,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 problem.structure, problem.box, fits[0].x, self.max_iter
             )
             return *found, 0.0
+        units = _UNITS * system.rounding(fits[0].x) / max(problem.reference, 1e-300)
         options: dict[str, Any] = {
             "max_iter": self.max_iter,
             "tol": self.tol,
-            "negligible": _ROUNDING * problem.reference,
+            "negligible": problem.reference * max(_ROUNDING, min(units, EXACT_FIT)),
         }
         if self.norm == "h2":
             runs = [minimise_h2(system, f, margin, **options) for f in promising(fits)]
@@ -606,13 +700,26 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         result: MinimaxResult,
         enough: float,
         searched: bool,
+        hurried: bool,
     ) -> None:
         """Warn of a search that did not converge, a poor fit, and open parameters.
 
         And of one fit that no other confirms, where starts were `searched` for and its
-        error is not `enough`.
+        error is not `enough`, or of a search that was `hurried`.
         """
-        if not result.converged:
+        errors = self.starts_["relative_error"].to_numpy()
+        timed_out = hurried and errors[0] > enough
+        if timed_out or (time_is_up() and not result.converged):
+            warn(
+                f"the search ended at `max_time`={self.max_time} s, with a relative "
+                f"error of {self.relative_error_:.2g} and `stationarity_` "
+                f"{self.stationarity_:.1g} (0 at an optimum): it did not look at all "
+                "starts, or not to the end. The best point is kept. Raise `max_time`, "
+                "or give `init`.",
+                ConvergenceWarning,
+            )
+            searched = False  # no more can be said of the starts
+        elif not result.converged:
             spent = self.n_iter_ >= self.max_iter
             warn(
                 f"the search {'ended at' if spent else 'stalled before'} "
@@ -624,7 +731,6 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 + ", or take a structure of fewer parameters.",
                 ConvergenceWarning,
             )
-        errors = self.starts_["relative_error"].to_numpy()
         together = int((errors <= errors[0] * (1.0 + _AGREE)).sum())
         if searched and len(errors) > 1 == together and errors[0] > enough:
             warn(
@@ -643,7 +749,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             )
         floor = self.structural_floor_ / max(problem.reference, 1e-300)
         explained = getattr(self, "p_value_", 0.0) > _IMPLAUSIBLE  # by the noise
-        if self.fit_error_ - floor > _POOR_FIT and not explained:
+        poor = min(self.fit_error_, self.relative_error_) - floor > _POOR_FIT
+        if poor and not explained:
             costs = self.starts_["relative_error"].to_numpy()
             agreeing = int((costs <= costs.min() * (1.0 + _AGREE)).sum())
             warn(

@@ -8,11 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..systems.least_squares import levenberg_marquardt
+from ..systems.least_squares import levenberg_marquardt, scaled_lstsq
+from .deadline import time_is_up
 from .error_system import ErrorSystem
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+
+# Powers of singular values in a sum that comes near their maximum, and steps for each
+_POWERS, _REWEIGHTED = (2, 4, 8, 16, 32), 4
+_NOTHING = 1e-6  # smaller parts of the maximum weigh alike: nothing
 
 _DECADES = 1.5  # channels whose sizes differ by less are left as they are
 
@@ -33,6 +38,7 @@ def fit_frequency_response(
     admissible: Callable[[Array], bool],
     scaling: Array | float = 1.0,
     max_iter: int = 100,
+    geodesic: bool = False,
 ) -> LeastSquaresResult | None:
     """Least-squares fit of ``G(theta)`` to the black box at the frequencies `omega`.
 
@@ -62,6 +68,8 @@ def fit_frequency_response(
         lower=structure.lower,
         upper=structure.upper,
         max_iter=max_iter,
+        stop=time_is_up,
+        geodesic=geodesic,
     )
     return LeastSquaresResult(x[0], float(cost[0])) if np.isfinite(cost[0]) else None
 
@@ -83,3 +91,39 @@ def channel_scaling(G: Complex) -> Array | None:
     if max(spread) < _DECADES:
         return None
     return 1.0 / (rows[:, None] * columns)
+
+
+def least_maximum(E: Complex, J: Complex) -> Array:
+    """``d`` with the least maximum over k of the norms of ``E_k + J_k d``, nearly.
+
+    `E` has shape (k, n_outputs, n_inputs), `J` (k, n_outputs, n_inputs, n_params). By
+    reweighted least squares for the sum of powers of the singular values, the power
+    raised step by step (Kahng, 1972).
+
+    Examples
+    --------
+    The number nearest to -1, 0 and 3 is in the middle of the extremes:
+
+    >>> E = np.array([1.0, 0.0, -3.0])[:, None, None] + 0j
+    >>> least_maximum(E, np.ones((3, 1, 1, 1))).round(2)
+    array([1.])
+    """
+    n, p = J.shape[-1], J.shape[1]
+    d = np.zeros(n)
+    for power in _POWERS:
+        for _ in range(_REWEIGHTED):
+            now = E + J @ d
+            U, s, _ = np.linalg.svd(now)
+            top = float(s.max(initial=0.0))
+            if top == 0.0:
+                return d
+            share = np.zeros((len(s), p))
+            share[:, : s.shape[1]] = s / top
+            root = np.maximum(share, _NOTHING)[:, None] ** (power / 2 - 1) * U
+            root = root @ U.conj().swapaxes(1, 2)
+            rows = np.einsum("kpq,kqmj->kpmj", root, J).reshape(-1, n)
+            rest = (root @ now).ravel()
+            A = np.vstack([rows.real, rows.imag])
+            b = np.concatenate([rest.real, rest.imag])
+            d = d - scaled_lstsq(A, b)[0] / (power - 1)
+    return d

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..systems.hinf_norm import PeakSet
 from ..systems.sampling import d2c_tustin
-from ..validation import real_array
+from ..validation import real_array, shown
 from .error_system import (
     ErrorSystem,
     Structure,
@@ -106,7 +106,7 @@ class MeasuredErrorSystem(ErrorSystem):
 
 def stack_response(G: Complex) -> Array:
     """(n_freq, n_outputs, n_inputs) to (n_freq, 2 n_outputs n_inputs), real first."""
-    flat = G.reshape(len(G), -1)
+    flat = G.reshape(len(G), G.shape[1] * G.shape[2])
     return np.hstack([flat.real, flat.imag])
 
 
@@ -126,9 +126,12 @@ def read_frequency_data(
             f"Got {grid.shape}."
         )
     if not np.isfinite(grid).all() or (grid < 0).any() or not (grid > 0).any():
-        raise ValueError("`omega` must be finite, not negative, and not only zero.")
+        raise ValueError(
+            "`omega` must be finite, not negative, and not only zero. Got "
+            f"{shown(omega)}."
+        )
     if len(np.unique(grid)) != len(grid):
-        raise ValueError("`omega` must hold every frequency once.")
+        raise ValueError(f"`omega` must hold every frequency once. Got {shown(omega)}.")
     table = np.asarray(frf)
     entries = n_outputs * n_inputs
     if np.iscomplexobj(table):

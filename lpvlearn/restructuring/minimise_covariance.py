@@ -38,6 +38,7 @@ from scipy.stats import chi2
 
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..systems.least_squares import levenberg_marquardt
+from .deadline import time_is_up
 from .error_system import ErrorSystem, Structure, Target, remembering
 from .limits import keeps_margin, natural_margin
 
@@ -222,6 +223,7 @@ def minimise_covariance(
         upper=upper,
         max_iter=max_iter,
         tol=_DECREASE,
+        stop=time_is_up,
     )
     theta, cost = reached[0], float(costs[0])
     if not np.isfinite(cost):

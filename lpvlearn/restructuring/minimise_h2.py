@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 
 from ..minimax.problem import MinimaxResult, Peaks, shortest_in_hull
 from .coordinates import metric_coordinates
+from .deadline import time_is_up
 from .error_system import ErrorSystem, Target
 from .least_squares import LeastSquaresResult
 from .limits import Limits, within_bounds
@@ -95,7 +96,7 @@ def minimise_h2(
         slope = _slope(
             gradient[active] @ T / J, *_scaled_limits(limits, theta, active, T)
         )
-        if slope <= tol or n_iter >= max_iter:
+        if slope <= tol or n_iter >= max_iter or time_is_up():
             break
         known, start = J, theta
         theta, steps = _quasi_newton(
@@ -139,6 +140,10 @@ def _slope(gradient: Array, c: Array, dc: Array) -> float:
     return shortest_in_hull(gradient[None], dc[c >= _BINDING])[0]
 
 
+class _TimeIsUp(Exception):
+    """Ends SciPy's search."""
+
+
 def _quasi_newton(
     system: ErrorSystem,
     limits: Limits,
@@ -156,11 +161,18 @@ def _quasi_newton(
         end[active] += T @ y
         return end
 
+    least, best = J, np.zeros(T.shape[1])
+
     def objective(y: Array) -> tuple[float, Array]:
+        nonlocal least, best
+        if time_is_up():
+            raise _TimeIsUp
         end = theta_of(y)
         if not limits.admissible(end):
             return _REFUSED, np.zeros_like(y)
         value, gradient = squared_h2(system, end)
+        if value < least:
+            least, best = value, y.copy()
         return value / J, (gradient[active] @ T) / J
 
     def kept(y: Array) -> tuple[Array, Array]:
@@ -169,23 +181,27 @@ def _quasi_newton(
             return np.full(1, -1.0), np.zeros((1, len(y)))
         return _scaled_limits(limits, end, active, T)
 
-    found = minimize(
-        objective,
-        np.zeros(T.shape[1]),
-        jac=True,
-        method="SLSQP",
-        constraints={
-            "type": "ineq",
-            "fun": lambda y: -kept(y)[0],
-            "jac": lambda y: -kept(y)[1],
-        },
-        options={"maxiter": max_iter, "ftol": _FINEST},
-        callback=lambda z: history.append(
-            {"objective": np.sqrt(J * max(objective(z)[0], 0.0))}
-        ),
-    )
-    end = within_bounds(system, theta_of(found.x))
-    return end if limits.admissible(end) else theta, int(found.nit)
+    known = len(history)
+    try:
+        best = minimize(
+            objective,
+            np.zeros(T.shape[1]),
+            jac=True,
+            method="SLSQP",
+            constraints={
+                "type": "ineq",
+                "fun": lambda y: -kept(y)[0],
+                "jac": lambda y: -kept(y)[1],
+            },
+            options={"maxiter": max_iter, "ftol": _FINEST},
+            callback=lambda z: history.append(
+                {"objective": np.sqrt(J * max(objective(z)[0], 0.0))}
+            ),
+        ).x
+    except _TimeIsUp:
+        pass
+    end = within_bounds(system, theta_of(best))
+    return end if limits.admissible(end) else theta, len(history) - known
 
 
 def _rounding(system: ErrorSystem, theta: Array) -> float:

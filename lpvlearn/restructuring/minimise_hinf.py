@@ -18,7 +18,8 @@ from ..minimax.problem import Flags, MinimaxProblem, MinimaxResult, Peaks
 from ..minimax.sqp import minimax_sqp
 from .central_path import PathPoint, central_path
 from .coordinates import CanonicalForm, Geodesics, ResponseGeometry, view_at
-from .error_system import ErrorSystem, vanishing_weight
+from .deadline import time_is_up
+from .error_system import ErrorSystem, Target, vanishing_weight
 from .least_squares import LeastSquaresResult, fit_frequency_response
 from .limits import Limits, within_bounds
 
@@ -27,6 +28,8 @@ Array = NDArray[np.float64]
 _DEPTH = 0.6  # peaks down to that fraction below the objective enter the local model
 _FLAT = 1e-7  # a peak with a smaller relative gradient does not depend on theta
 _CAP_TOLERANCE = 1e-7  # relative excess over the cap that rounding may make
+_RIPPLE = 1e-6  # relative height above the floor that a peak beside it may have
+_DIP = 1e-2  # part of a peak by which it stands out from the floor's shoulder
 _MAX_CAPS = 12  # frequencies at which the cap is a constraint: the last ones met
 
 # depths at which peaks that move are looked for below high constant ones
@@ -53,8 +56,10 @@ _FITS = 6  # basins that are followed at most
 _APART = 1e-4  # relative difference of the costs of different basins
 _ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
 _RADIUS = 0.1  # first trust-region radius of the solver
-_REMAINDER_TOLERANCE = 1e-3  # the choice among optimal points is soon good enough
-_REMAINDER_STEPS = 20  # iterations for that choice
+
+# The choice among optimal points, behind a weight and as it is: relative decrease that
+# ends it, and most steps
+_WEIGHTED_CHOICE, _CHOICE = (1e-3, 20), (1e-6, 60)
 
 
 @dataclass
@@ -109,13 +114,15 @@ class HinfObjective:
             if not steep.all():
                 flat = found.frequencies[~steep]
                 steep[~steep] = ~self.system.constant_at(theta, flat)
+            if not steep.all():
+                high = int(np.argmax(np.where(steep, -np.inf, found.values)))
+                if found.values[high] > self.floor:
+                    self.floor = float(found.values[high])
+                    self.floor_frequency = float(found.frequencies[high])
+            if self.floor > 0:
+                steep &= self._apart(theta, found.frequencies, found.values)
             if found.norm == 0.0 or steep.any():
                 break
-        if not steep.all():
-            high = int(np.argmax(np.where(steep, -np.inf, found.values)))
-            if found.values[high] > self.floor:
-                self.floor = float(found.values[high])
-                self.floor_frequency = float(found.frequencies[high])
         if not steep.any():  # nothing is left that the parameters could lower
             none = np.zeros(1)
             return Peaks(none, none, np.zeros((1, len(y))), np.zeros(1, bool))
@@ -127,6 +134,17 @@ class HinfObjective:
         )
         self._top = peaks.top
         return peaks
+
+    def _apart(self, theta: Array, omega: Array, values: Array) -> Flags:
+        """Whether peaks are above the floor, or the error dips between it and them."""
+        apart, grid = values > self.floor * (1.0 + _RIPPLE), self.system.grid
+        low, high = np.sort([omega, np.full(len(omega), self.floor_frequency)], axis=0)
+        for k in np.flatnonzero(~apart):
+            between = grid[(grid > low[k]) & (grid < high[k])]
+            if between.size:
+                dip = float(self.system.values(theta, between).min())
+                apart[k] = dip < (1.0 - _DIP) * values[k]
+        return apart
 
     def samples(self, y: Array, omega: Array) -> Peaks:
         """Singular values at fixed frequencies, and their gradients."""
@@ -172,6 +190,7 @@ class HinfObjective:
             self.constraints,
             self.system.grid,
             self.curve,
+            time_is_up,
         )
 
 
@@ -222,17 +241,14 @@ def minimise_hinf(
         )
         return theta, result, floor if floor > negligible else 0.0
     weight = vanishing_weight(system, objective.floor_frequency)
-    if weight is None:
-        certified = MinimaxResult(theta0, first, 0.0, 0.0, True, 0)
-        return theta0, certified, objective.floor
-    options["max_iter"] = max_iter
+    floor, options["max_iter"] = objective.floor, max_iter
     theta, result = _minimise_remainder(
-        system, system.reweighted(weight), objective.floor, theta0, limits, options
+        system, weight, objective, theta0, limits, options
     )
     # a constant peak is active: its zero gradient certifies the optimum, though
     # not a strict one
     certified = replace(result, stationarity=0.0, second_order=0.0, converged=True)
-    return theta, certified, objective.floor
+    return theta, certified, floor
 
 
 def _from_least_squares(
@@ -277,7 +293,7 @@ def _from_least_squares(
         settled = result.stationarity <= _STATIONARY and result.converged
         settled |= best[1].peaks.top <= options["negligible"]
         idle = result.converged and best[1].peaks.top >= (1.0 - _PROGRESS) * top
-        if settled or idle or used >= max_iter:
+        if settled or idle or used >= max_iter or time_is_up():
             break
         ahead = best[1].peaks.top < _AHEAD * size and limits.strict(best[0])
         inner = best[0] if ahead else path.theta
@@ -421,24 +437,39 @@ def _left_saddle(
 
 def _minimise_remainder(
     system: ErrorSystem,
-    remainder: ErrorSystem,
-    floor: float,
+    weight: Target | None,
+    above: HinfObjective,
     theta0: Array,
     limits: Limits,
     options: dict[str, Any],
 ) -> tuple[Array, MinimaxResult]:
-    """Minimise the weighted remainder while the error stays on its floor."""
-    grid, eye = system.grid, np.eye(len(theta0))
-    bound = HinfObjective(remainder, theta0, eye, limits, floor, system)
-    fit = fit_frequency_response(remainder, theta0, grid, admissible=bound.admissible)
-    assert fit is not None  # theta0 is admissible
-    size = max(remainder.peaks(fit.x).norm, 1e-300)
-    T = ResponseGeometry(remainder, fit.x, grid, size).T
-    objective = HinfObjective(remainder, fit.x, T, limits, floor, system)
-    # the optimum is certified by the floor; what follows chooses among optimal points
-    options = options | {
-        "tol": max(options["tol"], _REMAINDER_TOLERANCE),
-        "max_iter": min(options["max_iter"], _REMAINDER_STEPS),
-    }
-    result = minimax_sqp(objective.problem(), np.zeros(len(theta0)), **options)
-    return within_bounds(system, objective.theta(result.y)), result
+    """Minimise the peaks below a constant one, which certifies the optimum already.
+
+    First all of the error behind a weight that vanishes where that peak is, while its
+    norm stays on the floor: this finds the shoulder of the constant peak on which the
+    other ones are low. Then these peaks as they are.
+    """
+
+    def choice(tol: float, steps: int) -> dict[str, Any]:
+        most = min(options["max_iter"], steps)
+        return options | {"tol": max(options["tol"], tol), "max_iter": most}
+
+    grid, origin, history = system.grid, np.zeros(len(theta0)), []
+    if weight is not None:
+        remainder, floor = system.reweighted(weight), above.floor
+        bound = HinfObjective(remainder, theta0, above.T, limits, floor, system)
+        fit = fit_frequency_response(
+            remainder, theta0, grid, admissible=bound.admissible
+        )
+        assert fit is not None  # theta0 is admissible
+        size = max(remainder.peaks(fit.x).norm, 1e-300)
+        T = ResponseGeometry(remainder, fit.x, grid, size).T
+        objective = HinfObjective(remainder, fit.x, T, limits, floor, system)
+        first = minimax_sqp(objective.problem(), origin, **choice(*_WEIGHTED_CHOICE))
+        theta0 = within_bounds(system, objective.theta(first.y))
+        history = first.history
+        above = replace(above, theta0=theta0, T=T)
+    result = minimax_sqp(above.problem(), origin, **choice(*_CHOICE))
+    theta = within_bounds(system, above.theta(result.y))
+    n_iter, history = len(history) + result.n_iter, history + result.history
+    return theta, replace(result, n_iter=n_iter, history=history)

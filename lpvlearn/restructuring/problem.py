@@ -9,7 +9,7 @@ from its derivative J: which ones, by its rank; and to first order how exactly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -21,11 +21,13 @@ from ..models.statespace import DEVIATION, StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
 from ..validation import real_array
+from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, series
 from .least_squares import (
     LeastSquaresResult,
     channel_scaling,
     fit_frequency_response,
+    least_maximum,
 )
 from .limits import growth, keeps_margin, natural_margin
 from .measured import MeasuredErrorSystem, read_frequency_data, stable_realization
@@ -49,6 +51,11 @@ _LEAST_DECAY = 1e-4
 # Singular values smaller than that part of the largest are rounding: responses and
 # their derivatives are exact to about 1e-13, behind resolvents less so.
 _RANK_TOLERANCE = 1e-9
+_DIGITS = 1e-12  # of a response, that are lost where its terms cancel
+
+# Parameters whose own size changes the response by a smaller part are next to zero; and
+# the part of a promised change that tells a linear response.
+_ZERO, _LINEAR = 1e-3, 0.5
 
 _SAME = 1e-6  # relative difference of delays that is rounding
 
@@ -95,12 +102,22 @@ class RestructuringProblem:
         self, theta: Array, scaling: Array | float = 1.0
     ) -> LeastSquaresResult | None:
         """Least-squares fit of the response from given parameters; None if unstable."""
+        fit = self._fit(theta, scaling, False)
+        if fit is None or not EXACT_FIT < fit.relative_error <= GOOD_FIT:
+            return fit
+        # it may have stopped on the way along a curved valley
+        return self._fit(fit.x, scaling, True)
+
+    def _fit(
+        self, theta: Array, scaling: Array | float, geodesic: bool
+    ) -> LeastSquaresResult | None:
         fit = fit_frequency_response(
             self.system,
             theta,
             self.omega,
             admissible=self.is_stable,
             scaling=scaling,
+            geodesic=geodesic,
         )
         if fit is None:
             return None
@@ -135,6 +152,8 @@ class RestructuringProblem:
                 break
             if best > GOOD_FIT and number >= n_fits:
                 break
+            if fits and time_is_up():
+                break
             if scaling is not None:  # all channels alike first, then as they are
                 first = self.fit(theta, scaling)
                 theta = theta if first is None else first.x
@@ -144,21 +163,43 @@ class RestructuringProblem:
         return fits
 
     def identifiability(self, theta: Array) -> Identifiability:
-        """Which parameters the response determines."""
-        J = self.system.response_jacobian(theta, self.omega)[1]
+        """Which parameters the response determines, and how well."""
+        G, J = self.system.response_jacobian(theta, self.omega)
         scaling = channel_scaling(self.response)
         if scaling is not None:  # a faint channel tells parameters, too
-            J = J * scaling[..., None]
-        return Identifiability.from_jacobian(J, self.structure.parameter_names)
+            G, J = G * scaling, J * scaling[..., None]
+        level = np.linalg.norm(G, axis=(1, 2))
+        usual = float(np.sqrt(np.mean(level**2)))
+        effect = np.sqrt(np.sum(np.abs(J) ** 2, axis=(0, 1, 2)) / len(J))
+        sizes = np.where(theta == 0, 1.0, np.abs(theta))
+        # Next to zero, where the response is linear in a parameter, its errors count
+        # against what would matter: most zeros are meant to be zeros.
+        for j in np.flatnonzero(
+            (effect > 0) & (effect * np.abs(theta) < _ZERO * usual)
+        ):
+            step = np.zeros(len(theta))
+            step[j] = (-1.0 if theta[j] < 0 else 1.0) * usual / effect[j]
+            moved = self.system.response(theta + step, self.omega)
+            moved = moved if scaling is None else moved * scaling
+            change = np.sqrt(np.sum(np.abs(moved - G) ** 2) / len(G))
+            if change > _LINEAR * usual:
+                sizes[j] = abs(step[j])
+        names = self.structure.parameter_names
+        return Identifiability.from_jacobian(J * sizes, names, level)
 
-    def parameter_changes(self, theta: Array, dG: Complex) -> Array:
+    def parameter_changes(
+        self, theta: Array, dG: Complex, counts: Array | None = None
+    ) -> Array:
         """First-order changes of the parameters with the black box's response.
 
         Minimising the weighted mean square error, ``d theta = Re(K dG)`` with
         ``K = (J^T J)^-1 J^H W`` in real arithmetic. `dG` (r, k, n_outputs, n_inputs)
-        are changes of the response; several black boxes change alike.
+        are changes of the response; several black boxes change alike. A frequency
+        counts `counts` (k,) times.
         """
         W = self._weighted[0]
+        if counts is not None:
+            W = np.sqrt(counts)[:, None, None] * W
         J = self.system.response_jacobian(theta, self.omega)[1]
         WJ = np.einsum("kpq,kqmj->kpmj", W, J)
         flat = WJ.reshape(-1, J.shape[-1])
@@ -214,16 +255,35 @@ class RestructuringProblem:
         W = self._weighted[0]
         return W @ np.tile(G, (1, W.shape[2] // G.shape[1], 1))
 
-    def spread_covariance(self, theta: Array, models: Sequence[StateSpace]) -> Array:
+    def spread_covariance(
+        self, theta: Array, models: Sequence[StateSpace], norm: str
+    ) -> Array:
         """Covariance of the parameters of an averaged model from single realizations.
 
-        Every realization's response is carried to the parameters to first order; the
-        covariance of their mean is that of one divided by their number.
+        Every realization's response is carried to the parameters that minimise `norm`
+        in the linearised structure: the least maximum for "hinf", which is not linear
+        in the noise, else least squares, for "h2" over frequencies as its integral
+        counts them. The covariance of their mean is that of one divided by their
+        number.
         """
         undelayed = [model.with_input_delay(0) for model in models]
         G = np.array([model.frequency_response(self.omega) for model in undelayed])
-        changes = self.parameter_changes(theta, G - G.mean(0))
-        return np.cov(changes.T, ddof=1).reshape(len(theta), -1) / len(G)
+        noise = (G - G.mean(0)) / np.sqrt(len(G))
+        if norm == "hinf":
+            W = self._weighted[0]
+            J = self.system.response_jacobian(theta, self.omega)[1]
+            WJ = np.einsum("kpq,kqmj->kpmj", W, J)
+            copies = W.shape[2] // G.shape[2]  # of several black boxes
+            dE = W @ np.tile(noise, (1, 1, copies, 1))
+            # what the noise does not explain of the error is there with any noise
+            E = self.system.weighted_error(theta, self.omega)
+            explained = np.sum(np.abs(dE) ** 2) / max(np.sum(np.abs(E) ** 2), 1e-300)
+            E = E * np.sqrt(max(1.0 - float(explained), 0.0))
+            changes = np.array([least_maximum(E - part, WJ) for part in dE])
+        else:
+            counts = np.gradient(self.omega) if norm == "h2" else None
+            changes = self.parameter_changes(theta, noise, counts)
+        return np.cov(changes.T, ddof=1).reshape(len(theta), -1)
 
 
 def agreeing(fits: Sequence[LeastSquaresResult]) -> int:
@@ -487,23 +547,29 @@ class Identifiability:
         Number of parameter combinations that the response determines.
     n_params : int
     condition : float
-        Largest over smallest singular value; relative errors of the response grow into
-        the parameters by up to this factor. Infinite or huge if the rank is deficient.
+        The most by which a relative error of the response (root mean square over
+        frequency) may grow into relative errors of the parameters. Below 1 over the
+        black box's own relative error all parameters are known. Infinite if the rank is
+        deficient.
     directions : tuple of dict
-        One for every undetermined combination: change by parameter name, in steps that
-        have the same effect on the response, the largest 1; below 0.1 it is left out.
+        One for every undetermined combination: relative change by parameter name, the
+        largest 1; below 0.1 it is left out.
+    sensitivities : dict
+        The same as the condition by parameter name.
     """
 
     rank: int
     n_params: int
     condition: float
     directions: tuple[dict[str, float], ...]
+    sensitivities: dict[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
         if not self.directions:
             return (
                 f"all {self.n_params} parameters are identifiable "
-                f"(condition {self.condition:.2g})."
+                f"(condition {self.condition:.2g}, most that of "
+                f"{max(self.sensitivities, key=self.sensitivities.__getitem__)})."
             )
         parts = [
             " ".join(f"{value:+.2g} {name}" for name, value in direction.items())
@@ -511,46 +577,67 @@ class Identifiability:
         ]
         return (
             f"the response determines {self.rank} of the {self.n_params} parameters. "
-            f"It does not change along: {'; '.join(parts)} (in steps of equal effect). "
+            f"It does not change along: {'; '.join(parts)} (in relative steps). "
             "Fix a parameter of each combination in the template."
         )
 
     @classmethod
-    def from_jacobian(cls, J: Complex, names: Sequence[str]) -> Identifiability:
+    def from_jacobian(
+        cls, J: Complex, names: Sequence[str], level: Array | float = 1.0
+    ) -> Identifiability:
         """Analysis of the response Jacobian, (n_freq, n_outputs, n_inputs, n_params).
 
-        Every column is divided by its norm: the analysis does not depend on the units
-        of the parameters, nor on parameters that happen to be zero.
+        `J` holds changes with the steps that errors and directions are relative to,
+        `level` (n_freq,) the sizes of the response. The rank is that of columns divided
+        by their norms, of rows divided by the size of what they hold: it does not
+        depend on units, on parameters that happen to be zero, nor on how far the
+        response falls over frequency.
 
         Examples
         --------
         The gain ``b c`` of a response does not tell ``b`` from ``c``:
 
         >>> J = np.array([[[[2.0 + 0j, 3.0]]]])  # at b = 3, c = 2
-        >>> found = Identifiability.from_jacobian(J, ["b", "c"])
+        >>> found = Identifiability.from_jacobian(J * [3.0, 2.0], ["b", "c"], [6.0])
         >>> found.rank, found.directions
         (1, ({'b': 1.0, 'c': -1.0},))
         """
-        n = J.shape[-1]
-        flat = J.reshape(int(np.prod(J.shape[:-1])), n)
-        # Rows of zeros: few frequencies must not hide undetermined combinations.
-        columns = np.vstack([flat.real, flat.imag, np.zeros((n, n))])
-        effect = np.linalg.norm(columns, axis=0)
-        columns = columns / np.where(effect > 0, effect, 1.0)
-        _, s, Vt = np.linalg.svd(columns, full_matrices=False)
-        top = float(s.max(initial=0.0))
-        rank = int((s > _RANK_TOLERANCE * top).sum())
+        k, n = len(J), J.shape[-1]
+        level = np.broadcast_to(level, (k,))
+        size = np.maximum(level, _DIGITS * np.linalg.norm(J.reshape(k, -1), axis=1))
+        even = J / np.where(size > 0, size, 1.0)[:, None, None, None]
+        unit, s, Vt = _scaled_svd(even)
+        rank = int((s > _RANK_TOLERANCE * s.max(initial=0.0)).sum())
         directions = tuple(
             {
                 name: float(value)
                 for name, value in zip(names, row, strict=True)
                 if abs(value) > _NAMED
             }
-            for row in _sparse_rows(Vt[rank:])
+            for row in _sparse_rows(Vt[rank:] / unit)
         )
-        low = float(s.min(initial=top))
-        condition = top / low if low > 0 else np.inf
-        return cls(rank, n, condition, directions)
+        # errors of the response are alike at all frequencies
+        usual = max(float(np.linalg.norm(level)), 1e-300)
+        unit, s, Vt = _scaled_svd(J / usual)
+        inverse = (Vt / np.maximum(s, 1e-150)[:, None]).T / unit[:, None]
+        gains = np.linalg.norm(inverse, axis=1)
+        for direction in directions:
+            gains[[names.index(name) for name in direction]] = np.inf
+        condition = float(np.linalg.norm(inverse, 2)) if rank == n else np.inf
+        sensitivities = dict(zip(names, gains.tolist(), strict=True))
+        return cls(rank, n, condition, directions, sensitivities)
+
+
+def _scaled_svd(J: Complex) -> tuple[Array, Array, Array]:
+    """Lengths of the columns (1 for none), singular values and rows of unit ones."""
+    n = J.shape[-1]
+    flat = J.reshape(int(np.prod(J.shape[:-1])), n)
+    # rows of zeros: few frequencies must not hide undetermined combinations
+    columns = np.vstack([flat.real, flat.imag, np.zeros((n, n))])
+    unit = np.linalg.norm(columns, axis=0)
+    unit = np.where(unit > 0, unit, 1.0)
+    _, s, Vt = np.linalg.svd(columns / unit, full_matrices=False)
+    return unit, s, Vt
 
 
 def _sparse_rows(null: Array) -> Array:

@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 
 from ..minimax.problem import MinimaxResult, Peaks
 from ..systems.least_squares import Residuals, levenberg_marquardt
+from .deadline import time_is_up
 from .error_system import Structure, Target
 
 Array = NDArray[Any]
@@ -141,6 +142,7 @@ def similarity_starts(
         patience=_PATIENCE,
         exact=_ROUNDING * (1.0 + np.abs(problem.offset).sum()) ** 2,
         enough=_EXACT,
+        stop=time_is_up,
     )
     Z, cost = Z[np.isfinite(cost)], cost[np.isfinite(cost)]  # regular ones
     if len(Z) == 0:

@@ -20,9 +20,11 @@ from ..structures.mechanical import ImplicitMap
 from ..structures.structure import GrayBoxStructure, drawn_around
 from ..systems.balancing import balancing_transformation
 from .continuation import continued_fits
+from .deadline import time_is_up
 from .error_system import Target, frequency_grid, model_derivatives
 from .least_squares import LeastSquaresResult, channel_scaling
 from .limits import growth
+from .parts import start_by_parts
 from .problem import EXACT_FIT, GOOD_FIT, RestructuringProblem, agreeing
 from .similarity import scaled_problem, similarity_starts
 
@@ -48,6 +50,7 @@ _HOP_ROUNDS = 4  # from ever better fits
 _HOP_GAIN = 1e-3  # relative decrease of the cost that is worth another round
 _FAINT = 0.03  # size of modes that only fill the order: seen, but hardly disturbing
 _FAST = 3.0  # decay of these modes, relative to the fastest: they are out of the way
+_EXACT_PARTS = 1e-6  # distance of a start by parts that the black box itself is
 _SLOWEST = 1e-9  # poles smaller than that part of the largest are integrators
 
 # Starts at each time scale that are carried through a continuation: its steps cost as
@@ -114,7 +117,7 @@ def _rounds(
         more = problem.best_fits(candidates, n_fits, enough)
         fits = sorted(fits + more, key=_COST)
         best = fits[0].relative_error if fits else np.inf
-        if best <= enough:
+        if best <= enough or (fits and time_is_up()):
             break
         # the structure comes no nearer: different starts end at the same best cost
         least = 2 if number or best <= GOOD_FIT else n_fits
@@ -136,7 +139,7 @@ def hopped_fits(
     for _ in range(_HOP_ROUNDS):
         best, returned = fits[0], 0
         for size in _HOPS:
-            if returned == _HOP_RETURNS:
+            if returned == _HOP_RETURNS or time_is_up():
                 break
             theta = best.x * np.exp(size * rng.normal(size=len(best.x)))
             fit = problem.fit(np.clip(theta, lower, upper))
@@ -144,7 +147,7 @@ def hopped_fits(
                 fits = [*fits, fit]
                 returned += abs(fit.cost - best.cost) <= _SAME * best.cost
         fits = sorted(fits, key=_COST)
-        if fits[0].cost > best.cost * (1.0 - _HOP_GAIN):
+        if time_is_up() or fits[0].cost > best.cost * (1.0 - _HOP_GAIN):
             break
     return fits
 
@@ -219,15 +222,23 @@ def _similar_candidates(
     """Parameters of an affine structure from random similarities, shape (k, n_params).
 
     Where states are missing, modes fill the order that are faint, or that no input
-    moves, or that no output shows.
+    moves, or that no output shows. A sum of parts has a start of its own, by modes; no
+    others are needed where the black box is one of its models.
     """
     core = _reduced(box, order)
+    by_parts = []
     faint = [(_FAINT, _FAINT), (0.0, 1.0), (1.0, 0.0)]
     found = []
     for sizes in faint if len(core.A) < order else faint[:1]:
         full = _padded(core, order, rng, sizes)
+        start = start_by_parts(full, affine.offset, affine.basis, rng)
+        if start is not None:
+            theta, distance = start
+            by_parts.append(theta[None])
+            if distance <= _EXACT_PARTS and len(box.A) <= order:
+                break
         found.append(_random_similarities(full, affine, n_starts, rng))
-    return np.vstack(found)
+    return np.vstack(by_parts + found)
 
 
 def _random_similarities(

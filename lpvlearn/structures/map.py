@@ -23,6 +23,7 @@ from ..models.system_matrix import stack_system
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 
 # All steps are relative to the sizes of the parameters.
 _COMPLEX_STEP = 1e-30  # nothing is subtracted: its square is below any rounding
@@ -37,6 +38,7 @@ _AGREEMENT = 1e-4
 # function may lose two digits of its own.
 _ROUNDING = 1e-8
 
+_NO_SIZE = 1e-200  # a parameter smaller than that is zero: no step could be
 _LEAST_SIZE = 1e-3  # of a parameter near zero, relative to its usual size
 
 _FILTERS = threading.RLock()  # the warning filters are those of all threads
@@ -65,6 +67,10 @@ class StructureMap(ABC):
     def fix(self, values: Array, free: Flags) -> StructureMap:
         """The map of the `free` parameters, the others at their `values`."""
         return FixedMap(self, values, free)
+
+    def select(self, rows: Rows) -> StructureMap:
+        """The map to some rows of S; one may stand several times."""
+        return RowsMap(self, rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +190,7 @@ class RowsMap(StructureMap):
     """Some rows of the S of another map; one may stand several times."""
 
     parent: StructureMap
-    rows: NDArray[np.intp]
+    rows: Rows
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -281,4 +287,5 @@ def _central(f: Callable[[Any], Any], theta: Array, steps: Array) -> Array:
 def _parameter_scale(theta: Array, typical: Array) -> Array:
     """Size of every parameter; 0 stands for a usual value of 1."""
     usual = np.abs(typical)
-    return np.maximum(np.abs(theta), _LEAST_SIZE * np.where(usual > 0, usual, 1.0))
+    usual = np.where(usual > _NO_SIZE, usual, 1.0)
+    return np.maximum(np.abs(theta), _LEAST_SIZE * usual)

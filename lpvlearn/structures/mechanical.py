@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..validation import matrix, one_of
-from .map import AffineMap, StructureMap
+from .map import AffineMap, Rows, StructureMap
 from .templates import Affine, affine_arrays, check_shapes, parse_cells, system_cells
 
 Array = NDArray[np.float64]
@@ -81,6 +81,9 @@ class ImplicitMap(StructureMap):
             for X in (self.M, self.N)
         )
         return replace(self, M=M, N=N).simplest()
+
+    def select(self, rows: Rows) -> ImplicitMap:
+        return replace(self, W=self.W[rows], offset=self.offset[rows])
 
     def simplest(self) -> AffineMap | ImplicitMap:
         """The same map, affine where M holds no parameter; then it must be regular."""
@@ -166,6 +169,11 @@ class FluxMap(StructureMap):
         return _flux_of(
             self.equations.fix(values, free), self.transposed.fix(values, free)
         )
+
+    def select(self, rows: Rows) -> FluxMap:
+        N, offset = self.transposed.N[:, :, rows], self.transposed.offset[:, rows]
+        turned = replace(self.transposed, N=N, offset=offset)
+        return FluxMap(self.equations.select(rows), turned)
 
 
 def _flux_of(

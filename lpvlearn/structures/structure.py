@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.statespace import StateSpace
 from ..models.system_matrix import Blocks, blocks
-from ..validation import named_values, real_array
-from .map import AffineMap, FunctionMap, RowsMap, StructureMap
+from ..validation import named_values, names_of, real_array, shown, whole_number
+from .map import AffineMap, FunctionMap, StructureMap
 from .mechanical import FluxMap, ImplicitMap, descriptor_map, mechanical_map
 from .templates import (
     Entry,
@@ -34,7 +34,11 @@ Interval = Sequence[float | None]
 
 _SPREAD = 0.3  # standard deviation of log-parameters: a guess is right to a third
 
+_ASIDE = 0.1  # relative distance of a point at which another derivative is taken
+
 _DECADE = 10.0  # a range that spans more tells an order of magnitude, not a value
+_MOST_COPIES = 1000  # of the outputs: one for each weight or model
+
 _LISTED = 8  # names that a message lists
 
 
@@ -91,7 +95,25 @@ class GrayBoxStructure:
         ranges: Array | None = None,
         is_mechanical: bool = False,
     ) -> None:
+        order = whole_number("order", order, 0)
+        if not isinstance(map, StructureMap):
+            raise ValueError(
+                f"`map` must be a StructureMap. Got {shown(map)}. Write structures by "
+                "from_template, from_function or mechanical."
+            )
+        if np.ndim(parameter_names) != 1 or len(parameter_names) > 0:
+            parameter_names = names_of("parameter_names", parameter_names)
         q = len(parameter_names)
+        vectors = {"initial": initial, "lower": lower, "upper": upper, "ranges": ranges}
+        for name, values in vectors.items():
+            shape = (2, q) if name == "ranges" else (q,)
+            given = None if values is None else real_array(name, values)
+            if given is not None and given.shape != shape:
+                raise ValueError(
+                    f"`{name}` must have shape {shape}. Got {shown(values)}."
+                )
+            vectors[name] = given
+        initial, lower, upper, ranges = vectors.values()
         self.order, self.map = order, map
         self.parameter_names, self.n_params = tuple(parameter_names), q
         self.n_outputs, self.n_inputs = (int(k) - order for k in map.shape)
@@ -187,7 +209,8 @@ class GrayBoxStructure:
         """
         if E is None:
             return cls(*affine_system(A, B, C, D, parameter_names))
-        return cls(len(A), *descriptor_map(E, A, B, C, D, descriptor, parameter_names))
+        read = descriptor_map(E, A, B, C, D, descriptor, parameter_names)
+        return cls(len(A), *read)
 
     @classmethod
     def from_function(
@@ -582,7 +605,7 @@ class GrayBoxStructure:
 
     def _index(self, argument: str, name: Any) -> int:
         """Position of a parameter, or an error that names the argument."""
-        if name not in self.parameter_names:
+        if not isinstance(name, str) or name not in self.parameter_names:
             known = ", ".join(self.parameter_names[:_LISTED])
             more = ", ..." if self.n_params > _LISTED else ""
             raise ValueError(
@@ -613,9 +636,10 @@ class GrayBoxStructure:
 
     def with_stacked_outputs(self, copies: int) -> GrayBoxStructure:
         """The structure with all of its outputs several times, below each other."""
+        copies = whole_number("copies", copies, 1, _MOST_COPIES)
         states, outputs = np.split(np.arange(self.map.shape[0]), [self.order])
         rows = np.concatenate([states, np.tile(outputs, copies)])
-        return self._changed(map=RowsMap(self.map, rows))
+        return self._changed(map=self.map.select(rows))
 
     def draw(self, n: int, rng: np.random.Generator) -> Array | None:
         """Random parameter vectors from the ranges, or around the first guess.
@@ -678,15 +702,15 @@ class GrayBoxStructure:
             if set(theta) != set(self.parameter_names):
                 wrong = sorted(set(theta) ^ set(self.parameter_names), key=str)
                 raise ValueError(
-                    "parameters must have a value for each name of the structure. "
-                    f"Missing or unknown: {', '.join(map(str, wrong))}."
+                    "`theta` must have a value for each name of the structure. Got "
+                    f"missing or unknown ones: {', '.join(map(str, wrong))}."
                 )
             theta = [theta[name] for name in self.parameter_names]
-        vector = real_array("parameters", theta).reshape(-1)
+        vector = real_array("theta", theta).reshape(-1)
         if vector.shape != (self.n_params,) or not np.isfinite(vector).all():
             some = ", ".join(self.parameter_names[:4])
             raise ValueError(
-                f"parameters must be {self.n_params} finite values "
+                f"`theta` must be {self.n_params} finite values "
                 f"({some}{', ...' if self.n_params > 4 else ''}). Got {vector}."
             )
         return vector
@@ -711,8 +735,12 @@ class GrayBoxStructure:
     @property
     def free_feedthrough(self) -> NDArray[np.bool_]:
         """Which entries of D hold a parameter, shape (n_outputs, n_inputs)."""
-        n = self.order
-        return (self.jacobian(self.reference)[:, n:, n:] != 0).any(0)
+        n, points = self.order, [self.reference]
+        if not self.is_affine:  # a derivative may vanish at one point
+            move = _ASIDE * np.where(points[0] == 0, 1.0, points[0])
+            points.append(np.clip(points[0] + move, self.lower, self.upper))
+        slopes = np.nan_to_num([self.jacobian(point) for point in points])
+        return (slopes[:, :, n:, n:] != 0).any((0, 1))
 
     def feedthrough_of(self, D: Array) -> Array:
         """`D` where the structure has a parameter in it, else the structure's own D."""
@@ -725,6 +753,10 @@ class GrayBoxStructure:
         ----------
         theta : ndarray of shape (..., n_params)
         """
+        theta = np.asarray(theta)
+        fits = theta.dtype.kind in "fc" and theta.shape[-1:] == (self.n_params,)
+        if not fits or not np.isfinite(theta).all():
+            theta = self._stacked_params(theta)
         if self.is_affine or np.ndim(theta) == 1:
             return self.map.system_matrix(theta)
         rows = np.reshape(theta, (-1, self.n_params))
@@ -761,12 +793,17 @@ class GrayBoxStructure:
         ValueError
             If the last axis does not have length n_params.
         """
-        theta = real_array("theta", theta)
-        if theta.shape[-1:] != (self.n_params,):
+        return blocks(self.system_matrix(self._stacked_params(theta)), self.order)
+
+    def _stacked_params(self, theta: Any) -> Array:
+        stacked = real_array("theta", theta)
+        fits = stacked.shape[-1:] == (self.n_params,)
+        if not fits or not np.isfinite(stacked).all():
             raise ValueError(
-                f"`theta` must have shape (..., {self.n_params}). Got {theta.shape}."
+                f"`theta` must be finite, of shape (..., {self.n_params}). Got "
+                f"{shown(theta)}."
             )
-        return blocks(self.system_matrix(theta), self.order)
+        return stacked
 
     def model(
         self, theta: ArrayLike | Mapping[str, float], sampling_time: float | None = None
@@ -794,7 +831,7 @@ def drawn_around(guess: Array, n: int, rng: np.random.Generator) -> Array:
 
 def _number(value: Any) -> float:
     """`value` as a float that is not NaN; strings are refused."""
-    number = np.nan if isinstance(value, str | bool) else float(value)
-    if np.isnan(number):
-        raise ValueError(f"not a number: {value!r}")
-    return number
+    limit = real_array("bounds", value)
+    if isinstance(value, bool) or limit.ndim or np.isnan(limit):
+        raise ValueError(f"not a number: {shown(value)}")
+    return float(limit)

@@ -2,20 +2,24 @@
 
 A cell is a number or a string such as ``"-p9"`` or ``"2*k - 1"``. It is parsed into its
 coefficients; no code is ever evaluated. Canonical and modal forms are templates, too.
+
+Templates come from strangers' files: the parser takes numbers, names, ``+ - * / ( )``
+and nothing else, of a bounded length and depth, so that a cell ends at once in its
+coefficients or in its error. (Python's own would normalise names, and warn.)
 """
 
 from __future__ import annotations
 
-import ast
 import re
 from collections.abc import Sequence
-from numbers import Real
-from typing import Any
+from keyword import iskeyword
+from typing import Any, NoReturn
+from unicodedata import normalize
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..validation import one_of, whole_number
+from ..validation import flag, names_of, number, one_of, shown, whole_number
 from .map import AffineMap
 
 Array = NDArray[np.float64]
@@ -24,11 +28,17 @@ Entry = float | str
 Cells = list[list[Entry]]
 Affine = dict[str, float]  # coefficient of every name; "" is the constant
 
-# what parsing an expression may end in: RecursionError and MemoryError are how the
-# parser refuses one that is nested too deeply
-_UNREADABLE = (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError)
+_LONGEST = 10_000  # characters of a cell: thousands of terms
+_DEEPEST = 100  # parentheses and signs within each other, far from the stack's end
 
-_SHOWN = 60  # characters of a refused expression that its message shows
+_MOST_CELLS = 10**5  # of a form that is made: matrices of 300 x 300
+_MOST_ENTRIES = 2 * 10**8  # of the matrices of all parameters: 1.6 GB
+
+_TOKEN = re.compile(
+    r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
+    r"|(?P<name>[^\W\d]\w*)|(?P<sign>\*\*|[-+*/()])|(?P<end>$)|(?P<other>.))",
+    re.DOTALL,
+)
 
 
 def affine_system(
@@ -83,7 +93,15 @@ def affine_arrays(
 ) -> tuple[Array, Array, list[str]]:
     """The constant part, the part of every parameter, and the parameter names."""
     used = {name for row in rows for entry in row for name in entry if name}
+    _check_alike(used)
     names = _ordered_names(used, parameter_names)
+    size = len(names) * sum(map(len, rows))
+    if size > _MOST_ENTRIES:
+        raise ValueError(
+            f"`parameter_names` must be fewer: {len(names)} parameters in matrices of "
+            f"{sum(map(len, rows))} entries take {8 * size:.0e} bytes. Got more than "
+            f"{8 * _MOST_ENTRIES:.0e}; write the structure with from_function."
+        )
 
     def coefficients(name: str) -> list[list[float]]:
         return [[entry.get(name, 0.0) for entry in row] for row in rows]
@@ -93,25 +111,42 @@ def affine_arrays(
     return offset, basis.reshape(-1, *offset.shape), names
 
 
+def _check_alike(names: set[str]) -> None:
+    """Refuse names that are told apart by their code points alone."""
+    alike: dict[str, str] = {}
+    for name in sorted(names):
+        other = alike.setdefault(normalize("NFKC", name), name)
+        if other != name:
+            raise ValueError(
+                f"`parameter_names` must look different. Got {other!r} "
+                f"({ascii(other)}) and {name!r} ({ascii(name)}) in the template; write "
+                "them alike, or rename one."
+            )
+
+
 def _ordered_names(used: set[str], given: Sequence[str] | None) -> list[str]:
     """The parameter names in the given order, else natural order."""
     if given is None:
         return sorted(used, key=_natural)
-    if isinstance(given, str):
-        raise ValueError(f"`parameter_names` must be a list of names. Got {given!r}.")
-    if set(given) != used or len(set(given)) != len(given):
-        difference = sorted(set(given) ^ used)
+    given = names_of("parameter_names", given)
+    if set(given) != used:
+        difference = sorted(map(str, set(given) ^ used))
         raise ValueError(
             "`parameter_names` must name each parameter of the template once. "
-            f"Got {list(given)}; differing or repeated: {difference}."
+            f"Got {given}; differing: {difference}."
         )
-    return list(given)
+    return given
 
 
 def _natural(name: str) -> list[tuple[bool, int, str]]:
     """Sorting key by which p2 comes before p10."""
-    parts = re.findall(r"\d+|\D+", name)
-    return [(not t.isdigit(), int(t) if t.isdigit() else 0, t) for t in parts]
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return [
+        (False, len(t.lstrip("0")), t.lstrip("0"))
+        if t[0] in "0123456789"
+        else (True, 0, t)
+        for t in parts
+    ]
 
 
 def parse_cells(name: str, block: Any) -> list[list[Affine]]:
@@ -123,7 +158,7 @@ def parse_cells(name: str, block: Any) -> list[list[Affine]]:
         or not isinstance(block, Sequence)
         or any(isinstance(row, str) or not hasattr(row, "__iter__") for row in block)
     ):
-        raise ValueError(f"`{name}` must be a list of rows. Got {block!r}.")
+        raise ValueError(f"`{name}` must be a list of rows. Got {shown(block)}.")
     rows = [list(row) for row in block]
     if any(len(row) != len(rows[0]) for row in rows):
         raise ValueError(
@@ -139,50 +174,105 @@ def parse_cells(name: str, block: Any) -> list[list[Affine]]:
 def _entry(cell: str, entry: Any) -> Affine:
     if isinstance(entry, str):
         try:
-            affine = _affine(ast.parse(entry.strip(), mode="eval").body)
-        except _UNREADABLE as error:
-            shown = entry if len(entry) <= _SHOWN else entry[: _SHOWN - 3] + "..."
+            affine = _Parser(entry).expression_to_end()
+        except ValueError as error:
             raise ValueError(
                 f"`{cell}` must be a number or an affine expression of parameter names "
-                f"such as '-p9' or '2*k - 1'. Got {shown!r} ({error})."
+                f"such as '-p9' or '2*k - 1'. Got {shown(entry)} ({error})."
             ) from None
-    elif isinstance(entry, Real):
-        affine = {"": float(entry)}
     else:
-        raise ValueError(f"`{cell}` must be a number or a string. Got {entry!r}.")
+        rule = "a finite number or an affine expression of parameter names"
+        affine = {"": number(cell, entry, rule)}
     if not np.isfinite(list(affine.values())).all():
-        raise ValueError(f"`{cell}` must be finite. Got {entry!r}.")
+        raise ValueError(f"`{cell}` must be finite. Got {shown(entry)}.")
     # What cancels is not a parameter of the cell
     return {name: c for name, c in affine.items() if c != 0 or name == ""}
 
 
-def _affine(node: ast.expr) -> Affine:
-    """Coefficients of an affine expression; no evaluation of code."""
-    if (
-        isinstance(node, ast.Constant)
-        and isinstance(node.value, int | float)
-        and not isinstance(node.value, bool)
-    ):
-        return {"": float(node.value)}
-    if isinstance(node, ast.Name):
-        if node.id.lower() in ("nan", "inf", "infinity"):
-            raise ValueError(f"{node.id} is not a parameter name")
-        return {node.id: 1.0}
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
-        sign = -1.0 if isinstance(node.op, ast.USub) else 1.0
-        return {name: sign * c for name, c in _affine(node.operand).items()}
-    if isinstance(node, ast.BinOp):
-        left, right = _affine(node.left), _affine(node.right)
-        if isinstance(node.op, ast.Add | ast.Sub):
-            sign = -1.0 if isinstance(node.op, ast.Sub) else 1.0
-            names = {**left, **right}
-            return {n: left.get(n, 0.0) + sign * right.get(n, 0.0) for n in names}
-        if isinstance(node.op, ast.Mult) and (set(left) <= {""} or set(right) <= {""}):
-            number, other = (left, right) if set(left) <= {""} else (right, left)
-            return {name: number[""] * c for name, c in other.items()}
-        if isinstance(node.op, ast.Div) and set(right) <= {""} and right[""] != 0:
-            return {name: c / right[""] for name, c in left.items()}
-    raise ValueError("not affine; use GrayBoxStructure.from_function")
+class _Parser:
+    """Coefficients of an affine expression, by recursive descent."""
+
+    def __init__(self, text: str) -> None:
+        if len(text) > _LONGEST:
+            raise ValueError(f"{len(text)} characters, more than {_LONGEST}")
+        self.tokens = _TOKEN.finditer(text)
+        self.depth = 0
+        self.next()
+
+    def next(self) -> None:
+        token = next(self.tokens)
+        self.kind, self.text = str(token.lastgroup), token[0].strip()
+
+    def expression_to_end(self) -> Affine:
+        found = self.expression()
+        if self.kind != "end":
+            self.refuse()
+        return found
+
+    def refuse(self) -> NoReturn:
+        raise ValueError(
+            "not affine; use GrayBoxStructure.from_function"
+            if self.text in ("(", "**") or self.kind == "other"
+            else f"{shown(self.text)} is out of place"
+            if self.text
+            else "it ends early"
+        )
+
+    def expression(self) -> Affine:
+        total = self.term()
+        while self.text in ("+", "-"):
+            sign = -1.0 if self.text == "-" else 1.0
+            self.next()
+            for name, c in self.term().items():
+                total[name] = total.get(name, 0.0) + sign * c
+        return total
+
+    def term(self) -> Affine:
+        product = self.factor()
+        while self.text in ("*", "/"):
+            operator = self.text
+            self.next()
+            other = self.factor()
+            if operator == "*" and set(product) <= {""}:
+                product, other = other, product
+            if not set(other) <= {""}:
+                raise ValueError("not affine; use GrayBoxStructure.from_function")
+            by = other[""]
+            if operator == "/" and by == 0:
+                raise ValueError("division by zero")
+            product = {
+                name: c / by if operator == "/" else c * by
+                for name, c in product.items()
+            }
+        return product
+
+    def factor(self) -> Affine:
+        kind, text = self.kind, self.text
+        if kind == "number":
+            self.next()
+            return {"": float(text)}
+        if kind == "name":
+            number = text.lower() in ("nan", "inf", "infinity")
+            if number or iskeyword(text) or not text.isidentifier():
+                raise ValueError(f"{shown(text)} is not a parameter name")
+            self.next()
+            return {text: 1.0}
+        if text not in ("+", "-", "("):
+            self.refuse()
+        self.depth += 1
+        if self.depth > _DEEPEST:
+            raise ValueError(f"nested more than {_DEEPEST} deep")
+        self.next()
+        if text == "(":
+            found = self.expression()
+            if self.text != ")":
+                self.refuse()
+            self.next()
+        else:
+            sign = -1.0 if text == "-" else 1.0
+            found = {name: sign * c for name, c in self.factor().items()}
+        self.depth -= 1
+        return found
 
 
 def observable_canonical_cells(
@@ -207,7 +297,7 @@ def full_cells(
     order: int, n_inputs: int, n_outputs: int, feedthrough: bool
 ) -> tuple[Cells, Cells, Cells, Cells | None]:
     """A, B, C, D whose entries are all parameters: ``a1_1, a1_2, ...``."""
-    n = whole_number("order", order, 0)
+    n, feedthrough = whole_number("order", order, 0), flag("feedthrough", feedthrough)
     if n == 0 and not feedthrough:
         raise ValueError(
             "`feedthrough` must be True for order 0: a pure gain has no other "
@@ -215,6 +305,11 @@ def full_cells(
         )
     m = whole_number("n_inputs", n_inputs, 1)
     p = whole_number("n_outputs", n_outputs, 1)
+    if (n + p) * (n + m) > _MOST_CELLS:
+        raise ValueError(
+            f"`order`, `n_inputs` and `n_outputs` must make at most {_MOST_CELLS} "
+            f"entries. Got {n}, {m} and {p}."
+        )
     D = _full_block("d", p, m) if feedthrough else None
     return _full_block("a", n, n), _full_block("b", n, m), _full_block("c", p, n), D
 
@@ -234,6 +329,7 @@ def modal_cells(
     """A, B, C, D of the real modal form, see `GrayBoxStructure.modal`."""
     n_modes = whole_number("n_modes", n_modes, 0)
     n_real = whole_number("n_real", n_real, 0)
+    feedthrough = flag("feedthrough", feedthrough)
     if n_modes == n_real == 0:
         raise ValueError("`n_modes` or `n_real` must be at least 1. Got 0 and 0.")
     one_of("normalize", normalize, ("input", "output"))

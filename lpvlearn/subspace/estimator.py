@@ -456,6 +456,11 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
             )
         if choices.method == "auto":
             choices = choices._replace(method="po-moesp")
+        if y is None:
+            raise ValueError(
+                "SubspaceLTI requires y to be passed, but the target y is None: `y` "
+                "must hold the outputs of every batch."
+            )
         before = getattr(self, "_stream", None)
         if before is not None:
             before.check_options(options)

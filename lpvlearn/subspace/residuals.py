@@ -48,7 +48,7 @@ from ..systems.simulation import (
     free_responses,
     trend_signals,
 )
-from ..validation import one_of, whole_number
+from ..validation import one_of, share, whole_number
 from .hankel import cholesky_factor, correlation_sequence, stack_factors
 from .identification import centred
 from .noise import autoregression
@@ -277,8 +277,7 @@ def residual_tests(
     2     y1  present input    u1    1    True
     3     y1  future inputs    u1   25    True
     """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"`level` must lie between 0 and 1. Got {level!r}.")
+    level = share("level", level)
     residuals, n_lags = with_windows(residuals, n_lags)
     errors, inputs, output_names, input_names, fitted = residuals
     white = whiteness_tests(errors, n_lags, 0 if fitted is None else fitted.n_noise)

@@ -254,6 +254,8 @@ class Evidence:
 
     def poles_std(self) -> NDArray[np.complex128]:
         """Standard deviations of the poles, in the order of `StateSpace.poles`."""
+        if len(self.model.A) == 0:
+            return np.zeros(0, complex)
         covariance = self.covariance
         poles, J = _pole_jacobian(self.sections, self.free, len(covariance))
         order = np.lexsort((poles.imag, poles.real, np.abs(poles)))

@@ -161,24 +161,29 @@ class _Search:
         top = int(s.argmax())
         if s[top] == 0.0:
             return PeakSet(0.0, w[[top]], s[[top]])
-        if within is None:
-            peaks = self.refiner.highest(w, s, _WORTH_CLIMBING * s[top])
-            return _peak_set(self._raised(peaks)[:1])
+        first: list[Peak] = []
+        if within is None or not engine.is_modal:
+            climbing = self.refiner.highest(w, s, _WORTH_CLIMBING * s[top])
+            first = self._raised(climbing)[:1]
+        if engine.is_modal and first:
+            return _peak_set(first)
         # Samples in every interval above the level asked for, all peaks from them, and
-        # once more if the norm turns out higher than the best of these.
-        level = self.refiner.value(float(w[top])) * (1.0 - within)
-        crossings = self.levels.crossings(level * (1.0 - _BESIDE))
+        # once more if the norm turns out higher than the best of these. Where modes are
+        # ill conditioned, either search may miss a peak that the other one finds.
+        best = first[0].value if first else self.refiner.value(float(w[top]))
+        depth = 1.0 - (_BESIDE if within is None else within)
+        crossings = self.levels.crossings(best * depth * (1.0 - _BESIDE))
         inner = _between(crossings, self.refiner.end, TENTHS)
         w, s = self.refiner.sampled(np.concatenate((w, inner)))
-        peaks = self._every(w, s, level)
+        peaks = _joined(first, self._every(w, s, best * depth))
         raised = self._raised(peaks)
         if len(raised) > len(peaks):
             known = [peak.frequency for peak in raised]
             w, s = self.refiner.sampled(np.append(w, known))
-            level = raised[0].value * (1.0 - within)
-            peaks = self._every(w, s, level)
-        least = peaks[0].value * (1.0 - within) * (1.0 - _ROUNDING)
-        return _peak_set([peak for peak in peaks if peak.value >= least])
+            peaks = _joined(first, self._every(w, s, raised[0].value * depth))
+        least = peaks[0].value * depth * (1.0 - _ROUNDING)
+        kept = [peak for peak in peaks if peak.value >= least]
+        return _peak_set(kept[:1] if within is None else kept)
 
     def _every(self, w: NDArray, s: NDArray, level: float) -> list[Peak]:
         """Every peak above the level, the highest first."""
@@ -234,6 +239,12 @@ class _Search:
 
 def _falling(peaks: list[Peak]) -> list[Peak]:
     return sorted(peaks, key=lambda peak: -peak.value)
+
+
+def _joined(first: list[Peak], peaks: list[Peak]) -> list[Peak]:
+    """Peaks, the highest first, and the first one where none of them covers it."""
+    more = [p for p in first if not any(q.covers(p.frequency) for q in peaks)]
+    return _falling(peaks + more)
 
 
 def _peak_set(peaks: list[Peak]) -> PeakSet:

@@ -22,6 +22,8 @@ _LEAST_DAMPING = 1e-12  # below, it is rounding noise beside the squared columns
 _LARGEST_DAMPING = 1e12  # a step that short changes no digit
 _LESS, _MORE = 0.1, 4.0  # after a step that came as promised, or one that failed
 _AS_PROMISED = 0.75  # of the decrease of the linear model
+_AHEAD = 0.1  # part of a step at which its bend is looked at
+_BENT = 0.75  # bend, relative to the step, of a step that is too long
 _NOISE = 1e-14  # a promised relative decrease below it cannot be seen in sixteen digits
 
 
@@ -53,6 +55,11 @@ def column_scale(M: Array) -> Array:
 Residuals = Callable[[Array, Rows], tuple[Array, Callable[[Rows], Array]]]
 
 
+def never() -> bool:
+    """The answer of a search that nothing stops."""
+    return False
+
+
 class Minima(NamedTuple):
     """Where the starts ended: minimisers (k, n_unknowns) and costs ``|r|^2`` (k,).
 
@@ -75,6 +82,8 @@ def levenberg_marquardt(
     patience: int = 2,
     exact: float = 0.0,
     enough: int | None = None,
+    stop: Callable[[], bool] = never,
+    geodesic: bool = False,
 ) -> Minima:
     r"""Minimise ``|r(x)|^2`` from every row of a stack of starts, all in one batch.
 
@@ -87,7 +96,17 @@ def levenberg_marquardt(
     `longest` is the largest change of a variable in a step; `max_iter` counts the steps
     that are tried. A start ends when its cost falls by less than `tol` (relative)
     `patience` times in a row, when no step lowers it, or at a cost not above `exact`;
-    all end when `enough` of them are that low.
+    all end when `enough` of them are that low, or where `stop`, asked before every
+    step, says so.
+
+    With `geodesic`, a step bends as the residuals do: their second derivative r'' along
+    d, from one more evaluation, adds the half of :math:`-(J^T J + \lambda S^2)^{-1} J^T
+    r''`. Along a curved valley that reaches much further [1]_.
+
+    References
+    ----------
+    .. [1] M. K. Transtrum, J. P. Sethna, "Improvements to the Levenberg-Marquardt
+       algorithm for nonlinear least-squares minimization", arXiv:1201.5885, 2012.
     """
     x = np.clip(starts, lower, upper)
     k, q = x.shape
@@ -97,6 +116,7 @@ def levenberg_marquardt(
     H, g = np.zeros((k, q, q)), np.zeros((k, q))
     S, unit = np.zeros((k, q)), np.zeros((k, q))
     diagonal = np.arange(q)
+    at: dict[int, tuple[Array, Array]] = {}  # residuals and Jacobian, if `geodesic`
 
     def move(rows: Rows, trial: Array) -> NDArray[np.bool_]:
         """Take the trial points that lower the cost; which these are."""
@@ -116,13 +136,33 @@ def levenberg_marquardt(
         S[own] = np.maximum(S[own], np.sqrt(H[own][:, diagonal, diagonal]))
         held = ((x[own] <= lower) & (g[own] > 0)) | ((x[own] >= upper) & (g[own] < 0))
         unit[own] = np.where(held, 0.0, 1.0 / np.where(S[own] > 0, S[own], 1.0))
+        if geodesic:
+            at.update(zip(own.tolist(), zip(r[better], J, strict=True), strict=True))
         return better
+
+    def bend(rows: Rows, d: Array, damped: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Half of the second-order part of the steps `d`, and which can be trusted."""
+        with np.errstate(all="ignore"):
+            ahead = residuals(np.clip(x[rows] + _AHEAD * d, lower, upper), rows)[0]
+            g2 = np.zeros_like(d)
+            for i, row in enumerate(rows.tolist()):
+                r, J = at[row]
+                if len(ahead[i]) == len(r):
+                    g2[i] = J.T @ ((ahead[i] - r) / _AHEAD - J @ d[i])
+            D = unit[rows]
+            a = -D * np.linalg.solve(damped, (D * g2)[:, :, None])[:, :, 0] / _AHEAD
+        known = np.asarray(np.isfinite(a).all(1))
+        a = np.where(known[:, None], a, 0.0)
+        size = np.linalg.norm(S[rows] * a, axis=1)
+        return a, np.asarray(size <= _BENT * np.linalg.norm(S[rows] * d, axis=1))
 
     move(np.arange(k), x.copy())
     active, idle = np.isfinite(cost) & (cost > exact) & (q > 0), np.zeros(k, int)
     for _ in range(max_iter):
         rows = np.flatnonzero(active)
         if len(rows) == 0 or (enough is not None and (cost <= exact).sum() >= enough):
+            break
+        if stop():
             break
         D = unit[rows]
         damped = H[rows] * D[:, :, None] * D[:, None]
@@ -131,8 +171,8 @@ def levenberg_marquardt(
         d *= np.minimum(1.0, longest / np.maximum(np.abs(d).max(1), 1e-300))[:, None]
         trial = np.clip(x[rows] + d, lower, upper)
         taken = trial - x[rows]
-        bend = (H[rows] @ taken[:, :, None])[:, :, 0]
-        promised = -np.sum(taken * (2.0 * g[rows] + bend), axis=1)
+        slope = 2.0 * g[rows] + (H[rows] @ taken[:, :, None])[:, :, 0]
+        promised = -np.sum(taken * slope, axis=1)
         before = cost[rows]
         # a step that a bound cuts off may promise nothing where a shorter one does
         hopeful = promised > _NOISE * before
@@ -140,6 +180,12 @@ def levenberg_marquardt(
         damping[rows[cut]] *= _MORE
         active[rows] = (hopeful | cut) & (damping[rows] < _LARGEST_DAMPING)
         hopeful &= active[rows]
+        if geodesic and hopeful.any():
+            some = np.flatnonzero(hopeful)
+            more, trusted = bend(rows[some], d[some], damped[some])
+            trial[some] = np.clip(trial[some] + more, lower, upper)
+            hopeful[some] = trusted
+            damping[rows[some[~trusted]]] *= _MORE
         rows, before, promised = rows[hopeful], before[hopeful], promised[hopeful]
         if len(rows) == 0:
             continue

@@ -202,7 +202,7 @@ E = np.ones((100, 1))
             "`inputs` must be finite",
         ),
         (lambda m, X, y: ResidualDisplay(E[:9], E[:9]), "at least 22 samples.*Got 9"),
-        (lambda m, X, y: ResidualDisplay([], []), "at least 22 samples.*Got 0"),
+        (lambda m, X, y: ResidualDisplay([], []), "`errors` must be one array"),
         (
             lambda m, X, y: ResidualDisplay(E, E, output_names=["a", "b"]),
             "`output_names` must hold 1 names",

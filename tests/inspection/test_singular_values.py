@@ -42,8 +42,8 @@ def test_zero_singular_values_stay_on_the_logarithmic_axis():
     [
         ([[1.0]], None, r"`singular_values` must be a vector .* shape \(1, 1\)"),
         ([-1.0], None, "non-negative"),
-        ([0.0], None, "must not all be zero"),
-        ([1.0], 2, "`order` must be 0 to 1, the number of singular values. Got 2"),
+        ([0.0], None, "must begin with the largest"),
+        ([1.0], 2, "`order` must be a whole number from 0 to 1. Got 2"),
     ],
 )
 def test_singular_value_errors_teach(values, order, message):

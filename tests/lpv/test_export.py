@@ -38,7 +38,7 @@ def test_a_grid_has_the_frozen_models():
 
 def test_names_of_signals_must_fit():
     lpv = spring_lpv()
-    with pytest.raises(ValueError, match="`input_names` must name the 1 inputs"):
+    with pytest.raises(ValueError, match="`input_names` must be a list of 1"):
         replace(lpv, input_names=["a", "b"])
 
 

@@ -284,8 +284,8 @@ U, KAPPA = inputs(10), sweep(10)
         (lambda m: m.simulate(U, KAPPA, 0.0), "`sampling_time` must be a positive"),
         (lambda m: m.simulate(U, KAPPA, DT, [1.0]), r"`initial_state`.*\(2,\)"),
         (lambda m: m.free_responses(KAPPA, -1.0), "`sampling_time` must be a positive"),
-        (lambda m: m.at([0.0, 1.0]), "must have 1 columns"),
-        (lambda m: m.at(np.nan), "`scheduling` must be finite"),
+        (lambda m: m.at([0.0, 1.0]), "`kappa` must be one finite value"),
+        (lambda m: m.at(np.nan), "`kappa` must be one finite value"),
         (lambda m: m.frozen_poles([np.inf]), "`scheduling` must be finite"),
     ],
 )
@@ -526,7 +526,7 @@ def test_names_that_do_not_fit_are_refused(kappa, words):
 def test_a_model_without_names_says_so():
     with pytest.raises(ValueError, match="knows no names"):
         spring().at({"kappa": 1.0})
-    with pytest.raises(ValueError, match="`scheduling_names` must name the 1"):
+    with pytest.raises(ValueError, match="`scheduling_names` must be a list of 1"):
         replace(spring(), scheduling_names=["mass", "speed"])
 
 

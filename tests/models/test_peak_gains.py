@@ -50,3 +50,20 @@ def test_unstable_model():
 def test_errors_teach(options, words):
     with pytest.raises(ValueError, match=words):
         peak_gains(StateSpace(-1, 1, 1), **options)
+
+
+@pytest.mark.parametrize("seed", [0, 3, 11226])
+def test_the_norm_is_that_of_the_model_always(seed):
+    """Also of companion forms, whose modes are too ill conditioned to be used."""
+    rng = np.random.default_rng(seed)
+    half = int(rng.integers(6, 31)) // 2
+    w, z = 10 ** rng.uniform(0, 1, half), 10 ** rng.uniform(-3, -0.5, half)
+    poles = w * (-z + 1j * np.sqrt(1 - z * z))
+    a = np.real(np.poly(np.concatenate([poles, poles.conj()])))
+    A = np.eye(2 * half, k=-1)
+    A[0] = -a[1:]
+    C = rng.normal(size=(1, 2 * half)) * np.abs(a[:-1]) * 10 ** rng.uniform(-3, 0)
+    model = StateSpace(A, np.eye(2 * half)[:, :1], C)
+    for within in (1e-6, 0.5):
+        peaks = peak_gains(model, within=within)
+        assert peaks.norm == peaks.values[0] == model.hinf_norm()

@@ -26,7 +26,12 @@ from lpvlearn.pipeline.points import (
     restructure_points,
 )
 
-from ..conftest import spring_pipeline, spring_tables
+from ..conftest import (
+    KAPPA,
+    spring_pipeline,
+    spring_structure,
+    spring_tables,
+)
 
 # -- standard deviations of gray-box parameters ---------------------------------------
 
@@ -451,3 +456,24 @@ def test_a_bar_that_a_failure_ends_is_closed(capsys):
         run(4, verbose=1)
     shown = capsys.readouterr().err
     assert "3/4" in shown and shown.endswith("\n")
+
+
+def test_max_time_is_shared_by_the_points_and_told():
+    X, y = spring_tables(noise=0.02, n_samples=300, kappas=KAPPA[::3])
+    pipeline = spring_pipeline(max_time=1e-6, efficient=False)
+    with pytest.warns(ConvergenceWarning, match="max_time") as told:
+        pipeline.fit(X, y)
+    assert len(told) >= 2
+    assert {fit.max_time for fit in pipeline.restructurers_} == {0.75e-6 / 2}
+    own = GrayBoxRestructurer(spring_structure(), max_time=1e-9)
+    with pytest.warns(ConvergenceWarning, match="max_time"):
+        pipeline.set_params(restructurer=own).fit(X, y)
+    assert {fit.max_time for fit in pipeline.restructurers_} == {1e-9}
+    pipeline.set_params(max_time=1e3, restructurer=spring_pipeline().restructurer)
+    assert pipeline.fit(X, y).warnings_ == []
+
+
+@pytest.mark.parametrize("seconds", [0, -1.0, "long"])
+def test_no_time_is_refused(spring, seconds):
+    with pytest.raises(ValueError, match="`max_time` must be a positive number"):
+        spring_pipeline(max_time=seconds).fit(*spring[:2])

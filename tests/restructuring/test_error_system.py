@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lpvlearn import GrayBoxStructure
+from lpvlearn import GrayBoxStructure, StateSpace
 from lpvlearn.restructuring.error_system import ErrorSystem, Target, resolvent
 from lpvlearn.restructuring.measured import MeasuredErrorSystem
 
@@ -162,3 +162,22 @@ def test_measured_error_is_the_maximum_over_the_grid():
     assert np.isclose(peaks.norm, sigma.max(), rtol=1e-12)
     assert np.isclose(peaks.frequencies[0], omega[np.argmax(sigma)])
     assert peaks.norm <= system.peaks(theta).norm * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("dt", [None, 0.1])
+def test_rounding_is_what_a_unit_in_the_last_place_makes(dt):
+    system, theta, gray_box, black_box = error_system(
+        np.random.default_rng(3), (2, 2), dt
+    )
+    rng, unit, omega = np.random.default_rng(0), 1e-6, system.grid
+    squares = np.zeros(len(omega))
+    for model in (gray_box, black_box):
+        G = model.frequency_response(omega)
+        matrices = model.A, model.B, model.C, model.D
+        for _ in range(200):
+            signs = [rng.choice([-1.0, 1.0], M.shape) for M in matrices]
+            moved = [M * (1.0 + unit * s) for M, s in zip(matrices, signs, strict=True)]
+            other = StateSpace(*moved, dt).frequency_response(omega)
+            squares += np.sum(np.abs(other - G) ** 2, axis=(1, 2)) / 200
+    expected = np.finfo(float).eps * np.sqrt(squares.max()) / unit
+    assert np.isclose(system.rounding(theta), expected, rtol=0.1)

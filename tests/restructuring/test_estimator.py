@@ -6,10 +6,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import block_diag
+from scipy.stats import t as student
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 
-from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace, peak_gains
 from lpvlearn.datasets import FlexibleArm
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.restructuring.problem import problem_from_models
@@ -272,6 +275,48 @@ def test_covariance_of_the_parameters_predicts_their_spread():
     np.testing.assert_allclose(np.sqrt(np.diag(single)), spread, rtol=0.2)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+def test_the_covariance_is_that_of_the_norm_that_was_minimised(norm):
+    structure, params = CASES["heat_exchanger"]
+    theta = structure.check_params(params)
+    exact, rng, n = structure.model(theta), np.random.default_rng(0), 40
+    parts = (exact.A, exact.B, exact.C)
+
+    def noisy():
+        return StateSpace(
+            *(M * (1 + 1e-3 * rng.normal(size=M.shape)) for M in parts), exact.D
+        )
+
+    restructurer = GrayBoxRestructurer(structure, norm=norm)
+    models = [noisy() for _ in range(n)]
+    found = np.array(
+        [
+            restructurer.fit_model(model, starts=[theta], search=False).params_
+            for model in models
+        ]
+    )
+    fitted = restructurer.fit_model(exact, realizations=models)
+    single = np.sqrt(np.diag(fitted.params_covariance_) * n)
+    # all but D, which is exact
+    assert_allclose(single[:3], found.std(0, ddof=1)[:3], rtol=0.35)
+
+
+def test_confidence_intervals_are_those_of_student():
+    """Of a gain the mean is the optimum in any norm."""
+    d = np.array([2.9, 3.0, 3.3])
+    runs = [StateSpace([], [], [], [[x]]) for x in d]
+    mean = StateSpace([], [], [], [[d.mean()]])
+    fitted = GrayBoxRestructurer(GAIN).fit_model(mean, realizations=runs)
+    table = fitted.confidence_intervals(0.9)
+    low, high = student.interval(0.9, 2, d.mean(), d.std(ddof=1) / np.sqrt(3))
+    assert_allclose(table.loc["d"], [d.mean(), low, high], rtol=1e-6)
+    with pytest.raises(ValueError, match="`confidence` must be between"):
+        fitted.confidence_intervals(95)
+    with pytest.raises(ValueError, match="need the covariance"):
+        fitted.fit_model(mean).confidence_intervals()
+
+
 def test_restarts_from_perturbations_agree():
     structure, params = CASES["two_masses"]
     black_box = structure.model(params)
@@ -364,7 +409,7 @@ ERRORS = [
     ),
     (
         lambda: GrayBoxRestructurer(spring_structure(), init=[1.0]).fit_model(GOOD),
-        r"parameters must be 3 finite values \(b, c, k",
+        r"`theta` must be 3 finite values \(b, c, k",
     ),
     (
         lambda: GrayBoxRestructurer(frequency_weight=(3, 1)).fit_model(GOOD),
@@ -500,6 +545,45 @@ def test_the_minimum_of_a_peak_is_no_floor():
     assert fitted.structural_floor_ == 0 and fitted.lower_bound_ == 0
     assert np.isclose(fitted.error_, fitted.remaining_error_, rtol=1e-9)
     assert fitted.stationarity_ < 1e-6
+
+
+def squared_gain(theta):
+    return [[-theta[0]]], [[theta[0]]], [[1 + theta[1] ** 2]]
+
+
+@pytest.mark.parametrize("interval", [(0, None), (None, 0), (None, None)])
+def test_a_gain_at_its_turning_point_is_no_floor(interval):
+    """1 + q^2 begun at q = 0, where its derivative vanishes, at a bound or not."""
+    squared = GrayBoxStructure.from_function(squared_gain, {"a": 1.0, "q": 0.0})
+    squared = squared.with_bounds({"q": interval})
+    fitted = GrayBoxRestructurer(squared).fit_model(StateSpace(-2, 2, 3))
+    assert_allclose(np.abs(fitted.params_), [2, np.sqrt(2)], rtol=1e-6)
+    assert fitted.lower_bound_ == fitted.structural_floor_ == 0
+
+
+def test_the_peaks_below_a_floor_are_equally_high(rough):
+    """What is left below the floor is minimised, and told, without any weight."""
+    unit = GrayBoxStructure.from_template(
+        [[0, 1, 0, 0], ["-k", "-c", 0, 0], [0, 0, 0, 1], ["h", 0, "-h", "-d"]],
+        [[0], ["k"], [0], [0]],
+        [[0, 0, 1, 0]],
+    )
+    model = unit.model({"k": 4.0, "c": 4.0, "h": 100.0, "d": 15.0})
+    rough_A = model.A * (1 + 0.02 * np.random.default_rng(0).normal(size=(4, 4)))
+    off = StateSpace(rough_A, model.B, model.C)
+    off = StateSpace(rough_A, 1.05 * model.B / off.dc_gain(), model.C)
+    fitted = GrayBoxRestructurer(unit).fit_model(off)
+    error = StateSpace(
+        block_diag(fitted.lti_.A, off.A),
+        np.vstack([fitted.lti_.B, off.B]),
+        np.hstack([fitted.lti_.C, -off.C]),
+    )
+    peaks = peak_gains(error, within=0.9999)
+    moving = peaks.values[peaks.frequencies > 0]
+    assert_allclose(fitted.structural_floor_, peaks.norm, rtol=1e-9)
+    assert_allclose(fitted.remaining_error_, moving.max(), rtol=1e-6)
+    assert_allclose(moving, moving[0], rtol=1e-4)
+    assert len(moving) == 2
 
 
 def test_a_gain_that_the_structure_fixes_is_a_floor():

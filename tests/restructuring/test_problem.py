@@ -149,8 +149,10 @@ def test_the_exact_jacobian_is_the_difference():
 
 
 def analysis(structure, theta, omega=OMEGA):
-    J = exact_jacobian(structure, theta, omega)
-    return Identifiability.from_jacobian(J, structure.parameter_names)
+    J = exact_jacobian(structure, theta, omega) * np.abs(theta)
+    G = structure.model(theta).frequency_response(omega)
+    level = np.linalg.norm(G, axis=(1, 2))
+    return Identifiability.from_jacobian(J, structure.parameter_names, level)
 
 
 def test_a_spring_is_identifiable():
@@ -207,13 +209,77 @@ def test_a_full_structure_leaves_the_basis_open(order, n_inputs, n_outputs):
     assert structure.n_params - found.rank == order**2 == len(found.directions)
 
 
-def test_units_of_the_parameters_do_not_matter():
-    J = exact_jacobian(GrayBoxStructure.observable_canonical(2), [-4.0, -0.5, 1.0, 2.0])
-    names = ["a", "b", "c", "d"]
-    one = Identifiability.from_jacobian(J, names)
-    other = Identifiability.from_jacobian(J * 10.0 ** np.array([-9, 0, 9, 3]), names)
+def identified(structure, theta):
+    model = structure.model(theta)
+    return problem_from_models(structure, [model], None).identifiability(theta)
+
+
+def test_units_of_the_parameters_and_of_time_do_not_matter():
+    theta = np.array([-4.0, -0.5, 1.0, 2.0])
+    one = identified(GrayBoxStructure.observable_canonical(2), theta)
+    unit = [["1e-9*a", "1e9*b"], ["1e3*c", "d"]]
+    scaled = GrayBoxStructure.from_template(
+        [[0, 1e6], [f"1e6*{unit[0][0]}", f"1e6*{unit[0][1]}"]],
+        [[unit[1][0]], [unit[1][1]]],
+        [[1e6, 0]],
+    )
+    other = identified(scaled, theta * [1e9, 1e-9, 1e-3, 1.0])
     assert one.rank == other.rank == 4
     assert other.condition == pytest.approx(one.condition)
+    gains = list(one.sensitivities.values())
+    assert list(other.sensitivities.values()) == pytest.approx(gains)
+    assert max(gains) <= one.condition <= np.linalg.norm(gains)
+
+
+@pytest.mark.parametrize("faint", [1e-2, 1e-5])
+def test_a_faint_parameter_has_the_condition_of_its_effect(faint):
+    """1 / (s + a) + faint / (s + b): errors of the response grow by 1 / faint."""
+    structure = GrayBoxStructure.from_template(
+        [["-a", 0], [0, "-b"]], [[1], [1]], [[1, faint]]
+    )
+    found = identified(structure, np.array([1.0, 3.0]))
+    assert found.rank == 2
+    assert 1 < found.sensitivities["a"] < 10
+    assert 1 < found.condition * faint < 100
+    assert found.sensitivities["b"] == pytest.approx(found.condition, rel=0.1)
+    assert f"(condition {found.condition:.2g}, most that of b)" in str(found)
+
+
+def test_a_zero_that_the_response_is_linear_in_is_determined():
+    structure = GrayBoxStructure.observable_canonical(2)
+    one, other = (
+        identified(structure, np.array([-4.0, -1.0, zero, 1.0]))
+        for zero in (0.0, -1e-15)
+    )
+    assert one.condition == pytest.approx(other.condition, rel=1e-6)
+    assert one.condition < 100
+
+
+@pytest.mark.parametrize("order", [7, 8, 12])
+def test_a_canonical_form_of_any_order_is_identifiable(order):
+    rng = np.random.default_rng(order)
+    w, z = 10 ** rng.uniform(-1, 1.5, order // 2), 10 ** rng.uniform(-2, 0, order // 2)
+    poles = w * (-z + 1j * np.sqrt(1 - z * z))
+    a = np.real(np.poly([*poles, *poles.conj(), *[-1.0] * (order % 2)]))[1:]
+    b = rng.normal(size=order) * w.max() ** np.arange(1, order + 1)
+    structure = GrayBoxStructure.observable_canonical(order)
+    found = identified(structure, np.r_[-a[::-1], b])
+    assert found.rank == 2 * order and found.directions == ()
+
+
+def test_a_common_factor_shows_all_its_names():
+    structure = GrayBoxStructure.mechanical(
+        M=[["m1", 0], [0, "m2"]],
+        D=[["c", 0], [0, "c"]],
+        K=[["k1 + k2", "-k2"], ["-k2", "k2"]],
+        F=[["f"], [0]],
+    )
+    values = {"m1": 1.0, "m2": 2.0, "c": 3e-3, "k1": 1e5, "k2": 8e4, "f": 1e-3}
+    theta = np.array([values[name] for name in structure.parameter_names])
+    found = identified(structure, theta)
+    assert found.condition == np.inf
+    (direction,) = found.directions
+    assert direction == pytest.approx(dict.fromkeys(structure.parameter_names, 1.0))
 
 
 # -- how far the black box itself is known --------------------------------------------

@@ -208,6 +208,26 @@ def test_searches_begin_in_the_equations_of_motion_in_either_state():
     )
 
 
+@pytest.mark.parametrize("state", ["rate", "momentum"])
+def test_stacked_outputs_are_those_of_the_same_equations(state):
+    structure = MECHANICAL(M2, D2, K2, [[1], [0]], state=state)
+    stacked = structure.with_stacked_outputs(3)
+    assert_array_equal(stacked.reference, structure.reference)
+    theta, n = structure.reference * np.linspace(1.0, 2.0, 6), structure.order
+    for name in ("system_matrix", "jacobian", "curvature"):
+        S, T = getattr(structure, name)(theta), getattr(stacked, name)(theta)
+        assert_allclose(T[..., :n, :], S[..., :n, :], rtol=1e-12, atol=1e-12)
+        outputs = np.concatenate([S[..., n:, :]] * 3, axis=-2)
+        assert_allclose(T[..., n:, :], outputs, rtol=1e-12, atol=1e-12)
+    gains = np.array([0.1, 0.2])
+    assert_allclose(
+        stacked.implicit.natural_sizes(3.0, np.tile(gains, 3)),
+        structure.implicit.natural_sizes(3.0, gains),
+    )
+    assert not stacked.free_feedthrough.any()
+    assert np.isfinite(stacked.fix({"m1": 1.5}).reference).all()
+
+
 E_, A_ = [["m + j", "j"], ["j", 2]], [["-a", 1], ["-j", "-2*b"]]
 B_, C_ = [["g"], [1]], [["c", 1], [0, 1], ["j", 0]]
 

@@ -155,7 +155,7 @@ def wrong_jacobian(theta):
         ((pendulum, [1.0, np.nan, 1.0]), {}, "`initial` must hold one finite"),
         ((pendulum, [[1.0, 2.0, 3.0]]), {}, "`initial` must hold one finite"),
         ((pendulum, ["a"]), {}, "`initial` must hold real"),
-        ((pendulum, []), {}, "`parameter_names` must be distinct"),
+        ((pendulum, []), {}, "`parameter_names` must be a list of distinct"),
         ((pendulum, START), {"parameter_names": ["a", "b"]}, "`initial` must hold"),
         ((pendulum, START), {"parameter_names": ["a"] * 3}, "distinct names"),
         ((pendulum, {"a": 1.0}), {"parameter_names": ["b"]}, "`initial` must have a"),
@@ -209,9 +209,9 @@ def test_models_take_vectors_mappings_and_a_sampling_time():
     [
         ([1.0, 2.0], r"3 finite values \(b, c, k\)"),
         ([1.0, 2.0, np.nan], "3 finite values"),
-        (["a", "b", "c"], "`parameters` must hold real"),
-        ({"b": 1.0, "c": 2.0}, "Missing or unknown: k"),
-        ({"b": 1.0, "c": 2.0, "k": 3.0, "q": 1.0}, "Missing or unknown: q"),
+        (["a", "b", "c"], "`theta` must hold real"),
+        ({"b": 1.0, "c": 2.0}, "missing or unknown ones: k"),
+        ({"b": 1.0, "c": 2.0, "k": 3.0, "q": 1.0}, "missing or unknown ones: q"),
     ],
 )
 def test_wrong_parameters_are_explained(theta, message):
@@ -220,7 +220,9 @@ def test_wrong_parameters_are_explained(theta, message):
 
 
 def test_matrices_need_all_parameters():
-    with pytest.raises(ValueError, match=r"`theta` must have shape \(..., 3\)"):
+    with pytest.raises(
+        ValueError, match=r"`theta` must be finite, of shape \(..., 3\)"
+    ):
         spring_structure().matrices(np.ones((5, 2)))
 
 
@@ -473,3 +475,11 @@ def test_draws_repeat_with_the_generator():
     structure = GrayBoxStructure.from_function(pendulum, GUESS)
     draws = [structure.draw(5, np.random.default_rng(7)) for _ in range(2)]
     assert_array_equal(*draws)
+
+
+def test_a_feedthrough_is_free_where_its_derivative_vanishes_at_the_guess():
+    structure = GrayBoxStructure.from_function(
+        lambda t: ([[-t[0]]], [[t[0]]], [[1]], [[1 + t[1] ** 2]]),
+        {"a": 1.0, "q": 0.0},
+    )
+    assert structure.free_feedthrough.all()

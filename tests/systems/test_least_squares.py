@@ -50,3 +50,42 @@ def test_parameters_without_effect_stay():
 
     x, _ = levenberg_marquardt(residuals, np.array([[0.0, 7.0]]), max_iter=50)
     assert np.allclose(x, [[2.0, 7.0]])
+
+
+def test_bent_steps_follow_a_curved_valley():
+    def valley(x, _):
+        """A valley along a parabola, a hundred times steeper across."""
+        r = np.stack([1e2 * (x[:, 1] - x[:, 0] ** 2), 1.0 - x[:, 0]], axis=1)
+
+        def jacobian(kept):
+            J = np.zeros((len(kept), 2, 2))
+            J[:, 0, 0], J[:, 0, 1], J[:, 1, 0] = -2e2 * x[kept, 0], 1e2, -1.0
+            return J
+
+        return r, jacobian
+
+    start = np.array([[-3.0, 9.0]])
+    costs = [
+        levenberg_marquardt(valley, start, max_iter=30, tol=1e-12, geodesic=bent).cost
+        for bent in (False, True)
+    ]
+    assert costs[0] > 1e-2
+    assert costs[1] < 1e-20
+
+
+def test_bent_steps_keep_bounds_and_what_is_admissible():
+    starts = np.array([[-1.2, 1.0], [0.0, 0.0], [3.0, -2.0], [-2.0, 0.0]])
+    options = {"max_iter": 200, "tol": 1e-12, "geodesic": True}
+    x, cost = levenberg_marquardt(rosenbrock, starts, **options)
+    assert np.allclose(x[:3], 1.0, atol=1e-8)
+    assert cost[3] == np.inf
+    upper = np.array([0.5, 9.0])
+    x, cost = levenberg_marquardt(rosenbrock, np.zeros((1, 2)), upper=upper, **options)
+    assert np.allclose(x, [[0.5, 0.25]], atol=1e-6)
+
+
+def test_a_search_that_is_stopped_keeps_its_best():
+    looks = iter([False, False, True])
+    start = np.array([[-1.2, 1.0]])
+    x, cost = levenberg_marquardt(rosenbrock, start, stop=lambda: next(looks))
+    assert 0.0 < cost[0] < np.sum(rosenbrock(start, None)[0] ** 2)
