@@ -43,16 +43,20 @@ def aligned_models(models: Sequence[StateSpace], kappa: Array) -> list[StateSpac
     return aligned
 
 
-def spanning_tree(kappa: Array) -> tuple[Rows, Rows]:
+def spanning_tree(kappa: Array, *, outward: bool = True) -> tuple[Rows, Rows]:
     """Points in an order in which each follows its neighbour, and these neighbours.
 
-    From the point in the middle outward; the neighbour of point k is ``parents[k]``.
+    From the point in the middle outward, or from the one farthest outside; the
+    neighbour of point k is ``parents[k]``.
     """
     span = np.ptp(kappa, axis=0)
     scaled = (kappa - kappa.min(axis=0)) / np.where(span > 0, span, 1.0)
     tree = minimum_spanning_tree(cdist(scaled, scaled) + _APART)
-    first = int(np.argmin(np.linalg.norm(scaled - np.median(scaled, axis=0), axis=1)))
-    order, parents = breadth_first_order(tree, first, directed=False)
+    if outward:
+        away = np.linalg.norm(scaled - np.median(scaled, axis=0), axis=1)
+    else:
+        away = -np.linalg.norm(scaled - scaled.mean(axis=0), axis=1)
+    order, parents = breadth_first_order(tree, int(np.argmin(away)), directed=False)
     return order, parents
 
 

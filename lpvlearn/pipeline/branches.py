@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
+from ..lpv.alignment import spanning_tree
 from ..restructuring.problem import RestructuringProblem
 from ..structures.interchanges import interchanges
 from ..structures.structure import GrayBoxStructure
@@ -47,7 +47,6 @@ _UNKNOWN = 1e6  # variance, in squares of the spread, from which a value says no
 
 _KEPT = 200  # families of every length
 _WEIGHED = 24  # of them whose evidence is computed, for each prior of the search
-_APART = 1e-9  # of points at one place: a graph takes a distance of zero for none
 _CERTAIN = 0.95  # probability of the choice from which no more is said
 _TELLS = 0.05  # difference of two choices, in the spread of a parameter, that matters
 _DEVIATIONS = 3.0  # and in its standard deviations
@@ -106,7 +105,11 @@ def tied_branches(
         variances.append(np.array([spread[pi] for _, pi in origin])[inside])
         origins.append([origin[i] for i in np.flatnonzero(inside)])
     # without bounds the parts of a whole family may be numbered in any way
-    n_first = None if structure.is_bounded else len(optima[int(_tree_order(kappa)[0])])
+    n_first = (
+        None
+        if structure.is_bounded
+        else len(optima[int(spanning_tree(kappa, outward=False)[0][0])])
+    )
     chosen, doubts = smoothest_family(kappa, candidates, variances, n_first)
     family = np.array([c[i] for c, i in zip(candidates, chosen, strict=True)])
     own = np.array([found[0] for found in optima])
@@ -141,9 +144,11 @@ def _equal_optima(
     starts = [own.start_params_ for own in fitted]
     least = [max(own.fit_error_, _EXACT) for own in fitted]
     known = [[x[places]] for x in starts]
-    tree = _tree(_scaled(kappa)).toarray()
-    beside = [np.flatnonzero(row).tolist() for row in tree + tree.T]
-    waiting = [(i, starts[j]) for i, near in enumerate(beside) for j in near]
+    order, parents = spanning_tree(kappa, outward=False)
+    edges = [(int(k), int(parents[k])) for k in order[1:]]
+    edges = sorted([*edges, *((j, i) for i, j in edges)])
+    beside = [[j for i, j in edges if i == k] for k in range(len(kappa))]
+    waiting = [(i, starts[j]) for i, j in edges]
     for _ in range(_SWEEPS):
         new = []
         for i, start in waiting:
@@ -196,7 +201,8 @@ def smoothest_family(
     tree only the first `n_first` are taken, where the others would but number the parts
     of the whole family anew.
     """
-    x, order = _scaled(kappa), _tree_order(kappa)
+    x = _scaled(kappa)
+    order = spanning_tree(kappa, outward=False)[0].astype(np.intp)
     columns = np.flatnonzero(
         np.any([np.ptp(rows, axis=0) > 0 for rows in candidates], axis=0)
     )
@@ -230,17 +236,6 @@ def _scaled(kappa: Array) -> Array:
     """The points in units of their range, which is from -1/2 to 1/2."""
     span = np.ptp(kappa, axis=0)
     return np.asarray((kappa - kappa.min(axis=0)) / np.where(span > 0, span, 1.0) - 0.5)
-
-
-def _tree(x: Array) -> Any:
-    return minimum_spanning_tree(cdist(x, x) + _APART)
-
-
-def _tree_order(kappa: Array) -> Choices:
-    """The points along the minimum spanning tree, from the one farthest outside."""
-    x = _scaled(kappa)
-    first = int(np.argmax(np.linalg.norm(x - x.mean(axis=0), axis=1)))
-    return np.asarray(breadth_first_order(_tree(x), first, directed=False)[0], np.intp)
 
 
 def _units(candidates: Sequence[Array], columns: Choices) -> tuple[Array, Array]:
