@@ -91,8 +91,9 @@ pd.concat(
 # ----------
 # What the state of coordinates and rates leaves out is a term with the rate of the
 # scheduling variable, :math:`N(\kappa)\,\dot\kappa` in A. With ``rate="auto"`` such
-# terms are tried in all rows of A that hold parameters, and kept where they lower the
-# errors of pieces of the sweeps that they were not fitted to. Here they are:
+# terms are tried in all rows of A that hold parameters, drawn to zero as strongly as is
+# best for pieces of the sweeps that they were not fitted to, and kept where they lower
+# the errors of these. Here they are:
 
 pipeline.refiner_.rate_, pipeline.lpv_
 
