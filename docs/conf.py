@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import importlib.metadata
 import re
+import sys
 import warnings
+from pathlib import Path
 from typing import Any
 
 from sphinx.ext import autosummary
 from sphinx_gallery.sorting import FileNameSortKey
+
+sys.path.insert(0, str(Path(__file__).parent))
+from messages import write_page
 
 project = "lpvlearn"
 author = "The lpvlearn developers"
@@ -28,7 +33,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
 ]
 templates_path = ["_templates"]
-exclude_patterns = ["_build", "start", "guide", "examples"]
+exclude_patterns = ["_build", "start", "guide", "how_to", "examples"]
 html_static_path = ["_static"]
 html_css_files = ["lpvlearn.css"]
 
@@ -45,8 +50,8 @@ numpydoc_class_members_toctree = False
 # -- executed pages --------------------------------------------------------------------
 
 sphinx_gallery_conf = {
-    "examples_dirs": ["start", "guide", "examples"],
-    "gallery_dirs": ["auto_start", "auto_guide", "auto_examples"],
+    "examples_dirs": ["start", "guide", "how_to", "examples"],
+    "gallery_dirs": ["auto_start", "auto_guide", "auto_how_to", "auto_examples"],
     "within_subsection_order": FileNameSortKey,
     "filename_pattern": r"/plot_",
     "backreferences_dir": "generated/backreferences",
@@ -107,5 +112,6 @@ def make_restructured_text(
 
 
 def setup(app: Any) -> None:
-    """Register the hook, after numpydoc's own."""
+    """Register the hook, after numpydoc's own, and make the page of messages."""
     app.connect("autodoc-process-docstring", make_restructured_text, priority=900)
+    app.connect("builder-inited", lambda app: write_page())

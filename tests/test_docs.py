@@ -1,0 +1,100 @@
+"""What the documentation says is true of the code."""
+
+import re
+import runpy
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lpvlearn import GrayBoxRestructurer, StateSpace, SubspaceLTI, bft_score
+
+from .conftest import spring_structure, spring_tables
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+# A message with one of these words tells what to do.
+REMEDY = (
+    r"must|needs?|use|give|take|raise|lower|drop|fix|try|add|shorten|excite|update|"
+    r"leave|call|identify|interpolate|convert|another|avoids|fill|have it found|begin"
+)
+
+
+@pytest.fixture
+def messages(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS)
+    import messages
+
+    return messages
+
+
+def test_every_error_and_warning_stands_on_its_page(messages):
+    found, relayed = messages.all_messages()
+    assert relayed == messages.RELAYS
+    page = messages.page()
+    assert all(messages.escaped(message.text) in page for message in found)
+    assert sum(message.is_warning for message in found) > 40
+    assert len(found) > 440
+
+
+def test_every_message_tells_what_to_do_or_its_page_does(messages):
+    found, _ = messages.all_messages()
+    speechless = [
+        message.text
+        for message in found
+        if not re.search(rf"\b({REMEDY})\b", message.text, re.IGNORECASE)
+        and not messages.remedy_of(message.text)
+        and messages.section_of(message) != "Files"  # its head tells
+    ]
+    assert speechless == []
+    texts = [message.text for message in found]
+    spare = [k for k in messages.REMEDIES if not any(t.startswith(k) for t in texts)]
+    assert spare == []
+
+
+X, Y = spring_tables(n_samples=60)
+
+COMPLAINTS = {
+    "an option": lambda: SubspaceLTI(stability="no").fit(X[["force"]], Y),
+    "a role": lambda: SubspaceLTI(inputs="froce").fit(X, Y),
+    "a shape": lambda: bft_score(np.zeros((3, 1)), np.zeros((4, 1))),
+    "an unstable model": lambda: GrayBoxRestructurer(spring_structure()).fit_model(
+        StateSpace([[1.0]], [[1.0]], [[1.0]])
+    ),
+    "a horizon": lambda: SubspaceLTI(1, horizon=40, time="time", inputs="force").fit(
+        X[:60], Y[:60]
+    ),
+    "a time column that is an input": lambda: SubspaceLTI(1, inputs=None).fit(
+        X[["force", "time"]][:60], Y[:60]
+    ),
+}
+
+
+@pytest.mark.parametrize("complaint", COMPLAINTS.values(), ids=COMPLAINTS)
+def test_what_users_get_to_read_is_found_on_the_page(messages, complaint):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            complaint()
+        except ValueError as error:
+            told = [*(str(one.message) for one in told), str(error)]
+        else:
+            told = [str(one.message) for one in told]
+    assert told
+    patterns = [messages.pattern(m.text) for m in messages.all_messages()[0]]
+    for text in told:
+        assert any(pattern.fullmatch(text) for pattern in patterns), text
+
+
+@pytest.mark.slow
+def test_ten_plants_are_found_from_their_responses_and_from_data():
+    page = runpy.run_path(str(DOCS / "how_to" / "plot_1_plants.py"))
+    plants = page["summary"]
+    assert len(plants) == 10
+    assert (plants["from the response"] < 1e-8).all()
+    assert (plants["from data"] < 0.02).all()
+    # Two standard deviations hold 95 %; errors of one plant are not independent.
+    within = (plants["within +-"] * plants["parameters"]).sum()
+    assert within > 0.85 * plants["parameters"].sum()
+    assert "determines 3 of the 5" in str(page["told"][0].message)
