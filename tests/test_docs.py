@@ -87,9 +87,14 @@ def test_what_users_get_to_read_is_found_on_the_page(messages, complaint):
         assert any(pattern.fullmatch(text) for pattern in patterns), text
 
 
+def how_to(page):
+    """What a page computes, by the names of its variables."""
+    return runpy.run_path(str(DOCS / "how_to" / f"plot_{page}.py"))
+
+
 @pytest.mark.slow
 def test_ten_plants_are_found_from_their_responses_and_from_data():
-    page = runpy.run_path(str(DOCS / "how_to" / "plot_1_plants.py"))
+    page = how_to("1_plants")
     plants = page["summary"]
     assert len(plants) == 10
     assert (plants["from the response"] < 1e-8).all()
@@ -98,3 +103,20 @@ def test_ten_plants_are_found_from_their_responses_and_from_data():
     within = (plants["within +-"] * plants["parameters"]).sum()
     assert within > 0.85 * plants["parameters"].sum()
     assert "determines 3 of the 5" in str(page["told"][0].message)
+
+
+def test_a_log_of_a_logger_becomes_the_heater_that_wrote_it():
+    page = how_to("3_log")
+    found, fan = page["heater"].parameters_, np.array([0.2, 0.4, 0.6])
+    assert np.allclose(found["rate"], 0.01 + 0.02 * fan, rtol=0.01)
+    assert np.allclose(found["gain"], 0.004, rtol=0.01)
+    assert np.allclose(np.ravel(page["room"]), 21.0, atol=0.3)
+
+
+@pytest.mark.slow
+def test_the_scheduled_controller_does_what_no_fixed_one_does():
+    page = how_to("4_close_the_loop")
+    assert page["worst"].pop("scheduled") < 1 < min(page["worst"].values())
+    errors = page["result"].filter(like="error")
+    assert (errors.loc["scheduled"] < 0.8 * errors.loc["no controller"]).all()
+    assert (errors.loc["scheduled"] < errors.loc["for the middle angle"]).all()
