@@ -64,4 +64,5 @@ display = SimulationDisplay.from_predictions(
         for name in ("restructured", "balanced")
     },
     units="rad/s",
+    true_name="arm, without noise",
 )

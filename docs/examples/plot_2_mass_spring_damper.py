@@ -96,7 +96,12 @@ for k in range(3000):
     x = step.A @ x + step.B @ force[k]
 simulated = model.lpv_.simulate(force, warming, STEP)
 display = SimulationDisplay.from_predictions(
-    STEP * np.arange(3000), truth, simulated, units="m", output_names=["position"]
+    STEP * np.arange(3000),
+    truth,
+    simulated,
+    units="m",
+    true_name="truth",
+    output_names=["position"],
 )
 
 # %%

@@ -75,20 +75,24 @@ pd.DataFrame(
 ).round(2)
 
 # %%
-# Where were the experiments, and how well does the interpolation fit there? A picture
-# over two variables:
+# Where were the experiments, and how well does the interpolation fit there? A map for
+# each parameter; dots that stand out of it are off.
 
-import matplotlib.pyplot as plt
+from lpvlearn.inspection import ParameterDisplay, PoleDisplay, UncertaintyDisplay
 
-load, charge = np.meshgrid(np.linspace(0, 0.6, 50), np.linspace(0.2, 1.0, 50))
-grid = np.column_stack([load.ravel(), charge.ravel()])
-gain = model.lpv_.parameters(grid)[:, drone.parameter_names.index("gain")]
-fig, ax = plt.subplots(figsize=(6.5, 4), layout="constrained")
-mesh = ax.contourf(load, charge, gain.reshape(load.shape), levels=15, cmap="cividis")
-ax.plot(*model.operating_points_.T, "o", color="white", markeredgecolor="black")
-ax.set_xlabel("Load (kg)")
-ax.set_ylabel("Charge")
-bar = fig.colorbar(mesh, label="gain (m/s²)")
+units = {"gain": "m/s²", "drag": "1/s", "lag": "1/s", "load": "kg"}
+display = ParameterDisplay.from_estimator(model, units=units)
+
+# %%
+# The poles, coloured by either variable:
+
+display = PoleDisplay.from_estimator(model, units=units)
+
+# %%
+# What the model does not know: what noise leaves open over the range, and how far it is
+# from the local models at the operating points.
+
+display = UncertaintyDisplay.from_estimator(model, units=units)
 
 # %%
 # The frozen model anywhere in between, by name:
@@ -121,6 +125,7 @@ display = SimulationDisplay.from_predictions(
         ),
     },
     units="m/s",
+    true_name="truth",
     output_names=["height rate"],
 )
 

@@ -171,6 +171,13 @@ fit_report(crane, X_test, test["angle"]).round(3)
 display = SimulationDisplay.from_estimator(crane, X_test, test["angle"], units="rad")
 
 # %%
+# All there is to see of a model, on one page:
+
+from lpvlearn.inspection import plot_overview
+
+page = plot_overview(crane, X_test, test["angle"], units={"angle": "rad"})
+
+# %%
 # What is left is noise, and a term that no local experiment can show: while the rope is
 # hoisted, its speed acts on the swing. The model depends on the scheduling variable,
 # not on its rate of change.

@@ -6,11 +6,13 @@ Each class has class methods ``from_...`` that draw at once and return the displ
 
 from .bode import BodeDisplay
 from .error import ErrorDisplay
+from .overview import plot_overview
 from .parameters import ParameterDisplay
 from .poles import PoleDisplay
 from .residuals import ResidualDisplay
 from .simulation import SimulationDisplay
 from .singular_values import SingularValueDisplay
+from .uncertainty import UncertaintyDisplay
 
 __all__ = [
     "BodeDisplay",
@@ -20,4 +22,6 @@ __all__ = [
     "ResidualDisplay",
     "SimulationDisplay",
     "SingularValueDisplay",
+    "UncertaintyDisplay",
+    "plot_overview",
 ]

@@ -22,7 +22,7 @@ from .drawing import (
     tidy,
     whole,
 )
-from .fitted import check_model, models_of, unwrapped, with_others
+from .fitted import channel_names, check_model, models_of, unwrapped, with_others
 from .frequency import (
     check_frequencies,
     frequency_label,
@@ -252,7 +252,10 @@ class BodeDisplay:
         if whole("uncertainty", uncertainty, range(2)):
             omega = frequency_axis(list(models.values())) if omega is None else omega
             std = _uncertainty_of(unwrapped(estimator), own, kappa, omega)
-        return cls.from_models(models, omega=omega, std=std, phase=phase, ax=ax)
+        names = channel_names(unwrapped(estimator))
+        return cls.from_models(
+            models, omega=omega, std=std, phase=phase, ax=ax, **names
+        )
 
     def plot(
         self, ax: Any = None, *, phase: bool = False, n_std: float = 2.0

@@ -193,6 +193,58 @@ def with_unit(name: Hashable, unit: str | None) -> str:
     return f"{name} ({unit})" if unit else str(name)
 
 
+def units_of(
+    names: Sequence[Hashable], units: str | Sequence[str] | Mapping[str, str] | None
+) -> list[str | None]:
+    """A unit or None of every name: one for all, one for each, or by name."""
+    if units is None or isinstance(units, str):
+        return [units] * len(names)
+    if isinstance(units, Mapping):
+        return [units.get(str(name)) for name in names]
+    return list(names_of("units", units, len(names), ""))
+
+
+def labels_of(label: str | Sequence[str], n: int) -> list[str]:
+    """Labels of n scheduling variables; one for several is numbered."""
+    if isinstance(label, str):
+        return [label] if n == 1 else [f"{label}{k + 1}" for k in range(n)]
+    return names_of("scheduling_label", label, n, "κ")
+
+
+def colour_scale(values: Any) -> dict[str, Any]:
+    """Colour map and scale: cividis, lightness in step, without its palest end."""
+    from matplotlib import colormaps
+    from matplotlib.colors import ListedColormap, Normalize
+
+    cmap = ListedColormap(colormaps["cividis"](np.linspace(0.0, 0.9, 256)))
+    return {"cmap": cmap, "norm": Normalize(np.min(values), np.max(values))}
+
+
+def colour_bar(figure: Any, drawn: Any, ax: Any, label: str = "") -> Any:
+    """A bar beside the axes; its label runs along it, where none is too long."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.ticker import MaxNLocator
+
+    is_log = isinstance(drawn.norm, LogNorm)
+    ticks = None if is_log else MaxNLocator(5)
+    bar = figure.colorbar(drawn, ax=ax, pad=0.02, aspect=30, ticks=ticks)
+    if is_log:
+        plain_ticks(bar.ax.yaxis)
+    bar.set_label(label, fontsize=LABEL_SIZE)
+    bar.ax.tick_params(labelsize=TEXT_SIZE)
+    bar.outline.set_visible(False)
+    return bar
+
+
+def plain_ticks(axis: Any) -> None:
+    """0.1, 0.2, 0.5, 1 and so on along a logarithmic axis, in place of powers."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
 def names_of(argument: str, names: Any, n: int, letter: str) -> list[str]:
     """Given names, else the letter with numbers from 1."""
     if names is None:

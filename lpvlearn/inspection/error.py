@@ -12,7 +12,7 @@ from ..data.experiments import as_numbers
 from ..models.frequencies import frequency_axis, nyquist_frequency
 from ..models.statespace import StateSpace
 from .drawing import ACCENT, INK, MUTED, drawable, legend_above, single_axes, tidy
-from .fitted import check_model
+from .fitted import check_model, nearest_point, unwrapped
 from .frequency import (
     check_frequencies,
     frequency_label,
@@ -176,8 +176,9 @@ class ErrorDisplay:
     def from_estimator(
         cls,
         restructurer: Any,
-        model: StateSpace,
+        model: StateSpace | None = None,
         *,
+        kappa: float | ArrayLike | None = None,
         start: StateSpace | ArrayLike | str | None = "auto",
         omega: ArrayLike | None = None,
         ax: Any = None,
@@ -186,9 +187,11 @@ class ErrorDisplay:
 
         Parameters
         ----------
-        restructurer : fitted GrayBoxRestructurer
-        model : StateSpace
-            The black box that it was fitted to.
+        restructurer : fitted GrayBoxRestructurer or LocalLPVPipeline
+        model : StateSpace, default=None
+            The black box that it was fitted to; a pipeline has its own.
+        kappa : float or array-like of shape (n_scheduling,), default=None
+            Scheduling value near which to take the operating point of a pipeline.
         start : "auto", StateSpace, array-like of shape (n_params,) or None
             The gray-box model, or its parameters, to compare with. "auto" (default):
             the least-squares fit that the minimisation began with, where the
@@ -211,13 +214,19 @@ class ErrorDisplay:
         A feedthrough that the structure lacks is left out of the black box, as in the
         fit.
         """
+        restructurer = unwrapped(restructurer)
+        if getattr(restructurer, "restructurers_", None):
+            nearest = nearest_point(restructurer, kappa)
+            model = restructurer.local_models_[nearest]
+            restructurer = restructurer.restructurers_[nearest]
         if not hasattr(restructurer, "lti_") or not hasattr(restructurer, "structure_"):
             raise ValueError(
                 "`restructurer` must be a fitted GrayBoxRestructurer. Got "
                 f"{type(restructurer).__name__} without `lti_`; call fit_model() "
-                "first. A fitted pipeline holds its own in `restructurers_`."
+                "first, or give a pipeline with a structure."
             )
         check_model("model", model)
+        assert model is not None
         dropped = restructurer.dropped_feedthrough_
         if dropped.shape != model.D.shape:
             raise ValueError(

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import as_numbers
 from ..models.statespace import StateSpace
+from .drawing import units_of, with_unit
 
 
 def unwrapped(estimator: Any) -> Any:
@@ -33,7 +34,19 @@ def models_of(
             f"LocalLPVPipeline or OutputErrorLPV. Got {type(estimator).__name__} "
             "without `lti_` or `lpv_`; call fit() first."
         )
-    lpv, points = estimator.lpv_, getattr(estimator, "operating_points_", None)
+    lpv, place = estimator.lpv_, _place(estimator, kappa)
+    found = {}
+    if hasattr(estimator, "operating_points_"):
+        nearest = nearest_point(estimator, place)
+        found["local"] = estimator.local_models_[nearest]
+        if estimator.restructurers_:
+            found["gray-box"] = estimator.structured_models_[nearest]
+    return found | {"interpolated": lpv.at(place)}
+
+
+def _place(pipeline: Any, kappa: float | ArrayLike | None) -> NDArray[np.float64]:
+    """A scheduling value of the right shape, or a ValueError that tells the range."""
+    lpv, points = pipeline.lpv_, getattr(pipeline, "operating_points_", None)
     if kappa is None:
         known = "range is" if points is None else "operating points are"
         places = lpv.scheduling_range if points is None else points
@@ -47,13 +60,13 @@ def models_of(
         raise ValueError(
             f"`kappa` must hold {lpv.n_scheduling} scheduling value(s). Got {kappa!r}."
         )
-    found = {}
-    if points is not None:
-        nearest = int(np.argmin(np.linalg.norm(points - place, axis=1)))
-        found["local"] = estimator.local_models_[nearest]
-        if estimator.restructurers_:
-            found["gray-box"] = estimator.structured_models_[nearest]
-    return found | {"interpolated": lpv.at(place)}
+    return place
+
+
+def nearest_point(pipeline: Any, kappa: float | ArrayLike | None) -> int:
+    """Number of the operating point of a fitted pipeline that is nearest to `kappa`."""
+    distances = pipeline.operating_points_ - _place(pipeline, kappa)
+    return int(np.argmin(np.linalg.norm(distances, axis=1)))
 
 
 def fitted_pipeline(pipeline: Any, attribute: str) -> Any:
@@ -91,19 +104,21 @@ def with_others(own: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, 
     return {**own, **others}
 
 
-def check_one_scheduling(n_scheduling: int, what: str) -> None:
-    """A ValueError that teaches, unless there is one scheduling variable."""
-    if n_scheduling != 1:
-        raise ValueError(
-            f"{what} needs one scheduling variable as its axis. Got {n_scheduling}. "
-            "Fix all but one: draw the frozen models of a line through the scheduling "
-            "space with BodeDisplay.from_models."
-        )
+def scheduling_labels(
+    estimator: Any, n_scheduling: int, units: Mapping[str, str] | None = None
+) -> list[str]:
+    """Labels of a pipeline's scheduling variables, with their units."""
+    names = getattr(estimator, "scheduling", None)
+    names = list(names) if isinstance(names, (list, tuple)) else [names]
+    if len(names) != n_scheduling or not all(isinstance(name, str) for name in names):
+        names = [f"κ{k + 1}" for k in range(n_scheduling)]
+    return [
+        with_unit("κ" if n_scheduling == 1 and name in ("kappa", "κ1") else name, unit)
+        for name, unit in zip(names, units_of(names, units), strict=True)
+    ]
 
 
-def scheduling_name(estimator: Any) -> str:
-    """The name of a pipeline's only scheduling column, else kappa."""
-    name = getattr(estimator, "scheduling", None)
-    if isinstance(name, (list, tuple)) and len(name) == 1:
-        name = name[0]
-    return name if isinstance(name, str) and name != "kappa" else "κ"
+def channel_names(estimator: Any) -> dict[str, Any]:
+    """Names of the inputs and outputs of an estimator's LPV model, where it has one."""
+    lpv = getattr(estimator, "lpv_", None)
+    return {key: getattr(lpv, key, None) for key in ("input_names", "output_names")}

@@ -14,38 +14,44 @@ from ..data.experiments import as_numbers
 from .drawing import (
     axes_grid,
     by_name,
+    colour_bar,
+    colour_scale,
     drawable,
     figure_legend,
+    labels_of,
     named,
     names_of,
     point_style,
     tidy,
+    units_of,
     whole,
+    with_unit,
 )
-from .fitted import (
-    check_one_scheduling,
-    fitted_pipeline,
-    scheduling_name,
-    with_others,
-)
+from .fitted import fitted_pipeline, scheduling_labels, with_others
 
 Array = NDArray[np.float64]
 
 _N_CURVE = 200  # points of a curve
 
+_N_MAP = 60  # points along a side of a map
+
+_DOT = 34.0  # area of a point on a map, square points; those of further sets are rings
+
 _CONSTANT = 1e-6  # a parameter that varies less, relative to its size, is drawn flat
 
 
 class ParameterDisplay:
-    """Small multiples: each parameter over the scheduling variable.
+    """Small multiples: each parameter over the scheduling variable, or over two.
 
-    Points are local models, lines the interpolation through them. Make it with
-    `from_estimator` or `from_parameters`.
+    Points are local models, lines the interpolation through them. Over two variables
+    the interpolation is a map, on which the points are dots in the colours of the
+    map: those that stand out are off it. Further sets are rings about the dots. Make it
+    with `from_estimator` or `from_parameters`.
 
     Parameters
     ----------
-    kappa : array-like of shape (n_points,)
-        Scheduling values of the operating points.
+    kappa : array-like of shape (n_points,) or (n_points, n_scheduling)
+        Scheduling values of the operating points, of two variables at most.
     parameters : dict from str to array-like of shape (n_points, n_params)
         Sets of parameters, by name.
     names : sequence of str, default=None
@@ -53,23 +59,26 @@ class ParameterDisplay:
         The names of columns may be fewer than these: a selection.
     interpolators : dict from str to fitted regressor, default=None
         Curves for some of the sets: regressors that predict all parameters from
-        scheduling values of shape (n, 1).
+        scheduling values of shape (n, n_scheduling). A map shows the first.
     std : dict from str to array-like of shape (n_points, n_params), default=None
-        Standard deviations of some of the sets, drawn as bars at the points.
+        Standard deviations of some of the sets, drawn as bars at the points, over one
+        variable.
     curve_std : dict from str to callable, default=None
         Functions from scheduling values (n, 1) to standard deviations (n, n_params) of
         some of the curves, drawn as bands.
-    scheduling_label : str, default="κ"
-        Label of the horizontal axes.
+    scheduling_label : str or sequence of str, default="κ"
+        Labels of the axes; one for two variables is numbered.
+    units : dict from str to str, default=None
+        Units of the parameters, by name.
 
     Attributes
     ----------
     axes_ : ndarray of Axes of shape (n_params,)
     figure_ : Figure
-    lines_ : dict from str to list of Line2D
+    lines_ : dict from str to list of Line2D or PathCollection
         Points of each set, one entry a parameter.
-    curves_ : dict from str to list of Line2D
-        Curves of each set that has an interpolator.
+    curves_ : dict from str to list of Line2D or QuadMesh
+        Curves of each set that has an interpolator; the map of the first.
 
     Examples
     --------
@@ -93,13 +102,20 @@ class ParameterDisplay:
         interpolators: Mapping[str, Any] | None = None,
         std: Mapping[str, ArrayLike] | None = None,
         curve_std: Mapping[str, Callable[[Array], ArrayLike]] | None = None,
-        scheduling_label: str = "κ",
+        scheduling_label: str | Sequence[str] = "κ",
+        units: Mapping[str, str] | None = None,
     ) -> None:
         points = as_numbers("kappa", kappa)
-        if points.ndim == 2:
-            check_one_scheduling(points.shape[1], "ParameterDisplay")
-            points = points[:, 0]
-        self.kappa = points
+        self.kappa = points[:, None] if points.ndim < 2 else points
+        n_scheduling = self.kappa.shape[1]
+        if n_scheduling > 2:
+            raise ValueError(
+                "ParameterDisplay needs one or two scheduling variables as its axes. "
+                f"Got {n_scheduling}. Fix all but two: take the operating points and "
+                "parameters at one value of the others, and from_parameters()."
+            )
+        self.scheduling_labels = labels_of(scheduling_label, n_scheduling)
+        self.units = by_name("units", units)
         sets = named("parameters", parameters, "tables of parameters")
         self.all_names, self.chosen = _names_and_choice(sets, names)
         self.parameters, self.std = (
@@ -111,7 +127,6 @@ class ParameterDisplay:
         )
         self.interpolators = by_name("interpolators", interpolators)
         self.curve_std = by_name("curve_std", curve_std)
-        self.scheduling_label = scheduling_label
 
     def _table(self, argument: str, table: Any) -> Array:
         if hasattr(table, "columns"):
@@ -139,23 +154,28 @@ class ParameterDisplay:
         *,
         names: Sequence[Hashable] | None = None,
         interpolator: Any = None,
-        scheduling_label: str = "κ",
-        n_columns: int = 4,
+        scheduling_label: str | Sequence[str] = "κ",
+        units: Mapping[str, str] | None = None,
+        n_columns: int | None = None,
         ax: Any = None,
     ) -> ParameterDisplay:
         """Draw sets of parameters, and a fitted curve through each.
 
         Parameters
         ----------
-        kappa : array-like of shape (n_points,) or (n_points, 1)
+        kappa : array-like of shape (n_points,) or (n_points, n_scheduling)
+            Of two scheduling variables at most.
         parameters : dict from str to array-like of shape (n_points, n_params)
             DataFrames bring the names of the parameters.
         names : sequence of str, default=None
             Names of the columns of arrays; a selection of columns of DataFrames.
         interpolator : regressor, default=None
             Fitted (a clone) to each set for its curve. None draws points only.
-        scheduling_label : str, default="κ"
-        n_columns : int, default=4
+        scheduling_label : str or sequence of str, default="κ"
+        units : dict from str to str, default=None
+            Units of the parameters, by name.
+        n_columns : int, default=None
+            Panels in a row; None is 4, of maps 2.
         ax : Axes or array of Axes, default=None
 
         Returns
@@ -165,18 +185,23 @@ class ParameterDisplay:
         Raises
         ------
         ValueError
-            If shapes do not fit, or there are several scheduling variables.
+            If shapes do not fit, or there are three scheduling variables or more.
         """
-        display = cls(kappa, parameters, names=names, scheduling_label=scheduling_label)
+        display = cls(
+            kappa,
+            parameters,
+            names=names,
+            scheduling_label=scheduling_label,
+            units=units,
+        )
         if interpolator is not None and not hasattr(interpolator, "get_params"):
             raise ValueError(
                 "`interpolator` must be a regressor, such as PolynomialLPV(), or None. "
                 f"Got {type(interpolator).__name__}."
             )
         if interpolator is not None:
-            X = display.kappa[:, None]
             display.interpolators = {
-                name: clone(interpolator).fit(X, theta)
+                name: clone(interpolator).fit(display.kappa, theta)
                 for name, theta in display.parameters.items()
             }
         return display.plot(ax, n_columns=n_columns)
@@ -189,9 +214,10 @@ class ParameterDisplay:
         others: Mapping[str, ArrayLike] | None = None,
         names: Sequence[Hashable] | None = None,
         name: str | None = None,
-        uncertainty: bool = False,
-        scheduling_label: str | None = None,
-        n_columns: int = 4,
+        uncertainty: bool | None = None,
+        scheduling_label: str | Sequence[str] | None = None,
+        units: Mapping[str, str] | None = None,
+        n_columns: int | None = None,
         ax: Any = None,
     ) -> ParameterDisplay:
         """Draw a pipeline's local parameters and their interpolation.
@@ -199,7 +225,7 @@ class ParameterDisplay:
         Parameters
         ----------
         pipeline : fitted LocalLPVPipeline
-            With one scheduling variable.
+            With one or two scheduling variables.
         others : dict from str to array-like of shape (n_points, n_params), default=None
             Parameters at the same operating points to compare with, drawn as points:
             the truth, an analytic model.
@@ -208,14 +234,17 @@ class ParameterDisplay:
         name : str, default=None
             Of the pipeline's parameters in the legend. None is "restructured", or
             "balanced" without a restructurer.
-        uncertainty : bool, default=False
-            Whether to draw two standard deviations, where they are known: of the local
-            parameters as bars, of their interpolation as a band. Of the parameters,
+        uncertainty : bool, default=None
+            Whether to draw two standard deviations: of the local parameters as bars, of
+            their interpolation as a band. None draws what is known. Of the parameters,
             that is: what the model's own error does to outputs is another thing, see
-            `SimulationDisplay`.
-        scheduling_label : str, default=None
-            None is the name of the scheduling column.
-        n_columns : int, default=4
+            `SimulationDisplay`. Over two variables it is not drawn.
+        scheduling_label : str or sequence of str, default=None
+            None is the names of the scheduling columns.
+        units : dict from str to str, default=None
+            Units of the parameters and of the scheduling variables, by name.
+        n_columns : int, default=None
+            Panels in a row; None is 4, of maps 2.
         ax : Axes or array of Axes, default=None
 
         Returns
@@ -225,34 +254,39 @@ class ParameterDisplay:
         Raises
         ------
         ValueError
-            If the pipeline is not fitted or has several scheduling variables, `others`
-            has other shapes, or the uncertainty is not known.
+            If the pipeline is not fitted or has more than two scheduling variables,
+            `others` has other shapes, or the uncertainty is asked for and not known.
         """
         pipeline = fitted_pipeline(pipeline, "parameters_")
-        check_one_scheduling(pipeline.operating_points_.shape[1], "ParameterDisplay")
         if name is not None:
             name = str(name)
         else:
             name = "restructured" if pipeline.restructurers_ else "balanced"
         table = pipeline.parameters_
         known: dict[str, Any] = {}
-        if whole("uncertainty", uncertainty, range(2)):
+        asked = uncertainty is None or whole("uncertainty", uncertainty, range(2))
+        if asked and uncertainty is not None:
             pipeline.lpv_.covariance_root()  # refuses where there is none
-            known = {"curve_std": {name: partial(_curve_std, pipeline.lpv_)}}
+        if asked:
+            if pipeline.lpv_.covariance is not None:
+                known["curve_std"] = {name: partial(_curve_std, pipeline.lpv_)}
             if np.isfinite(pipeline.parameters_std_).all(axis=None):
                 known["std"] = {name: pipeline.parameters_std_}
+        n_scheduling = pipeline.operating_points_.shape[1]
         display = cls(
-            pipeline.operating_points_[:, 0],
+            pipeline.operating_points_,
             with_others({name: table}, by_name("others", others)),
             names=names,
             interpolators={name: pipeline.interpolator_},
             **known,
-            scheduling_label=scheduling_label or scheduling_name(pipeline),
+            scheduling_label=scheduling_label
+            or scheduling_labels(pipeline, n_scheduling, units),
+            units=units,
         )
         return display.plot(ax, n_columns=n_columns)
 
     def plot(
-        self, ax: Any = None, *, n_columns: int = 4, n_std: float = 2.0
+        self, ax: Any = None, *, n_columns: int | None = None, n_std: float = 2.0
     ) -> ParameterDisplay:
         """Draw a panel for each parameter.
 
@@ -260,8 +294,8 @@ class ParameterDisplay:
         ----------
         ax : Axes or array of Axes, default=None
             None makes a figure. Of an array, as many as there are places in the grid.
-        n_columns : int, default=4
-            Panels in a row.
+        n_columns : int, default=None
+            Panels in a row; None is 4, of maps 2.
         n_std : float, default=2.0
             Half-width of bars and bands, in standard deviations.
 
@@ -269,17 +303,77 @@ class ParameterDisplay:
         -------
         ParameterDisplay
         """
-        names = self.names
+        names, maps = self.names, self.kappa.shape[1] == 2
+        if n_columns is None:
+            n_columns = 2 if maps else 4
         n_columns = min(whole("n_columns", n_columns, range(1, 100)), len(names))
         n_rows = -(-len(names) // n_columns)
-        height = 0.6 + (1.45 if n_rows > 1 else 2.4) * n_rows
+        row = 2.3 if maps else 1.45 if n_rows > 1 else 2.4
+        height = 0.6 + row * n_rows
         self.figure_, axes = axes_grid(ax, n_rows, n_columns, height=height)
         for spare in axes.flat[len(names) :]:
             spare.set_axis_off()
         self.axes_ = axes.ravel()[: len(names)]
         self.lines_: dict[str, list[Any]] = {name: [] for name in self.parameters}
         self.curves_: dict[str, list[Any]] = {name: [] for name in self.interpolators}
-        fine = np.linspace(self.kappa.min(), self.kappa.max(), _N_CURVE)
+        (self._draw_maps if maps else self._draw_curves)(n_std)
+        for number, one in enumerate(self.axes_):
+            self._dress(one, names[number], number >= len(names) - n_columns)
+            if maps and number % n_columns == 0:
+                one.set_ylabel(self.scheduling_labels[1])
+        if not maps or len(self.parameters) > 1:
+            handles = [
+                lines[name][0]
+                for name in self.parameters
+                for lines in (self.lines_, {} if maps else self.curves_)
+                if name in lines
+            ]
+            figure_legend(self.figure_, self.axes_[0], handles, own=ax is None)
+        drawable(self.figure_)
+        return self
+
+    def _draw_maps(self, _: float) -> None:
+        """The interpolation as a map, points as dots and rings in its colours."""
+        sides = [np.linspace(low, high, _N_MAP) for low, high in _limits(self.kappa)]
+        grid = np.stack(np.meshgrid(*sides), axis=-1)
+        shown = next(iter(self.interpolators), None)
+        surface = None
+        if shown is not None:
+            found = self.interpolators[shown].predict(grid.reshape(-1, 2))
+            surface = np.reshape(found, (_N_MAP, _N_MAP, -1))
+        for one, column in zip(self.axes_, self.chosen, strict=True):
+            values = [theta[:, column] for theta in self.parameters.values()]
+            if surface is not None:
+                values.append(surface[..., column].ravel())
+            colours = colour_scale(np.concatenate(values))
+            if surface is not None:
+                drawn = one.pcolormesh(
+                    *sides,
+                    surface[..., column],
+                    shading="nearest",
+                    rasterized=True,
+                    **colours,
+                )
+                self.curves_[str(shown)].append(drawn)
+            for k, name in enumerate(self.parameters):
+                drawn = one.scatter(
+                    *self.kappa.T,
+                    c=values[k],
+                    s=_DOT * (1 + 1.6 * k) ** 2,
+                    edgecolors="white",
+                    linewidths=0.9,
+                    zorder=9 - k,
+                    label=name,
+                    clip_on=False,  # most stand on the border
+                    **colours,
+                )
+                self.lines_[name].append(drawn)
+            colour_bar(self.figure_, drawn, one)
+
+    def _draw_curves(self, n_std: float) -> None:
+        """Points with bars, curves with bands."""
+        kappa = self.kappa[:, 0]
+        fine = np.linspace(kappa.min(), kappa.max(), _N_CURVE)
         curves = {
             name: np.reshape(model.predict(fine[:, None]), (_N_CURVE, -1))
             for name, model in self.interpolators.items()
@@ -292,12 +386,12 @@ class ParameterDisplay:
             style = point_style(k)
             for one, column in zip(self.axes_, self.chosen, strict=True):
                 (points,) = one.plot(
-                    self.kappa, theta[:, column], label=name, zorder=3 + k, **style
+                    kappa, theta[:, column], label=name, zorder=3 + k, **style
                 )
                 self.lines_[name].append(points)
                 if name in self.std:
                     one.errorbar(
-                        self.kappa,
+                        kappa,
                         theta[:, column],
                         n_std * self.std[name][:, column],
                         fmt="none",
@@ -325,36 +419,35 @@ class ParameterDisplay:
                         linestyle=("-", "--", "-.", ":")[k % 4],
                     )
                     self.curves_[name].append(curve)
-        for number, one in enumerate(self.axes_):
-            self._dress(one, names[number], number >= len(names) - n_columns)
-        handles = [
-            lines[name][0]
-            for name in self.parameters
-            for lines in (self.lines_, self.curves_)
-            if name in lines
-        ]
-        figure_legend(self.figure_, self.axes_[0], handles, own=ax is None)
-        drawable(self.figure_)
-        return self
 
     def _dress(self, ax: Any, name: str, lowest: bool) -> None:
         from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
         tidy(ax)
-        ax.margins(0.08, 0.12)
-        ax.set_title(name, fontsize=9, pad=3)
+        title = with_unit(name, units_of([name], self.units)[0])
+        ax.set_title(title, fontsize=9, pad=3)
         ax.xaxis.set_major_locator(MaxNLocator(4))
         ax.yaxis.set_major_locator(MaxNLocator(4))
+        if lowest:
+            ax.set_xlabel(self.scheduling_labels[0])
+        if self.kappa.shape[1] == 2:
+            ax.grid(False)
+            return
+        ax.margins(0.08, 0.12)
         formatter = ScalarFormatter(useMathText=True, useOffset=False)
         formatter.set_powerlimits((-3, 4))
         ax.yaxis.set_major_formatter(formatter)
-        if lowest:
-            ax.set_xlabel(self.scheduling_label)
         low, high = ax.dataLim.y0, ax.dataLim.y1
         size = max(abs(low), abs(high))
         # Else the axis magnifies rounding errors of a constant.
         if high - low < _CONSTANT * size:
             ax.set_ylim(low - 0.1 * size, high + 0.1 * size)
+
+
+def _limits(kappa: Array) -> Array:
+    """Lowest and highest value of each variable, a little apart where they agree."""
+    low, high = kappa.min(axis=0), kappa.max(axis=0)
+    return np.column_stack([low, np.where(high > low, high, low + 1.0)])
 
 
 def _curve_std(lpv: Any, kappa: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,20 +10,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import as_numbers
 from .drawing import (
-    LABEL_SIZE,
     MUTED,
-    TEXT_SIZE,
+    axes_grid,
+    colour_bar,
+    colour_scale,
     drawable,
+    labels_of,
     legend_above,
-    single_axes,
     tidy,
     whole,
 )
-from .fitted import (
-    check_one_scheduling,
-    fitted_pipeline,
-    scheduling_name,
-)
+from .fitted import fitted_pipeline, scheduling_labels
 
 Array = NDArray[np.float64]
 
@@ -30,36 +28,43 @@ Complex = NDArray[np.complex128]
 
 _DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)  # damping ratios that get a ray
 
-_N_POINTS = 101  # frozen models over the range: their poles make a line
+# Frozen models over the range of one scheduling variable: their poles make a line. Of
+# several, so many in all at most, on a grid.
+_N_POINTS, _N_GRID = 101, 500
+
+
+_REAL = 1e-6  # imaginary parts, relative to the largest pole, that are rounding
 
 
 class PoleDisplay:
     """Poles of the frozen models in the s-plane, coloured by the scheduling value.
 
-    Make it with `from_model` or `from_estimator`.
+    Of several scheduling variables, there is a panel for each, with the same poles
+    coloured by that variable. Make it with `from_model` or `from_estimator`.
 
     Parameters
     ----------
-    kappa : array-like of shape (n_points,)
+    kappa : array-like of shape (n_points,) or (n_points, n_scheduling)
         Scheduling values.
     poles : array-like of shape (n_points, order)
         Poles of the frozen models, rad/s.
-    local_kappa : array-like of shape (n_local,), default=None
+    local_kappa : array-like of shape (n_local,) or (n_local, n_scheduling)
         Scheduling values of local models, drawn as rings.
     local_poles : array-like of shape (n_local, order), default=None
         Their poles, rad/s.
-    scheduling_label : str, default="κ"
-        Label of the colour bar.
+    scheduling_label : str or sequence of str, default="κ"
+        Labels of the colour bars; one for several variables is numbered.
 
     Attributes
     ----------
     ax_ : Axes
-    axes_ : ndarray of Axes of shape (1,)
+        The first panel.
+    axes_ : ndarray of Axes of shape (n_scheduling,)
     figure_ : Figure
     points_ : PathCollection
-        The poles, in the order of ``poles.ravel()``.
+        The poles of the first panel, in the order of ``poles.ravel()``.
     local_points_ : PathCollection or None
-    colorbar_ : Colorbar
+    colorbars_ : list of Colorbar
 
     Examples
     --------
@@ -82,14 +87,14 @@ class PoleDisplay:
         *,
         local_kappa: ArrayLike | None = None,
         local_poles: ArrayLike | None = None,
-        scheduling_label: str = "κ",
+        scheduling_label: str | Sequence[str] = "κ",
     ) -> None:
         self.kappa, self.poles = _pair("", kappa, poles)
-        self.local_kappa, self.local_poles = np.zeros(0), np.zeros((0, 0), complex)
+        self.local_kappa, self.local_poles = self.kappa[:0], self.poles[:0]
         if local_poles is not None and local_kappa is not None:
             pair = _pair("local_", local_kappa, local_poles)
             self.local_kappa, self.local_poles = pair
-        self.scheduling_label = scheduling_label
+        self.scheduling_labels = labels_of(scheduling_label, self.kappa.shape[1])
 
     @classmethod
     def from_model(
@@ -98,7 +103,7 @@ class PoleDisplay:
         *,
         kappa: ArrayLike | None = None,
         damping: bool = False,
-        scheduling_label: str = "κ",
+        scheduling_label: str | Sequence[str] = "κ",
         ax: Any = None,
     ) -> PoleDisplay:
         """Draw the poles of an LPV model.
@@ -106,13 +111,12 @@ class PoleDisplay:
         Parameters
         ----------
         model : LPVStateSpace
-            With one scheduling variable.
-        kappa : array-like of shape (n_points,), default=None
-            Scheduling values; None is 101 over the identified range.
+        kappa : array-like, (n_points,) or (n_points, n_scheduling), default=None
+            Scheduling values; None is a grid over the identified range.
         damping : bool, default=False
             Whether to draw lines of constant damping ratio.
-        scheduling_label : str, default="κ"
-        ax : Axes, default=None
+        scheduling_label : str or sequence of str, default="κ"
+        ax : Axes or array of Axes, default=None
 
         Returns
         -------
@@ -121,7 +125,7 @@ class PoleDisplay:
         Raises
         ------
         ValueError
-            If the model has several scheduling variables.
+            If `model` is no LPV model.
         """
         if not hasattr(model, "frozen_poles"):
             raise ValueError(
@@ -139,7 +143,8 @@ class PoleDisplay:
         *,
         kappa: ArrayLike | None = None,
         damping: bool = False,
-        scheduling_label: str | None = None,
+        scheduling_label: str | Sequence[str] | None = None,
+        units: Mapping[str, str] | None = None,
         ax: Any = None,
     ) -> PoleDisplay:
         """Draw the poles of a pipeline's model, and those of its local models.
@@ -147,14 +152,15 @@ class PoleDisplay:
         Parameters
         ----------
         pipeline : fitted LocalLPVPipeline or OutputErrorLPV
-            With one scheduling variable. The black-box local models of a pipeline are
-            drawn as rings.
-        kappa : array-like of shape (n_points,), default=None
-            Scheduling values; None is 101 over the identified range.
+            The black-box local models of a pipeline are drawn as rings.
+        kappa : array-like, (n_points,) or (n_points, n_scheduling), default=None
+            Scheduling values; None is a grid over the identified range.
         damping : bool, default=False
-        scheduling_label : str, default=None
-            None is the name of the scheduling column.
-        ax : Axes, default=None
+        scheduling_label : str or sequence of str, default=None
+            None is the names of the scheduling columns.
+        units : dict from str to str, default=None
+            Of the scheduling variables, by name.
+        ax : Axes or array of Axes, default=None
 
         Returns
         -------
@@ -163,22 +169,23 @@ class PoleDisplay:
         Raises
         ------
         ValueError
-            If the pipeline is not fitted or has several scheduling variables.
+            If the pipeline is not fitted.
         """
         pipeline = fitted_pipeline(pipeline, "lpv_")
         grid = _grid(pipeline.lpv_, kappa)
         local: dict[str, Any] = {}
         if hasattr(pipeline, "local_models_"):
-            points, models = pipeline.operating_points_[:, 0], pipeline.local_models_
+            points, models = pipeline.operating_points_, pipeline.local_models_
             local = {
-                "local_kappa": np.repeat(points, [model.order for model in models]),
+                "local_kappa": np.repeat(points, [m.order for m in models], axis=0),
                 "local_poles": np.concatenate([m.poles() for m in models])[:, None],
             }
         display = cls(
             grid,
             pipeline.lpv_.frozen_poles(grid),
             **local,
-            scheduling_label=scheduling_label or scheduling_name(pipeline),
+            scheduling_label=scheduling_label
+            or scheduling_labels(pipeline, grid.shape[1], units),
         )
         return display.plot(ax, damping=damping)
 
@@ -187,8 +194,8 @@ class PoleDisplay:
 
         Parameters
         ----------
-        ax : Axes, default=None
-            None makes a figure.
+        ax : Axes or array of Axes, default=None
+            None makes a figure. Of an array, a panel for each scheduling variable.
         damping : bool, default=False
             Whether to draw lines of constant damping ratio.
 
@@ -196,60 +203,62 @@ class PoleDisplay:
         -------
         PoleDisplay
         """
+        n_panels = self.kappa.shape[1]
+        self.figure_, axes = axes_grid(
+            ax, 1, n_panels, height=4.4, sharex=True, sharey=True
+        )
+        self.axes_ = axes[0]
+        self.ax_ = self.axes_[0]
+        self.colorbars_: list[Any] = []
+        panels = [self._draw(j, one) for j, one in enumerate(self.axes_)]
+        self.points_, self.local_points_ = panels[0]
+        self.ax_.set_ylabel("Imaginary part (rad/s)")
+        if whole("damping", damping, range(2)):
+            for one in self.axes_:
+                _draw_damping(one)
+        drawable(self.figure_)
+        return self
+
+    def _draw(self, j: int, one: Any) -> tuple[Any, Any]:
+        """Poles coloured by scheduling variable j, and rings likewise."""
         from matplotlib.lines import Line2D
 
-        self.figure_, self.axes_ = single_axes(ax, height=4.4)
-        self.ax_ = one = self.axes_[0]
-        colours = _colours(np.concatenate([self.kappa, self.local_kappa]))
+        colours = colour_scale(np.concatenate([self.kappa, self.local_kappa])[:, j])
         s = self.poles.ravel()
-        kappa = np.repeat(self.kappa, self.poles.shape[1])
-        self.points_ = one.scatter(
+        kappa = np.repeat(self.kappa[:, j], self.poles.shape[1])
+        points = one.scatter(
             s.real, s.imag, c=kappa, s=9, linewidths=0, zorder=3, **colours
         )
-        self.local_points_ = None
+        rings = None
         if self.local_poles.size:
             s = self.local_poles.ravel()
-            kappa = np.repeat(self.local_kappa, self.local_poles.shape[1])
-            rings = colours["cmap"](colours["norm"](kappa))
-            self.local_points_ = one.scatter(
+            kappa = np.repeat(self.local_kappa[:, j], self.local_poles.shape[1])
+            rings = one.scatter(
                 s.real,
                 s.imag,
                 s=46,
                 facecolors="none",
-                edgecolors=rings,
+                edgecolors=colours["cmap"](colours["norm"](kappa)),
                 linewidths=1.4,
                 zorder=4,
             )
             ring = Line2D([], [], color=MUTED, marker="o", markerfacecolor="none")
             ring.set(linestyle="", label="local models")
-            legend_above(one, [ring])
+            if j == 0:
+                legend_above(one, [ring])
         tidy(one)
         one.autoscale_view()
+        size = np.abs(self.poles).max()
+        if np.abs(self.poles.imag).max() < _REAL * size:  # else rounding is magnified
+            one.set_ylim(-0.25 * size, 0.25 * size)
         # The border of stability is part of the picture.
         one.set_xlim(right=max(one.get_xlim()[1], -0.03 * one.get_xlim()[0]))
         one.set_xlabel("Real part (rad/s)")
-        one.set_ylabel("Imaginary part (rad/s)")
         one.axvline(0.0, color="0.35", linewidth=0.9, zorder=1)
         one.axhline(0.0, color="0.7", linewidth=0.7, zorder=1)
-        if whole("damping", damping, range(2)):
-            _draw_damping(one)
-        self.colorbar_ = self.figure_.colorbar(
-            self.points_, ax=one, pad=0.02, aspect=30
-        )
-        self.colorbar_.ax.set_title(self.scheduling_label, fontsize=LABEL_SIZE)
-        self.colorbar_.ax.tick_params(labelsize=TEXT_SIZE)
-        self.colorbar_.outline.set_visible(False)
-        drawable(self.figure_)
-        return self
-
-
-def _colours(kappa: Array) -> dict[str, Any]:
-    """Colour map and scale: cividis, lightness in step, without its palest end."""
-    from matplotlib import colormaps
-    from matplotlib.colors import ListedColormap, Normalize
-
-    cmap = ListedColormap(colormaps["cividis"](np.linspace(0.0, 0.9, 256)))
-    return {"cmap": cmap, "norm": Normalize(kappa.min(), kappa.max())}
+        bar = colour_bar(self.figure_, points, one, self.scheduling_labels[j])
+        self.colorbars_.append(bar)
+        return points, rings
 
 
 def _draw_damping(ax: Any) -> None:
@@ -276,15 +285,17 @@ def _draw_damping(ax: Any) -> None:
 
 
 def _grid(model: Any, kappa: ArrayLike | None) -> Array:
-    check_one_scheduling(model.n_scheduling, "PoleDisplay")
+    n = model.n_scheduling
     if kappa is not None:
-        return as_numbers("kappa", kappa).reshape(-1)
-    low, high = model.scheduling_range[:, 0]
-    return np.linspace(low, high, _N_POINTS)
+        return as_numbers("kappa", kappa).reshape(-1, n)
+    size = _N_POINTS if n == 1 else max(3, int(_N_GRID ** (1 / n)))
+    axes = [np.linspace(low, high, size) for low, high in model.scheduling_range.T]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, n)
 
 
 def _pair(prefix: str, kappa: ArrayLike, poles: ArrayLike) -> tuple[Array, Complex]:
-    points = as_numbers(f"{prefix}kappa", kappa).reshape(-1)
+    points = as_numbers(f"{prefix}kappa", kappa)
+    points = points[:, None] if points.ndim < 2 else points
     table = as_numbers(f"{prefix}poles", poles, imaginary=True)
     if table.ndim != 2 or len(table) != len(points) or table.size == 0:
         raise ValueError(

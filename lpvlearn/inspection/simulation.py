@@ -29,12 +29,15 @@ from .drawing import (
     line_style,
     names_of,
     tidy,
+    units_of,
     whole,
     with_unit,
 )
 from .fitted import unwrapped
 
 Array = NDArray[np.float64]
+
+Units = str | Sequence[str] | Mapping[str, str] | None
 
 # Dense signals hide each other whatever their dashes: a broad pale line for the
 # measurement stays visible under thin dark ones.
@@ -60,9 +63,11 @@ class SimulationDisplay:
         Standard deviations of some of the simulated outputs, drawn as bands.
     output_names : sequence of str, default=None
         None is y1, y2, ...
-    units : str or sequence of str, default=None
-        Unit of all outputs, or one for each.
+    units : str, sequence of str or dict, default=None
+        Unit of all outputs, one for each, or by name.
     time_label : str, default="Time (s)"
+    true_name : str, default="measured"
+        What `y_true` is, in the legend.
 
     Attributes
     ----------
@@ -73,7 +78,7 @@ class SimulationDisplay:
     axes_ : ndarray of Axes of shape (n_outputs,)
     figure_ : Figure
     lines_ : dict from str to list of Line2D
-        By "measured" and the names of the models; one line for each output.
+        By `true_name` and the names of the models; one line for each output.
 
     Examples
     --------
@@ -95,8 +100,9 @@ class SimulationDisplay:
         *,
         std: Mapping[str, ArrayLike] | None = None,
         output_names: Sequence[Hashable] | None = None,
-        units: str | Sequence[str] | None = None,
+        units: Units = None,
         time_label: str = "Time (s)",
+        true_name: str = "measured",
     ) -> None:
         self.y_true, names = read_outputs(y_true)
         n_outputs = self.y_true.shape[1]
@@ -110,9 +116,11 @@ class SimulationDisplay:
             name: read_outputs(y)[0]
             for name, y in by_name("predictions", predictions).items()
         }
-        if "measured" in self.predictions:
+        self.true_name = true_name
+        if true_name in self.predictions:
             raise ValueError(
-                "`y_pred` must not name a simulation 'measured', which names `y_true`."
+                f"`y_pred` must not name a simulation {true_name!r}, which names "
+                "`y_true`."
             )
         self.bft_, self.n_missing_ = {}, np.isnan(self.y_true).sum(axis=0)
         for name, y_pred in self.predictions.items():
@@ -134,10 +142,7 @@ class SimulationDisplay:
                 )
         given = names if output_names is None else output_names
         self.output_names = names_of("output_names", given, n_outputs, "y")
-        if units is None or isinstance(units, str):
-            self.units: list[str | None] = [units] * n_outputs
-        else:
-            self.units = list(names_of("units", units, n_outputs, ""))
+        self.units = units_of(self.output_names, units)
         self.time_label = time_label
 
     @classmethod
@@ -148,7 +153,8 @@ class SimulationDisplay:
         y_pred: Mapping[str, ArrayLike] | ArrayLike,
         *,
         output_names: Sequence[Hashable] | None = None,
-        units: str | Sequence[str] | None = None,
+        units: Units = None,
+        true_name: str = "measured",
         zoom: tuple[float, float] | None = None,
         ax: Any = None,
     ) -> SimulationDisplay:
@@ -162,7 +168,9 @@ class SimulationDisplay:
         y_pred : dict from str to array-like of the shape of `y_true`, or one of these
         output_names : sequence of str, default=None
             None is the columns of `y_true`, else y1, y2, ...
-        units : str or sequence of str, default=None
+        units : str, sequence of str or dict, default=None
+        true_name : str, default="measured"
+            What `y_true` is, in the legend: "simulated arm", "truth".
         zoom : tuple (t_start, t_stop), default=None
             Part of the record to draw, in seconds; the fit stays that of the whole.
         ax : Axes or array of Axes, default=None
@@ -178,7 +186,14 @@ class SimulationDisplay:
             measurement, or `zoom` holds no samples.
         """
         named = y_pred if isinstance(y_pred, Mapping) else {"simulated": y_pred}
-        display = cls(time, y_true, named, output_names=output_names, units=units)
+        display = cls(
+            time,
+            y_true,
+            named,
+            output_names=output_names,
+            units=units,
+            true_name=true_name,
+        )
         return display.plot(ax, zoom=zoom)
 
     @classmethod
@@ -192,7 +207,7 @@ class SimulationDisplay:
         initial_state: str = "rest",
         name: str = "simulated",
         uncertainty: bool = False,
-        units: str | Sequence[str] | None = None,
+        units: Units = None,
         zoom: tuple[float, float] | None = None,
         ax: Any = None,
     ) -> SimulationDisplay:
@@ -215,7 +230,7 @@ class SimulationDisplay:
             Whether to draw the band of two standard deviations of the outputs without
             noise: those of ``predict(X, return_std=True)``, as `LocalLPVPipeline` and
             `OutputErrorLPV` have it.
-        units : str or sequence of str, default=None
+        units : str, sequence of str or dict, default=None
             Of the outputs.
         zoom : tuple (t_start, t_stop), default=None
             Part of the experiment to draw, in seconds.
@@ -297,15 +312,15 @@ class SimulationDisplay:
         height = 0.5 + (2.9 if n_outputs == 1 else 2.0 * n_outputs)
         self.figure_, axes = axes_grid(ax, n_outputs, 1, height=height, sharex=True)
         self.axes_ = axes[:, 0]
-        self.lines_: dict[str, list[Any]] = {"measured": []}
+        self.lines_: dict[str, list[Any]] = {self.true_name: []}
         self.lines_ |= {name: [] for name in self.predictions}
         title = None
         if zoom is not None:
             title = f"BFT of the whole record, {self.time[0]:g} to {self.time[-1]:g} s"
         for i, one in enumerate(self.axes_):
             lost = self.n_missing_[i]
-            known = f"measured, {lost} missing" if lost else "measured"
-            signals = {"measured": (self.y_true, known)}
+            known = f"{self.true_name}, {lost} missing" if lost else self.true_name
+            signals = {self.true_name: (self.y_true, known)}
             for name, y_pred in self.predictions.items():
                 wide = f" ± {n_std:g} std" if name in self.std else ""
                 fit = f"{name}{wide}: BFT {self.bft_[name][i]:.1f} %"

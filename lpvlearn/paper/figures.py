@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import PolynomialLPV
+from .. import LocalLPVPipeline, PolynomialLPV
 from ..inspection import BodeDisplay, ParameterDisplay, SimulationDisplay
 from ..inspection.drawing import axes_grid, figure_legend, tidy
 from .experiment import PaperExperiment
@@ -19,6 +19,8 @@ from .tables import local_experiments, nearest_model, simulate_sweep
 Array = NDArray[np.float64]
 
 _RATE = "rad/s"  # unit of inputs and outputs
+
+_TRUE = "arm, without noise"  # what the validation data are
 
 _DOTS_PER_INCH = 130  # 1040 pixels wide
 
@@ -124,6 +126,7 @@ def draw_local_responses(experiment: PaperExperiment) -> tuple[Any, str]:
         y.rename(columns=str),
         {"local model": simulated},
         units=_RATE,
+        true_name=_TRUE,
         zoom=(0.0, min(1.0, float(X["time"].iloc[-1]))),
     )
     angle = _nearest_angle(data.theta2, kappa)
@@ -168,12 +171,19 @@ def draw_parameters(experiment: PaperExperiment) -> tuple[Any, str]:
         sets,
         names=names,
         interpolators={"restructured": experiment.lpv["restructured"].interpolator},
+        std=_deviations(experiment.pipeline),
         scheduling_label="κ = cos θ₂",
     ).plot()
     return display.figure_, (
         f"Parameters of the restructured and the analytic models, degree "
         f"{experiment.degree}"
     )
+
+
+def _deviations(pipeline: LocalLPVPipeline) -> dict[str, Any]:
+    """Standard deviations of the restructured parameters, where they are known."""
+    std = pipeline.parameters_std_
+    return {"restructured": std} if np.isfinite(std).all(axis=None) else {}
 
 
 def draw_balanced(experiment: PaperExperiment) -> tuple[Any, str]:
@@ -229,6 +239,7 @@ def draw_sweep(experiment: PaperExperiment, name: str) -> tuple[Any, str]:
         data.y_sweep,
         {f"LPV, {name}": simulate_sweep(experiment.lpv[name], data)},
         units=_RATE,
+        true_name=_TRUE,
     )
     return display.figure_, f"LPV model from the {name} local models on the sweep"
 

@@ -28,6 +28,7 @@ from ..inspection.parameters import ParameterDisplay
 from ..inspection.poles import PoleDisplay
 from ..inspection.residuals import ResidualDisplay
 from ..inspection.simulation import SimulationDisplay
+from ..inspection.uncertainty import UncertaintyDisplay
 from ..metrics.reports import as_shown, fit_report, readable_report
 from ..metrics.scorers import InitialState
 from ..structures.structure import GrayBoxStructure
@@ -240,23 +241,29 @@ class _Page:
         )
 
     def parameters(self, pipeline: Any) -> None:
-        if not self._has_one_variable(pipeline):
-            return
+        if pipeline.operating_points_.shape[1] > 2:
+            return self.note("Drawn for one or two scheduling variables only.")
         names = list(pipeline.parameters_)[:_MOST_FIGURES]
         with self._figures():
             for name in names:
                 with self._axes(f"{name} at the operating points") as ax:
-                    ParameterDisplay.from_estimator(pipeline, names=[name], ax=ax)
-                    ax.set_title(self._named(name), fontsize=9)
+                    ParameterDisplay.from_estimator(
+                        pipeline, names=[name], units=self._units, ax=ax
+                    )
         self._left_out(len(pipeline.parameters_.columns), "parameters")
 
     def responses(self, pipeline: Any) -> None:
         points, lpv = pipeline.operating_points_, pipeline.lpv_
         with self._figures():
-            if lpv.order and self._has_one_variable(pipeline):
+            if lpv.order:
                 caption = "Poles over the scheduling variable; rings: the local models"
-                with self._axes(caption) as ax:
-                    PoleDisplay.from_estimator(pipeline, ax=ax)
+                with self._axes(caption, (1, points.shape[1])) as axes:
+                    PoleDisplay.from_estimator(pipeline, units=self._units, ax=axes)
+            if points.shape[1] <= 2:
+                with self._axes("What the model does not know, over its range") as ax:
+                    UncertaintyDisplay.from_estimator(
+                        pipeline, units=self._units, ax=ax
+                    )
             # the first operating point, the middle one and the last
             for k in sorted({0, len(points) // 2, len(points) - 1}):
                 place = as_shown(pipeline.report_.index[k])
@@ -323,12 +330,6 @@ class _Page:
             "inputs. On the samples of the fit the tests are a little too lenient."
         )
 
-    def _has_one_variable(self, pipeline: Any) -> bool:
-        one = pipeline.operating_points_.shape[1] == 1
-        if not one:
-            self.note("Drawn for one scheduling variable only.")
-        return one
-
     def _left_out(self, n: int, what: str) -> None:
         if n > _MOST_FIGURES:
             self.note(f"The first {_MOST_FIGURES} of {n} {what} are drawn.")
@@ -339,6 +340,8 @@ def _inline(svg: str, prefix: str, caption: str, width: float) -> str:
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg)
+    # equal colour bars are equal images, of equal names
+    svg = re.sub(r'(<image [^>]*?) id="[^"]*"', r"\1", svg)
     for mark in ('id="', "url(#", 'xlink:href="#'):
         svg = svg.replace(mark, mark + prefix)
     label = f'<svg role="img" aria-label="{escape(caption)}"'

@@ -120,3 +120,13 @@ def test_error_display_refuses_another_black_box(pipeline):
         ErrorDisplay.from_estimator(fitted, [1])
     with pytest.raises(ValueError, match="`start` must be 'auto', .* Got 'fit'"):
         ErrorDisplay.from_estimator(fitted, ONE, start="fit")
+
+
+def test_a_pipeline_shows_the_error_at_the_point_nearest_to_kappa(pipeline):
+    display = ErrorDisplay.from_estimator(pipeline, kappa=0.9)
+    own = ErrorDisplay.from_estimator(
+        pipeline.restructurers_[2], pipeline.local_models_[2]
+    )
+    assert_allclose(display.error, own.error)
+    with pytest.raises(ValueError, match="`kappa` must tell at which"):
+        ErrorDisplay.from_estimator(pipeline)

@@ -79,10 +79,10 @@ def test_a_constant_parameter_is_drawn_flat():
     ("kappa", "parameters", "names", "message"),
     [
         (
-            np.ones((4, 2)),
+            np.ones((4, 3)),
             {"a": np.ones((4, 1))},
             None,
-            "needs one scheduling variable",
+            "needs one or two scheduling variables.* Got 3",
         ),
         (KAPPA, {"a": np.ones((3, 1))}, None, r"`parameters\['a'\]` must .*\(4, 1\)"),
         (KAPPA, np.ones((4, 1)), None, "`parameters` must be a dict"),
@@ -117,6 +117,42 @@ def test_bands_are_those_of_the_interpolation(noisy):
         edges = band.get_paths()[0].vertices[:, 1]
         assert_allclose(edges.max(), (mean + 2 * std)[:, k].max())
         assert_allclose(edges.min(), (mean - 2 * std)[:, k].min())
+
+
+def test_bands_are_left_out_on_request_and_where_they_are_not_known(noisy):
+    display = ParameterDisplay.from_estimator(noisy, uncertainty=False)
+    assert not any(ax.collections for ax in display.axes_)
+    known = ParameterDisplay.from_estimator(noisy)
+    assert all(len(ax.collections) == 2 for ax in known.axes_)
+
+
+def test_two_variables_make_maps_with_the_points_in_their_colours():
+    rng = np.random.default_rng(0)
+    kappa = rng.uniform(0, 1, (9, 2))
+    theta = pd.DataFrame({"k": 1 + kappa @ [2, 3], "c": kappa[:, 0]})
+    display = ParameterDisplay.from_parameters(
+        kappa,
+        {"local": theta, "other": theta + 1},
+        interpolator=PolynomialLPV(degree=1),
+        scheduling_label=["load (kg)", "charge"],
+        units={"k": "N/m"},
+    )
+    assert [ax.get_title() for ax in display.axes_] == ["k (N/m)", "c"]
+    first = display.axes_[0]
+    assert (first.get_xlabel(), first.get_ylabel()) == ("load (kg)", "charge")
+    for k, name in enumerate(theta):
+        dots, rings = (display.lines_[which][k] for which in ("local", "other"))
+        assert_allclose(dots.get_offsets(), kappa)
+        assert_allclose(dots.get_array(), theta[name])
+        assert_allclose(rings.get_array(), theta[name] + 1)
+        (surface,) = display.curves_["local"][k : k + 1]
+        low, high = kappa.min(axis=0), kappa.max(axis=0)
+        if name == "k":  # linear, so the map's corners tell it
+            corner = surface.get_array().reshape(60, 60)[0, 0]
+            assert_allclose(corner, 1 + low @ [2, 3])
+            top = surface.get_array().reshape(60, 60)[-1, -1]
+            assert_allclose(top, 1 + high @ [2, 3])
+        assert dots.norm.vmin == rings.norm.vmin == surface.norm.vmin
 
 
 def test_bars_need_the_shape_of_the_parameters():

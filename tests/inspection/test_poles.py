@@ -71,9 +71,37 @@ def test_poles_of_a_pipeline_show_the_local_models_as_rings(pipeline):
     assert_allclose(drawn, local)
 
 
+def test_several_variables_have_a_panel_and_a_colour_bar_each():
+    lpv = lpv_of(3)
+    display = PoleDisplay.from_model(lpv)
+    assert display.kappa.shape == (7**3, 3)
+    assert_array_equal(display.kappa.min(axis=0), [0, 0, 0])
+    assert_array_equal(display.kappa.max(axis=0), [1, 1, 1])
+    assert len(display.axes_) == len(display.colorbars_) == 3
+    labels = [bar.ax.get_ylabel() for bar in display.colorbars_]
+    assert labels == ["κ1", "κ2", "κ3"]
+    for j, ax in enumerate(display.axes_):
+        (points,) = ax.collections
+        assert_array_equal(points.get_array(), np.repeat(display.kappa[:, j], 2))
+        drawn = points.get_offsets() @ [1, 1j]
+        assert_allclose(drawn, lpv.frozen_poles(display.kappa).ravel())
+
+
+def test_the_label_of_a_colour_bar_is_within_the_picture():
+    long = "temperature of the bearing at the far end (degrees Celsius)"
+    display = PoleDisplay.from_model(lpv_of(1), scheduling_label=long)
+    figure = display.figure_
+    figure.draw_without_rendering()
+    label = display.colorbars_[0].ax.yaxis.label.get_window_extent()
+    assert figure.bbox.x0 <= label.x0 and label.x1 <= figure.bbox.x1
+
+
+def test_real_poles_are_not_drawn_by_their_rounding():
+    display = PoleDisplay([0.0, 1.0], [[-1 + 1e-17j], [-2 - 1e-17j]]).plot()
+    assert display.ax_.get_ylim()[1] > 0.1
+
+
 def test_pole_errors_teach():
-    with pytest.raises(ValueError, match="needs one scheduling variable.* Got 2"):
-        PoleDisplay.from_model(lpv_of(2))
     with pytest.raises(ValueError, match="`model` must be an LPVStateSpace"):
         PoleDisplay.from_model(spring(0.0))
     with pytest.raises(ValueError, match=r"`poles` must have shape \(1, order\)"):

@@ -158,3 +158,17 @@ def test_bands_that_are_not_known_are_refused(noisy, tables):
     for std in ({"other": y}, {"model": np.ones(2)}):
         with pytest.raises(ValueError, match="`std` must have names of simulations"):
             SimulationDisplay(time, y, {"model": y}, std=std)
+
+
+def test_what_was_not_measured_is_not_called_so():
+    time = np.arange(5.0)
+    display = SimulationDisplay.from_predictions(
+        time, time, {"model": time}, true_name="truth", units={"y1": "m"}
+    )
+    assert list(display.lines_) == ["truth", "model"]
+    legend = display.axes_[0].get_legend().get_texts()[0].get_text()
+    assert (legend, display.axes_[0].get_ylabel()) == ("truth", "y1 (m)")
+    with pytest.raises(ValueError, match="must not name a simulation 'truth'"):
+        SimulationDisplay.from_predictions(
+            time, time, {"truth": time}, true_name="truth"
+        )

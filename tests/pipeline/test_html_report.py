@@ -76,7 +76,8 @@ def test_page_stands_alone_and_tells_what_the_tables_tell(fitted, spring, tmp_pa
         assert words in text
     assert any("position (mm)" in words for words in page.texts)
     figures = [words for words in page.attributes if words[:2] == ("svg", "role")]
-    assert len(figures) == 3 + 1 + 3 + 1 + 1  # parameters, poles, gains, sweep, errors
+    # parameters, poles, what is not known, gains, sweep, errors
+    assert len(figures) == 3 + 1 + 1 + 3 + 1 + 1
 
 
 def test_without_a_table_it_tells_of_the_fit_alone(fitted, tmp_path):
@@ -125,7 +126,8 @@ def test_several_inputs_outputs_and_scheduling_variables(tmp_path):
     y = np.vstack(outputs)
     pipeline.fit(X, y)
     text = page_of(pipeline, tmp_path / "report.html", X, y)[1]
-    assert "Drawn for one scheduling variable only." in text
+    assert "Drawn for" not in text
+    assert text.count("Poles over the scheduling variable") == 2  # name and caption
 
 
 def test_its_code_makes_the_same_model(fitted, spring, tmp_path, monkeypatch):
