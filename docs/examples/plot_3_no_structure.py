@@ -117,6 +117,7 @@ display = SimulationDisplay.from_predictions(
         "canonical": canonical.lpv_.simulate(u, kappa, STEP),
     },
     units="m",
+    true_name="truth",
 )
 
 # %%

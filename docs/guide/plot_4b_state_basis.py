@@ -79,6 +79,7 @@ display = SimulationDisplay.from_predictions(
         for name, model in models.items()
     },
     units="rad/s",
+    true_name="truth",
     output_names=["angular velocity"],
 )
 

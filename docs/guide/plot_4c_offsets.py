@@ -83,7 +83,11 @@ simulated = {
     "none": without.predict(data.X_large),
 }
 display = SimulationDisplay.from_predictions(
-    data.X_large["time"], data.y_large, simulated, units="rad"
+    data.X_large["time"],
+    data.y_large,
+    simulated,
+    units="rad",
+    true_name="disc, without noise",
 )
 {name: round(bft_score(data.y_large, y), 1) for name, y in simulated.items()}
 

@@ -67,7 +67,11 @@ float(np.abs(pipeline.predict(data.X_sweep) - y).max())
 # speeds for which a collection of linear models need not be valid.
 
 display = SimulationDisplay.from_predictions(
-    data.X_sweep["time"], data.y_sweep, {"LPV": y}, units="rad/s"
+    data.X_sweep["time"],
+    data.y_sweep,
+    {"LPV": y},
+    units="rad/s",
+    true_name="arm, without noise",
 )
 
 # %%

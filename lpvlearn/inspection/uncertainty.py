@@ -110,8 +110,8 @@ class UncertaintyDisplay:
         pipeline : fitted LocalLPVPipeline
             With one or two scheduling variables.
         omega : array-like of shape (n_freq,), default=None
-            Angular frequencies to look at, rad/s. None: around the poles of the local
-            models.
+            Angular frequencies to look at, rad/s. None: around the poles of the model
+            at each scheduling value.
         units : dict from str to str, default=None
             Of the scheduling variables, by name.
         ax : Axes, default=None
@@ -127,10 +127,8 @@ class UncertaintyDisplay:
         """
         pipeline = fitted_pipeline(pipeline, "local_models_")
         lpv, points = pipeline.lpv_, pipeline.operating_points_
-        frequencies = frequency_axis(pipeline.local_models_) if omega is None else omega
-        frequencies = np.asarray(frequencies, dtype=float)
         error = [
-            _relative(lpv.at(place), model, frequencies)
+            _relative(lpv.at(place), model, omega)
             for place, model in zip(points, pipeline.local_models_, strict=True)
         ]
         known: dict[str, Any] = {}
@@ -141,11 +139,7 @@ class UncertaintyDisplay:
                 np.linspace(low, high, size) for low, high in lpv.scheduling_range.T
             ]
             grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, n)
-            std = [
-                _peak(lpv.frequency_response_std(place, frequencies))
-                / _peak(lpv.at(place).frequency_response(frequencies))
-                for place in grid
-            ]
+            std = [_deviation(lpv, place, omega) for place in grid]
             known = {"grid": grid, "std": std}
         labels = scheduling_labels(pipeline, n, units)
         return cls(points, error, **known, scheduling_label=labels).plot(ax)
@@ -241,11 +235,19 @@ def _rows(
 
 def _peak(response: NDArray[Any]) -> float:
     """Largest singular value over frequency."""
-    size = np.abs(response) if np.isrealobj(response) else response
-    return float(np.linalg.norm(size, 2, axis=(1, 2)).max())
+    return float(np.linalg.norm(response, 2, axis=(1, 2)).max())
 
 
-def _relative(one: StateSpace, other: StateSpace, omega: Array) -> float:
+def _relative(one: StateSpace, other: StateSpace, omega: ArrayLike | None) -> float:
     """Distance of two responses, relative to the first."""
-    mine, its = (model.frequency_response(omega) for model in (one, other))
+    axis = frequency_axis([one, other]) if omega is None else np.asarray(omega, float)
+    mine, its = (model.frequency_response(axis) for model in (one, other))
     return _peak(mine - its) / _peak(mine)
+
+
+def _deviation(lpv: Any, place: Array, omega: ArrayLike | None) -> float:
+    """Standard deviation of a frozen response, relative to the response."""
+    frozen = lpv.at(place)
+    axis = frequency_axis([frozen]) if omega is None else np.asarray(omega, float)
+    std = np.abs(lpv.frequency_response_std(place, axis))
+    return _peak(std) / _peak(frozen.frequency_response(axis))
