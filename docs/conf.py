@@ -13,6 +13,7 @@ from sphinx.ext import autosummary
 from sphinx_gallery.sorting import FileNameSortKey
 
 sys.path.insert(0, str(Path(__file__).parent))
+from landing import draw_landing_picture
 from messages import write_page
 
 project = "lpvlearn"
@@ -111,7 +112,35 @@ def make_restructured_text(
             lines[i] = "".join(parts)
 
 
+def mend_links_of_sources(
+    app: Any, pagename: str, template: str, context: dict[str, Any], doctree: Any
+) -> None:
+    """Links from sources to their documentation, by the name that stands there.
+
+    viewcode takes one module for all that a file defines; a file's classes may be
+    documented under a package, and its functions at the top.
+    """
+
+    def mended(link: re.Match[str]) -> str:
+        page, anchor = link.groups()
+        short = page.rsplit(".", 1)[-1]
+        _, found, member = anchor.partition(f".{short}")
+        return f'generated/{page}.html#{page if found else anchor}{member}"'
+
+    if pagename.startswith("_modules/"):
+        context["body"] = re.sub(
+            r'generated/([\w.]+)\.html#([\w.]+)"', mended, context["body"]
+        )
+
+
+def make_pages(app: Any) -> None:
+    """What is made from the code before Sphinx reads: messages, the first picture."""
+    write_page()
+    draw_landing_picture()
+
+
 def setup(app: Any) -> None:
-    """Register the hook, after numpydoc's own, and make the page of messages."""
+    """Register the hooks, those of docstrings after numpydoc's own."""
     app.connect("autodoc-process-docstring", make_restructured_text, priority=900)
-    app.connect("builder-inited", lambda app: write_page())
+    app.connect("builder-inited", make_pages, priority=100)  # before the gallery
+    app.connect("html-page-context", mend_links_of_sources)

@@ -15,10 +15,10 @@ A model is as good as its simulation of data that it has never seen.
 #
 # .. math::
 #
-#    \mathrm{BFT}_k = 100 \max\!\Big(1 - \frac{\|y_k - \hat y_k\|}{\|y_k - \bar y_k\|},
-#    0\Big), \qquad
-#    \mathrm{VAF}_k = 100 \max\!\Big(1 - \frac{\mathrm{var}(y_k - \hat y_k)}
-#    {\mathrm{var}(y_k)}, 0\Big).
+#    \mathrm{BFT}_k &= 100 \max\!\Big(1 - \frac{\|y_k - \hat y_k\|}{\|y_k - \bar y_k\|},
+#    0\Big) \\
+#    \mathrm{VAF}_k &= 100 \max\!\Big(1 - \frac{\mathrm{var}(y_k - \hat y_k)}
+#    {\mathrm{var}(y_k)}, 0\Big)
 #
 # BFT is the stricter: an error of 10 % of the signal is a BFT of 90, but a VAF of 99.
 # BFT is the *fit* of MATLAB's ``compare``. ``score`` of an estimator is :math:`R^2`, as
