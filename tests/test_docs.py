@@ -87,6 +87,22 @@ def test_what_users_get_to_read_is_found_on_the_page(messages, complaint):
         assert any(pattern.fullmatch(text) for pattern in patterns), text
 
 
+def test_links_that_lead_nowhere_are_found(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(DOCS)
+    from check_links import dead_links
+
+    one, two = tmp_path / "one.html", tmp_path / "sub" / "two.html"
+    two.parent.mkdir()
+    one.write_text('<a href="sub/two.html#here"></a><a href="https://x.org/y"></a>')
+    two.write_text('<p id="here"></p><a href="../one.html"></a><a href="#here"></a>')
+    assert dead_links(tmp_path) == []
+    one.write_text('<a href="sub/two.html#there"></a><img src="three.png">')
+    assert dead_links(tmp_path) == [
+        "one.html: sub/two.html#there",
+        "one.html: three.png",
+    ]
+
+
 def how_to(page):
     """What a page computes, by the names of its variables."""
     return runpy.run_path(str(DOCS / "how_to" / f"plot_{page}.py"))

@@ -20,7 +20,9 @@ from .drawing import (
     named,
     names_of,
     tidy,
+    units_of,
     whole,
+    with_unit,
 )
 from .fitted import channel_names, check_model, models_of, unwrapped, with_others
 from .frequency import (
@@ -56,6 +58,8 @@ class BodeDisplay:
         square.
     output_names, input_names : sequence of str, default=None
         None is y1, y2, ... and u1, u2, ...
+    units : dict from str to str, default=None
+        Units of outputs and inputs, by name.
     frequency_label : str, default="Frequency (rad/s)"
 
     Attributes
@@ -87,6 +91,7 @@ class BodeDisplay:
         std: Mapping[str, ArrayLike] | None = None,
         output_names: Sequence[Hashable] | None = None,
         input_names: Sequence[Hashable] | None = None,
+        units: Mapping[str, str] | None = None,
         frequency_label: str = "Frequency (rad/s)",
     ) -> None:
         self.frequency_label = frequency_label
@@ -112,6 +117,7 @@ class BodeDisplay:
         self.std = self._check_std(std)
         self.output_names = names_of("output_names", output_names, first[1], "y")
         self.input_names = names_of("input_names", input_names, first[2], "u")
+        self.units = by_name("units", units)
 
     def _check_std(self, std: Mapping[str, ArrayLike] | None) -> dict[str, Array]:
         found = {}
@@ -144,6 +150,7 @@ class BodeDisplay:
         std: Mapping[str, ArrayLike] | None = None,
         output_names: Sequence[Hashable] | None = None,
         input_names: Sequence[Hashable] | None = None,
+        units: Mapping[str, str] | None = None,
         phase: bool = False,
         ax: Any = None,
     ) -> BodeDisplay:
@@ -162,6 +169,8 @@ class BodeDisplay:
             Standard deviations of the responses at `omega`, which is then needed;
             as in the constructor.
         output_names, input_names : sequence of str, default=None
+        units : dict from str to str, default=None
+            Units of outputs and inputs, by name.
         phase : bool, default=False
             Whether to draw the phases below the magnitudes.
         ax : Axes or array of Axes, default=None
@@ -198,6 +207,7 @@ class BodeDisplay:
         names: dict[str, Any] = {
             "output_names": output_names,
             "input_names": input_names,
+            "units": units,
             "frequency_label": frequency_label(list(models.values())),
         }
         return cls(grid, responses, std=std, **names).plot(ax, phase=phase)
@@ -211,6 +221,7 @@ class BodeDisplay:
         others: Mapping[str, StateSpace] | None = None,
         omega: ArrayLike | None = None,
         uncertainty: bool = False,
+        units: Mapping[str, str] | None = None,
         phase: bool = False,
         ax: Any = None,
     ) -> BodeDisplay:
@@ -231,6 +242,8 @@ class BodeDisplay:
             Whether to draw the band of two standard deviations, which `SubspaceLTI`
             knows of its model, and a pipeline of the interpolated one: that of the
             coefficients (``lpv_.covariance``), without the model's own error.
+        units : dict from str to str, default=None
+            Units of outputs and inputs, by name.
         phase : bool, default=False
         ax : Axes or array of Axes, default=None
 
@@ -254,7 +267,7 @@ class BodeDisplay:
             std = _uncertainty_of(unwrapped(estimator), own, kappa, omega)
         names = channel_names(unwrapped(estimator))
         return cls.from_models(
-            models, omega=omega, std=std, phase=phase, ax=ax, **names
+            models, omega=omega, std=std, units=units, phase=phase, ax=ax, **names
         )
 
     def plot(
@@ -324,12 +337,19 @@ class BodeDisplay:
             ax.set_xscale("log")
             ax.set_xlim(self.omega[0], self.omega[-1])
             tidy(ax)
-        for j, name in enumerate(self.input_names):
-            if len(self.input_names) > 1:
+        inputs, outputs = (
+            [
+                with_unit(*pair)
+                for pair in zip(names, units_of(names, self.units), strict=True)
+            ]
+            for names in (self.input_names, self.output_names)
+        )
+        for j, name in enumerate(inputs):
+            if len(inputs) > 1 or self.units:
                 axes[0, j].set_title(f"from {name}", fontsize=9)
             axes[-1, j].set_xlabel(self.frequency_label)
-        for i, name in enumerate(self.output_names):
-            several = len(self.output_names) > 1 or len(self.input_names) > 1
+        for i, name in enumerate(outputs):
+            several = len(outputs) > 1 or len(inputs) > 1 or self.units
             prefix = f"to {name}\n" if several else ""
             self.axes_[i, 0].set_ylabel(f"{prefix}Magnitude (dB)")
             top = max(ax.dataLim.y1 for ax in self.axes_[i])

@@ -44,7 +44,7 @@ def plot_overview(
         Label of the experiment to simulate; None is the first in the table.
     initial_state : {"rest", "estimate"}, default="rest"
     units : dict from str to str, default=None
-        Units of outputs, parameters and scheduling variables, by name.
+        Units of inputs, outputs, parameters and scheduling variables, by name.
 
     Returns
     -------
@@ -102,7 +102,11 @@ def plot_overview(
     UncertaintyDisplay.from_estimator(pipeline, units=units, ax=axes[2])
     uncertainty = lpv.covariance is not None
     BodeDisplay.from_estimator(
-        pipeline, kappa=np.asarray(middle), uncertainty=uncertainty, ax=axes[3]
+        pipeline,
+        kappa=np.asarray(middle),
+        uncertainty=uncertainty,
+        units=units,
+        ax=axes[3],
     )
     if X is not None:
         SimulationDisplay.from_estimator(

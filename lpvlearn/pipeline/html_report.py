@@ -269,7 +269,9 @@ class _Page:
                 place = as_shown(pipeline.report_.index[k])
                 shape = (lpv.n_outputs, lpv.n_inputs)
                 with self._axes(f"Gain at operating point {place}", shape) as axes:
-                    BodeDisplay.from_estimator(pipeline, kappa=points[k], ax=axes)
+                    BodeDisplay.from_estimator(
+                        pipeline, kappa=points[k], units=self._units, ax=axes
+                    )
 
     def simulations(
         self, pipeline: Any, X: Any, y: Any, initial_state: InitialState

@@ -225,3 +225,13 @@ def test_bode_of_a_pipeline_asks_for_the_scheduling_value(pipeline):
         BodeDisplay.from_estimator(pipeline)
     with pytest.raises(ValueError, match=r"`kappa` must hold 1 scheduling value"):
         BodeDisplay.from_estimator(pipeline, kappa=[0.0, 1.0])
+
+
+def test_a_pipeline_names_its_signals_and_units_stand_with_them(pipeline):
+    units = {"u": "N", "angle": "rad"}
+    display = BodeDisplay.from_estimator(pipeline, kappa=0.0, units=units)
+    ax = display.axes_[0, 0]
+    assert ax.get_title() == "from u (N)"
+    assert ax.get_ylabel() == "to angle (rad)\nMagnitude (dB)"
+    alone = BodeDisplay.from_estimator(pipeline, kappa=0.0).axes_[0, 0]
+    assert (alone.get_title(), alone.get_ylabel()) == ("", "Magnitude (dB)")
