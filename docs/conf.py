@@ -35,6 +35,7 @@ extensions = [
 ]
 templates_path = ["_templates"]
 exclude_patterns = ["_build", "start", "guide", "how_to", "examples"]
+smartquotes = False  # messages are found by the characters they have
 html_static_path = ["_static"]
 html_css_files = ["lpvlearn.css"]
 
@@ -86,7 +87,7 @@ html_theme_options = {
     "footer_end": [],
     "pygments_light_style": "default",
 }
-html_sidebars = {"index": [], "how_good": []}
+html_sidebars = {page: [] for page in ("index", "how_good", "messages", "glossary")}
 html_context = {"default_mode": "light"}
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True

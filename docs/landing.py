@@ -33,7 +33,7 @@ def draw_landing_picture() -> None:
         time="time",
     ).fit(data.X, y)
     figure, axes = plt.subplots(
-        1, 3, figsize=(11, 3.1), layout="constrained", width_ratios=[1, 0.8, 1.2]
+        1, 3, figsize=(9, 2.7), layout="constrained", width_ratios=[1, 0.8, 1.2]
     )
     points = pipeline.operating_points_[:, 0]
     for k, (_, rows) in enumerate(data.X.groupby("run", sort=False)):
@@ -65,10 +65,10 @@ def draw_landing_picture() -> None:
     axes[2].legend(frameon=False, fontsize=9, ncols=2, loc="lower left")
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)
-        ax.title.set_fontsize(11)
+        ax.title.set_fontsize(10.5)
     axes[0].spines["left"].set_visible(False)
     axes[2].spines["left"].set_visible(False)
-    figure.savefig(TARGET, dpi=150)
+    figure.savefig(TARGET, dpi=180)
     plt.close(figure)
 
 
