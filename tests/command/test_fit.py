@@ -28,7 +28,7 @@ def test_results_are_those_of_the_spring(folder):
     assert "Simulation of sweep.csv, from rest" in text
     page = (folder / "spring" / "report.html").read_text()
     assert "position (m)" in page and "k (1/s2)" in page
-    assert len(list((folder / "spring" / "figures").glob("*.svg"))) == 9
+    assert len(list((folder / "spring" / "figures").glob("*.svg"))) == 10
     assert [path for path in folder.iterdir() if path.name.startswith(".")] == []
 
 
