@@ -100,9 +100,10 @@ class _Module:
         """Expressions that are told, their texts, and what they are told as."""
         for node in ast.walk(self._tree):
             if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-                if node.exc.args:
+                kind = ast.unparse(node.exc.func)
+                if node.exc.args and kind != "SystemExit":
                     told = node.exc.args[0]
-                    yield told, self._texts(told), ast.unparse(node.exc.func)
+                    yield told, self._texts(told), kind
             elif isinstance(node, ast.Call):
                 name = getattr(node.func, "id", getattr(node.func, "attr", ""))
                 if name in _FUNNELS and len(node.args) > _FUNNELS[name]:

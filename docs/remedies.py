@@ -70,6 +70,8 @@ REMEDIES = {
     "… lacks the column(s)": "Name the columns as in the table of the fit.",
     "… lacks outputs to compare with": "Give a table with the outputs of the fit.",
     "--output …: there is": "Take another name.",
+    "--output …: it cannot be written": "Make room on the disk, or take a folder that "
+    "you may write to.",
     "there is no such file": "Check the path; it counts from the current folder.",
     "…: there is no such file": "Check the path; it counts from the current folder.",
     "a structure of the form": "Leave out what it does not take.",
