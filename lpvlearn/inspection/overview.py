@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .bode import BodeDisplay
-from .drawing import WIDTH
+from .drawing import WIDTH, by_name
 from .fitted import fitted_pipeline
 from .parameters import ParameterDisplay
 from .poles import PoleDisplay
@@ -71,6 +71,7 @@ def plot_overview(
     from matplotlib import pyplot as plt
 
     pipeline = fitted_pipeline(pipeline, "parameters_")
+    units = by_name("units", units)
     lpv, points = pipeline.lpv_, pipeline.operating_points_
     names = list(pipeline.parameters_)[:_MOST_PARAMETERS]
     maps = points.shape[1] == 2

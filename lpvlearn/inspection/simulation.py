@@ -116,7 +116,7 @@ class SimulationDisplay:
             name: read_outputs(y)[0]
             for name, y in by_name("predictions", predictions).items()
         }
-        self.true_name = true_name
+        self.true_name = true_name = str(true_name)
         if true_name in self.predictions:
             raise ValueError(
                 f"`y_pred` must not name a simulation {true_name!r}, which names "

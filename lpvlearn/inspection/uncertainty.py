@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..data.experiments import as_numbers
 from ..models.frequencies import frequency_axis
 from ..models.statespace import StateSpace
 from .drawing import (
@@ -16,11 +17,14 @@ from .drawing import (
     axes_grid,
     colour_bar,
     colour_scale,
+    drawable,
+    labels_of,
     legend_above,
     plain_ticks,
     tidy,
 )
 from .fitted import fitted_pipeline, scheduling_labels
+from .frequency import check_frequencies
 
 Array = NDArray[np.float64]
 
@@ -54,7 +58,7 @@ class UncertaintyDisplay:
         one running fastest.
     std : array-like of shape (n_grid,), default=None
         Relative standard deviations.
-    scheduling_label : sequence of str, default=("κ",)
+    scheduling_label : str or sequence of str, default="κ"
 
     Attributes
     ----------
@@ -80,7 +84,7 @@ class UncertaintyDisplay:
         *,
         grid: ArrayLike | None = None,
         std: ArrayLike | None = None,
-        scheduling_label: Sequence[str] = ("κ",),
+        scheduling_label: str | Sequence[str] = "κ",
     ) -> None:
         self.kappa, self.error = _rows("kappa", "error", kappa, error)
         self.grid, self.std = self.kappa[:0], self.error[:0]
@@ -92,7 +96,13 @@ class UncertaintyDisplay:
                 f"Got {self.kappa.shape[1]}. See the column interpolation_error of "
                 "`report_` for the errors at the operating points."
             )
-        self.scheduling_labels = list(scheduling_label)
+        n_scheduling = self.kappa.shape[1]
+        if self.grid.shape[1] != n_scheduling:
+            raise ValueError(
+                f"`grid` must have the {n_scheduling} column(s) of `kappa`. Got "
+                f"{self.grid.shape[1]}."
+            )
+        self.scheduling_labels = labels_of(scheduling_label, n_scheduling)
 
     @classmethod
     def from_estimator(
@@ -127,6 +137,7 @@ class UncertaintyDisplay:
         """
         pipeline = fitted_pipeline(pipeline, "local_models_")
         lpv, points = pipeline.lpv_, pipeline.operating_points_
+        omega = None if omega is None else check_frequencies(omega)
         error = [
             _relative(lpv.at(place), model, omega)
             for place, model in zip(points, pipeline.local_models_, strict=True)
@@ -163,6 +174,7 @@ class UncertaintyDisplay:
         tidy(one)
         one.set_xlabel(self.scheduling_labels[0])
         (self._draw_map if self.kappa.shape[1] == 2 else self._draw_curve)(one)
+        drawable(self.figure_)
         return self
 
     def _draw_curve(self, ax: Any) -> None:
@@ -223,7 +235,7 @@ class UncertaintyDisplay:
 def _rows(
     name: str, of: str, places: ArrayLike, values: ArrayLike
 ) -> tuple[Array, Array]:
-    kappa, found = np.asarray(places, float), np.asarray(values, float)
+    kappa, found = as_numbers(name, places), as_numbers(of, values)
     kappa = kappa[:, None] if kappa.ndim < 2 else kappa
     if found.shape != kappa.shape[:1] or not len(found):
         raise ValueError(
@@ -238,16 +250,16 @@ def _peak(response: NDArray[Any]) -> float:
     return float(np.linalg.norm(response, 2, axis=(1, 2)).max())
 
 
-def _relative(one: StateSpace, other: StateSpace, omega: ArrayLike | None) -> float:
+def _relative(one: StateSpace, other: StateSpace, omega: Array | None) -> float:
     """Distance of two responses, relative to the first."""
-    axis = frequency_axis([one, other]) if omega is None else np.asarray(omega, float)
+    axis = frequency_axis([one, other]) if omega is None else omega
     mine, its = (model.frequency_response(axis) for model in (one, other))
     return _peak(mine - its) / _peak(mine)
 
 
-def _deviation(lpv: Any, place: Array, omega: ArrayLike | None) -> float:
+def _deviation(lpv: Any, place: Array, omega: Array | None) -> float:
     """Standard deviation of a frozen response, relative to the response."""
     frozen = lpv.at(place)
-    axis = frequency_axis([frozen]) if omega is None else np.asarray(omega, float)
+    axis = frequency_axis([frozen]) if omega is None else omega
     std = np.abs(lpv.frequency_response_std(place, axis))
     return _peak(std) / _peak(frozen.frequency_response(axis))

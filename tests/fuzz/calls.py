@@ -634,6 +634,17 @@ def display_calls(w):
         drawing(i.SingularValueDisplay.from_estimator),
         {"subspace": w.subspace, "n_shown": 3},
     )
+    yield "UncertaintyDisplay", constructed(i.UncertaintyDisplay), {
+        "kappa": w.kappa, "error": w.kappa[:, 0] + 0.1, "grid": w.kappa,
+        "std": w.kappa[:, 0] + 0.2, "scheduling_label": "s",
+    }  # fmt: skip
+    yield "UncertaintyDisplay.from_estimator", drawing(
+        i.UncertaintyDisplay.from_estimator
+    ), {"pipeline": w.pipeline, "omega": w.omega, "units": {"kappa": "m"}}  # fmt: skip
+    yield "plot_overview", i.plot_overview, {
+        "pipeline": w.pipeline, "X": w.X, "y": w.y, "experiment": "p0r0",
+        "units": {"position": "m"},
+    }  # fmt: skip
 
 
 # Seconds of a valid call are behind the weights: all groups cost about as much.
@@ -649,7 +660,11 @@ GROUPS = (
     (dataset_calls, 0.7),
     (display_calls, 0.2),
 )
-WEIGHTS = {"LocalLPVPipeline.to_html_report": 0.0, "suggest_operating_point": 0.05}
+WEIGHTS = {
+    "LocalLPVPipeline.to_html_report": 0.0,
+    "plot_overview": 0.0,
+    "suggest_operating_point": 0.05,
+}
 
 # Gains at a pole and errors of unstable models are infinite, missing samples are NaN.
 OPEN = {
