@@ -22,6 +22,8 @@ ABOUT = {
     "The command": "All options: :ref:`command`, or ``lpvlearn fit --help``.",
 }
 
+_CELL = "A cell of a template holds a sum of names with factors, as ``2*k - 1``."
+
 REMEDIES = {
     # -- warnings
     "`y` has the row labels of X in another order": "Nothing is wrong if the labels "
@@ -91,6 +93,13 @@ REMEDIES = {
     "`start` has": "Fit on the columns that the model was made for.",
     "the model is not minimal": "Some states are not reached or not seen: lower "
     "`order`.",
+    "… by finite values": "Leave that value out of the range, or interpolate by "
+    "another form: a rational one may have a pole there.",
+    "… is out of place": _CELL,
+    "it ends early": _CELL,
+    "… characters, more than": _CELL,
+    "nested more than": _CELL,
+    "division by zero": _CELL,
     "not a number": "Values of parameters are numbers.",
     "not affine": "A template holds sums of parameters with factors; products and "
     "functions of them go into a function.",
