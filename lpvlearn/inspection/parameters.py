@@ -472,6 +472,8 @@ def _names_and_choice(
                 f"`names` must be among the parameters {', '.join(known[:20])}. Got "
                 f"{name!r}."
             )
+    if not wanted:
+        raise ValueError("`names` must name at least one parameter. Got none.")
     return known, [known.index(name) for name in wanted]
 
 

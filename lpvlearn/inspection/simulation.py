@@ -383,7 +383,7 @@ def _rows_of(estimator: Any, X: Any, label: Hashable) -> NDArray[np.intp]:
             f"experiment. Got {label!r}."
         )
     labels = column.labels([rows[0] for rows in groups])
-    if label not in labels:
+    if not isinstance(label, Hashable) or label not in labels:
         shown = ", ".join(map(repr, labels[:10]))
         shown += ", ..." if len(labels) > 10 else ""
         raise ValueError(
