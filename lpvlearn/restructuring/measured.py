@@ -7,12 +7,14 @@ similarity transformations start from.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..systems.hinf_norm import PeakSet
 from ..systems.sampling import d2c_tustin
-from ..validation import real_array, shown
+from ..validation import real_array, shown, whole_number
 from .error_system import (
     ErrorSystem,
     Structure,
@@ -28,6 +30,9 @@ Complex = NDArray[np.complex128]
 # Relative difference of measured neighbours that count as equally high: at an optimum
 # two of them often are, up to what the search has still to gain.
 _BESIDE = 1e-3
+
+# A coherence is estimated from few averages: never nearer to one than that
+_LEAST_INCOHERENCE = 1e-6
 
 # Least decay of a realised pole, relative to its size and to the highest frequency
 _LEAST_DAMPING, _LEAST_RATE = 1e-4, 1e-9
@@ -153,7 +158,49 @@ def read_frequency_data(
     if not np.isfinite(G).all():
         k = int(np.argwhere(~np.isfinite(G))[0, 0])
         raise ValueError(f"`frf` must be finite. Got a NaN or infinity in row {k}.")
+    if not G.any():
+        raise ValueError(
+            "`frf` must not be zero at all frequencies: nothing tells the parameters "
+            "then. Got zeros only."
+        )
     return grid, G.reshape(len(grid), n_outputs, n_inputs).astype(complex)
+
+
+def read_noise(
+    noise: ArrayLike | None, coherence: ArrayLike | None, n_averages: Any, G: Complex
+) -> Array | None:
+    """Standard deviations of the entries of a response `G`; None where none are told.
+
+    Of the whole complex error: its real part has half of the variance. From a coherence
+    of so many independent averages, ``|G| sqrt((1 - c) / (c n))``.
+    """
+    if noise is None and coherence is None:
+        return None
+    if noise is not None and coherence is not None:
+        raise ValueError(
+            "`noise` and `coherence` tell the same thing: give one of them. Got both."
+        )
+    name, given = ("noise", noise) if coherence is None else ("coherence", coherence)
+    values = real_array(name, given)
+    shape = values.shape
+    if values.ndim == 1:
+        values = values[:, None, None]
+    k, p, m = G.shape
+    known = values.ndim == 3 and values.shape in ((k, 1, 1), G.shape)
+    most = np.inf if coherence is None else 1.0
+    if not known or not ((values > 0) & (values <= most) & np.isfinite(values)).all():
+        rule = "positive" if coherence is None else "above 0, and 1 at most"
+        raise ValueError(
+            f"`{name}` must have shape ({k},) or ({k}, {p}, {m}), with values {rule}. "
+            f"Got shape {shape}."
+        )
+    if coherence is not None:
+        whole_number("n_averages", n_averages, 1)
+        open_ = np.maximum(1.0 - values, _LEAST_INCOHERENCE)
+        # of an entry that happens to be small, as that of its size over frequency
+        size = np.maximum(np.abs(G), _LEAST_INCOHERENCE * np.abs(G).max())
+        values = size * np.sqrt(open_ / values / n_averages)
+    return np.broadcast_to(values, G.shape)
 
 
 def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
