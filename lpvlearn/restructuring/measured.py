@@ -261,28 +261,39 @@ def stable_realization(omega: Array, G: Complex, order: int) -> Target | None:
 
     Else with unstable poles reflected, and B and D fitted to the response anew, as in
     vector fitting: noise, or an order that the system does not have, puts poles of a
-    realisation to the right. None where that leaves no stable model.
+    realisation to the right. Of a lower order where the data are too few, and lags of
+    the middle frequency where there is none; None for order 0 alone.
     """
-    model = realize_response(omega, G, order)
-    if model is None:
+    for n in range(order, 0, -1):
+        model = realize_response(omega, G, n)
+        if model is None:
+            continue
+        poles, V = np.linalg.eig(model.A)
+        least = _LEAST_DAMPING * np.abs(poles) + _LEAST_RATE * float(omega.max())
+        if (poles.real <= -least).all():
+            return model
+        decay = np.maximum(np.abs(poles.real), least)
+        try:
+            A = np.real((V * (1j * poles.imag - decay)) @ np.linalg.inv(V))
+        except np.linalg.LinAlgError:  # poles that coincide
+            continue
+        if (np.linalg.eigvals(A).real < 0).all():
+            return _with_poles(omega, G, A, model.C)
+    if order == 0:
         return None
-    poles, V = np.linalg.eig(model.A)
-    least = _LEAST_DAMPING * np.abs(poles) + _LEAST_RATE * float(omega.max())
-    if (poles.real <= -least).all():
-        return model
-    decay = np.maximum(np.abs(poles.real), least)
-    try:
-        A = np.real((V * (1j * poles.imag - decay)) @ np.linalg.inv(V))
-    except np.linalg.LinAlgError:  # poles that coincide
-        return None
-    if not (np.linalg.eigvals(A).real < 0).all():
-        return None
+    p, positive = G.shape[1], omega[omega > 0]
+    rate = float(np.exp(0.5 * np.log(positive.min() * positive.max())))
+    return _with_poles(omega, G, -rate * np.eye(p), np.eye(p))
+
+
+def _with_poles(omega: Array, G: Complex, A: Array, C: Array) -> Target:
+    """The model of least squares with that A and C."""
     (k, p, m), n = G.shape, len(A)
     X = resolvent(A, laplace_variable(omega, None)[0])
-    left = np.concatenate([model.C @ X, np.broadcast_to(np.eye(p), (k, p, p))], axis=2)
+    left = np.concatenate([C @ X, np.broadcast_to(np.eye(p), (k, p, p))], axis=2)
     flat, rhs = left.reshape(k * p, n + p), G.reshape(k * p, m)
     rows, target = np.vstack([flat.real, flat.imag]), np.vstack([rhs.real, rhs.imag])
     size = np.linalg.norm(rows, axis=0)
     size = np.where(size > 0, size, 1.0)
     BD = np.linalg.lstsq(rows / size, target, rcond=None)[0] / size[:, None]
-    return Target(A, BD[:n], model.C, BD[n:])
+    return Target(A, BD[:n], C, BD[n:])

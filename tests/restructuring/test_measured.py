@@ -261,3 +261,13 @@ def test_errors_count_in_standard_deviations_of_the_noise():
     assert_allclose(ratio, 2.0, rtol=0.2)
     table = known.confidence_intervals(0.999)
     assert ((table["lower"] < [2, 3]) & (table["upper"] > [2, 3])).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+@pytest.mark.filterwarnings("ignore")
+def test_fewer_data_than_parameters_raise_nothing(count):
+    structure = GrayBoxStructure.observable_canonical(5)
+    omega = np.geomspace(0.1, 5.0, count)
+    frf = response(count, 1, 1, seed=3)
+    fitted = GrayBoxRestructurer(structure, n_starts=2, max_iter=10).fit(omega, frf)
+    assert fitted.lti_.is_stable and np.isfinite(fitted.params_).all()

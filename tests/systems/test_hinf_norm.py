@@ -408,3 +408,34 @@ def test_adversarial_systems_match_a_pole_aware_grid(seed: int) -> None:
         errors = verdict.low, verdict.high, verdict.all_peaks
         assert max(errors) <= stress.TOLERANCE, (case.family, verdict)
         assert verdict.missed == verdict.false == 0, (case.family, verdict)
+
+
+@pytest.mark.parametrize("exponent", [-1000, -600, -400, 400, 480, 600, 1000])
+@pytest.mark.parametrize("where", ["B", "C", "B and D", "A", "B, not C"])
+def test_scales_at_the_ends_of_the_numbers_change_no_digit(
+    exponent: int, where: str
+) -> None:
+    rng = np.random.default_rng(0)
+    A = np.array([[-0.1, 2, 0], [-2, -0.1, 1], [0, 0, -3]])
+    B, C, D = rng.normal(size=(3, 2)), rng.normal(size=(2, 3)), np.zeros((2, 2))
+    unit, gain, rate = 2.0**exponent, 2.0**exponent, 1.0
+    if where == "A":
+        A, B, gain, rate = unit * A, unit * B, 1.0, unit
+    elif where == "B and D":
+        B, D = unit * B, unit * rng.normal(size=(2, 2))
+    elif where == "B, not C":
+        B, C, gain = unit * B, C / unit, 1.0
+    else:
+        B, C = (unit * B, C) if where == "B" else (B, unit * C)
+    usual = linf_norm(A / rate, B / (gain * rate), C, D / gain, within=0.5)
+    if where == "C":
+        usual = linf_norm(A, B, C / gain, D, within=0.5)
+    elif where == "B, not C":
+        usual = linf_norm(A, B / unit, C * unit, D, within=0.5)
+    found = linf_norm(A, B, C, D, within=0.5)
+    assert_allclose(found.norm / gain, usual.norm, rtol=1e-13)
+    assert_allclose(found.values / gain, usual.values, rtol=1e-13)
+    assert_allclose(found.frequencies / rate, usual.frequencies, rtol=1e-9)
+    G = frequency_response(A, B, C, D, found.frequencies)
+    sigma = np.linalg.norm(G / gain, 2, axis=(1, 2))
+    assert_allclose(sigma, usual.values, rtol=1e-9)
