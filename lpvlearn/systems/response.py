@@ -31,7 +31,7 @@ _DELAY = 1e-12  # decay a sample of a sampled model's pole at the origin (a dela
 
 
 class ScaledSystem(NamedTuple):
-    """A system in units of time and gain in which its numbers are neither huge nor tiny.
+    """A system in units of time and gain that make no number huge or tiny.
 
     ``G(j omega) = 2^gain G_scaled(j omega / 2^rate)``; all powers of two are exact.
     """

@@ -439,3 +439,24 @@ def test_scales_at_the_ends_of_the_numbers_change_no_digit(
     G = frequency_response(A, B, C, D, found.frequencies)
     sigma = np.linalg.norm(G / gain, 2, axis=(1, 2))
     assert_allclose(sigma, usual.values, rtol=1e-9)
+
+
+@pytest.mark.parametrize("distance", [1e-8, 1e-9, 1e-10, 1e-11, 3e-13])
+def test_poles_beside_the_circle_cost_what_the_last_place_of_the_data_does(
+    distance: float,
+) -> None:
+    """Against the quotient of polynomials in extended precision, of the same data."""
+    if np.finfo(np.longdouble).eps > 1e-18:
+        pytest.skip("long double is no wider than double here")
+    for angle in (0.3, 1.1, 2.9):
+        a1, a2 = 2 * (1 - distance) * np.cos(angle), -((1 - distance) ** 2)
+        found = linf_norm(
+            np.array([[a1, a2], [1.0, 0]]), np.eye(2)[:, :1], np.eye(2)[1:],
+            np.zeros((1, 1)), dt=1.0,
+        )  # fmt: skip
+        long1, long2 = np.longdouble(a1), np.longdouble(a2)
+        # of the squared denominator, a parabola in the cosine
+        least = (1 + long2) ** 2 * (1 + long1**2 / (4 * long2))
+        last_place = np.finfo(float).eps / distance
+        exact = float(1 / np.sqrt(least))
+        assert abs(found.norm / exact - 1) < 5 * last_place + 1e-10
