@@ -53,6 +53,7 @@ from .problem import (
     problem_from_response,
 )
 from .similarity import minimise_bilinear
+from .starts import DISCRETE_BOX
 from .starts import search as starts_of
 
 Array = NDArray[np.float64]
@@ -823,12 +824,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                     "a wrong basin."
                 )
                 + " Give `init`, or raise `n_starts`, to search elsewhere."
-                + (
-                    ""
-                    if self.structure is None or self.lti_.is_continuous
-                    else " The black box is in discrete time: convert it by "
-                    "to_continuous() if the structure is in continuous time."
-                ),
+                + DISCRETE_BOX
+                * (self.structure is not None and not self.lti_.is_continuous),
                 ConvergenceWarning,
             )
         if self.identifiability_.rank < self.structure_.n_params:
