@@ -206,7 +206,7 @@ class RestructuringProblem:
         W = self._weighted[0]
         if counts is not None:
             W = np.sqrt(counts)[:, None, None] * W
-        J = self.system.response_jacobian(theta, self.omega)[1]
+        J = self._free_jacobian(theta)
         WJ = np.einsum("kpq,kqmj->kpmj", W, J)
         flat = WJ.reshape(-1, J.shape[-1])
         inverse = np.linalg.pinv(np.vstack([flat.real, flat.imag]))
@@ -216,6 +216,12 @@ class RestructuringProblem:
         if K.shape[2] != dG.shape[2]:  # several black boxes were stacked
             K = K.reshape(*K.shape[:2], -1, *dG.shape[2:]).sum(2)
         return np.asarray(np.einsum("jkpm,rkpm->rj", K.conj(), dG).real)
+
+    def _free_jacobian(self, theta: Array) -> Complex:
+        """Derivative of the response; zero by parameters that their bounds hold."""
+        J = self.system.response_jacobian(theta, self.omega)[1]
+        lower, upper = self.structure.lower, self.structure.upper
+        return np.where((theta <= lower) | (theta >= upper), 0.0, J)
 
     def check_realizations(self, models: Sequence[Any]) -> None:
         """Refuse what cannot be the realizations that the black box is the mean of."""
@@ -293,8 +299,7 @@ class RestructuringProblem:
             changes = self.parameter_changes(theta, noise, counts)
         else:
             W = self._weighted[0]
-            J = self.system.response_jacobian(theta, self.omega)[1]
-            WJ = np.einsum("kpq,kqmj->kpmj", W, J)
+            WJ = np.einsum("kpq,kqmj->kpmj", W, self._free_jacobian(theta))
             copies = W.shape[2] // noise.shape[2]  # of several black boxes
             dE = W @ np.tile(noise, (1, 1, copies, 1))
             # what the noise does not explain of the error is there with any noise
@@ -598,10 +603,11 @@ class Identifiability:
 
     def __str__(self) -> str:
         if not self.directions:
+            by_name = sorted(self.sensitivities, key=self.sensitivities.__getitem__)
+            worst = f", most that of {by_name[-1]}" if by_name else ""
             return (
                 f"all {self.n_params} parameters are identifiable "
-                f"(condition {self.condition:.2g}, most that of "
-                f"{max(self.sensitivities, key=self.sensitivities.__getitem__)})."
+                f"(condition {self.condition:.2g}{worst})."
             )
         parts = [
             " ".join(f"{value:+.2g} {name}" for name, value in direction.items())

@@ -108,13 +108,14 @@ def linf_norm(
             "`within` must be None, for one peak, or a fraction of the norm in "
             f"[0, 1). Got {within}."
         )
-    if len(A) == 0:
-        return _constant(D)
     scaled = scaled_system(A, B, C, D, dt is not None)
-    search = _Search(FrequencyEngine(*scaled[:4], discrete=dt is not None))
-    if stable and (search.depth >= -search.on_boundary).any():
-        return PeakSet(np.inf, np.empty(0), np.empty(0))
-    found = search.run(within)
+    if len(A) == 0:
+        found = _constant(scaled.D)
+    else:
+        search = _Search(FrequencyEngine(*scaled[:4], discrete=dt is not None))
+        if stable and (search.depth >= -search.on_boundary).any():
+            return PeakSet(np.inf, np.empty(0), np.empty(0))
+        found = search.run(within)
     if scaled.rate or scaled.gain:
         values = times_power(found.values, scaled.gain)
         frequencies = times_power(found.frequencies, scaled.rate)

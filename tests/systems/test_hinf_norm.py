@@ -427,6 +427,8 @@ def test_scales_at_the_ends_of_the_numbers_change_no_digit(
         B, C, gain = unit * B, C / unit, 1.0
     else:
         B, C = (unit * B, C) if where == "B" else (B, unit * C)
+    empty = np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0))
+    assert linf_norm(*empty, unit * np.eye(2)).norm == unit
     usual = linf_norm(A / rate, B / (gain * rate), C, D / gain, within=0.5)
     if where == "C":
         usual = linf_norm(A, B, C / gain, D, within=0.5)
