@@ -326,8 +326,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         if hasattr(self, "params_covariance_"):
             self.covariance_degrees_of_freedom_ = np.inf
         elif len(realizations):
+            norm = "hinf" if self.norm == "covariance" else self.norm  # no uncertainty
             self.params_covariance_ = problem.spread_covariance(
-                self.params_, realizations, self.norm
+                self.params_, realizations, norm
             )
             self.covariance_degrees_of_freedom_ = len(realizations) - 1.0
         return self
@@ -403,6 +404,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             raise ValueError(
                 "`norm='covariance'` needs the `noise` of the response, or its "
                 "`coherence`. Got neither."
+            )
+        if self.norm == "covariance" and sample_weight is not None:
+            raise ValueError(
+                "`sample_weight` must be None with norm='covariance', which weighs the "
+                "error by its `noise`: put a larger one where the response is doubted."
             )
         self._restructure(problem, [], uncertainty=problem.uncertainty([], []))
         if hasattr(self, "params_covariance_"):

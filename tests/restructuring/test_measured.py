@@ -239,6 +239,8 @@ def test_weighed_by_its_noise_a_gain_is_the_weighted_mean():
     assert fitted.degrees_of_freedom_ == 59 and fitted.p_value_ > 1e-3
     with pytest.raises(ValueError, match="needs the `noise`"):
         fitted.fit(omega, G)
+    with pytest.raises(ValueError, match="`sample_weight` must be None"):
+        fitted.fit(omega, G, np.ones(30), noise=std)
 
 
 def test_errors_count_in_standard_deviations_of_the_noise():
