@@ -185,9 +185,10 @@ class RestructuringProblem:
         ):
             step = np.zeros(len(theta))
             step[j] = (-1.0 if theta[j] < 0 else 1.0) * usual / effect[j]
-            moved = self.system.response(theta + step, self.omega)
-            moved = moved if scaling is None else moved * scaling
-            change = np.sqrt(np.sum(np.abs(moved - G) ** 2) / len(G))
+            with np.errstate(all="ignore"):  # there need not be a model
+                moved = self.system.response(theta + step, self.omega)
+                moved = moved if scaling is None else moved * scaling
+                change = np.sqrt(np.sum(np.abs(moved - G) ** 2) / len(G))
             if change > _LINEAR * usual:
                 sizes[j] = abs(step[j])
         names = self.structure.parameter_names
