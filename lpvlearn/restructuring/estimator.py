@@ -31,6 +31,7 @@ from ..validation import (
     one_of,
     positive_time,
     real_array,
+    share,
     shown,
     whole_number,
 )
@@ -521,10 +522,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         b    3.0  2.752  3.248
         """
         check_is_fitted(self, "params_")
-        if not 0 < confidence < 1:
-            raise ValueError(
-                f"`confidence` must be between 0 and 1. Got {confidence!r}."
-            )
+        confidence = share("confidence", confidence)
         if not hasattr(self, "params_covariance_"):
             raise ValueError(
                 "confidence intervals need the covariance of the parameters. Got a fit "
