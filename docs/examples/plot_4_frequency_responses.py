@@ -66,6 +66,18 @@ found = pd.DataFrame(
 found.round(3)
 
 # %%
+# Where the noise is known (``noise``, a standard deviation, or a ``coherence`` with its
+# number of averages), errors count in standard deviations, and the covariance of the
+# parameters is told. ``norm="covariance"`` minimises their squares instead of the
+# largest one: the efficient parameters, whose `p_value_` doubts a wrong structure.
+
+std = np.full(len(omega), 0.001 * np.abs(measured[0]).max())
+efficient = GrayBoxRestructurer(modal, norm="covariance", init=fits[0].params_)
+efficient.fit(omega, measured[0], noise=std)
+print(f"p-value {efficient.p_value_:.2f}")
+efficient.confidence_intervals().assign(truth=true_parameters(0.0)).round(3)
+
+# %%
 # The truth:
 
 pd.DataFrame(map(true_parameters, positions), index=found.index)[found.columns].round(3)

@@ -285,8 +285,9 @@ reduced.history_
 # is off by a little. No parameter can lower that part of the error: it is a *floor*. A
 # minimisation that ignored this would stop at once, since everything below the floor is
 # invisible to the norm. So the floor is recognised (a peak whose gradient is zero),
-# reported, and set aside by a weight that vanishes at its frequency; the weighted error
-# is minimised among all parameters that keep the norm at the floor:
+# reported, and set aside: first by a weight that vanishes at its frequency, then the
+# peaks below it are minimised as they are, among all parameters that keep the norm at
+# the floor:
 
 display = ErrorDisplay.from_estimator(restructurer, black_box)
 pd.Series(
@@ -298,8 +299,8 @@ pd.Series(
 )
 
 # %%
-# The dashed line is the floor. A dot marks each frequency at which the weighted error
-# has one of its equally high peaks. Grey: the least-squares fit that the minimisation
+# The dashed line is the floor. A dot marks each frequency at which the error has one of
+# its equally high peaks below. Grey: the least-squares fit that the minimisation
 # began with, whose peaks near the resonances are higher.
 #
 # The result
@@ -315,7 +316,9 @@ pd.DataFrame(
 # Is the structure identifiable?
 # ------------------------------
 # Two parameters that only appear as a product cannot be told apart by any experiment.
-# The derivative of the frequency response tells: its rank, and which combination is
-# weakest.
+# The derivative of the frequency response tells: its rank, and how far a relative error
+# of the response may grow into relative errors of the parameters (``condition``; by
+# name, ``sensitivities``). Times the black box's own relative error this tells which
+# parameters are known.
 
 restructurer.identifiability_

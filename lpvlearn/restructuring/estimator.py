@@ -31,13 +31,19 @@ from ..validation import (
     one_of,
     positive_time,
     real_array,
+    share,
     shown,
     whole_number,
 )
 from .deadline import bounded, time_is_up
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
-from .minimise_covariance import Estimate, efficient_parameters
+from .minimise_covariance import (
+    Estimate,
+    efficient_parameters,
+    measured_response,
+    minimise_covariance,
+)
 from .minimise_h2 import minimise_h2
 from .minimise_hinf import SOLVERS, is_saddle, minimise_hinf, promising
 from .problem import (
@@ -48,6 +54,7 @@ from .problem import (
     problem_from_response,
 )
 from .similarity import minimise_bilinear
+from .starts import DISCRETE_BOX
 from .starts import search as starts_of
 
 Array = NDArray[np.float64]
@@ -77,6 +84,8 @@ _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "degrees_of_freedom_",
     "p_value_",
 )
+
+_DRAWS = 64  # of a known noise: a standard deviation to 9 %
 
 _SEARCH_SHARE = 0.7  # of `max_time`, for the starts: the rest is the minimisation's
 
@@ -184,12 +193,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         Relative root-mean-square error over frequency of the best least-squares fit.
     params_covariance_ : ndarray of shape (n_params, n_params)
         Covariance of `params_`, the parameters that minimise `norm`, from the spread of
-        the `realizations`, or that of the `estimates`, given to `fit_model`; absent
-        without them. Infinite variances where the estimates do not determine a
-        parameter, none at its bound.
+        the `realizations`, or that of the `estimates`, given to `fit_model`, or the
+        `noise` given to `fit`; absent without them. Infinite variances where these do
+        not determine a parameter, none at its bound.
     covariance_degrees_of_freedom_ : float
-        What the covariance is known from: one less than the realizations, infinite for
-        `estimates`; see :meth:`confidence_intervals`.
+        What the covariance is known from: one less than the realizations, or draws of
+        the noise; infinite for ``norm="covariance"``; see :meth:`confidence_intervals`.
     start_params_ : ndarray of shape (n_params,)
         Least-squares fit that the search started from.
     starts_ : DataFrame
@@ -318,8 +327,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         if hasattr(self, "params_covariance_"):
             self.covariance_degrees_of_freedom_ = np.inf
         elif len(realizations):
+            norm = "hinf" if self.norm == "covariance" else self.norm  # no uncertainty
             self.params_covariance_ = problem.spread_covariance(
-                self.params_, realizations, self.norm
+                self.params_, realizations, norm
             )
             self.covariance_degrees_of_freedom_ = len(realizations) - 1.0
         return self
@@ -329,6 +339,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         omega: ArrayLike,
         frf: ArrayLike,
         sample_weight: ArrayLike | None = None,
+        *,
+        noise: ArrayLike | None = None,
+        coherence: ArrayLike | None = None,
+        n_averages: int | None = None,
     ) -> GrayBoxRestructurer:
         """Restructure a measured frequency response.
 
@@ -340,25 +354,72 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             Real parts of the entries of the response, row by row, then the imaginary
             parts; a complex array of shape (n_freq, n_outputs, n_inputs) is accepted.
         sample_weight : array-like of shape (n_freq,), default=None
-            Weight of the error at every frequency, e.g. the inverse of the standard
-            deviation of the measurement.
+            Weight of the error at every frequency.
+        noise : array-like of shape (n_freq,), or that of complex `frf`, default=None
+            Standard deviation of the error of the response, ``sqrt(E|e|^2)``, at every
+            frequency, or of every entry; independent. Errors then count in standard
+            deviations (those of an output's entries together), and the covariance of
+            the parameters is told.
+        coherence : array-like of those shapes, default=None
+            In place of `noise`: the squared coherence c of inputs and outputs, above 0
+            and at most 1, whose ``|G| sqrt((1 - c) / (c n_averages))`` it is.
+        n_averages : int, default=None
+            How many independent spectra were averaged for the coherence.
 
         Raises
         ------
         ValueError
-            If `structure` is None (a response does not tell the order), or shapes do
-            not fit.
+            If `structure` is None (a response does not tell the order), shapes do not
+            fit, `frf` is zero, or ``norm="covariance"`` has no noise.
+
+        Examples
+        --------
+        >>> lag = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+        >>> omega, rng = np.geomspace(0.1, 10, 40), np.random.default_rng(0)
+        >>> errors = 0.05 * rng.normal(size=(40, 2)) @ [1, 1j] / np.sqrt(2)
+        >>> restructurer = GrayBoxRestructurer(lag, norm="covariance")
+        >>> frf = 3 / (1j * omega + 2) + errors
+        >>> found = restructurer.fit(omega, frf, noise=np.full(40, 0.05))
+        >>> found.confidence_intervals().round(2)
+           value  lower  upper
+        a   2.07   2.01   2.12
+        b   3.07   3.00   3.14
         """
         self._check_options()
-        if self.norm != "hinf":
+        if self.norm not in ("hinf", "covariance"):
             raise ValueError(
-                "`norm` must be 'hinf' to fit a frequency response. Got "
-                f"{self.norm!r}; identify a model first and use fit_model()."
+                "`norm` must be 'hinf' or 'covariance' to fit a frequency response. "
+                f"Got {self.norm!r}; identify a model first and use fit_model()."
             )
         problem = problem_from_response(
-            self.structure, omega, frf, self.frequency_weight, sample_weight
+            self.structure,
+            omega,
+            frf,
+            self.frequency_weight,
+            sample_weight,
+            noise,
+            coherence,
+            n_averages,
         )
-        self._restructure(problem, [])
+        if self.norm == "covariance" and problem.noise is None:
+            raise ValueError(
+                "`norm='covariance'` needs the `noise` of the response, or its "
+                "`coherence`. Got neither."
+            )
+        if self.norm == "covariance" and sample_weight is not None:
+            raise ValueError(
+                "`sample_weight` must be None with norm='covariance', which weighs the "
+                "error by its `noise`: put a larger one where the response is doubted."
+            )
+        self._restructure(problem, [], uncertainty=problem.uncertainty([], []))
+        if hasattr(self, "params_covariance_"):
+            self.covariance_degrees_of_freedom_ = np.inf
+        elif problem.noise is not None:
+            seed = check_random_state(self.random_state).randint(2**31)
+            self.params_covariance_ = problem.noise_covariance(
+                self.params_, _DRAWS, seed
+            )
+            self.covariance_degrees_of_freedom_ = _DRAWS - 1.0
         self.n_features_in_ = 1
         return self
 
@@ -461,10 +522,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         b    3.0  2.752  3.248
         """
         check_is_fitted(self, "params_")
-        if not 0 < confidence < 1:
-            raise ValueError(
-                f"`confidence` must be between 0 and 1. Got {confidence!r}."
-            )
+        confidence = share("confidence", confidence)
         if not hasattr(self, "params_covariance_"):
             raise ValueError(
                 "confidence intervals need the covariance of the parameters. Got a fit "
@@ -665,9 +723,15 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self.hinf_params_, self.hinf_error_ = self.params_, self.error_
         self.chi2_ = self.degrees_of_freedom_ = self.p_value_ = np.nan
         dt, size = problem.system.dt, problem.reference
-        found = efficient_parameters(
-            problem.structure, estimates, self.params_, sampling_time=dt
-        )
+        if problem.noise is None:
+            found = efficient_parameters(
+                problem.structure, estimates, self.params_, sampling_time=dt
+            )
+        else:
+            box = measured_response(problem.omega, problem.response, problem.noise)
+            found = minimise_covariance(
+                problem.system, self.params_, problem.margin, [box]
+            )
         if found is None:
             return
         self.params_, self.params_covariance_ = found.theta, found.covariance
@@ -749,8 +813,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             )
         floor = self.structural_floor_ / max(problem.reference, 1e-300)
         explained = getattr(self, "p_value_", 0.0) > _IMPLAUSIBLE  # by the noise
-        poor = min(self.fit_error_, self.relative_error_) - floor > _POOR_FIT
-        if poor and not explained:
+        error = min(self.fit_error_, self.relative_error_) - floor
+        if error > max(_POOR_FIT, enough) and not explained:
             costs = self.starts_["relative_error"].to_numpy()
             agreeing = int((costs <= costs.min() * (1.0 + _AGREE)).sum())
             warn(
@@ -764,12 +828,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                     "a wrong basin."
                 )
                 + " Give `init`, or raise `n_starts`, to search elsewhere."
-                + (
-                    ""
-                    if self.structure is None or self.lti_.is_continuous
-                    else " The black box is in discrete time: convert it by "
-                    "to_continuous() if the structure is in continuous time."
-                ),
+                + DISCRETE_BOX
+                * (self.structure is not None and not self.lti_.is_continuous),
                 ConvergenceWarning,
             )
         if self.identifiability_.rank < self.structure_.n_params:

@@ -7,12 +7,14 @@ similarity transformations start from.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..systems.hinf_norm import PeakSet
 from ..systems.sampling import d2c_tustin
-from ..validation import real_array, shown
+from ..validation import real_array, shown, whole_number
 from .error_system import (
     ErrorSystem,
     Structure,
@@ -28,6 +30,9 @@ Complex = NDArray[np.complex128]
 # Relative difference of measured neighbours that count as equally high: at an optimum
 # two of them often are, up to what the search has still to gain.
 _BESIDE = 1e-3
+
+# A coherence is estimated from few averages: never nearer to one than that
+_LEAST_INCOHERENCE = 1e-6
 
 # Least decay of a realised pole, relative to its size and to the highest frequency
 _LEAST_DAMPING, _LEAST_RATE = 1e-4, 1e-9
@@ -153,7 +158,49 @@ def read_frequency_data(
     if not np.isfinite(G).all():
         k = int(np.argwhere(~np.isfinite(G))[0, 0])
         raise ValueError(f"`frf` must be finite. Got a NaN or infinity in row {k}.")
+    if not G.any():
+        raise ValueError(
+            "`frf` must not be zero at all frequencies: nothing tells the parameters "
+            "then. Got zeros only."
+        )
     return grid, G.reshape(len(grid), n_outputs, n_inputs).astype(complex)
+
+
+def read_noise(
+    noise: ArrayLike | None, coherence: ArrayLike | None, n_averages: Any, G: Complex
+) -> Array | None:
+    """Standard deviations of the entries of a response `G`; None where none are told.
+
+    Of the whole complex error: its real part has half of the variance. From a coherence
+    of so many independent averages, ``|G| sqrt((1 - c) / (c n))``.
+    """
+    if noise is None and coherence is None:
+        return None
+    if noise is not None and coherence is not None:
+        raise ValueError(
+            "`noise` and `coherence` tell the same thing: give one of them. Got both."
+        )
+    name, given = ("noise", noise) if coherence is None else ("coherence", coherence)
+    values = real_array(name, given)
+    shape = values.shape
+    if values.ndim == 1:
+        values = values[:, None, None]
+    k, p, m = G.shape
+    known = values.ndim == 3 and values.shape in ((k, 1, 1), G.shape)
+    most = np.inf if coherence is None else 1.0
+    if not known or not ((values > 0) & (values <= most) & np.isfinite(values)).all():
+        rule = "positive" if coherence is None else "above 0, and 1 at most"
+        raise ValueError(
+            f"`{name}` must have shape ({k},) or ({k}, {p}, {m}), with values {rule}. "
+            f"Got shape {shape}."
+        )
+    if coherence is not None:
+        whole_number("n_averages", n_averages, 1)
+        open_ = np.maximum(1.0 - values, _LEAST_INCOHERENCE)
+        # of an entry that happens to be small, as that of its size over frequency
+        size = np.maximum(np.abs(G), _LEAST_INCOHERENCE * np.abs(G).max())
+        values = size * np.sqrt(open_ / values / n_averages)
+    return np.broadcast_to(values, G.shape)
 
 
 def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
@@ -214,28 +261,39 @@ def stable_realization(omega: Array, G: Complex, order: int) -> Target | None:
 
     Else with unstable poles reflected, and B and D fitted to the response anew, as in
     vector fitting: noise, or an order that the system does not have, puts poles of a
-    realisation to the right. None where that leaves no stable model.
+    realisation to the right. Of a lower order where the data are too few, and lags of
+    the middle frequency where there is none; None for order 0 alone.
     """
-    model = realize_response(omega, G, order)
-    if model is None:
+    for n in range(order, 0, -1):
+        model = realize_response(omega, G, n)
+        if model is None:
+            continue
+        poles, V = np.linalg.eig(model.A)
+        least = _LEAST_DAMPING * np.abs(poles) + _LEAST_RATE * float(omega.max())
+        if (poles.real <= -least).all():
+            return model
+        decay = np.maximum(np.abs(poles.real), least)
+        try:
+            A = np.real((V * (1j * poles.imag - decay)) @ np.linalg.inv(V))
+        except np.linalg.LinAlgError:  # poles that coincide
+            continue
+        if (np.linalg.eigvals(A).real < 0).all():
+            return _with_poles(omega, G, A, model.C)
+    if order == 0:
         return None
-    poles, V = np.linalg.eig(model.A)
-    least = _LEAST_DAMPING * np.abs(poles) + _LEAST_RATE * float(omega.max())
-    if (poles.real <= -least).all():
-        return model
-    decay = np.maximum(np.abs(poles.real), least)
-    try:
-        A = np.real((V * (1j * poles.imag - decay)) @ np.linalg.inv(V))
-    except np.linalg.LinAlgError:  # poles that coincide
-        return None
-    if not (np.linalg.eigvals(A).real < 0).all():
-        return None
+    p, positive = G.shape[1], omega[omega > 0]
+    rate = float(np.exp(0.5 * np.log(positive.min() * positive.max())))
+    return _with_poles(omega, G, -rate * np.eye(p), np.eye(p))
+
+
+def _with_poles(omega: Array, G: Complex, A: Array, C: Array) -> Target:
+    """The model of least squares with that A and C."""
     (k, p, m), n = G.shape, len(A)
     X = resolvent(A, laplace_variable(omega, None)[0])
-    left = np.concatenate([model.C @ X, np.broadcast_to(np.eye(p), (k, p, p))], axis=2)
+    left = np.concatenate([C @ X, np.broadcast_to(np.eye(p), (k, p, p))], axis=2)
     flat, rhs = left.reshape(k * p, n + p), G.reshape(k * p, m)
     rows, target = np.vstack([flat.real, flat.imag]), np.vstack([rhs.real, rhs.imag])
     size = np.linalg.norm(rows, axis=0)
     size = np.where(size > 0, size, 1.0)
     BD = np.linalg.lstsq(rows / size, target, rcond=None)[0] / size[:, None]
-    return Target(A, BD[:n], model.C, BD[n:])
+    return Target(A, BD[:n], C, BD[n:])

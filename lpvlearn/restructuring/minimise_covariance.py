@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
+from scipy.sparse import diags_array
 from scipy.stats import chi2
 
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
@@ -75,7 +76,7 @@ class UncertainResponse:
 
     omega: Array  # (k,), rad/s
     response: Complex  # g0: (k, n_outputs, n_inputs)
-    whitening: Array  # V^+: (p, 2 k n_outputs n_inputs)
+    whitening: Any  # V^+: (p, 2 k n_outputs n_inputs), an array or a sparse one
 
     def coordinates(self, response: Complex) -> Array:
         """``z = V^+ (g - g0)``, shape (p,), of another response."""
@@ -119,6 +120,17 @@ def uncertain_response(
     U, s, _ = np.linalg.svd(V / std[:, None], full_matrices=False)
     kept = s > _FAINT * s[0]
     return UncertainResponse(omega, G, (U[:, kept] / s[kept]).T / std)
+
+
+def measured_response(omega: Array, G: Complex, std: Array) -> UncertainResponse:
+    """A measured response whose entries have independent errors.
+
+    `std` (k, n_outputs, n_inputs) are standard deviations of the whole complex errors,
+    of whose variance the real part has half.
+    """
+    return UncertainResponse(
+        omega, G, diags_array(np.sqrt(2.0) / _parts(std + 1j * std))
+    )
 
 
 @dataclass(frozen=True)

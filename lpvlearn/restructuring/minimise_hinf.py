@@ -124,8 +124,8 @@ class HinfObjective:
             if found.norm == 0.0 or steep.any():
                 break
         if not steep.any():  # nothing is left that the parameters could lower
-            none = np.zeros(1)
-            return Peaks(none, none, np.zeros((1, len(y))), np.zeros(1, bool))
+            still, at = np.zeros((1, len(y))), np.full(1, self.floor_frequency)
+            return Peaks(np.zeros(1), at, still, np.zeros(1, bool))
         peaks = Peaks(
             found.values[steep],
             found.frequencies[steep],

@@ -30,7 +30,12 @@ from .least_squares import (
     least_maximum,
 )
 from .limits import growth, keeps_margin, natural_margin
-from .measured import MeasuredErrorSystem, read_frequency_data, stable_realization
+from .measured import (
+    MeasuredErrorSystem,
+    read_frequency_data,
+    read_noise,
+    stable_realization,
+)
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -75,6 +80,7 @@ class RestructuringProblem:
     dropped_feedthrough: Array  # (n_outputs, n_inputs)
     lower_bound: float  # no parameters have a smaller error
     input_delay: Array  # (n_inputs,) of the black box, which no structure has
+    noise: Array | None = None  # standard deviations of the entries of a response
 
     @cached_property
     def response(self) -> Complex:
@@ -179,9 +185,10 @@ class RestructuringProblem:
         ):
             step = np.zeros(len(theta))
             step[j] = (-1.0 if theta[j] < 0 else 1.0) * usual / effect[j]
-            moved = self.system.response(theta + step, self.omega)
-            moved = moved if scaling is None else moved * scaling
-            change = np.sqrt(np.sum(np.abs(moved - G) ** 2) / len(G))
+            with np.errstate(all="ignore"):  # there need not be a model
+                moved = self.system.response(theta + step, self.omega)
+                moved = moved if scaling is None else moved * scaling
+                change = np.sqrt(np.sum(np.abs(moved - G) ** 2) / len(G))
             if change > _LINEAR * usual:
                 sizes[j] = abs(step[j])
         names = self.structure.parameter_names
@@ -200,7 +207,7 @@ class RestructuringProblem:
         W = self._weighted[0]
         if counts is not None:
             W = np.sqrt(counts)[:, None, None] * W
-        J = self.system.response_jacobian(theta, self.omega)[1]
+        J = self._free_jacobian(theta)
         WJ = np.einsum("kpq,kqmj->kpmj", W, J)
         flat = WJ.reshape(-1, J.shape[-1])
         inverse = np.linalg.pinv(np.vstack([flat.real, flat.imag]))
@@ -210,6 +217,12 @@ class RestructuringProblem:
         if K.shape[2] != dG.shape[2]:  # several black boxes were stacked
             K = K.reshape(*K.shape[:2], -1, *dG.shape[2:]).sum(2)
         return np.asarray(np.einsum("jkpm,rkpm->rj", K.conj(), dG).real)
+
+    def _free_jacobian(self, theta: Array) -> Complex:
+        """Derivative of the response; zero by parameters that their bounds hold."""
+        J = self.system.response_jacobian(theta, self.omega)[1]
+        lower, upper = self.structure.lower, self.structure.upper
+        return np.where((theta <= lower) | (theta >= upper), 0.0, J)
 
     def check_realizations(self, models: Sequence[Any]) -> None:
         """Refuse what cannot be the realizations that the black box is the mean of."""
@@ -233,11 +246,13 @@ class RestructuringProblem:
     ) -> float:
         """Standard deviation of the response, relative, as errors of `fit` are.
 
-        From the spread of realizations that it is the mean of, or of models at either
-        side of independent estimates; zero where neither tells.
+        From the noise of a response, the spread of realizations that the black box is
+        the mean of, or models at either side of independent estimates; else zero.
         """
         squares = 0.0
-        if estimates:
+        if self.noise is not None:
+            squares = float(np.sum(np.abs(self._weighted[0]) ** 2 @ self.noise**2))
+        elif estimates:
             count = len(estimates)
             pairs = [pair for _, both in estimates for pair in both]
             steps = [self._weighted_response(a) - self._weighted_response(b)
@@ -260,29 +275,40 @@ class RestructuringProblem:
     ) -> Array:
         """Covariance of the parameters of an averaged model from single realizations.
 
-        Every realization's response is carried to the parameters that minimise `norm`
-        in the linearised structure: the least maximum for "hinf", which is not linear
-        in the noise, else least squares, for "h2" over frequencies as its integral
-        counts them. The covariance of their mean is that of one divided by their
-        number.
+        That of their mean is that of one divided by their number.
         """
         undelayed = [model.with_input_delay(0) for model in models]
         G = np.array([model.frequency_response(self.omega) for model in undelayed])
-        noise = (G - G.mean(0)) / np.sqrt(len(G))
-        if norm == "hinf":
+        return self.carried_covariance(theta, (G - G.mean(0)) / np.sqrt(len(G)), norm)
+
+    def noise_covariance(self, theta: Array, draws: int, seed: int) -> Array:
+        """Covariance of the parameters of a response with noise, from so many draws."""
+        rng = np.random.default_rng(seed)
+        real, imaginary = rng.normal(size=(2, draws, *self.response.shape))
+        noise = self.noise * np.sqrt(0.5) * (real + 1j * imaginary)
+        return self.carried_covariance(theta, noise, "hinf")
+
+    def carried_covariance(self, theta: Array, noise: Complex, norm: str) -> Array:
+        """Covariance of the parameters that minimise `norm`, from draws of the noise.
+
+        In the linearised structure: the least maximum for "hinf", which is not linear
+        in the noise, else least squares, for "h2" over frequencies as its integral
+        counts them.
+        """
+        if norm != "hinf":
+            counts = np.gradient(self.omega) if norm == "h2" else None
+            changes = self.parameter_changes(theta, noise, counts)
+        else:
             W = self._weighted[0]
-            J = self.system.response_jacobian(theta, self.omega)[1]
-            WJ = np.einsum("kpq,kqmj->kpmj", W, J)
-            copies = W.shape[2] // G.shape[2]  # of several black boxes
+            WJ = np.einsum("kpq,kqmj->kpmj", W, self._free_jacobian(theta))
+            copies = W.shape[2] // noise.shape[2]  # of several black boxes
             dE = W @ np.tile(noise, (1, 1, copies, 1))
             # what the noise does not explain of the error is there with any noise
             E = self.system.weighted_error(theta, self.omega)
-            explained = np.sum(np.abs(dE) ** 2) / max(np.sum(np.abs(E) ** 2), 1e-300)
-            E = E * np.sqrt(max(1.0 - float(explained), 0.0))
+            variance = np.sum(np.abs(dE) ** 2) / (len(dE) - 1)
+            explained = variance / max(float(np.sum(np.abs(E) ** 2)), 1e-300)
+            E = E * np.sqrt(max(1.0 - explained, 0.0))
             changes = np.array([least_maximum(E - part, WJ) for part in dE])
-        else:
-            counts = np.gradient(self.omega) if norm == "h2" else None
-            changes = self.parameter_changes(theta, noise, counts)
         return np.cov(changes.T, ddof=1).reshape(len(theta), -1)
 
 
@@ -437,8 +463,15 @@ def problem_from_response(
     frf: ArrayLike,
     weight: Any,
     sample_weight: ArrayLike | None,
+    noise: ArrayLike | None = None,
+    coherence: ArrayLike | None = None,
+    n_averages: int | None = None,
 ) -> RestructuringProblem:
-    """Match a measured frequency response over its frequencies."""
+    """Match a measured frequency response over its frequencies.
+
+    Errors count in standard deviations of the noise, of all inputs together, where they
+    are told.
+    """
     if not isinstance(structure, GrayBoxStructure):
         raise ValueError(
             "`structure` must be given to fit a frequency response, which does not "
@@ -463,6 +496,10 @@ def problem_from_response(
                 f"{np.shape(sample_weight)}."
             )
         W = W * scale[:, None, None]
+    std = read_noise(noise, coherence, n_averages, G)
+    if std is not None:
+        W = W / np.sqrt(np.mean(std**2, axis=2))[:, None, :]
+        std = std[np.argsort(grid)]
     system = MeasuredErrorSystem(structure, grid, G, W)
     return RestructuringProblem(
         structure,
@@ -474,6 +511,7 @@ def problem_from_response(
         np.zeros(G.shape[1:]),
         0.0,
         np.zeros(structure.n_inputs),
+        std,
     )
 
 
@@ -566,10 +604,11 @@ class Identifiability:
 
     def __str__(self) -> str:
         if not self.directions:
+            by_name = sorted(self.sensitivities, key=self.sensitivities.__getitem__)
+            worst = f", most that of {by_name[-1]}" if by_name else ""
             return (
                 f"all {self.n_params} parameters are identifiable "
-                f"(condition {self.condition:.2g}, most that of "
-                f"{max(self.sensitivities, key=self.sensitivities.__getitem__)})."
+                f"(condition {self.condition:.2g}{worst})."
             )
         parts = [
             " ".join(f"{value:+.2g} {name}" for name, value in direction.items())

@@ -34,6 +34,11 @@ Array = NDArray[np.float64]
 # that far from what it is meant to describe, and starts may agree on a wrong basin.
 _FAR_FIT = 0.1
 
+DISCRETE_BOX = (  # what often is wrong then
+    " The black box is in discrete time: convert it by to_continuous() if the "
+    "structure is in continuous time."
+)
+
 _COST = attrgetter("cost")  # by which fits are sorted
 _ROUNDS = 3  # more starts; then a smoother response; then both, thoroughly
 _N_FITS = 3  # of a round, from the best candidates: their ranking is seldom far off
@@ -91,10 +96,32 @@ def search(
             fits = _rounds(problem, guess, n_starts, given, rng, enough)
         if fits:
             return problem, fits
+    silent = _without_effect(problem, np.random.default_rng(seed))
+    if silent:
+        raise ValueError(
+            "`structure` must have parameters that change its response. Got "
+            f"{', '.join(silent)}, which change nothing: an input or an output may be "
+            "missing in B, C or D."
+        )
     raise ValueError(
         "no stable starting point was found for `structure`. Give `init`, a vector of "
         f"parameters of a stable model, or raise `n_starts` (got {n_starts})."
+        + DISCRETE_BOX
+        * (problem.system.dt is not None)
     )
+
+
+def _without_effect(
+    problem: RestructuringProblem, rng: np.random.Generator
+) -> list[str]:
+    """Names of the parameters that change no response at a random point."""
+    structure = problem.structure
+    theta = np.clip(
+        rng.normal(size=structure.n_params), structure.lower, structure.upper
+    )
+    J = problem.system.response_jacobian(theta, problem.omega)[1]
+    effect = np.abs(np.nan_to_num(J, nan=1.0)).max((0, 1, 2))
+    return [n for n, e in zip(structure.parameter_names, effect, strict=True) if e == 0]
 
 
 def _rounds(

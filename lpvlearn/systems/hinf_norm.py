@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from .peaks import TENTHS, Peak, PeakRefiner, sigma_max
-from .response import FrequencyEngine
+from .response import FrequencyEngine, scaled_system, times_power
 
 _EPS = float(np.finfo(float).eps)
 
@@ -108,12 +108,19 @@ def linf_norm(
             "`within` must be None, for one peak, or a fraction of the norm in "
             f"[0, 1). Got {within}."
         )
+    scaled = scaled_system(A, B, C, D, dt is not None)
     if len(A) == 0:
-        return _constant(D)
-    search = _Search(FrequencyEngine(A, B, C, D, discrete=dt is not None))
-    if stable and (search.depth >= -search.on_boundary).any():
-        return PeakSet(np.inf, np.empty(0), np.empty(0))
-    found = search.run(within)
+        found = _constant(scaled.D)
+    else:
+        search = _Search(FrequencyEngine(*scaled[:4], discrete=dt is not None))
+        if stable and (search.depth >= -search.on_boundary).any():
+            return PeakSet(np.inf, np.empty(0), np.empty(0))
+        found = search.run(within)
+    if scaled.rate or scaled.gain:
+        values = times_power(found.values, scaled.gain)
+        frequencies = times_power(found.frequencies, scaled.rate)
+        norm = float(times_power(np.array(found.norm), scaled.gain))
+        found = PeakSet(norm, frequencies, values)
     if dt is None:
         return found
     return PeakSet(found.norm, found.frequencies / dt, found.values)

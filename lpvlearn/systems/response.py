@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lapack, schur
@@ -20,8 +22,57 @@ _ACCURACY = 1e-9
 # the extended precision of the residuals.
 _REFINEMENTS = 3
 
+# Powers of two of the largest entries of a system beyond which its units are changed:
+# far from those whose squares, or fourth powers, leave the floating-point numbers.
+_EXTREME = 150
+
 _STACK_ENTRIES = 4_000_000  # of the matrices factored at once: 64 MB
 _DELAY = 1e-12  # decay a sample of a sampled model's pole at the origin (a delay)
+
+
+class ScaledSystem(NamedTuple):
+    """A system in units of time and gain that make no number huge or tiny.
+
+    ``G(j omega) = 2^gain G_scaled(j omega / 2^rate)``; all powers of two are exact.
+    """
+
+    A: NDArray
+    B: NDArray
+    C: NDArray
+    D: NDArray
+    rate: int  # 0 in discrete time
+    gain: int
+
+
+def scaled_system(
+    A: NDArray, B: NDArray, C: NDArray, D: NDArray, discrete: bool
+) -> ScaledSystem:
+    """The system in such units; as it is where squares do not leave the numbers."""
+    a, b, c, d = (_exponent(M) for M in (A, B, C, D))
+    extreme = max(abs(e) for e in (a, b, c, d, b + c, b + c - a)) > _EXTREME
+    if not extreme:
+        return ScaledSystem(A, B, C, D, 0, 0)
+    rate = 0 if discrete or not A.any() else a
+    through = b + c - rate
+    ways = [e for e, there in ((through, B.any() and C.any()), (d, D.any())) if there]
+    gain = max(ways, default=0)
+    shift = min(through - gain, 0)
+    B = times_power(B, shift // 2 - b)
+    C = times_power(C, shift - shift // 2 - c)
+    A, D = times_power(A, -rate), times_power(D, -gain)
+    return ScaledSystem(A, B, C, D, rate, gain)
+
+
+def _exponent(M: NDArray) -> int:
+    """Power of two of the largest entry; 0 where there is none."""
+    return int(np.frexp(np.abs(M).max(initial=0.0))[1])
+
+
+def times_power(M: NDArray, exponent: int) -> NDArray:
+    """``M 2^exponent``, whose power may be beyond all numbers where M 2^e is not."""
+    third = exponent // 3
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        return np.asarray(M * 2.0**third * 2.0**third * 2.0 ** (exponent - 2 * third))
 
 
 def frequency_response(
@@ -54,9 +105,11 @@ def frequency_response(
     if len(A) == 0:
         G[finite] = D
     elif finite.any():
-        engine = FrequencyEngine(A, B, C, D, discrete=dt is not None)
-        angles = omega[finite] * (1.0 if dt is None else dt)
-        G[finite] = engine.accurate(angles).transpose(2, 0, 1)
+        scaled = scaled_system(A, B, C, D, dt is not None)
+        engine = FrequencyEngine(*scaled[:4], discrete=dt is not None)
+        angles = times_power(omega[finite], -scaled.rate) * (1.0 if dt is None else dt)
+        found = engine.accurate(angles).transpose(2, 0, 1)
+        G[finite] = times_power(found, scaled.gain) if scaled.gain else found
     return G
 
 

@@ -259,6 +259,19 @@ def restructuring_calls(w):
     ), {"omega": w.omega, "frf": frf, "sample_weight": np.ones(3), **options,
         "norm": "hinf",
         "init": THETA, "random_state": 0}  # fmt: skip
+    noisy = {"omega": w.omega, "frf": frf, "noise": np.full(3, 1e-3)}
+    known = lp.GrayBoxRestructurer(w.structure, norm="covariance", init=THETA)
+    yield "GrayBoxRestructurer.fit(noise)", (
+        lambda omega, frf, noise: known.fit(omega, frf, noise=noise).params_
+    ), noisy  # fmt: skip
+    yield "GrayBoxRestructurer.fit(coherence)", (
+        lambda coherence, n_averages: clone(known).set_params(norm="hinf").fit(
+            w.omega, frf, coherence=coherence, n_averages=n_averages
+        ).params_
+    ), {"coherence": np.full(3, 0.9), "n_averages": 8}  # fmt: skip
+    yield "GrayBoxRestructurer.confidence_intervals", (
+        lambda confidence: clone(known).fit(**noisy).confidence_intervals(confidence)
+    ), {"confidence": 0.9}  # fmt: skip
     yield "GrayBoxRestructurer.fit_model", (
         lambda model, **o: lp.GrayBoxRestructurer(**{**options, **o})
         .fit_model(model).params_

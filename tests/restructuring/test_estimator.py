@@ -317,6 +317,17 @@ def test_confidence_intervals_are_those_of_student():
         fitted.fit_model(mean).confidence_intervals()
 
 
+@pytest.mark.parametrize("norm", ["hinf", "h2"])
+def test_a_parameter_at_its_bound_has_no_variance(norm, rough):
+    bounded = LAG.with_bounds({"a": (2.5, None)})
+    runs = [StateSpace(-2 + e, 3, 1) for e in (-0.1, 0.0, 0.1)]
+    fitted = GrayBoxRestructurer(bounded, norm=norm)
+    fitted.fit_model(runs[1], realizations=runs)
+    assert fitted.params_[0] == 2.5
+    variance = np.diag(fitted.params_covariance_)
+    assert variance[0] == 0 < variance[1]
+
+
 def test_restarts_from_perturbations_agree():
     structure, params = CASES["two_masses"]
     black_box = structure.model(params)

@@ -1,8 +1,9 @@
 """Starting points: neighbouring basins, and positive parameters."""
 
 import numpy as np
+import pytest
 
-from lpvlearn import GrayBoxStructure, StateSpace
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.restructuring.problem import problem_from_models
 from lpvlearn.restructuring.starts import continuation_candidates, hopped_fits
 
@@ -61,3 +62,12 @@ def test_positive_parameters_lead_to_a_chain_of_masses():
         chain, box, nothing, np.random.default_rng(0), thorough=True
     )
     assert np.isclose(found, truth, rtol=1e-3).all(1).any()
+
+
+def test_what_keeps_a_search_from_starting_is_told():
+    silent = GrayBoxStructure.from_template([["-a"]], [[0]], [["c"]])
+    with pytest.raises(ValueError, match="Got a, c, which change nothing"):
+        GrayBoxRestructurer(silent).fit_model(StateSpace(-2, 3, 1))
+    unstable = GrayBoxStructure.from_template([[2]], [["b"]], [[1]])
+    with pytest.raises(ValueError, match="no stable starting point.*discrete time"):
+        GrayBoxRestructurer(unstable).fit_model(StateSpace(0.5, 3, 1, None, 1.0))

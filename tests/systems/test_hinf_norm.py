@@ -408,3 +408,57 @@ def test_adversarial_systems_match_a_pole_aware_grid(seed: int) -> None:
         errors = verdict.low, verdict.high, verdict.all_peaks
         assert max(errors) <= stress.TOLERANCE, (case.family, verdict)
         assert verdict.missed == verdict.false == 0, (case.family, verdict)
+
+
+@pytest.mark.parametrize("exponent", [-1000, -600, -400, 400, 480, 600, 1000])
+@pytest.mark.parametrize("where", ["B", "C", "B and D", "A", "B, not C"])
+def test_scales_at_the_ends_of_the_numbers_change_no_digit(
+    exponent: int, where: str
+) -> None:
+    rng = np.random.default_rng(0)
+    A = np.array([[-0.1, 2, 0], [-2, -0.1, 1], [0, 0, -3]])
+    B, C, D = rng.normal(size=(3, 2)), rng.normal(size=(2, 3)), np.zeros((2, 2))
+    unit, gain, rate = 2.0**exponent, 2.0**exponent, 1.0
+    if where == "A":
+        A, B, gain, rate = unit * A, unit * B, 1.0, unit
+    elif where == "B and D":
+        B, D = unit * B, unit * rng.normal(size=(2, 2))
+    elif where == "B, not C":
+        B, C, gain = unit * B, C / unit, 1.0
+    else:
+        B, C = (unit * B, C) if where == "B" else (B, unit * C)
+    empty = np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((2, 0))
+    assert linf_norm(*empty, unit * np.eye(2)).norm == unit
+    usual = linf_norm(A / rate, B / (gain * rate), C, D / gain, within=0.5)
+    if where == "C":
+        usual = linf_norm(A, B, C / gain, D, within=0.5)
+    elif where == "B, not C":
+        usual = linf_norm(A, B / unit, C * unit, D, within=0.5)
+    found = linf_norm(A, B, C, D, within=0.5)
+    assert_allclose(found.norm / gain, usual.norm, rtol=1e-13)
+    assert_allclose(found.values / gain, usual.values, rtol=1e-13)
+    assert_allclose(found.frequencies / rate, usual.frequencies, rtol=1e-9)
+    G = frequency_response(A, B, C, D, found.frequencies)
+    sigma = np.linalg.norm(G / gain, 2, axis=(1, 2))
+    assert_allclose(sigma, usual.values, rtol=1e-9)
+
+
+@pytest.mark.parametrize("distance", [1e-8, 1e-9, 1e-10, 1e-11, 3e-13])
+def test_poles_beside_the_circle_cost_what_the_last_place_of_the_data_does(
+    distance: float,
+) -> None:
+    """Against the quotient of polynomials in extended precision, of the same data."""
+    if np.finfo(np.longdouble).eps > 1e-18:
+        pytest.skip("long double is no wider than double here")
+    for angle in (0.3, 1.1, 2.9):
+        a1, a2 = 2 * (1 - distance) * np.cos(angle), -((1 - distance) ** 2)
+        found = linf_norm(
+            np.array([[a1, a2], [1.0, 0]]), np.eye(2)[:, :1], np.eye(2)[1:],
+            np.zeros((1, 1)), dt=1.0,
+        )  # fmt: skip
+        long1, long2 = np.longdouble(a1), np.longdouble(a2)
+        # of the squared denominator, a parabola in the cosine
+        least = (1 + long2) ** 2 * (1 + long1**2 / (4 * long2))
+        last_place = np.finfo(float).eps / distance
+        exact = float(1 / np.sqrt(least))
+        assert abs(found.norm / exact - 1) < 5 * last_place + 1e-10
