@@ -118,6 +118,13 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     frequency_weight : StateSpace, (low, high) or None, default=None
         Weight W of the error, ``W (G - G0)``: a stable model with one output for all
         outputs alike, or a square one; or a band in rad/s, None leaving a side open.
+    known_poles : array-like of float, default=None
+        Poles on the axis or beyond that black box and structure share, as the zero of
+        an integrator: real, in 1/s (of a discrete-time model 1 for an integrator). None
+        are those that the structure has for all parameters, by fixed entries. They are
+        divided out of both: the error is weighted by ``(s - p) / (s - q)`` on every
+        output that shows the pole p, with ``q = -p``, or, for an integrator, ``-c``, c
+        being the slowest rate of the black box's other poles. See Notes.
     max_iter : int, default=1000
         Newton steps on the central path and iterations of the solver, in all.
     max_time : float, default=None
@@ -208,6 +215,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     maximum over frequency (:mod:`~lpvlearn.restructuring.central_path`); the solver
     ends it.
 
+    A motor's position has an integrator, and the distance of two integrators of
+    different gains is infinite. With s / (s + c) in front it is that of the gains at
+    low frequencies, and Eq. (6) above c. All errors, bounds and certificates are then
+    those of the weighted error; `lti_` has the pole. A black box whose pole lies near
+    but is stable is weighted alike, not divided.
+
     Examples
     --------
     >>> import numpy as np
@@ -229,6 +242,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         init: str | ArrayLike = "similarity",
         n_starts: int = 16,
         frequency_weight: FrequencyWeight = None,
+        known_poles: ArrayLike | None = None,
         max_iter: int = 1000,
         max_time: float | None = None,
         tol: float = 1e-10,
@@ -240,6 +254,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self.init = init
         self.n_starts = n_starts
         self.frequency_weight = frequency_weight
+        self.known_poles = known_poles
         self.max_iter = max_iter
         self.max_time = max_time
         self.tol = tol
@@ -356,7 +371,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 f"{self.norm!r}; identify a model first and use fit_model()."
             )
         problem = problem_from_response(
-            self.structure, omega, frf, self.frequency_weight, sample_weight
+            self.structure,
+            omega,
+            frf,
+            self.frequency_weight,
+            sample_weight,
+            self.known_poles,
         )
         self._restructure(problem, [])
         self.n_features_in_ = 1
@@ -537,7 +557,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """What is minimised: the distance of the structure to one or several models."""
         self._check_options()
         models = list(model) if isinstance(model, Sequence) and model else [model]
-        return problem_from_models(self.structure, models, self.frequency_weight)
+        return problem_from_models(
+            self.structure, models, self.frequency_weight, self.known_poles
+        )
 
     def _restructure(
         self,
@@ -626,7 +648,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     ) -> None:
         """Attributes that describe the result."""
         system = problem.system
-        self.structure_ = problem.structure
+        self.structure_ = problem.whole
         self.lti_ = problem.model(self.params_)
         peaks = system.peaks(self.params_)
         self.error_ = peaks.norm
