@@ -687,8 +687,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self.hinf_params_, self.hinf_error_ = self.params_, self.error_
         self.chi2_ = self.degrees_of_freedom_ = self.p_value_ = np.nan
         dt, size = problem.system.dt, problem.reference
+        known: dict[str, Any] = {}
+        if problem.division is not None:
+            known = {"admissible": problem.is_stable, "omega": problem.omega}
         found = efficient_parameters(
-            problem.structure, estimates, self.params_, sampling_time=dt
+            problem.whole, estimates, self.params_, sampling_time=dt, **known
         )
         if found is None:
             return

@@ -147,6 +147,21 @@ def divide(
     return structure, Division(tuple(steps), dt)
 
 
+def integrators(structure: GrayBoxStructure) -> int:
+    """How many poles at zero the structure has for all parameters."""
+    thetas = _drawn(structure)
+    if not thetas or 0.0 not in _fixed_poles(structure, thetas, None):
+        return 0
+    return _multiplicity(_blocks(structure, thetas[0])[0], 0.0)
+
+
+def _multiplicity(A: Array, pole: float) -> int:
+    """How often a matrix has an eigenvalue, one of a chain as it splits."""
+    own = np.linalg.eigvals(A)
+    near = np.sqrt(_FIXED) * max(float(np.abs(own).max()), 1e-300)
+    return int((np.abs(own - pole) <= near).sum())
+
+
 def _frame(
     step: _Step, CV: Array, V: Array, n_inputs: int
 ) -> tuple[Array, Array, Array]:
@@ -258,13 +273,11 @@ def _slowest(
     if given is not None:
         return given
     dt, found = boxes[0].dt, []
-    own = np.linalg.eigvals(A)
-    near = np.sqrt(_FIXED) * max(float(np.abs(own).max()), 1e-300)
     for box in boxes:
         poles = np.linalg.eigvals(box.A).astype(complex)
         for pole in known:
-            count = int((np.abs(own - pole) <= near).sum())
-            poles = poles[np.argsort(np.abs(poles - pole), kind="stable")[count:]]
+            near = np.argsort(np.abs(poles - pole), kind="stable")
+            poles = poles[near[_multiplicity(A, pole) :]]
         found.append(poles if dt is None else np.log(poles[poles != 0]) / dt)
     size = np.abs(np.concatenate(found))
     size = size[size > 0]
