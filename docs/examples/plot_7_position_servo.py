@@ -65,7 +65,7 @@ truth = pd.DataFrame(
     [true_parameters(reach) for reach in pipeline.operating_points_[:, 0]],
     index=pipeline.parameters_.index,
 )
-pipeline.parameters_.join(truth, rsuffix=" (true)").round(3)
+pipeline.parameters_.join(truth.add_suffix(" (true)")).round(3)
 
 # %%
 # The poles between the operating points: the integrator is at zero everywhere.
