@@ -221,14 +221,20 @@ def _blocks(structure: GrayBoxStructure, theta: Array) -> tuple[Array, Array]:
 
 
 def _drawn(structure: GrayBoxStructure) -> list[Array]:
-    """Random parameters, of which every value is another."""
+    """Random parameters within the bounds: none is zero, nor the same twice."""
     rng = np.random.default_rng(0)
     lower, upper = structure.lower, structure.upper
-    guess = structure.initial
-    sizes = np.ones(structure.n_params) if guess is None else guess
+    guess = np.ones(structure.n_params)
+    if structure.initial is not None:
+        guess = np.where(structure.initial == 0, 1.0, structure.initial)
+    width = np.minimum(0.2 * (upper - lower), 1.0)
     found: list[Array] = []
     for _ in range(10 * _DRAWS):
-        theta = np.clip(sizes * np.exp(0.3 * rng.normal(size=len(sizes))), lower, upper)
+        factor = np.exp(0.3 * rng.normal(size=len(guess)))
+        theta = guess * factor
+        theta = np.where(theta <= lower, lower + width * factor, theta)
+        theta = np.where(theta >= upper, upper - width * factor, theta)
+        theta = np.clip(theta, lower, upper)
         if np.isfinite(structure.map.system_matrix(theta)).all():
             found.append(theta)
         if len(found) == _DRAWS:

@@ -150,6 +150,25 @@ def test_realizations_of_servos_have_a_covariance():
     np.testing.assert_allclose(std, thetas.std(0, ddof=1), rtol=0.03)
 
 
+SPRING = template([[0, 1], ["k", "c"]], [[0], ["b"]], [[1, 0]])
+
+
+@pytest.mark.parametrize(
+    "structure",
+    [
+        SPRING,
+        SPRING.with_bounds({"k": (None, 0), "c": (None, 0)}),
+        SPRING.with_bounds({"k": (-9, 0), "c": (-2, 0), "b": (0, 0.5)}),
+        GrayBoxStructure.from_function(
+            lambda p: ([[0, 1], [p[0], p[1]]], [[0], [1]], [[1, 0]]), [0.0, 0.0]
+        ),
+    ],
+)
+def test_a_pole_that_parameters_move_is_not_known(structure):
+    box = SPRING.model({"k": -4.0, "c": -1.0, "b": 0.3})
+    assert divide(structure, [target_of(box)], None) == (structure, None)
+
+
 GAIN = template([[0, 1], [0, "-a"]], [[0], [1]], [["g", 0]])
 
 
