@@ -32,11 +32,12 @@ def integrating_flags(integrating: Any, names: Sequence[Any]) -> Flags:
     """
     if integrating is True:
         return np.ones(len(names), bool)
-    given = integrating if isinstance(integrating, list | tuple) else [integrating]
+    many = list | tuple | np.ndarray | pd.Index
+    given = list(integrating) if isinstance(integrating, many) else [integrating]
     flags, known = np.zeros(len(names), bool), list(names)
-    for one in given:
+    for one in given or [None]:
         whole = isinstance(one, int | np.integer) and not isinstance(one, bool)
-        if one in known and not isinstance(one, bool):
+        if np.ndim(one) == 0 and not isinstance(one, bool) and one in known:
             flags[known.index(one)] = True
         elif whole and 0 <= one < len(known):
             flags[one] = True
