@@ -39,6 +39,7 @@ Flags = NDArray[np.bool_]
 
 _DRAWS = 3  # random parameters at which a pole must be, to be there for all
 _FIXED = 1e-10  # relative singular value or difference that is rounding of a structure
+_CLEAN = 1e-12  # entry of a unit eigenvector that is rounding
 _SHARED = 1e-6  # the same of a black box, whose pole is one of several rounded numbers
 _NEAR = 0.05  # distance of a pole, relative to c, that is an estimate of a known one
 _STEPS = 8  # poles of one value in a chain: more integrators no one has in series
@@ -198,7 +199,14 @@ def _directions(A: Array, pole: float, tolerance: float) -> Array:
         return np.zeros((0, 0))
     _, s, Vt = np.linalg.svd(A - pole * np.eye(len(A)))
     size = max(float(np.linalg.norm(A, 2)), abs(pole), 1e-300)
-    return np.asarray(Vt[s <= tolerance * size].T)
+    V = np.asarray(Vt[s <= tolerance * size].T)
+    if tolerance > _FIXED:
+        return V
+    # in bad units a pole may be small beside others: row by row it is none
+    V = np.where(np.abs(V) > _CLEAN, V, 0.0)
+    terms = np.abs(A) @ np.abs(V) + abs(pole) * np.abs(V)
+    rest = np.abs(A @ V - pole * V)
+    return V[:, (rest <= _FIXED * terms).all(0)]
 
 
 def _snapped(A: Array, step: _Step) -> Array:

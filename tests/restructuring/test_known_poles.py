@@ -158,6 +158,7 @@ SPRING = template([[0, 1], ["k", "c"]], [[0], ["b"]], [[1, 0]])
     [
         SPRING,
         SPRING.with_bounds({"k": (None, 0), "c": (None, 0)}),
+        template([[0, 1e6], ["1e-3 * k", "1e15 * c"]], [[0], ["b"]], [[1e6, 0]]),
         SPRING.with_bounds({"k": (-9, 0), "c": (-2, 0), "b": (0, 0.5)}),
         GrayBoxStructure.from_function(
             lambda p: ([[0, 1], [p[0], p[1]]], [[0], [1]], [[1, 0]]), [0.0, 0.0]
