@@ -305,6 +305,8 @@ local.residual_tests(X, y)
 # * ``missing="split"`` ends an experiment before a sample with NaN, or a row that the
 #   ``time`` column misses, and starts another one after it, with an initial state and a
 #   constant of its own: :ref:`guide_logs`.
+# * ``integrating="angle"`` identifies the rate of an output that integrates, and
+#   integrates the model: see the example of a position servo.
 # * ``stability="enforce"`` returns a stable model and says in ``stability_loss_`` what
 #   that cost.
 

@@ -313,6 +313,19 @@ pd.DataFrame(
 ).round(2)
 
 # %%
+# Integrators
+# -----------
+# A structure that has a pole at zero for all parameters, as a position has by ``x1' =
+# x2``, shares it with the black box. The distance of two integrators is infinite
+# unless their gains agree: both are divided by it, and the error is weighted by
+# ``s / (s + c)``, which compares gains at low frequencies. Poles that are known
+# otherwise are named by ``known_poles``.
+#
+# Large problems
+# --------------
+# ``max_time=10`` ends the search after ten seconds at the best point it has, and says
+# so.
+#
 # Is the structure identifiable?
 # ------------------------------
 # Two parameters that only appear as a product cannot be told apart by any experiment.

@@ -45,6 +45,7 @@ from ..metrics.scorers import InitialState
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
+from ..subspace.integrating import integrating_flags
 from ..validation import one_of, positive_time, whole_number
 from .html_report import html_report
 from .output_error import (
@@ -413,7 +414,7 @@ list, default=None
 
         with watch.step("local models"):  # step 3: a black box at every point
             local, points = identify_points(
-                SubspaceLTI() if self.local is None else self.local,
+                self._local(),
                 points,
                 runner,
                 structure=structure,
@@ -599,6 +600,16 @@ list, default=None
         refined = self.refiner_ = runner.call(refine_model, *arguments)
         self.lpv_, self.interpolator_ = refined.lpv_, refined.lpv_.interpolator
         self.scheduling_range_ = np.asarray(self.lpv_.identified_range)
+
+    def _local(self) -> Any:
+        """The local estimator, which knows no names of outputs, but their places."""
+        local = SubspaceLTI() if self.local is None else self.local
+        integrating = getattr(local, "integrating", None)
+        if integrating is None or integrating is True:
+            return local
+        flags = integrating_flags(integrating, self.output_names_)
+        places = np.flatnonzero(flags).tolist()
+        return clone(local).set_params(integrating=places)
 
     def _restructurer(self) -> Any:
         """The restructurer to clone, or the way without one."""

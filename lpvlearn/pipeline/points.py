@@ -31,6 +31,7 @@ from ..lpv.alignment import aligned_models
 from ..lpv.equilibria import points_of_work
 from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.deadline import bounded, time_is_up
+from ..restructuring.known_poles import integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..structures.structure import GrayBoxStructure
@@ -53,6 +54,10 @@ _Task = tuple[StateSpace, list[StateSpace], list[Estimate]]
 _SWEEPS = 4  # passes over the points: help travels that far from a good one
 
 _NEIGHBOURS = 2  # points that help one: those to either side along one variable
+
+# A pole that much slower than the others is an integrator, and an output shows it by
+# more than that part of the output that does most.
+_STANDING = 0.05
 
 _FIRST_SHARE = 0.75  # of `max_time`, before the points help one another
 
@@ -101,7 +106,10 @@ def identify_points(
     """
     chooses = local.get_params(deep=False).get("order") == "auto"
     if chooses and isinstance(structure, GrayBoxStructure):
-        local = clone(local).set_params(order=structure.order)
+        rest = structure.order
+        if _integrates(local):  # the model of the rates has not the integrators
+            rest -= integrators(structure)
+        local = clone(local).set_params(order=rest)
     # Where a record stood in the table does not matter: splits share their results.
     groups = [[_bare(e) for e in group] for group in points.experiments]
 
@@ -136,6 +144,11 @@ def identify_point(
     matrices averaged (the paper's Monte Carlo). Refuses outputs that do not vary, and
     an unstable model, which cannot be balanced. `efficient` gives `estimates`.
     """
+    if _integrates(local) and combine == "average":
+        raise ValueError(
+            "`combine` must be 'pool' for a local estimator with `integrating`: models "
+            "with integrators cannot be balanced. Got 'average'."
+        )
     advice = _look_at_outputs(experiments)
     labels = list(dict.fromkeys(e.label for e in experiments))
     if combine == "pool" or len(labels) == 1:
@@ -143,7 +156,12 @@ def identify_point(
         pairs = _deviated(fitted)
         if _from_closed_loop(fitted):
             advice = _HELD + advice
-        lti = _continuous(fitted.lti_, discretization, advice)
+        rates = getattr(fitted, "rates_", None)
+        if rates is None:
+            lti = _continuous(fitted.lti_, discretization, advice)
+        else:  # stable but for the integrators
+            _continuous(rates.lti_, discretization, advice)
+            lti = fitted.lti_.to_continuous(discretization)
         found = LocalModel(
             lti,
             fitted.lti_.order,
@@ -197,6 +215,11 @@ def identify_point(
     )
 
 
+def _integrates(local: Any) -> bool:
+    """Whether an estimator identifies the rates of outputs, and integrates them."""
+    return getattr(local, "integrating", None) is not None
+
+
 def _deviated(fitted: Any) -> list[ModelPair]:
     """Models to either side of a fitted one, where the estimator knows them."""
     pairs = getattr(fitted, "deviated_models", None)
@@ -222,6 +245,8 @@ def _equilibrium(
     not looked for constants, or does not tell.
     """
     first = fitted[0]
+    if _integrates(first):  # it rests anywhere
+        return None
     looked = getattr(first, "offset", None) or getattr(first, "detrend", None)
     if not looked or not hasattr(first, "resting_point"):
         return None
@@ -366,6 +391,7 @@ def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpa
         lti = model.to_continuous(discretization)
     if not lti.is_stable:
         worst = lti.poles()[np.argmax(lti.poles().real)]
+        advice = _integrating_outputs(lti) + advice
         raise ValueError(
             f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
             "local=SubspaceLTI(stability='enforce'), another `order`, a longer "
@@ -382,6 +408,24 @@ def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpa
             "sampling time or a lower `order` avoids it."
         )
     return lti.balance()
+
+
+def _integrating_outputs(lti: StateSpace) -> str:
+    """Which outputs integrate, where the only pole that does not decay is about zero.
+
+    It is that of the outputs that show it.
+    """
+    poles, V = np.linalg.eig(lti.A)
+    i = int(np.argmax(poles.real))
+    others = np.delete(np.abs(poles), i)
+    if poles[i].imag or abs(poles[i]) > _STANDING * others.min(initial=np.inf):
+        return ""
+    seen = np.abs(lti.C @ V[:, i].real)
+    places = np.flatnonzero(seen > _STANDING * seen.max()).tolist()
+    return (
+        f"If outputs {places} integrate, as a position does, name them: "
+        f"local=SubspaceLTI(integrating={places}) identifies their rates. "
+    )
 
 
 def common_delay(
@@ -714,10 +758,7 @@ def covariance_of_parameters(
     `frequency_weight` of `GrayBoxRestructurer`.
     """
     problem = problem_from_models(structure, [model], weight)
-
-    def response(of: StateSpace) -> NDArray[np.complex128]:
-        return of.with_input_delay(0).frequency_response(problem.omega)
-
+    response = problem.response_of
     changes = [response(above) - response(below) for above, below in deviated]
     T = problem.parameter_changes(theta, np.array(changes)) / (2.0 * DEVIATION)
     return T.T @ T

@@ -107,7 +107,9 @@ def tables(
         met = found.structure.model(interpolated[k])
         distance = (gray_box.with_input_delay(0) - met).hinf_norm()
         size = gray_box.hinf_norm()
-        row["interpolation_error"] = distance / size if size > 0 else np.nan
+        # infinite with integrators, whose gains need not agree
+        known = 0 < size < np.inf
+        row["interpolation_error"] = distance / size if known else np.nan
         row["interpolation_FIT"] = parameter_fit(theta[k], interpolated[k])
         row["growth_rate"] = growth[k]
         if found.restructurers:

@@ -127,6 +127,13 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     frequency_weight : StateSpace, (low, high) or None, default=None
         Weight W of the error, ``W (G - G0)``: a stable model with one output for all
         outputs alike, or a square one; or a band in rad/s, None leaving a side open.
+    known_poles : array-like of float, default=None
+        Poles on the axis or beyond that black box and structure share, as the zero of
+        an integrator: real, in 1/s (of a discrete-time model 1 for an integrator). None
+        are those that the structure has for all parameters, by fixed entries. They are
+        divided out of both: the error is weighted by ``(s - p) / (s - q)`` on every
+        output that shows the pole p, with ``q = -p``, or, for an integrator, ``-c``, c
+        being the slowest rate of the black box's other poles. See Notes.
     max_iter : int, default=1000
         Newton steps on the central path and iterations of the solver, in all.
     max_time : float, default=None
@@ -217,6 +224,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     maximum over frequency (:mod:`~lpvlearn.restructuring.central_path`); the solver
     ends it.
 
+    A motor's position has an integrator, and the distance of two integrators of
+    different gains is infinite. With s / (s + c) in front it is that of the gains at
+    low frequencies, and Eq. (6) above c. All errors, bounds and certificates are then
+    those of the weighted error; `lti_` has the pole. A black box whose pole lies near
+    but is stable is weighted alike, not divided.
+
     Examples
     --------
     >>> import numpy as np
@@ -238,6 +251,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         init: str | ArrayLike = "similarity",
         n_starts: int = 16,
         frequency_weight: FrequencyWeight = None,
+        known_poles: ArrayLike | None = None,
         max_iter: int = 1000,
         max_time: float | None = None,
         tol: float = 1e-10,
@@ -249,6 +263,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self.init = init
         self.n_starts = n_starts
         self.frequency_weight = frequency_weight
+        self.known_poles = known_poles
         self.max_iter = max_iter
         self.max_time = max_time
         self.tol = tol
@@ -400,6 +415,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             noise,
             coherence,
             n_averages,
+            self.known_poles,
         )
         if self.norm == "covariance" and problem.noise is None:
             raise ValueError(
@@ -595,7 +611,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """What is minimised: the distance of the structure to one or several models."""
         self._check_options()
         models = list(model) if isinstance(model, Sequence) and model else [model]
-        return problem_from_models(self.structure, models, self.frequency_weight)
+        return problem_from_models(
+            self.structure, models, self.frequency_weight, self.known_poles
+        )
 
     def _restructure(
         self,
@@ -684,7 +702,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     ) -> None:
         """Attributes that describe the result."""
         system = problem.system
-        self.structure_ = problem.structure
+        self.structure_ = problem.whole
         self.lti_ = problem.model(self.params_)
         peaks = system.peaks(self.params_)
         self.error_ = peaks.norm
@@ -723,9 +741,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self.hinf_params_, self.hinf_error_ = self.params_, self.error_
         self.chi2_ = self.degrees_of_freedom_ = self.p_value_ = np.nan
         dt, size = problem.system.dt, problem.reference
+        known: dict[str, Any] = {}
+        if problem.division is not None:
+            known = {"admissible": problem.is_stable, "omega": problem.omega}
         if problem.noise is None:
             found = efficient_parameters(
-                problem.structure, estimates, self.params_, sampling_time=dt
+                problem.whole, estimates, self.params_, sampling_time=dt, **known
             )
         else:
             box = measured_response(problem.omega, problem.response, problem.noise)

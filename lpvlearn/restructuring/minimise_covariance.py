@@ -156,24 +156,32 @@ def efficient_parameters(
     start: Array,
     *,
     sampling_time: float | None = None,
+    admissible: Callable[[Array], bool] | None = None,
+    omega: Array | None = None,
 ) -> CovarianceFit | None:
     """Parameters of a structure from independent estimates of one system.
 
     The estimates are those of all experiments, or of each realization of the noise,
     with their models on either side. Where these are in discrete time and the structure
     (`sampling_time`) is not, it is sampled behind a hold. None where an uncertainty is
-    not known, or the start does not keep the stability margin.
+    not known, or the start does not keep the stability margin. Of models with known
+    poles a margin says nothing: what is `admissible`, and frequencies that see the
+    other poles, are given.
     """
     first = estimates[0][0]
     target = Target(first.A, first.B, first.C, first.D, first.sampling_time)
     if first.sampling_time is not None and sampling_time is None:
         structure = SampledStructure(structure, first.sampling_time)
     system = ErrorSystem(structure, target)
-    found = [uncertain_response(box, pairs, system.grid) for box, pairs in estimates]
+    grid = system.grid if omega is None else omega
+    if first.sampling_time is not None:
+        grid = grid[grid < np.pi / first.sampling_time]
+    found = [uncertain_response(box, pairs, grid) for box, pairs in estimates]
     boxes = [box for box in found if box is not None]
     if len(boxes) < len(found):
         return None
-    return minimise_covariance(system, start, natural_margin(target), boxes)
+    margin = natural_margin(target)
+    return minimise_covariance(system, start, margin, boxes, admissible=admissible)
 
 
 def minimise_covariance(
@@ -182,6 +190,7 @@ def minimise_covariance(
     margin: float,
     boxes: Sequence[UncertainResponse],
     *,
+    admissible: Callable[[Array], bool] | None = None,
     max_iter: int = 100,
 ) -> CovarianceFit | None:
     """Parameters nearest to black boxes in the metric of their own uncertainty.
@@ -222,11 +231,12 @@ def minimise_covariance(
         return np.concatenate(z), np.vstack(J)
 
     def residuals(x: Array, _: Any) -> tuple[Array, Callable[..., Array]]:
-        if not keeps_margin(system, x[0], margin):
+        if not kept(x[0]):
             return np.full((1, 1), np.nan), lambda _: np.zeros((1, 1, x.shape[1]))
         z, J = coordinates(x[0])
         return z[None], lambda _: J[None]
 
+    kept = admissible or (lambda theta: keeps_margin(system, theta, margin))
     lower, upper = system.structure.lower, system.structure.upper
     reached, costs = levenberg_marquardt(
         residuals,

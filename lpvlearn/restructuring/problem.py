@@ -23,6 +23,7 @@ from ..systems.hinf_norm import hinf_norm
 from ..validation import real_array
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, series
+from .known_poles import Division, divide
 from .least_squares import (
     LeastSquaresResult,
     channel_scaling,
@@ -80,6 +81,9 @@ class RestructuringProblem:
     dropped_feedthrough: Array  # (n_outputs, n_inputs)
     lower_bound: float  # no parameters have a smaller error
     input_delay: Array  # (n_inputs,) of the black box, which no structure has
+    # the structure as it was given, where known poles are divided out of this one
+    whole: GrayBoxStructure
+    division: Division | None = None
     noise: Array | None = None  # standard deviations of the entries of a response
 
     @cached_property
@@ -97,7 +101,7 @@ class RestructuringProblem:
 
     def model(self, theta: Array) -> StateSpace:
         """The gray-box model of parameters, with the delay of the black box."""
-        model = self.structure.model(theta, self.system.dt)
+        model = self.whole.model(theta, self.system.dt)
         return model.with_input_delay(self.input_delay)
 
     def is_stable(self, theta: Array) -> bool:
@@ -265,8 +269,13 @@ class RestructuringProblem:
             squares = float(variance) / len(G)
         return float(np.sqrt(squares / len(self.omega))) / self._weighted[2]
 
-    def _weighted_response(self, model: StateSpace) -> Complex:
+    def response_of(self, model: StateSpace) -> Complex:
+        """Response of a model at the frequencies, without delays and known poles."""
         G = model.with_input_delay(0).frequency_response(self.omega)
+        return G if self.division is None else self.division.weight(self.omega) * G
+
+    def _weighted_response(self, model: StateSpace) -> Complex:
+        G = self.response_of(model)
         W = self._weighted[0]
         return W @ np.tile(G, (1, W.shape[2] // G.shape[1], 1))
 
@@ -277,8 +286,7 @@ class RestructuringProblem:
 
         That of their mean is that of one divided by their number.
         """
-        undelayed = [model.with_input_delay(0) for model in models]
-        G = np.array([model.frequency_response(self.omega) for model in undelayed])
+        G = np.array([self.response_of(model) for model in models])
         return self.carried_covariance(theta, (G - G.mean(0)) / np.sqrt(len(G)), norm)
 
     def noise_covariance(self, theta: Array, draws: int, seed: int) -> Array:
@@ -329,7 +337,10 @@ def _distinct(thetas: Array) -> Array:
 
 
 def problem_from_models(
-    structure: GrayBoxStructure | None, models: Sequence[Any], weight: Any
+    structure: GrayBoxStructure | None,
+    models: Sequence[Any],
+    weight: Any,
+    known_poles: ArrayLike | None = None,
 ) -> RestructuringProblem:
     """Match state-space models with the exact H-infinity norm.
 
@@ -338,7 +349,10 @@ def problem_from_models(
     they are. Several models are stacked.
     """
     for model in models:
-        _check_model(model)
+        if not isinstance(model, StateSpace):
+            raise ValueError(
+                f"`model` must be a StateSpace. Got {type(model).__name__}."
+            )
     first = models[0]
     if structure is not None:
         _check_time(structure, first.sampling_time)
@@ -366,6 +380,12 @@ def problem_from_models(
         Target(m.A, m.B, m.C, structure.feedthrough_of(m.D), m.sampling_time)
         for m in models
     ]
+    whole = structure
+    structure, division = divide(structure, boxes, known_poles)
+    if division is not None:
+        boxes = [division.of(box) for box in boxes]
+    for box in boxes:
+        _check_stable(box)
     filter_ = _weight_model(weight, p, dt)
     behind = None
     if filter_ is not None:
@@ -380,7 +400,8 @@ def problem_from_models(
     if system.weight is not None:
         parts = series(*parts, system.weight)
     bound = 0.0
-    if len(models) == 1 and filter_ is None and len(first.A) > structure.order:
+    plain = division is None and filter_ is None
+    if len(models) == 1 and plain and len(first.A) > structure.order:
         bound = float(first.hankel_singular_values()[structure.order])
     return RestructuringProblem(
         structure,
@@ -392,20 +413,23 @@ def problem_from_models(
         first.D - boxes[0].D,
         bound,
         first.input_delay,
+        whole,
+        division,
     )
 
 
-def _check_model(model: Any) -> None:
-    if not isinstance(model, StateSpace):
-        raise ValueError(f"`model` must be a StateSpace. Got {type(model).__name__}.")
-    if not model.is_stable:
-        worst = model.poles()[np.argmax(growth(model.poles(), model.sampling_time))]
+def _check_stable(box: Target) -> None:
+    poles = np.linalg.eigvals(box.A).astype(complex)
+    rates = growth(poles, box.dt)
+    if not rates.max(initial=-np.inf) < 0:
+        worst = poles[np.argmax(rates)]
         raise ValueError(
             "`model` must be stable: its distance to a gray-box model is infinite "
             f"otherwise. Got a pole at {worst:.4g}. Identify it with "
-            "stability='enforce'; or, if only a controller holds the system, identify "
-            "the closed loop, with the controller's reference as input and the "
-            "controller in the structure."
+            "stability='enforce'; if it is an integrator, write it into the structure "
+            "with fixed entries, and both are divided by it; or, if only a "
+            "controller holds the system, identify the closed loop, with the "
+            "controller's reference as input and the controller in the structure."
         )
 
 
@@ -466,6 +490,7 @@ def problem_from_response(
     noise: ArrayLike | None = None,
     coherence: ArrayLike | None = None,
     n_averages: int | None = None,
+    known_poles: ArrayLike | None = None,
 ) -> RestructuringProblem:
     """Match a measured frequency response over its frequencies.
 
@@ -497,6 +522,15 @@ def problem_from_response(
             )
         W = W * scale[:, None, None]
     std = read_noise(noise, coherence, n_averages, G)
+    whole, nothing = structure, Target(*(np.zeros((0, 0)),) * 4)
+    low, high = grid[grid > 0].min(), grid.max()
+    structure, division = divide(
+        structure, [nothing], known_poles, slowest=float(np.sqrt(low * high))
+    )
+    if division is not None:
+        _check_positive(grid, division)
+        divided = division.weight(grid)
+        G, std = divided * G, None if std is None else np.abs(divided) * std
     if std is not None:
         W = W / np.sqrt(np.mean(std**2, axis=2))[:, None, :]
         std = std[np.argsort(grid)]
@@ -511,8 +545,18 @@ def problem_from_response(
         np.zeros(G.shape[1:]),
         0.0,
         np.zeros(structure.n_inputs),
+        whole,
+        division,
         std,
     )
+
+
+def _check_positive(grid: Array, division: Division) -> None:
+    if grid.min() == 0 and any(step.pole == 0 for step in division.steps):
+        raise ValueError(
+            "`omega` must be positive where `structure` has an integrator, whose "
+            "response is infinite at zero. Got 0."
+        )
 
 
 def _weight_model(

@@ -207,6 +207,41 @@ class RowsMap(StructureMap):
         return None if H is None else H[:, :, self.rows]
 
 
+@dataclass(frozen=True, eq=False)
+class FramedMap(StructureMap):
+    """``left S right + constant`` for the S of another map."""
+
+    parent: StructureMap
+    left: Array
+    right: Array
+    constant: Array
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.constant.shape
+
+    def system_matrix(self, theta: Array) -> Array:
+        own = self.left @ self.parent.system_matrix(theta) @ self.right
+        return np.asarray(own + self.constant)
+
+    def jacobian(self, theta: Array) -> Array:
+        return np.asarray(self.left @ self.parent.jacobian(theta) @ self.right)
+
+    def curvature(self, theta: Array) -> Array | None:
+        H = self.parent.curvature(theta)
+        return None if H is None else np.asarray(self.left @ H @ self.right)
+
+
+def framed(
+    map: StructureMap, left: Array, right: Array, constant: Array
+) -> StructureMap:
+    """``left S right + constant``, which is affine where S is."""
+    if isinstance(map, AffineMap):
+        offset = left @ map.offset @ right + constant
+        return AffineMap(offset, left @ map.basis @ right)
+    return FramedMap(map, left, right, constant)
+
+
 def numerical_jacobian(
     f: Callable[[Any], Any], theta: Array, typical: Array, takes_complex: bool = False
 ) -> Array:

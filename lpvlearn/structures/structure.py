@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..models.statespace import StateSpace
 from ..models.system_matrix import Blocks, blocks
 from ..validation import named_values, names_of, real_array, shown, whole_number
-from .map import AffineMap, FunctionMap, StructureMap
+from .map import AffineMap, FramedMap, FunctionMap, StructureMap
 from .mechanical import FluxMap, ImplicitMap, descriptor_map, mechanical_map
 from .templates import (
     Entry,
@@ -127,6 +127,8 @@ class GrayBoxStructure:
         self.offset = None if affine is None else affine.offset
         self.basis = None if affine is None else affine.basis
         # the equations M(theta) X = N(theta) of a structure that solves them
+        while isinstance(map, FramedMap):
+            map = map.parent
         equations = map.equations if isinstance(map, FluxMap) else map
         self.implicit = equations if isinstance(equations, ImplicitMap) else None
         if self.implicit is not None and initial is None:
@@ -640,6 +642,10 @@ class GrayBoxStructure:
         states, outputs = np.split(np.arange(self.map.shape[0]), [self.order])
         rows = np.concatenate([states, np.tile(outputs, copies)])
         return self._changed(map=self.map.select(rows))
+
+    def with_map(self, order: int, map: StructureMap) -> GrayBoxStructure:
+        """The parameters and what is known of them, with another map and order."""
+        return self._changed(order=order, map=map)
 
     def draw(self, n: int, rng: np.random.Generator) -> Array | None:
         """Random parameter vectors from the ranges, or around the first guess.

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.experiments import (
@@ -43,6 +43,13 @@ from .fit import (
     fit_pairs,
     warn_about,
     warn_about_horizon,
+)
+from .integrating import (
+    RateEvidence,
+    as_table,
+    integrated,
+    integrating_flags,
+    rates_of,
 )
 from .offsets import N_TRENDS
 from .residuals import (
@@ -134,6 +141,12 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
     missing : {"raise", "split"}, default="raise"
         "split" ends an experiment before a sample with NaN, or a row that the `time`
         column misses, and starts another after it, with an initial state of its own.
+    integrating : True, str, int or list of them, default=None
+        Outputs with an integrator, as the position of a motor: by the columns of y or
+        their positions, True for all. Their rates ``(y[k+1] - y[k]) / dt`` are
+        identified in their place (`rates_`), and integrated: `lti_` has a pole at one
+        for each, beside the `order` states of the model of the rates. Levels of these
+        outputs are initial states; `offset` finds none.
     time_tol : float, default=0.01
         Largest deviation of a time stamp from an even grid, relative to the step. For
         more, see `resample`.
@@ -170,6 +183,9 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         lost within their order), validation_bft (percent, on parts held out; NaN
         where that was not looked at), chosen. Of "pbsid" orders are those of plant and
         noise together, error that of the regression on their states.
+    rates_ : SubspaceLTI
+        With `integrating`, fitted to the rates of these outputs: `selection_`,
+        `residual_` and what is not below are its own.
     residual_ : float
         Simulation error on the data relative to the outputs, root mean square; of
         "pbsid" the error of one-step prediction.
@@ -292,6 +308,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         detrend: str | None = None,
         offset: str | None = "auto",
         missing: str = "raise",
+        integrating: Any = None,
         time_tol: float = TIME_TOL,
         inputs: Any = None,
         experiment: Any = None,
@@ -312,6 +329,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         self.detrend = detrend
         self.offset = offset
         self.missing = missing
+        self.integrating = integrating
         self.time_tol = time_tol
         self.inputs = inputs
         self.experiment = experiment
@@ -349,6 +367,9 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
             depends on past inputs (beyond chance, and 1 % of the outputs): the model
             lacks states, a delay or a nonlinearity.
         """
+        self.__dict__.pop("rates_", None)  # of an earlier fit
+        if self.integrating is not None:
+            return self._fit_rates(X, y)
         choices = check_options(self.get_params(deep=False))
         experiments = self._read(X, y, reset=True, cut=False)
         self.time_jitter_ = max(e.jitter for e in experiments)
@@ -368,6 +389,50 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         warn_about(fitted, told)
         if choices.order is not None and choices.horizon is not None:
             warn_about_horizon(fitted, choices)
+        return self
+
+    def _fit_rates(self, X: Any, y: Any) -> Self:
+        """Identify the rates of integrating outputs, and integrate their model."""
+        if self.detrend is not None or self.offset not in (None, "auto"):
+            raise ValueError(
+                "`integrating` needs detrend=None, and offset=None or 'auto': a "
+                "constant rate is no offset of an output. Got "
+                f"detrend={self.detrend!r}, offset={self.offset!r}."
+            )
+        experiments = self._read(X, y, reset=True)
+        self.time_jitter_ = max(e.jitter for e in experiments)
+        self._stream, self._single_output = None, np.asarray(y).ndim == 1
+        flags = integrating_flags(self.integrating, read_outputs(y)[1])
+        step = self._step_of(experiments)
+        table, rates = as_table(rates_of(experiments, flags, float(step)))
+        m = table.shape[1] - 1
+        direct = np.broadcast_to(self.feedthrough, (len(flags), m)) | flags[:, None]
+        rate_model = clone(self).set_params(
+            integrating=None,
+            offset=None,
+            missing="raise",
+            feedthrough=direct if not direct.all() else True,
+            sampling_time=None if step is True else step,
+            inputs=list(table.columns[:-1]),
+            experiment=table.columns[-1],
+            time=None,
+            scheduling=None,
+            operating_point=None,
+        )
+        self.rates_ = inner = rate_model.fit(table, rates)
+        self.lti_ = integrated(inner.lti_, flags)
+        self._evidence: Any = RateEvidence(inner.deviated_models(), flags, m)
+        self.input_delay_, self.order_ = self.lti_.input_delay, self.lti_.order
+        self.horizon_, self.method_ = inner.horizon_, inner.method_
+        self.selection_, self.residual_ = inner.selection_, inner.residual_
+        self.singular_values_ = inner.singular_values_
+        self.stability_loss_, self.n_outputs_ = inner.stability_loss_, len(flags)
+        self._offsets = inner._offsets  # zero
+        self.offset_: str | None = None
+        self.offsets_differ_ = False
+        self.input_offset_ = inner.input_offset_
+        self.output_offset_ = inner.output_offset_
+        self.output_drift_ = inner.output_drift_
         return self
 
     def partial_fit(self, X: Any, y: Any) -> Self:
@@ -437,6 +502,11 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         """
         options = self.get_params(deep=False)
         choices = check_options(options)
+        if self.integrating is not None:
+            raise ValueError(
+                "`integrating` must be None in partial_fit. Got "
+                f"{self.integrating!r}. Give it the rates of the outputs, or use `fit`."
+            )
         if self.detrend is not None:
             raise ValueError(
                 "`detrend` must be None in partial_fit, which never sees a whole "

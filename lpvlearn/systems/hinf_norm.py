@@ -178,6 +178,8 @@ class _Search:
         # once more if the norm turns out higher than the best of these. Where modes are
         # ill conditioned, either search may miss a peak that the other one finds.
         best = first[0].value if first else self.refiner.value(float(w[top]))
+        if best == 0.0:  # the sample was rounding
+            return PeakSet(float(s[top]), w[[top]], s[[top]])
         depth = 1.0 - (_BESIDE if within is None else within)
         crossings = self.levels.crossings(best * depth * (1.0 - _BESIDE))
         inner = _between(crossings, self.refiner.end, TENTHS)

@@ -1,0 +1,133 @@
+"""Outputs with an integrator: identified from their differences, and integrated.
+
+An integrator is a pole at one that no record tells from a slow one. The rates of the
+outputs ``(y[k+1] - y[k]) / dt`` do not have it: their model, with a feedthrough from
+the inputs of the step, is stable, and behind ``y[k+1] = y[k] + dt rate[k]`` it is that
+of the outputs, exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..data.experiments import Experiment
+from ..models.statespace import ModelPair, StateSpace
+from .simulation_fit import Freedom
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+def integrating_flags(integrating: Any, names: Sequence[Any]) -> Flags:
+    """Which outputs are named, or all for True.
+
+    >>> integrating_flags("angle", ["angle", "current"])
+    array([ True, False])
+    """
+    if integrating is True:
+        return np.ones(len(names), bool)
+    many = list | tuple | np.ndarray | pd.Index
+    given = list(integrating) if isinstance(integrating, many) else [integrating]
+    flags, known = np.zeros(len(names), bool), list(names)
+    for one in given or [None]:
+        whole = isinstance(one, int | np.integer) and not isinstance(one, bool)
+        if np.ndim(one) == 0 and not isinstance(one, bool) and one in known:
+            flags[known.index(one)] = True
+        elif whole and 0 <= one < len(known):
+            flags[one] = True
+        else:
+            raise ValueError(
+                "`integrating` must be None, True, or name outputs by the columns of "
+                f"y, {known}, or their positions. Got {one!r}."
+            )
+    return flags
+
+
+def rates_of(
+    experiments: Sequence[Experiment], flags: Flags, step: float
+) -> list[Experiment]:
+    """The experiments with the rates of some outputs, without their last samples."""
+    found = []
+    for e in experiments:
+        if e.outputs is None or len(e.rows) < 2:
+            raise ValueError(
+                "`integrating` needs experiments of two samples or more. Got one, "
+                f"{e.label!r}, of {len(e.rows)}."
+            )
+        y = np.where(flags, np.diff(e.outputs, axis=0) / step, e.outputs[:-1])
+        kappa = None if e.scheduling is None else e.scheduling[:-1]
+        shorter = replace(
+            e, rows=e.rows[:-1], inputs=e.inputs[:-1], outputs=y, scheduling=kappa
+        )
+        found.append(shorter)
+    return found
+
+
+def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:
+    """Inputs with a last column that tells the experiments apart, and outputs."""
+    u = np.vstack([e.inputs for e in experiments])
+    y = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    names = [str(name) for name in experiments[0].input_names or range(u.shape[1])]
+    label = "experiment"
+    while label in names:
+        label += "_"
+    table = pd.DataFrame(u, columns=names)
+    table[label] = np.repeat(
+        np.arange(len(experiments)), [len(e.rows) for e in experiments]
+    )
+    return table, y
+
+
+def integrated(model: StateSpace, flags: Flags) -> StateSpace:
+    """The model of the outputs from that of the rates of some of them.
+
+    >>> rate = StateSpace(0.5, 1.0, 1.0, 0.2, sampling_time=1.0)
+    >>> integrated(rate, np.array([True])).poles()
+    array([0.5+0.j, 1. +0.j])
+    """
+    E, dt = np.eye(len(flags))[flags], float(model.sampling_time or 1.0)
+    n, r = model.order, len(E)
+    A = np.block([[model.A, np.zeros((n, r))], [dt * E @ model.C, np.eye(r)]])
+    B = np.vstack([model.B, dt * E @ model.D])
+    own = ~flags[:, None]
+    C = np.hstack([np.where(own, model.C, 0.0), E.T])
+    D = np.where(own, model.D, 0.0)
+    return StateSpace(A, B, C, D, model.sampling_time, input_delay=model.input_delay)
+
+
+class RateEvidence:
+    """What is known of a model with integrators: that of the rates, integrated.
+
+    What has no place here (noise, residuals) is known of the rates alone.
+    """
+
+    def __init__(self, pairs: list[ModelPair], flags: Flags, n_inputs: int) -> None:
+        self._pairs, self._flags = pairs, flags
+        self.free = Freedom(np.ones((len(flags), n_inputs), bool))
+
+    def deviated_models(self, lti: StateSpace) -> list[ModelPair]:
+        """Models to either side, with the integrators."""
+        return [
+            (integrated(above, self._flags), integrated(below, self._flags))
+            for above, below in self._pairs
+        ]
+
+    @property
+    def records(self) -> Any:
+        """None: residuals are those of the rates."""
+        return self._refuse()
+
+    def _refuse(self, *_: Any) -> Any:
+        raise ValueError(
+            "with `integrating`, the errors and their statistics are known of the "
+            "rates of the outputs. Ask `rates_`, the SubspaceLTI of these."
+        )
+
+    predictor = poles_std = _refuse
+    frequency_response_covariance = frequency_response_std = _refuse

@@ -1,0 +1,146 @@
+"""Outputs with an integrator: identified from their rates."""
+
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    StateSpace,
+    SubspaceLTI,
+    from_trajectories,
+)
+from lpvlearn.pipeline.points import _integrating_outputs
+
+STEP = 0.02
+SERVO = GrayBoxStructure.from_template(
+    [[0, 1], [0, "-a"]], [[0], ["b"]], [[1, 0], [0, 1]]
+)
+
+
+def record(noise=0.0, seed=0, a=3.0, b=2.0, n=600):
+    """Input, and angle and speed of a motor."""
+    rng = np.random.default_rng(seed)
+    u = rng.choice([-1.0, 1.0], size=(n // 5, 1)).repeat(5, axis=0)
+    y = SERVO.model({"a": a, "b": b}).simulate(u, sampling_time=STEP)
+    y = y + noise * y.std(axis=0) * rng.normal(size=y.shape)
+    return u, pd.DataFrame(y, columns=["angle", "speed"])
+
+
+def test_a_motor_is_identified_exactly_with_its_integrator():
+    u, y = record()
+    local = SubspaceLTI(1, sampling_time=STEP, integrating="angle").fit(u, y)
+    assert local.order_ == 2
+    assert np.abs(local.lti_.poles() - 1.0).min() < 1e-12
+    omega = np.geomspace(0.1, 50.0, 30)
+    truth = SERVO.model({"a": 3.0, "b": 2.0}).to_discrete(STEP)
+    np.testing.assert_allclose(
+        local.lti_.frequency_response(omega),
+        truth.frequency_response(omega),
+        rtol=1e-6,
+        atol=1e-9,
+    )
+    assert local.score(u, y) > 1 - 1e-9
+    level = y + np.array([40.0, 0.0])  # of an angle that no one has set to zero
+    np.testing.assert_allclose(
+        local.predict_with_initial_state(u, level), level, atol=1e-6
+    )
+    again = pickle.loads(pickle.dumps(local))
+    np.testing.assert_array_equal(again.predict(u), local.predict(u))
+    plain = local.set_params(integrating=None, order=2).fit(u, y)
+    assert not hasattr(plain, "rates_")
+
+
+def test_several_experiments_are_not_joined():
+    parts = [record(seed=k) for k in range(3)]
+    X = pd.concat(
+        [pd.DataFrame({"u": u[:, 0], "run": k}) for k, (u, _) in enumerate(parts)]
+    )
+    y = pd.concat([y + [k, 0.0] for k, (_, y) in enumerate(parts)])  # other angles
+    roles = {"sampling_time": STEP, "experiment": "run"}
+    local = SubspaceLTI(1, integrating=["angle"], **roles).fit(X, y)
+    poles = np.sort(local.lti_.to_continuous("zoh").poles().real)
+    np.testing.assert_allclose(poles, [-3.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("integrating", [["angel"], [2], "x", [True]])
+def test_outputs_must_be_known(integrating):
+    with pytest.raises(ValueError, match="`integrating` must be None, True, or name"):
+        SubspaceLTI(1, integrating=integrating).fit(*record(n=100))
+
+
+def test_what_is_known_of_the_rates_is_asked_of_them():
+    u, y = record(noise=0.01)
+    local = SubspaceLTI(1, sampling_time=STEP, integrating=[0]).fit(u, y)
+    for ask in (
+        lambda: local.predictor_,
+        lambda: local.frequency_response_std([1.0]),
+        lambda: local.residual_tests(u, y),
+        lambda: local.predict_ahead(u, y),
+    ):
+        with pytest.raises(ValueError, match="Ask `rates_`"):
+            ask()
+    with pytest.raises(ValueError, match="`integrating` must be None in partial_fit"):
+        local.partial_fit(u, y)
+    with pytest.raises(ValueError, match="needs detrend=None"):
+        SubspaceLTI(1, integrating=[0], offset="constant").fit(u, y)
+    pairs = local.deviated_models()
+    assert pairs and all(abs(m.poles() - 1.0).min() < 1e-12 for m in pairs[0])
+
+
+INERTIA = (1.0, 2.0, 3.0)
+
+
+def servo_tables(noise=1e-3):
+    trajectories = []
+    for k, inertia in enumerate(INERTIA):
+        u, y = record(noise, seed=k, a=3.0 / inertia, b=6.0 / inertia)
+        trajectories.append((u, inertia, y.to_numpy()[:, :1]))
+    X, y = from_trajectories(trajectories, sampling_time=STEP)
+    return X, pd.DataFrame(np.asarray(y), columns=["angle"])
+
+
+ANGLE = GrayBoxStructure.from_template([[0, 1], [0, "-a"]], [[0], ["b"]], [[1, 0]])
+ROLES = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+
+
+@pytest.mark.parametrize("efficient", [False, True])
+def test_a_servo_from_data_to_the_lpv_model(efficient):
+    X, y = servo_tables()
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(integrating="angle"),
+        GrayBoxRestructurer(ANGLE),
+        efficient=efficient,
+        **ROLES,
+    ).fit(X, y)
+    truth = np.array([[3.0 / j, 6.0 / j] for j in INERTIA])
+    np.testing.assert_allclose(pipeline.parameters_[["a", "b"]], truth, rtol=0.01)
+    assert np.isfinite(pipeline.parameters_std_).all().all()
+    assert pipeline.score(X, y) > 0.999
+    assert pipeline.lpv_.at(1.5).poles()[0] == 0.0
+    assert pipeline.warnings_ == []
+
+
+def test_models_with_integrators_are_not_averaged():
+    X, y = servo_tables()
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(1, integrating=True),
+        GrayBoxRestructurer(ANGLE),
+        combine="average",
+        **ROLES,
+    )
+    with pytest.raises(ValueError, match="`combine` must be 'pool'"):
+        pipeline.fit(X, y)
+
+
+def test_integrators_are_offered_by_name():
+    drifting = StateSpace(
+        [[1e-4, 1.0], [0.0, -3.0]], [[0.0], [1.0]], [[0.0, 1.0], [1.0, 0.0]]
+    )
+    assert "SubspaceLTI(integrating=[1])" in _integrating_outputs(drifting)
+    growing = StateSpace([[2.0, 1.0], [0.0, -3.0]], [[0.0], [1.0]], [[1.0, 0.0]])
+    assert _integrating_outputs(growing) == ""
