@@ -13,7 +13,7 @@ from ..validation import naming_argument, number, real_array, shown, whole_numbe
 
 Array = NDArray[np.float64]
 
-_MOST_STEPS = 10_000  # of integration in a sampling period, 1 s with the defaults
+_MOST_STEPS = 10_000  # of integration in a sampling period: 5 s of the arm
 
 _MOST = 1e8  # samples, experiments or bits of a built-in data set: more is a mistake
 

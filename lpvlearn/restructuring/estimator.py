@@ -19,9 +19,10 @@ from scipy.stats import t as student
 from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
+from sklearn.utils.metadata_routing import UNUSED
 from sklearn.utils.validation import check_is_fitted
 
-from ..exceptions import RankWarning, VersionedPickle, warn
+from ..exceptions import RankWarning, VersionedPickle, all_or_nothing, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
@@ -228,6 +229,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     >>> dict(zip(structure.parameter_names, restructurer.params_.round(6).tolist()))
     {'b': 2.0, 'c': 0.5, 'k': 4.0}
     """
+
+    # Data under names of their own, which scikit-learn would route as metadata.
+    __metadata_request__fit = {"omega": UNUSED, "frf": UNUSED}
+    __metadata_request__predict = {"omega": UNUSED}
 
     def __init__(
         self,
@@ -597,6 +602,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         models = list(model) if isinstance(model, Sequence) and model else [model]
         return problem_from_models(self.structure, models, self.frequency_weight)
 
+    @all_or_nothing
     def _restructure(
         self,
         problem: RestructuringProblem,
@@ -609,16 +615,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
 
         All attributes are those of this fit, or, where it fails, of the one before.
         """
-        before = self.__dict__.copy()
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
-        try:
-            with bounded(self.max_time):
-                self._searched(problem, given, estimates, uncertainty, only_given)
-        except BaseException:  # an interruption, too
-            self.__dict__.clear()
-            self.__dict__.update(before)
-            raise
+        with bounded(self.max_time):
+            self._searched(problem, given, estimates, uncertainty, only_given)
 
     def _searched(
         self,
