@@ -151,7 +151,7 @@ def as_list(keys: Any) -> list[Any]:
     if keys is None:
         return []
     many = isinstance(keys, (list, tuple, np.ndarray, pd.Index))
-    return list(keys) if many else [keys]
+    return list(keys) if many and np.ndim(keys) else [keys]
 
 
 def is_table(X: Any) -> bool:

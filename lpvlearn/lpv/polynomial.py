@@ -217,6 +217,7 @@ def powers_up_to(degree: int, highest: NDArray[np.intp]) -> NDArray[np.intp]:
     Those of every variable up to its `highest`; by increasing total degree,
     lexicographic within one. Only what is kept is listed.
     """
+    degree = min(degree, int(np.sum(highest)))
     powers = np.zeros((1, 0), np.intp)
     for most in np.minimum(highest, degree):
         own = np.tile(np.arange(most + 1), len(powers))

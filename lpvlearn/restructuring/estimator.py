@@ -560,7 +560,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             Relative deviation of every parameter from `params_`, and `error_`.
         """
         check_is_fitted(self, "params_")
-        whole_number("n_restarts", n_restarts, 1)
+        whole_number("n_restarts", n_restarts, 1, _MOST_STARTS)
         size = number("size", size, "from 0 to 1", low=0.0, high=1.0)
         rng = np.random.default_rng(0)
         rows, norm, params = [], self.norm, self.params_
