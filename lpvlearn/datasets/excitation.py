@@ -118,7 +118,7 @@ def samples_of(name: str, duration: float, sampling_time: float) -> int:
     """Number of samples in a duration."""
     dt = check_size("sampling_time", sampling_time)
     rule = f"finite and at least `sampling_time` ({dt} s)"
-    return check_count(name, round(number(name, duration, rule, low=dt) / dt))
+    return check_count(name, float(np.rint(number(name, duration, rule, low=dt) / dt)))
 
 
 def check_count(name: str, value: Any) -> int:

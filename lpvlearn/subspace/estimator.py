@@ -878,7 +878,10 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
     def _per_sample(self, omega: ArrayLike) -> Array:
         """Angular frequencies in radians per sample."""
         step = self.lti_.sampling_time or 1.0
-        return frequencies(omega) * step
+        found = frequencies(omega) * step
+        if not np.isfinite(found).all():
+            raise ValueError(f"`omega` must be finite. Got {found.max()} per sample.")
+        return found
 
     def resting_point(self) -> tuple[Array, Array]:
         """Inputs and outputs at rest: `input_offset_` and `output_offset_` pooled.
