@@ -8,11 +8,14 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import wraps
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
+
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 _HERE = str(Path(__file__).parent) + os.sep
 
@@ -101,6 +104,25 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
             outermost = level
         level, frame = level + 1, frame.f_back
     warnings.warn(message, category, stacklevel=outermost + 2)
+
+
+def all_or_nothing(method: Method) -> Method:
+    """A method that leaves the attributes as they were where it fails, or is stopped.
+
+    What an attribute refers to must not be changed in its place.
+    """
+
+    @wraps(method)
+    def careful(self: Any, *args: Any, **options: Any) -> Any:
+        before = self.__dict__.copy()
+        try:
+            return method(self, *args, **options)
+        except BaseException:  # an interruption, too
+            self.__dict__.clear()
+            self.__dict__.update(before)
+            raise
+
+    return cast(Method, careful)
 
 
 def version() -> str:

@@ -49,6 +49,8 @@ NO_TIME = (  # what a message says where seconds are needed and nothing tells th
     "sampling_time=1 counts time in samples."
 )
 
+_SQUARED = 1e150  # data of which the squares are numbers
+
 _ALIKE = 0.6  # likeness (difflib's, its default) from which a name may have been meant
 _N_SHOWN = 10  # names in an error message, lest a wide table fills the screen
 
@@ -89,7 +91,8 @@ class Column:
             raise ValueError(
                 f"Complex data not supported: column {self.name!r} of {argument}."
             )
-        if kind not in "mM":  # which numpy would turn into nanoseconds
+        imaginary = kind == "O" and any(map(np.iscomplexobj, series))
+        if kind not in "mM" and not imaginary:  # dates would be nanoseconds
             try:
                 return series.to_numpy(dtype=np.float64, na_value=np.nan)
             except (TypeError, ValueError, OverflowError):
@@ -131,7 +134,7 @@ def _listed(names: Sequence[Any]) -> str:
 def _first_not_a_number(values: Iterable[Any]) -> int | None:
     for row, value in enumerate(values):
         try:
-            float(value)
+            float("j" if np.iscomplexobj(value) else value)
         except (TypeError, ValueError, OverflowError):
             if value is not pd.NA and value is not None:
                 return row
@@ -148,7 +151,7 @@ def as_list(keys: Any) -> list[Any]:
     if keys is None:
         return []
     many = isinstance(keys, (list, tuple, np.ndarray, pd.Index))
-    return list(keys) if many else [keys]
+    return list(keys) if many and np.ndim(keys) else [keys]
 
 
 def is_table(X: Any) -> bool:
@@ -471,6 +474,8 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
             f"`{argument}` must hold numbers. Got dates or time differences, which are "
             "a `time` column beside inputs at best."
         )
+    if kind == "O" and any(map(np.iscomplexobj, np.ravel(values))):
+        raise ValueError(f"Complex data not supported: `{argument}` holds some.")
     if np.ma.isMaskedArray(values):
         values = np.ma.filled(values.astype(float), np.nan)  # masked ones are missing
     try:
@@ -528,14 +533,14 @@ def _check_finite(
     remedy: str,
 ) -> None:
     """Refuse infinity, and NaN where it may not be, naming the first."""
-    finite = np.isfinite(matrix) | (allow_missing & np.isnan(matrix))
+    finite = (np.abs(matrix) < _SQUARED) | (allow_missing & np.isnan(matrix))
     if finite.all():
         return
     column = int(np.argmin(finite.all(axis=0)))
     row = int(np.argmin(finite[:, column]))
     where = next(k for k, rows in enumerate(groups) if row in rows)
     missing = np.isnan(matrix[row, column])
-    what = "NaN" if missing else "infinity or a value too large for dtype('float64')"
+    what = "NaN" if missing else "infinity or a value too large to be squared"
     raise ValueError(
         f"Input {argument} contains {what}. First in column {names[column]!r} of "
         f"experiment {labels[where]!r}, at row {row}: fill the gap (interpolate)"

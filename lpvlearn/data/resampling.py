@@ -136,10 +136,11 @@ def resample(
     step = float(f"{own:.{_DIGITS}g}")
     if sampling_time is not None:
         step = positive_time("sampling_time", sampling_time)
-        if step < own / _FINEST:
+        longest = max(record.seconds[-1] - record.seconds[0] for record in records)
+        if not own / _FINEST <= step <= longest:
             raise ValueError(
-                f"`sampling_time` must be at least {own / _FINEST:.3g} s, {_FINEST} "
-                f"points for each sample. Got {step} s."
+                f"`sampling_time` must be {own / _FINEST:.3g} s ({_FINEST} points for "
+                f"each sample) to {longest:.6g} s, the longest record. Got {step} s."
             )
     # As many points of a finer grid to each point as the record has samples.
     n_fine = int(np.ceil(step / (_AS_FINE * own))) if antialias else 1

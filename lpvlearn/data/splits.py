@@ -88,6 +88,8 @@ class _SplitOfExperiments(BaseCrossValidator):
 
     n_splits: int | str
 
+    __metadata_request__split = {"groups": True}  # where scikit-learn routes metadata
+
     def get_n_splits(self, X: Any = None, y: Any = None, groups: Any = None) -> int:
         """Number of folds.
 

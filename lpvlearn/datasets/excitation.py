@@ -13,7 +13,9 @@ from ..validation import naming_argument, number, real_array, shown, whole_numbe
 
 Array = NDArray[np.float64]
 
-_MOST_STEPS = 10_000  # of integration in a sampling period, 1 s with the defaults
+_MOST_BITS = 10**6  # of a window that is balanced: all of one are held at once
+
+_MOST_STEPS = 10_000  # of integration in a sampling period: 5 s of the arm
 
 _MOST = 1e8  # samples, experiments or bits of a built-in data set: more is a mistake
 
@@ -71,7 +73,7 @@ def prbs(
     )
     clock, amplitude = check_count("clock", clock), check_size("amplitude", amplitude)
     if balance is not None:
-        balance = whole_number("balance", balance, 2)
+        balance = whole_number("balance", balance, 2, _MOST_BITS)
         if balance % 2:
             raise ValueError(f"`balance` must be even, or None. Got {balance}.")
     rng = (
@@ -118,7 +120,7 @@ def samples_of(name: str, duration: float, sampling_time: float) -> int:
     """Number of samples in a duration."""
     dt = check_size("sampling_time", sampling_time)
     rule = f"finite and at least `sampling_time` ({dt} s)"
-    return check_count(name, round(number(name, duration, rule, low=dt) / dt))
+    return check_count(name, float(np.rint(number(name, duration, rule, low=dt) / dt)))
 
 
 def check_count(name: str, value: Any) -> int:

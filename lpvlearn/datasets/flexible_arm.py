@@ -449,7 +449,7 @@ def _pair_experiments(
     if not np.isfinite(reference).all():
         raise ValueError("`velocity_reference` must be finite. Got NaN or infinity.")
     angles = real_array("theta2", theta2)
-    if angles.ndim > 1 or not np.isfinite(angles).all():
+    if angles.ndim > 1 or angles.size == 0 or not np.isfinite(angles).all():
         raise ValueError(
             "`theta2` must be one finite angle in rad or one for each experiment. "
             f"Got {angles}."

@@ -16,7 +16,7 @@ from sklearn.utils.validation import (
     validate_data,
 )
 
-from ..exceptions import ExtrapolationWarning, VersionedPickle, warn
+from ..exceptions import ExtrapolationWarning, VersionedPickle, all_or_nothing, warn
 from ..validation import naming_argument, one_of, real_array
 from .weighting import WeightedPoints, is_chance, weighted_points
 
@@ -48,6 +48,7 @@ class Interpolator(
 
     extrapolation: str
 
+    @all_or_nothing
     def fit(
         self, X: ArrayLike, y: ArrayLike, covariance: ArrayLike | None = None
     ) -> Self:
@@ -289,7 +290,7 @@ class Interpolator(
             )
         weight = _check_weight(sample_weight, kappa)
         self._single_parameter = params.ndim == 1
-        theta = params.astype(np.float64).reshape(len(params), -1)
+        theta = real_array("y", params).reshape(len(kappa), -1)
         # A point of weight zero counts as absent, for the range too.
         kappa = kappa[weight > 0]
         self.scheduling_range_ = np.array([kappa.min(axis=0), kappa.max(axis=0)])

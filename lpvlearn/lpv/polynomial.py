@@ -9,7 +9,7 @@ from numpy.polynomial import Chebyshev, Legendre, Polynomial
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import RankWarning, warn
+from ..exceptions import RankWarning, all_or_nothing, warn
 from ..validation import one_of, whole_number
 from .interpolator import Interpolator, carried_by_terms, domains, to_unit
 from .weighting import WeightedPoints
@@ -114,6 +114,7 @@ class PolynomialLPV(Interpolator):
         self.basis = basis
         self.extrapolation = extrapolation
 
+    @all_or_nothing
     def fit(  # type: ignore[override]  # scikit-learn has weights in third place
         self,
         X: ArrayLike,
@@ -216,6 +217,7 @@ def powers_up_to(degree: int, highest: NDArray[np.intp]) -> NDArray[np.intp]:
     Those of every variable up to its `highest`; by increasing total degree,
     lexicographic within one. Only what is kept is listed.
     """
+    degree = min(degree, int(np.sum(highest)))
     powers = np.zeros((1, 0), np.intp)
     for most in np.minimum(highest, degree):
         own = np.tile(np.arange(most + 1), len(powers))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import read_outputs
-from ..validation import real_array
+from ..validation import real_array, shown
 
 Multioutput = Literal["raw_values", "uniform_average"] | ArrayLike
 
@@ -242,9 +242,10 @@ def _percent(
             f"output. Got {multioutput!r}."
         )
     weights = real_array("multioutput", multioutput)
-    if weights.shape != scores.shape or weights.min() < 0 or weights.sum() == 0:
+    usable = np.isfinite(weights).all() and (weights >= 0).all() and weights.any()
+    if weights.shape != scores.shape or not usable:
         raise ValueError(
             "`multioutput` must hold one non-negative weight for each of "
-            f"{len(scores)} output(s), not all zero. Got {multioutput!r}."
+            f"{len(scores)} output(s), not all zero. Got {shown(multioutput)}."
         )
     return float(np.average(scores, weights=weights))

@@ -35,7 +35,7 @@ from ..data.operating_points import (
     moving_experiments,
 )
 from ..data.timestamps import TIME_TOL
-from ..exceptions import retold, warn
+from ..exceptions import all_or_nothing, retold, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
@@ -354,6 +354,7 @@ list, default=None
 
     # -- fitting -------------------------------------------------------------------
 
+    @all_or_nothing
     def fit(self, X: Any, y: Any) -> LocalLPVPipeline:
         """Identify the LPV model from local experiments.
 

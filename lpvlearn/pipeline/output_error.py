@@ -23,7 +23,7 @@ from ..data.experiments import (
 from ..data.operating_points import check_outputs
 from ..data.preparation import part_of
 from ..data.timestamps import TIME_TOL
-from ..exceptions import collected
+from ..exceptions import all_or_nothing, collected
 from ..lpv.bands import left_out_errors
 from ..lpv.interpolator import Interpolator, grid_over
 from ..lpv.model import LPVStateSpace
@@ -237,6 +237,7 @@ class OutputErrorLPV(ScheduledEstimator):
         self.n_jobs = n_jobs
         self.verbose = verbose
 
+    @all_or_nothing
     def fit(self, X: Any, y: Any) -> OutputErrorLPV:
         """Fit the model to the experiments of a table.
 

@@ -19,9 +19,10 @@ from scipy.stats import t as student
 from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
+from sklearn.utils.metadata_routing import UNUSED
 from sklearn.utils.validation import check_is_fitted
 
-from ..exceptions import RankWarning, VersionedPickle, warn
+from ..exceptions import RankWarning, VersionedPickle, all_or_nothing, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
@@ -241,6 +242,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     >>> dict(zip(structure.parameter_names, restructurer.params_.round(6).tolist()))
     {'b': 2.0, 'c': 0.5, 'k': 4.0}
     """
+
+    # Data under names of their own, which scikit-learn would route as metadata.
+    __metadata_request__fit = {"omega": UNUSED, "frf": UNUSED}
+    __metadata_request__predict = {"omega": UNUSED}
 
     def __init__(
         self,
@@ -571,7 +576,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             Relative deviation of every parameter from `params_`, and `error_`.
         """
         check_is_fitted(self, "params_")
-        whole_number("n_restarts", n_restarts, 1)
+        whole_number("n_restarts", n_restarts, 1, _MOST_STARTS)
         size = number("size", size, "from 0 to 1", low=0.0, high=1.0)
         rng = np.random.default_rng(0)
         rows, norm, params = [], self.norm, self.params_
@@ -615,6 +620,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self.structure, models, self.frequency_weight, self.known_poles
         )
 
+    @all_or_nothing
     def _restructure(
         self,
         problem: RestructuringProblem,
@@ -627,16 +633,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
 
         All attributes are those of this fit, or, where it fails, of the one before.
         """
-        before = self.__dict__.copy()
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
-        try:
-            with bounded(self.max_time):
-                self._searched(problem, given, estimates, uncertainty, only_given)
-        except BaseException:  # an interruption, too
-            self.__dict__.clear()
-            self.__dict__.update(before)
-            raise
+        with bounded(self.max_time):
+            self._searched(problem, given, estimates, uncertainty, only_given)
 
     def _searched(
         self,

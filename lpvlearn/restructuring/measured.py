@@ -31,6 +31,8 @@ Complex = NDArray[np.complex128]
 # two of them often are, up to what the search has still to gain.
 _BESIDE = 1e-3
 
+_SMALLEST = 1e-100  # largest entry of a response, in units that make sense
+
 # A coherence is estimated from few averages: never nearer to one than that
 _LEAST_INCOHERENCE = 1e-6
 
@@ -162,6 +164,12 @@ def read_frequency_data(
         raise ValueError(
             "`frf` must not be zero at all frequencies: nothing tells the parameters "
             "then. Got zeros only."
+        )
+    largest = float(np.abs(G).max(initial=0.0))
+    if not _SMALLEST < largest < 1.0 / _SMALLEST:
+        raise ValueError(
+            f"`frf` must be of a size from {_SMALLEST:g} to {1.0 / _SMALLEST:g}, of "
+            f"which the squares are numbers. Got {largest:.3g}; take another unit."
         )
     return grid, G.reshape(len(grid), n_outputs, n_inputs).astype(complex)
 

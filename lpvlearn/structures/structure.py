@@ -759,8 +759,8 @@ class GrayBoxStructure:
         ----------
         theta : ndarray of shape (..., n_params)
         """
-        theta = np.asarray(theta)
-        fits = theta.dtype.kind in "fc" and theta.shape[-1:] == (self.n_params,)
+        array = isinstance(theta, np.ndarray) and theta.dtype.kind in "fc"
+        fits = array and theta.shape[-1:] == (self.n_params,)
         if not fits or not np.isfinite(theta).all():
             theta = self._stacked_params(theta)
         if self.is_affine or np.ndim(theta) == 1:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -25,7 +24,7 @@ from ..data.experiments import (
 from ..data.preparation import DETRENDS, read_runs, remove_trends, split_at_gaps
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL
-from ..exceptions import VersionedPickle, warn
+from ..exceptions import VersionedPickle, all_or_nothing, warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
 from ..systems.simulation import (
@@ -337,6 +336,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         self.scheduling = scheduling
         self.operating_point = operating_point
 
+    @all_or_nothing
     def fit(self, X: Any, y: Any) -> Self:
         """Identify the model.
 
@@ -435,6 +435,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         self.output_drift_ = inner.output_drift_
         return self
 
+    @all_or_nothing
     def partial_fit(self, X: Any, y: Any) -> Self:
         """Go on with the next batch of a stream, in memory independent of its length.
 
@@ -534,38 +535,27 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         before = getattr(self, "_stream", None)
         if before is not None:
             before.check_options(options)
-        with self._unchanged_where_refused():
-            experiments = read_experiments(
-                self,
-                X,
-                y,
-                sampling_time=self.sampling_time,
-                reset=before is None,
-                allow_missing="Xy" if self.missing == "split" else "",
-            )
-            jitter = 0.0 if before is None else self.time_jitter_
-            self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
-            if before is None:
-                step = self._step_of(experiments)
-                stream = SampleStream(choices, options, experiments, step)
-                self._single_output = np.asarray(y).ndim == 1
-            else:
-                stream = before.branch()
-            fitted = stream.add(experiments, Table(X).one(self.time, "time"))
-            if fitted is not None:
-                self._take(fitted, stream.step, stream.delay)
-            self._stream = stream
+        experiments = read_experiments(
+            self,
+            X,
+            y,
+            sampling_time=self.sampling_time,
+            reset=before is None,
+            allow_missing="Xy" if self.missing == "split" else "",
+        )
+        jitter = 0.0 if before is None else self.time_jitter_
+        self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
+        if before is None:
+            step = self._step_of(experiments)
+            stream = SampleStream(choices, options, experiments, step)
+            self._single_output = np.asarray(y).ndim == 1
+        else:
+            stream = before.branch()
+        fitted = stream.add(experiments, Table(X).one(self.time, "time"))
+        if fitted is not None:
+            self._take(fitted, stream.step, stream.delay)
+        self._stream = stream
         return self
-
-    @contextmanager
-    def _unchanged_where_refused(self) -> Iterator[None]:
-        """Put the attributes back where a batch ends in an error."""
-        before = dict(self.__dict__)
-        try:
-            yield
-        except BaseException:
-            self.__dict__ = before
-            raise
 
     def _delay_of(self, experiments: list[Experiment], choices: Choices) -> Delay:
         """Delays in samples, given or found."""
@@ -958,7 +948,10 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
     def _per_sample(self, omega: ArrayLike) -> Array:
         """Angular frequencies in radians per sample."""
         step = self.lti_.sampling_time or 1.0
-        return frequencies(omega) * step
+        found = frequencies(omega) * step
+        if not np.isfinite(found).all():
+            raise ValueError(f"`omega` must be finite. Got {found.max()} per sample.")
+        return found
 
     def resting_point(self) -> tuple[Array, Array]:
         """Inputs and outputs at rest: `input_offset_` and `output_offset_` pooled.

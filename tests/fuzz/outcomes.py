@@ -26,11 +26,12 @@ REFUSALS = (ValueError, TypeError, NotFittedError, AttributeError, OSError)
 # A message that teaches names an argument, a column or a place, and what it got.
 NAMES = re.compile(
     r"`[^`]+`|\bX\b|\by\b|[Cc]olumn|[Ee]xperiment|operating point|y_true"
-    r"|[Ii]nput variables|Found array|Input contains"
+    r"|scheduling \[|scheduling variable|feature name|[Ii]nput variables"
+    r"|Found array|Input contains"
 )
 GOT = re.compile(
     r"[Gg]ot|[Ff]ound |contains|not supported|not known|missing|expecting|is None"
-    r"|beyond all"
+    r"|beyond all|different number|diverges within|but your input has"
 )
 
 

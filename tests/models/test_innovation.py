@@ -179,3 +179,23 @@ def test_one_missing_output_is_expected_from_the_other(record):
     same = InnovationModel(alone.lti, alone.noise._replace(K=one))
     lost[:, 1], y[:, 1] = np.nan, 0.0
     assert_allclose(alone.predict(u, lost), same.predict(u, y), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        ({"lti": StateSpace(-1, 1, 1)}, "`lti` must be a StateSpace in discrete time"),
+        ({"noise": NoiseModel(*np.ones((4, 2, 2)))}, "`noise` must have A .2, 2., C"),
+        ({"noise": None}, "`noise` must be a NoiseModel"),
+        ({"gain": np.ones((2, 1))}, "`gain` must have shape .1, 1."),
+        ({"gain": [["a"]]}, "`gain` must hold real numbers"),
+    ],
+)
+def test_parts_that_do_not_fit_are_told(wrong, words):
+    one = np.ones((1, 1))
+    parts = {
+        "lti": StateSpace(0.5, 1, 1, sampling_time=1.0),
+        "noise": NoiseModel(0.5 * one, one, one, one),
+    }
+    with pytest.raises(ValueError, match=words):
+        InnovationModel(**parts | wrong)

@@ -433,12 +433,10 @@ def test_every_class_has_a_form_of_all_it_needs(pipeline, refined, fitted):
 
 
 def test_what_load_would_refuse_is_not_written(tmp_path):
-    lti = StateSpace(0.5, 1, 1, sampling_time=1.0)
-    unfit = InnovationModel(lti, NoiseModel(*np.ones((4, 2, 2))))
     nodes = np.random.default_rng(0).normal(size=(3001, 2))
-    for model in (unfit, SplineLPV("linear").fit(nodes, nodes)):
-        with pytest.raises(ValueError, match="`model` must be one that `load` can"):
-            save(model, tmp_path / "model.zip")
+    large = SplineLPV("linear").fit(nodes, nodes)
+    with pytest.raises(ValueError, match="`model` must be one that `load` can"):
+        save(large, tmp_path / "model.zip")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -411,7 +411,7 @@ def test_columns_gaps_and_trends_are_those_of_the_fit():
     ("options", "message"),
     [
         ({"errors": "other"}, "`errors` must be 'simulation' or 'prediction'"),
-        ({"level": 0.0}, "`level` must lie between 0 and 1. Got 0.0"),
+        ({"level": 0.0}, "`level` must be between 0 and 1. Got 0.0"),
         ({"y": np.zeros((100, 2))}, r"`y` must hold the 1 output\(s\).* Got 2"),
         ({"y": None}, "`y` must hold the measured outputs. Got None"),
     ],

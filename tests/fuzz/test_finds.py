@@ -1,0 +1,149 @@
+"""What fuzzing found, by class: each was a wrong result, a hang or a riddle."""
+
+from decimal import Decimal
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import lpvlearn as lp
+from lpvlearn.datasets import FlexibleArm
+from lpvlearn.inspection import SimulationDisplay
+from lpvlearn.validation import number, real_array, whole_number
+
+from ..conftest import spring_lpv
+from .calls import QUICK, TABLE_ROLES, world
+
+NO_NUMBERS = {
+    "complex numbers among objects": np.array([1.0, 2.0 + 0j], object),
+    "NumPy's complex numbers among objects": np.array([np.complex128(1j)], object),
+    "text among objects": np.array([1.0, "2"], object),
+    "bytes": np.array([b"1"]),
+    "dates": np.array(["2020-01-01"], "M8[s]"),
+    "time differences, which NumPy counts as integers": np.timedelta64(1, "s"),
+    "time differences among objects": np.array([np.timedelta64(1, "s")], object),
+    "dicts": np.array([{}, {}], object),
+    "an integer beyond floats": [10**400],
+    "an integer of too many digits to be shown": 10**5000,
+    "a signalling NaN": Decimal("sNaN"),
+    "a missing scalar": None,
+    "pandas' missing scalar": pd.NA,
+    "rows of several lengths": [[1.0], [1.0, 2.0]],
+    "records": np.array([(1, 2.0)], dtype=[("a", int), ("b", float)]),
+}
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_what_is_no_number_is_refused_by_name(value):
+    with pytest.raises(ValueError, match=r"^`gain` must hold real numbers only. Got"):
+        real_array("gain", value)
+    with pytest.raises(ValueError, match=r"^`gain` must be a finite number. Got"):
+        number("gain", value)
+    if not isinstance(value, int):
+        with pytest.raises(ValueError, match=r"^`gain` must be an integer, at least 0"):
+            whole_number("gain", value, 0)
+
+
+@pytest.mark.parametrize(
+    "value, expected",
+    [
+        (np.ma.masked_equal([1.0, -9.0], -9.0), [1.0, np.nan]),
+        (pd.Series([1, None], dtype="Int64"), [1.0, np.nan]),
+        (np.array([1.0, None], object), [1.0, np.nan]),
+        ([Decimal("0.5"), True], [0.5, 1.0]),
+        (pd.Series([2, 1], dtype="category"), [2.0, 1.0]),
+        (np.array([1, 2], ">f8"), [1.0, 2.0]),
+    ],
+)
+def test_numbers_come_in_many_dresses_and_what_is_missing_is_nan(value, expected):
+    found = real_array("gain", value)
+    np.testing.assert_array_equal(found, expected)
+    assert found.dtype == np.float64 and found.flags.writeable
+
+
+@pytest.mark.parametrize("of", [np.array, pd.Series])
+def test_tables_of_one_axis_are_told_by_splitters_and_scorers(of):
+    x, w = of([1.0, 2.0, 3.0, 4.0]), world()
+    for split in (lp.ExperimentSplit(2), lp.BlockedTimeSeriesSplit(2)):
+        with pytest.raises(ValueError, match="X must have shape"):
+            list(split.split(x))
+    for scorer in (lp.bft_scorer, lp.vaf_scorer):
+        with pytest.raises(ValueError, match="X must|`X` must|as many rows as X"):
+            scorer(w.subspace, x, w.y)
+
+
+def test_a_stream_asks_for_the_outputs_of_every_batch():
+    w = world()
+    model = lp.SubspaceLTI(**QUICK, **TABLE_ROLES).partial_fit(w.X, w.y)
+    before = model.lti_
+    with pytest.raises(ValueError, match="`y` must hold the outputs of every batch"):
+        model.partial_fit(w.X.assign(run="more"), None)
+    assert model.lti_ is before
+
+
+def test_a_gain_has_no_poles_to_be_uncertain_of():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((200, 1))
+    y = 2.0 * u + 0.01 * rng.standard_normal((200, 1))
+    model = lp.SubspaceLTI(0, refine="simulation", sampling_time=1.0).fit(u, y)
+    assert model.poles_std_.shape == (0,)
+
+
+@pytest.mark.parametrize("A", [[[0.0]], [[0, 1], [0, 0]], [[0, 0], [0, -1]]])
+@pytest.mark.parametrize("sampling_time", [None, 0.1])
+def test_a_singular_state_matrix_is_a_model_like_others(A, sampling_time):
+    n = len(A)
+    model = lp.StateSpace(A, np.ones((n, 1)), np.ones((1, n)), None, sampling_time)
+    if sampling_time is None:
+        assert np.isinf(model.dc_gain()).all() and model.hinf_norm() == np.inf
+        integrated = model.to_discrete(0.1).simulate(np.ones(9))
+        assert np.isfinite(integrated).all()
+    else:
+        with pytest.raises(ValueError, match="pole"):
+            model.to_continuous()
+
+
+@pytest.mark.parametrize("label", ["$x_{", "cost $ and $_", r"$\frac$", "$x_1$", "$"])
+def test_dollars_that_are_no_formula_are_drawn(label):
+    time, y = np.arange(9.0), np.ones((9, 1)) * np.arange(9.0)[:, None]
+    display = SimulationDisplay.from_predictions(
+        time, y, {label: y}, output_names=[label], units=label
+    )
+    display.figure_.canvas.draw()
+
+
+def test_a_high_degree_in_many_variables_ends_at_once():
+    rng = np.random.default_rng(0)
+    X, y = rng.standard_normal((100, 4)), rng.standard_normal(100)
+    with pytest.raises(ValueError, match="`degree` must make at most 10000 terms"):
+        lp.PolynomialLPV(100).fit(X, y)
+    levels = np.array(np.meshgrid([0, 1], [0, 1], [0, 1], [0.0, 1])).reshape(4, -1).T
+    model = lp.PolynomialLPV(100).fit(levels, levels.prod(axis=1))
+    assert len(model.powers_) == 16
+
+
+def test_a_sampling_period_of_ages_is_no_integration():
+    with pytest.raises(ValueError, match="at most 10000 integration steps"):
+        FlexibleArm().simulate(np.zeros((3, 2)), 0.5, 1e16)
+
+
+def test_a_scheduling_value_beyond_all_numbers_is_told():
+    with pytest.raises(ValueError, match="near the range of the fit"):
+        spring_lpv().at(1e308)
+    line = lp.PolynomialLPV(2).fit([[0.0], [1.0], [2.0]], [0.0, 1.0, 4.0])
+    for evaluate in (line.predict, line.sensitivities):
+        with pytest.raises(ValueError, match="near the range of the fit"):
+            evaluate([[1e308]])
+
+
+def test_a_forged_report_is_refused_when_it_is_read(tmp_path):
+    pipeline = world().pipeline
+    path, whole = tmp_path / "m.zip", pipeline.report_
+    try:
+        pipeline.report_ = whole.drop(columns="interpolation_error")
+        with pytest.raises(ValueError, match="its tables do not tell what those"):
+            lp.save(pipeline, path)
+    finally:
+        pipeline.report_ = whole
+    lp.save(pipeline, path)
+    assert lp.load(path).summary() == pipeline.summary()
