@@ -14,7 +14,8 @@ Are constants significant? At a model, fitted with or without them, the effect t
 constants on the outputs is freed of what initial states and parameters could explain
 (their Jacobian). With the errors v of the model the score ``g = t.T v`` does not depend
 on small errors of the parameters (Neyman), and has covariance ``t.T cov(v) t``; as t is
-slow, the spectral density of v at frequency zero stands for cov(v).
+slow, the spectral density of v at frequency zero stands for cov(v): at a model without
+constants too, unless they explain most of v, which is not noise then.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ N_TRENDS = {"auto": 0, None: 0, "constant": 1, "linear": 2}
 # Chance of a constant that is not there: of fitting again with constants, and of
 # keeping them. One that is kept costs what an unknown does.
 _SUSPICIOUS, _SIGNIFICANT = 1e-2, 1e-3
+
+_MOSTLY = 0.5  # part of the squared errors; noise of long memory has a quarter at most
 
 _N_TESTED = 20  # experiments that the tests look at; more of them tell the same
 
@@ -211,11 +214,16 @@ def chance_of_constants(evidence: Evidence, *, equal: bool = False) -> float:
         parts.append(part)
         error = whole.y.T - lti_response(*model[:4], whole.u.T, x0)
         errors.append(error - error.mean(axis=0))
-    return _chance(parts, errors, equal)
+    return _chance(parts, errors, equal, evidence.levels is not None)
 
 
-def _chance(parts: Sequence[Array], errors: Sequence[Array], equal: bool) -> float:
-    """As `chance_of_constants`, from regressions ``[constants, Jacobian, error]``."""
+def _chance(
+    parts: Sequence[Array], errors: Sequence[Array], equal: bool, freed: bool
+) -> float:
+    """As `chance_of_constants`, from regressions ``[constants, Jacobian, error]``.
+
+    `freed` errors are of a model with constants.
+    """
     ny, n_samples = errors[0].shape[1], sum(map(len, errors))
     rows = np.vstack(parts)
     constants, jacobian, error = rows[:, :ny], rows[:, ny:-1], rows[:, -1]
@@ -238,10 +246,17 @@ def _chance(parts: Sequence[Array], errors: Sequence[Array], equal: bool) -> flo
     chance = _tail(score, effect, white, n_error)
     if chance > _SUSPICIOUS:
         return chance  # that of coloured noise takes as long as a step of refinement
+    left = error - explained @ (explained.T @ error)
+    if not freed and _squares(linalg.orth(own).T @ left) > _MOSTLY * _squares(left):
+        return chance
     # Noise of long memory tells its density at zero no better than few samples do.
     density = spectral_density(autoregression(errors), np.zeros(1))[0].real + rounding
     share = min(1.0, float(np.min(np.diagonal(white) / np.diagonal(density))))
     return _tail(score, effect, density, share * n_error)
+
+
+def _squares(x: Array) -> float:
+    return float(np.sum(x**2))
 
 
 def _tail(score: Array, effect: Array, density: Array, n_error: float) -> float:

@@ -401,6 +401,20 @@ def test_experiments_of_a_long_table_have_their_own_constants(system, short_stre
     np.testing.assert_allclose(model.output_offset_, levels, rtol=0.2, atol=3.0)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_constants_that_bend_a_slow_pole_are_found(seed):
+    """Errors that a constant explains are no coloured noise."""
+    rng, step = np.random.default_rng(seed), 2.0
+    heater = StateSpace(-0.014, 0.004, 1.0)
+    u = 500.0 + 300.0 * rng.choice([-1.0, 1.0], 30).repeat(20)
+    y = heater.simulate(u, sampling_time=step, initial_state=[140.0])[:, 0] + 21.0
+    y += 0.3 * rng.standard_normal(len(u))
+    model = SubspaceLTI(1, feedthrough=False, sampling_time=step).fit(u[:, None], y)
+    assert model.offset_ == "constant"
+    pole = model.lti_.to_continuous().poles().real
+    np.testing.assert_allclose(pole, -0.014, rtol=0.02)
+
+
 @pytest.mark.parametrize(
     "choice", [{"refine": False}, {"refine": False, "initial_state": "rest"}]
 )
