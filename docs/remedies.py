@@ -57,6 +57,8 @@ REMEDIES = {
     "The inputs know the noise of the outputs": "See :ref:`guide_local`.",
     "The simulation error depends on past inputs": "Judge by the error itself: a lack "
     "that is far below the noise is harmless.",
+    "with `integrating`, the errors and their statistics": "``model.rates_`` tests and "
+    "predicts the rates, of which its table is made.",
     "The errors of … are rounding": "Nothing to do: the data are noise-free.",
     "The first … samples of the stream leave it without a model": "Begin with samples "
     "in which all inputs vary.",

@@ -85,9 +85,8 @@ log.describe().loc[["count", "min", "max"]].round(2)
 # One row is missing in every record, and one temperature. ``missing="split"`` cuts
 # there. The speed is held as well as a fan holds it; its mean over a record is the
 # operating point, and ``scheduling_tol`` says which means are one point. The
-# temperature stands about that of the room. ``offset="auto"`` looks for such constants,
-# and finds those that a slow motion does not explain as well; of a heater, which is one
-# slow motion, we say that there is one.
+# temperature stands about that of the room. The local models look for such constants
+# (``offset="auto"``) and find them here.
 
 from lpvlearn import (
     GrayBoxRestructurer,
@@ -98,7 +97,7 @@ from lpvlearn import (
 
 first_order = GrayBoxStructure.from_template(A=[["-rate"]], B=[["gain"]], C=[[1]])
 heater = LocalLPVPipeline(
-    SubspaceLTI(1, feedthrough=False, missing="split", offset="constant"),
+    SubspaceLTI(1, feedthrough=False, missing="split"),
     GrayBoxRestructurer(first_order),
     scheduling="speed",
     experiment="record",

@@ -172,6 +172,7 @@ REFINED = {
     "momentum": (GrayBoxRestructurer(FlexibleArm().structure("momentum")), None),
     "rates": (GrayBoxRestructurer(FlexibleArm().structure()), None),
     "aligned, cubic": ("aligned", PolynomialLPV(3)),
+    "aligned, rational": ("aligned", RationalLPV(2, 2)),
 }
 ALONE = {
     "sweeps alone, momentum": (
