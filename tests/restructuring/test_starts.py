@@ -68,8 +68,7 @@ def test_what_keeps_a_search_from_starting_is_told():
     silent = GrayBoxStructure.from_template([["-a"]], [[0]], [["c"]])
     with pytest.raises(ValueError, match="Got a, c, which change nothing"):
         GrayBoxRestructurer(silent).fit_model(StateSpace(-2, 3, 1))
-    unstable = GrayBoxStructure.from_template(
-        [["a"]], [["b"]], [[1]], bounds={"a": (2, 3)}
-    )
+    unstable = GrayBoxStructure.from_template([["a"]], [["b"]], [[1]])
+    unstable = unstable.with_bounds({"a": (2, 3)})
     with pytest.raises(ValueError, match="no stable starting point.*discrete time"):
         GrayBoxRestructurer(unstable).fit_model(StateSpace(0.5, 3, 1, None, 1.0))
