@@ -84,6 +84,7 @@ def test_usage_is_another_status(folder, missing):
     assert f"required: {missing}" in error
 
 
+@pytest.mark.slow
 def test_json_gaps_other_csv_and_an_own_folder(folder, tmp_path):
     table = pd.read_csv(folder / "runs.csv")
     table.loc[100:105, "position"] = np.nan

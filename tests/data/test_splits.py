@@ -198,6 +198,7 @@ def test_grid_search_over_all_three_steps_refits_the_best(data, pipeline):
     np.testing.assert_array_equal(search.predict(X), fitted.predict(X))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 def test_learning_curve_over_experiments_rises_with_their_number():
     kappas = (0.0, 0.75, 1.5)

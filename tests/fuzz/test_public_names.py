@@ -49,6 +49,7 @@ def test_every_public_name_is_called():
     assert public - called <= NOT_CALLED
 
 
+@pytest.mark.slow
 def test_valid_calls_are_right():
     for name, call in calls().items():
         if call.weight:

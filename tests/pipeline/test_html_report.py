@@ -111,6 +111,7 @@ def test_names_are_text_and_warnings_are_kept_with_their_remedies(tmp_path, spri
     assert any("x & <y>" in words for words in page.texts)
 
 
+@pytest.mark.slow
 def test_several_inputs_outputs_and_scheduling_variables(tmp_path):
     rng = np.random.default_rng(0)
     model = stable_model(1, 2, 2, 2)

@@ -144,6 +144,7 @@ def test_searches_and_splits_work(both, memory):
 # -- alone -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [None, RationalLPV(2, 1), SplineLPV("cubic")])
 def test_from_a_time_invariant_model_of_the_table(form):
     X, y = sweeps(noise=0.0, n_samples=600)
@@ -157,6 +158,7 @@ def test_from_a_time_invariant_model_of_the_table(form):
         )
 
 
+@pytest.mark.slow
 def test_without_a_structure_matrices_are_affine_in_the_scheduling():
     truth = spring_lpv()
     X, _ = sweeps()

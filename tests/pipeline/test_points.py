@@ -89,6 +89,7 @@ def test_more_experiments_tell_more(short_springs):
     assert ratio.median().between(1.5, 2.7).all()  # the root of 4
 
 
+@pytest.mark.slow
 def test_deviations_are_the_spread_over_new_noise():
     found, told = [], []
     for seed in range(20):
@@ -178,6 +179,7 @@ def test_a_frequency_weight_enters_the_covariance():
     np.testing.assert_allclose(weighted, plain, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_average_tells_its_own_spread_and_a_single_experiment_that_of_its_fit():
     X, y = spring_tables(0.05, n_samples=300, n_repeats=3)
     average = spring_pipeline(combine="average").fit(X, y)
