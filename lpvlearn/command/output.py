@@ -80,15 +80,15 @@ def _told(target: Path, folder: Path | None = None) -> Iterator[None]:
         where = error.filename
         if folder and where is not None and not str(where).startswith(str(folder)):
             raise  # another file's
-        if error.errno == errno.ENOENT:
+        if error.errno == errno.ENOENT or (folder and not folder.exists()):
             advice = "The folder has vanished: do not move or clear it meanwhile."
         elif error.errno in _FULL:
             advice = "Free space there, or take another place."
         else:
             advice = "Take a place where you may write."
         raise OSError(
-            f"--output {target}: it cannot be written ({error.strerror}), and nothing "
-            f"of it is there. {advice}"
+            f"--output {target}: it cannot be written ({error.strerror or error}), and "
+            f"nothing of it is there. {advice}"
         ) from error
 
 
