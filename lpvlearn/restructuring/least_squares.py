@@ -16,8 +16,11 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 # Powers of singular values in a sum that comes near their maximum, and steps for each
-_POWERS, _REWEIGHTED = (2, 4, 8, 16, 32), 4
+_POWERS, _REWEIGHTED = (2, 4, 8, 16, 32, 64, 128, 256), 20
 _NOTHING = 1e-6  # smaller parts of the maximum weigh alike: nothing
+_FAR = 10.0  # times the maximum: a power of it is the limit of a float
+_HALVINGS = 12  # of a step that does not lower the sum
+_SLOW = 1e-2  # relative decrease of the sum that the next power may as well have
 
 _DECADES = 1.5  # channels whose sizes differ by less are left as they are
 
@@ -98,7 +101,7 @@ def least_maximum(E: Complex, J: Complex) -> Array:
 
     `E` has shape (k, n_outputs, n_inputs), `J` (k, n_outputs, n_inputs, n_params). By
     reweighted least squares for the sum of powers of the singular values, the power
-    raised step by step (Kahng, 1972).
+    raised step by step (Kahng, 1972), each step cut until the sum falls.
 
     Examples
     --------
@@ -109,11 +112,10 @@ def least_maximum(E: Complex, J: Complex) -> Array:
     array([1.])
     """
     n, p = J.shape[-1], J.shape[1]
-    d = np.zeros(n)
+    d, now = np.zeros(n), E
+    U, s, _ = np.linalg.svd(now)
     for power in _POWERS:
         for _ in range(_REWEIGHTED):
-            now = E + J @ d
-            U, s, _ = np.linalg.svd(now)
             top = float(s.max(initial=0.0))
             if top == 0.0:
                 return d
@@ -125,5 +127,16 @@ def least_maximum(E: Complex, J: Complex) -> Array:
             rest = (root @ now).ravel()
             A = np.vstack([rows.real, rows.imag])
             b = np.concatenate([rest.real, rest.imag])
-            d = d - scaled_lstsq(A, b)[0] / (power - 1)
+            step, total = scaled_lstsq(A, b)[0], np.sum(share**power)
+            for length in 0.5 ** np.arange(_HALVINGS):
+                trial = E + J @ (d - length * step)
+                U_new, s_new, _ = np.linalg.svd(trial)
+                new = np.sum(np.minimum(s_new / top, _FAR) ** power)
+                if new < total:
+                    break
+            else:
+                break
+            d, now, U, s = d - length * step, trial, U_new, s_new
+            if new > (1.0 - _SLOW) * total:
+                break
     return d
