@@ -355,6 +355,8 @@ def refine_with_rates(
     least, drawn, moving = min(tried, key=lambda one: one[0])
     if rate == "auto" and not least < (1.0 - _WORTH) * loss(static.model):
         return refine(start, records, own, prior, **options)
+    if not np.isfinite(least):  # all of them diverge on other pieces
+        moving = with_rate_terms(start)[0]
     drawn = drawn * (length(records) / length(seen))
     return refine(moving, records, own, known.widened(drawn), fixed=fixed, **options)
 

@@ -55,6 +55,13 @@ INTERPOLATORS = {
     "cubic spline": SplineLPV("cubic"),
 }
 
+ALIGNED = {  # black boxes, whose entries have no covariance
+    "AutoLPV": AutoLPV(),
+    "parabola": PolynomialLPV(2),
+    "cubic": PolynomialLPV(3),
+    "rational": RationalLPV(2, 2),
+}
+
 SPRING = GrayBoxStructure.from_template([[0, 1], ["-k", "-c"]], [[0], ["b"]], [[1, 0]])
 COEFFICIENTS = np.array([[30, 0, 0], [1.2, 0.4, 0], [40, 10, 12]])  # of b, c, k
 STEP = 0.05  # s
@@ -87,6 +94,12 @@ def bench_arm(n_points: int, seeds: range) -> None:
                 table = sweeps_table(model, sweeps)
                 bft = table[table["metric"] == "BFT"]["ours"].to_numpy()
                 fits[state, name].append(bft)
+        for name, interpolator in ALIGNED.items():
+            turned = LocalLPVPipeline(LOCAL, "aligned", interpolator, **ROLES)
+            table = sweeps_table(turned.fit(data.X, data.y).lpv_, sweeps)
+            fits["aligned", name].append(
+                table[table["metric"] == "BFT"]["ours"].to_numpy()
+            )
     print(f"\nFlexible arm, {n_points} points: BFT up (y1, y2), down (y1, y2)")
     for (state, name), values in sorted(fits.items()):
         mean, worst = (
