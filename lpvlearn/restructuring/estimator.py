@@ -86,7 +86,7 @@ _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "p_value_",
 )
 
-_DRAWS = 64  # of a known noise: a standard deviation to 9 %
+_DRAWS = 32  # of the noise: standard deviations to an eighth
 
 _SEARCH_SHARE = 0.7  # of `max_time`, for the starts: the rest is the minimisation's
 
@@ -205,8 +205,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         `noise` given to `fit`; absent without them. Infinite variances where these do
         not determine a parameter, none at its bound.
     covariance_degrees_of_freedom_ : float
-        What the covariance is known from: one less than the realizations, or draws of
-        the noise; infinite for ``norm="covariance"``; see :meth:`confidence_intervals`.
+        What the covariance is known from: one less than the realizations (32 of them
+        at most for the H-infinity norm), or draws of the noise; infinite for ``norm="covariance"``; see :meth:`confidence_intervals`.
     start_params_ : ndarray of shape (n_params,)
         Least-squares fit that the search started from.
     starts_ : DataFrame
@@ -348,10 +348,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self.covariance_degrees_of_freedom_ = np.inf
         elif len(realizations):
             norm = "hinf" if self.norm == "covariance" else self.norm  # no uncertainty
-            self.params_covariance_ = problem.spread_covariance(
-                self.params_, realizations, norm
-            )
-            self.covariance_degrees_of_freedom_ = len(realizations) - 1.0
+            # of the maximum each is a minimisation: some tell the spread of all
+            seen = realizations[:_DRAWS] if norm == "hinf" else realizations
+            spread = problem.spread_covariance(self.params_, seen, norm)
+            self.params_covariance_ = spread * (len(seen) / len(realizations))
+            self.covariance_degrees_of_freedom_ = len(seen) - 1.0
         return self
 
     def fit(

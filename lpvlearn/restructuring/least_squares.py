@@ -16,11 +16,11 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 # Powers of singular values in a sum that comes near their maximum, and steps for each
-_POWERS, _REWEIGHTED = (2, 4, 8, 16, 32, 64, 128, 256), 20
+_POWERS, _REWEIGHTED = (2, 4, 8, 16, 32, 64, 128, 256), 6
 _NOTHING = 1e-6  # smaller parts of the maximum weigh alike: nothing
 _FAR = 10.0  # times the maximum: a power of it is the limit of a float
 _HALVINGS = 12  # of a step that does not lower the sum
-_SLOW = 1e-2  # relative decrease of the sum that the next power may as well have
+_SLOW = 5e-2  # relative decrease of the sum that the next power may as well have
 
 _DECADES = 1.5  # channels whose sizes differ by less are left as they are
 
