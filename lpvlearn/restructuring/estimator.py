@@ -206,7 +206,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         not determine a parameter, none at its bound.
     covariance_degrees_of_freedom_ : float
         What the covariance is known from: one less than the realizations (32 of them
-        at most for the H-infinity norm), or draws of the noise; infinite for ``norm="covariance"``; see :meth:`confidence_intervals`.
+        at most for the H-infinity norm), or draws of the noise; infinite for
+        ``norm="covariance"``; see :meth:`confidence_intervals`.
     start_params_ : ndarray of shape (n_params,)
         Least-squares fit that the search started from.
     starts_ : DataFrame
