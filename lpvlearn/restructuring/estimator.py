@@ -87,6 +87,7 @@ _ABSENT_ELSEWHERE = (  # attributes that not every fit has
 )
 
 _DRAWS = 32  # of the noise: standard deviations to an eighth
+_EFFORT = 512  # realizations times parameters, of which more are left out beyond these
 
 _SEARCH_SHARE = 0.7  # of `max_time`, for the starts: the rest is the minimisation's
 
@@ -205,8 +206,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         `noise` given to `fit`; absent without them. Infinite variances where these do
         not determine a parameter, none at its bound.
     covariance_degrees_of_freedom_ : float
-        What the covariance is known from: one less than the realizations (32 of them
-        at most for the H-infinity norm), or draws of the noise; infinite for
+        What the covariance is known from: one less than the realizations (for the
+        H-infinity norm some of them, where there are many for many parameters), or
+        than the draws of the noise; infinite for
         ``norm="covariance"``; see :meth:`confidence_intervals`.
     start_params_ : ndarray of shape (n_params,)
         Least-squares fit that the search started from.
@@ -350,7 +352,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         elif len(realizations):
             norm = "hinf" if self.norm == "covariance" else self.norm  # no uncertainty
             # of the maximum each is a minimisation: some tell the spread of all
-            seen = realizations[:_DRAWS] if norm == "hinf" else realizations
+            few = max(_DRAWS, _EFFORT // len(self.params_))
+            seen = realizations[:few] if norm == "hinf" else realizations
             spread = problem.spread_covariance(self.params_, seen, norm)
             self.params_covariance_ = spread * (len(seen) / len(realizations))
             self.covariance_degrees_of_freedom_ = len(seen) - 1.0
