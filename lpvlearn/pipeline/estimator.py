@@ -529,7 +529,7 @@ list, default=None
         Notes
         -----
         What the simulation of X warns of stands on the page and is not warned of here.
-        The figures of parameters and poles need one scheduling variable.
+        The figures of parameters and poles need one scheduling variable, or two.
         """
         page = html_report(
             self,
