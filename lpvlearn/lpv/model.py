@@ -612,21 +612,7 @@ class LPVStateSpace:
         ExtrapolationWarning
             Outside of `identified_range`.
         """
-        u = finite_samples("u", u, self.n_inputs)
-        delay, n = self._samples_of_delay(sampling_time), self.order
-        kappa = self._scheduling(scheduling)
-        u0, _, x0 = self.silenced()._point_of_work(kappa[:1])
-        x, before = x0.sum(axis=0), np.repeat(u0.sum(axis=0), delay)
-        if initial_state is not None:
-            given = state_vector(initial_state, n, int(delay.sum()))
-            x = given[:n]
-            if self.bases and len(kappa):
-                x = np.linalg.solve(self._basis_at(kappa[0]), x)
-            if np.size(initial_state) > n:
-                before = given[n:]
-        late = delayed(u, delay, before)
-        if self.offsets is not None:
-            late = np.column_stack([late, np.ones(len(u))])
+        _, kappa, late, x = self._run(u, scheduling, sampling_time, initial_state)
         y = self._response(late[:, :, None], kappa, sampling_time, x[:, None])
         return y[:, :, 0]
 
@@ -650,16 +636,76 @@ class LPVStateSpace:
         ValueError
             As `simulate`.
         """
-        kappa, n = self._scheduling(scheduling), self.order
-        delay = self._samples_of_delay(sampling_time)
+        kappa = self._scheduling(scheduling)
+        late, x = self._unit_runs(kappa, self._samples_of_delay(sampling_time))
+        return self._response(late, kappa, sampling_time, x)
+
+    def rest_and_free_responses(
+        self,
+        u: ArrayLike,
+        scheduling: ArrayLike | Mapping[Any, ArrayLike],
+        sampling_time: float,
+    ) -> tuple[Array, Array]:
+        """`simulate` from rest and `free_responses`, by half the effort of the two.
+
+        Parameters
+        ----------
+        u : array-like of shape (n_samples, n_inputs)
+        scheduling : array-like of shape (n_samples, n_scheduling) or (n_samples,)
+        sampling_time : float
+            Seconds.
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_outputs)
+        ndarray of shape (n_samples, n_outputs, order + n_in_transit)
+
+        Raises
+        ------
+        ValueError
+            As `simulate`.
+        """
+        u, kappa, late, x = self._run(u, scheduling, sampling_time, None)
+        units, states = self._unit_runs(kappa, self._samples_of_delay(sampling_time))
+        still = np.zeros((len(u), late.shape[1] - units.shape[1], units.shape[2]))
+        late = np.concatenate(
+            [late[:, :, None], np.concatenate([units, still], axis=1)], axis=2
+        )
+        start = np.column_stack([x, states])
+        y = self._response(late, kappa, sampling_time, start)
+        return y[:, :, 0], y[:, :, 1:]
+
+    def _run(
+        self, u: Any, scheduling: Any, dt: float, initial_state: Any
+    ) -> tuple[Array, Array, Array, Array]:
+        """Inputs, scheduling, all that drives the states, and their initial ones."""
+        u = finite_samples("u", u, self.n_inputs)
+        delay, n = self._samples_of_delay(dt), self.order
+        kappa = self._scheduling(scheduling)
+        u0, _, x0 = self.silenced()._point_of_work(kappa[:1])
+        x, before = x0.sum(axis=0), np.repeat(u0.sum(axis=0), delay)
+        if initial_state is not None:
+            given = state_vector(initial_state, n, int(delay.sum()))
+            x = given[:n]
+            if self.bases and len(kappa):
+                x = np.linalg.solve(self._basis_at(kappa[0]), x)
+            if np.size(initial_state) > n:
+                before = given[n:]
+        late = delayed(u, delay, before)
+        if self.offsets is not None:
+            late = np.column_stack([late, np.ones(len(u))])
+        return u, kappa, late, x
+
+    def _unit_runs(self, kappa: Array, delay: NDArray[np.intp]) -> tuple[Array, Array]:
+        """What drives runs from unit initial states, and units in transit."""
+        n = self.order
         unit = np.eye(n + delay.sum())
         n_driving = self.n_inputs if delay.any() else 0
         x: Array = unit[:n]
         if self.bases and len(kappa):
             x = np.linalg.inv(self._basis_at(kappa[0])) @ x
         none = np.zeros((len(kappa), n_driving, len(unit)))
-        late = delayed(none, delay, unit[n:])
-        return self._response(late, kappa, sampling_time, x)
+        return delayed(none, delay, unit[n:]), x
 
     def _samples_of_delay(self, sampling_time: float) -> NDArray[np.intp]:
         """Delays in samples, which they must be a whole number of."""

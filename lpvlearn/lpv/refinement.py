@@ -38,9 +38,18 @@ _SETTLED = 0.02  # relative change of standard deviations that needs no other ro
 # which a model without a structure has, many steps more would fit the noise alone.
 _TOL = 1e-3
 
+# The same of a search whose end is not the last: for variances that are estimated anew
+# afterwards, and of terms that pieces of the records choose among, each from the other.
+_ROUGH = 0.02
+
 # Standard deviation of an output's errors, relative to the output, below which they
 # weigh no more: those of exact data are rounding.
 _EXACT = 1e-9
+
+# Marquardt's damping of the first step. Local experiments, or a first fit, have left
+# the search near its end, and coefficients that hardly tell from each other need more
+# than a thousandth of their lengths: with 1e-3 it takes twice as many steps.
+_DAMPING = 1e-6
 
 _PIECES = 8  # of a record, not shorter than _PIECE samples a state
 _PIECE = 20
@@ -121,13 +130,15 @@ def simulated(
 
     These make the least of the weighted errors. Raises a DivergenceError.
     """
-    y = model.simulate(record.u, record.kappa, record.dt)
+    if own.initial_state:
+        y, free = model.rest_and_free_responses(record.u, record.kappa, record.dt)
+        free = free[:, :, : model.order]
+    else:
+        y = model.simulate(record.u, record.kappa, record.dt)
+        free = np.zeros((*y.shape, 0))
     error = record.y - y
     if not (own.initial_state or own.constant):
         return -error, np.zeros(0)
-    free = np.zeros((*y.shape, 0))
-    if own.initial_state:
-        free = model.free_responses(record.kappa, record.dt)[:, :, : model.order]
     columns = own.columns(free)
     found = estimate_initial_state(columns * weight[:, None], error * weight)
     return columns @ found - error, found
@@ -192,15 +203,17 @@ def refine(
     prior: Prior | None = None,
     *,
     fixed: Flags | None = None,
+    deviation: Array | None = None,
     max_iter: int = 200,
     run: Run = in_turn,
     tell: Callable[[float], None] = lambda cost: None,
 ) -> Refined:
     """Fit the coefficients of a model, which must not diverge on the records.
 
-    `fixed` coefficients stay; `prior` is one of all of them. `max_iter` counts the
-    steps that are tried, of all estimates of the variances. `run` gives the results of
-    tasks, a record each; `tell` hears the cost of every step taken.
+    `fixed` coefficients stay; `prior` is one of all of them. With the `deviation` of
+    every output known the search is a rough one. `max_iter` counts the steps that are
+    tried, of all estimates of the variances. `run` gives the results of tasks, a record
+    each; `tell` hears the cost of every step taken.
     """
     bases, start = start.bases, replace(start.silenced(), bases=())
     c0 = coefficients_of(start)
@@ -211,7 +224,7 @@ def refine(
         centre, information = prior.centre[free], prior.information[np.ix_(free, free)]
     total = np.sqrt(np.mean(np.vstack([r.y for r in records]) ** 2, axis=0))
     costs: list[tuple[int, float]] = []
-    left = max_iter
+    left, told = max_iter, information
 
     def model_of(c: Array) -> LPVStateSpace:
         full = c0.copy()
@@ -221,7 +234,7 @@ def refine(
     def all_errors(model: LPVStateSpace, weight: Array) -> list[tuple[Array, Array]]:
         return list(run(later(simulated)(model, r, own, weight) for r in records))
 
-    def deviation(errors: list[tuple[Array, Array]]) -> Array:
+    def remaining(errors: list[tuple[Array, Array]]) -> Array:
         rms = np.sqrt(np.mean(np.vstack([e for e, _ in errors]) ** 2, axis=0))
         return np.maximum(rms, _EXACT * np.where(total > 0, total, 1.0))
 
@@ -239,7 +252,7 @@ def refine(
         G[1:, 1:] += information
         return G
 
-    def minimise(c: Array, weight: Array, n_round: int) -> Array:
+    def minimise(c: Array, weight: Array, n_round: int, rough: bool) -> Array:
         def residuals(trial: Array, rows: NDArray[np.intp]) -> tuple[Array, Callable]:
             """In coordinates whose first axis is that of the residuals themselves."""
             nonlocal left
@@ -255,29 +268,48 @@ def refine(
             r[0, 0] = np.sqrt(cost)
 
             def jacobian(kept: NDArray[np.intp]) -> Array:
+                nonlocal told
                 costs.append((n_round, cost))
                 tell(cost)
                 G = gram(trial[0], errors, weight)
+                told = G[1:, 1:]
                 return _rotated(G, r[0, 0])[None]
 
             return r, jacobian
 
-        return levenberg_marquardt(residuals, c[None], max_iter=max_iter, tol=_TOL).x[0]
+        tol, patience = (_ROUGH, 1) if rough else (_TOL, 2)
+        return levenberg_marquardt(
+            residuals,
+            c[None],
+            max_iter=max_iter,
+            tol=tol,
+            patience=patience,
+            first_damping=_DAMPING,
+        ).x[0]
 
-    c, weight = c0[free], 1.0 / total
-    weight = 1.0 / deviation(all_errors(start, np.where(total > 0, weight, 1.0)))
+    c, known = c0[free], deviation is not None
+    if deviation is None:
+        weight = 1.0 / np.where(total > 0, total, 1.0)
+        deviation = remaining(all_errors(start, weight))
     for n_round in range(_ROUNDS):
-        c = minimise(c, weight, n_round)
+        first, before, weight = n_round == 0, deviation, 1.0 / deviation
+        c = minimise(c, weight, n_round, rough=first)
         errors = all_errors(model_of(c), weight)
-        before, weight = weight, 1.0 / deviation(errors)
-        if left < 1 or np.abs(before / weight - 1.0).max() <= _SETTLED:
+        if known or left < 1:
             break
-    model = model_of(c)
-    G = gram(c, errors, weight)
-    own_parts = [found for _, found in errors]
-    model = replace(model, bases=bases)
-    tried = max_iter - left
-    return Refined(model, G[1:, 1:], free, 1.0 / weight, own_parts, prior, costs, tried)
+        deviation = remaining(errors)
+        if not first and np.abs(deviation / before - 1.0).max() <= _SETTLED:
+            break
+    return Refined(
+        replace(model_of(c), bases=bases),
+        told,
+        free,
+        deviation,
+        [found for _, found in errors],
+        prior,
+        costs,
+        n_iter=max_iter - left,
+    )
 
 
 def _rotated(G: Array, size: float) -> Array:
@@ -331,6 +363,7 @@ def refine_with_rates(
     seen, unseen = pieces[::2], pieces[1::2] or pieces
     there = own._replace(initial_state=True)
     static = refine(start, seen, there, prior, **options)
+    rough = options | {"fixed": fixed, "deviation": static.deviation}
 
     def loss(model: LPVStateSpace) -> float:
         return sum(_loss(model, r, there, 1.0 / static.deviation) for r in unseen)
@@ -339,16 +372,13 @@ def refine_with_rates(
         return sum(len(r.u) for r in records)
 
     moving = replace(static.model, rate_terms=moving.rate_terms)
-    at_zero = refine(moving, seen, there, fixed=fixed, **options | {"max_iter": 0})
+    at_zero = refine(moving, seen, there, **rough | {"max_iter": 0})
     told = np.zeros(len(fixed))  # by the pieces, of every coefficient alone
     told[~fixed] = np.diag(at_zero.information)
     tried = []
     for share in _SHRINKAGE:
         drawn = share * told[len(c0) :]
-        found = refine(
-            moving, seen, there, known.widened(drawn), fixed=fixed, **options
-        )
-        moving = found.model
+        moving = refine(moving, seen, there, known.widened(drawn), **rough).model
         tried.append((loss(moving), drawn, moving))
         if tried[-1][0] > tried[-2:][0][0]:  # and weaker ones are worse
             break

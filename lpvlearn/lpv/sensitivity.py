@@ -97,12 +97,12 @@ def output_slopes(
     late = delayed(u, delay, np.repeat(u0[0], delay)) - u0
     rates = rates_of_change(kappa, dt)
     unit = _units(model, kappa, rates)
-    x, X = x0 / unit, np.zeros((n, n + n_free))
-    X[:, :n] = np.diag(1.0 / unit)
+    x, own, X = x0 / unit, np.diag(1.0 / unit), np.zeros((n, n_free))
+    moved_by = _moving_entries(model, free)
     size = max(_FEWEST, _ENTRIES // ((n + model.n_outputs) * (n + len(free))))
     for start in range(0, len(u), size):
         rows = slice(start, min(start + size, len(u)))
-        A, B, C, _, E = _linearised(model, kappa[rows], rates[rows], unit)
+        A, B, C, _, E = _linearised(model, kappa[rows], rates[rows], unit, moved_by)
         offset = model.state_offset(kappa[rows]) / unit
         w = late[rows]
         n_steps = _steps_of(_norm(A) * dt)
@@ -118,24 +118,26 @@ def output_slopes(
             F = Ah @ F + _step_slopes(A, B, E[..., :n, :], xi, w, h)
             xi = (Ah @ xi[:, :, None] + Bh @ w[:, :, None])[:, :, 0]
         F = np.concatenate([F, direct], axis=1)
-        F = _by_coefficients(model, kappa[rows], rates[rows], F)[:, :, free]
-        forcing = np.zeros((len(w), n, n + n_free))
-        forcing[:, :, n:] = F[:, :n]
-        X_all = state_trajectory(Ad, forcing, X)
-        J = C @ X_all
-        J[:, :, n:] += F[:, n:]
-        yield rows, J
+        F = _by_coefficients(model, kappa[rows], rates[rows], F, free, moved_by)
+        free_states = state_trajectory(Ad, np.zeros((len(w), n, n)), own)
+        slopes = state_trajectory(Ad, F[:, :n], X)
+        yield rows, np.concatenate([C @ free_states, C @ slopes + F[:, n:]], axis=2)
         x = Ad[-1] @ states[-1] + moved[-1] + Bd[-1] @ w[-1]
-        X = Ad[-1] @ X_all[-1] + forcing[-1]
+        own = Ad[-1] @ free_states[-1]
+        X = Ad[-1] @ slopes[-1] + F[-1, :n]
 
 
 def _linearised(
-    model: LPVStateSpace, kappa: Array, rates: Array, unit: Array
+    model: LPVStateSpace,
+    kappa: Array,
+    rates: Array,
+    unit: Array,
+    moved_by: NDArray[np.intp],
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Matrices in units of the states, and the directions of S.
 
     Directions (..., n_directions, n + n_outputs, n + n_inputs): those of the
-    parameters, and the entries of A where rate terms change them.
+    parameters, and the entries of A that rate terms change.
     """
     structure, n, n_rates = model.structure, model.order, model.n_scheduling
     S = np.array(structure.system_matrix(model.parameters(kappa)))
@@ -149,9 +151,8 @@ def _linearised(
         E = tabulate(jacobians, kappa[:, 0]) if n_rates == 1 else jacobians(kappa)
     if model.rate_terms is not None:
         S[:, :n, :n] += model.rate_part(kappa, rates)
-        entries = np.zeros((n * n, *S.shape[1:]))
-        row, column = np.divmod(np.arange(n * n), n)
-        entries[np.arange(n * n), row, column] = 1.0
+        entries = np.zeros((len(moved_by), *S.shape[1:]))
+        entries[np.arange(len(moved_by)), *np.divmod(moved_by, n)] = 1.0
         entries = np.broadcast_to(entries, (*E.shape[:-3], *entries.shape))
         E = np.concatenate([E, entries], axis=-3)
     rows = np.concatenate([unit, np.ones(structure.n_outputs)])[:, None]
@@ -159,19 +160,44 @@ def _linearised(
     return *blocks(S / rows * columns, n), E / rows * columns
 
 
-def _by_coefficients(
-    model: LPVStateSpace, kappa: Array, rates: Array, slopes: Array
-) -> Array:
-    """Derivatives along the directions (last axis), carried to all coefficients."""
-    n_params = model.structure.n_params
-    static = model.interpolator.sensitivities(kappa, slopes[:, :, :n_params])
+def _moving_entries(model: LPVStateSpace, free: Flags) -> NDArray[np.intp]:
+    """Entries of A, row by row, of which a rate term is free.
+
+    Only polynomials, whose coefficients are term by term, have some that are not.
+    """
     if model.rate_terms is None:
-        return static
-    moving = rates[:, None, :, None] * slopes[:, :, None, n_params:]
-    moving = moving.reshape(*slopes.shape[:2], -1)
-    return np.concatenate(
-        [static, model.rate_terms.sensitivities(kappa, moving)], axis=2
-    )
+        return np.arange(0)
+    of_rates = free[len(model.interpolator.coefficients()) :]
+    if of_rates.all():
+        return np.arange(model.order**2)
+    return np.flatnonzero(of_rates.reshape(-1, model.order**2).any(axis=0))
+
+
+def _by_coefficients(
+    model: LPVStateSpace,
+    kappa: Array,
+    rates: Array,
+    slopes: Array,
+    free: Flags,
+    moved_by: NDArray[np.intp],
+) -> Array:
+    """Derivatives along the directions (last axis), carried to free coefficients."""
+    n_params = model.structure.n_params
+    parts = [model.interpolator.sensitivities(kappa, slopes[:, :, :n_params])]
+    flags = [free[: parts[0].shape[2]]]
+    if model.rate_terms is not None:
+        moving = rates[:, None, :, None] * slopes[:, :, None, n_params:]
+        moving = moving.reshape(*slopes.shape[:2], -1)
+        parts.append(model.rate_terms.sensitivities(kappa, moving))
+        own = free[len(flags[0]) :]
+        if not own.all():
+            own = own.reshape(-1, model.order**2)[:, moved_by].ravel()
+        flags.append(own)
+    kept = [
+        part if some.all() else part[:, :, some]
+        for part, some in zip(parts, flags, strict=True)
+    ]
+    return kept[0] if len(kept) == 1 else np.concatenate(kept, axis=2)
 
 
 def _units(model: LPVStateSpace, kappa: Array, rates: Array) -> Array:

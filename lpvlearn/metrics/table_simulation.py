@@ -52,7 +52,9 @@ class ScheduledModel(Protocol):
         self, inputs: Any, scheduling: Any, sampling_time: float, /
     ) -> Array: ...
 
-    def free_responses(self, scheduling: Any, sampling_time: float) -> Array: ...
+    def rest_and_free_responses(
+        self, inputs: Any, scheduling: Any, sampling_time: float, /
+    ) -> tuple[Array, Array]: ...
 
 
 def fit_of(
@@ -125,10 +127,9 @@ def _simulate(
         raise ValueError(NO_TIME.format("the model is"))
     if isinstance(model, ScheduledModel):
         kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
-        rest = model.simulate(e.inputs, kappa, dt)
         if not estimate:
-            return rest
-        free = model.free_responses(kappa, dt)
+            return model.simulate(e.inputs, kappa, dt)
+        rest, free = model.rest_and_free_responses(e.inputs, kappa, dt)
         error = _outputs(e, model.n_outputs) - rest
         return rest + free @ estimate_initial_state(free, error)
     return _simulate(model.to_discrete(dt), e, dt, estimate)

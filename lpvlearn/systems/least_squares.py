@@ -84,6 +84,7 @@ def levenberg_marquardt(
     enough: int | None = None,
     stop: Callable[[], bool] = never,
     geodesic: bool = False,
+    first_damping: float = _FIRST_DAMPING,
 ) -> Minima:
     r"""Minimise ``|r(x)|^2`` from every row of a stack of starts, all in one batch.
 
@@ -110,7 +111,7 @@ def levenberg_marquardt(
     """
     x = np.clip(starts, lower, upper)
     k, q = x.shape
-    cost, damping = np.full(k, np.inf), np.full(k, _FIRST_DAMPING)
+    cost, damping = np.full(k, np.inf), np.full(k, first_damping)
     # At x: J^T J, J^T r, the longest columns of J so far, and their inverses, 0 where
     # a bound holds the variable
     H, g = np.zeros((k, q, q)), np.zeros((k, q))

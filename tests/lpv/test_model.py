@@ -661,6 +661,24 @@ def test_a_change_of_basis_takes_the_offsets_along():
     assert_allclose(moved, y + free @ [1.0, 2.0], atol=1e-11)
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        spring,
+        about_offsets,
+        lambda: replace(spring(), input_delay=[3 * DT, DT]),
+        lambda: replace(about_offsets(), input_delay=[3 * DT] * 2),
+        lambda: about_offsets().change_basis(growing),
+    ],
+)
+def test_both_responses_come_in_one_pass(make):
+    model = make()
+    u, kappa = inputs(60)[:, : model.n_inputs], sweep(60)
+    rest, free = model.rest_and_free_responses(u, kappa, DT)
+    assert_allclose(rest, model.simulate(u, kappa, DT), atol=1e-13)
+    assert_allclose(free, model.free_responses(kappa, DT), atol=1e-13)
+
+
 def test_extrapolated_offsets_are_told_once():
     kappa = np.linspace(0, 2.2, 100)
     with pytest.warns(ExtrapolationWarning) as caught:
