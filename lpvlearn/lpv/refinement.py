@@ -401,9 +401,11 @@ def _pieces(record: Record, order: int) -> list[Record]:
 def _loss(model: LPVStateSpace, record: Record, own: Own, weight: Array) -> float:
     """Weighted sum of squares of the errors; infinite where the model diverges."""
     try:
-        return float(np.sum((simulated(model, record, own, weight)[0] * weight) ** 2))
+        error = simulated(model, record, own, weight)[0] * weight
     except DivergenceError:
         return np.inf
+    with np.errstate(over="ignore"):  # it nearly diverges
+        return float(np.sum(error**2))
 
 
 def local_prior(

@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 
 _INFINITY = 1e30  # what daqp takes for no bound
 _PRIMAL, _DUAL = 1e-11, 1e-12  # its tolerances: no promise below them is acted on
+# Where it cycles at that: primal tolerances that end nearly all cycles, and the part of
+# the decrease by which their steps may break what the program asks
+_LOOSER, _BROKEN = (1e-9, 1e-7), 1e-2
 _RANK = 1e-10  # relative singular value of a span: gradients are known to less
 _BINDING = -1e-9  # relative value from which a constraint binds: a step's rounding
 # Least curvatures of a convexified Hessian, relative to that of the Lagrangian: along
@@ -59,17 +62,16 @@ def epigraph_step(
     span = 1.0 + np.abs(values).max() + radius * np.abs(G).sum(1).max()
     upper = np.concatenate([np.full(q, radius), [span], -values, -constraint_values])
     lower = np.concatenate([-upper[: q + 1], np.full(k + c, -_INFINITY)])
-    x, _, flag, info = daqp.solve(
-        P,
-        f,
-        A,
-        upper,
-        lower,
-        np.zeros(q + 1 + k + c, dtype=np.int32),
-        primal_tol=_PRIMAL,
-        dual_tol=_DUAL,
-    )
-    if flag < 1 or not np.isfinite(x).all():
+    senses = np.zeros(len(upper), dtype=np.int32)
+    for tol in (_PRIMAL, *_LOOSER):
+        x, _, flag, info = daqp.solve(
+            P, f, A, upper, lower, senses, primal_tol=tol, dual_tol=_DUAL
+        )
+        if flag >= 1 and np.isfinite(x).all():
+            break
+    else:
+        return None
+    if tol > _PRIMAL and (A @ x - upper[q + 1 :]).max() > _BROKEN * -x[q]:
         return None
     multipliers = np.maximum(np.asarray(info["lam"])[q + 1 :], 0.0)
     return np.asarray(x[:q]), multipliers[:k], multipliers[k:]

@@ -37,7 +37,7 @@ _BENT = 1.0  # part of a step that its bend may be at most
 _EXACT = 1e-7  # relative residual of a realisation in a canonical form
 _NUDGE = 1e-2  # relative change of all entries that makes a model a generic one
 _MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
-_SAME_NORM = 1e-7  # relative difference that rounding may make
+_SAME_NORM = 1e-5  # relative difference that rounding may make: 3e-7 for 24 states
 
 
 def metric_coordinates(J: Complex, size: float) -> Array:

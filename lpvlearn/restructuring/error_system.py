@@ -32,6 +32,10 @@ _LEAST_SIZES = (1e-3, 1.0)
 
 _RESPONSE_ROUNDING = 1e-12  # of a response, whose digits the error has lost
 
+# Derivatives of S whose entries are that much fewer than the entries of S, for every
+# input, are taken entry by entry: ten times faster for canonical forms of 24 states.
+_FEW = 25
+
 # singular values are told apart down to that fraction of the largest: their gap divides
 _GAP = 1e-10
 
@@ -153,6 +157,12 @@ class ResponsePoint:
 def derivatives(L: Complex, S: Array, R: Complex) -> Complex:
     """``dE_j = L S_j R``, Eq. (24)-(25), shape (k, n_outputs, n_inputs, n_params)."""
     k, p, _ = L.shape
+    j, a, b = np.nonzero(S)
+    starts = np.searchsorted(j, np.arange(len(S) + 1))
+    if _FEW * R.shape[2] * len(j) < S.size and (np.diff(starts) > 0).all():
+        entries = (S[j, a, b] * R.swapaxes(1, 2)[:, :, b])[:, None] * L[:, :, None, a]
+        one_each = len(j) == len(S)
+        return entries if one_each else np.add.reduceat(entries, starts[:-1], axis=3)
     # contract the short axes first: (k, p, a) (j, a, b) -> (k, p, j, b)
     left = np.tensordot(L, S, axes=(2, 1)).reshape(k, p * len(S), -1)
     return (left @ R).reshape(k, p, len(S), -1).swapaxes(2, 3)
