@@ -18,7 +18,6 @@ from joblib import delayed as later
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from ..exceptions import DivergenceError
 from ..systems.least_squares import RCOND, column_scale, levenberg_marquardt
 from ..systems.simulation import estimate_initial_state
 from .interpolator import grid_over
@@ -366,7 +365,7 @@ def refine_with_rates(
     rough = options | {"fixed": fixed, "deviation": static.deviation}
 
     def loss(model: LPVStateSpace) -> float:
-        return sum(_loss(model, r, there, 1.0 / static.deviation) for r in unseen)
+        return sum(squares(model, r, there, 1.0 / static.deviation) for r in unseen)
 
     def length(records: Sequence[Record]) -> int:
         return sum(len(r.u) for r in records)
@@ -398,11 +397,11 @@ def _pieces(record: Record, order: int) -> list[Record]:
     return [Record(u, y, kappa, record.dt) for u, y, kappa in zip(*parts, strict=True)]
 
 
-def _loss(model: LPVStateSpace, record: Record, own: Own, weight: Array) -> float:
-    """Weighted sum of squares of the errors; infinite where the model diverges."""
+def squares(model: LPVStateSpace, record: Record, own: Own, weight: Array) -> float:
+    """Sum of the weighted squares of the errors; infinite where there are none."""
     try:
         error = simulated(model, record, own, weight)[0] * weight
-    except DivergenceError:
+    except ValueError:  # it diverges, or has no matrices there
         return np.inf
     with np.errstate(over="ignore"):  # it nearly diverges
         return float(np.sum(error**2))

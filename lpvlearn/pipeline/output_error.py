@@ -37,6 +37,7 @@ from ..lpv.refinement import (
     refine,
     refine_with_rates,
     simulated,
+    squares,
 )
 from ..lpv.weighting import covariance_of
 from ..metrics.scores import bft_score
@@ -519,11 +520,7 @@ def _promising(
     own, one = Own(True, False), np.ones(models[0].n_outputs)
 
     def loss(model: LPVStateSpace) -> float:
-        try:
-            errors = [simulated(model, record, own, one)[0] for record in records]
-        except ValueError:
-            return np.inf
-        return float(sum(np.sum(error**2) for error in errors))
+        return sum(squares(model, record, own, one) for record in records)
 
     def soon(model: LPVStateSpace) -> float:
         try:
