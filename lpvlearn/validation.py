@@ -16,6 +16,10 @@ Array = NDArray[np.float64]
 
 _SHOWN = 80  # characters of a value in a message, lest a table fills the screen
 
+SQUARED = 1e150  # numbers below it have squares that are numbers
+
+_LONGEST = 1e100  # seconds: times of samples, and what divides by them, are numbers
+
 _LATEST = 1e9  # samples of an input's delay: more are no record's
 
 
@@ -120,6 +124,17 @@ def shown(value: Any) -> str:
     return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
 
+def squarable(name: str, array: NDArray[Any]) -> NDArray[Any]:
+    """The array, whose finite values must have squares that are numbers."""
+    huge = array[np.isfinite(array) & ~(np.abs(array) < SQUARED)]
+    if len(huge):
+        raise ValueError(
+            f"`{name}` must hold numbers below {SQUARED:g}, as they are squared. Got "
+            f"{huge[0]}; take another unit."
+        )
+    return array
+
+
 def matrix(name: str, value: ArrayLike) -> Array:
     """`value` as a new finite matrix; a number or one row may stand for it."""
     array = real_array(name, value)
@@ -141,7 +156,8 @@ def _finite(name: str, array: Array, place: str) -> Array:
 
 def positive_time(name: str, value: Any) -> float:
     """`value` as a positive finite float, or a ValueError that names it."""
-    return number(name, value, "a positive number of seconds", above=0.0)
+    rule = f"a positive number of seconds, at most {_LONGEST:g}"
+    return number(name, value, rule, above=0.0, high=_LONGEST)
 
 
 def is_whole(value: Any) -> bool:
@@ -182,7 +198,7 @@ def frequencies(omega: ArrayLike) -> Array:
             "`omega` must have shape (n_freq,) and hold no NaN. Got "
             f"shape {omega.shape} with {np.isnan(omega).sum()} NaN."
         )
-    return omega
+    return squarable("omega", omega)
 
 
 def place(name: str, value: Any, n: int) -> Array:
@@ -260,10 +276,18 @@ def input_delays(value: ArrayLike, n_inputs: int, *, samples: bool) -> NDArray[A
     )
 
 
+def has_one_axis(value: Any) -> bool:
+    """Whether a value is a list, or an array like one."""
+    try:
+        return np.ndim(value) == 1
+    except ValueError:  # rows of several lengths
+        return False
+
+
 def names_of(argument: str, names: Any, n: int | None = None) -> list[Any]:
     """`names` as a list of different ones, `n` of them or any number above zero."""
     listed: list[Any] = []
-    if not isinstance(names, str | bytes | Mapping) and np.ndim(names) == 1:
+    if has_one_axis(names) and not isinstance(names, Mapping):
         listed = list(names)
     try:
         distinct = len({*listed}) == len(listed)

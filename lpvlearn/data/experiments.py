@@ -21,7 +21,15 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_array, check_consistent_length, validate_data
 
 from ..exceptions import DivergenceError
-from ..validation import complex_array, is_whole, positive_time, real_array, shown
+from ..validation import (
+    SQUARED,
+    complex_array,
+    is_whole,
+    positive_time,
+    real_array,
+    shown,
+    squarable,
+)
 from .alignment import align_outputs
 from .forgotten_roles import warn_of_disorder, warn_of_forgotten_roles
 from .timestamps import (
@@ -49,7 +57,6 @@ NO_TIME = (  # what a message says where seconds are needed and nothing tells th
     "sampling_time=1 counts time in samples."
 )
 
-_SQUARED = 1e150  # data of which the squares are numbers
 
 _ALIKE = 0.6  # likeness (difflib's, its default) from which a name may have been meant
 _N_SHOWN = 10  # names in an error message, lest a wide table fills the screen
@@ -150,8 +157,8 @@ def as_list(keys: Any) -> list[Any]:
     """The columns with a role, as a list; empty for None."""
     if keys is None:
         return []
-    many = isinstance(keys, (list, tuple, np.ndarray, pd.Index))
-    return list(keys) if many and np.ndim(keys) else [keys]
+    array = isinstance(keys, np.ndarray) and keys.ndim
+    return list(keys) if array or isinstance(keys, (list, tuple, pd.Index)) else [keys]
 
 
 def is_table(X: Any) -> bool:
@@ -510,10 +517,10 @@ def as_numbers(argument: str, values: Any, *, imaginary: bool = False) -> NDArra
     """Numbers in an array of any shape, a single one in a vector.
 
     Raises a ValueError about the `argument` where one is not a real number, or where it
-    may be `imaginary`, no number.
+    may be `imaginary`, no number, or too large for its square to be one.
     """
     read = complex_array if imaginary else real_array
-    return np.atleast_1d(read(argument, values))
+    return squarable(argument, np.atleast_1d(read(argument, values)))
 
 
 def _numbers(columns: Sequence[Column], n_rows: int, argument: str) -> Array:
@@ -533,7 +540,7 @@ def _check_finite(
     remedy: str,
 ) -> None:
     """Refuse infinity, and NaN where it may not be, naming the first."""
-    finite = (np.abs(matrix) < _SQUARED) | (allow_missing & np.isnan(matrix))
+    finite = (np.abs(matrix) < SQUARED) | (allow_missing & np.isnan(matrix))
     if finite.all():
         return
     column = int(np.argmin(finite.all(axis=0)))

@@ -124,8 +124,8 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
                 else ""
             )
             raise ValueError(
-                f"Experiment {run.label!r} must be local. Its scheduling variable "
-                f"{worst + 1} spreads over {spread[worst]:.4g}, more than "
+                f"Experiment {run.label!r} must be local. Got a scheduling variable "
+                f"{worst + 1} that spreads over {spread[worst]:.4g}, more than "
                 f"{_MAX_SPREAD:g} times the {compared} ({scale[worst]:.4g}). Keep such "
                 "a record for validation, cut it into local experiments, or refine the "
                 f"model with it: refiner=OutputErrorLPV().{several}"

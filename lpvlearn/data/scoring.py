@@ -10,7 +10,7 @@ from scipy.special import fdtrc
 from sklearn.metrics import r2_score
 
 from ..exceptions import collected, warn
-from ..validation import real_array, shown
+from ..validation import real_array, shown, squarable
 from .alignment import align_outputs
 from .experiments import read_outputs
 
@@ -29,7 +29,6 @@ _GAIN = 2.0
 # starts in motion that cost more than 10 points were found.)
 _MODE, _CHANCE = 2, 1e-3
 
-_SQUARED = 1e150  # outputs of which the squares are numbers
 
 _SETTLED = 0.99  # share of its energy within which a transient is over
 _WINDOWS = 8  # of that length in a record; of a longer transient the start will do
@@ -64,11 +63,7 @@ def score_from_rest(
                 f"one for each row. Got {shown(sample_weight)}."
             )
         weight = weight[known]
-    largest = np.abs(measured[known]).max()
-    if not largest < _SQUARED:
-        raise ValueError(
-            f"`y` must be finite and below {_SQUARED:g}: it is squared. Got {largest}."
-        )
+    squarable("y", measured[known])
     score = r2_score(measured[known], simulated[known], sample_weight=weight)
     warn_of_motion(estimator, X, y, simulated)
     return float(score)

@@ -395,7 +395,7 @@ class BlockedTimeSeriesSplit(_SplitOfExperiments):
             train, test = [], []
             for e in experiments:
                 edges = np.linspace(0, len(e.rows), n_splits + 2).astype(int)
-                begin = 0 if longest is None else max(0, edges[fold] - longest)
+                begin = 0 if longest is None else max(0, int(edges[fold]) - longest)
                 train.append(e.rows[begin : edges[fold]])
                 test.append(e.rows[edges[fold] + gap : edges[fold + 1]])
             yield train, test

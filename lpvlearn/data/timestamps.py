@@ -28,6 +28,8 @@ TIME_TOL = 0.01  # of the estimators: what a clock's jitter costs is far below n
 _MAX_DECIMALS = 9
 _SLOP, _LARGEST_SLOP = 1e-6, 0.01
 
+_LATEST = 1e30  # seconds: single precision holds them too
+
 _USE_INSTEAD = (
     "A dynamic model needs the samples of an experiment complete and in the order of "
     "time. Do not shuffle rows: split by experiment with ExperimentSplit, GroupKFold "
@@ -72,12 +74,16 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
     else:
         if kind == "c":
             _raise_bad_time(column, 0, series)
+        if kind == "O":
+            text = series.map(lambda value: isinstance(value, str | bytes))
+            if text.any():  # which NumPy reads, and nothing else adds to
+                _raise_bad_time(column, int(np.argmax(text)), series)
         try:
             seconds = series.to_numpy(dtype=np.float64, na_value=np.nan)
         except (TypeError, ValueError):
             numbers = pd.to_numeric(series, errors="coerce")
             _raise_bad_time(column, int(np.argmax(numbers.isna())), series)
-    finite = np.isfinite(seconds)
+    finite = np.abs(seconds) < _LATEST
     if not finite.all():
         _raise_bad_time(column, int(np.argmin(finite)), series)
     return seconds

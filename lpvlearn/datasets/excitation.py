@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,10 @@ Array = NDArray[np.float64]
 _MOST_BITS = 10**6  # of a window that is balanced: all of one are held at once
 
 _MOST_STEPS = 10_000  # of integration in a sampling period: 5 s of the arm
+
+_LOUDEST = 1000  # decibels of noise above its signal: its squares are numbers still
+
+_MOST_ROWS = 1e7  # of a built-in data set: more take minutes and the memory
 
 _MOST = 1e8  # samples, experiments or bits of a built-in data set: more is a mistake
 
@@ -134,6 +139,17 @@ def check_count(name: str, value: Any) -> int:
     return int(whole)
 
 
+def check_rows(**counts: int) -> None:
+    """Refuse a data set whose counts, multiplied, are more rows than one may hold."""
+    rows = math.prod(counts.values())
+    if rows > _MOST_ROWS:
+        names = " times ".join(f"`{name}`" for name in counts)
+        raise ValueError(
+            f"{names} must be at most {_MOST_ROWS:g} rows. Got {rows:.4g}; make "
+            "several data sets of other seeds."
+        )
+
+
 def check_size(name: str, value: Any, may_be_zero: bool = False) -> float:
     """`value` as a finite positive number (or zero, where that may be)."""
     if may_be_zero:
@@ -144,9 +160,10 @@ def check_size(name: str, value: Any, may_be_zero: bool = False) -> float:
 def decibels(name: str, value: Any) -> float:
     """`value` as a ratio in decibels, which may be infinite."""
     ratio = real_array(name, value)
-    if ratio.ndim or np.isnan(ratio):
+    if ratio.ndim or not ratio >= -_LOUDEST:
         raise ValueError(
-            f"`{name}` must be a number of decibels or infinity. Got {shown(value)}."
+            f"`{name}` must be a number of decibels, at least {-_LOUDEST:g}, or "
+            f"infinity. Got {shown(value)}."
         )
     return float(ratio)
 

@@ -13,6 +13,7 @@ from sklearn.utils import Bunch
 from ..validation import number, real_array, shown
 from .excitation import (
     check_count,
+    check_rows,
     decibels,
     measurement_noise,
     prbs,
@@ -175,6 +176,10 @@ def make_flexible_arm(
     theta2 = np.pi * np.arange(1, n_points + 1) / (n_points + 1)
     n_samples = samples_of("duration", duration, sampling_time)
     n_sweep = samples_of("sweep_duration", sweep_duration, sampling_time)
+    check_rows(
+        n_operating_points=n_points, n_realizations=n_repeats, duration=n_samples
+    )
+    check_rows(n_operating_points=n_points, sweep_duration=n_sweep)
     clocks = _clock_samples("clock", clock, sampling_time)
     sweep_clocks = _clock_samples("sweep_clock", sweep_clock, sampling_time)
     if balance_time is not None:

@@ -15,6 +15,7 @@ from ..structures.structure import GrayBoxStructure
 from ..validation import naming_argument, number, real_array, shown
 from .excitation import (
     check_count,
+    check_rows,
     check_size,
     decibels,
     measurement_noise,
@@ -334,6 +335,10 @@ def make_unbalanced_disc(
     n_samples = samples_of("duration", duration, sampling_time)
     n_large = samples_of("large_duration", large_duration, sampling_time)
     bit = samples_of("clock", clock, sampling_time)
+    check_rows(
+        n_operating_points=n_points, n_realizations=n_repeats, duration=n_samples
+    )
+    check_rows(large_duration=n_large)
     angles = np.linspace(-reach, reach, n_points) if n_points > 1 else np.zeros(1)
     voltages = disc.holding_voltage(angles)
     input_rng, noise_rng, local_rng, large_rng = spawn_generators(random_state, 4)

@@ -6,6 +6,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from ..data.experiments import as_numbers
 
@@ -245,11 +246,17 @@ def plain_ticks(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def is_names(names: Any) -> bool:
+    """Whether a value is a list of what may be a name."""
+    listed = pd.api.types.is_list_like(names, allow_sets=False)
+    return listed and all(isinstance(name, Hashable) for name in names)
+
+
 def names_of(argument: str, names: Any, n: int, letter: str) -> list[str]:
     """Given names, else the letter with numbers from 1."""
     if names is None:
         return [f"{letter}{k + 1}" for k in range(n)]
-    if isinstance(names, str) or np.ndim(names) != 1 or len(names) != n:
+    if not is_names(names) or len(names) != n:
         raise ValueError(f"`{argument}` must hold {n} names. Got {names!r}.")
     return [str(name) for name in names]
 

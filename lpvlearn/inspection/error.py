@@ -91,13 +91,14 @@ class ErrorDisplay:
                 f"{len(self.active_frequencies)} `active_frequencies`. Got "
                 f"{len(self.active_values)}."
             )
-        level = as_numbers("floor", floor)
-        if level.shape != (1,) or not 0 <= level[0] < np.inf:
+        self.floor = _level("floor", floor, np.finfo(float).max)
+        norms = {} if norms is None else norms
+        if not isinstance(norms, Mapping):
             raise ValueError(
-                f"`floor` must be a finite number of at least 0. Got {floor}."
+                "`norms` must be a mapping from names to numbers. Got "
+                f"{type(norms).__name__}."
             )
-        self.floor = float(level[0])
-        self.norms = dict(norms or {})
+        self.norms = {k: _level(f"norms[{k!r}]", norm) for k, norm in norms.items()}
 
     def _curve(self, name: str, values: ArrayLike) -> Array:
         curve = as_numbers(name, values)
@@ -354,3 +355,11 @@ def _sigma(model: StateSpace, omega: Array) -> Array:
 
 def _vector(name: str, values: ArrayLike | None) -> Array:
     return np.zeros(0) if values is None else as_numbers(name, values).reshape(-1)
+
+
+def _level(name: str, value: Any, most: float = np.inf) -> float:
+    level = as_numbers(name, value)
+    if level.shape != (1,) or not 0 <= level[0] <= most:
+        kind = "number" if most == np.inf else "finite number"
+        raise ValueError(f"`{name}` must be a {kind} of at least 0. Got {value}.")
+    return float(level[0])

@@ -18,6 +18,7 @@ from .drawing import (
     colour_scale,
     drawable,
     figure_legend,
+    is_names,
     labels_of,
     named,
     names_of,
@@ -279,8 +280,9 @@ class ParameterDisplay:
             names=names,
             interpolators={name: pipeline.interpolator_},
             **known,
-            scheduling_label=scheduling_label
-            or scheduling_labels(pipeline, n_scheduling, units),
+            scheduling_label=scheduling_labels(pipeline, n_scheduling, units)
+            if scheduling_label is None
+            else scheduling_label,
             units=units,
         )
         return display.plot(ax, n_columns=n_columns)
@@ -465,6 +467,8 @@ def _names_and_choice(
         n_params = shape[-1] if len(shape) == 2 else 0
         return names_of("names", names, n_params, "p"), list(range(n_params))
     known = [str(column) for column in tables[0].columns]
+    if names is not None and not is_names(names):
+        raise ValueError(f"`names` must be a list of parameters. Got {names!r}.")
     wanted = known if names is None else [str(name) for name in names]
     for name in wanted:
         if name not in known:

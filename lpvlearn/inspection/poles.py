@@ -184,8 +184,9 @@ class PoleDisplay:
             grid,
             pipeline.lpv_.frozen_poles(grid),
             **local,
-            scheduling_label=scheduling_label
-            or scheduling_labels(pipeline, grid.shape[1], units),
+            scheduling_label=scheduling_labels(pipeline, grid.shape[1], units)
+            if scheduling_label is None
+            else scheduling_label,
         )
         return display.plot(ax, damping=damping)
 

@@ -17,7 +17,7 @@ from sklearn.utils.validation import (
 )
 
 from ..exceptions import ExtrapolationWarning, VersionedPickle, all_or_nothing, warn
-from ..validation import naming_argument, one_of, real_array
+from ..validation import SQUARED, naming_argument, one_of, real_array, squarable
 from .weighting import WeightedPoints, is_chance, weighted_points
 
 Array = NDArray[np.float64]
@@ -104,6 +104,33 @@ class Interpolator(
         """
         values = self._values(self._place(X))
         return values[:, 0] if self._single_parameter else values
+
+    def score(
+        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
+    ) -> float:
+        """Coefficient of determination of `predict`, as scikit-learn's regressors.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_scheduling)
+            Scheduling values.
+        y : array-like of shape (n_samples, n_params) or (n_samples,)
+            Parameters there.
+        sample_weight : array-like of shape (n_samples,), default=None
+            Weights of the samples.
+
+        Returns
+        -------
+        float
+            1 for equal parameters.
+
+        Raises
+        ------
+        ValueError
+            When a value is too large to be squared, or shapes do not fit.
+        """
+        squarable("y", real_array("y", y))
+        return float(super().score(X, y, sample_weight))
 
     def coefficients(self) -> Array:
         """The numbers that the fitted form has, one after another.
@@ -215,7 +242,7 @@ class Interpolator(
             return self._finite(kappa, self._evaluate(kappa))
 
     def _finite(self, kappa: Array, values: Array) -> Array:
-        finite = np.isfinite(values).reshape(len(kappa), -1).all(axis=1)
+        finite = (np.abs(values) < SQUARED).reshape(len(kappa), -1).all(axis=1)
         if not finite.all():
             raise ValueError(
                 "`X` must hold scheduling values near the range of the fit, where "
@@ -291,6 +318,7 @@ class Interpolator(
         weight = _check_weight(sample_weight, kappa)
         self._single_parameter = params.ndim == 1
         theta = real_array("y", params).reshape(len(kappa), -1)
+        squarable("X", kappa), squarable("y", theta)
         # A point of weight zero counts as absent, for the range too.
         kappa = kappa[weight > 0]
         self.scheduling_range_ = np.array([kappa.min(axis=0), kappa.max(axis=0)])

@@ -169,8 +169,15 @@ class PolynomialLPV(Interpolator):
 
     def _publish(self) -> None:
         """Set `coef_`; predictions use the well-conditioned form."""
-        conversion = conversion_to(self.basis, self.powers_, self.scheduling_range_)
-        coef = conversion @ self._chebyshev_coef
+        with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
+            conversion = conversion_to(self.basis, self.powers_, self.scheduling_range_)
+            coef = conversion @ self._chebyshev_coef
+        if not np.isfinite(coef).all():
+            raise ValueError(
+                "`X` must have a range whose powers are numbers. Got "
+                f"{self.scheduling_range_[0]} to {self.scheduling_range_[1]}; take "
+                "another unit, or basis='chebyshev'."
+            )
         self.coef_ = coef[:, 0] if self._single_parameter else coef.T
 
     def _evaluate(self, kappa: Array) -> Array:

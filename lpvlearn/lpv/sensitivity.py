@@ -216,10 +216,10 @@ def _steps_of(norm: float) -> int:
     """Number of steps of the series in a sample, over which A has this norm."""
     if norm > _LONGEST * _MOST_STEPS:
         raise ValueError(
-            f"`sampling_time` must not be {norm:.0f} times as long as the fastest "
-            "states of the model take: its derivatives would not come to an end. Leave "
-            "what is that fast out of the structure, as a feedthrough, or sample "
-            "faster."
+            f"`sampling_time` must be at most {_LONGEST * _MOST_STEPS:.0f} times as "
+            "long as the fastest states of the model take: its derivatives would not "
+            f"come to an end. Got {norm:.4g} times. Leave what is that fast out of the "
+            "structure, as a feedthrough, or sample faster."
         )
     return max(1, int(np.ceil(norm / _LONGEST)))
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..data.experiments import OPTIONAL_ROLES, ROLES, Table, fitted_roles
 from ..models.statespace import StateSpace
-from ..validation import one_of
+from ..validation import one_of, squarable
 from .scorers import (
     InitialState,
     check_options,
@@ -108,7 +108,7 @@ def _measures(
     true: NDArray[np.float64], pred: NDArray[np.float64]
 ) -> dict[str, NDArray[Any]]:
     """Measures of fit of every output; NaN for one that was never measured."""
-    missing = np.isnan(true)
+    missing = np.isnan(squarable("y", true))
     known = np.asarray(~missing.all(axis=0))
     columns: dict[str, NDArray[Any]] = {}
     true, pred = true[:, known], pred[:, known]

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import read_outputs
-from ..validation import real_array, shown
+from ..validation import real_array, shown, squarable
+
+_WORST = -1e300  # of a fit, of which the percentage is a number still
 
 Multioutput = Literal["raw_values", "uniform_average"] | ArrayLike
 
@@ -104,7 +106,7 @@ def vaf_score(
     true, pred = _read_pair(y_true, y_pred)
     _check_measured(true)
     error, spread = _norm(_centred(true - pred)), _norm(_centred(true))
-    return _percent(error**2, spread**2, multioutput)
+    return _percent(error, spread, multioutput, power=2)
 
 
 def parameter_fit(params_true: ArrayLike, params_pred: ArrayLike) -> float:
@@ -147,7 +149,9 @@ def parameter_fit(params_true: ArrayLike, params_pred: ArrayLike) -> float:
             f"{eta.shape} and {eta_hat.shape}."
         )
     true, pred = _read_pair(eta.ravel(), eta_hat.ravel(), names, missing=False)
-    return float(100 * _fit_ratio(_norm(true - pred), _norm(_centred(true)))[0])
+    squarable(names[0], true), squarable(names[1], pred)
+    fit = _fit_ratio(_norm(true - pred), _norm(_centred(true)))[0]
+    return float(100 * max(fit, _WORST))
 
 
 def r2_ratio(y_true: ArrayLike, y_pred: ArrayLike) -> NDArray[np.float64]:
@@ -207,31 +211,38 @@ def _centred(values: NDArray[np.float64]) -> NDArray[np.float64]:
     # The rounded mean of equal numbers may differ from them in the last digit.
     known = ~np.isnan(values)
     count = np.maximum(known.sum(axis=0), 1)
-    mean = np.where(known, values, 0.0).sum(axis=0) / count
+    with np.errstate(over="ignore"):
+        mean = np.where(known, values, 0.0).sum(axis=0) / count
     highest = np.where(known, values, -np.inf).max(axis=0)
     lowest = np.where(known, values, np.inf).min(axis=0)
     return np.where(known & (highest == lowest), 0.0, values - mean)
 
 
 def _norm(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    known = np.nan_to_num(values, posinf=np.inf)
+    size = np.frexp(np.abs(known).max(initial=0.0))[1]  # whose squares are numbers
     with np.errstate(over="ignore"):
-        return np.linalg.norm(np.nan_to_num(values, posinf=np.inf), axis=0)
+        return np.ldexp(np.linalg.norm(np.ldexp(known, -size), axis=0), size)
 
 
 def _fit_ratio(
-    error: NDArray[np.float64], spread: NDArray[np.float64]
+    error: NDArray[np.float64], spread: NDArray[np.float64], power: int = 1
 ) -> NDArray[np.float64]:
-    """Return 1 - error / spread; for a spread of zero, 1 without error, else 0."""
+    """1 - (error / spread)^power; for a spread of zero, 1 without error, else 0."""
     varies = spread > 0
-    ratio = 1 - error / np.where(varies, spread, 1.0)
+    with np.errstate(over="ignore"):
+        ratio = 1 - (error / np.where(varies, spread, 1.0)) ** power
     return np.where(varies, ratio, error == 0)
 
 
 def _percent(
-    error: NDArray[np.float64], spread: NDArray[np.float64], multioutput: Multioutput
+    error: NDArray[np.float64],
+    spread: NDArray[np.float64],
+    multioutput: Multioutput,
+    power: int = 1,
 ) -> Any:
     """Fit of the outputs in percent, at least 0, averaged as asked."""
-    scores = 100 * np.maximum(_fit_ratio(error, spread), 0)
+    scores = 100 * np.maximum(_fit_ratio(error, spread, power), 0)
     if isinstance(multioutput, str):
         if multioutput == "raw_values":
             return scores

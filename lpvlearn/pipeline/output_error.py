@@ -48,6 +48,7 @@ from ..validation import number, one_of, positive_time, whole_number
 from .bands import output_errors
 from .points import StructuredModels, balanced_entries, identify_point
 from .scheduled import ScheduledEstimator
+from .stability import growth_rates
 from .workers import results_of
 
 Array = NDArray[np.float64]
@@ -55,6 +56,11 @@ Array = NDArray[np.float64]
 _NO_COEFFICIENTS = (
     "`{}` needs an interpolator with coefficients to fit: AutoLPV, PolynomialLPV, "
     "RationalLPV or SplineLPV. Got {}."
+)
+
+_UNSEEN = (
+    "No experiment that stays there was fitted: measure one, or lower the degree of "
+    "the interpolator."
 )
 
 # Parts of an experiment, each nearer to an operating point than the whole, of which
@@ -259,6 +265,11 @@ class OutputErrorLPV(ScheduledEstimator):
             is not one of those above.
         DivergenceError
             If the start diverges on an experiment.
+
+        Warns
+        -----
+        UserWarning
+            If the model is unstable at values within its range.
         """
         self._check_options()
         experiments = self._read(X, y, reset=True)
@@ -267,7 +278,9 @@ class OutputErrorLPV(ScheduledEstimator):
         self._single_output = np.asarray(y).ndim == 1
         self.output_names_, self.n_outputs_ = names, len(names)
         dt = self._sampling_time(experiments)
-        return self.refine(self._start(experiments, dt), experiments, dt)
+        self.refine(self._start(experiments, dt), experiments, dt)
+        growth_rates(self.lpv_, grid_over(self.lpv_.scheduling_range, 3), _UNSEEN)
+        return self
 
     def refine(
         self,

@@ -16,11 +16,17 @@ _STEPS = 20  # into which the way from a point to its neighbour is cut
 _ROUNDING = 1e-8  # of the largest pole: an integrator's may lie so far to the right
 
 
-def growth_rates(lpv: LPVStateSpace, kappa: Array) -> Array:
+OVERSHOT = (
+    "The local models are stable; the interpolation between them overshoots. Use "
+    "interpolator=SplineLPV(), which does not, a lower degree, or measure there too "
+    "(`suggest_operating_point`)."
+)
+
+
+def growth_rates(lpv: LPVStateSpace, kappa: Array, remedy: str = OVERSHOT) -> Array:
     """Largest real part (1/s) of the frozen poles about each operating point.
 
-    Half-way to its neighbours. What grows is told: the range, and what may be done. The
-    local models are stable, so that the interpolation is at fault.
+    Half-way to its neighbours. What grows is told: the range, and the `remedy`.
     """
     model, ends = lpv.silenced(), neighbours(kappa)
     rates = _rates(model, kappa)
@@ -46,9 +52,7 @@ def growth_rates(lpv: LPVStateSpace, kappa: Array) -> Array:
         warn(
             f"`lpv_` is unstable at values within its range, of {places}: a pole has "
             f"real part {worst:.3g} 1/s, and simulations that stay there grow without "
-            "bound. The local models are stable; the interpolation between them "
-            "overshoots. Use interpolator=SplineLPV(), which does not, "
-            "a lower degree, or measure there too (`suggest_operating_point`)."
+            f"bound. {remedy}"
         )
     return rates
 

@@ -34,6 +34,7 @@ from ..validation import (
     real_array,
     share,
     shown,
+    squarable,
     whole_number,
 )
 from .deadline import bounded, time_is_up
@@ -317,6 +318,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             If a model is unstable, the structure has other inputs or outputs, or
             ``norm="covariance"`` has no estimates.
         """
+        self._check_options()
         if self.norm == "covariance" and not len(estimates):
             raise ValueError(
                 "`norm='covariance'` needs `estimates`: an identified model with its "
@@ -879,6 +881,33 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         check_is_fitted(self, "lti_")
         grid = real_array("omega", omega).reshape(-1)
         return stack_response(self.lti_.frequency_response(grid))
+
+    def score(
+        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
+    ) -> float:
+        """Coefficient of determination of `predict`, as scikit-learn's regressors.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_freq,) or (n_freq, 1)
+            Angular frequencies, rad/s.
+        y : array-like of shape (n_freq, 2 * n_outputs * n_inputs)
+            The response there, as `predict` gives it.
+        sample_weight : array-like of shape (n_freq,), default=None
+            Weights of the frequencies.
+
+        Returns
+        -------
+        float
+            1 for an equal response.
+
+        Raises
+        ------
+        ValueError
+            When a value is too large to be squared, or shapes do not fit.
+        """
+        squarable("y", real_array("y", y))
+        return float(super().score(X, y, sample_weight))
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()

@@ -195,9 +195,9 @@ def read_noise(
         values = values[:, None, None]
     k, p, m = G.shape
     known = values.ndim == 3 and values.shape in ((k, 1, 1), G.shape)
-    most = np.inf if coherence is None else 1.0
-    if not known or not ((values > 0) & (values <= most) & np.isfinite(values)).all():
-        rule = "positive" if coherence is None else "above 0, and 1 at most"
+    least, most = (_SMALLEST, 1 / _SMALLEST) if coherence is None else (0.0, 1.0)
+    if not known or not ((values > least) & (values <= most)).all():
+        rule = f"above {least:g}, and {most:g} at most"
         raise ValueError(
             f"`{name}` must have shape ({k},) or ({k}, {p}, {m}), with values {rule}. "
             f"Got shape {shape}."

@@ -17,7 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.statespace import StateSpace
 from ..models.system_matrix import Blocks, blocks
-from ..validation import named_values, names_of, real_array, shown, whole_number
+from ..validation import (
+    has_one_axis,
+    named_values,
+    names_of,
+    real_array,
+    shown,
+    whole_number,
+)
 from .map import AffineMap, FramedMap, FunctionMap, StructureMap
 from .mechanical import FluxMap, ImplicitMap, descriptor_map, mechanical_map
 from .templates import (
@@ -101,7 +108,7 @@ class GrayBoxStructure:
                 f"`map` must be a StructureMap. Got {shown(map)}. Write structures by "
                 "from_template, from_function or mechanical."
             )
-        if np.ndim(parameter_names) != 1 or len(parameter_names) > 0:
+        if not has_one_axis(parameter_names) or len(parameter_names) > 0:
             parameter_names = names_of("parameter_names", parameter_names)
         q = len(parameter_names)
         vectors = {"initial": initial, "lower": lower, "upper": upper, "ranges": ranges}
@@ -759,7 +766,7 @@ class GrayBoxStructure:
         ----------
         theta : ndarray of shape (..., n_params)
         """
-        array = isinstance(theta, np.ndarray) and theta.dtype.kind in "fc"
+        array = type(theta) is np.ndarray and theta.dtype.kind in "fc"
         fits = array and theta.shape[-1:] == (self.n_params,)
         if not fits or not np.isfinite(theta).all():
             theta = self._stacked_params(theta)

@@ -21,7 +21,7 @@ from ..data.preparation import (
     remove_trends,
 )
 from ..exceptions import RankWarning, warn
-from ..validation import one_of, positive_time
+from ..validation import is_whole, one_of, positive_time, shown
 from .closed_loop import identify_closed_loop
 from .held_out import HeldOut
 from .identification import (
@@ -130,11 +130,10 @@ def check_options(options: Mapping[str, Any]) -> Choices:
 def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:
     if isinstance(value, str) and value == "auto":
         return None
-    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not is_integer or value < lowest:
+    if not is_whole(value) or value < lowest:
         raise ValueError(
-            f"`{name}` must be 'auto' or an integer of at least {lowest}. "
-            f"Got {value!r}."
+            f"`{name}` must be 'auto' or an integer of at least {lowest}. Got "
+            f"{shown(value)}."
         )
     return int(value)
 

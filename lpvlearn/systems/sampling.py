@@ -51,8 +51,8 @@ def sample_zoh(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
     if not np.isfinite(E).all():
         fastest = np.linalg.eigvals(A).real.max()
         raise ValueError(
-            f"`sampling_time` of {dt:g} s is too long for an unstable pole with real "
-            f"part {fastest:.3g} rad/s: the sampled model overflows. Shorten it."
+            "`sampling_time` must be short for the fastest pole: the sampled model "
+            f"overflows. Got {dt:g} s, and a pole of real part {fastest:.3g} rad/s."
         )
     return E[..., :n, :n], E[..., :n, n:]
 

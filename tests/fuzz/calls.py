@@ -702,3 +702,12 @@ def calls():
         for group, weight in GROUPS
         for name, function, arguments in group(world())
     }
+
+
+def shares(n_cases):
+    """How many of `n_cases` are each call's."""
+    total = sum(call.weight for call in calls().values())
+    return {
+        name: max(1, round(n_cases * call.weight / total)) if call.weight else 0
+        for name, call in calls().items()
+    }

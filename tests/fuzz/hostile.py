@@ -105,7 +105,14 @@ def _or_as_it_is(change, draw, value):
     """The changed value; where numpy or pandas know no such change, the value."""
     try:
         return change(draw, value)
-    except (TypeError, ValueError, OverflowError, IndexError, ImportError):
+    except (
+        TypeError,
+        ValueError,
+        ArithmeticError,
+        LookupError,
+        AttributeError,
+        ImportError,
+    ):
         return value
 
 
@@ -267,3 +274,11 @@ def hostile(value):
     if isinstance(value, int | float) and not isinstance(value, bool):
         return st.one_of(st.sampled_from(NUMBERS), ANY)
     return ANY
+
+
+@st.composite
+def spoiled(draw, arguments):
+    """What a caller gave in the place of one or two of the valid `arguments`."""
+    names = st.sampled_from(sorted(arguments))
+    some = draw(st.lists(names, min_size=1, max_size=2, unique=True))
+    return {name: draw(hostile(arguments[name])) for name in some}

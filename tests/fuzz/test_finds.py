@@ -12,7 +12,7 @@ from lpvlearn.inspection import SimulationDisplay
 from lpvlearn.validation import number, real_array, whole_number
 
 from ..conftest import spring_lpv
-from .calls import QUICK, TABLE_ROLES, world
+from .calls import QUICK, TABLE_ROLES, calls, world
 
 NO_NUMBERS = {
     "complex numbers among objects": np.array([1.0, 2.0 + 0j], object),
@@ -147,3 +147,60 @@ def test_a_forged_report_is_refused_when_it_is_read(tmp_path):
         pipeline.report_ = whole
     lp.save(pipeline, path)
     assert lp.load(path).summary() == pipeline.summary()
+
+
+HUGE = np.full((4, 2), 1e308)
+
+
+@pytest.mark.parametrize(
+    "name, spoiled, told",
+    [
+        ("SubspaceLTI.fit", {"inputs": [[1], [1, 2]]}, "column"),
+        ("SubspaceLTI.fit(arrays)", {"order": np.timedelta64(1, "s")}, "`order` must"),
+        ("PoleDisplay", {"scheduling_label": [[1], [1, 2]]}, "`scheduling_label` must"),
+        ("PoleDisplay", {"local_poles": HUGE}, "below 1e\\+150"),
+        ("ParameterDisplay.from_estimator", {"names": pd.NaT}, "`names` must"),
+        ("ErrorDisplay", {"norms": "text"}, "`norms` must be a mapping"),
+        ("PolynomialLPV", {"X": HUGE[:, :1]}, "`X` must hold numbers below"),
+        ("PolynomialLPV.score", {"y": HUGE}, "`y` must hold numbers below"),
+        ("AutoLPV", {"X": 1e-200 * np.ones((4, 1)).cumsum(0)}, "whose powers"),
+        ("GrayBoxRestructurer.score", {"y": HUGE[:3]}, "`y` must hold numbers below"),
+        ("GrayBoxRestructurer.fit_model", {"norm": np.eye(3)}, "`norm` must be"),
+        ("GrayBoxRestructurer.predict", {"omega": [1e200]}, "`omega` must hold"),
+        ("fit_report(pipeline)", {"y": np.full((180, 1), 1e308)}, "`y` must hold"),
+        ("from_trajectories", {"sampling_time": 1e308}, "at most 1e\\+100"),
+        ("make_flexible_arm", {"n_realizations": 10**6}, "`n_realizations`.*rows"),
+        ("make_unbalanced_disc", {"duration": 1e6}, "`duration` must be at most"),
+        ("make_unbalanced_disc", {"snr_db": -np.inf}, "`snr_db` must be"),
+    ],
+)
+def test_what_surveys_found_is_told(name, spoiled, told):
+    call = calls()[name]
+    with pytest.raises(ValueError, match=told):
+        call.function(**{**call.arguments, **spoiled})
+
+
+def test_what_surveys_found_is_right():
+    structure, theta = world().structure, np.array([30.0, 1.2, 40.0])
+    masked = structure.system_matrix(np.ma.masked_less(theta, 0.0))
+    assert (masked == structure.system_matrix(theta)).all()
+    folds = lp.BlockedTimeSeriesSplit(2, max_train_size=2**63)
+    assert len(list(folds.split(np.ones((9, 1))))) == 2
+    assert lp.parameter_fit([1.0, 2.0], [1.0, 1e120]) < -1e100
+    for score in (lp.bft_score, lp.vaf_score):
+        assert score(1e-200 * theta, 1e-200 * theta[::-1]) == score(theta, theta[::-1])
+
+
+def test_times_of_text_are_refused_by_all():
+    call, X = calls()["resample"], world().X.astype({"time": str})
+    with pytest.raises(ValueError, match="convert text"):
+        call.function(**{**call.arguments, "X": X})
+
+
+def test_an_output_error_model_that_grows_within_its_range_is_told():
+    w = world()
+    with pytest.warns(UserWarning, match="unstable at values within.*`?No experiment"):
+        lp.OutputErrorLPV(  # the table's time, taken for a scheduling variable
+            w.lpv, inputs="force", scheduling="time", experiment="kappa", time="time",
+            max_iter=2,
+        ).fit(w.X, w.y)  # fmt: skip
