@@ -93,7 +93,8 @@ def prbs(
         windows = np.ones((n_channels, -(-n_bits // balance), balance))
         windows[..., balance // 2 :] = -1.0
         bits = rng.permuted(windows, axis=-1).reshape(n_channels, -1)
-    return amplitude * np.repeat(bits, clock, axis=1)[:, :n_samples].T
+    held = np.repeat(bits[:, :n_bits], min(clock, n_samples), axis=1)
+    return amplitude * held[:, :n_samples].T
 
 
 def measurement_noise(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2 as chi_square
 
-from ..validation import real_array
+from ..validation import real_array, squarable
 
 Array = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def weighted_points(
     used = weight > 0
     P = None
     if covariance is not None:
-        P = real_array("covariance", covariance)
+        P = squarable("covariance", real_array("covariance", covariance))
         n, q = theta.shape
         if P.shape == (n,) and q == 1:
             P = P[:, None, None]

@@ -172,6 +172,7 @@ HUGE = np.full((4, 2), 1e308)
         ("make_flexible_arm", {"n_realizations": 10**6}, "`n_realizations`.*rows"),
         ("make_unbalanced_disc", {"duration": 1e6}, "`duration` must be at most"),
         ("make_unbalanced_disc", {"snr_db": -np.inf}, "`snr_db` must be"),
+        ("SplineLPV", {"covariance": np.full((4, 2, 2), 1e200)}, "`covariance` must"),
     ],
 )
 def test_what_surveys_found_is_told(name, spoiled, told):
