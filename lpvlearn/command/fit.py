@@ -21,7 +21,7 @@ from .. import (
 from .judgement import measured_signals, simulation_text, told_warnings, warnings_text
 from .output import whole_folder
 from .structure_file import read_structure
-from .tables import check_table, columns_of, read_table, with_times
+from .tables import check_table, columns_of, read_tables, with_times
 
 INTERPOLATIONS = {
     "auto": AutoLPV,
@@ -38,33 +38,41 @@ def fit(options: argparse.Namespace) -> None:
     """Run the command."""
     if options.degree is not None and options.interpolation != "polynomial":
         raise ValueError("--degree is that of --interpolation polynomial.")
-    judged = options.validation or options.table
-    check_table(judged)
+    for path in [*options.table, *(options.validation or ())]:
+        check_table(path)
     with whole_folder(options.output, options.overwrite) as folder:
         with told_warnings() as warned:
-            table = read_table(options.table, options.format)
+            form, start = options.format, options.initial_state
+            label = options.experiment is None
+            judged = found = read_tables(
+                options.table, form, options.experiment, label=label
+            )
+            options.experiment, table = found.experiment, found.rows
             outputs = columns_of("--outputs", options.outputs, table)
             roles = _roles(options, table, outputs)
             features = _features(table, roles, outputs)
-            structure, units = None, dict[str, str]()
+            structure, units = None, found.units
             if options.structure is not None:
                 given = _all_of(roles, but="inputs")
                 inputs = roles["inputs"] or [f for f in features if f not in given]
-                structure, units = read_structure(
+                structure, own = read_structure(
                     options.structure, len(inputs), len(outputs)
                 )
+                units = units | own
             pipeline = _pipeline(options, roles, structure)
-            table = with_times(table, roles["time"])
+            table = with_times(table, roles["time"], form.time_unit)
             pipeline.fit(table[features], table[outputs])
             if options.validation is not None:
-                table = read_table(judged, options.format)
-                table = with_times(table, roles["time"])
+                judged = read_tables(
+                    options.validation, form, found.experiment, label=True
+                )
+                table = with_times(judged.rows, roles["time"], form.time_unit)
             X, y = measured_signals(pipeline, table, judged.name)
-            report = fit_report(pipeline, X, y, initial_state=options.initial_state)
+            report = fit_report(pipeline, X, y, initial_state=start)
         text = "\n\n".join(
             [
                 pipeline.summary(),
-                simulation_text(report, judged.name, options.initial_state),
+                simulation_text(report, judged.name, start),
                 warnings_text(warned),
             ]
         )
@@ -76,8 +84,8 @@ def fit(options: argparse.Namespace) -> None:
             folder / "report.html",
             X,
             y,
-            initial_state=options.initial_state,
-            title=f"LPV model of {options.table.name}",
+            initial_state=start,
+            title=f"LPV model of {found.name}",
             units=units,
             figures=folder / "figures",
         )

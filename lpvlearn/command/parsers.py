@@ -9,7 +9,7 @@ from typing import Any
 
 from .ending import status_of
 from .fit import INTERPOLATIONS, fit
-from .tables import Format
+from .tables import TIME_UNITS, Format
 from .use import predict, report
 
 _FIT = """\
@@ -19,6 +19,8 @@ examples:
   lpvlearn fit runs.csv --inputs force --outputs position --scheduling kappa \\
       --experiment run --time time --structure spring.toml \\
       --validation sweep.csv --output spring
+  lpvlearn fit run_*.csv --outputs position --scheduling kappa --time time \\
+      --output spring                    (each file is one experiment)
 
 spring.toml, the structure as a template; names in its cells are the parameters:
   A = [[0, 1], ["-k", "-c"]]
@@ -62,7 +64,7 @@ def add_commands(commands: Any) -> None:
         commands, "predict", "simulate a model along a table", _PREDICT, predict
     )
     _add_model(parser)
-    parser.add_argument("table", type=Path, metavar="TABLE", help=_TABLE)
+    _add_tables(parser, "table")
     _add_start(parser)
     parser.add_argument(
         "--output",
@@ -73,12 +75,7 @@ def add_commands(commands: Any) -> None:
     _add_format(parser)
     parser = _command(commands, "report", "tell how good a model is", _REPORT, report)
     _add_model(parser)
-    parser.add_argument(
-        "--table",
-        type=Path,
-        metavar="TABLE",
-        help="measured outputs, to be compared with the simulation",
-    )
+    _add_tables(parser, "--table", "measured, to be compared with the simulation")
     _add_start(parser)
     parser.add_argument(
         "--output",
@@ -89,7 +86,10 @@ def add_commands(commands: Any) -> None:
     _add_format(parser)
 
 
-_TABLE = "a .csv, .parquet or .xlsx file with one row per sample"
+_TABLE = (
+    "a .csv, .txt, .parquet or .xlsx file with one row per sample; several files, or "
+    "sheets of a workbook, are as many experiments"
+)
 
 
 def _command(
@@ -107,20 +107,22 @@ def _command(
 
 
 def _run(command: Callable[..., None], options: argparse.Namespace) -> int:
-    options.format = Format(options.separator, options.decimal)
+    options.format = Format(
+        options.separator, options.decimal, options.encoding, options.time_unit
+    )
     return status_of(options.command, lambda: command(options))
 
 
 def _add_fit(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("table", type=Path, metavar="TABLE", help=_TABLE)
+    _add_tables(parser, "table")
     roles = parser.add_argument_group("columns, by name; several with commas between")
     for name, what in (
         ("inputs", "what drives the system (default: all without another role)"),
         ("outputs", "what answers (required)"),
         ("scheduling", "what the dynamics depend on (default: nothing)"),
-        ("experiment", "which run a row belongs to (default: all are one run)"),
-        ("time", "seconds or dates"),
+        ("experiment", "which run a row belongs to (default: each file is one)"),
+        ("time", "seconds or dates; see --time-unit"),
         ("operating-point", "labels of the operating points (default: found)"),
     ):
         required = name == "outputs"
@@ -155,11 +157,8 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
         help="keep the H-infinity optimum, do not weigh by the noise",
     )
     add = parser.add_argument
-    add(
-        "--validation",
-        type=Path,
-        metavar="TABLE",
-        help="table to judge the model by (default: that of the fit)",
+    _add_tables(
+        parser, "--validation", "to judge the model by (default: that of the fit)"
     )
     _add_start(parser)
     add("--jobs", type=int, metavar="J", help="operating points at the same time")
@@ -179,6 +178,10 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     _add_format(parser)
 
 
+def _add_tables(parser: argparse.ArgumentParser, name: str, text: str = _TABLE) -> None:
+    parser.add_argument(name, type=Path, metavar="TABLE", nargs="+", help=text)
+
+
 def _add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "model", type=Path, metavar="MODEL", help="model.zip of lpvlearn fit"
@@ -196,9 +199,13 @@ def _add_start(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_format(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--separator", metavar="C", help="between columns of a csv (default comma)"
-    )
-    parser.add_argument(
-        "--decimal", default=".", metavar="C", help="decimal mark of a csv (default .)"
+    group = parser.add_argument_group("how a file is written, where that is not found")
+    add = group.add_argument
+    add("--separator", metavar="C", help="between columns of a file of text")
+    add("--decimal", metavar="C", help="decimal mark")
+    add("--encoding", metavar="NAME", help="of the characters, such as cp1252")
+    add(
+        "--time-unit",
+        choices=TIME_UNITS,
+        help="of numbers in the column of the time (default s)",
     )

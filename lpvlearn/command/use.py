@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,7 +19,7 @@ from .judgement import (
     warnings_text,
 )
 from .output import whole_file
-from .tables import check_table, read_table, with_times, write_table
+from .tables import check_table, read_tables, with_times, write_table
 
 
 def predict(options: argparse.Namespace) -> None:
@@ -27,25 +28,24 @@ def predict(options: argparse.Namespace) -> None:
     if options.output is not None:
         check_table(options.output)
     with told_warnings() as warned:
-        pipeline, table = _model_and_table(options)
-        X, y = signals_of(pipeline, table, options.table.name)
+        pipeline, table, name = _model_and_table(options)
+        X, y = signals_of(pipeline, table, name)
         if estimate:
-            X, y = measured_signals(pipeline, table, options.table.name)
+            X, y = measured_signals(pipeline, table, name)
             found = pipeline.predict_with_initial_state(X, y)
         else:
             found = np.asarray(pipeline.predict(X))
         text = []
         if y is not None:
             report = fit_report(pipeline, X, y, initial_state=options.initial_state)
-            text = [simulation_text(report, options.table.name, options.initial_state)]
+            text = [simulation_text(report, name, options.initial_state)]
     kept = [n for n in (pipeline.experiment, pipeline.time) if n is not None]
     simulated = pd.DataFrame(
         np.reshape(found, (len(X), -1)), X.index, list(pipeline.output_names_)
     )
     simulated = pd.concat([X[list(dict.fromkeys(kept))], simulated], axis=1)
     if options.output is None:
-        form = {"sep": options.format.separator or ",", "decimal": options.decimal}
-        simulated.to_csv(sys.stdout, index=False, **form)
+        write_table(simulated, None, options.format)
     else:
         with whole_file(options.output) as part:
             write_table(simulated, part, options.format)
@@ -58,10 +58,9 @@ def predict(options: argparse.Namespace) -> None:
 def report(options: argparse.Namespace) -> None:
     """Run the command: what the fit found, and the simulation of a table."""
     with told_warnings() as warned:
-        pipeline, table = _model_and_table(options)
+        pipeline, table, name = _model_and_table(options)
         text, X, y = [pipeline.summary()], None, None
         if table is not None:
-            name = options.table.name
             X, y = measured_signals(pipeline, table, name)
             found = fit_report(pipeline, X, y, initial_state=options.initial_state)
             text.append(simulation_text(found, name, options.initial_state))
@@ -72,11 +71,17 @@ def report(options: argparse.Namespace) -> None:
     print("\n\n".join(text))
 
 
-def _model_and_table(
-    options: argparse.Namespace,
-) -> tuple[LocalLPVPipeline, pd.DataFrame | None]:
-    if options.table is not None:
-        check_table(options.table)
+class _Given(NamedTuple):
+    """A fitted pipeline, and a table to simulate, if any."""
+
+    pipeline: LocalLPVPipeline
+    table: pd.DataFrame | None
+    name: str = ""
+
+
+def _model_and_table(options: argparse.Namespace) -> _Given:
+    for path in options.table or ():
+        check_table(path)
     if not Path(options.model).is_file():
         raise ValueError(f"{options.model}: there is no such file.")
     pipeline = load(options.model)
@@ -86,6 +91,8 @@ def _model_and_table(
             f"fit writes. It holds a {type(pipeline).__name__}."
         )
     if options.table is None:
-        return pipeline, None
-    table = read_table(options.table, options.format)
-    return pipeline, with_times(table, pipeline.time)
+        return _Given(pipeline, None)
+    form, experiment = options.format, pipeline.experiment
+    found = read_tables(options.table, form, experiment, label=experiment is not None)
+    table = with_times(found.rows, pipeline.time, form.time_unit)
+    return _Given(pipeline, table, found.name)

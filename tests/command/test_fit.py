@@ -48,7 +48,7 @@ def test_a_folder_is_not_written_over_unasked(folder):
         (["--time", "time,run"], "--time must name one column. Got 2."),
         (["--structure", "none.toml"], "none.toml: there is no such file."),
         (["--scheduling", "run"], "lpvlearn fit: "),
-        (["--validation", "a.dat"], "a.dat: the end of the name must be one of .csv"),
+        (["--validation", "a.mdf"], "a.mdf: the end of the name must be one of .csv"),
         (["--degree", "2"], "--degree is that of --interpolation polynomial."),
         (["--validation", "none.csv"], "none.csv: there is no such file."),
     ],
@@ -97,7 +97,7 @@ def test_json_gaps_other_csv_and_an_own_folder(folder, tmp_path):
     (target / "notes.txt").write_text("mine")
     status, _, error = run(
         *("fit", path, *ROLES, "--structure", form, "--output", target),
-        *("--overwrite", "--separator", ";", "--decimal", ",", "--missing", "split"),
+        *("--overwrite", "--missing", "split"),
         *("--interpolation", "polynomial", "--degree", "2"),
     )
     assert (status, error) == (0, "")
@@ -107,10 +107,10 @@ def test_json_gaps_other_csv_and_an_own_folder(folder, tmp_path):
     assert_allclose(points["param_a2_1"], -truth[:, 2], rtol=1e-6)
     assert points["n_samples"].tolist() == [294, 300, 300, 300]
     arguments = ["fit", path, *ROLES, "--output", tmp_path / "b"]
-    status, _, error = run(*arguments)
-    assert status == 1 and "tell --separator" in error
-    status, _, error = run(*arguments, "--separator", ";", "--decimal", ",")
+    status, _, error = run(*arguments)  # separator and decimal mark are found
     assert status == 1 and "missing='split'" in error
+    status, _, error = run(*arguments, "--separator", "|")
+    assert status == 1 and "tell --separator" in error
 
 
 @pytest.mark.parametrize("end", ["parquet", "xlsx"])

@@ -68,7 +68,7 @@ def test_failures_tell_why(folder, model, tmp_path):
         (("report", inputs), "must be a whole file that `save`"),
         (("predict", model, inputs), "inputs.csv lacks the column(s) 'kappa'"),
         (("predict", model, tmp_path / "empty.csv"), "empty.csv cannot be read"),
-        (("predict", model, inputs, "--output", "a.dat"), "a.dat: the end of the name"),
+        (("predict", model, inputs, "--output", "a.mdf"), "a.mdf: the end of the name"),
     ):
         status, out, error = run(*arguments)
         assert (status, out) == (1, "")
