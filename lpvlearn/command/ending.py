@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -12,6 +13,14 @@ from typing import Any, NoReturn
 
 _INTERRUPTED = 130  # a shell's status of a program that Ctrl-C ended
 _SIGNALLED = 128  # a shell's status of a program that a signal ended, and its number
+
+# What the library calls an argument is an option here.
+_OPTIONS = (
+    (r"missing='split' \(of SubspaceLTI\)|missing='split'", "--missing split"),
+    (r"initial_state='estimate'", "--initial-state estimate"),
+    (r"`(inputs|scheduling|experiment|time|order|missing)`", r"`--\1`"),
+    (r"`(operating|sampling)_(point|time)`", r"`--\1-\2`"),
+)
 
 _ENDING = ("SIGTERM", "SIGHUP")  # where a system has them
 
@@ -27,9 +36,16 @@ def status_of(name: str, command: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         return _INTERRUPTED
     except (ValueError, TypeError, OSError, RuntimeError, MemoryError) as error:
-        print(f"lpvlearn {name}: {error}", file=sys.stderr)
+        print(f"lpvlearn {name}: {in_options(str(error))}", file=sys.stderr)
         return 1
     return 0
+
+
+def in_options(text: str) -> str:
+    """A message of the library in the words of the command."""
+    for words, option in _OPTIONS:
+        text = re.sub(words, option, text)
+    return text
 
 
 @contextmanager

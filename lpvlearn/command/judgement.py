@@ -12,6 +12,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from .. import LocalLPVPipeline, readable_report
+from .ending import in_options
 
 _LINE = 88  # characters
 
@@ -74,7 +75,9 @@ def told_warnings() -> Iterator[list[str]]:
 def warnings_text(messages: Sequence[str]) -> str:
     """Warnings as a list under a heading."""
     items = [
-        textwrap.fill(message, _LINE, initial_indent="- ", subsequent_indent="  ")
+        textwrap.fill(
+            in_options(message), _LINE, initial_indent="- ", subsequent_indent="  "
+        )
         for message in messages
     ]
     return "\n".join(["Warnings", "", *items]) if items else "No warnings."

@@ -10,6 +10,7 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -116,7 +117,9 @@ def read_tables(
     if left:
         shown = ", ".join(map(repr, sorted(left)))
         warnings.warn(
-            f"Columns are left out that not every table has: {shown}.", stacklevel=2
+            f"Columns are left out that not every table has: {shown}. Add them to the "
+            "others where they are needed.",
+            stacklevel=2,
         )
     rows, units = [], dict[str, str]()
     labels = _different([record.label for record in records])
@@ -273,13 +276,13 @@ def _header(cells: Sequence[Sequence[Any]], *, commas: bool) -> Header:
     full = [k for k, row in enumerate(kinds) if len(row) == width]
     place = next((k for k in full if 2 * kinds[k].count("") < width), None)
     if place is None:
-        raise ValueError("it holds no table: no line has a cell in most columns.")
+        raise ValueError("it must hold a table with names above its columns.")
     row, below = cells[place], [k for k in full if k > place][:2]
     if kinds[place].count("number") > kinds[place].count("text"):
         names = [f"c{k + 1}" for k in range(width)]
         warnings.warn(
-            f"The table has no names of columns. They are called {names[0]} to "
-            f"{names[-1]}.",
+            f"The columns have no names: use {names[0]} to {names[-1]}, or give them "
+            "names in the first line of the file.",
             stacklevel=2,
         )
         return Header(names, {}, place)
@@ -328,14 +331,14 @@ def _sheets(path: Path) -> list[Record]:
         rows = raw.iloc[first:].set_axis(names, axis=1).infer_objects()
         found.append(Record(str(sheet), rows, units))
     if not found:
-        raise ValueError("no sheet holds a table with names of columns.")
+        raise ValueError("a sheet must hold a table with names above its columns.")
     largest = max(found, key=lambda record: record.rows.size)
     kept = [r for r in found if set(r.rows.columns) == set(largest.rows.columns)]
     left = [r.label for r in found if set(r.rows.columns) != set(largest.rows.columns)]
     if left:
         warnings.warn(
-            f"Sheets of {path.name} are left out whose columns are not those of "
-            f"{largest.label!r}: {', '.join(map(repr, left))}.",
+            f"Sheets of {path.name} are left out: {', '.join(map(repr, left))}. Give "
+            f"them the columns of {largest.label!r} to have them read as experiments.",
             stacklevel=2,
         )
     return kept
@@ -379,14 +382,15 @@ def _dates(values: pd.Series) -> pd.Series:
     by_day = bool(text.str.match(r"^\d+\.\d+\.").any() or (first > 12).any())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of formats that are guessed
-        for form in (None, "ISO8601", "mixed"):
-            try:
-                return pd.to_datetime(
-                    text, format=form, dayfirst=by_day, utc=True
-                ).dt.tz_localize(None)
-            except ValueError:
-                continue
-    raise ValueError("no dates.")
+        for form in (None, "ISO8601"):
+            with suppress(ValueError):
+                return _utc(text, form, by_day)
+        return _utc(text, "mixed", by_day)
+
+
+def _utc(text: pd.Series, form: str | None, by_day: bool) -> pd.Series:
+    dates = pd.to_datetime(text, format=form, dayfirst=by_day, utc=True)
+    return dates.dt.tz_localize(None)
 
 
 def columns_of(option: str, text: str | None, table: pd.DataFrame) -> list[str]:

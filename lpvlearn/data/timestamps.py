@@ -10,6 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ..exceptions import warn
+
 Indices = NDArray[np.intp]
 
 # Relative tolerance on a single time step (beyond the rounding of its stamps), and on
@@ -49,6 +51,9 @@ _RESTARTS = (
     "tells them apart. "
 )
 
+# Stamps beyond are no seconds since 1970, but parts of them: the year 5138.
+_LATEST = 1e11
+
 # Share of the steps up to which a table does not look shuffled: those that go back in
 # time, where experiments follow each other, or leave rows out, as a logger does.
 _FEW = 0.05
@@ -86,6 +91,12 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
     finite = np.abs(seconds) < _LATEST
     if not finite.all():
         _raise_bad_time(column, int(np.argmin(finite)), series)
+    if len(seconds) and seconds.min() > _LATEST:
+        warn(
+            f"Time column {column!r} begins at {seconds.min():.4g}. Numbers are read "
+            "as seconds; if these are milliseconds since 1970, give dates instead: "
+            f"pandas.to_datetime(X[{column!r}], unit='ms')."
+        )
     return seconds
 
 

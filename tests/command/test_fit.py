@@ -71,7 +71,7 @@ def test_what_was_warned_of_is_told_where_the_fit_fails(folder, tmp_path):
     )
     assert status == 1  # the time is taken for an input, and so not known
     assert "Input column 'time' rises by the same 0.02" in error
-    assert "sampling_time" in error
+    assert "`--sampling-time`" in error
 
 
 @pytest.mark.parametrize("missing", ["--outputs", "--output"])
@@ -108,7 +108,7 @@ def test_json_gaps_other_csv_and_an_own_folder(folder, tmp_path):
     assert points["n_samples"].tolist() == [294, 300, 300, 300]
     arguments = ["fit", path, *ROLES, "--output", tmp_path / "b"]
     status, _, error = run(*arguments)  # separator and decimal mark are found
-    assert status == 1 and "missing='split'" in error
+    assert status == 1 and "Identify with --missing split, which" in error
     status, _, error = run(*arguments, "--separator", "|")
     assert status == 1 and "tell --separator" in error
 

@@ -97,7 +97,7 @@ def test_numbers_since_1970_are_dates_and_others_have_their_unit(
 def test_tables_without_names_say_what_their_columns_are_called(tmp_path, table):
     path = tmp_path / "a.csv"
     table[NAMES[1:]].to_csv(path, index=False, header=False)
-    with pytest.warns(UserWarning, match="They are called c1 to c2"):
+    with pytest.warns(UserWarning, match="use c1 to c2, or give"):
         assert list(read(path)[0]) == ["c1", "c2"]
 
 
@@ -127,7 +127,9 @@ def test_sheets_of_the_same_columns_are_experiments(tmp_path, table):
         pd.DataFrame({"by": ["Ann"]}).to_excel(book, sheet_name="Info", index=False)
         for name in ("V1", "V2"):
             table.to_excel(book, sheet_name=name, startrow=2, startcol=1, index=False)
-    with pytest.warns(UserWarning, match="those of 'V1': 'Info'"):
+    with pytest.warns(
+        UserWarning, match="left out: 'Info'. Give them the columns of 'V1'"
+    ):
         found = read_tables([path], Format(), None, label=True)
     assert list(found.rows["experiment"].unique()) == ["a V1", "a V2"]
     check(found.rows[NAMES].iloc[:40], table)

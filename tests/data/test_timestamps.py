@@ -142,3 +142,10 @@ def test_steps_agree_as_far_as_jitter_lets_them_be_known():
 def test_a_tolerance_is_a_share_of_the_step(tol):
     with pytest.raises(ValueError, match="`time_tol` must be a share"):
         check_time_tol(tol)
+
+
+def test_milliseconds_since_1970_are_told():
+    stamps = 1.7726e12 + 50.0 * np.arange(5)
+    with pytest.warns(UserWarning, match=r"X\['t'\], unit='ms'"):
+        time_in_seconds(stamps, "t")
+    assert time_in_seconds(stamps / 1e3, "t")[0] > 1e9  # seconds since 1970 are fine
