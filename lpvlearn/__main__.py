@@ -13,6 +13,7 @@ import joblib
 
 from .command import add_commands
 from .command.ending import status_of
+from .command.judgement import course
 from .command.output import whole_folder
 from .paper import run_paper_experiment, save_figures, tables_text
 
@@ -95,6 +96,8 @@ def _paper(options: argparse.Namespace) -> None:
     with (
         whole_folder(options.output, overwrite=True) as folder,
         _points_done(options.output, options.resume) as memory,
+        course() as told,
+        told.step("experiment", bar=True),
     ):
         experiment = run_paper_experiment(
             options.realizations,
@@ -115,6 +118,8 @@ def _paper(options: argparse.Namespace) -> None:
         tables = experiment.tables | {"timing": experiment.watch.table()}
         tables["timing"].to_csv(folder / "timing.csv", index=False)
     print(tables_text(experiment, tables))
+    if told.warned:
+        print(f"\n{told.text()}")
     print(
         f"\n{len(tables)} tables (csv) and {len(figures)} figures (png) are in "
         f"{options.output}/"

@@ -18,7 +18,7 @@ from .. import (
     fit_report,
     save,
 )
-from .judgement import measured_signals, simulation_text, told_warnings, warnings_text
+from .judgement import course, measured_signals, simulation_text
 from .output import whole_folder
 from .structure_file import read_structure
 from .tables import check_table, columns_of, read_tables, with_times
@@ -40,9 +40,12 @@ def fit(options: argparse.Namespace) -> None:
         raise ValueError("--degree is that of --interpolation polynomial.")
     for path in [*options.table, *(options.validation or ())]:
         check_table(path)
-    with whole_folder(options.output, options.overwrite) as folder:
-        with told_warnings() as warned:
-            form, start = options.format, options.initial_state
+    form, start = options.format, options.initial_state
+    with (
+        whole_folder(options.output, options.overwrite) as folder,
+        course(verbose=not options.quiet) as told,
+    ):
+        with told.step("reading of the table"):
             label = options.experiment is None
             judged = found = read_tables(
                 options.table, form, options.experiment, label=label
@@ -61,35 +64,34 @@ def fit(options: argparse.Namespace) -> None:
                 units = units | own
             pipeline = _pipeline(options, roles, structure)
             table = with_times(table, roles["time"], form.time_unit)
+        with told.step("fit", bar=True):
             pipeline.fit(table[features], table[outputs])
-            if options.validation is not None:
+        if options.validation is not None:
+            with told.step("reading of the validation"):
                 judged = read_tables(
                     options.validation, form, found.experiment, label=True
                 )
                 table = with_times(judged.rows, roles["time"], form.time_unit)
+        with told.step("simulation"):
             X, y = measured_signals(pipeline, table, judged.name)
             report = fit_report(pipeline, X, y, initial_state=start)
-        text = "\n\n".join(
-            [
-                pipeline.summary(),
-                simulation_text(report, judged.name, start),
-                warnings_text(warned),
-            ]
-        )
+        with told.step("report", bar=True):
+            pipeline.report_.to_csv(folder / "points.csv")
+            pipeline.parameter_report_.to_csv(folder / "parameters.csv")
+            report.to_csv(folder / "fit.csv", index=False)
+            pipeline.to_html_report(
+                folder / "report.html",
+                X,
+                y,
+                initial_state=start,
+                title=f"LPV model of {found.name}",
+                units=units,
+                figures=folder / "figures",
+            )
+            save(pipeline, folder / "model.zip")
+        simulated = simulation_text(report, judged.name, start)
+        text = "\n\n".join([pipeline.summary(), simulated, told.text()])
         (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
-        pipeline.report_.to_csv(folder / "points.csv")
-        pipeline.parameter_report_.to_csv(folder / "parameters.csv")
-        report.to_csv(folder / "fit.csv", index=False)
-        pipeline.to_html_report(
-            folder / "report.html",
-            X,
-            y,
-            initial_state=start,
-            title=f"LPV model of {found.name}",
-            units=units,
-            figures=folder / "figures",
-        )
-        save(pipeline, folder / "model.zip")
     if not options.quiet:
         print(
             f"{text}\n\nThe report, tables, figures and model are in {options.output}"

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from .. import LocalLPVPipeline, readable_report
+from ..pipeline.estimator import Stopwatch
 from .ending import in_options
 
 _LINE = 88  # characters
@@ -58,26 +59,60 @@ def simulation_text(report: pd.DataFrame, name: str, initial_state: str) -> str:
     )
 
 
+class Course:
+    """The steps of a command: what lasts is told at once, warnings at the end."""
+
+    def __init__(self, verbose: bool) -> None:
+        self._watch = Stopwatch(verbose)
+        self._told: dict[str, list[str]] = {}  # by step
+
+    @contextmanager
+    def step(self, name: str, *, bar: bool = False) -> Iterator[None]:
+        """Collect what the block warns of; `bar` as of `Stopwatch.step`."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                with self._watch.step(name, bar=bar):
+                    yield
+            finally:
+                self.add(name, [str(warning.message) for warning in caught])
+
+    def add(self, name: str, messages: Sequence[str]) -> None:
+        """Let the step have warned of these; each counts once."""
+        known = [message for told in self._told.values() for message in told]
+        new = [m for m in dict.fromkeys(messages) if m not in known]
+        if new:
+            self._told.setdefault(name, []).extend(new)
+
+    @property
+    def warned(self) -> bool:
+        """Whether a step did."""
+        return bool(self._told)
+
+    def text(self) -> str:
+        """The warnings as lists, under the step that gave them."""
+        lines = []
+        for name, messages in self._told.items():
+            lines += ["", f"Warnings of the {name}", ""]
+            lines += [
+                textwrap.fill(
+                    in_options(message),
+                    _LINE,
+                    initial_indent="- ",
+                    subsequent_indent="  ",
+                )
+                for message in messages
+            ]
+        return "\n".join(lines[1:]) or "No warnings."
+
+
 @contextmanager
-def told_warnings() -> Iterator[list[str]]:
-    """What the block warns of, each once; printed only where the block fails."""
-    messages: list[str] = []
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        try:
-            yield messages
-        finally:
-            messages += dict.fromkeys(str(warning.message) for warning in told)
-            if messages and sys.exc_info()[0] is not None:
-                print(warnings_text(messages), file=sys.stderr)
-
-
-def warnings_text(messages: Sequence[str]) -> str:
-    """Warnings as a list under a heading."""
-    items = [
-        textwrap.fill(
-            in_options(message), _LINE, initial_indent="- ", subsequent_indent="  "
-        )
-        for message in messages
-    ]
-    return "\n".join(["Warnings", "", *items]) if items else "No warnings."
+def course(*, verbose: bool = True) -> Iterator[Course]:
+    """The course of a command, whose warnings are printed here where it fails."""
+    found = Course(verbose)
+    try:
+        yield found
+    except Exception:
+        if found.warned:
+            print(found.text(), file=sys.stderr)
+        raise

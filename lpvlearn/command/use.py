@@ -12,11 +12,11 @@ import pandas as pd
 
 from .. import LocalLPVPipeline, fit_report, load
 from .judgement import (
+    Course,
+    course,
     measured_signals,
     signals_of,
     simulation_text,
-    told_warnings,
-    warnings_text,
 )
 from .output import whole_file
 from .tables import check_table, read_tables, with_times, write_table
@@ -27,18 +27,19 @@ def predict(options: argparse.Namespace) -> None:
     estimate = options.initial_state == "estimate"
     if options.output is not None:
         check_table(options.output)
-    with told_warnings() as warned:
-        pipeline, table, name = _model_and_table(options)
-        X, y = signals_of(pipeline, table, name)
-        if estimate:
-            X, y = measured_signals(pipeline, table, name)
-            found = pipeline.predict_with_initial_state(X, y)
-        else:
-            found = np.asarray(pipeline.predict(X))
-        text = []
-        if y is not None:
-            report = fit_report(pipeline, X, y, initial_state=options.initial_state)
-            text = [simulation_text(report, name, options.initial_state)]
+    with course() as told:
+        pipeline, table, name = _model_and_table(options, told)
+        with told.step("simulation"):
+            X, y = signals_of(pipeline, table, name)
+            if estimate:
+                X, y = measured_signals(pipeline, table, name)
+                found = pipeline.predict_with_initial_state(X, y)
+            else:
+                found = np.asarray(pipeline.predict(X))
+            text = []
+            if y is not None:
+                report = fit_report(pipeline, X, y, initial_state=options.initial_state)
+                text = [simulation_text(report, name, options.initial_state)]
     kept = [n for n in (pipeline.experiment, pipeline.time) if n is not None]
     simulated = pd.DataFrame(
         np.reshape(found, (len(X), -1)), X.index, list(pipeline.output_names_)
@@ -49,26 +50,27 @@ def predict(options: argparse.Namespace) -> None:
     else:
         with whole_file(options.output) as part:
             write_table(simulated, part, options.format)
-    if warned:
-        text.append(warnings_text(warned))
+    if told.warned:
+        text.append(told.text())
     if text:  # beside the table, not in it
         print("\n\n".join(text), file=sys.stderr)
 
 
 def report(options: argparse.Namespace) -> None:
     """Run the command: what the fit found, and the simulation of a table."""
-    with told_warnings() as warned:
-        pipeline, table, name = _model_and_table(options)
+    with course() as told:
+        pipeline, table, name = _model_and_table(options, told)
+        told.add("fit", pipeline.warnings_)
         text, X, y = [pipeline.summary()], None, None
         if table is not None:
-            X, y = measured_signals(pipeline, table, name)
-            found = fit_report(pipeline, X, y, initial_state=options.initial_state)
-            text.append(simulation_text(found, name, options.initial_state))
+            with told.step("simulation"):
+                X, y = measured_signals(pipeline, table, name)
+                found = fit_report(pipeline, X, y, initial_state=options.initial_state)
+                text.append(simulation_text(found, name, options.initial_state))
         if options.output is not None:
-            with whole_file(options.output) as part:
+            with told.step("report", bar=True), whole_file(options.output) as part:
                 pipeline.to_html_report(part, X, y, initial_state=options.initial_state)
-    text.append(warnings_text([*pipeline.warnings_, *warned]))
-    print("\n\n".join(text))
+    print("\n\n".join([*text, told.text()]))
 
 
 class _Given(NamedTuple):
@@ -79,7 +81,7 @@ class _Given(NamedTuple):
     name: str = ""
 
 
-def _model_and_table(options: argparse.Namespace) -> _Given:
+def _model_and_table(options: argparse.Namespace, told: Course) -> _Given:
     for path in options.table or ():
         check_table(path)
     if not Path(options.model).is_file():
@@ -93,6 +95,8 @@ def _model_and_table(options: argparse.Namespace) -> _Given:
     if options.table is None:
         return _Given(pipeline, None)
     form, experiment = options.format, pipeline.experiment
-    found = read_tables(options.table, form, experiment, label=experiment is not None)
-    table = with_times(found.rows, pipeline.time, form.time_unit)
+    with told.step("reading of the table"):
+        label = experiment is not None
+        found = read_tables(options.table, form, experiment, label=label)
+        table = with_times(found.rows, pipeline.time, form.time_unit)
     return _Given(pipeline, table, found.name)

@@ -6,6 +6,7 @@ realizations, local models, restructuring, interpolation, and validation on a sw
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,6 @@ from .. import (
     SubspaceLTI,
 )
 from ..datasets import make_flexible_arm
-from ..exceptions import collected
 from ..pipeline.estimator import Stopwatch
 from ..pipeline.points import balanced_entries
 from .tables import (
@@ -105,13 +105,13 @@ def run_paper_experiment(
     memory : path, default=None
         Folder that keeps the operating points done, as of `LocalLPVPipeline`.
     verbose : int, default=0
-        1 shows progress bars.
+        1 shows progress bars, and lines of other steps that take long.
 
     Returns
     -------
     PaperExperiment
     """
-    watch = Stopwatch()
+    watch = Stopwatch(verbose)
     with watch.step("simulation of the arm"):
         data = make_flexible_arm(
             n_realizations=n_realizations, random_state=random_state
@@ -135,7 +135,9 @@ def run_paper_experiment(
     watch.seconds |= pipeline.step_times_
     other = "pi-moesp" if method == "po-moesp" else "po-moesp"
     # whose interpolation is of no interest, nor is what is told of it
-    with watch.step(f"local models by {other}, for comparison"), collected():
+    compared = f"local models by {other}, for comparison"
+    with watch.step(compared, bar=True), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         comparison = LocalLPVPipeline(
             SubspaceLTI(data.structure.order, method=other, **_LOCAL),
             "passthrough",

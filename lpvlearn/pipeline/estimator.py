@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import pickle
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
+from threading import Timer
 from time import perf_counter
 from typing import Any
 
@@ -85,17 +87,31 @@ _STEPS = {
 }
 
 
+_PATIENCE = 2.0  # seconds after which one asks oneself what is going on
+
+
 @dataclass
 class Stopwatch:
-    """Wall-clock seconds of each step, in the order of the steps."""
+    """Wall-clock seconds of each step, in the order of the steps.
 
+    With `verbose`, a step without a bar of its own is told once it is long.
+    """
+
+    verbose: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
-    def step(self, name: str) -> Iterator[None]:
+    def step(self, name: str, *, bar: bool = False) -> Iterator[None]:
         """Add the time that the block takes to the step."""
+        told = Timer(_PATIENCE, print, [f"{name} ..."], {"file": sys.stderr})
+        told.daemon = True
+        if self.verbose and not bar:
+            told.start()
         start = perf_counter()
-        yield
+        try:
+            yield
+        finally:
+            told.cancel()
         self.seconds[name] = self.seconds.get(name, 0.0) + perf_counter() - start
 
     def table(self) -> pd.DataFrame:
@@ -184,7 +200,8 @@ list, default=None
     n_jobs : int, default=None
         Operating points worked on at the same time.
     verbose : int, default=0
-        1 shows a progress bar.
+        1 shows progress on the standard error: a bar, or a line for other steps that
+        take more than two seconds. 0 prints nothing.
 
     Attributes
     ----------
@@ -393,7 +410,7 @@ list, default=None
         steps = {"local": self.local, "restructurer": self.restructurer}
         memory = _checked_memory(self.memory, steps)
         runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
-        restructurer, watch = self._restructurer(), Stopwatch()
+        restructurer, watch = self._restructurer(), Stopwatch(self.verbose)
         efficient = getattr(restructurer, "norm", None) == "covariance"
 
         with watch.step("reading of the table"):  # steps 1 and 2, and their groups
@@ -413,7 +430,7 @@ list, default=None
             points = local_experiments(experiments, self.scheduling_tol)
             self.sampling_time_ = self._sampling_time(experiments, structure)
 
-        with watch.step("local models"):  # step 3: a black box at every point
+        with watch.step("local models", bar=True):  # step 3: a black box at every point
             local, points = identify_points(
                 self._local(),
                 points,
@@ -425,7 +442,9 @@ list, default=None
                 efficient=self.efficient or efficient,
             )
 
-        with watch.step("restructuring"):  # step 4: all of them in one structure
+        with watch.step(
+            "restructuring", bar=True
+        ):  # step 4: all of them in one structure
             found = restructure_points(
                 restructurer, local, points, runner, self.max_time
             )
@@ -460,7 +479,7 @@ list, default=None
 
         self.refiner_ = None
         if moving:
-            with watch.step("refinement"):  # on data that moves
+            with watch.step("refinement", bar=True):  # on data that moves
                 self._refine(moving, found, runner)
 
         with watch.step("interpolation and report"):
@@ -531,16 +550,17 @@ list, default=None
         What the simulation of X warns of stands on the page and is not warned of here.
         The figures of parameters and poles need one scheduling variable, or two.
         """
-        page = html_report(
-            self,
-            self._summarised(),
-            X,
-            y,
-            initial_state=initial_state,
-            title=title,
-            units=units or {},
-            figures=None if figures is None else Path(figures),
-        )
+        with Stopwatch(self.verbose).step("figures of the report"):
+            page = html_report(
+                self,
+                self._summarised(),
+                X,
+                y,
+                initial_state=initial_state,
+                title=title,
+                units=units or {},
+                figures=None if figures is None else Path(figures),
+            )
         place = Path(path)
         part = place.with_name(f".{place.name}.part")
         part.write_text(page, encoding="utf-8")

@@ -41,7 +41,9 @@ def test_predict_from_the_middle_of_an_experiment(folder, model, tmp_path):
     simulated = pd.read_csv(io.StringIO(out))
     assert_allclose(simulated["position"], table["position"], atol=0.01)
     error = run("predict", model, path)[2]
-    assert "Warnings" in error and "- " in error  # from rest it begins in mid-motion
+    assert (
+        "Warnings of the simulation" in error and "- " in error
+    )  # from rest it begins in mid-motion
 
 
 def test_report_tells_the_summary_and_writes_a_page(folder, model, tmp_path):

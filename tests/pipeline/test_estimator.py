@@ -1,6 +1,7 @@
 """LocalLPVPipeline: from local experiments to an LPV model."""
 
 import pickle
+import time
 import warnings
 
 import numpy as np
@@ -750,3 +751,16 @@ def test_a_passed_through_model_keeps_its_delay():
     for model in pipeline.structured_models_:
         np.testing.assert_allclose(model.input_delay, [0.04])
     assert pipeline.score(X, y) > 0.99
+
+
+@pytest.mark.parametrize(
+    ("verbose", "bar", "told"),
+    [(1, False, "figures ...\n"), (1, True, ""), (0, False, "")],
+)
+def test_steps_that_last_are_told_where_wanted(capsys, monkeypatch, verbose, bar, told):
+    monkeypatch.setattr("lpvlearn.pipeline.estimator._PATIENCE", 0.0)
+    watch = Stopwatch(verbose)
+    with watch.step("figures", bar=bar):
+        time.sleep(0.1)
+    assert capsys.readouterr() == ("", told)
+    assert watch.seconds["figures"] >= 0.1
