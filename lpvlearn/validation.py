@@ -301,6 +301,20 @@ def names_of(argument: str, names: Any, n: int | None = None) -> list[Any]:
     return listed
 
 
+def units_by_name(units: Any) -> dict[str, str] | None:
+    """The argument `units`, a mapping from names to text, as a dict; None stays."""
+    if units is None:
+        return None
+    if not isinstance(units, Mapping) or not all(
+        isinstance(unit, str) for unit in units.values()
+    ):
+        raise ValueError(
+            "`units` must be a dict from names to units, such as {'angle': 'rad'}. Got "
+            f"{shown(units)}."
+        )
+    return {str(name): unit for name, unit in units.items()}
+
+
 def named_values(
     argument: str,
     values: ArrayLike | Mapping[str, float],

@@ -91,8 +91,9 @@ print(np.abs(lfr.at(0.3).A - lpv.at(0.3).A).max() / np.abs(lpv.at(0.3).A).max())
 # Frozen models
 # -------------
 # ``grid`` gives a list of :class:`~lpvlearn.StateSpace`, ``to_control`` of
-# ``control.StateSpace`` with the names of the signals, and ``to_mat`` a file for
-# MATLAB's ``ssInterpolant``:
+# ``control.StateSpace``, ``to_xarray`` one ``xarray.Dataset``, and ``to_mat`` a file
+# for MATLAB's ``ssInterpolant``. All of them bear the names of the signals, and their
+# units where the pipeline was told them (``units={"torque": "N m", "angle": "rad"}``):
 
 models = lpv.grid(np.linspace(-0.8, 0.8, 17))
 print(len(models), models[0])
@@ -106,6 +107,10 @@ print(len(models), models[0])
 #
 #     m = load("arm.mat"); g = ss(m.A, m.B, m.C, m.D, InputDelay=m.InputDelay);
 #     g.SamplingGrid = m.SamplingGrid; lpv = ssInterpolant(g, m.offsets);
+#
+# The dataset has the scheduling variables as coordinates:
+# ``ds = lpv.to_xarray(points)``, then ``ds["A"].sel(kappa=0.4)`` or
+# ``ds["A"].interp(kappa=0.41)``.
 #
 # MATLAB interpolates the matrices linearly between the points, so take these close.
 # With several scheduling variables, all combinations of some values become a

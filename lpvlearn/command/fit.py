@@ -62,7 +62,9 @@ def fit(options: argparse.Namespace) -> None:
                     options.structure, len(inputs), len(outputs)
                 )
                 units = units | own
-            pipeline = _pipeline(options, roles, structure)
+            pipeline = _pipeline(options, roles, structure).set_params(
+                units=units or None
+            )
             table = with_times(table, roles["time"], form.time_unit)
         with told.step("fit", bar=True):
             pipeline.fit(table[features], table[outputs])
@@ -85,7 +87,6 @@ def fit(options: argparse.Namespace) -> None:
                 y,
                 initial_state=start,
                 title=f"LPV model of {found.name}",
-                units=units,
                 figures=folder / "figures",
             )
             save(pipeline, folder / "model.zip")

@@ -24,7 +24,7 @@ from .drawing import (
     whole,
     with_unit,
 )
-from .fitted import channel_names, check_model, models_of, unwrapped, with_others
+from .fitted import check_model, models_of, unwrapped, with_others
 from .frequency import (
     check_frequencies,
     frequency_label,
@@ -169,8 +169,9 @@ class BodeDisplay:
             Standard deviations of the responses at `omega`, which is then needed;
             as in the constructor.
         output_names, input_names : sequence of str, default=None
+            None: those of the first model that has them.
         units : dict from str to str, default=None
-            Units of outputs and inputs, by name.
+            Units of outputs and inputs, by name; None: those that a model knows.
         phase : bool, default=False
             Whether to draw the phases below the magnitudes.
         ax : Axes or array of Axes, default=None
@@ -204,10 +205,17 @@ class BodeDisplay:
         responses = {
             name: response_up_to_nyquist(model, grid) for name, model in models.items()
         }
-        names: dict[str, Any] = {
+        told = {
             "output_names": output_names,
             "input_names": input_names,
             "units": units,
+        }
+        for key, given in told.items():  # else by the first model that knows them
+            known = [getattr(model, key) for model in models.values()]
+            if given is None:
+                told[key] = next((own for own in known if own is not None), None)
+        names: dict[str, Any] = {
+            **told,
             "frequency_label": frequency_label(list(models.values())),
         }
         return cls(grid, responses, std=std, **names).plot(ax, phase=phase)
@@ -243,7 +251,7 @@ class BodeDisplay:
             knows of its model, and a pipeline of the interpolated one: that of the
             coefficients (``lpv_.covariance``), without the model's own error.
         units : dict from str to str, default=None
-            Units of outputs and inputs, by name.
+            Units of outputs and inputs, by name; None: those that a model knows.
         phase : bool, default=False
         ax : Axes or array of Axes, default=None
 
@@ -265,9 +273,8 @@ class BodeDisplay:
         if whole("uncertainty", uncertainty, range(2)):
             omega = frequency_axis(list(models.values())) if omega is None else omega
             std = _uncertainty_of(unwrapped(estimator), own, kappa, omega)
-        names = channel_names(unwrapped(estimator))
         return cls.from_models(
-            models, omega=omega, std=std, units=units, phase=phase, ax=ax, **names
+            models, omega=omega, std=std, units=units, phase=phase, ax=ax
         )
 
     def plot(

@@ -114,11 +114,13 @@ def scheduling_labels(
         names = [f"κ{k + 1}" for k in range(n_scheduling)]
     return [
         with_unit("κ" if n_scheduling == 1 and name in ("kappa", "κ1") else name, unit)
-        for name, unit in zip(names, units_of(names, units), strict=True)
+        for name, unit in zip(
+            names, units_of(names, units_for(estimator, units)), strict=True
+        )
     ]
 
 
-def channel_names(estimator: Any) -> dict[str, Any]:
-    """Names of the inputs and outputs of an estimator's LPV model, where it has one."""
-    lpv = getattr(estimator, "lpv_", None)
-    return {key: getattr(lpv, key, None) for key in ("input_names", "output_names")}
+def units_for(estimator: Any, units: Any) -> Any:
+    """The units given, or those that the estimator's LPV model knows."""
+    known = getattr(getattr(estimator, "lpv_", None), "units", None)
+    return known if units is None else units

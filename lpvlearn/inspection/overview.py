@@ -9,7 +9,7 @@ import numpy as np
 
 from .bode import BodeDisplay
 from .drawing import WIDTH, by_name
-from .fitted import fitted_pipeline
+from .fitted import fitted_pipeline, units_for
 from .parameters import ParameterDisplay
 from .poles import PoleDisplay
 from .residuals import ResidualDisplay
@@ -44,7 +44,8 @@ def plot_overview(
         Label of the experiment to simulate; None is the first in the table.
     initial_state : {"rest", "estimate"}, default="rest"
     units : dict from str to str, default=None
-        Units of inputs, outputs, parameters and scheduling variables, by name.
+        Units of inputs, outputs, parameters and scheduling variables, by name; None:
+        those that the pipeline knows.
 
     Returns
     -------
@@ -71,7 +72,7 @@ def plot_overview(
     from matplotlib import pyplot as plt
 
     pipeline = fitted_pipeline(pipeline, "parameters_")
-    units = by_name("units", units)
+    units = by_name("units", units_for(pipeline, units))
     lpv, points = pipeline.lpv_, pipeline.operating_points_
     names = list(pipeline.parameters_)[:_MOST_PARAMETERS]
     maps = points.shape[1] == 2

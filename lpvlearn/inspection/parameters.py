@@ -28,7 +28,7 @@ from .drawing import (
     whole,
     with_unit,
 )
-from .fitted import fitted_pipeline, scheduling_labels, with_others
+from .fitted import fitted_pipeline, scheduling_labels, units_for, with_others
 
 Array = NDArray[np.float64]
 
@@ -243,7 +243,8 @@ class ParameterDisplay:
         scheduling_label : str or sequence of str, default=None
             None is the names of the scheduling columns.
         units : dict from str to str, default=None
-            Units of the parameters and of the scheduling variables, by name.
+            Units of the parameters and of the scheduling variables, by name; None:
+            those that the pipeline knows.
         n_columns : int, default=None
             Panels in a row; None is 4, of maps 2.
         ax : Axes or array of Axes, default=None
@@ -283,7 +284,7 @@ class ParameterDisplay:
             scheduling_label=scheduling_labels(pipeline, n_scheduling, units)
             if scheduling_label is None
             else scheduling_label,
-            units=units,
+            units=units_for(pipeline, units),
         )
         return display.plot(ax, n_columns=n_columns)
 

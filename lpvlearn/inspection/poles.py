@@ -159,7 +159,7 @@ class PoleDisplay:
         scheduling_label : str or sequence of str, default=None
             None is the names of the scheduling columns.
         units : dict from str to str, default=None
-            Of the scheduling variables, by name.
+            Of the scheduling variables, by name; None: those that the pipeline knows.
         ax : Axes or array of Axes, default=None
 
         Returns

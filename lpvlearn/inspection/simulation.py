@@ -33,7 +33,7 @@ from .drawing import (
     whole,
     with_unit,
 )
-from .fitted import unwrapped
+from .fitted import units_for, unwrapped
 
 Array = NDArray[np.float64]
 
@@ -231,7 +231,7 @@ class SimulationDisplay:
             noise: those of ``predict(X, return_std=True)``, as `LocalLPVPipeline` and
             `OutputErrorLPV` have it.
         units : str, sequence of str or dict, default=None
-            Of the outputs.
+            Of the outputs; None: those that the pipeline knows.
         zoom : tuple (t_start, t_stop), default=None
             Part of the experiment to draw, in seconds.
         ax : Axes or array of Axes, default=None
@@ -280,7 +280,7 @@ class SimulationDisplay:
             {str(name): found.simulated},
             std=std,
             output_names=names,
-            units=units,
+            units=units_for(estimator, units),
             time_label=label,
         )
         return display.plot(ax, zoom=zoom)

@@ -123,7 +123,7 @@ class UncertaintyDisplay:
             Angular frequencies to look at, rad/s. None: around the poles of the model
             at each scheduling value.
         units : dict from str to str, default=None
-            Of the scheduling variables, by name.
+            Of the scheduling variables, by name; None: those that the pipeline knows.
         ax : Axes, default=None
 
         Returns

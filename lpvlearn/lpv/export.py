@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,14 @@ from scipy.io import savemat
 from ..models.statespace import StateSpace
 
 Array = NDArray[np.float64]
+
+# Of the matrices over a grid; the second axis of A needs a name of its own.
+_DIMENSIONS = {
+    "A": ("state", "from_state"),
+    "B": ("state", "input"),
+    "C": ("output", "state"),
+    "D": ("output", "input"),
+}
 
 _LONGEST = 63  # characters of a name in MATLAB
 
@@ -28,6 +36,7 @@ class Grid(NamedTuple):
     scheduling: Sequence[Hashable]
     inputs: Sequence[Hashable]
     outputs: Sequence[Hashable]
+    units: Mapping[str, str]  # by name, where known
 
 
 def control_models(grid: Grid) -> list[Any]:
@@ -77,9 +86,12 @@ def write_mat(path: str | os.PathLike[str], grid: Grid) -> None:
             )
         },
         "offsets": offsets,
-        "InputName": np.array([[str(name)] for name in grid.inputs], dtype=object),
-        "OutputName": np.array([[str(name)] for name in grid.outputs], dtype=object),
     }
+    for side, names in (("Input", grid.inputs), ("Output", grid.outputs)):
+        units = [grid.units.get(str(name), "") for name in names]
+        for what, texts in (("Name", map(str, names)), ("Unit", units)):
+            cells = np.array([[text] for text in texts], dtype=object)
+            content[f"{side}{what}"] = cells
     target = Path(path)
     part = target.with_name(f".{target.name}.{os.getpid()}")
     try:
@@ -88,6 +100,50 @@ def write_mat(path: str | os.PathLike[str], grid: Grid) -> None:
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
+
+
+def as_dataset(grid: Grid) -> Any:
+    """The models as an `xarray.Dataset`, see `LPVStateSpace.to_xarray`."""
+    from xarray import Dataset
+
+    names = [str(name) for name in grid.scheduling]
+    order, shape = _rectangular(grid.points)
+    points, n = grid.points[order], grid.points.shape[1]
+    places: dict[str, Any] = {
+        name: ("point", column) for name, column in zip(names, points.T, strict=True)
+    }
+    over = ["point"]
+    axes = [np.unique(column) for column in points.T]
+    if n == 1 or shape == tuple(map(len, axes)):
+        over, axes = names, [points[:, 0]] if n == 1 else axes
+        places = dict(zip(names, axes, strict=True))
+    sizes = [len(axis) for axis in axes] if over == names else [len(points)]
+
+    def part(values: Sequence[Array], *dims: str) -> Any:
+        stacked = np.stack([values[k] for k in order])
+        return [*over, *dims], stacked.reshape((*sizes, *stacked.shape[1:]))
+
+    places["input"] = [str(name) for name in grid.inputs]
+    places["output"] = [str(name) for name in grid.outputs]
+    found = Dataset(
+        {
+            name: part([getattr(model, name) for model in grid.models], *dims)
+            for name, dims in _DIMENSIONS.items()
+        }
+        | {
+            f"{letter}0": part(list(grid.offsets[letter]), dim)
+            for letter, dim in (("u", "input"), ("y", "output"), ("x", "state"))
+        }
+        | {"input_delay": ("input", grid.models[0].input_delay)},
+        places,
+    )
+    for name in names:
+        if name in grid.units:
+            found[name].attrs["units"] = grid.units[name]
+    for side in ("input", "output"):
+        units = [grid.units.get(name, "") for name in found[side].values.tolist()]
+        found = found.assign_coords({f"{side}_unit": (side, units)})
+    return found
 
 
 def _rectangular(points: Array) -> tuple[NDArray[np.intp], tuple[int, ...]]:

@@ -37,9 +37,10 @@ from ..validation import (
     real_array,
     shown,
     state_vector,
+    units_by_name,
 )
 from .coefficients import MatrixCoefficients, matrix_coefficients
-from .export import Grid, control_models, write_mat
+from .export import Grid, as_dataset, control_models, write_mat
 from .lfr import LinearFractionalModel, linear_fractional
 from .weighting import covariance_factor
 
@@ -101,6 +102,9 @@ class LPVStateSpace:
     covariance : array-like of shape (n_coefficients, n_coefficients), default=None
         Of the coefficients of `interpolator`, then of `rate_terms`, which both have
         them (`AutoLPV` and its like). None: not known.
+    units : dict of str to str, default=None
+        Units of signals, scheduling variables and parameters, by name: those of
+        displays, reports and files of MATLAB.
 
     Attributes
     ----------
@@ -163,6 +167,7 @@ class LPVStateSpace:
     output_names: Sequence[Hashable] | None = None
     rate_terms: Any = None
     covariance: ArrayLike | None = None
+    units: Mapping[str, str] | None = None
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -200,6 +205,7 @@ class LPVStateSpace:
             names, n = getattr(self, f"{signal}_names"), getattr(self, f"n_{signal}s")
             if names is not None:
                 names_of(f"{signal}_names", names, n)
+        object.__setattr__(self, "units", units_by_name(self.units))
         delay = input_delays(self.input_delay, self.n_inputs, samples=False)
         object.__setattr__(self, "input_delay", delay)
         if self.covariance is not None:
@@ -481,6 +487,11 @@ class LPVStateSpace:
             A = model.A + self.rate_part(place[None], speed[None])[0]
             model = StateSpace(A, model.B, model.C, model.D)
         model = model.with_input_delay(self.input_delay)
+        inputs, outputs = (
+            names if _are_names(names) else None
+            for names in (self.input_names, self.output_names)
+        )
+        model = model.with_names(inputs, outputs, self.units)
         if not self.bases:
             return model
         T = self._basis_at(place)
@@ -489,8 +500,7 @@ class LPVStateSpace:
             return model
         slopes = numerical_jacobian(self._basis_at, place, self.scheduling_range[1])
         term = np.tensordot(speed, slopes, 1) @ np.linalg.inv(T)
-        A, delay = model.A + term, self.input_delay
-        return StateSpace(A, model.B, model.C, model.D, input_delay=delay)
+        return replace(model, A=model.A + term)
 
     def change_basis(self, T: _Basis) -> LPVStateSpace:
         """The same system in the state ``z = T(kappa) x``.
@@ -780,7 +790,7 @@ class LPVStateSpace:
             g.SamplingGrid = m.SamplingGrid; lpv = ssInterpolant(g, m.offsets);
 
         and, for the names, ``lpv.InputName = m.InputName``, ``lpv.OutputName =
-        m.OutputName``.
+        m.OutputName``, and likewise ``InputUnit`` and ``OutputUnit``.
 
         Parameters
         ----------
@@ -802,10 +812,33 @@ class LPVStateSpace:
         behind those of the matrices, ``SamplingGrid`` (a structure with a field for
         each scheduling variable), ``offsets`` (an array of structures ``dx``, ``x``,
         ``u``, ``y``, over the grid), ``Ts`` (0: continuous time), ``InputDelay`` (s),
-        ``InputName`` and ``OutputName``. Names of scheduling variables are changed to
-        such as MATLAB takes.
+        ``InputName``, ``OutputName``, ``InputUnit`` and ``OutputUnit``. Names of
+        scheduling variables are changed to such as MATLAB takes.
         """
         write_mat(path, self._grid(points))
+
+    def to_xarray(self, points: ArrayLike | Mapping[Any, ArrayLike]) -> Any:
+        """The frozen models as an ``xarray.Dataset`` (needs xarray).
+
+        Parameters
+        ----------
+        points : array-like of shape (n_points, n_scheduling) or (n_points,), mapping
+            As in :meth:`grid`. All combinations of some values of each variable become
+            a rectangular grid, other points a dimension "point".
+
+        Returns
+        -------
+        xarray.Dataset
+            ``A``, ``B``, ``C``, ``D`` and the offsets ``u0``, ``y0``, ``x0``, over the
+            scheduling variables and the dimensions "state", "input" and "output"; with
+            the names and units of the signals, and ``input_delay`` (s).
+
+        Raises
+        ------
+        ValueError
+            As `grid`.
+        """
+        return as_dataset(self._grid(points))
 
     def _grid(self, points: Any) -> Grid:
         places = self._scheduling(points)
@@ -824,12 +857,13 @@ class LPVStateSpace:
             self._names("scheduling", "kappa"),
             self._names("input", "u"),
             self._names("output", "y"),
+            self.units or {},
         )
 
     def _names(self, which: str, letter: str) -> tuple[Hashable, ...]:
         """Names of the signals; numbered ones where they have none, or bare numbers."""
         names = getattr(self, f"{which}_names")
-        if names is None or any(isinstance(name, Integral) for name in names):
+        if not _are_names(names):
             n = getattr(self, "n_scheduling" if letter == "kappa" else f"n_{which}s")
             one = which == "scheduling" and n == 1
             return (letter,) if one else tuple(f"{letter}{k + 1}" for k in range(n))
@@ -1089,6 +1123,11 @@ class LPVStateSpace:
 def rates_of_change(kappa: Array, dt: float) -> Array:
     """Rates (1/s) of a trajectory (n_samples, n_scheduling), by central differences."""
     return np.gradient(kappa, dt, axis=0) if len(kappa) > 1 else np.zeros_like(kappa)
+
+
+def _are_names(names: Sequence[Hashable] | None) -> bool:
+    """Whether columns had names, where arrays have numbers."""
+    return names is not None and not any(isinstance(name, Integral) for name in names)
 
 
 def _predicted(regressor: Any, kappa: Array, n_values: int, wanted: str) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,9 +27,11 @@ from ..validation import (
     input_delays,
     matrix,
     measured_samples,
+    names_of,
     one_of,
     positive_time,
     state_vector,
+    units_by_name,
     whole_number,
 )
 
@@ -65,6 +68,10 @@ class StateSpace:
     input_delay : number or array-like of shape (n_inputs,), default=0
         Delay of the inputs, beyond what the matrices make: samples in discrete time,
         seconds in continuous time. As attribute, an array with one of each input.
+    input_names, output_names : sequence, default=None
+        Names of the signals; None: they are numbered. Conversions keep them.
+    units : dict of str to str, default=None
+        Units of the signals, by name.
 
     Attributes
     ----------
@@ -102,6 +109,9 @@ class StateSpace:
     D: Array
     sampling_time: float | None
     input_delay: NDArray[Any]
+    input_names: Sequence[Hashable] | None
+    output_names: Sequence[Hashable] | None
+    units: Mapping[str, str] | None
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -114,6 +124,9 @@ class StateSpace:
         D: ArrayLike | None = None,
         sampling_time: float | None = None,
         input_delay: ArrayLike = 0,
+        input_names: Sequence[Hashable] | None = None,
+        output_names: Sequence[Hashable] | None = None,
+        units: Mapping[str, str] | None = None,
     ) -> None:
         A, B, C = matrix("A", A), matrix("B", B), matrix("C", C)
         n = len(A)
@@ -150,11 +163,32 @@ class StateSpace:
         names = ("sampling_time", "input_delay", "order", "n_outputs", "n_inputs")
         for name, number in zip(names, (dt, delay, n, *shape), strict=True):
             object.__setattr__(self, name, number)
+        for name, given, n in (
+            ("input_names", input_names, self.n_inputs),
+            ("output_names", output_names, self.n_outputs),
+        ):
+            listed = None if given is None else names_of(name, given, n)
+            object.__setattr__(self, name, listed)
+        object.__setattr__(self, "units", units_by_name(units))
+
+    def _of(
+        self,
+        A: ArrayLike,
+        B: ArrayLike,
+        C: ArrayLike,
+        D: ArrayLike,
+        sampling_time: float | None = None,
+        input_delay: ArrayLike = 0,
+    ) -> StateSpace:
+        """Another model of the same signals."""
+        names = self.input_names, self.output_names, self.units
+        return StateSpace(A, B, C, D, sampling_time, input_delay, *names)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies and pickles are built anew, so that their arrays are read-only too.
         matrices = self.A, self.B, self.C, self.D
-        return type(self), (*matrices, self.sampling_time, self.input_delay)
+        names = self.input_names, self.output_names, self.units
+        return type(self), (*matrices, self.sampling_time, self.input_delay, *names)
 
     def __repr__(self) -> str:
         dt = self.sampling_time
@@ -381,7 +415,24 @@ class StateSpace:
         array([0., 0., 0., 1.])
         """
         dt = self.sampling_time
-        return StateSpace(self.A, self.B, self.C, self.D, dt, input_delay)
+        return self._of(self.A, self.B, self.C, self.D, dt, input_delay)
+
+    def with_names(
+        self,
+        input_names: Sequence[Hashable] | None = None,
+        output_names: Sequence[Hashable] | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> StateSpace:
+        """The model with other names and units of its signals, as of the class.
+
+        Examples
+        --------
+        >>> StateSpace(-1, 1, 1).with_names(["force"], ["speed"]).output_names
+        ['speed']
+        """
+        matrices = self.A, self.B, self.C, self.D
+        names = input_names, output_names, units
+        return StateSpace(*matrices, self.sampling_time, self.input_delay, *names)
 
     def absorb_delay(self) -> StateSpace:
         """The same discrete-time model with its delays as states, poles at the origin.
@@ -428,7 +479,7 @@ class StateSpace:
             B[:, j], D[:, j] = 0.0, 0.0
             B[last - 1, j] = 1.0
             first = last
-        return StateSpace(A, B, C, D, self.sampling_time)
+        return self._of(A, B, C, D, self.sampling_time)
 
     def transform(self, T: ArrayLike) -> StateSpace:
         """Change the state basis: ``(T A T^-1, T B, C T^-1, D)``.
@@ -459,7 +510,7 @@ class StateSpace:
             raise ValueError("`T` must be invertible. Got a singular matrix.")
         A, C = (np.linalg.solve(T.T, M.T).T for M in (T @ self.A, self.C))
         dt = self.sampling_time
-        return StateSpace(A, T @ self.B, C, self.D, dt, self.input_delay)
+        return self._of(A, T @ self.B, C, self.D, dt, self.input_delay)
 
     def __sub__(self, other: StateSpace) -> StateSpace:
         """The error system ``G - G_other``, whose norms are distances (Eq. (8))."""
@@ -484,7 +535,7 @@ class StateSpace:
         A = np.zeros((n + k, n + k))
         A[:n, :n], A[n:, n:] = self.A, other.A
         B, C = np.vstack([self.B, other.B]), np.hstack([self.C, -other.C])
-        return StateSpace(A, B, C, self.D - other.D, dt, delay)
+        return self._of(A, B, C, self.D - other.D, dt, delay)
 
     def hankel_singular_values(self) -> Array:
         """Hankel singular values of a stable model, descending, shape (order,).
@@ -523,7 +574,7 @@ class StateSpace:
         A, B, C = left @ self.A @ right, left @ self.B, self.C @ right
         signs = np.where(B.sum(1) < 0, -1.0, 1.0)
         A, B, C = signs[:, None] * A * signs, signs[:, None] * B, C * signs
-        return StateSpace(A, B, C, self.D, self.sampling_time, self.input_delay)
+        return self._of(A, B, C, self.D, self.sampling_time, self.input_delay)
 
     def _balancing(self, what: str) -> tuple[Array, Array, Array]:
         """Hankel singular values and projections of a stable model, for `what`."""
@@ -570,13 +621,13 @@ class StateSpace:
         delay, late = split_delay(self.input_delay, dt)
         matrices = self.A, self.B, self.C, self.D
         if method == "zoh":
-            return StateSpace(*sample_zoh_late(*matrices, dt, late), dt, delay)
+            return self._of(*sample_zoh_late(*matrices, dt, late), dt, delay)
         if late.any():
             raise ValueError(
                 "`method='tustin'` needs delays that are whole numbers of samples of "
                 f"{dt:g} s. Got {self}. Use `method='zoh'`, which is exact."
             )
-        return StateSpace(*c2d_tustin(*matrices, dt), dt, delay)
+        return self._of(*c2d_tustin(*matrices, dt), dt, delay)
 
     def to_continuous(self, method: str = "zoh") -> StateSpace:
         """Convert a discrete-time model to continuous time.
@@ -615,7 +666,7 @@ class StateSpace:
             )
         if method == "tustin":
             matrices = d2c_tustin(self.A, self.B, self.C, self.D, dt)
-            return StateSpace(*matrices, input_delay=dt * self.input_delay)
+            return self._of(*matrices, input_delay=dt * self.input_delay)
         A, B, C, doubled = d2c_zoh(self.A, self.B, self.C, dt)
         if len(doubled):
             warn(
@@ -625,7 +676,7 @@ class StateSpace:
                 "grows by one. A shorter sampling time or a lower order avoids it.",
                 RuntimeWarning,
             )
-        return StateSpace(A, B, C, self.D, input_delay=dt * self.input_delay)
+        return self._of(A, B, C, self.D, input_delay=dt * self.input_delay)
 
     def to_control(self, **names: Any) -> Any:
         """The model as a ``control.StateSpace`` (needs python-control).
@@ -633,7 +684,9 @@ class StateSpace:
         Parameters
         ----------
         **names : str or list of str
-            `name`, `inputs`, `outputs` and `states` of ``control.ss``.
+            `name`, `inputs`, `outputs` and `states` of ``control.ss``; inputs and
+            outputs are by default the names of the model, with ``_`` for a dot, which
+            may not stand there.
 
         Raises
         ------
@@ -649,6 +702,10 @@ class StateSpace:
             )
         import control
 
+        for key in ("inputs", "outputs"):
+            own = getattr(self, f"{key[:-1]}_names")
+            if own is not None:
+                names.setdefault(key, [str(name).replace(".", "_") for name in own])
         dt = 0 if self.is_continuous else self.sampling_time
         return control.ss(self.A, self.B, self.C, self.D, dt, **names)
 
@@ -672,7 +729,12 @@ class StateSpace:
                 "`model.dt` must be 0 (continuous time), a sampling time in seconds or "
                 "True (discrete time, in samples). Got None."
             )
-        return cls(model.A, model.B, model.C, model.D, dt if dt > 0 else None)
+        names = (
+            getattr(model, "input_labels", None),
+            getattr(model, "output_labels", None),
+        )
+        step = dt if dt > 0 else None
+        return cls(model.A, model.B, model.C, model.D, step, 0, *names)
 
 
 # The uncertainty of a model, told by models to either side of it along independent

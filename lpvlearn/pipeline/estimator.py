@@ -48,7 +48,7 @@ from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
-from ..validation import one_of, positive_time, whole_number
+from ..validation import one_of, positive_time, units_by_name, whole_number
 from .html_report import html_report
 from .output_error import (
     known_coefficients,
@@ -184,6 +184,9 @@ list, default=None
         False keeps the paper's H-infinity optimum; so does a point whose covariance is
         not known, and a restructurer with another norm or a frequency weight what it
         minimises.
+    units : dict of str to str, default=None
+        Units of columns and parameters, by name: ``{"angle": "rad", "k": "1/s2"}``.
+        They stand in `lpv_` and its frozen models, displays, reports and files.
     on_error : {"raise", "skip"}, default="raise"
         What a failure at one operating point does: raise an error that names it, or
         leave the point out with a warning.
@@ -333,6 +336,7 @@ list, default=None
         discretization: str = "zoh",
         offsets: str | None = "auto",
         efficient: bool = True,
+        units: Mapping[str, str] | None = None,
         on_error: str = "raise",
         max_time: float | None = None,
         memory: Any = None,
@@ -355,6 +359,7 @@ list, default=None
         self.discretization = discretization
         self.offsets = offsets
         self.efficient = efficient
+        self.units = units
         self.on_error = on_error
         self.max_time = max_time
         self.memory = memory
@@ -471,6 +476,7 @@ list, default=None
                 input_delay=common_delay(found.local, kappa, self.sampling_time_),
                 input_names=experiments[0].input_names,
                 output_names=self.output_names_,
+                units=self.units,
                 offsets=self._fit_offsets(found),
             )
             late = self.lpv_.input_delay / self.sampling_time_
@@ -534,7 +540,7 @@ list, default=None
             mid-motion.
         title : str, default=None
         units : dict of str to str, default=None
-            Units of outputs and parameters, by name.
+            Units of columns and parameters, by name; None: those of the pipeline.
         figures : str or path, default=None
             A folder, made where there is none, that gets every figure as an SVG file.
 
@@ -550,6 +556,7 @@ list, default=None
         What the simulation of X warns of stands on the page and is not warned of here.
         The figures of parameters and poles need one scheduling variable, or two.
         """
+        by_name = self.units if units is None else units_by_name(units)
         with Stopwatch(self.verbose).step("figures of the report"):
             page = html_report(
                 self,
@@ -558,7 +565,7 @@ list, default=None
                 y,
                 initial_state=initial_state,
                 title=title,
-                units=units or {},
+                units=by_name or {},
                 figures=None if figures is None else Path(figures),
             )
         place = Path(path)
@@ -656,6 +663,7 @@ list, default=None
         one_of("on_error", self.on_error, ("raise", "skip"))
         one_of("offsets", self.offsets, ("auto", None))
         one_of("efficient", self.efficient, (True, False))
+        units_by_name(self.units)
         if self.refiner is not None and self.scheduling is None:
             raise ValueError(
                 "`refiner` needs `scheduling`, the columns that move. Got None."

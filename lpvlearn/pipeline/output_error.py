@@ -354,6 +354,7 @@ class OutputErrorLPV(ScheduledEstimator):
             scheduling_range=inner,
             identified_range=identified,
             covariance=self.coefficients_covariance_,
+            output_names=start.output_names or getattr(self, "output_names_", None),
         )
         self.scheduling_range_, self.sampling_time_ = identified, sampling_time
         names = as_list(self.scheduling) or as_list(start.scheduling_names)

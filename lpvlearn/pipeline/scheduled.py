@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import check_is_fitted
 
+from ..data.containers import OutputContainer
 from ..data.experiments import Experiment, n_rows_of, read_experiments
 from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
@@ -25,7 +26,12 @@ Array = NDArray[np.float64]
 
 
 class ScheduledEstimator(
-    VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator, ABC
+    OutputContainer,
+    VersionedPickle,
+    MultiOutputMixin,
+    RegressorMixin,
+    BaseEstimator,
+    ABC,
 ):
     """Simulates tables with the model `lpv_` that an heir fits to one."""
 
@@ -56,6 +62,7 @@ class ScheduledEstimator(
         Returns
         -------
         ndarray of shape (n_samples, n_outputs), or (n_samples,) after a 1-D y
+            A table after ``set_output(transform="pandas")``.
         std : ndarray of the same shape
             With `return_std`. A band of 95 % is 1.96 of them to both sides.
 
@@ -73,11 +80,12 @@ class ScheduledEstimator(
         """
         check_is_fitted(self, "lpv_")
         return_std = flag("return_std", return_std)
-        y = self._simulate(self._read(X, None), n_rows_of(X), estimate=False)
+        y = self._simulate(self._read(X, None), X, estimate=False)
         if not return_std:
             return y
-        total = self.prediction_std(X).xs("total", axis=1, level="part")
-        return y, total.to_numpy().reshape(y.shape)
+        total = self.prediction_std(X).xs("total", axis=1, level="part").to_numpy()
+        total = total[:, 0] if self._single_output else total
+        return y, self._contained(total, X, self.lpv_.output_names)
 
     def prediction_std(self, X: Any) -> pd.DataFrame:
         """Standard deviations of the outputs that `predict` gives, part by part.
@@ -141,9 +149,7 @@ class ScheduledEstimator(
             missing inputs or scheduling values; the simulation begins anew after them.
         """
         check_is_fitted(self, "lpv_")
-        return self._simulate(
-            self._read(X, y, outputs=False), n_rows_of(X), estimate=True
-        )
+        return self._simulate(self._read(X, y, outputs=False), X, estimate=True)
 
     def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
         """Coefficient of determination of the simulation from rest.
@@ -175,8 +181,8 @@ class ScheduledEstimator(
         return [e.rows for e in found]
 
     def _simulate(
-        self, experiments: list[Experiment], n_samples: int, *, estimate: bool
-    ) -> Array:
+        self, experiments: list[Experiment], X: Any, *, estimate: bool
+    ) -> Any:
         signals = [e.scheduling for e in experiments if e.scheduling is not None]
         clips = getattr(self.lpv_.interpolator, "extrapolation", None) == "clip"
         if signals and not clips:
@@ -185,9 +191,10 @@ class ScheduledEstimator(
             )
         model = self.lpv_.silenced()  # said above, of all experiments at once
         out = simulate_experiments(
-            model, experiments, self.sampling_time_, n_samples, estimate=estimate
+            model, experiments, self.sampling_time_, n_rows_of(X), estimate=estimate
         )
-        return out[:, 0] if self._single_output else out
+        out = out[:, 0] if self._single_output else out
+        return self._contained(out, X, model.output_names)
 
     def _read(
         self, X: Any, y: Any, *, reset: bool = False, **options: Any

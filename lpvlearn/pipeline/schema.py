@@ -67,6 +67,9 @@ FORMS: dict[type, dict[str, str]] = {
         "D": "float[n_outputs, n_inputs]",
         "sampling_time": "any?",
         "input_delay": "any",
+        "input_names": "any?",
+        "output_names": "any?",
+        "units": "any?",
     },
     NoiseModel: {
         "A": "float[n_states, n_states]",
@@ -124,6 +127,7 @@ FORMS: dict[type, dict[str, str]] = {
         "covariance": "float[n_coefficients, n_coefficients]?",
         "input_names": "any?",
         "output_names": "any?",
+        "units": "any?",
     },
     PolynomialLPV: _POINTS
     | _MISFIT

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from numbers import Integral
 from typing import Any, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
 from sklearn.utils.validation import check_is_fitted
 
+from ..data.containers import OutputContainer
 from ..data.experiments import (
     OPTIONAL_ROLES,
     Experiment,
@@ -64,7 +66,9 @@ from .stream import SampleStream, fit_as_stream
 Array = NDArray[np.float64]
 
 
-class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator):
+class SubspaceLTI(
+    OutputContainer, VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator
+):
     """Linear time-invariant state-space model by subspace identification.
 
     The observability matrix is estimated from compressed block-Hankel data by one of
@@ -386,6 +390,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
             names = experiments[0].input_names
             fitted = fit_pairs(pairs, choices, told, detrend=self.detrend, names=names)
         self._take(fitted, self._step_of(experiments), delay)
+        self._name(experiments, y)
         warn_about(fitted, told)
         if choices.order is not None and choices.horizon is not None:
             warn_about_horizon(fitted, choices)
@@ -421,6 +426,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         )
         self.rates_ = inner = rate_model.fit(table, rates)
         self.lti_ = integrated(inner.lti_, flags)
+        self._name(experiments, y)
         self._evidence: Any = RateEvidence(inner.deviated_models(), flags, m)
         self.input_delay_, self.order_ = self.lti_.input_delay, self.lti_.order
         self.horizon_, self.method_ = inner.horizon_, inner.method_
@@ -554,6 +560,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         fitted = stream.add(experiments, Table(X).one(self.time, "time"))
         if fitted is not None:
             self._take(fitted, stream.step, stream.delay)
+            self._name(experiments, y)
         self._stream = stream
         return self
 
@@ -609,6 +616,13 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         self.output_drift_ = fitted.offsets.drifts / step
         self.offsets_differ_ = fitted.offsets.differ
 
+    def _name(self, experiments: Sequence[Experiment], y: Any) -> None:
+        """Let the model know the names of the columns."""
+        inputs = experiments[0].input_names
+        numbered = any(isinstance(name, Integral) for name in inputs)  # of an array
+        outputs = read_outputs(y)[1]
+        self.lti_ = self.lti_.with_names(None if numbered else inputs, outputs)
+
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
         """Seconds between the samples of a table; True where nothing tells them."""
         for e in experiments:
@@ -626,6 +640,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
         Returns
         -------
         ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            A table after ``set_output(transform="pandas")``.
 
         Raises
         ------
@@ -646,7 +661,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
                 "are known, predict_with_initial_state(X, y) and "
                 "initial_state='estimate' of scores estimate those of every experiment."
             )
-        return self._in_table(self._read(X, None), n_rows_of(X), self._simulated)
+        return self._in_table(self._read(X, None), X, self._simulated)
 
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate the outputs from initial states estimated on measured outputs.
@@ -674,7 +689,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
             u0, _ = self.resting_point()
             return level + self.lti_.simulate(e.inputs - u0, initial_state=x0)
 
-        return self._in_table(self._read(X, y, outputs=False), n_rows_of(X), simulated)
+        return self._in_table(self._read(X, y, outputs=False), X, simulated)
 
     def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
         """Coefficient of determination of the simulation from rest.
@@ -732,7 +747,7 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
             u, y = e.inputs - u0, _outputs_of(e) - level
             return level + predictor.predict(u, y, steps=steps, initial_state=x0)
 
-        return self._in_table(experiments, n_rows_of(X), predicted)
+        return self._in_table(experiments, X, predicted)
 
     def residual_tests(
         self,
@@ -1038,15 +1053,16 @@ class SubspaceLTI(VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimat
     def _in_table(
         self,
         experiments: Sequence[Experiment],
-        n_samples: int,
+        X: Any,
         outputs: Callable[[Experiment], Array],
-    ) -> Array:
+    ) -> Any:
         """Outputs in the rows of their samples, NaN elsewhere."""
-        out = np.full((n_samples, self.n_outputs_), np.nan)
+        out = np.full((n_rows_of(X), self.n_outputs_), np.nan)
         for e in experiments:
             with naming(e):
                 out[e.rows] = outputs(e)
-        return out[:, 0] if self._single_output else out
+        out = out[:, 0] if self._single_output else out
+        return self._contained(out, X, self.lti_.output_names)
 
 
 def _outputs_of(experiment: Experiment) -> Array:

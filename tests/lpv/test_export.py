@@ -67,6 +67,7 @@ def test_a_mat_file_has_all_that_an_interpolant_needs(tmp_path):
             input_names=["force"],
             output_names=["position"],
             input_delay=0.2,
+            units={"position": "mm"},
         )
     )
     points = [0.0, 0.5, 1.0, 1.5]
@@ -85,6 +86,7 @@ def test_a_mat_file_has_all_that_an_interpolant_needs(tmp_path):
     assert found["Ts"] == 0 and found["InputDelay"] == 0.2
     assert found["InputName"][0, 0] == "force"
     assert found["OutputName"][0, 0] == "position"
+    assert found["InputUnit"][0, 0].size == 0 and found["OutputUnit"][0, 0] == "mm"
     assert [file.name for file in tmp_path.iterdir()] == ["model.mat"]
 
 
@@ -124,3 +126,34 @@ def test_names_that_are_no_identifiers_are_changed(tmp_path):
     grid = loadmat(tmp_path / "m.mat", struct_as_record=False)["SamplingGrid"][0, 0]
     assert len(grid._fieldnames) == 3
     assert all(name.isidentifier() and name[0].isalpha() for name in grid._fieldnames)
+
+
+def test_frozen_models_know_names_and_units():
+    lpv = replace(spring_lpv(), input_names=["force"], units={"force": "N"})
+    assert lpv.at(0.5).input_names == ["force"] and lpv.at(0.5).output_names is None
+    assert lpv.grid([0.5])[0].units == {"force": "N"}
+    assert replace(lpv, input_names=[3]).at(0.5).input_names is None  # of an array
+    turned = lpv.change_basis(np.diag([1.0, 2.0]))
+    assert turned.at(0.5, rate=0.1).input_names == ["force"]
+
+
+def test_a_dataset_has_the_models_over_the_scheduling_variables():
+    pytest.importorskip("xarray")
+    units = {"kappa": "m", "x": "mm"}
+    lpv = with_offsets(replace(spring_lpv(), output_names=["x"], units=units))
+    found = lpv.to_xarray([1.0, 0.0, 0.5])
+    for k in (0.0, 0.5, 1.0):
+        here = found.sel(kappa=k)
+        for name in "ABCD":
+            assert_array_equal(here[name], getattr(lpv.at(k), name))
+        assert_allclose(here["u0"], [1 + 2 * k])
+    assert found["kappa"].attrs == {"units": "m"}
+    assert found["output"].item() == "x" and found["output_unit"].item() == "mm"
+    two, _ = lpv_model(PolynomialLPV(1), 2)
+    points = np.array([[a, b] for b in (0.0, 1.0) for a in (0.5, 0.0, 1.0)])
+    full = two.to_xarray(points)
+    assert full["A"].sizes == {"kappa1": 3, "kappa2": 2, "state": 3, "from_state": 3}
+    assert_allclose(full["B"].sel(kappa1=0.5, kappa2=1.0), two.at([0.5, 1.0]).B)
+    some = two.to_xarray(points[:5])
+    assert some["A"].sizes["point"] == 5
+    assert_allclose(some["B"][2], two.at([some["kappa1"][2], some["kappa2"][2]]).B)

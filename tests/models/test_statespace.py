@@ -576,3 +576,41 @@ def test_what_cannot_be_done_with_delays_says_what_can():
 def test_what_is_no_delay_is_refused(delay):
     with pytest.raises(ValueError, match="`input_delay` must"):
         late_model(delay=delay)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda m: m.to_discrete(0.1),
+        lambda m: m.to_discrete(0.1, "tustin").to_continuous("tustin"),
+        lambda m: m.to_discrete(0.1).to_continuous(),
+        lambda m: m.transform(2 * np.eye(2)),
+        lambda m: m.balance(),
+        lambda m: m.with_input_delay(0.2),
+        lambda m: m.to_discrete(0.1).with_input_delay(1).absorb_delay(),
+        lambda m: m - m,
+        lambda m: pickle.loads(pickle.dumps(m)),
+        copy.deepcopy,
+    ],
+)
+def test_names_and_units_go_along(changed):
+    A, B, C = [[0, 1], [-4, -1]], [[0], [1]], [[1, 0]]
+    names = (["force"], ["angle"], {"force": "N", "angle": "rad"})
+    found = changed(StateSpace(A, B, C).with_names(*names))
+    assert (found.input_names, found.output_names, found.units) == names
+
+
+def test_names_and_units_must_be_those_of_the_signals():
+    with pytest.raises(ValueError, match="`input_names` must be a list of 1 distinct"):
+        StateSpace(-1, 1, 1, input_names=["a", "b"])
+    with pytest.raises(ValueError, match="`units` must be a dict from names to units"):
+        StateSpace(-1, 1, 1, units={"a": 1})
+
+
+def test_python_control_knows_the_names():
+    pytest.importorskip("control")
+    model = StateSpace(-1, 1, 1, input_names=["u.1"], output_names=["speed"])
+    taken = model.to_control()
+    assert (taken.input_labels, taken.output_labels) == (["u_1"], ["speed"])
+    assert model.to_control(inputs="force").input_labels == ["force"]
+    assert StateSpace.from_control(taken).output_names == ["speed"]

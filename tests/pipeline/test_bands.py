@@ -1,5 +1,7 @@
 """Bands of predictions: parts that are told apart, on tables."""
 
+import copy
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -46,6 +48,19 @@ def test_parts_add_up(name, request):
     np.testing.assert_allclose(measured, np.hypot(total, levels["noise"]))
     assert own[0] == 0  # at rest before anything has moved
     assert np.isfinite(table).all(axis=None)
+
+
+def test_tables_where_they_are_wanted(local):
+    X, _ = spring_sweep(50)
+    X.index = X.index + 7
+    tabled = copy.copy(local).set_output(transform="pandas")
+    for found, plain in zip(
+        tabled.predict(X, return_std=True),
+        local.predict(X, return_std=True),
+        strict=True,
+    ):
+        assert found.index.equals(X.index) and list(found) == ["position"]
+        np.testing.assert_array_equal(found, plain)
 
 
 @pytest.mark.parametrize("name", ["local", "moving"])

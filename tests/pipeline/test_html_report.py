@@ -14,6 +14,8 @@ from lpvlearn import (
     GrayBoxStructure,
     LocalLPVPipeline,
     SubspaceLTI,
+    load,
+    save,
 )
 from lpvlearn.pipeline.html_report import reproducing_code
 
@@ -78,6 +80,24 @@ def test_page_stands_alone_and_tells_what_the_tables_tell(fitted, spring, tmp_pa
     figures = [words for words in page.attributes if words[:2] == ("svg", "role")]
     # parameters, poles, what is not known, gains, sweep, errors
     assert len(figures) == 3 + 1 + 1 + 3 + 1 + 1
+
+
+def test_units_of_the_pipeline_reach_its_pages_pictures_and_files(spring, tmp_path):
+    X, y = spring[:2]
+    units = {"position": "mm", "kappa": "kg", "force": "N", "k": "1/s2"}
+    local = SubspaceLTI(2, horizon=8)
+    pipeline = spring_pipeline(local=local, units=units).fit(X, y)
+    save(pipeline, tmp_path / "model.zip")
+    loaded = load(tmp_path / "model.zip")
+    assert loaded.lpv_.units == loaded.lpv_.at(0.5).units == units
+    assert loaded.lpv_.at(0.5).input_names == ["force"]
+    (tmp_path / "model.zip").unlink()
+    text = page_of(loaded, tmp_path / "report.html", X[:300], y[:300])[1]
+    for words in ("position (mm)", "k (1/s2)", "κ (kg)", "force (N)"):
+        assert words in text
+    bad = spring_pipeline(units=["mm"])
+    with pytest.raises(ValueError, match="`units` must be a dict from names"):
+        bad.fit(X, y)
 
 
 def test_without_a_table_it_tells_of_the_fit_alone(fitted, tmp_path):

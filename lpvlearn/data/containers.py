@@ -1,0 +1,56 @@
+"""What `predict` returns: an array, or a DataFrame where `set_output` says so."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..validation import one_of
+
+_CONTAINERS = ("default", "pandas", "polars", None)
+
+
+class OutputContainer:
+    """An estimator of which `set_output` chooses the container of predictions.
+
+    The choice stands where scikit-learn keeps that of transformers: `clone`, and with
+    it searches and cross-validation, takes it along.
+    """
+
+    def set_output(self, *, transform: str | None = None) -> Self:
+        """Choose what `predict` and its like return, as scikit-learn's transformers do.
+
+        Parameters
+        ----------
+        transform : {"default", "pandas", "polars"}, default=None
+            Arrays, or tables with the names of the outputs; those of pandas have the
+            row labels of X. None leaves the choice as it is.
+
+        Returns
+        -------
+        self
+        """
+        one_of("transform", transform, _CONTAINERS)
+        if transform is not None:
+            self._sklearn_output_config = {"transform": transform}
+        return self
+
+    def _contained(
+        self, found: NDArray[np.float64], X: Any, names: Sequence[Hashable] | None
+    ) -> Any:
+        """Outputs in the rows of X, in the container that was chosen."""
+        wanted = getattr(self, "_sklearn_output_config", {}).get("transform", "default")
+        if wanted == "default":
+            return found
+        columns = found.reshape(len(found), -1)
+        if names is None:
+            names = [f"y{k + 1}" for k in range(columns.shape[1])]
+        if wanted == "polars":
+            from polars import DataFrame
+
+            return DataFrame(columns, schema=[str(name) for name in names])
+        return pd.DataFrame(columns, getattr(X, "index", None), list(names))
