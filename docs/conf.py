@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import re
 import sys
+import textwrap
 import warnings
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,10 @@ sphinx_gallery_conf = {
     "plot_gallery": True,
     "download_all_examples": False,
 }
+# Warnings on the pages: without a path of the machine that built them, and wrapped.
+warnings.formatwarning = lambda message, category, *_, **__: (
+    textwrap.fill(f"{category.__name__}: {message}", 88) + "\n"
+)
 # Pickles of this setting hold a class of sphinx-gallery, which Sphinx says aloud.
 suppress_warnings = ["config.cache"]
 warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")

@@ -17,6 +17,7 @@ _SIGNALLED = 128  # a shell's status of a program that a signal ended, and its n
 # What the library calls an argument is an option here.
 _OPTIONS = (
     (r"missing='split' \(of SubspaceLTI\)|missing='split'", "--missing split"),
+    (r"norm='hinf' \(in a pipeline, efficient=False\)", "--hinf"),
     (r"initial_state='estimate'", "--initial-state estimate"),
     (r"`(inputs|scheduling|experiment|time|order|missing)`", r"`--\1`"),
     (r"`(operating|sampling)_(point|time)`", r"`--\1-\2`"),

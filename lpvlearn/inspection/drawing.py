@@ -190,8 +190,9 @@ def whole(argument: str, value: Any, allowed: range) -> int:
 
 
 def with_unit(name: Hashable, unit: str | None) -> str:
-    """A quantity's label with its unit in parentheses."""
-    return f"{name} ({unit})" if unit else str(name)
+    """A quantity's label with its unit in parentheses, if its name has none."""
+    told = str(name).rstrip()[-1:] in (")", "]")
+    return f"{name} ({unit})" if unit and not told else str(name)
 
 
 def units_of(

@@ -198,7 +198,7 @@ class UncertaintyDisplay:
         )
         ax.set_ylabel("Error of the model (%)")
         plain_ticks(ax.yaxis)
-        legend_above(ax, [*handles, self.points_])
+        legend_above(ax, [*handles, self.points_], n_columns=1)
 
     def _draw_map(self, ax: Any) -> None:
         from matplotlib.colors import LogNorm

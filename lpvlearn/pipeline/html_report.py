@@ -65,7 +65,7 @@ th { font-weight: 600; border-bottom: 2px solid #888; }
 thead th { white-space: normal; vertical-align: bottom; }
 tbody th { text-align: left; border-bottom: 0; }
 tbody tr:nth-child(odd) { background: #f4f4f2; }
-.figures { display: grid; gap: 1.2rem;
+.figures { display: grid; gap: 1.2rem; margin-top: 1.2rem;
   grid-template-columns: repeat(auto-fill, minmax(min(100%, 22rem), 1fr)); }
 figure { margin: 0; min-width: 0; }
 figure.wide { grid-column: 1 / -1; }

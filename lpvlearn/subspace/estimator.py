@@ -617,11 +617,13 @@ class SubspaceLTI(
         self.offsets_differ_ = fitted.offsets.differ
 
     def _name(self, experiments: Sequence[Experiment], y: Any) -> None:
-        """Let the model know the names of the columns."""
+        """Let the model know the names of the columns, which arrays have not."""
         inputs = experiments[0].input_names
-        numbered = any(isinstance(name, Integral) for name in inputs)  # of an array
-        outputs = read_outputs(y)[1]
-        self.lti_ = self.lti_.with_names(None if numbered else inputs, outputs)
+        numbered = any(isinstance(name, Integral) for name in inputs)
+        named = hasattr(y, "columns") or getattr(y, "name", None) is not None
+        self.lti_ = self.lti_.with_names(
+            None if numbered else inputs, read_outputs(y)[1] if named else None
+        )
 
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
         """Seconds between the samples of a table; True where nothing tells them."""

@@ -18,7 +18,7 @@ from lpvlearn.inspection import (
     SimulationDisplay,
     SingularValueDisplay,
 )
-from lpvlearn.inspection.drawing import line_style
+from lpvlearn.inspection.drawing import line_style, with_unit
 
 from .conftest import ONE, random_model, spring
 
@@ -107,3 +107,11 @@ def test_displays_ask_for_a_fitted_pipeline():
     for display in (ParameterDisplay, PoleDisplay):
         with pytest.raises(ValueError, match=r"fitted LocalLPVPipeline.*call fit"):
             display.from_estimator(LocalLPVPipeline())
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [("angle", "angle (rad)"), ("angle (°)", "angle (°)"), ("I [A]", "I [A]")],
+)
+def test_a_name_with_a_unit_gets_no_other_one(name, label):
+    assert with_unit(name, "rad") == label
