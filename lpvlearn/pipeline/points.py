@@ -173,27 +173,22 @@ def identify_point(
         if efficient and pairs:
             found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
         return found
-    # The first realisation chooses order, horizon and method, the others follow it.
-    # A realisation with gaps is several experiments of one label.
     realisations = [[e for e in experiments if e.label == label] for label in labels]
-    fitted = _fit_local(local, realisations[0], sampling_time)
-    if _from_closed_loop(fitted):
-        advice = _HELD + advice
-    chosen = clone(local)
-    for name in ("order", "horizon", "method", "input_delay"):
-        if name in chosen.get_params() and hasattr(fitted, name + "_"):
-            chosen.set_params(**{name: getattr(fitted, name + "_")})
-    models, failures, kept = [], [], []
+    models, failures = [], []
+    kept: list[Any] = []
     estimates: list[Estimate] = []
-    for realisation in realisations:
-        refitted = _fit_local(chosen, realisation, sampling_time)
-        model, pairs = refitted.lti_, _deviated(refitted) if efficient else []
+    for label, fitted in zip(
+        labels, _fit_alike(local, realisations, sampling_time), strict=True
+    ):
+        if not kept and _from_closed_loop(fitted):
+            advice = _HELD + advice
+        model, pairs = fitted.lti_, _deviated(fitted) if efficient else []
         try:
             models.append(_continuous(model, discretization, advice))
             estimates.append(_in_own_time(model, pairs, discretization))
-            kept.append(refitted)
+            kept.append(fitted)
         except ValueError as error:
-            failures.append((realisation[0].label, error))
+            failures.append((label, error))
     if not models:
         raise failures[0][1]
     if failures:
@@ -206,8 +201,8 @@ def identify_point(
     known, lti = all(pairs for _, pairs in estimates), _average(models)
     return LocalModel(
         lti,
-        fitted.lti_.order,
-        _horizon(fitted),
+        kept[0].lti_.order,
+        _horizon(kept[0]),
         models,
         estimates=estimates if known else [],
         n_trend=max(map(_n_trend, kept)),
@@ -309,10 +304,43 @@ def _all_continuous(pairs: list[ModelPair], method: str) -> list[ModelPair]:
         return [(a.to_continuous(method), b.to_continuous(method)) for a, b in pairs]
 
 
+def _fit_alike(
+    local: Any, realisations: Sequence[Sequence[Experiment]], sampling_time: float
+) -> list[Any]:
+    """Clones of the local estimator for every realisation of one system.
+
+    The first realisation chooses order, horizon and method, the others follow it. One
+    with gaps is several experiments.
+    """
+    if hasattr(local, "fit_each") and all(len(runs) == 1 for runs in realisations):
+        whole = [run for runs in realisations for run in runs]
+        return _fit_table(local, whole, sampling_time, "fit_each")
+    first = _fit_local(local, realisations[0], sampling_time)
+    chosen = clone(local)
+    for name in ("order", "horizon", "method", "input_delay"):
+        if name in chosen.get_params() and hasattr(first, name + "_"):
+            chosen.set_params(**{name: getattr(first, name + "_")})
+    others = [_fit_local(chosen, runs, sampling_time) for runs in realisations[1:]]
+    return [first, *others]
+
+
 def _fit_local(
     local: Any, experiments: Sequence[Experiment], sampling_time: float
 ) -> Any:
     """A clone of the local estimator, fitted on the experiments as one table."""
+    fitted = _fit_table(local, experiments, sampling_time, "fit")
+    if not isinstance(getattr(fitted, "lti_", None), StateSpace):
+        raise ValueError(
+            "`local` must be an estimator that identifies a StateSpace model, its "
+            f"attribute `lti_`, as SubspaceLTI does. Got {type(local).__name__}."
+        )
+    return fitted
+
+
+def _fit_table(
+    local: Any, experiments: Sequence[Experiment], sampling_time: float, method: str
+) -> Any:
+    """What a clone's method of fitting returns for the experiments as one table."""
     u = np.vstack([e.inputs for e in experiments])
     y = np.vstack([e.outputs for e in experiments if e.outputs is not None])
     label = np.repeat(np.arange(len(experiments)), [len(e.rows) for e in experiments])
@@ -327,13 +355,7 @@ def _fit_local(
     estimator = clone(local)
     known = estimator.get_params(deep=False)
     estimator.set_params(**{name: own[name] for name in own if name in known})
-    fitted = estimator.fit(table, y)
-    if not isinstance(getattr(fitted, "lti_", None), StateSpace):
-        raise ValueError(
-            "`local` must be an estimator that identifies a StateSpace model, its "
-            f"attribute `lti_`, as SubspaceLTI does. Got {type(local).__name__}."
-        )
-    return fitted
+    return getattr(estimator, method)(table, y)
 
 
 def _column_names(inputs: Sequence[Hashable], n_inputs: int) -> list[str]:

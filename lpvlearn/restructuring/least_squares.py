@@ -111,32 +111,59 @@ def least_maximum(E: Complex, J: Complex) -> Array:
     >>> least_maximum(E, np.ones((3, 1, 1, 1))).round(2)
     array([1.])
     """
-    n, p = J.shape[-1], J.shape[1]
-    d, now = np.zeros(n), E
-    U, s, _ = np.linalg.svd(now)
+    n = J.shape[-1]
+    d, now = np.zeros(n), _squares(E)
     for power in _POWERS:
         for _ in range(_REWEIGHTED):
-            top = float(s.max(initial=0.0))
+            top = float(now.s.max(initial=0.0))
             if top == 0.0:
                 return d
-            share = np.zeros((len(s), p))
-            share[:, : s.shape[1]] = s / top
-            root = np.maximum(share, _NOTHING)[:, None] ** (power / 2 - 1) * U
-            root = root @ U.conj().swapaxes(1, 2)
+            share = now.s / top
+            root = now.function(np.maximum(share, _NOTHING) ** (power / 2 - 1))
             rows = np.einsum("kpq,kqmj->kpmj", root, J).reshape(-1, n)
-            rest = (root @ now).ravel()
+            rest = (root @ now.E).ravel()
             A = np.vstack([rows.real, rows.imag])
             b = np.concatenate([rest.real, rest.imag])
             step, total = scaled_lstsq(A, b)[0], np.sum(share**power)
+            change = J @ step
             for length in 0.5 ** np.arange(_HALVINGS):
-                trial = E + J @ (d - length * step)
-                U_new, s_new, _ = np.linalg.svd(trial)
-                new = np.sum(np.minimum(s_new / top, _FAR) ** power)
+                trial = _squares(now.E - length * change)
+                new = np.sum(np.minimum(trial.s / top, _FAR) ** power)
                 if new < total:
                     break
             else:
                 break
-            d, now, U, s = d - length * step, trial, U_new, s_new
+            d, now = d - length * step, trial
             if new > (1.0 - _SLOW) * total:
                 break
     return d
+
+
+class _Squares(NamedTuple):
+    """Matrices (k, p, m) and their squares ``M = E E^H``, of eigenvalues ``s**2``."""
+
+    E: Complex
+    M: Complex
+    s: Array  # (k, p), singular values
+
+    def function(self, values: Array) -> Complex:
+        """What has the eigenvectors of M and other eigenvalues, those of each `s`."""
+        if self.s.shape[1] != 2:
+            U = np.linalg.eigh(self.M)[1]
+            return (U * values[:, None]) @ U.conj().swapaxes(1, 2)
+        gap = np.diff(self.s**2)
+        slope = np.divide(np.diff(values), gap, out=np.zeros_like(gap), where=gap > 0)
+        function = slope[:, :, None] * self.M
+        function[:, [0, 1], [0, 1]] += values[:, :1] - slope * self.s[:, :1] ** 2
+        return function
+
+
+def _squares(E: Complex) -> _Squares:
+    M = E @ E.conj().swapaxes(1, 2)
+    if M.shape[1] != 2:
+        values = np.linalg.eigvalsh(M)
+    else:  # many times as fast as LAPACK, matrix by matrix
+        middle = 0.5 * (M[:, 0, 0] + M[:, 1, 1]).real
+        radius = np.hypot(0.5 * (M[:, 0, 0] - M[:, 1, 1]).real, np.abs(M[:, 0, 1]))
+        values = np.stack([middle - radius, middle + radius], axis=1)
+    return _Squares(E, M, np.sqrt(np.maximum(values, 0.0)))

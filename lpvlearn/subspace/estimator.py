@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from numbers import Integral
 from typing import Any, Self
@@ -376,25 +377,101 @@ class SubspaceLTI(
             return self._fit_rates(X, y)
         choices = check_options(self.get_params(deep=False))
         experiments = self._read(X, y, reset=True, cut=False)
+        self._single_output = np.asarray(y).ndim == 1
+        delay, told = self._delay_of(experiments, choices), set[str]()
+        self._identify(experiments, choices, delay, told)
+        return self
+
+    def fit_each(self, X: Any, y: Any) -> list[Self]:
+        """Fit one model to every experiment, as the first one chooses.
+
+        For many experiments of one kind, such as realizations of the noise (a Monte
+        Carlo): what `fit` chooses (order, horizon, method, delay, whether there are
+        constants) it chooses for the first, whose data it tests for feedback and lack
+        of states, too. The others follow, in a fraction of the time.
+
+        Parameters
+        ----------
+        X : DataFrame or array-like of shape (n_samples, n_features)
+            As in `fit`.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+
+        Returns
+        -------
+        list of SubspaceLTI
+            Fitted clones, in the order of the experiments.
+
+        Raises
+        ------
+        ValueError
+            As `fit`, and if `integrating` is set.
+
+        Warns
+        -----
+        RankWarning, UserWarning
+            As `fit`, each kind once.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lpvlearn import StateSpace, SubspaceLTI, from_trajectories
+        >>> rng, true = np.random.default_rng(0), StateSpace(0.9, 1, 1, None, True)
+        >>> u = rng.standard_normal(500)
+        >>> y = true.simulate(u).ravel()
+        >>> X, y = from_trajectories(
+        ...     [(u, 0.0, y + 0.3 * rng.standard_normal(500)) for _ in range(20)])
+        >>> roles = {"experiment": "experiment", "scheduling": "kappa"}
+        >>> models = SubspaceLTI(1, **roles).fit_each(X, y)
+        >>> poles = [model.lti_.poles()[0].real for model in models]
+        >>> print(f"{np.mean(poles):.3f}, {np.std(poles):.4f}")
+        0.899, 0.0009
+        """
+        if self.integrating is not None:
+            raise ValueError(
+                f"`integrating` must be None in fit_each. Got {self.integrating!r}. "
+                "Give it the rates of the outputs, or `fit` every experiment."
+            )
+        choices = check_options(self.get_params(deep=False))
+        first = clone(self)
+        experiments = first._read(X, y, reset=True, cut=False)
+        first._single_output = np.asarray(y).ndim == 1
+        others = [copy(first) for _ in experiments[1:]]
+        delay, told = first._delay_of(experiments[:1], choices), set[str]()
+        known = first._identify(experiments[:1], choices, delay, told)
+        told.add("lack")  # the test of which takes as long as a fit
+        for other, experiment in zip(others, experiments[1:], strict=True):
+            other._identify([experiment], choices, delay, told, known)
+        return [first, *others]
+
+    def _identify(
+        self,
+        experiments: list[Experiment],
+        choices: Choices,
+        delay: Delay,
+        told: set[str],
+        known: LocalFit | None = None,
+    ) -> LocalFit:
+        """Identify the model of experiments, by what is `known` of others like them."""
         self.time_jitter_ = max(e.jitter for e in experiments)
-        delay = self._delay_of(experiments, choices)
         gaps = self.missing == "split"
         experiments = self._with_late_inputs(experiments, delay, gaps)
         self._stream: SampleStream | None = None
-        self._single_output = np.asarray(y).ndim == 1
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
-        told: set[str] = set()
         gaps |= bool(delay.any()) and choices.initial_states
+        if known is not None:
+            choices = choices.following(known)
         fitted = fit_as_stream(pairs, choices, told, detrend=self.detrend, gaps=gaps)
         if fitted is None:
             names = experiments[0].input_names
-            fitted = fit_pairs(pairs, choices, told, detrend=self.detrend, names=names)
+            fitted = fit_pairs(
+                pairs, choices, told, detrend=self.detrend, names=names, known=known
+            )
         self._take(fitted, self._step_of(experiments), delay)
         self._name(experiments, y)
         warn_about(fitted, told)
-        if choices.order is not None and choices.horizon is not None:
+        if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
-        return self
+        return fitted
 
     def _fit_rates(self, X: Any, y: Any) -> Self:
         """Identify the rates of integrating outputs, and integrate their model."""
@@ -603,7 +680,7 @@ class SubspaceLTI(
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
         self.method_ = fitted.method
-        self.selection_ = fitted.selection.table()
+        self.selection_ = fitted.selection.table
         self.n_outputs_ = len(fitted.evidence.output_scale)
         self.initial_states_ = fitted.model.initial_states
         self.singular_values_ = fitted.singular_values

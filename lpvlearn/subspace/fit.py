@@ -25,6 +25,7 @@ from ..validation import is_whole, one_of, positive_time, shown
 from .closed_loop import identify_closed_loop
 from .held_out import HeldOut
 from .identification import (
+    Candidate,
     ScaledRecords,
     Settings,
     centred,
@@ -68,6 +69,20 @@ class Choices(NamedTuple):
     enforce_stability: bool = False
     initial_states: bool = True  # False starts every experiment from rest
     offset: str | None = None  # "auto" is to be chosen
+
+    def following(self, known: LocalFit) -> Choices:
+        """What was chosen for samples that tell the same."""
+        evidence, refine = known.evidence, self.refine
+        if refine == "auto" and known.method != "pbsid":
+            refine = "simulation" if evidence.whitening.is_none else "prediction"
+            refine = refine if evidence.refined or known.stability_loss else False
+        return self._replace(
+            order=known.selection.order,
+            horizon=known.selection.horizon,
+            method=known.method,
+            refine=refine,
+            offset=DETRENDS[evidence.free.n_trend],
+        )
 
     def settings(
         self, n_outputs: int, n_inputs: int, basis: Array, n_trend: int = 0
@@ -178,6 +193,20 @@ class LocalFit(NamedTuple):
     first_model: Realization  # of `scaled`, the samples that were fitted as one table:
     scaled: ScaledRecords  # all of them, or the first ones of a long table or a stream
 
+    def follows(self, order: int, settings: Settings) -> bool:
+        """Whether it leads to a model of other samples with these settings."""
+        own, free = self.evidence.free, settings.free
+        same = own.n_trend == free.n_trend and own.direct.shape == free.direct.shape
+        same &= order == self.selection.order and self.method == settings.method
+        return same and settings.refine and self.evidence.refined
+
+    def candidate(self, output_scale: Array) -> Candidate:
+        """The model of outputs in another scale."""
+        evidence, horizon = self.evidence, self.selection.horizon
+        ratio = evidence.output_scale / output_scale
+        model = evidence.model._replace(C=evidence.model.C * ratio[:, None])
+        return Candidate(model, horizon, evidence.whitening, True)
+
 
 def fit_pairs(
     pairs: Pairs,
@@ -186,12 +215,14 @@ def fit_pairs(
     *,
     detrend: str | None = None,
     names: Sequence[Hashable] | None = None,
+    known: LocalFit | None = None,
 ) -> LocalFit:
     """Check, detrend, choose and identify.
 
     `told` are the kinds of warnings that were given and are not repeated, `names` those
-    of the inputs, for messages. `TooFewSamples` where an input is constant or the
-    samples are too few.
+    of the inputs, for messages; of samples like those of a `known` fit feedback is not
+    looked for again. `TooFewSamples` where an input is constant or the samples are too
+    few.
     """
     try:
         check_excitation(pairs, names)
@@ -202,7 +233,7 @@ def fit_pairs(
     # The errors of a rough model are not the noise that constants must stand out of.
     rough = choices.offset == "auto" and choices.refine is False
     judged = choices._replace(refine="simulation") if rough else choices
-    fitted = _fit(pairs, judged, told, n_trend)
+    fitted = _fit(pairs, judged, told, n_trend, known)
     # A slow mode of the noise, which outputs drive, stands for constants only too well;
     # so does one of a model that has to start at rest.
     hides = fitted.method == "pbsid" or not choices.initial_states
@@ -225,8 +256,8 @@ def _fit(
 ) -> LocalFit:
     """Choose and identify, with `n_trend` trends of every output and experiment.
 
-    What is `known` of the same samples with other trends is the feedback, whose test
-    gives every experiment a constant.
+    What is `known` of the same samples with other trends, or of others like them, is
+    the feedback, whose test gives every experiment a constant.
     """
     n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
     order, horizon = choices.order, choices.horizon
@@ -247,7 +278,7 @@ def _fit(
         except ValueError as error:
             raise TooFewSamples(str(error)) from None
     else:
-        plant = _identify_open_loop(scaled, basis, order, horizon, settings)
+        plant = _identify_open_loop(scaled, basis, order, horizon, settings, known)
     offsets = attributed(plant.evidence, centres, whole)
     evidence, offsets = with_levels(plant.evidence, offsets)
     return LocalFit(
@@ -271,17 +302,26 @@ def _identify_open_loop(
     order: int | None,
     horizon: int | None,
     settings: Settings,
+    like: LocalFit | None = None,
 ) -> PlantFit:
     """Identify a plant whose inputs do not know the noise, by choice where not given.
 
-    `basis` is that of the `Evidence`.
+    `basis` is that of the `Evidence`. From the model of samples `like` these a few
+    steps lead to that of these, unless it fits them worse.
     """
-    chosen = None
+    chosen = found = None
     if order is None or horizon is None:
         chosen = select(scaled.records, order, horizon, settings)
         order, horizon = chosen.order, chosen.horizon
-    known = None if chosen is None else chosen.candidate
-    found = identify(scaled.records, order, horizon, settings, known)
+    elif like is not None and like.follows(order, settings):
+        chosen, start = like.selection, like.candidate(scaled.output_scale)
+        found = identify(scaled.records, order, horizon, settings, start, near=True)
+        found = found._replace(singular_values=like.singular_values)
+        if found.residual > _WORSE * like.residual:
+            chosen = found = None
+    if found is None:
+        known = None if chosen is None else chosen.candidate
+        found = identify(scaled.records, order, horizon, settings, known)
     if chosen is None:
         only = Row(order, horizon, found.residual, 0.0, np.nan)
         chosen = Selection(order, horizon, [only])
@@ -392,6 +432,10 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
             f"{better[0]} is {100.0 * better[1]:.3g} %. Use horizon='auto'."
         )
 
+
+# A model of like samples has led into another minimum where the error ends this many
+# times as large as theirs; between realizations of noise it varies by a few per cent.
+_WORSE = 1.2
 
 _USELESS = 0.9  # share of the outputs' size left unexplained that is reported
 _HALF = 0.5  # share of their energy that enforced stability must cost to be reported

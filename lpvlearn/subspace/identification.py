@@ -6,7 +6,7 @@ sequence: the function core of `lpvlearn.subspace.SubspaceLTI`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +28,7 @@ from .signals import Record, output_energy, shorten
 from .simulation_fit import (
     Freedom,
     Realization,
+    block_fit,
     simulation_errors,
     simulation_fit,
     with_initial_states,
@@ -247,21 +248,52 @@ def fit_once(
     start: Realization | None = None,
 ) -> Fitted:
     """Model of whitened records, from their subspace or another model of them."""
-    white, free = whitening.records(records, settings.free), settings.free
+    white = whitening.records(records, settings.free)
     width = {horizon: order + settings.n_noise_states}
     subspace = subspaces_of(white, width, settings.method)[horizon]
     model = realize(subspace, white, order, settings)
     if settings.refine:
         if start is not None:
-            other = restarted(start, whitening, white, free)
+            other = restarted(start, whitening, white, settings.free)
             if other.loss < model.loss and not settings.enforce_stability:
                 model = other
-        model = refine_simulation(model, white, free)
-    if not whitening.is_none:
-        model = whitening.undone(model)
-        model = with_initial_states(model, records, free, whitening.weight)
+        model = refine_simulation(model, white, settings.free)
+    model = _of_records(model, records, whitening, settings.free)
     candidate = Candidate(model, horizon, whitening, settings.refine)
     return Fitted(candidate, subspace.singular_values)
+
+
+def refit(
+    records: Sequence[Record],
+    order: int,
+    horizon: int,
+    settings: Settings,
+    whitening: Whitening,
+    start: Realization,
+) -> Fitted:
+    """As `fit_once`, from a model that is near: the subspace is not asked."""
+    white = whitening.records(records, settings.free)
+    if start.blocks is None:
+        model = restarted(start, whitening, white, settings.free)
+    else:
+        C = whitening.model(start).C
+        model = block_fit(start.blocks, C, white, settings.free)
+    model = refine_simulation(model, white, settings.free)
+    model = _of_records(model, records, whitening, settings.free)
+    return Fitted(Candidate(model, horizon, whitening, True), np.zeros(0))
+
+
+def _of_records(
+    model: Realization,
+    records: Sequence[Record],
+    whitening: Whitening,
+    free: Freedom,
+) -> Realization:
+    """What a model of whitened records is of the records themselves."""
+    if whitening.is_none:
+        return model
+    model = whitening.undone(model)
+    return with_initial_states(model, records, free, whitening.weight)
 
 
 def restarted(
@@ -304,17 +336,21 @@ def identify(
     horizon: int,
     settings: Settings,
     known: Candidate | None = None,
+    *,
+    near: bool = False,
 ) -> Identified:
     """Model of scaled records; every experiment has its own initial state.
 
     Refined on the simulation error, then on that error whitened by what noise there is
-    in it, or at once by the noise of a model that is `known`. With ``compare`` the
-    simpler one is kept where it simulates parts held out clearly better.
+    in it, or at once by the noise of a model that is `known`; that is all that it
+    begins from where it is `near`. With ``compare`` the simpler one is kept where it
+    simulates parts held out clearly better.
     """
     none = Whitening.none(len(records[0].y))
     as_found = settings._replace(enforce_stability=False)
     first, start = (none, None) if known is None else (known.whitening, known.model)
-    fitted = fit_once(records, order, horizon, as_found, first, start)
+    fit: Callable[..., Fitted] = refit if near else fit_once
+    fitted = fit(records, order, horizon, as_found, first, start)
     chosen = fitted.candidate
     filtered = known is not None or len(records[0].y) == 1
     some, errors = shorten(records)[0], None
@@ -323,7 +359,7 @@ def identify(
             errors = simulation_errors(chosen.model, some)
         whitening = Whitening.of(errors, settings.free, filtered=filtered)
         if not whitening.is_close_to(chosen.whitening):
-            again = fit_once(records, order, horizon, as_found, whitening, chosen.model)
+            again = fit(records, order, horizon, as_found, whitening, chosen.model)
             chosen, errors = again.candidate, None
         elif filtered:
             break

@@ -16,6 +16,8 @@ A horizon that was given is not questioned but by `better_horizon`, after the fi
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -106,7 +108,8 @@ class Row(NamedTuple):
     validation_bft: float
 
 
-class Selection(NamedTuple):
+@dataclass(frozen=True)
+class Selection:
     """The order and the horizon chosen, and everything that was tried."""
 
     order: int
@@ -115,6 +118,7 @@ class Selection(NamedTuple):
     candidate: Candidate | None = None  # the choice, of thinned records
     held_out: HeldOut | None = None  # its errors
 
+    @cached_property
     def table(self) -> pd.DataFrame:
         """One row per candidate, and which of them was chosen."""
         columns = [np.array(column) for column in zip(*self.rows, strict=True)]
@@ -136,7 +140,7 @@ class PlantFit(NamedTuple):
 def selection_text(table: pd.DataFrame) -> str:
     """The best horizon of every order as text, the chosen row marked.
 
-    >>> print(selection_text(Selection(2, 9, [Row(2, 9, 0.031, 0.0, 96.9)]).table()))
+    >>> print(selection_text(Selection(2, 9, [Row(2, 9, 0.031, 0.0, 96.9)]).table))
     order  horizon  error [%]  criterion  validation BFT [%]
         2        9     3.1000     0.0000               96.90  <- chosen
     """
@@ -175,7 +179,7 @@ def select(
     by_evidence = settings._replace(enforce_stability=False, refine=True)
     if settings.refine and not settings.enforce_stability:
         chosen = _search(records, order, horizon, by_evidence)
-        return chosen if settings.weigh else chosen._replace(candidate=None)
+        return chosen if settings.weigh else replace(chosen, candidate=None)
     rows: list[Row] = []
     if order is None:
         chosen = _search(records, None, horizon, by_evidence)

@@ -5,12 +5,13 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 from scipy.signal import lfilter
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn import StateSpace, SubspaceLTI, from_trajectories
 from lpvlearn.exceptions import DivergenceError, RankWarning
 from lpvlearn.systems.simulation import lti_response
 
@@ -344,3 +345,52 @@ def test_predictions_that_diverge_name_experiment_and_sample():
     ):
         with pytest.raises(DivergenceError, match="Experiment 'long': .*pole at 1.5"):
             use(both)
+
+
+def realizations(rng, n, noise=0.05, n_samples=600):
+    """Tables of one system under one input, `n` experiments of new noise."""
+    model = StateSpace(modes(0.9, 0.7 + 0.5j), np.ones((3, 1)), [[1, 1, 0]], None, 1.0)
+    u = rng.standard_normal(n_samples)
+    y = model.simulate(u)[:, 0]
+    runs = [(u, 0.0, y + noise * rng.standard_normal(n_samples)) for _ in range(n)]
+    return from_trajectories(runs)
+
+
+@pytest.mark.parametrize("refine", ["auto", "simulation", False])
+def test_each_experiment_has_the_model_of_its_own_fit(rng, refine):
+    """Followers of the first: the same choices, the same minimum of their own."""
+    X, y = realizations(rng, 4)
+    roles = {"experiment": "experiment", "scheduling": "kappa"}
+    models = SubspaceLTI(3, refine=refine, **roles).fit_each(X, y)
+    options = {"horizon": models[0].horizon_, "offset": models[0].offset_}
+    omega = np.linspace(0.0, 3.0, 50)
+    for model, (_, own) in zip(models, X.groupby("experiment"), strict=True):
+        alone = SubspaceLTI(3, refine=refine, **options, **roles)
+        alone.fit(own, y.loc[own.index])
+        G, G0 = (m.lti_.frequency_response(omega) for m in (model, alone))
+        if refine is False:
+            assert_allclose(G, G0, rtol=1e-9)
+        else:
+            assert (
+                np.abs(G - G0) < 0.2 * np.abs(alone.frequency_response_std(omega))
+            ).all()
+        assert model.horizon_ == models[0].horizon_
+        assert_allclose(model.residual_, alone.residual_, rtol=1e-3)
+
+
+def test_an_experiment_unlike_the_first_is_fitted_on_its_own(rng):
+    """Of another system: no few steps from the model of the first lead to its own."""
+    X, y = realizations(rng, 2)
+    last = (X["experiment"] == X["experiment"].iloc[-1]).to_numpy()
+    other = StateSpace(modes(-0.8, 0.1 + 0.9j), np.ones((3, 1)), [[1, 0, 2]], None, 1.0)
+    y = np.asarray(y).copy()
+    y[last] = other.simulate(X["u1"].to_numpy()[last])
+    roles = {"experiment": "experiment", "scheduling": "kappa"}
+    models = SubspaceLTI(3, refine="simulation", **roles).fit_each(X, y)
+    assert_allclose(models[1].lti_.poles(), other.poles(), atol=1e-6)
+
+
+def test_each_needs_outputs_that_do_not_integrate(rng):
+    X, y = realizations(rng, 2)
+    with pytest.raises(ValueError, match="`integrating` must be None in fit_each"):
+        SubspaceLTI(3, integrating=True, experiment="experiment").fit_each(X, y)

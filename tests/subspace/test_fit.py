@@ -1,6 +1,7 @@
 """Gaps, trends, known zeros, stability, poor horizons, and what must hold."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -329,7 +330,7 @@ def test_a_fit_that_parts_held_out_do_not_confirm_is_told(rng):
     fitted = fit_pairs([(u, y)], choices, set())
     for residual, expected in ((0.05, 0), (0.4, 0), (0.6, 1)):
         held_out = fitted.selection.held_out._replace(residual=residual)
-        poor = fitted._replace(selection=fitted.selection._replace(held_out=held_out))
+        poor = fitted._replace(selection=replace(fitted.selection, held_out=held_out))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             warn_about(poor, set())

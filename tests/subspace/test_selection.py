@@ -47,7 +47,7 @@ def test_coloured_noise_is_not_taken_for_states():
 
 def test_losses_do_not_rise_with_the_order():
     chosen = select([coloured(1, 300)], None, None, Settings(freedom(2, 1)))
-    table = chosen.table().dropna(subset="criterion").set_index("order")["criterion"]
+    table = chosen.table.dropna(subset="criterion").set_index("order")["criterion"]
     n_values, per_state = 2 * (300 - 1), 1 + 2 + 1
     # Without the price of the parameters only the logarithm of the loss is left.
     loss = table - table.index * per_state * np.log(n_values) / n_values
@@ -67,7 +67,7 @@ def test_a_given_order_is_kept_and_its_horizon_found():
         settings = Settings(freedom(2, 1))
         chosen = select([coloured(3, 400)], order, None, settings)
         assert chosen.order == order == len(chosen.candidate.model.A)
-        assert set(chosen.table()["order"]) == {order}
+        assert set(chosen.table["order"]) == {order}
 
 
 def test_a_given_horizon_bounds_the_orders_that_are_tried():
