@@ -39,6 +39,7 @@ from ..systems.simulation import (
 from ..validation import frequencies, input_delays, one_of
 from .delay import Delay, find_delays, with_late_inputs
 from .fit import (
+    TESTS,
     Choices,
     LocalFit,
     check_options,
@@ -438,7 +439,7 @@ class SubspaceLTI(
         others = [copy(first) for _ in experiments[1:]]
         delay, told = first._delay_of(experiments[:1], choices), set[str]()
         known = first._identify(experiments[:1], choices, delay, told)
-        told.add("lack")  # the test of which takes as long as a fit
+        told |= TESTS  # once is enough
         for other, experiment in zip(others, experiments[1:], strict=True):
             other._identify([experiment], choices, delay, told, known)
         return [first, *others]

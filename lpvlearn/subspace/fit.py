@@ -438,6 +438,9 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
 _WORSE = 1.2
 
 _USELESS = 0.9  # share of the outputs' size left unexplained that is reported
+# What is told from tests that take as long as a fit
+TESTS = {"held out", "static gain", "lack"}
+
 _HALF = 0.5  # share of their energy that enforced stability must cost to be reported
 # Share of its fit (one less the relative error) that parts held out must confirm; with
 # 200 samples at equal noise and signal a right model comes to two thirds.
@@ -505,7 +508,8 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
         )
-    if fitted.selection.held_out is not None and residual <= _USELESS:
+    choice_is_told = TESTS <= told or residual > _USELESS
+    if fitted.selection.held_out is not None and not choice_is_told:
         _warn_about_choice(fitted, fitted.selection.held_out, told)
     feedback = None if fitted.method == "pbsid" else fitted.feedback
     if feedback is None or fitted.stability_loss or "lack" in told:

@@ -272,13 +272,14 @@ def refit(
     start: Realization,
 ) -> Fitted:
     """As `fit_once`, from a model that is near: the subspace is not asked."""
-    white = whitening.records(records, settings.free)
-    if start.blocks is None:
-        model = restarted(start, whitening, white, settings.free)
+    white, free = whitening.records(records, settings.free), settings.free
+    one_each = len(white) == len(start.initial_states) == 1 and not free.n_trend
+    if one_each and start.blocks is not None:
+        model = whitening.model(start)._replace(loss=np.inf)
+        model = refine_simulation(model, white, free, fitted=False)
     else:
-        C = whitening.model(start).C
-        model = block_fit(start.blocks, C, white, settings.free)
-    model = refine_simulation(model, white, settings.free)
+        model = restarted(start, whitening, white, free)
+        model = refine_simulation(model, white, free)
     model = _of_records(model, records, whitening, settings.free)
     return Fitted(Candidate(model, horizon, whitening, True), np.zeros(0))
 

@@ -52,11 +52,14 @@ def refine_simulation(
     records: Sequence[Record],
     free: Freedom,
     max_iter: int = _MAX_ITER,
+    *,
+    fitted: bool = True,
 ) -> Realization:
     """Minimise the simulation error by Gauss-Newton steps with damping.
 
     Starts from a model of `simulation_fit` on these records, scaled to comparable size
-    channel by channel. Only steps that reduce the error are taken; a stable model stays
+    channel by channel, or where it is not `fitted` on one that is like this single
+    record. Only steps that reduce the error are taken; a stable model stays
     stable. A model without section form (poles of high multiplicity), of order 0, or
     whose simulation overflows is returned as it is.
 
@@ -65,7 +68,7 @@ def refine_simulation(
     was from the predicted one: an exact prediction is the mark of a quadratic
     function, whose minimum one step reaches.
     """
-    if model.A.size == 0 or not np.isfinite(model.loss):
+    if model.A.size == 0 or (fitted and not np.isfinite(model.loss)):
         return model
     energy = output_energy(records)
     n_values = sum(record.y.size for record in records)
@@ -76,6 +79,8 @@ def refine_simulation(
         if regression is None:
             return model
         jacobian, residual = regression[:, :-1], regression[:, -1]
+        if not fitted:
+            model, fitted = model._replace(loss=float(residual @ residual)), True
         step, rank = scaled_lstsq(jacobian, residual, _RCOND)
         left_over = residual - jacobian @ step
         predicted = float(residual @ residual - left_over @ left_over)
