@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -269,12 +269,23 @@ def drawable(figure: Any) -> None:
     first look at the figure where it is none.
     """
     from matplotlib.mathtext import MathTextParser
-    from matplotlib.text import Text
 
     parser: Any = MathTextParser("path")
-    for text in figure.findobj(Text):
+    for text in _texts(figure):
         if text.get_text().count("$") > 1 and text.get_parse_math():
             try:
                 parser.parse(text.get_text())
             except ValueError:
                 text.set_parse_math(False)
+
+
+def _texts(artist: Any) -> Iterator[Any]:
+    """All texts but the labels of ticks, which are numbers, and made when drawn."""
+    from matplotlib.axis import Axis
+    from matplotlib.text import Text
+
+    if isinstance(artist, Text):
+        yield artist
+    children = [artist.label] if isinstance(artist, Axis) else artist.get_children()
+    for child in children:
+        yield from _texts(child)

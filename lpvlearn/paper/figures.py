@@ -56,17 +56,17 @@ def save_figures(experiment: PaperExperiment, directory: Path) -> list[Path]:
     The figures are closed when they are saved: none is shown.
     """
     from matplotlib import pyplot as plt
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     directory.mkdir(parents=True, exist_ok=True)
     paths = []
     for number, draw in _FIGURES.items():
         figure, title = draw(experiment)
         _entitle(figure, f"Figure {number}. {title}")
-        # Saving would lay the figure out twice: do it once, and keep it.
-        figure.draw_without_rendering()
-        figure.set_layout_engine("none")
         path = directory / f"figure{number:02d}.png"
-        figure.savefig(path, dpi=_DOTS_PER_INCH)
+        figure.set_dpi(_DOTS_PER_INCH)
+        with path.open("wb") as file:
+            FigureCanvasAgg(figure).print_png(file)  # drawn once, by savefig thrice
         plt.close(figure)
         paths.append(path)
     return paths

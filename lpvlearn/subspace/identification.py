@@ -28,7 +28,6 @@ from .signals import Record, output_energy, shorten
 from .simulation_fit import (
     Freedom,
     Realization,
-    block_fit,
     simulation_errors,
     simulation_fit,
     with_initial_states,

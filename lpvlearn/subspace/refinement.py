@@ -25,7 +25,7 @@ from .simulation_fit import Freedom, Realization, block_fit, linearised, moved_m
 
 Array = NDArray[np.float64]
 
-_MAX_ITER = 20  # steps; from a subspace model a handful does
+MAX_ITER = 20  # steps; from a subspace model a handful does
 
 # Directions of the step that the data do not determine: the choice of basis, mostly.
 _RCOND = 1e-9
@@ -51,7 +51,7 @@ def refine_simulation(
     model: Realization,
     records: Sequence[Record],
     free: Freedom,
-    max_iter: int = _MAX_ITER,
+    max_iter: int = MAX_ITER,
     *,
     fitted: bool = True,
 ) -> Realization:

@@ -38,7 +38,7 @@ from .identification import (
 )
 from .noise import Whitening, autoregression
 from .realization import ObservabilitySubspace
-from .refinement import refine_simulation
+from .refinement import MAX_ITER, refine_simulation
 from .signals import Record, output_energy, thinned
 from .simulation_fit import (
     Realization,
@@ -365,7 +365,7 @@ def _try_orders(
     records: Sequence[Record],
     whitening: Whitening,
     settings: Settings,
-    max_iter: int | None = None,
+    max_iter: int = MAX_ITER,
 ) -> list[_Tried]:
     """Every order in turn on whitened records, until further states gain nothing."""
     records = whitening.records(records, settings.free)
@@ -374,14 +374,13 @@ def _try_orders(
     tried: list[_Tried] = []
     best, stale = np.inf, 0
     energy = output_energy(records)
-    steps = {} if max_iter is None else {"max_iter": max_iter}
     for order in orders:
         starts = _starts(order, spaces, records, settings)
         if not starts:
             break
         horizon = _best_horizon(starts, refine=True)
         start = starts[horizon]
-        model = refine_simulation(start, records, settings.free, **steps)
+        model = refine_simulation(start, records, settings.free, max_iter)
         if tried and model.loss > _AS_GOOD * tried[-1].model.loss:
             other = _with_more_states(tried[-1].model, records, settings)
             if other is not None and other.loss < model.loss:
