@@ -381,6 +381,7 @@ class SubspaceLTI(
         self._single_output = np.asarray(y).ndim == 1
         delay, told = self._delay_of(experiments, choices), set[str]()
         self._identify(experiments, choices, delay, told)
+        self._name(experiments, y)
         return self
 
     def fit_each(self, X: Any, y: Any) -> list[Self]:
@@ -442,6 +443,8 @@ class SubspaceLTI(
         told |= TESTS  # once is enough
         for other, experiment in zip(others, experiments[1:], strict=True):
             other._identify([experiment], choices, delay, told, known)
+        for model in (first, *others):
+            model._name(experiments, y)
         return [first, *others]
 
     def _identify(
@@ -468,7 +471,6 @@ class SubspaceLTI(
                 pairs, choices, told, detrend=self.detrend, names=names, known=known
             )
         self._take(fitted, self._step_of(experiments), delay)
-        self._name(experiments, y)
         warn_about(fitted, told)
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
