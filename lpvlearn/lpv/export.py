@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.io import savemat
 
 from ..models.statespace import StateSpace
 
@@ -96,6 +95,10 @@ def write_mat(path: str | os.PathLike[str], grid: Grid) -> None:
     part = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         with part.open("wb") as file:
+            from scipy.io import (
+                savemat,
+            )  # half of what importing this library would take
+
             savemat(file, content, long_field_names=True)
         part.replace(target)
     finally:

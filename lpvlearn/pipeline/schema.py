@@ -205,6 +205,7 @@ FORMS: dict[type, dict[str, str]] = {
         "_offsets": "Offsets[n_experiments, n_inputs, n_outputs]",
         "_evidence": "Known[n_inputs, n_outputs]",
         "_stream": "-",
+        "_stale": "-",
     },
     Identifiability: {
         "rank": "whole",
@@ -411,6 +412,7 @@ def forms_of(kind: Any) -> dict[str, Form]:
     own: type = type(kind)
     forms = _forms_of_class(own)
     if isinstance(kind, BaseEstimator):
+        hasattr(kind, "lti_")  # a stream makes its model when it is asked for
         more = [n for n in vars(kind) if n.endswith("_") and not n.startswith("_")]
         forms = forms | {n: Form("any?", fitted=True) for n in more if n not in forms}
     return forms

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from numbers import Integral
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 import pandas as pd
@@ -66,6 +66,29 @@ from .selection import selection_text
 from .stream import SampleStream, fit_as_stream
 
 Array = NDArray[np.float64]
+
+
+# Fitted attributes that follow from the samples so far.
+_TAKEN = (
+    "_evidence",
+    "lti_",
+    "input_delay_",
+    "order_",
+    "horizon_",
+    "method_",
+    "selection_",
+    "n_outputs_",
+    "initial_states_",
+    "singular_values_",
+    "residual_",
+    "stability_loss_",
+    "_offsets",
+    "offset_",
+    "input_offset_",
+    "output_offset_",
+    "output_drift_",
+    "offsets_differ_",
+)
 
 
 class SubspaceLTI(
@@ -381,7 +404,7 @@ class SubspaceLTI(
         self._single_output = np.asarray(y).ndim == 1
         delay, told = self._delay_of(experiments, choices), set[str]()
         self._identify(experiments, choices, delay, told)
-        self._name(experiments, y)
+        self.lti_ = self.lti_.with_names(*_names_of(experiments, y))
         return self
 
     def fit_each(self, X: Any, y: Any) -> list[Self]:
@@ -506,7 +529,7 @@ class SubspaceLTI(
         )
         self.rates_ = inner = rate_model.fit(table, rates)
         self.lti_ = integrated(inner.lti_, flags)
-        self._name(experiments, y)
+        self.lti_ = self.lti_.with_names(*_names_of(experiments, y))
         self._evidence: Any = RateEvidence(inner.deviated_models(), flags, m)
         self.input_delay_, self.order_ = self.lti_.input_delay, self.lti_.order
         self.horizon_, self.method_ = inner.horizon_, inner.method_
@@ -559,9 +582,11 @@ class SubspaceLTI(
         Notes
         -----
         The model is the one that `fit` finds from all batches as one table, however
-        they are cut. The first 131,072 samples are kept (the last ones where the first
-        do not make a model). Then order and
-        horizon stay, and only summaries grow: the compressed Hankel data, and
+        they are cut. It is made where the samples have doubled, and in between when
+        somebody asks for it (``model.lti_``), and may warn then: batches may be small.
+        The first 131,072 samples are kept (the last ones where the first do not make a
+        model). Then order and horizon stay, and only summaries grow: the compressed
+        Hankel data, and
         the simulation error linearised around the model of the moment, each sample
         once. Of a longer table `fit` makes the same summaries in the same order. It
         alone can go back to the samples, and does so where the linearisation turns out
@@ -634,15 +659,39 @@ class SubspaceLTI(
         if before is None:
             step = self._step_of(experiments)
             stream = SampleStream(choices, options, experiments, step)
+            stream.names = _names_of(experiments, y)
             self._single_output = np.asarray(y).ndim == 1
         else:
             stream = before.branch()
         fitted = stream.add(experiments, Table(X).one(self.time, "time"))
         if fitted is not None:
-            self._take(fitted, stream.step, stream.delay)
-            self._name(experiments, y)
+            self._take_up(fitted, stream)
         self._stream = stream
+        if stream.waits:  # for someone to ask for the model, see __getattr__
+            known = [name for name in _TAKEN if name in self.__dict__]
+            stale = {name: self.__dict__.pop(name) for name in known}
+            self._stale = self.__dict__.get("_stale", {}) | stale
         return self
+
+    def __getattr__(self, name: str) -> Any:
+        """What a stream has not told yet, where small batches wait for it."""
+        if name in _TAKEN and "_stale" in self.__dict__:
+            stream = cast(SampleStream, self._stream)
+            stale = self.__dict__.pop("_stale")
+            try:
+                fitted = stream.fit()
+            except BaseException:
+                self._stale = stale
+                raise
+            if fitted is None:  # too few samples still
+                self.__dict__.update(stale)
+            else:
+                self._take_up(fitted, stream)
+        return self.__getattribute__(name)
+
+    def _take_up(self, fitted: LocalFit, stream: SampleStream) -> None:
+        self._take(fitted, stream.step, stream.delay)
+        self.lti_ = self.lti_.with_names(*stream.names)
 
     def _delay_of(self, experiments: list[Experiment], choices: Choices) -> Delay:
         """Delays in samples, given or found."""
@@ -677,6 +726,7 @@ class SubspaceLTI(
 
     def _take(self, fitted: LocalFit, step: float, delay: Delay) -> None:
         """Set the fitted attributes."""
+        self.__dict__.pop("_stale", None)
         self._evidence = replace(fitted.evidence, input_delay=delay)
         self.lti_ = self._evidence.state_space(fitted.model, step)
         self.input_delay_ = self.lti_.input_delay
@@ -695,15 +745,6 @@ class SubspaceLTI(
         self.output_offset_ = fitted.offsets.outputs
         self.output_drift_ = fitted.offsets.drifts / step
         self.offsets_differ_ = fitted.offsets.differ
-
-    def _name(self, experiments: Sequence[Experiment], y: Any) -> None:
-        """Let the model know the names of the columns, which arrays have not."""
-        inputs = experiments[0].input_names
-        numbered = any(isinstance(name, Integral) for name in inputs)
-        named = hasattr(y, "columns") or getattr(y, "name", None) is not None
-        self.lti_ = self.lti_.with_names(
-            None if numbered else inputs, read_outputs(y)[1] if named else None
-        )
 
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
         """Seconds between the samples of a table; True where nothing tells them."""
@@ -1152,3 +1193,11 @@ def _outputs_of(experiment: Experiment) -> Array:
     if experiment.outputs is None:
         raise ValueError("`y` must hold the measured outputs. Got None.")
     return experiment.outputs
+
+
+def _names_of(experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:
+    """Names of inputs and outputs, as columns have them; None for those of arrays."""
+    inputs = experiments[0].input_names
+    numbered = any(isinstance(name, Integral) for name in inputs)
+    named = hasattr(y, "columns") or getattr(y, "name", None) is not None
+    return None if numbered else inputs, read_outputs(y)[1] if named else None

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from copy import copy, deepcopy
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,10 @@ Array = NDArray[np.float64]
 # Samples that are kept, and fitted like one table, before only summaries grow: enough
 # for a model that the rest can be linearised around, and a second or two of work.
 BUFFER = 131_072
+
+# Samples after which another model is due when summaries grow. Before, as many as the
+# last one was made of: all attempts together cost twice the last one.
+_DUE = 4_096
 
 # Share of the buffer that is given up at once where no model can be made of it: so that
 # not every batch is worth another attempt.
@@ -166,42 +171,53 @@ class SampleBuffer:
     def __init__(self, gaps: bool) -> None:
         self.n_samples = 0
         self._gaps = gaps
-        self._pieces: list[Piece] = []
+        self._chunks: list[Piece] = []  # of which branches share what is before both
+        self._n_chunks, self._n_last = 0, 0  # samples since the last experiment began
 
     @property
     def pairs(self) -> Pairs:
         """Experiments that are kept."""
-        return [(u, y) for u, y, _ in self._pieces if len(u) > self._gaps]
+        return [(u, y) for u, y, _ in self._pieces() if len(u) > self._gaps]
+
+    def _pieces(self) -> list[Piece]:
+        """The experiments, each in one piece; they are kept so, too."""
+        chunks = self._chunks[: self._n_chunks]
+        starts = [k for k, chunk in enumerate(chunks) if chunk.starts]
+        if len(starts) < len(chunks):
+            parts = pairwise([*starts, len(chunks)])
+            chunks = [_in_one(chunks[i:j]) for i, j in parts]
+            self._chunks, self._n_chunks = chunks, len(chunks)
+        return chunks
 
     def branch(self) -> SampleBuffer:
         """A buffer that goes on from here and leaves this one as it is."""
-        # Arrays are replaced, never changed in place: both may hold them.
-        other = copy(self)
-        other._pieces = list(self._pieces)
-        return other
+        return copy(self)
 
     def add(self, pieces: Sequence[Piece]) -> list[Piece]:
         """Keep as many samples as there is room for; what is left over."""
         left: list[Piece] = []
         for u, y, starts in pieces:
-            if starts and self._gaps and self._pieces and len(self._pieces[-1].u) == 1:
-                self._pieces.pop()
+            starts = starts or not self._n_chunks
+            if starts and self._gaps and self._n_last == 1:
                 self.n_samples -= 1
+                self._n_last = 0
             n = min(len(u), BUFFER - self.n_samples)
             if left or (starts and self.n_samples == BUFFER - 1):
                 # A first sample that is cut off from what follows tells nothing.
                 n = 0
-            if n > 0 and (starts or not self._pieces):
-                self._pieces.append(Piece(u[:n], y[:n], True))
-            elif n > 0:
-                before = self._pieces[-1]
-                self._pieces[-1] = Piece(
-                    np.vstack([before.u, u[:n]]), np.vstack([before.y, y[:n]]), True
-                )
+            if n > 0:
+                self._keep(Piece(u[:n], y[:n], starts))
+                self._n_last = n + (0 if starts else self._n_last)
             if n < len(u):
                 left.append(Piece(u[n:], y[n:], starts and n == 0))
             self.n_samples += n
         return left
+
+    def _keep(self, chunk: Piece) -> None:
+        if len(self._chunks) > self._n_chunks:  # another branch went on from here
+            self._chunks = self._chunks[: self._n_chunks]
+        self._chunks.append(chunk)
+        self._n_chunks += 1
 
     def slide(self, left: Sequence[Piece]) -> list[Piece]:
         """Make room for what is left over by leaving out the oldest samples.
@@ -210,12 +226,22 @@ class SampleBuffer:
         """
         surplus = BUFFER // _SLIDE
         self.n_samples -= surplus
+        *before, last = self._pieces()
+        pieces = [p for p in before if len(p.u) > self._gaps] + [last]
         while surplus:
-            u, y, _ = self._pieces[0]
+            u, y, _ = pieces[0]
             n = min(surplus, len(u))
-            self._pieces[:1] = [Piece(u[n:], y[n:], True)] if n < len(u) else []
+            pieces[:1] = [Piece(u[n:], y[n:], True)] if n < len(u) else []
             surplus -= n
+        self._chunks, self._n_chunks = pieces, len(pieces)
         return self.add(left)
+
+
+def _in_one(chunks: Sequence[Piece]) -> Piece:
+    if len(chunks) == 1:
+        return chunks[0]
+    u, y, _ = zip(*chunks, strict=True)
+    return Piece(np.vstack(u), np.vstack(y), True)
 
 
 class SampleStream:
@@ -236,6 +262,7 @@ class SampleStream:
     ) -> None:
         self._choices, self._options = choices, deepcopy(options)
         self._given_step, self._names = step, first[0].input_names
+        self.names: tuple[Any, Any] = (None, None)  # of the model's inputs and outputs
         n_inputs, self._n_outputs = first[0].inputs.shape[1], _n_outputs(first)
         settings = choices.settings(self._n_outputs, n_inputs, np.eye(n_inputs))
         settings.check_size([BUFFER], choices.order, choices.horizon)
@@ -251,6 +278,7 @@ class SampleStream:
         self._buffer = SampleBuffer(gaps or unknown)
         self._summary: StreamSummary | None = None
         self._first_residual = np.nan
+        self._n_new, self._n_fitted = 0, 0  # samples since, and of, the last attempt
 
     @property
     def step(self) -> float:
@@ -281,10 +309,11 @@ class SampleStream:
     ) -> LocalFit | None:
         """Take up a batch: its experiments by appearance, and the times of its rows.
 
-        The model of all samples; None where the batch adds nothing to what was found
-        before, or the samples are still too few. After a ValueError (other outputs than
-        in the first batch, an experiment that does not go on evenly in time) this
-        stream must be left: go on from the one that it branched off.
+        The model of all samples, where as many came since the last attempt that another
+        is due: so that small batches cost no more than large ones. Else None, and `fit`
+        tells it when it is asked for. After a ValueError (other outputs than in the
+        first batch, an experiment that does not go on evenly in time) this stream must
+        be left: go on from the one that it branched off.
         """
         n_outputs = _n_outputs(experiments)
         if n_outputs != self._n_outputs:
@@ -294,11 +323,29 @@ class SampleStream:
                 "every batch, or begin anew with `fit`."
             )
         pieces, fitted = self._cut(experiments, times), None
+        self._n_new += sum(len(piece.u) for piece in pieces)
         if self._summary is None:
-            fitted, pieces = self._fit_kept(pieces)
-        if pieces and self._summary is not None:
-            fitted = self._fit_summaries(self._summary, pieces)
-        return fitted
+            pieces = self._buffer.add(pieces)
+            if pieces or self._buffer.n_samples >= BUFFER:
+                fitted, pieces = self._fit_kept(pieces)
+                self._n_new = sum(len(piece.u) for piece in pieces)
+        if self._summary is not None:
+            for piece in pieces:
+                self._summary.add(piece)
+        due = self._n_fitted if self._summary is None else _DUE
+        return self.fit() if self._n_new >= due else fitted
+
+    @property
+    def waits(self) -> bool:
+        """Whether samples came that the last attempt at a model does not know."""
+        return self._n_new > 0
+
+    def fit(self) -> LocalFit | None:
+        """The model of all samples; None where they are still too few."""
+        self._n_fitted, self._n_new = self._n_fitted + self._n_new, 0
+        if self._summary is not None:
+            return self._fit_summaries(self._summary)
+        return self._fit_kept([])[0]
 
     def _cut(
         self, experiments: Sequence[Experiment], times: Column | None
@@ -335,10 +382,9 @@ class SampleStream:
         self._label, self._open, self._in_transit = ordered[-1].label, unbroken, transit
         return out
 
-    def _fit_kept(self, pieces: Sequence[Piece]) -> tuple[LocalFit | None, list[Piece]]:
+    def _fit_kept(self, left: Sequence[Piece]) -> tuple[LocalFit | None, list[Piece]]:
         """Fit while all samples are still there; what they leave no room for."""
-        buffer, choices = self._buffer, self._choices
-        left = buffer.add(pieces)
+        buffer, choices, left = self._buffer, self._choices, list(left)
         if not buffer.pairs:  # nothing but gaps so far
             return None, left
         while True:
@@ -366,11 +412,7 @@ class SampleStream:
             self._buffer = SampleBuffer(gaps=False)
         return fitted, left
 
-    def _fit_summaries(
-        self, summary: StreamSummary, pieces: Sequence[Piece]
-    ) -> LocalFit:
-        for piece in pieces:
-            summary.add(piece)
+    def _fit_summaries(self, summary: StreamSummary) -> LocalFit:
         fitted = summary.fit()
         warn_about_pole(fitted.model.A, self._told)
         # A linearisation may not see itself how far off it is.

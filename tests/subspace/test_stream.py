@@ -1,5 +1,6 @@
 """partial_fit: the model of a stream is that of one table, in bounded memory."""
 
+import copy
 import pickle
 import warnings
 
@@ -586,3 +587,29 @@ def test_dropped_rows_and_jitter_of_a_stream_are_those_of_its_table(timed, dates
     with pytest.raises(ValueError, match=r"row\(s\) are missing|does not continue"):
         strict = SubspaceLTI(**{**options, "missing": "raise"})
         strict.partial_fit(X[:60], y[:60]).partial_fit(X[60:148], y[60:148])
+
+
+def test_small_batches_make_few_models_and_the_same(system, monkeypatch):
+    made, fit = [], stream_module.fit_pairs
+    monkeypatch.setattr(
+        stream_module, "fit_pairs", lambda *a, **k: made.append(1) or fit(*a, **k)
+    )
+    u, y = record(system, 900)
+    model = fed(SubspaceLTI(5, horizon=8), u, y, [5] * 180)
+    assert len(made) <= 10  # doublings of 5 samples, each of which tries for a model
+    copies = pickle.loads(pickle.dumps(model)), model
+    whole = SubspaceLTI(5, horizon=8).fit(u, y)
+    for one in copies:
+        np.testing.assert_allclose(response(one), response(whole), rtol=1e-9)
+    assert len(made) <= 12 and not hasattr(model, "no_such_attribute_")
+
+
+def test_branches_of_a_stream_leave_each_other_alone(system):
+    u, y = record(system, 600)
+    first = SubspaceLTI(5, horizon=8).partial_fit(u[:300], y[:300])
+    other = copy.copy(first)
+    first.partial_fit(u[300:], y[300:])
+    other.partial_fit(u[300:400], 2 * y[300:400])
+    whole = SubspaceLTI(5, horizon=8).fit(u, y)
+    np.testing.assert_allclose(response(first), response(whole), rtol=1e-9)
+    assert abs(response(other) - response(whole)).max() > 1e-3
