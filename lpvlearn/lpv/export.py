@@ -95,9 +95,7 @@ def write_mat(path: str | os.PathLike[str], grid: Grid) -> None:
     part = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         with part.open("wb") as file:
-            from scipy.io import (
-                savemat,
-            )  # half of what importing this library would take
+            from scipy.io import savemat  # slow to import
 
             savemat(file, content, long_field_names=True)
         part.replace(target)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import pickle
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Timer
 from time import perf_counter
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
@@ -25,6 +26,7 @@ from sklearn.utils.validation import (
     has_fit_parameter,
 )
 
+from ..data.dataset import experiments_of, kept_on_disk, open_dataset
 from ..data.experiments import (
     NO_TIME,
     Experiment,
@@ -406,11 +408,82 @@ list, default=None
             point. They come when the fit ends, and stay in `warnings_`.
         """
         with retold() as told:
-            self._fit(X, y)
+            self._fit(lambda: self._table(X, y))
         self.warnings_ = [warning.message for warning in told]
         return self
 
-    def _fit(self, X: Any, y: Any) -> None:
+    @all_or_nothing
+    def fit_dataset(self, dataset: Any, outputs: str | Sequence[str]) -> Self:
+        """Identify the LPV model from a data set that may be larger than memory.
+
+        Parameters
+        ----------
+        dataset : path or pyarrow.dataset.Dataset
+            Parquet files of one table, or a folder of them, which may be partitioned
+            (``run=3/part.parquet``). The rows of an experiment follow each other.
+        outputs : str or list of str
+            Columns of the outputs. The others are those of `X` in `fit`.
+
+        Returns
+        -------
+        self
+            As `fit` of the whole table leaves it. What was read lies in a file in the
+            temporary folder (`TMPDIR`) meanwhile, as large as the table in memory.
+
+        Raises
+        ------
+        ValueError
+            As `fit`, and if the data set is empty, has not the columns, or the rows of
+            an experiment do not follow each other.
+        ImportError
+            If pyarrow is not installed.
+
+        Notes
+        -----
+        Memory is that of the experiments of the largest operating point, times
+        `n_jobs`; with ``combine="average"`` of the largest experiment.
+
+        Examples
+        --------
+        >>> from lpvlearn import LocalLPVPipeline
+        >>> pipeline = LocalLPVPipeline(
+        ...     restructurer="passthrough", scheduling="kappa", experiment="experiment"
+        ... )
+        >>> pipeline.fit_dataset("runs/", outputs="angle")  # doctest: +SKIP
+        """
+        opened, names = open_dataset(dataset), as_list(outputs)
+        missing = [name for name in names if name not in opened.schema.names]
+        if missing or not names:
+            raise ValueError(
+                "`outputs` must name columns of the dataset, which has "
+                f"{', '.join(map(repr, opened.schema.names))}. Got {outputs!r}."
+            )
+        with TemporaryDirectory(prefix="lpvlearn-") as folder, retold() as told:
+            path, y = (
+                Path(folder) / "numbers",
+                outputs if isinstance(outputs, str) else names,
+            )
+            self._fit(lambda: kept_on_disk(self._read_by_part(opened, y), path))
+        self.warnings_ = [warning.message for warning in told]
+        return self
+
+    def _table(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
+        """The experiments of a table to be fitted."""
+        experiments = self._read(X, y, reset=True, **options)
+        self.output_names_ = read_outputs(y)[1]
+        self._single_output = np.asarray(y).ndim == 1
+        return experiments
+
+    def _read_by_part(self, dataset: Any, outputs: Any) -> Iterator[Experiment]:
+        """The experiments of a data set, which all have the step of the first."""
+        step = None
+        for table in experiments_of(dataset, self.experiment):
+            X, y = table.drop(columns=outputs), table[outputs]
+            for e in self._table(X, y, fitted_step=step):
+                step = e.sampling_time if step is None else step
+                yield e
+
+    def _fit(self, read: Callable[[], list[Experiment]]) -> None:
         self._check_options()
         steps = {"local": self.local, "restructurer": self.restructurer}
         memory = _checked_memory(self.memory, steps)
@@ -419,10 +492,8 @@ list, default=None
         efficient = getattr(restructurer, "norm", None) == "covariance"
 
         with watch.step("reading of the table"):  # steps 1 and 2, and their groups
-            experiments = self._read(X, y, reset=True)
-            self.output_names_ = read_outputs(y)[1]
+            experiments = read()
             self.n_outputs_ = len(self.output_names_)
-            self._single_output = np.asarray(y).ndim == 1
             check_outputs(experiments, self.output_names_)
             self.time_jitter_ = max(e.jitter for e in experiments)
             structure = getattr(restructurer, "structure", None)

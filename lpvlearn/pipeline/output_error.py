@@ -58,10 +58,7 @@ _NO_COEFFICIENTS = (
     "RationalLPV or SplineLPV. Got {}."
 )
 
-_UNSEEN = (
-    "No experiment that stays there was fitted: measure one, or lower the degree of "
-    "the interpolator."
-)
+_UNSEEN = "No experiment that stays there was fitted."
 
 # Parts of an experiment, each nearer to an operating point than the whole, of which
 # time-invariant models are made, too; how many of these are tried, by so many steps.

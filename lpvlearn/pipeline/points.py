@@ -282,11 +282,13 @@ def motions(
 
     A channel that stands still counts as moving by one.
     """
-    found = []
+    found, n = [], sum(len(e.inputs) for e in experiments)
     for values in zip(*((e.inputs, e.outputs) for e in experiments), strict=True):
-        own = np.vstack([v - v.mean(axis=0) for v in values])
-        scale = np.sqrt(np.mean(own**2, axis=0))
-        found.append((np.vstack(values).mean(axis=0), np.where(scale > 0, scale, 1.0)))
+        sums = [
+            (v.sum(axis=0), ((v - v.mean(axis=0)) ** 2).sum(axis=0)) for v in values
+        ]
+        mean, variance = np.sum(sums, axis=0) / n
+        found.append((mean, np.where(variance > 0, np.sqrt(variance), 1.0)))
     return found[0], found[1]
 
 
@@ -378,7 +380,7 @@ def _bare(experiment: Experiment) -> Experiment:
     """An experiment without its place in the table."""
     return replace(
         experiment,
-        rows=np.arange(len(experiment.rows)),
+        rows=np.broadcast_to(np.intp(0), len(experiment.rows)),
         scheduling=None,
         operating_point=None,
     )

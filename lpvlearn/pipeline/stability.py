@@ -16,17 +16,16 @@ _STEPS = 20  # into which the way from a point to its neighbour is cut
 _ROUNDING = 1e-8  # of the largest pole: an integrator's may lie so far to the right
 
 
-OVERSHOT = (
-    "The local models are stable; the interpolation between them overshoots. Use "
-    "interpolator=SplineLPV(), which does not, a lower degree, or measure there too "
-    "(`suggest_operating_point`)."
+_OVERSHOT = (
+    "The local models are stable; the interpolation between them overshoots, which "
+    "interpolator=SplineLPV() does not."
 )
 
 
-def growth_rates(lpv: LPVStateSpace, kappa: Array, remedy: str = OVERSHOT) -> Array:
+def growth_rates(lpv: LPVStateSpace, kappa: Array, cause: str = _OVERSHOT) -> Array:
     """Largest real part (1/s) of the frozen poles about each operating point.
 
-    Half-way to its neighbours. What grows is told: the range, and the `remedy`.
+    Half-way to its neighbours. What grows is told: the range, and the `cause`.
     """
     model, ends = lpv.silenced(), neighbours(kappa)
     rates = _rates(model, kappa)
@@ -52,7 +51,8 @@ def growth_rates(lpv: LPVStateSpace, kappa: Array, remedy: str = OVERSHOT) -> Ar
         warn(
             f"`lpv_` is unstable at values within its range, of {places}: a pole has "
             f"real part {worst:.3g} 1/s, and simulations that stay there grow without "
-            f"bound. {remedy}"
+            f"bound. {cause} Use a lower degree, or measure there too "
+            "(`suggest_operating_point`)."
         )
     return rates
 

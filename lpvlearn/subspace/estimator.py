@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import replace
 from numbers import Integral
@@ -467,7 +467,7 @@ class SubspaceLTI(
         for other, experiment in zip(others, experiments[1:], strict=True):
             other._identify([experiment], choices, delay, told, known)
         for model in (first, *others):
-            model._name(experiments, y)
+            model.lti_ = model.lti_.with_names(*_names_of(experiments, y))
         return [first, *others]
 
     def _identify(
@@ -671,6 +671,54 @@ class SubspaceLTI(
             known = [name for name in _TAKEN if name in self.__dict__]
             stale = {name: self.__dict__.pop(name) for name in known}
             self._stale = self.__dict__.get("_stale", {}) | stale
+        return self
+
+    @all_or_nothing
+    def fit_batches(self, batches: Iterable[tuple[Any, Any]]) -> Self:
+        """Fit a stream of batches from its beginning, of which one is held at a time.
+
+        Parameters
+        ----------
+        batches : iterable of (X, y)
+            Tables as in `partial_fit`: of a generator, say, or of a database.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            As `partial_fit`, and if the batches are none, are no pairs, or are too few
+            samples for a model.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lpvlearn import StateSpace, SubspaceLTI
+        >>> def batches(n):
+        ...     rng, truth = np.random.default_rng(0), StateSpace(0.9, 1, 1, 0, 1.0)
+        ...     for _ in range(n):
+        ...         u = rng.standard_normal((200, 1))
+        ...         yield u, truth.simulate(u)
+        >>> SubspaceLTI(1, horizon=5).fit_batches(batches(1)).lti_.poles().round(6)
+        array([0.9+0.j])
+        """
+        self._stream = None
+        for name in (*_TAKEN, "_stale", "rates_"):
+            self.__dict__.pop(name, None)
+        for number, batch in enumerate(batches):
+            if not isinstance(batch, tuple | list) or len(batch) != 2:
+                raise ValueError(
+                    "`batches` must be an iterable of pairs (X, y). Got "
+                    f"{type(batch).__name__} as number {number}."
+                )
+            self.partial_fit(*batch)
+        if not hasattr(self, "lti_"):
+            raise ValueError(
+                "`batches` must hold enough samples for a model. Got "
+                f"{0 if self._stream is None else self._stream.n_samples}."
+            )
         return self
 
     def __getattr__(self, name: str) -> Any:

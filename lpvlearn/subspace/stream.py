@@ -336,6 +336,11 @@ class SampleStream:
         return self.fit() if self._n_new >= due else fitted
 
     @property
+    def n_samples(self) -> int:
+        """How many came, without those that gaps left alone."""
+        return self._n_fitted + self._n_new
+
+    @property
     def waits(self) -> bool:
         """Whether samples came that the last attempt at a model does not know."""
         return self._n_new > 0

@@ -613,3 +613,21 @@ def test_branches_of_a_stream_leave_each_other_alone(system):
     whole = SubspaceLTI(5, horizon=8).fit(u, y)
     np.testing.assert_allclose(response(first), response(whole), rtol=1e-9)
     assert abs(response(other) - response(whole)).max() > 1e-3
+
+
+def test_batches_of_an_iterable_are_a_stream(system):
+    u, y = record(system, 900)
+    whole = SubspaceLTI(5, horizon=8).fit(u, y)
+    one = SubspaceLTI(5, horizon=8)
+    for _ in range(2):  # every time from the beginning
+        one.fit_batches((u[k : k + 50], y[k : k + 50]) for k in range(0, 900, 50))
+        np.testing.assert_allclose(response(one), response(whole), rtol=1e-9)
+    before = one.lti_
+    for batches, told in [
+        ([], "enough samples for a model. Got 0"),
+        ([(u[:3], y[:3])], "enough samples for a model. Got 3"),
+        ([u], "pairs .X, y.. Got ndarray as number 0"),
+    ]:
+        with pytest.raises(ValueError, match=told):
+            one.fit_batches(batches)
+    assert one.lti_ is before
