@@ -62,11 +62,7 @@ def experiments_of(dataset: Any, experiment: Hashable) -> Iterator[pd.DataFrame]
         )
     parts: list[pd.DataFrame] = []
     label, seen = None, set()
-    options = {"batch_size": _ROWS, "batch_readahead": 1, "fragment_readahead": 1}
-    for batch in dataset.to_batches(**options):
-        rows = batch.to_pandas()
-        if not len(rows):
-            continue
+    for rows in _tables_of(dataset):
         column = [None] * len(rows) if experiment is None else rows[experiment]
         labels = np.asarray(column, object)
         changes = np.flatnonzero(labels[1:] != labels[:-1]) + 1
@@ -88,6 +84,19 @@ def experiments_of(dataset: Any, experiment: Hashable) -> Iterator[pd.DataFrame]
     if not parts:
         raise ValueError("`dataset` must hold at least one row. Got none.")
     yield pd.concat(parts, ignore_index=True)
+
+
+def _tables_of(dataset: Any) -> Iterator[pd.DataFrame]:
+    """Tables of some rows each, in their order."""
+    for fragment in dataset.get_fragments():
+        # reading a whole file goes ahead of us, and holds what it has read
+        groups = getattr(fragment, "split_by_row_group", lambda one=fragment: [one])
+        for group in groups():
+            for batch in group.to_batches(
+                schema=dataset.schema, batch_size=_ROWS, batch_readahead=1
+            ):
+                if len(batch):
+                    yield batch.to_pandas()
 
 
 def kept_on_disk(

@@ -11,6 +11,7 @@ import os
 import resource
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -19,21 +20,35 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
+_EVERY = 0.005  # seconds between two looks at memory
+
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 
 class Cost:
-    """CPU seconds of a block, and its peak of memory (MB) beyond what was there."""
+    """CPU seconds of a block, and its peak of memory (MB) beyond what was there.
+
+    Of memory that is not a file's: the system takes pages of files when it needs them.
+    """
 
     def __enter__(self):
-        Path("/proc/self/clear_refs").write_text("5")  # the peak so far is forgotten
-        self._start, self._before = time.process_time(), _status("VmRSS")
+        self._before = self._peak = _status("RssAnon")
+        self._ended = threading.Event()
+        self._watch = threading.Thread(target=self._look)
+        self._watch.start()
+        self._start = time.process_time()
         return self
+
+    def _look(self):
+        while not self._ended.wait(_EVERY):
+            self._peak = max(self._peak, _status("RssAnon"))
 
     def __exit__(self, *_):
         self.seconds = time.process_time() - self._start
-        self.megabytes = _status("VmHWM") - self._before
+        self._ended.set()
+        self._watch.join()
+        self.megabytes = max(self._peak, _status("RssAnon")) - self._before
 
 
 def _status(field):
@@ -85,7 +100,7 @@ def points(n_points):
     from tests.conftest import ROLES, spring_tables
 
     n_points = int(n_points)
-    kappas = np.linspace(0.0, 1.5, n_points)
+    kappas = 0.1 * np.arange(n_points)  # beyond what merges points, for any number
     X, y = spring_tables(noise=1e-3, n_samples=400, kappas=kappas)
     pipeline = LocalLPVPipeline(
         restructurer="passthrough", interpolator=PolynomialLPV(2), **ROLES
@@ -101,7 +116,7 @@ def structured(n_points):
     from tests.conftest import ROLES, spring_structure, spring_tables
 
     n_points = int(n_points)
-    kappas = np.linspace(0.0, 1.5, n_points)
+    kappas = 0.1 * np.arange(n_points)  # beyond what merges points, for any number
     X, y = spring_tables(noise=1e-3, n_samples=400, kappas=kappas)
     from lpvlearn import GrayBoxRestructurer
 
@@ -164,6 +179,67 @@ def prediction(n_samples):
     return f"{cost.seconds:6.2f} s  {cost.megabytes / _size(X):5.1f} tables"
 
 
+def dataset(megabytes):
+    """fit_dataset of so many MB: 20 points, experiments of 62,500 rows."""
+    import shutil
+    import tempfile
+
+    import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from lpvlearn import LocalLPVPipeline, PolynomialLPV, SubspaceLTI
+    from tests.conftest import ROLES, spring_lpv
+
+    n, per_run = int(float(megabytes) * 2**20 / 40), 62_500
+    n_runs = max(20, n // per_run)
+    folder = Path(tempfile.mkdtemp(prefix="growth-"))
+    try:
+        rng, models = np.random.default_rng(0), {}
+        for run in range(n_runs):
+            kappa = 1.5 * (run % 20) / 19
+            models.setdefault(kappa, spring_lpv().at(kappa).to_discrete(0.02))
+            u = rng.standard_normal(per_run)
+            y = models[kappa].simulate(u)[:, 0]
+            y += 0.01 * y.std() * rng.standard_normal(per_run)
+            time = 0.02 * np.arange(per_run)
+            columns = {"force": u, "kappa": kappa, "run": run, "time": time, "y": y}
+            table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
+            pq.write_table(table, folder / f"{run:06}.parquet")
+        local = SubspaceLTI(2, horizon=10, feedthrough=False)
+        pipeline = LocalLPVPipeline(local, "passthrough", PolynomialLPV(2), **ROLES)
+        with Cost() as cost:
+            pipeline.fit_dataset(folder, "y")
+    finally:
+        shutil.rmtree(folder)
+    size = n_runs * per_run * 40 / 2**20
+    return (
+        f"{n_runs} experiments, {size:.0f} MB in memory: {cost.seconds:6.1f} s  "
+        f"{cost.megabytes:5.0f} MB"
+    )
+
+
+def stream(n_rows):
+    """fit_batches of a generator, 100,000 rows each."""
+    from lpvlearn import StateSpace, SubspaceLTI
+
+    n_rows, size = int(float(n_rows)), 100_000
+    model = StateSpace([[0.9, 0.3], [-0.3, 0.9]], [[1], [0]], [[1, 0]], None, 1.0)
+
+    def batches():
+        rng = np.random.default_rng(0)
+        for run in range(n_rows // size):
+            u = rng.standard_normal((size, 1))
+            y = model.simulate(u)
+            X = np.column_stack([u, np.full(size, run)])
+            yield X, y + 0.01 * rng.standard_normal(y.shape)
+
+    with Cost() as cost:
+        SubspaceLTI(2, inputs=[0], experiment=1).fit_batches(batches())
+    size = 24 * n_rows / 2**20
+    return f"{size:.0f} MB: {cost.seconds:6.2f} s  {cost.megabytes:5.0f} MB"
+
+
 def imports(module):
     """Importing a module, least of seven runs."""
     times = []
@@ -181,6 +257,8 @@ MEASURES = {
     batches: (1, 10, 100, 1_000, 10_000, 100_000),
     simulation: (10_000, 100_000, 1_000_000),
     prediction: (1_000_000,),
+    stream: (1e6, 1e7),
+    dataset: (100, 1000),
     imports: ("sklearn.linear_model", "lpvlearn"),
 }
 

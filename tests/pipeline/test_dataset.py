@@ -56,6 +56,14 @@ def test_a_folder_of_partitions_is_read_by_its_names(tables, tmp_path):
     assert found.predict(table[X.columns]).ndim == 1
 
 
+def test_a_dataset_of_arrow_is_one(tables):
+    pa, arrow = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.dataset")
+    X, y = tables
+    table = pa.Table.from_pandas(X.join(y), preserve_index=False)
+    found = chain().fit_dataset(arrow.dataset(table), ["position"])
+    assert_same_fit(found, chain().fit(X, y))
+
+
 def written(tmp_path, tables, change):
     path = tmp_path / "t.parquet"
     change(tables[0].join(tables[1])).to_parquet(path)
