@@ -776,7 +776,7 @@ class SubspaceLTI(
         """Set the fitted attributes."""
         self.__dict__.pop("_stale", None)
         self._evidence = replace(fitted.evidence, input_delay=delay)
-        self.lti_ = self._evidence.state_space(fitted.model, step)
+        self.lti_: StateSpace = self._evidence.state_space(fitted.model, step)
         self.input_delay_ = self.lti_.input_delay
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
