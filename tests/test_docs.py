@@ -1,7 +1,10 @@
 """What the documentation says is true of the code."""
 
+import ast
+import io
 import re
 import runpy
+import tokenize
 import warnings
 from pathlib import Path
 
@@ -101,6 +104,57 @@ def test_links_that_lead_nowhere_are_found(monkeypatch, tmp_path):
         "one.html: sub/two.html#there",
         "one.html: three.png",
     ]
+
+
+# What is not written, and what is instead: British spelling, and the field's words.
+TERMS = {
+    r"noise realisation": "noise realization",
+    r"(mini|maxi|opti)miz(e|ing)": "-mise",
+    r"(linear|general|regular|stabil|initial|summar|factor|recogn)iz": "-ise",
+    r"\bcolors?\b": "colour",
+    r"behavior": "behaviour",
+    r"neighbor": "neighbour",
+    r"\bcenter": "centre",
+    r"analyz": "analyse",
+    r"\bdatasets\b": "data sets",
+    r"timestamp": "time stamp",
+    r"sub-space|eigen-value|feed-through": "one word",
+    r"\bstate space model|\bgray box model|\bblack box model": "with a hyphen",
+    r"blackbox|graybox|grey[- ]box": "black box, gray box",
+    r"(?<!npy-)\b(matlab|Matlab)\b": "MATLAB",
+    r"Scikit-Learn|[Ss]cikit [Ll]earn": "scikit-learn",
+    r"h-infinity|H infinity": "H-infinity",
+    r"\b(hankel|nyquist|laplace|gramian)": "a name, with a capital",
+}
+
+
+def prose_of(path):
+    """What a page or a source says: no code, no names, no titles of papers."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+        parts = [t.string for t in tokens if t.type == tokenize.COMMENT]
+        documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+        found = [n for n in ast.walk(ast.parse(text)) if isinstance(n, documented)]
+        text = "\n\n".join([*parts, *(ast.get_docstring(n) or "" for n in found)])
+    quoted = r"```.*?```|``[^`]*``|`[^`]*`|\"[^\"]*\"|<[^>]*>"
+    lines = r"^ *(>>>|\.\.\.|\.\.) [^\n]*|^ +(link|:\w+):[^\n]*|^   [\w.]+\n"
+    return re.sub(f"{quoted}|{lines}", " ", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def test_terms_are_spelled_as_the_list_says():
+    root = DOCS.parent
+    pages = [*DOCS.rglob("*.rst"), *DOCS.rglob("*.py"), *root.glob("*.md")]
+    pages = [
+        p for p in pages if not any("auto_" in x or x == "generated" for x in p.parts)
+    ]
+    found = [
+        f"{path.relative_to(root)}: {word[0]!r}, here {spelled}"
+        for path in [*pages, *(root / "lpvlearn").rglob("*.py")]
+        for pattern, spelled in TERMS.items()
+        for word in re.finditer(pattern, prose_of(path))
+    ]
+    assert found == []
 
 
 def how_to(page):

@@ -33,10 +33,16 @@ def test_commands_stand_behind_their_markers(marker):
     assert commands[0].startswith("python3 -m venv .venv && ")
 
 
-def test_spring_table_follows_from_its_seed():
+def test_small_tables_follow_from_their_seeds():
     path = ROOT / "datasets" / "regenerate.py"
     spec = importlib.util.spec_from_file_location("regenerate", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    stored = pd.read_csv(ROOT / "datasets" / "varying_spring.csv")
-    pd.testing.assert_frame_equal(module.spring_table(), stored, atol=1.5e-5)
+    crane, hoisting = module.crane_tables()
+    for name, table, atol in (
+        ("varying_spring", module.spring_table(), 1.5e-5),
+        ("gantry_crane", crane, 1.5e-6),
+        ("gantry_crane_hoisting", hoisting, 1.5e-6),
+    ):
+        stored = pd.read_csv(ROOT / "datasets" / f"{name}.csv")
+        pd.testing.assert_frame_equal(table, stored, atol=atol)

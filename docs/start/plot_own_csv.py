@@ -11,69 +11,18 @@ the model has never seen, and the model's use.
 """
 
 # %%
-# The file
-# --------
-# You have such a file already. Here it is simulated, so that the page can run: at five
-# rope lengths, somebody shook the trolley for 40 seconds and recorded the swing angle.
-# (The code in this block is the crane, nothing of the library; skip it.)
-
-import tempfile
-from pathlib import Path
+# Read it
+# -------
+# At five rope lengths, somebody shook the trolley for 40 seconds and recorded the swing
+# angle, every 0.05 s. The file ships with the library; any other CSV file will do as
+# well. One row is one sampling instant, one column says which run a row belongs to.
 
 import numpy as np
 import pandas as pd
 
-GRAVITY, DAMPING = 9.81, 0.15  # m/s2, 1/s
-SAMPLING_TIME = 0.05  # s
+from lpvlearn.datasets import data_folder
 
-
-def swing(acceleration, rope):
-    """Swing angle (rad) of the load: a pendulum of varying length on a trolley."""
-    hoisting = np.gradient(rope, SAMPLING_TIME)
-    angle, rate, out = 0.0, 0.0, []
-    for a, length, speed in zip(acceleration, rope, hoisting, strict=True):
-        out.append(angle)
-        for _ in range(10):
-            torque = GRAVITY * np.sin(angle) + a * np.cos(angle) + 2 * speed * rate
-            rate += SAMPLING_TIME / 10 * (-torque / length - DAMPING * rate)
-            angle += SAMPLING_TIME / 10 * rate
-    return np.array(out)
-
-
-def record(run, rope, rng):
-    """One run as a table with measurement noise."""
-    n = len(rope)
-    acceleration = 0.3 * np.repeat(rng.choice([-1.0, 1.0], n // 5 + 1), 5)[:n]
-    angle = swing(acceleration, rope)
-    return pd.DataFrame(
-        {
-            "run": run,
-            "time": SAMPLING_TIME * np.arange(n),
-            "acceleration": acceleration,
-            "rope": rope,
-            "angle": angle + 0.002 * rng.standard_normal(n),
-        }
-    )
-
-
-rng = np.random.default_rng(0)
-lengths = [1.0, 1.5, 2.0, 2.5, 3.0]
-runs = [
-    record(f"run {i}", np.full(800, length), rng) for i, length in enumerate(lengths)
-]
-folder = Path(tempfile.mkdtemp())
-pd.concat(runs).to_csv(folder / "crane.csv", index=False)
-
-# A record to test the model on: the load is hoisted during it.
-hoisted = record("hoisting", np.linspace(3.0, 1.0, 800), rng)
-hoisted.to_csv(folder / "hoisting.csv", index=False)
-
-# %%
-# Read it
-# -------
-# One row is one sampling instant. One column says which run a row belongs to.
-
-table = pd.read_csv(folder / "crane.csv")
+table = pd.read_csv(data_folder() / "gantry_crane.csv")
 table.groupby("run").head(2)
 
 # %%
@@ -121,7 +70,7 @@ crane.parameters_.round(3)
 # to hide that.
 
 length = crane.parameters_.index
-truth = pd.DataFrame({"b": 1 / length, "k": GRAVITY / length}, index=length)
+truth = pd.DataFrame({"b": 1 / length, "k": 9.81 / length}, index=length)
 truth.round(3)
 
 # %%
@@ -163,7 +112,7 @@ crane.report_[["relative_error", "interpolation_error"]].round(4)
 
 from lpvlearn import bft_score, fit_report
 
-test = pd.read_csv(folder / "hoisting.csv")
+test = pd.read_csv(data_folder() / "gantry_crane_hoisting.csv")
 X_test = test.assign(per_rope=1 / test["rope"])[X.columns]
 fit_report(crane, X_test, test["angle"]).round(3)
 

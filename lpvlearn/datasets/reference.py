@@ -29,12 +29,24 @@ FLOAT_FORMAT = "%.7g"
 
 
 def data_folder() -> Path:
-    """Folder of the data files, in a wheel or in an editable install.
+    """Folder of the data files that ship with the library.
+
+    Returns
+    -------
+    Path
 
     Raises
     ------
     FileNotFoundError
-        If neither place holds the files.
+        If they are neither in the package nor, as in an editable install, beside it.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from lpvlearn.datasets import data_folder
+    >>> pd.read_csv(data_folder() / "gantry_crane.csv", nrows=1)
+         run  time  acceleration  rope     angle
+    0  run 0   0.0           0.3   1.0  0.004005
     """
     here = Path(__file__).resolve().parent
     candidates = [here / "data", here.parents[1] / "datasets"]
