@@ -59,6 +59,7 @@ pre { font: .875rem/1.45 ui-monospace, "DejaVu Sans Mono", monospace; padding: .
   background: #f4f4f2; border-radius: .3rem; }
 pre.text { white-space: pre-wrap; overflow-wrap: anywhere; }
 .scroll, pre.code { overflow-x: auto; }
+.figures + .scroll { margin-top: 1.2rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .7rem; text-align: right; white-space: nowrap; }
 th { font-weight: 600; border-bottom: 2px solid #888; }
