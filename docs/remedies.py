@@ -66,6 +66,9 @@ REMEDIES = {
     ":ref:`guide_files`.",
     "the experiments at one operating point have": "See :ref:`guide_points_of_work`.",
     "The experiments of `fit` have": "See :ref:`guide_points_of_work`.",
+    "`lpv_` is unstable at values within": "An operating point or an experiment there "
+    "decides; a lower degree, or momenta as states, often suffice: "
+    ":ref:`guide_interpolation`, :ref:`guide_state_basis`.",
     # -- errors
     "--degree is that of": "Add ``--interpolation polynomial``, or leave ``--degree`` "
     "out.",
@@ -85,6 +88,8 @@ REMEDIES = {
     "…: the table has no column": "Names are compared exactly, with capitals and "
     "spaces.",
     "Complex data not supported": "Give real and imaginary parts as columns.",
+    "Experiment … must be local": "Where one record holds several levels, cut it as "
+    ":ref:`how_to_log` shows.",
     "Experiment …: …": "The text after the colon is explained at its own place.",
     "the simulation diverges": "The model is unstable, or is taken where it is: see "
     "``poles()`` or ``frozen_poles(kappa)``.",

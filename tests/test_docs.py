@@ -138,7 +138,9 @@ def prose_of(path):
         found = [n for n in ast.walk(ast.parse(text)) if isinstance(n, documented)]
         text = "\n\n".join([*parts, *(ast.get_docstring(n) or "" for n in found)])
     quoted = r"```.*?```|``[^`]*``|`[^`]*`|\"[^\"]*\"|<[^>]*>"
-    lines = r"^ *(>>>|\.\.\.|\.\.) [^\n]*|^ +(link|:\w+):[^\n]*|^   [\w.]+\n"
+    lines = (
+        r"^# {5}[^\n]*|^ *(>>>|\.\.\.|\.\.) [^\n]*|^ +(link|:\w+):[^\n]*|^   [\w.]+\n"
+    )
     return re.sub(f"{quoted}|{lines}", " ", text, flags=re.DOTALL | re.MULTILINE)
 
 

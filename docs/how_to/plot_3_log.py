@@ -118,3 +118,16 @@ room = [
     for speed in speeds
 ]
 pd.Series(np.ravel(room), index=pd.Index(speeds, name="speed")).round(1)
+
+# %%
+# One record of several levels
+# ----------------------------
+# Often there is one long record, in which the scheduling variable was held at one level
+# after another. Each stretch in which it is held becomes an experiment; what is between
+# is left out, or kept as a test of the model::
+#
+#     held = log["speed"].rolling(51, center=True, min_periods=1).std() < 0.01
+#     log["record"] = (held != held.shift()).cumsum()
+#     log = log[held]
+#
+# The window is a second or two, the limit a few times the noise of the variable.
