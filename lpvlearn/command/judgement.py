@@ -63,7 +63,7 @@ class Course:
     """The steps of a command: what lasts is told at once, warnings at the end."""
 
     def __init__(self, verbose: bool) -> None:
-        self._watch = Stopwatch(verbose)
+        self._watch = Stopwatch(verbose=verbose)
         self._told: dict[str, list[str]] = {}  # by step
 
     @contextmanager

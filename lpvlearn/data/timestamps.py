@@ -52,7 +52,7 @@ _RESTARTS = (
 )
 
 # Stamps beyond are no seconds since 1970, but parts of them: the year 5138.
-_LATEST = 1e11
+_SINCE_1970 = 1e11
 
 # Share of the steps up to which a table does not look shuffled: those that go back in
 # time, where experiments follow each other, or leave rows out, as a logger does.
@@ -91,7 +91,7 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
     finite = np.abs(seconds) < _LATEST
     if not finite.all():
         _raise_bad_time(column, int(np.argmin(finite)), series)
-    if len(seconds) and seconds.min() > _LATEST:
+    if len(seconds) and seconds.min() > _SINCE_1970:
         warn(
             f"Time column {column!r} begins at {seconds.min():.4g}. Numbers are read "
             "as seconds; if these are milliseconds since 1970, give dates instead: "

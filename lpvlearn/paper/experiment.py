@@ -111,7 +111,7 @@ def run_paper_experiment(
     -------
     PaperExperiment
     """
-    watch = Stopwatch(verbose)
+    watch = Stopwatch(verbose=verbose)
     with watch.step("simulation of the arm"):
         data = make_flexible_arm(
             n_realizations=n_realizations, random_state=random_state

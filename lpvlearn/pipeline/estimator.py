@@ -99,8 +99,8 @@ class Stopwatch:
     With `verbose`, a step without a bar of its own is told once it is long.
     """
 
-    verbose: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
+    verbose: int = 0
 
     @contextmanager
     def step(self, name: str, *, bar: bool = False) -> Iterator[None]:
@@ -488,7 +488,7 @@ list, default=None
         steps = {"local": self.local, "restructurer": self.restructurer}
         memory = _checked_memory(self.memory, steps)
         runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
-        restructurer, watch = self._restructurer(), Stopwatch(self.verbose)
+        restructurer, watch = self._restructurer(), Stopwatch(verbose=self.verbose)
         efficient = getattr(restructurer, "norm", None) == "covariance"
 
         with watch.step("reading of the table"):  # steps 1 and 2, and their groups
@@ -628,7 +628,7 @@ list, default=None
         The figures of parameters and poles need one scheduling variable, or two.
         """
         by_name = self.units if units is None else units_by_name(units)
-        with Stopwatch(self.verbose).step("figures of the report"):
+        with Stopwatch(verbose=self.verbose).step("figures of the report"):
             page = html_report(
                 self,
                 self._summarised(),

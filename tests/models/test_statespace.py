@@ -295,7 +295,7 @@ CONTINUOUS, DISCRETE = random_model(0), random_model(0, sampling_time=0.1)
         (lambda: CONTINUOUS.to_discrete(0), "`sampling_time` must be a positive"),
         (lambda: DISCRETE.to_continuous("euler"), "`method`.*'euler'"),
         (lambda: CONTINUOUS.to_continuous("euler"), "`method`.*'euler'"),
-        (lambda: StateSpace(1e6, 1, 1).to_discrete(1.0), "too long.*1e\\+06"),
+        (lambda: StateSpace(1e6, 1, 1).to_discrete(1.0), "must be short.*1e\\+06"),
         (lambda: CONTINUOUS.balance(5), "`order` must be an integer, 0 to 4"),
         (lambda: CONTINUOUS.balance(-1), "`order` must be an integer, 0 to 4"),
         (lambda: CONTINUOUS.balance(2.0), "`order` must be an integer"),

@@ -759,7 +759,7 @@ def test_a_passed_through_model_keeps_its_delay():
 )
 def test_steps_that_last_are_told_where_wanted(capsys, monkeypatch, verbose, bar, told):
     monkeypatch.setattr("lpvlearn.pipeline.estimator._PATIENCE", 0.0)
-    watch = Stopwatch(verbose)
+    watch = Stopwatch(verbose=verbose)
     with watch.step("figures", bar=bar):
         time.sleep(0.1)
     assert capsys.readouterr() == ("", told)
