@@ -404,7 +404,7 @@ class SubspaceLTI(
         self._single_output = np.asarray(y).ndim == 1
         delay, told = self._delay_of(experiments, choices), set[str]()
         self._identify(experiments, choices, delay, told)
-        self.lti_ = self.lti_.with_names(*_names_of(experiments, y))
+        self._name(*_names_of(experiments, y))
         return self
 
     def fit_each(self, X: Any, y: Any) -> list[Self]:
@@ -467,7 +467,7 @@ class SubspaceLTI(
         for other, experiment in zip(others, experiments[1:], strict=True):
             other._identify([experiment], choices, delay, told, known)
         for model in (first, *others):
-            model.lti_ = model.lti_.with_names(*_names_of(experiments, y))
+            model._name(*_names_of(experiments, y))
         return [first, *others]
 
     def _identify(
@@ -528,8 +528,8 @@ class SubspaceLTI(
             operating_point=None,
         )
         self.rates_ = inner = rate_model.fit(table, rates)
-        self.lti_ = integrated(inner.lti_, flags)
-        self.lti_ = self.lti_.with_names(*_names_of(experiments, y))
+        self.lti_: StateSpace = integrated(inner.lti_, flags)
+        self._name(*_names_of(experiments, y))
         self._evidence: Any = RateEvidence(inner.deviated_models(), flags, m)
         self.input_delay_, self.order_ = self.lti_.input_delay, self.lti_.order
         self.horizon_, self.method_ = inner.horizon_, inner.method_
@@ -739,7 +739,7 @@ class SubspaceLTI(
 
     def _take_up(self, fitted: LocalFit, stream: SampleStream) -> None:
         self._take(fitted, stream.step, stream.delay)
-        self.lti_ = self.lti_.with_names(*stream.names)
+        self._name(*stream.names)
 
     def _delay_of(self, experiments: list[Experiment], choices: Choices) -> Delay:
         """Delays in samples, given or found."""
@@ -776,7 +776,7 @@ class SubspaceLTI(
         """Set the fitted attributes."""
         self.__dict__.pop("_stale", None)
         self._evidence = replace(fitted.evidence, input_delay=delay)
-        self.lti_: StateSpace = self._evidence.state_space(fitted.model, step)
+        self.lti_ = self._evidence.state_space(fitted.model, step)
         self.input_delay_ = self.lti_.input_delay
         self.order_ = fitted.selection.order
         self.horizon_ = fitted.selection.horizon
@@ -793,6 +793,10 @@ class SubspaceLTI(
         self.output_offset_ = fitted.offsets.outputs
         self.output_drift_ = fitted.offsets.drifts / step
         self.offsets_differ_ = fitted.offsets.differ
+
+    def _name(self, inputs: Any, outputs: Any) -> None:
+        """Let the model know the names of the columns, where they have some."""
+        self.lti_ = self.lti_.with_names(inputs, outputs)
 
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
         """Seconds between the samples of a table; True where nothing tells them."""
