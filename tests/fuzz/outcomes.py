@@ -1,7 +1,9 @@
 """What became of a call: right or taught, or one of the classes that may not be."""
 
+import contextlib
 import re
 import signal
+import tempfile
 import traceback
 import warnings
 from pathlib import Path
@@ -51,15 +53,17 @@ class Hangs(BaseException):
 def outcome_of_spoiled(call, spoiled):
     """What became of a call with arguments in the place of valid ones, in time.
 
-    A value that is no number is right where the call's documentation says so.
+    A value that is no number is right where the call's documentation says so. Files go
+    to a folder that does not last.
     """
     before = signal.signal(signal.SIGALRM, _ring)
-    signal.alarm(SECONDS)
-    try:
-        found = outcome_of(lambda: call.function(**{**call.arguments, **spoiled}))
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        signal.alarm(SECONDS)
+        try:
+            found = outcome_of(lambda: call.function(**{**call.arguments, **spoiled}))
+        finally:
+            signal.alarm(0)
+            signal.signal(signal.SIGALRM, before)
     open = found.kind == "not finite" and found.detail.startswith(call.open)
     return Outcome("right", found.detail) if open else found
 
