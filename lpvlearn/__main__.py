@@ -10,12 +10,18 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import joblib
+import pandas as pd
 
 from .command import add_commands
 from .command.ending import status_of
 from .command.judgement import course
 from .command.output import whole_folder
-from .paper import run_paper_experiment, save_figures, tables_text
+from .paper import (
+    PaperExperiment,
+    run_paper_experiment,
+    save_figures,
+    tables_text,
+)
 
 _MAX_JOBS = 7  # one for each operating point of the paper
 
@@ -99,6 +105,15 @@ def _paper(options: argparse.Namespace) -> None:
         course() as told,
         told.step("experiment", bar=True),
     ):
+
+        def save(experiment: PaperExperiment) -> None:
+            _save_tables(experiment.tables, folder)
+            with experiment.watch.step("figures"):
+                import matplotlib
+
+                matplotlib.use("agg")  # there may be no screen
+                save_figures(experiment, folder)
+
         experiment = run_paper_experiment(
             options.realizations,
             options.degree,
@@ -107,23 +122,22 @@ def _paper(options: argparse.Namespace) -> None:
             n_jobs=options.jobs or min(_MAX_JOBS, joblib.cpu_count()),
             memory=memory,
             verbose=1,
+            meanwhile=save,
         )
-        for name, table in experiment.tables.items():
-            table.to_csv(folder / f"{name}.csv", index=False)
-        with experiment.watch.step("figures"):
-            import matplotlib
-
-            matplotlib.use("agg")  # there may be no screen
-            figures = save_figures(experiment, folder)
-        tables = experiment.tables | {"timing": experiment.watch.table()}
-        tables["timing"].to_csv(folder / "timing.csv", index=False)
-    print(tables_text(experiment, tables))
+        _save_tables(experiment.tables, folder)
+        n_figures = len(list(folder.glob("*.png")))
+    print(tables_text(experiment))
     if told.warned:
         print(f"\n{told.text()}")
     print(
-        f"\n{len(tables)} tables (csv) and {len(figures)} figures (png) are in "
+        f"\n{len(experiment.tables)} tables (csv) and {n_figures} figures (png) are in "
         f"{options.output}/"
     )
+
+
+def _save_tables(tables: dict[str, pd.DataFrame], folder: Path) -> None:
+    for name, table in tables.items():
+        table.to_csv(folder / f"{name}.csv", index=False)
 
 
 @contextmanager

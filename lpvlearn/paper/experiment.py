@@ -6,12 +6,13 @@ realizations, local models, restructuring, interpolation, and validation on a sw
 
 from __future__ import annotations
 
-import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from joblib import Memory
 from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
@@ -21,16 +22,23 @@ from .. import (
     LocalLPVPipeline,
     LPVStateSpace,
     PolynomialLPV,
+    StateSpace,
     SubspaceLTI,
 )
 from ..datasets import make_flexible_arm
 from ..pipeline.estimator import Stopwatch
-from ..pipeline.points import balanced_entries
+from ..pipeline.points import (
+    PointRunner,
+    balanced_entries,
+    experiments_of,
+    identify_point,
+)
 from .tables import (
     ParameterSet,
     both_sweeps,
     interpolation_table,
     local_table,
+    nearest_model,
     restructuring_table,
     sweeps_table,
     validation_table,
@@ -51,8 +59,10 @@ class PaperExperiment:
     ----------
     data : Bunch
         From `make_flexible_arm`.
-    pipeline, comparison : LocalLPVPipeline
-        The method, fitted; the local models by the other subspace method.
+    pipeline : LocalLPVPipeline
+        The method, fitted.
+    comparison : list of StateSpace
+        The local models by the other subspace method, angle by angle.
     parameters : dict of str to ParameterSet
         "restructured", "analytic" and "balanced".
     lpv : dict of str to LPVStateSpace
@@ -64,12 +74,12 @@ class PaperExperiment:
     method, other_method : str
         Subspace methods of `pipeline` and `comparison`.
     watch : Stopwatch
-        Seconds of the steps; times of further steps (figures) are added to it.
+        Seconds of the steps, one after the other.
     """
 
     data: Bunch
     pipeline: LocalLPVPipeline
-    comparison: LocalLPVPipeline
+    comparison: list[StateSpace]
     parameters: dict[str, ParameterSet]
     lpv: dict[str, LPVStateSpace]
     tables: dict[str, pd.DataFrame]
@@ -89,6 +99,7 @@ def run_paper_experiment(
     n_jobs: int | None = None,
     memory: Any = None,
     verbose: int = 0,
+    meanwhile: Callable[[PaperExperiment], object] | None = None,
 ) -> PaperExperiment:
     """Run the protocol of Section 3 and tabulate it beside the published figures.
 
@@ -106,6 +117,9 @@ def run_paper_experiment(
         Folder that keeps the operating points done, as of `LocalLPVPipeline`.
     verbose : int, default=0
         1 shows progress bars, and lines of other steps that take long.
+    meanwhile : function, default=None
+        Called with the experiment, without `comparison` and what follows from it, while
+        other processes (`n_jobs`) are at work on that.
 
     Returns
     -------
@@ -134,16 +148,19 @@ def run_paper_experiment(
     ).fit(data.X, data.y)
     watch.seconds |= pipeline.step_times_
     other = "pi-moesp" if method == "po-moesp" else "po-moesp"
-    # whose interpolation is of no interest, nor is what is told of it
-    compared = f"local models by {other}, for comparison"
-    with watch.step(compared, bar=True), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        comparison = LocalLPVPipeline(
-            SubspaceLTI(data.structure.order, method=other, **_LOCAL),
-            "passthrough",
-            PolynomialLPV(degree),
-            **roles,
-        ).fit(data.X, data.y)
+    runner = PointRunner(n_jobs, verbose, "raise", Memory(memory, verbose=0))
+    compared = runner.start(
+        f"local models by {other}",
+        identify_point,
+        [
+            (SubspaceLTI(data.structure.order, method=other, **_LOCAL), runs)
+            for runs in _experiments(data)
+        ],
+        data.operating_points[:, None],
+        sampling_time=data.sampling_time,
+        combine=roles["combine"],
+        discretization=pipeline.discretization,
+    )
     with watch.step("validation"):
         kappa = pipeline.operating_points_
         analytic = [data.arm.parameters(np.arccos(k)) for k in kappa[:, 0]]
@@ -157,19 +174,18 @@ def run_paper_experiment(
             name: _interpolated(found, kappa, degree)
             for name, found in parameters.items()
         }
+        models = [nearest_model(pipeline, k) for k in data.operating_points]
         tables = {
-            "table1": local_table(pipeline, data),
-            "table1_other": local_table(comparison, data),
+            "table1": local_table(models, data),
             "table2": restructuring_table(pipeline, data),
             "table3": interpolation_table(parameters, kappa),
             "table4": validation_table(lpv, data),
             "momentum": sweeps_table(_of_momenta(pipeline, data), both_sweeps(data)),
         }
-    tables["timing"] = watch.table()
-    return PaperExperiment(
+    experiment = PaperExperiment(
         data,
         pipeline,
-        comparison,
+        [],
         parameters,
         lpv,
         tables,
@@ -179,6 +195,25 @@ def run_paper_experiment(
         other,
         watch,
     )
+    if meanwhile is not None:
+        meanwhile(experiment)
+    waiting = f"local models by {other}, beyond the time of the two before"
+    with watch.step(waiting, bar=True):
+        comparison = [done.result.lti for done in compared() if done is not None]
+    tables["table1_other"] = local_table(comparison, data)
+    tables["timing"] = watch.table()
+    return replace(experiment, comparison=comparison)
+
+
+def _experiments(data: Bunch) -> list[Any]:
+    """The experiments at every angle."""
+    n_samples = np.count_nonzero(data.X["experiment"] == 0)
+    shape = (len(data.theta2), -1, n_samples, 2)
+    u, y = data.X[["u1", "u2"]].to_numpy(), data.y.to_numpy()
+    return [
+        experiments_of(*pair, data.sampling_time)
+        for pair in zip(u.reshape(shape), y.reshape(shape), strict=True)
+    ]
 
 
 def _interpolated(found: ParameterSet, kappa: Array, degree: int) -> LPVStateSpace:

@@ -9,22 +9,9 @@ import pandas as pd
 from .experiment import PaperExperiment
 
 
-def tables_text(
-    experiment: PaperExperiment, tables: dict[str, pd.DataFrame] | None = None
-) -> str:
-    """The tables of the paper as text, ours beside the published ones.
-
-    Parameters
-    ----------
-    experiment : PaperExperiment
-    tables : dict of str to DataFrame, default=None
-        None: those of the experiment.
-
-    Returns
-    -------
-    str
-    """
-    tables = experiment.tables if tables is None else tables
+def tables_text(experiment: PaperExperiment) -> str:
+    """The tables of the paper as text, ours beside the published ones."""
+    tables = experiment.tables
     n_points = len(experiment.data.theta2)
     angles = [f"{i + 1} pi/{n_points + 1}" for i in range(n_points)]
     n = experiment.n_realizations

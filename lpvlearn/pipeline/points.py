@@ -210,6 +210,15 @@ def identify_point(
     )
 
 
+def experiments_of(u: Array, y: Array, sampling_time: float) -> list[Experiment]:
+    """Experiments of one length, (n_experiments, n_samples, n_channels) each."""
+    rows = np.arange(u.shape[1])
+    return [
+        Experiment(k, rows, *pair, sampling_time=sampling_time)
+        for k, pair in enumerate(zip(u, y, strict=True))
+    ]
+
+
 def _integrates(local: Any) -> bool:
     """Whether an estimator identifies the rates of outputs, and integrates them."""
     return getattr(local, "integrating", None) is not None
@@ -852,17 +861,40 @@ class PointRunner:
         A failure names the point (by `kappa`), unless another one fails in the same
         words: the cause is an option then.
         """
+        return self.start(what, function, arguments, kappa, **shared)()
+
+    def start(
+        self,
+        what: str,
+        function: Callable[..., Any],
+        arguments: Sequence[tuple[Any, ...]],
+        kappa: Array,
+        **shared: Any,
+    ) -> Callable[[], list[Done | None]]:
+        """As `run`, whose results a call of what is returned waits for.
+
+        Other processes are at work in the meantime.
+        """
         kept = self._remembered(function)
         stop = self.on_error == "raise"
         tasks = (
             delayed(_attempt)(kept, args, shared, k if stop else None)
             for k, args in enumerate(arguments)
         )
-        results: Any = results_of(tasks, self.n_jobs)
+        results = results_of(tasks, self.n_jobs)
+
+        def again(k: int) -> Any:
+            return _attempt(kept, arguments[k], shared, None)
+
+        return lambda: self._wait(results, what, kappa, again)
+
+    def _wait(
+        self, results: Any, what: str, kappa: Array, again: Callable[[int], Any]
+    ) -> list[Done | None]:
         if self.verbose:
             from tqdm import tqdm  # slow to import
 
-            results = tqdm(results, desc=what, total=len(arguments))
+            results = tqdm(results, desc=what, total=len(kappa))
         found: list[Done | _Failure] = []
         try:
             found.extend(results)
@@ -872,7 +904,7 @@ class PointRunner:
                 results.close()  # or the warnings would stand in the bar's line
             _tell([*_done(found[:k]), Done(None, told)], kappa)
             # The point, or an option? A neighbour (the last for the first) tells.
-            other = _attempt(kept, arguments[k - 1], shared, None)
+            other = again(k - 1)
             if isinstance(other, _Failure) and other.text == str(error):
                 raise ValueError(str(error)) from error
             skip = "" if "on_error" in str(error) else _SKIP

@@ -28,11 +28,16 @@ _KILLED = (
 def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
     """Results of tasks in their order, as they come, from `n_jobs` processes.
 
-    Raises a RuntimeError where one of them is killed from outside.
+    These are at work from now on. Raises a RuntimeError where one of them is killed
+    from outside.
     """
     watched = (delayed(_in_worker)(os.getpid(), *task) for task in tasks)
+    return _guarded(Parallel(n_jobs=n_jobs, return_as="generator")(watched))
+
+
+def _guarded(results: Iterator[Any]) -> Iterator[Any]:
     try:
-        yield from Parallel(n_jobs=n_jobs, return_as="generator")(watched)
+        yield from results
     except BrokenProcessPool as error:
         raise RuntimeError(_KILLED) from error
 
