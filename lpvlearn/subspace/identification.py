@@ -170,17 +170,18 @@ def centred(pairs: Pairs, n_trend: int, initial_states: bool) -> tuple[Pairs, Ce
 
     A model with trends (and initial states, for inputs) of its own is not changed.
     """
-    moved, levels, trends = [], [], []
-    for u, y in pairs:
+    n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
+    moved: Pairs = []
+    levels = np.zeros((len(pairs), n_inputs))
+    trends = np.zeros((len(pairs), n_trend, n_outputs))
+    for k, (u, y) in enumerate(pairs if n_trend else []):
         signals = trend_signals(len(u), n_trend).T
-        trend = linalg.lstsq(signals, y)[0] if n_trend else np.zeros((0, y.shape[1]))
-        level = u.mean(axis=0)
-        far = n_trend > 0 and initial_states
-        level = np.where(far & (np.abs(level) > _FAR * u.std(axis=0)), level, 0.0)
-        moved.append((u - level, y - signals @ trend) if n_trend else (u, y))
-        levels.append(level)
-        trends.append(trend)
-    return moved, Centres(np.array(levels), np.array(trends))
+        trends[k] = linalg.lstsq(signals, y)[0]
+        if initial_states:
+            level = u.mean(axis=0)
+            levels[k] = np.where(np.abs(level) > _FAR * u.std(axis=0), level, 0.0)
+        moved.append((u - levels[k], y - signals @ trends[k]))
+    return moved or pairs, Centres(levels, trends)
 
 
 def subspaces_of(
