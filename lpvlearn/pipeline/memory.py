@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from joblib import hash
 
 from ..exceptions import warn
 
@@ -90,6 +89,14 @@ class _Kept(NamedTuple):
     key: str
     result: Any
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # As bytes: joblib's own way with many small arrays is slow.
+        return _kept, (self.key, pickle.dumps(self.result, pickle.HIGHEST_PROTOCOL))
+
+
+def _kept(key: str, data: bytes) -> _Kept:
+    return _Kept(key, pickle.loads(data))
+
 
 class _Unknown(Exception):
     """Names code that cannot be told from another version of itself."""
@@ -120,39 +127,48 @@ def _library() -> bytes:
 
 def _parts(value: Any, seen: set[int]) -> Iterator[str]:
     """What tells a value: its data, and all code within it that is not `seen` yet."""
-    finder = _CodeFinder()
+    values = _Values()
     try:
-        finder.dump(value)
-        if not isinstance(value, FunctionType | type):
-            yield str(hash(value, coerce_mmap=True))
+        try:
+            values.dump(value)
+        except ValueError:  # parts that hold each other
+            values = _Values(fast=False)
+            values.dump(value)
     except Exception as error:  # an object that is no data may raise anything
         raise _Unknown(f"{value!r} ({error})") from error
-    for code in finder.found:
+    yield values.digest.hexdigest()
+    for code in values.found:
         yield from _code_parts(code, seen)
 
 
-class _CodeFinder(pickle.Pickler):
-    """Finds functions and classes within an object, which a pickle has by name."""
+class _Values(pickle.Pickler):
+    """A digest of an object's values, and the functions and classes within.
 
-    def __init__(self) -> None:
-        super().__init__(_Nowhere())
+    Equal values give equal digests, however they are laid out in memory, and if `fast`
+    whether or not parts of them are one object.
+    """
+
+    def __init__(self, fast: bool = True) -> None:
+        self.digest = hashlib.blake2b(digest_size=16)
         self.found: list[Any] = []
+        super().__init__(self, pickle.HIGHEST_PROTOCOL)
+        self.fast = fast  # writes what comes again, again
 
-    def persistent_id(self, obj: Any) -> str | None:
-        """That of what need not be looked into, code and numbers."""
+    def write(self, data: bytes) -> None:
+        """What is pickled, as a file takes it."""
+        self.digest.update(data)
+
+    def persistent_id(self, obj: Any) -> Any:
+        """What stands for code, arrays of numbers, and sets; None for the rest."""
         if isinstance(obj, FunctionType | type):
             self.found.append(obj)
-            return "code"
-        return (
-            "numbers" if isinstance(obj, np.ndarray) and obj.dtype != object else None
-        )
-
-
-class _Nowhere:
-    """A file that keeps nothing."""
-
-    def write(self, data: Any) -> int:
-        return len(data)
+            return f"{obj.__module__}.{obj.__qualname__}"
+        if type(obj) in (np.ndarray, np.memmap) and not obj.dtype.hasobject:
+            data = hashlib.blake2b(obj.tobytes(), digest_size=16).digest()
+            return str(obj.dtype.descr), obj.shape, data
+        if isinstance(obj, set | frozenset):  # whose order is one of a process
+            return type(obj).__name__, sorted(map(fingerprint, obj))
+        return None
 
 
 def _code_parts(code: Any, seen: set[int]) -> Iterator[str]:
@@ -216,7 +232,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 def _source_of(module: ModuleType) -> str:
     try:
-        return str(hash(Path(str(module.__file__)).read_bytes()))
+        return hashlib.blake2b(Path(str(module.__file__)).read_bytes()).hexdigest()
     except (AttributeError, OSError) as error:
         raise _Unknown(f"the module {module.__name__!r} ({error})") from error
 

@@ -256,3 +256,17 @@ def matrices(theta):
         found.append(pipeline.fit(X, y).parameters_.to_numpy())
     np.testing.assert_allclose(found[1] / found[0], [[2, 1, 1]] * 2, rtol=1e-5)
     np.testing.assert_array_equal(found[0], found[2])
+
+
+def test_equal_values_have_one_fingerprint():
+    """However they lie in memory, are shared, ordered in a set, or hold each other."""
+    x = np.arange(6.0).reshape(2, 3)
+    assert fingerprint(x) == fingerprint(np.asfortranarray(x)) != fingerprint(x.T)
+    assert fingerprint([x, x]) == fingerprint([x, x.copy()])
+    assert fingerprint({"b", "a"}) == fingerprint({"a", "b"}) != fingerprint({"a"})
+    assert fingerprint(x) != fingerprint(x.astype(np.float32))
+    rings = [[1], [1], [2]]
+    for ring in rings:
+        ring.append(ring)
+    first, same, other = map(fingerprint, rings)
+    assert first == same != other
