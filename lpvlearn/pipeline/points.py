@@ -544,15 +544,7 @@ def restructure_points(
     weighed = getattr(restructurer, "norm", None) in ("hinf", "covariance")
     weighed = weighed and restructurer.frequency_weight is None
     tasks: list[_Task] = [
-        (
-            _plain(model.lti),
-            [_plain(other) for other in model.realizations],
-            [
-                (_plain(one), [(_plain(a), _plain(b)) for a, b in pairs])
-                for one, pairs in model.estimates
-                if weighed
-            ],
-        )
+        (model.lti, model.realizations, model.estimates if weighed else [])
         for model in local
     ]
     found = runner.run(
@@ -627,7 +619,7 @@ def _covariance(fitted: Any, model: LocalModel, runner: PointRunner) -> Array | 
             fitted.structure_,
             fitted.params_,
             getattr(fitted, "frequency_weight", None),
-            _plain(model.lti),
+            model.lti,
             model.deviated,
         )
     return known
@@ -795,12 +787,6 @@ def covariance_of_parameters(
     changes = [response(above) - response(below) for above, below in deviated]
     T = problem.parameter_changes(theta, np.array(changes)) / (2.0 * DEVIATION)
     return T.T @ T
-
-
-def _plain(model: StateSpace) -> StateSpace:
-    """The model with matrices laid out as a memory returns them, to be found there."""
-    A, B, C, D = (np.array(M, order="C") for M in (model.A, model.B, model.C, model.D))
-    return StateSpace(A, B, C, D, model.sampling_time, model.input_delay.copy())
 
 
 def balanced_entries(
