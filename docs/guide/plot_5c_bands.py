@@ -19,6 +19,8 @@ A simulation may be wrong for two reasons, which are told apart:
 # momenta (see :ref:`guide_state_basis`), and the same refined on two sweeps with noise
 # (see :ref:`guide_refinement`):
 
+import tempfile
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -59,6 +61,7 @@ steps = {
     "scheduling": "kappa",
     "experiment": "experiment",
     "time": "time",
+    "memory": tempfile.mkdtemp(),  # both begin with the same local models
 }
 local = LocalLPVPipeline(**steps).fit(data.X, data.y)
 refined = LocalLPVPipeline(refiner=OutputErrorLPV(), **steps).fit(X, y)

@@ -49,6 +49,7 @@ model = LocalLPVPipeline(
     GrayBoxRestructurer(spring),
     PolynomialLPV(degree=2),
     time="time",
+    memory=tempfile.mkdtemp(),  # splits share points, which are identified once
     **roles,
 )
 X.head(3)
@@ -149,7 +150,7 @@ print(cross_val_score(model, X, y, cv=ExperimentSplit(2, **roles), n_jobs=2).rou
 from sklearn.model_selection import GridSearchCV
 
 search = GridSearchCV(
-    model.set_params(memory=tempfile.mkdtemp()),
+    model,
     {
         "local__horizon": [6, 10],
         "restructurer__norm": ["hinf", "h2"],
