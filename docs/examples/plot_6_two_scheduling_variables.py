@@ -49,6 +49,8 @@ X.groupby("experiment").first().head(4)
 # Total degree 2: six terms (1, load, charge, load\ :sup:`2`, load x charge,
 # charge\ :sup:`2`) for twelve points.
 
+import tempfile
+
 from lpvlearn import GrayBoxRestructurer, LocalLPVPipeline, PolynomialLPV, SubspaceLTI
 
 model = LocalLPVPipeline(
@@ -58,6 +60,7 @@ model = LocalLPVPipeline(
     scheduling=["load", "charge"],
     experiment="experiment",
     time="time",
+    memory=tempfile.mkdtemp(),  # for another interpolator, below
 ).fit(X, y)
 model.parameters_.round(3)
 

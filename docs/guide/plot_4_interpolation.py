@@ -19,7 +19,10 @@ these tell which form may be true.
 """
 
 # %%
-# The whole method up to here is a pipeline of three estimators:
+# The whole method up to here is a pipeline of three estimators. Its ``memory`` keeps
+# what the first two found: another interpolator is a matter of a second.
+
+import tempfile
 
 from lpvlearn import (
     GrayBoxRestructurer,
@@ -35,6 +38,7 @@ pipeline = LocalLPVPipeline(
     local=SubspaceLTI(horizon=60, feedthrough=False),
     restructurer=GrayBoxRestructurer(data.structure),
     interpolator=PolynomialLPV(degree=2),
+    memory=tempfile.mkdtemp(),
     **roles,
 )
 pipeline.fit(data.X, data.y)

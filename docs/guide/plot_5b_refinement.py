@@ -24,6 +24,8 @@ local experiments know of the coefficients, their information :math:`\Lambda`.
 # Local experiments on the flexible arm, in the state of coordinates and rates (see
 # :ref:`guide_state_basis`: it leaves a term with the rate of the elbow out)...
 
+import tempfile
+
 import numpy as np
 import pandas as pd
 
@@ -62,10 +64,12 @@ y = pd.concat([data.y, y_moving], ignore_index=True)
 # refine:
 
 roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+memory = tempfile.mkdtemp()  # the local models are those of the next fit, too
 pipeline = LocalLPVPipeline(
     SubspaceLTI(6, feedthrough=False, horizon=60),
     GrayBoxRestructurer(data.structure),
     refiner=OutputErrorLPV(),
+    memory=memory,
     **roles,
 ).fit(X, y)
 pipeline.refiner_.report_.round(1)
@@ -76,6 +80,7 @@ pipeline.refiner_.report_.round(1)
 local = LocalLPVPipeline(
     SubspaceLTI(6, feedthrough=False, horizon=60),
     GrayBoxRestructurer(data.structure),
+    memory=memory,
     **roles,
 ).fit(data.X, data.y)
 pd.concat(
