@@ -1,0 +1,80 @@
+r"""
+.. _how_to_large:
+
+More data than memory, more than one machine
+============================================
+
+A log of weeks does not fit into memory, and a search over options may want more than one
+computer. Neither needs another model, and neither changes its figures.
+"""
+
+# %%
+# Batches of a stream
+# -------------------
+# :meth:`SubspaceLTI.fit_batches <lpvlearn.SubspaceLTI.fit_batches>` takes what yields
+# tables: a generator, a database, a folder of files. One of them is held at a time.
+
+import numpy as np
+
+from lpvlearn import LocalLPVPipeline, StateSpace, SubspaceLTI
+from lpvlearn.datasets import load_varying_spring
+
+truth = StateSpace([[0.9, 0.3], [-0.3, 0.9]], [[1], [0]], [[1, 0]], None, 1.0)
+
+
+def batches():
+    rng = np.random.default_rng(0)
+    for run in range(4):
+        u = rng.standard_normal((1000, 1))
+        X = np.column_stack([u, np.full(1000, run)])
+        yield X, truth.simulate(u) + 0.01 * rng.standard_normal((1000, 1))
+
+
+local = SubspaceLTI(2, inputs=[0], experiment=1).fit_batches(batches())
+local.lti_.poles().round(3)
+
+# %%
+# A data set on the disk
+# ----------------------
+# :meth:`LocalLPVPipeline.fit_dataset <lpvlearn.LocalLPVPipeline.fit_dataset>` reads
+# parquet files, or a folder of them, experiment by experiment; it wants pyarrow
+# (``pip install "lpvlearn[tables]"``). The rows of an experiment follow each other, in the
+# order of time; the other columns keep their roles. What `fit` finds in the whole table, it
+# finds too. Memory is that of the largest operating point.
+
+import tempfile
+from importlib.util import find_spec
+from pathlib import Path
+
+spring = load_varying_spring()
+roles = {"scheduling": "kappa", "experiment": "run", "time": "time"}
+pipeline = LocalLPVPipeline(restructurer="passthrough", **roles)
+whole = pipeline.fit(spring.X, spring.y).parameters_
+
+if find_spec("pyarrow"):
+    with tempfile.TemporaryDirectory() as folder:
+        outputs = list(spring.y.columns)
+        path = Path(folder) / "spring.parquet"
+        spring.X.join(spring.y).to_parquet(path)
+        found = pipeline.fit_dataset(path, outputs).parameters_
+    print(np.array_equal(found, whole))
+
+# %%
+# Many machines
+# -------------
+# Whatever takes `n_jobs` runs on joblib's backends, so on a cluster of dask
+# (``pip install "lpvlearn[dask]"``)::
+#
+#     from dask.distributed import Client
+#     from joblib import parallel_config
+#
+#     client = Client("scheduler:8786")
+#     with parallel_config(backend="dask"):
+#         pipeline.set_params(n_jobs=8).fit(X, y)
+#     with parallel_config(backend="dask", scatter=[X, y]):  # the table, sent once
+#         search.fit(X, y)
+#
+# The figures are those of one process, to the bit. A worker that dies under
+# `LocalLPVPipeline.fit` costs its points anew; under a search joblib and dask lose what that
+# worker alone held, and the search ends with their error: give `n_jobs` to the pipeline, or
+# run it again with `memory`, which keeps what was finished.
