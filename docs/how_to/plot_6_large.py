@@ -4,8 +4,8 @@ r"""
 More data than memory, more than one machine
 ============================================
 
-A log of weeks does not fit into memory, and a search over options may want more than one
-computer. Neither needs another model, and neither changes its figures.
+A log of weeks does not fit into memory, and a search over options may want more than
+one computer. Neither needs another model, and neither changes its figures.
 """
 
 # %%
@@ -38,9 +38,9 @@ local.lti_.poles().round(3)
 # ----------------------
 # :meth:`LocalLPVPipeline.fit_dataset <lpvlearn.LocalLPVPipeline.fit_dataset>` reads
 # parquet files, or a folder of them, experiment by experiment; it wants pyarrow
-# (``pip install "lpvlearn[tables]"``). The rows of an experiment follow each other, in the
-# order of time; the other columns keep their roles. What `fit` finds in the whole table, it
-# finds too. Memory is that of the largest operating point.
+# (``pip install "lpvlearn[tables]"``). The rows of an experiment follow each other, in
+# the order of time; the other columns keep their roles. What `fit` finds in the whole
+# table, it finds too. Memory is that of the largest operating point.
 
 import tempfile
 from importlib.util import find_spec
@@ -75,6 +75,6 @@ if find_spec("pyarrow"):
 #         search.fit(X, y)
 #
 # The figures are those of one process, to the bit. A worker that dies under
-# `LocalLPVPipeline.fit` costs its points anew; under a search joblib and dask lose what that
-# worker alone held, and the search ends with their error: give `n_jobs` to the pipeline, or
-# run it again with `memory`, which keeps what was finished.
+# `LocalLPVPipeline.fit` costs its points anew; under a search joblib and dask lose what
+# that worker alone held, and the search ends with their error: give `n_jobs` to the
+# pipeline, or run it again with `memory`, which keeps what was finished.
