@@ -12,7 +12,7 @@ from pathlib import Path
 import joblib
 import pandas as pd
 
-from .command import add_commands
+from .command import __version__, add_commands
 from .command.ending import status_of
 from .command.judgement import course
 from .command.output import whole_folder
@@ -25,6 +25,8 @@ from .paper import (
 
 _MAX_JOBS = 7  # one for each operating point of the paper
 
+_ABOUT = ("-h", "--help", "--version")  # of the command, not of the paper's
+
 _PAPER = (
     "The flexible-arm experiment of the paper: Tables 1-4 beside the published ones, "
     "and Figures 2-10."
@@ -34,12 +36,15 @@ _PAPER = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if not given or (given[0].startswith("-") and given[0] not in ("-h", "--help")):
+    if not given or (given[0].startswith("-") and given[0] not in _ABOUT):
         given.insert(0, "paper")
     parser = argparse.ArgumentParser(
         prog="lpvlearn",
         description="Local linear parameter-varying (LPV) identification.",
         epilog="Without a word it is paper. 'lpvlearn fit --help' shows examples.",
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"%(prog)s {__version__}"
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     add_commands(commands)

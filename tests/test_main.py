@@ -2,6 +2,7 @@
 
 import pytest
 
+import lpvlearn
 from lpvlearn import __main__ as command
 from lpvlearn.__main__ import main
 
@@ -38,3 +39,10 @@ def test_other_words_are_refused(capsys):
         main(["identify"])
     assert end.value.code == 2
     assert "invalid choice: 'identify'" in capsys.readouterr().err
+
+
+def test_the_version_is_told(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"lpvlearn {lpvlearn.__version__}\n"
