@@ -2,9 +2,11 @@
 
 Each experiment is cut into pieces of equal length, and every piece but the first is
 held out once: the model is fitted again without it, from where it was, and simulated
-through it from the state (and the constant) that the samples before tell. What a
-likelihood says rests on its noise model being right; this does not, and so has the last
-word where a system is not quite what the models can be.
+through it from the state (and the constant) that suits it best. Those that the samples
+before tell would be no measure of a model: what moves a system besides its inputs adds
+up behind an integrator. What a likelihood says rests on its noise model being right;
+this does not, and so has the last word where a system is not quite what the models can
+be.
 """
 
 from __future__ import annotations
@@ -84,18 +86,22 @@ def held_out(
         for record, (start, stop) in zip(records, cuts, strict=True):
             if start == stop:
                 continue
-            u, y = record.u.T[:stop], record.y.T[:stop]
+            begin = 0 if at_rest else start
+            u, y = record.u.T[begin:stop], record.y.T[start:stop]
             with np.errstate(over="ignore", invalid="ignore"):
-                error = y - lti_response(model.A, model.B, model.C, model.D, u)
+                answer = lti_response(model.A, model.B, model.C, model.D, u)
+                error = y - answer[start - begin :]
                 if len(record.trend) or not at_rest:
-                    trend = record.trend[:, :stop]
-                    free = free_responses(model.A, W @ model.C, stop, trend)
-                    free = free[:, :, len(model.A) * at_rest :]
-                    own = estimate_initial_state(free[:start], error[:start] @ W.T)
+                    trend = record.trend[:, begin:stop]
+                    free = free_responses(model.A, W @ model.C, stop - begin, trend)
+                    free = free[start - begin :, :, len(model.A) * at_rest :]
+                    own = estimate_initial_state(free, error @ W.T)
                     error = error - np.linalg.solve(W, (free @ own).T).T
-            error = error[start:]
+                    # What these unknowns take of the noise is made up for.
+                    spare = error.size - own.size
+                    error *= np.sqrt(error.size / spare) if spare > 0 else np.nan
             errors.append(error)
-            outputs.append(y[start:])
+            outputs.append(y)
             with np.errstate(over="ignore", invalid="ignore"):
                 parts = np.array_split(error, min(_N_BLOCKS, len(error)))
                 blocks += [float((part**2).sum()) for part in parts]

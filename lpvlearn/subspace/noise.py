@@ -33,6 +33,10 @@ Array = NDArray[np.float64]
 # Lags that are allowed for by the number of samples: 10 log10(n), a customary limit.
 _LAGS_PER_DECADE = 10.0
 
+# Part of an experiment over which its errors rise from zero and fall to it: noise of
+# long memory that ends abruptly looks like noise with jumps (Dahlhaus, 1988).
+_TAPERED = 0.2
+
 _PATIENCE = 12  # lags beyond the best number that are looked at
 
 _MAX_CONDITION = 1e8  # of eigenvectors, which would lose half of the spectrum's digits
@@ -205,10 +209,13 @@ def autoregression(
         allowed = min(allowed, highest)
     highest = max(0, min(int(_LAGS_PER_DECADE * np.log10(n_samples)), allowed))
     lags = np.zeros((highest + 1, ny, ny))
+    weight = 0.0
     for v in errors:
         known = min(len(v), highest + 1)
-        lags[:known] += correlation_sequence(v, known)
-    lags /= n_samples
+        taper = scipy.signal.windows.tukey(len(v) + 2, _TAPERED)[1:-1, None]
+        lags[:known] += correlation_sequence(taper * v, known)
+        weight += float((taper**2).sum())
+    lags /= weight
     # Channels of very different size must not spoil the determinants.
     scale = np.sqrt(np.maximum(np.diagonal(lags[0]), 0.0))
     scale[scale == 0.0] = 1.0

@@ -33,12 +33,12 @@ from ..systems.least_squares import column_scale
 from ..systems.simulation import lti_response, trend_signals
 from .identification import Centres
 from .noise import autoregression, spectral_density
+from .selection import criterion_of
 from .signals import Record, signal_factor
 from .simulation_fit import (
     in_sections,
     jacobian_regression,
     project_out,
-    simulation_errors,
 )
 from .statistics import Evidence
 
@@ -63,10 +63,6 @@ _RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refi
 _ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
 _FAR = 10.0  # standard deviations between the mean of a channel and zero
 _SLOW = 3.0  # time constants per experiment of a mode that may stand for a constant
-
-# A model with constants, perhaps of a lower order, whose squared errors are larger by
-# this factor leaves out more than constants explain.
-_AS_GOOD = 1.05
 
 
 class Offsets(NamedTuple):
@@ -138,12 +134,12 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
 def may_have_constants(evidence: Evidence) -> bool:
     """Whether a model without constants should be tried with them.
 
-    They show in its errors, or a slow mode that the inputs hardly reach stands for
-    them; where a channel is far from zero, nothing but its mean may have been fitted.
+    They show in its errors, or a slow mode may stand for them; where a channel is far
+    from zero, nothing but its mean may have been fitted.
     """
     if _is_far([np.vstack((r.u, r.y)) for r in evidence.records]):
         return True
-    return _has_idle_mode(evidence) or chance_of_constants(evidence) < _SUSPICIOUS
+    return _has_slow_mode(evidence) or chance_of_constants(evidence) < _SUSPICIOUS
 
 
 def _is_far(parts: Sequence[Array]) -> bool:
@@ -154,40 +150,31 @@ def _is_far(parts: Sequence[Array]) -> bool:
 
 
 def constants_matter(without: Evidence, other: Evidence) -> bool:
-    """Whether the model with constants, `other`, is to be preferred."""
-    ratio = _error_energies(other) / _error_energies(without)
-    as_good = np.exp(np.log(ratio).mean()) <= _AS_GOOD
-    return bool(as_good) and chance_of_constants(other) < _SIGNIFICANT
+    """Whether the model with constants, `other`, is to be preferred.
 
-
-def _error_energies(evidence: Evidence) -> Array:
-    """Of every output, in its units; what is rounding counts as the same."""
-    errors = np.vstack(simulation_errors(evidence.model, evidence.records))
-    total = (errors**2).sum(axis=0) + len(errors) * _ROUNDING**2
-    return total * evidence.output_scale**2
-
-
-def _has_idle_mode(evidence: Evidence) -> bool:
-    """Whether a slow mode moves by its initial state more than by the inputs."""
-    model, records = evidence.model, evidence.records
-    if not model.A.size:
+    By the criterion of the orders. That takes a constant by chance now and then, and is
+    enough where fewer states are left: some of them stood for constants, or for what
+    an offset of the inputs is behind an integrator.
+    """
+    if not _criterion(other) < _criterion(without):
         return False
-    longest = max(record.u.shape[1] for record in records)
-    poles, left, _ = linalg.eig(model.A, left=True)
-    for pole, w in zip(poles, left.T.conj(), strict=True):
-        if abs(1.0 - pole) * longest > _SLOW or pole.imag < 0.0:
-            continue
-        step = np.array([[pole.real, -pole.imag], [pole.imag, pole.real]])
-        B = np.array([(w @ model.B).real, (w @ model.B).imag])
-        eye, none = np.eye(2), np.zeros((2, B.shape[1]))
-        free = forced = 0.0
-        for record, x0 in zip(records, model.initial_states, strict=True):
-            start, u = np.array([(w @ x0).real, (w @ x0).imag]), record.u.T
-            free += (lti_response(step, none, eye, none, u, start) ** 2).sum()
-            forced += (lti_response(step, B, eye, none, u) ** 2).sum()
-        if free > forced:
-            return True
-    return False
+    fewer = len(other.model.A) < len(without.model.A)
+    return fewer or chance_of_constants(other) < _SIGNIFICANT
+
+
+def _criterion(evidence: Evidence) -> float:
+    """That of the orders, of outputs in their units."""
+    records = evidence.records
+    n_samples = sum(record.u.shape[1] for record in records)
+    units = 2.0 * n_samples * float(np.log(evidence.output_scale).sum())
+    return units + criterion_of(evidence.model, records, evidence.free)
+
+
+def _has_slow_mode(evidence: Evidence) -> bool:
+    """Whether a mode decays, or grows, too slowly to be told from a constant."""
+    longest = max(record.u.shape[1] for record in evidence.records)
+    rates = 1.0 - np.linalg.eigvals(evidence.model.A).real
+    return bool((rates * longest <= _SLOW).any())
 
 
 def chance_of_constants(evidence: Evidence, *, equal: bool = False) -> float:

@@ -41,6 +41,7 @@ from .realization import ObservabilitySubspace
 from .refinement import MAX_ITER, refine_simulation
 from .signals import Record, output_energy, thinned
 from .simulation_fit import (
+    Freedom,
     Realization,
     simulation_errors,
     simulation_fit,
@@ -385,7 +386,7 @@ def _try_orders(
             other = _with_more_states(tried[-1].model, records, settings)
             if other is not None and other.loss < model.loss:
                 model = other
-        criterion = _criterion(model, records, settings)
+        criterion = criterion_of(model, records, settings.free)
         tried.append(_Tried(order, horizon, model, criterion, starts))
         stale = 0 if criterion < best else stale + 1
         best = min(best, criterion)
@@ -394,21 +395,19 @@ def _try_orders(
     return tried
 
 
-def _criterion(
-    model: Realization, records: Sequence[Record], settings: Settings
-) -> float:
-    """Likelihood and number of parameters of a model of whitened records.
+def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -> float:
+    """Likelihood and number of parameters of a model of records, whitened or not.
 
     Minus twice the logarithm of the likelihood, and the price of the parameters with
     the correction that a ratio of sums of squares in few samples needs. The errors that
     a model leaves tell the noise of every output anew: by that of the model before,
     states that follow slow noise would prove themselves right.
     """
-    n, (ny, m) = len(model.A), settings.free.direct.shape
+    n, (ny, m) = len(model.A), free.direct.shape
     n_values = sum(record.y.size for record in records)
     n_samples = n_values // ny
-    own = len(model.initial_states) * settings.free.n_own(n)
-    n_parameters = n * (m + ny) + int(settings.free.direct.sum()) + own
+    own = len(model.initial_states) * free.n_own(n)
+    n_parameters = n * (m + ny) + int(free.direct.sum()) + own
     few = n_values / max(n_values - n_parameters, 1)
     if not np.isfinite(model.loss):
         return np.inf
