@@ -385,6 +385,10 @@ def _heed(
             )
             none = np.zeros_like(direct)
             settings = settings._replace(free=settings.free._replace(direct=none))
+        what += (
+            " A model that is only to simulate records of the same loop may do so "
+            "better by method='po-moesp'."
+        )
     tell(told, "feedback", what)
     return settings
 

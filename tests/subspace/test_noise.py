@@ -37,6 +37,16 @@ def test_autoregression_recovers_a_vector_process():
     assert abs(np.linalg.eigvals(model.A - model.K @ model.C)).max() < 1e-9
 
 
+def test_noise_of_long_memory_does_not_begin_with_a_jump():
+    """Nor end with one: the variance of the innovations (1) would be 1.7."""
+    logs = []
+    for seed in range(20):
+        e = np.random.default_rng(seed).standard_normal((2400, 1))
+        v = lfilter([1.0], [1.0, -0.998], e, axis=0)[2000:]
+        logs.append(np.log(autoregression([v]).covariance[0, 0]))
+    assert abs(np.mean(logs)) < 0.1 and np.std(logs) < 0.15
+
+
 def test_white_and_vanishing_errors_have_no_noise_states():
     white = np.random.default_rng(0).standard_normal((3000, 2))
     assert len(autoregression([white]).A) == 0

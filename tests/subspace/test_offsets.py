@@ -143,6 +143,19 @@ def test_a_gain_has_a_constant(rng):
     np.testing.assert_allclose(model.predict(u), 3.0 * u + 2.0)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_constant_is_cheaper_than_an_integrator(seed):
+    """In slow noise a pole at one follows that as well, and simulates nothing."""
+    rng = np.random.default_rng(seed)
+    u = lfilter([0.3], [1.0, -0.95], rng.standard_normal((300, 1)), axis=0)
+    e = 0.06 * rng.standard_normal((800, 1))
+    v = lfilter([1.0], [1.0, -1.6, 0.62], e, axis=0)[500:]
+    y = 50.0 + lfilter([0.0, 0.0, -0.4, -0.2], [1.0, -1.0, 0.3], u, axis=0) + v
+    model = SubspaceLTI().fit(u, y)
+    assert model.offset_ == "constant" and model.order_ == 3
+    assert np.abs(model.lti_.poles()).max() < 0.9
+
+
 def test_detrending_may_be_followed_by_constants(rng):
     """What transients add to the mean is an error without them."""
     X, y = table(rng)
