@@ -113,7 +113,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch)
     def fails(*args, **kwargs):
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("lpvlearn.lpv.export.savemat", fails)
+    monkeypatch.setattr("scipy.io.savemat", fails)
     with pytest.raises(OSError, match="no space"):
         spring_lpv().to_mat(path, [0.0])
     assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
