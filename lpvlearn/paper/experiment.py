@@ -27,12 +27,9 @@ from .. import (
 )
 from ..datasets import make_flexible_arm
 from ..pipeline.estimator import Stopwatch
-from ..pipeline.points import (
-    PointRunner,
-    balanced_entries,
-    experiments_of,
-    identify_point,
-)
+from ..pipeline.local_models import experiments_of, identify_point
+from ..pipeline.runner import PointRunner
+from ..pipeline.structured_models import balanced_entries
 from .tables import (
     ParameterSet,
     both_sweeps,

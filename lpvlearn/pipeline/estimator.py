@@ -52,23 +52,18 @@ from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
 from ..validation import one_of, positive_time, units_by_name, whole_number
 from .html_report import html_report
+from .local_models import common_delay, identify_points
 from .output_error import (
     known_coefficients,
     local_covariance,
     local_output_errors,
     refine_model,
 )
-from .points import (
-    PointRunner,
-    StructuredModels,
-    common_delay,
-    identify_points,
-    offsets_of_points,
-    restructure_points,
-)
 from .reports import Summary, Tables, summarise, tables
+from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
+from .structured_models import StructuredModels, offsets_of_points, restructure_points
 
 Array = NDArray[np.float64]
 

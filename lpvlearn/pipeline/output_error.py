@@ -46,9 +46,10 @@ from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..validation import number, one_of, positive_time, whole_number
 from .bands import output_errors
-from .points import StructuredModels, balanced_entries, identify_point
+from .local_models import identify_point
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
+from .structured_models import StructuredModels, balanced_entries
 from .workers import results_of
 
 Array = NDArray[np.float64]

@@ -16,7 +16,8 @@ from ..metrics.reports import as_shown, readable_report
 from ..metrics.scores import parameter_fit
 from ..metrics.table_simulation import fit_of
 from ..restructuring.estimator import GrayBoxRestructurer
-from .points import LocalModel, StructuredModels, motions
+from .local_models import LocalModel, motions
+from .structured_models import StructuredModels
 
 Array = NDArray[np.float64]
 

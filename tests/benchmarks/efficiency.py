@@ -32,7 +32,8 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, SubspaceLTI
-from lpvlearn.pipeline.points import _average, covariance_of_parameters
+from lpvlearn.pipeline.local_models import _average
+from lpvlearn.pipeline.structured_models import covariance_of_parameters
 from lpvlearn.restructuring.minimise_covariance import efficient_parameters
 
 STRUCTURE = GrayBoxStructure.mechanical(

@@ -15,7 +15,7 @@ from joblib import Memory
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure
 from lpvlearn.pipeline.memory import fingerprint
-from lpvlearn.pipeline.points import PointRunner
+from lpvlearn.pipeline.runner import PointRunner
 
 from ..conftest import spring_pipeline, spring_structure, spring_tables
 

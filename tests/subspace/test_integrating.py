@@ -14,7 +14,7 @@ from lpvlearn import (
     SubspaceLTI,
     from_trajectories,
 )
-from lpvlearn.pipeline.points import _integrating_outputs
+from lpvlearn.pipeline.local_models import _integrating_outputs
 
 STEP = 0.02
 SERVO = GrayBoxStructure.from_template(

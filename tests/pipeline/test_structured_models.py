@@ -1,10 +1,8 @@
-"""Steps 3 and 4 at the operating points: deviations, what is kept, what fails."""
+"""Step 4 at the operating points: covariances, what is kept, time that is bounded."""
 
-import joblib
 import numpy as np
 import pandas as pd
 import pytest
-from joblib import Memory
 from scipy.optimize import least_squares
 from sklearn.exceptions import ConvergenceWarning
 
@@ -17,12 +15,9 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.exceptions import warn
-from lpvlearn.pipeline.points import (
-    LocalModel,
-    PointRunner,
+from lpvlearn.pipeline.local_models import LocalModel, identify_point
+from lpvlearn.pipeline.structured_models import (
     covariance_of_parameters,
-    identify_point,
     restructure_points,
 )
 
@@ -123,43 +118,6 @@ def test_nothing_is_claimed_where_the_covariance_is_not_known(options):
         discretization="zoh",
     )
     assert point.deviated == []
-
-
-def loop_record(seed, pole=0.9, n_samples=1500):
-    """A first-order plant with process noise, under feedback one sample late."""
-    r, e = np.random.default_rng(seed).standard_normal((2, n_samples))
-    u, y, x = np.zeros((n_samples, 1)), np.zeros((n_samples, 1)), 0.0
-    for t in range(n_samples):
-        y[t] = x + 0.5 * e[t]
-        u[t] = r[t] - (0.5 * y[t - 1] if t else 0.0)
-        x = pole * x + u[t, 0] + 0.4 * e[t]
-    return Experiment(seed, np.arange(n_samples), u, y)
-
-
-@pytest.mark.parametrize("combine", ["pool", "average"])
-def test_a_plant_in_a_loop_keeps_what_its_own_method_found(combine):
-    records = [loop_record(seed) for seed in range(2)]
-    local = SubspaceLTI(1, feedthrough=False)
-    options = {"sampling_time": STEP, "combine": combine, "discretization": "zoh"}
-    with pytest.warns(UserWarning, match="closed loop.*'pbsid' was taken"):
-        point = identify_point(local, records, efficient=True, **options)
-    n_estimates = 1 if combine == "pool" else 2
-    assert len(point.estimates) == n_estimates
-    for model, pairs in point.estimates:
-        error = np.log(0.9) / STEP - np.log(model.poles()[0].real) / STEP
-        both = [np.log([m.poles()[0].real for m in pair]) / STEP for pair in pairs]
-        std = np.sqrt(sum((a - b) ** 2 for a, b in both)) / 0.02
-        assert 0.01 < std < 0.5 and abs(error) < 3.0 * std
-
-
-def test_a_plant_that_only_its_loop_holds_is_refused_with_the_remedy():
-    options = {"sampling_time": STEP, "combine": "pool", "discretization": "zoh"}
-    local = SubspaceLTI(1, method="pbsid", feedthrough=False)
-    with (
-        pytest.warns(UserWarning, match="unstable.*controller's reference"),
-        pytest.raises(ValueError, match="must be stable.*identify the closed loop"),
-    ):
-        identify_point(local, [loop_record(0, 1.1)], **options)
 
 
 def test_a_frequency_weight_enters_the_covariance():
@@ -356,108 +314,7 @@ def test_without_a_covariance_the_hinf_optimum_is_kept():
     assert pipeline.parameters_std_.isna().all(axis=None)
 
 
-# -- the runner -----------------------------------------------------------------------
-
-
-def runner(memory, **options):
-    return PointRunner(**{"n_jobs": None, "verbose": 0, "on_error": "raise", **options},
-                       memory=memory)  # fmt: skip
-
-
-# -- failures --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("on_error", "n_jobs"),
-    [("raise", None), ("skip", None), pytest.param("raise", 2, marks=pytest.mark.slow)],
-)
-def test_a_failure_that_all_points_share_names_none(spring, on_error, n_jobs):
-    pipeline = spring_pipeline(
-        local=SubspaceLTI(order=400), on_error=on_error, n_jobs=n_jobs
-    )
-    with pytest.raises(ValueError, match="^`order` must be at most .*400"):
-        pipeline.fit(*spring[:2])
-
-
-def test_different_failures_everywhere_tell_the_first(spring):
-    X, y, _, _ = spring
-    unequal = (X["kappa"] < 0.2) | (X["time"] < 4 + X["kappa"])
-    pipeline = spring_pipeline(local=SubspaceLTI(order=400), on_error="skip")
-    with pytest.raises(
-        ValueError, match="every .* failed. First operating point 0 .*400"
-    ):
-        pipeline.fit(X[unequal], y[unequal])
-
-
-# -- what the points warn of -----------------------------------------------------------
-
-
-def noisy(number):
-    """A step that warns: of what all points share, and of what is its own."""
-    warn("A shared cause.", ConvergenceWarning)
-    warn("A shared cause.", ConvergenceWarning)
-    if number == 1:
-        warn("A cause of its own.")
-    if number == 3:
-        raise ValueError("It fails.")
-    return number
-
-
-def run(n_points, *, verbose=0, n_jobs=None, on_error="raise"):
-    runner = PointRunner(n_jobs, verbose, on_error, Memory(None))
-    arguments = [(k,) for k in range(n_points)]
-    return runner.run("steps", noisy, arguments, np.arange(float(n_points))[:, None])
-
-
-@pytest.mark.parametrize("n_jobs", [None, 2])
-def test_what_points_warn_of_comes_with_their_results(n_jobs):
-    found = run(3, n_jobs=n_jobs)  # a warning would be an error
-    assert [done.result for done in found] == [0, 1, 2]
-    assert [len(done.told) for done in found] == [2, 3, 2]
-
-
-def test_threads_do_not_mix_what_they_warn_of():
-    with joblib.parallel_config("threading"):
-        found = run(3, n_jobs=3)
-    assert [len(done.told) for done in found] == [2, 3, 2]
-
-
-def test_a_failure_still_tells_what_was_warned_of():
-    with pytest.warns(UserWarning) as caught:
-        with pytest.raises(ValueError, match=r"point 3 \(scheduling 3\): It fails\."):
-            run(4)
-    texts = [str(w.message) for w in caught]
-    own = "A cause of its own. (At operating point 1 (scheduling 1).)"
-    assert texts == ["A shared cause. (At all operating points.)", own]
-
-
-def test_a_progress_bar_stays_whole(capsys):
-    """Warnings come after the bar, once, at the points that they are about."""
-    X, y = spring_tables(n_samples=150)
-    poor = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
-    with pytest.warns(ConvergenceWarning, match="comes no nearer") as caught:
-        LocalLPVPipeline(
-            SubspaceLTI(2, horizon=8),
-            GrayBoxRestructurer(poor, n_starts=1),
-            scheduling="kappa",
-            experiment="run",
-            time="time",
-            verbose=1,
-        ).fit(X, y)
-    shown = capsys.readouterr().err
-    assert "restructuring: 100%" in shown and "Warning" not in shown
-    texts = [str(w.message) for w in caught if "no nearer" in str(w.message)]
-    assert len(set(texts)) == len(texts)
-    assert all("(At operating point" in text for text in texts)
-    assert {w.filename for w in caught} == {__file__}
-
-
-@pytest.mark.filterwarnings("ignore:A shared cause", "ignore:A cause of its own")
-def test_a_bar_that_a_failure_ends_is_closed(capsys):
-    with pytest.raises(ValueError, match="It fails"):
-        run(4, verbose=1)
-    shown = capsys.readouterr().err
-    assert "3/4" in shown and shown.endswith("\n")
+# -- time and wrong options ------------------------------------------------------------
 
 
 def test_max_time_is_shared_by_the_points_and_told():

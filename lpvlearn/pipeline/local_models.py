@@ -1,0 +1,462 @@
+"""Step 3 at the operating points: a black box each, in continuous time.
+
+The experiments of every point make one model, or one each; these are averaged then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from sklearn.base import clone
+
+from ..data.experiments import ROLES, Experiment
+from ..data.operating_points import OperatingPoints
+from ..data.preparation import DETRENDS
+from ..exceptions import collected, warn
+from ..models.statespace import ModelPair, StateSpace, with_signs_of
+from ..restructuring.known_poles import integrators
+from ..restructuring.minimise_covariance import Estimate
+from ..structures.structure import GrayBoxStructure
+from .runner import Done, PointRunner, label_of, tell_skipped
+
+Array = NDArray[np.float64]
+
+# Mean of an output in standard deviations, from which it looks like an offset (a record
+# that rises steadily from rest has a mean of 1.7).
+_OFFSET = 5.0
+
+# Standard deviation of the constants of experiments at a point, in those of outputs,
+# that a user should know of.
+_APART = 0.1
+
+# A pole that much slower than the others is an integrator, and an output shows it by
+# more than that part of the output that does most.
+_STANDING = 0.05
+
+_HELD = (
+    "If only its controller holds the plant, identify the closed loop, with the "
+    "controller's reference as input and the controller in the structure. "
+)
+
+
+@dataclass(frozen=True)
+class LocalModel:
+    """The black-box model of one operating point."""
+
+    lti: StateSpace  # continuous time, balanced
+    order: int  # as identified, in discrete time
+    horizon: int | None  # of the subspace step, where the estimator tells it
+    realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
+    deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
+    n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
+    # inputs and outputs at rest, near the experiments; None: not looked for
+    rest: tuple[Array, Array] | None = None
+    # the model as identified (of every realization) with models to either side of it,
+    # where the covariance is known; with "zoh" in discrete time
+    estimates: list[Estimate] = field(default_factory=list)
+
+
+def identify_points(
+    local: Any,
+    points: OperatingPoints,
+    runner: PointRunner,
+    *,
+    structure: GrayBoxStructure | None,
+    **options: Any,
+) -> tuple[list[LocalModel], OperatingPoints]:
+    """Local models of the operating points, and which of these did not fail.
+
+    The order of the structure replaces ``order="auto"`` of the local estimator; without
+    one, "auto" becomes the highest order that a point takes. Options as in
+    `identify_point`.
+    """
+    chooses = local.get_params(deep=False).get("order") == "auto"
+    if chooses and isinstance(structure, GrayBoxStructure):
+        rest = structure.order
+        if _integrates(local):  # the model of the rates has not the integrators
+            rest -= integrators(structure)
+        local = clone(local).set_params(order=rest)
+    # Where a record stood in the table does not matter: splits share their results.
+    groups = [[_bare(e) for e in group] for group in points.experiments]
+
+    def identify(estimator: Any) -> list[Done | None]:
+        arguments = [(estimator, group) for group in groups]
+        return runner.run(
+            "local models", identify_point, arguments, points.kappa, **options
+        )
+
+    found = identify(local)
+    orders = {done.result.order for done in found if done is not None}
+    if chooses and structure is None and len(orders) > 1:
+        found = identify(clone(local).set_params(order=max(orders)))
+    tell_skipped(found, points.kappa)
+    kept = [k for k, done in enumerate(found) if done is not None]
+    return [done.result for done in found if done is not None], points.keep(kept)
+
+
+def identify_point(
+    local: Any,
+    experiments: Sequence[Experiment],
+    *,
+    sampling_time: float,
+    combine: str,
+    discretization: str,
+    efficient: bool = False,
+) -> LocalModel:
+    """Identify the local model of one operating point by a clone of `local`.
+
+    Fitted, it has `lti_`, a discrete-time StateSpace. `combine` is "pool", one fit of
+    all experiments, or "average": one model each, balanced, signs aligned, and the
+    matrices averaged (the paper's Monte Carlo). Refuses outputs that do not vary, and
+    an unstable model, which cannot be balanced. `efficient` gives `estimates`.
+    """
+    if _integrates(local) and combine == "average":
+        raise ValueError(
+            "`combine` must be 'pool' for a local estimator with `integrating`: models "
+            "with integrators cannot be balanced. Got 'average'."
+        )
+    advice = _look_at_outputs(experiments)
+    labels = list(dict.fromkeys(e.label for e in experiments))
+    if combine == "pool" or len(labels) == 1:
+        fitted = _fit_local(local, experiments, sampling_time)
+        pairs = _deviated(fitted)
+        if _from_closed_loop(fitted):
+            advice = _HELD + advice
+        rates = getattr(fitted, "rates_", None)
+        if rates is None:
+            lti = _continuous(fitted.lti_, discretization, advice)
+        else:  # stable but for the integrators
+            _continuous(rates.lti_, discretization, advice)
+            lti = fitted.lti_.to_continuous(discretization)
+        found = LocalModel(
+            lti,
+            fitted.lti_.order,
+            _horizon(fitted),
+            deviated=_all_continuous(pairs, discretization),
+            n_trend=_n_trend(fitted),
+            rest=_equilibrium(lti, [fitted], experiments),
+        )
+        if efficient and pairs:
+            found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
+        return found
+    realisations = [[e for e in experiments if e.label == label] for label in labels]
+    models, failures = [], []
+    kept: list[Any] = []
+    estimates: list[Estimate] = []
+    for label, fitted in zip(
+        labels, _fit_alike(local, realisations, sampling_time), strict=True
+    ):
+        if not kept and _from_closed_loop(fitted):
+            advice = _HELD + advice
+        model, pairs = fitted.lti_, _deviated(fitted) if efficient else []
+        try:
+            models.append(_continuous(model, discretization, advice))
+            estimates.append(_in_own_time(model, pairs, discretization))
+            kept.append(fitted)
+        except ValueError as error:
+            failures.append((label, error))
+    if not models:
+        raise failures[0][1]
+    if failures:
+        warn(
+            f"{len(failures)} of {len(labels)} realisations were left out of the "
+            f"average; the first, {failures[0][0]!r}: {failures[0][1]}"
+        )
+    lowest = min(model.order for model in models)  # where none grew
+    models = [model for model in models if model.order == lowest]
+    known, lti = all(pairs for _, pairs in estimates), _average(models)
+    return LocalModel(
+        lti,
+        kept[0].lti_.order,
+        _horizon(kept[0]),
+        models,
+        estimates=estimates if known else [],
+        n_trend=max(map(_n_trend, kept)),
+        rest=_equilibrium(lti, kept, experiments),
+    )
+
+
+def experiments_of(u: Array, y: Array, sampling_time: float) -> list[Experiment]:
+    """Experiments of one length, (n_experiments, n_samples, n_channels) each."""
+    rows = np.arange(u.shape[1])
+    return [
+        Experiment(k, rows, *pair, sampling_time=sampling_time)
+        for k, pair in enumerate(zip(u, y, strict=True))
+    ]
+
+
+def _integrates(local: Any) -> bool:
+    """Whether an estimator identifies the rates of outputs, and integrates them."""
+    return getattr(local, "integrating", None) is not None
+
+
+def _deviated(fitted: Any) -> list[ModelPair]:
+    """Models to either side of a fitted one, where the estimator knows them."""
+    pairs = getattr(fitted, "deviated_models", None)
+    return [] if pairs is None else pairs()
+
+
+def _from_closed_loop(fitted: Any) -> bool:
+    return getattr(fitted, "method_", None) == "pbsid"
+
+
+def _n_trend(fitted: Any) -> int:
+    """Trends of every output and experiment in a model, as `LocalModel` has them."""
+    trends = {getattr(fitted, name, None) for name in ("offset_", "detrend")}
+    return max(n for n, trend in enumerate(DETRENDS) if trend in trends or n == 0)
+
+
+def _equilibrium(
+    lti: StateSpace, fitted: Sequence[Any], experiments: Sequence[Experiment]
+) -> tuple[Array, Array] | None:
+    """Inputs and outputs at which the model rests, nearest to the experiments' means.
+
+    In units of how far they move within the experiments. None where the estimator has
+    not looked for constants, or does not tell.
+    """
+    first = fitted[0]
+    if _integrates(first):  # it rests anywhere
+        return None
+    looked = getattr(first, "offset", None) or getattr(first, "detrend", None)
+    if not looked or not hasattr(first, "resting_point"):
+        return None
+    _tell_different_constants(lti, fitted, experiments)
+    known = [own.resting_point() for own in fitted]
+    u0, y0 = (np.mean(values, axis=0) for values in zip(*known, strict=True))
+    (u, u_scale), (y, y_scale) = motions(experiments)
+    gain = lti.dc_gain()
+    step, *_ = np.linalg.lstsq(
+        np.vstack([np.diag(1.0 / u_scale), gain / y_scale[:, None]]),
+        np.concatenate([(u - u0) / u_scale, (y - y0) / y_scale]),
+    )
+    return u0 + step, y0 + gain @ step
+
+
+def _tell_different_constants(
+    lti: StateSpace, fitted: Sequence[Any], experiments: Sequence[Experiment]
+) -> None:
+    """Warn of constants that differ from experiment to experiment at one point."""
+    levels = [
+        own.output_offset_ - own.input_offset_ @ lti.dc_gain().T for own in fitted
+    ]
+    apart = np.vstack(levels).std(axis=0) > _APART * motions(experiments)[1][1]
+    differ = len(fitted) > 1 or any(own.offsets_differ_ for own in fitted)
+    if differ and apart.any():
+        warn(
+            "the experiments at one operating point have different constants in their "
+            "outputs. The LPV model takes their mean, and is off by the rest: subtract "
+            "what drifted between experiments from y, or let the scheduling variables "
+            "tell what the constants depend on."
+        )
+
+
+def motions(
+    experiments: Sequence[Experiment],
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Mean, and standard deviation about that of every experiment, of inputs, outputs.
+
+    A channel that stands still counts as moving by one.
+    """
+    found, n = [], sum(len(e.inputs) for e in experiments)
+    for values in zip(*((e.inputs, e.outputs) for e in experiments), strict=True):
+        sums = [
+            (v.sum(axis=0), ((v - v.mean(axis=0)) ** 2).sum(axis=0)) for v in values
+        ]
+        mean, variance = np.sum(sums, axis=0) / n
+        found.append((mean, np.where(variance > 0, np.sqrt(variance), 1.0)))
+    return found[0], found[1]
+
+
+def _in_own_time(
+    model: StateSpace, pairs: list[ModelPair], method: str
+) -> tuple[StateSpace, list[ModelPair]]:
+    """In discrete time where inputs are held, else as the continuous-time model."""
+    if method == "zoh":
+        return model, pairs
+    return model.to_continuous(method), _all_continuous(pairs, method)
+
+
+def _all_continuous(pairs: list[ModelPair], method: str) -> list[ModelPair]:
+    with collected():  # the estimate's own conversion says it once
+        return [(a.to_continuous(method), b.to_continuous(method)) for a, b in pairs]
+
+
+def _fit_alike(
+    local: Any, realisations: Sequence[Sequence[Experiment]], sampling_time: float
+) -> list[Any]:
+    """Clones of the local estimator for every realisation of one system.
+
+    The first realisation chooses order, horizon and method, the others follow it. One
+    with gaps is several experiments.
+    """
+    if hasattr(local, "fit_each") and all(len(runs) == 1 for runs in realisations):
+        whole = [run for runs in realisations for run in runs]
+        return _fit_table(local, whole, sampling_time, "fit_each")
+    first = _fit_local(local, realisations[0], sampling_time)
+    chosen = clone(local)
+    for name in ("order", "horizon", "method", "input_delay"):
+        if name in chosen.get_params() and hasattr(first, name + "_"):
+            chosen.set_params(**{name: getattr(first, name + "_")})
+    others = [_fit_local(chosen, runs, sampling_time) for runs in realisations[1:]]
+    return [first, *others]
+
+
+def _fit_local(
+    local: Any, experiments: Sequence[Experiment], sampling_time: float
+) -> Any:
+    """A clone of the local estimator, fitted on the experiments as one table."""
+    fitted = _fit_table(local, experiments, sampling_time, "fit")
+    if not isinstance(getattr(fitted, "lti_", None), StateSpace):
+        raise ValueError(
+            "`local` must be an estimator that identifies a StateSpace model, its "
+            f"attribute `lti_`, as SubspaceLTI does. Got {type(local).__name__}."
+        )
+    return fitted
+
+
+def _fit_table(
+    local: Any, experiments: Sequence[Experiment], sampling_time: float, method: str
+) -> Any:
+    """What a clone's method of fitting returns for the experiments as one table."""
+    u = np.vstack([e.inputs for e in experiments])
+    y = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    label = np.repeat(np.arange(len(experiments)), [len(e.rows) for e in experiments])
+    names = _column_names(experiments[0].input_names, u.shape[1])
+    table = pd.DataFrame(np.column_stack([u, label]), columns=names)
+    own: dict[str, Any] = {
+        **dict.fromkeys(ROLES),
+        "inputs": names[:-1],
+        "experiment": names[-1],
+        "sampling_time": sampling_time,
+    }
+    estimator = clone(local)
+    known = estimator.get_params(deep=False)
+    estimator.set_params(**{name: own[name] for name in own if name in known})
+    return getattr(estimator, method)(table, y)
+
+
+def _column_names(inputs: Sequence[Hashable], n_inputs: int) -> list[str]:
+    """Names of the inputs as the user knows them, and of a column of labels."""
+    names = [str(name) for name in inputs or range(n_inputs)]
+    label = "experiment"
+    while label in names:
+        label += "_"
+    return [*names, label]
+
+
+def _average(models: Sequence[StateSpace]) -> StateSpace:
+    """Average balanced models of one order, state signs aligned to the first."""
+    aligned = [with_signs_of(models[0], model) for model in models]
+    A, B, C, D = (np.mean([getattr(m, M) for m in aligned], axis=0) for M in "ABCD")
+    return StateSpace(A, B, C, D, input_delay=models[0].input_delay)
+
+
+def _bare(experiment: Experiment) -> Experiment:
+    """An experiment without its place in the table."""
+    return replace(
+        experiment,
+        rows=np.broadcast_to(np.intp(0), len(experiment.rows)),
+        scheduling=None,
+        operating_point=None,
+    )
+
+
+def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
+    """What to try first if the model turns out unstable: offsets make it so."""
+    outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    if len(outputs) > len(experiments) and not np.ptp(outputs, axis=0).any():
+        raise ValueError(
+            f"An output must vary. Got {outputs[0].tolist()} throughout: no dynamics "
+            "can be identified from it."
+        )
+    inputs = np.vstack([e.inputs for e in experiments])
+    far = [
+        (name, place)
+        for name, place, values in (("outputs", "y", outputs), ("inputs", "X", inputs))
+        if (np.abs(values.mean(axis=0)) > _OFFSET * values.std(axis=0)).any()
+    ]
+    if not far:
+        return "Try "
+    names, places = (" and ".join(words) for words in zip(*far, strict=True))
+    return (
+        f"The {names} stand far from zero: subtract their value at rest from {places} "
+        "(a simulation begins there), or let the local models find a constant: "
+        "local=SubspaceLTI(offset='auto'). Else try "
+    )
+
+
+def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpace:
+    with collected():  # said below
+        lti = model.to_continuous(discretization)
+    if not lti.is_stable:
+        worst = lti.poles()[np.argmax(lti.poles().real)]
+        advice = _integrating_outputs(lti) + advice
+        raise ValueError(
+            f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
+            "local=SubspaceLTI(stability='enforce'), another `order`, a longer "
+            "`horizon` or more data, or leave the point out by on_error='skip'."
+        )
+    if lti.order > model.order:
+        poles = model.poles()
+        poles = poles[(poles.real < 0) & (poles.imag == 0)].real
+        warn(
+            f"the identified model of order {model.order} has "
+            f"{lti.order - model.order} pole(s) on the negative real axis "
+            f"({', '.join(f'{p:.3g}' for p in poles)}), as no continuous-time model of "
+            "that order has: what becomes of the point is the nearest one. A shorter "
+            "sampling time or a lower `order` avoids it."
+        )
+    return lti.balance()
+
+
+def _integrating_outputs(lti: StateSpace) -> str:
+    """Which outputs integrate, where the only pole that does not decay is about zero.
+
+    It is that of the outputs that show it.
+    """
+    poles, V = np.linalg.eig(lti.A)
+    i = int(np.argmax(poles.real))
+    others = np.delete(np.abs(poles), i)
+    if poles[i].imag or abs(poles[i]) > _STANDING * others.min(initial=np.inf):
+        return ""
+    seen = np.abs(lti.C @ V[:, i].real)
+    places = np.flatnonzero(seen > _STANDING * seen.max()).tolist()
+    return (
+        f"If outputs {places} integrate, as a position does, name them: "
+        f"local=SubspaceLTI(integrating={places}) identifies their rates. "
+    )
+
+
+def common_delay(
+    local: Sequence[LocalModel], kappa: Array, sampling_time: float
+) -> Array:
+    """Delay of the inputs, seconds, of all operating points: their lower median.
+
+    Warns where they do not agree.
+    """
+    delays = np.array([model.lti.input_delay for model in local])
+    median = np.sort(delays, axis=0)[(len(delays) - 1) // 2]
+    samples = np.round(delays / sampling_time).astype(int)
+    if (samples != samples[0]).any():
+        each = "; ".join(
+            f"{label_of(row)}: {', '.join(map(str, own))}"
+            for row, own in zip(kappa, samples.tolist(), strict=True)
+        )
+        taken = ", ".join(map(str, np.round(median / sampling_time).astype(int)))
+        warn(
+            "the input delay differs between operating points (scheduling: samples of "
+            f"each input; {each}). The LPV model takes the median, {taken}; the local "
+            "models keep their own. Where the system has one delay, give it: "
+            "local=SubspaceLTI(input_delay=...)."
+        )
+    return median
+
+
+def _horizon(fitted: Any) -> int | None:
+    horizon = getattr(fitted, "horizon_", None)
+    return None if horizon is None else int(horizon)

@@ -1,0 +1,228 @@
+"""Any step at several operating points at a time.
+
+A `PointRunner` tells progress and failures, and keeps results in a memory.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from joblib import Memory, delayed
+from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
+
+from ..exceptions import Told, collected, warn
+from .memory import Remembered
+from .workers import results_of
+
+Array = NDArray[np.float64]
+
+_SKIP = " (Mend the experiments there, or leave the point out by on_error='skip'.)"
+
+
+@dataclass(frozen=True)
+class PointRunner:
+    """How a step is applied to the operating points."""
+
+    n_jobs: int | None  # points worked on at the same time
+    verbose: int  # 1 shows a progress bar
+    on_error: str  # "raise" or "skip": whether a point that fails stops the others
+    memory: Memory  # where results are kept; without a location, nowhere
+
+    def run(
+        self,
+        what: str,
+        function: Callable[..., Any],
+        arguments: Sequence[tuple[Any, ...]],
+        kappa: Array,
+        **shared: Any,
+    ) -> list[Done | None]:
+        """Results of a step at every operating point; None where it failed and may.
+
+        What the points warn of comes with them: given at once, warnings would tear
+        the progress bar, name no point, and be lost in other processes.
+
+        The function takes the arguments of a point and the shared keywords; the memory
+        knows its results by the values of all of them. `what` labels the progress bar.
+        A failure names the point (by `kappa`), unless another one fails in the same
+        words: the cause is an option then.
+        """
+        return self.start(what, function, arguments, kappa, **shared)()
+
+    def start(
+        self,
+        what: str,
+        function: Callable[..., Any],
+        arguments: Sequence[tuple[Any, ...]],
+        kappa: Array,
+        **shared: Any,
+    ) -> Callable[[], list[Done | None]]:
+        """As `run`, whose results a call of what is returned waits for.
+
+        Other processes are at work in the meantime.
+        """
+        kept = self._remembered(function)
+        stop = self.on_error == "raise"
+        tasks = (
+            delayed(_attempt)(kept, args, shared, k if stop else None)
+            for k, args in enumerate(arguments)
+        )
+        results = results_of(tasks, self.n_jobs)
+
+        def again(k: int) -> Any:
+            return _attempt(kept, arguments[k], shared, None)
+
+        return lambda: self._wait(results, what, kappa, again)
+
+    def _wait(
+        self, results: Any, what: str, kappa: Array, again: Callable[[int], Any]
+    ) -> list[Done | None]:
+        if self.verbose:
+            from tqdm import tqdm  # slow to import
+
+            results = tqdm(results, desc=what, total=len(kappa))
+        found: list[Done | _Failure] = []
+        try:
+            found.extend(results)
+        except _Stopped as stopped:
+            k, error, told = stopped.args
+            if self.verbose:
+                results.close()  # or the warnings would stand in the bar's line
+            tell_skipped([*_done(found[:k]), Done(None, told)], kappa)
+            # The point, or an option? A neighbour (the last for the first) tells.
+            other = again(k - 1)
+            if isinstance(other, _Failure) and other.text == str(error):
+                raise ValueError(str(error)) from error
+            skip = "" if "on_error" in str(error) else _SKIP
+            raise ValueError(f"{place_of(k, kappa)}: {error}{skip}") from error
+        failures = {k: r for k, r in enumerate(found) if isinstance(r, _Failure)}
+        if len(failures) == len(found):
+            first = failures[0]
+            if all(failure.text == first.text for failure in failures.values()):
+                raise ValueError(first.text) from first.error
+            raise ValueError(
+                f"{what}: every operating point failed. First {place_of(0, kappa)}: "
+                f"{first.text}"
+            ) from first.error
+        for k, failure in failures.items():
+            warn(f"left out {place_of(k, kappa)}: {failure.text}")
+        return _done(found)
+
+    def call(
+        self, function: Callable[..., Any], *args: Any, ignore: Sequence[str] = ()
+    ) -> Any:
+        """Call a function at the top of a module, or take its result from the memory.
+
+        The arguments to `ignore` follow from the others and do not tell results apart.
+        """
+        return self._remembered(function, ignore)(*args)
+
+    def _remembered(
+        self, function: Callable[..., Any], ignore: Sequence[str] = ()
+    ) -> Callable[..., Any]:
+        if hasattr(self.memory, "store_backend"):
+            return Remembered(function, self.memory.store_backend, tuple(ignore))
+        # An object with the interface of joblib.Memory: its own affair.
+        return self.memory.cache(function, ignore=list(ignore))
+
+
+class Done(NamedTuple):
+    """The result of a step at a point, and what was told on the way."""
+
+    result: Any
+    told: list[Told]
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """Why a point failed."""
+
+    error: Exception
+
+    @property
+    def text(self) -> str:
+        return str(self.error)
+
+
+class _Stopped(Exception):
+    """A failure that ends the step: number of the point, error, what was told."""
+
+
+def _attempt(
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
+    shared: dict[str, Any],
+    stop_as: int | None,
+) -> Any:
+    """Run a step at one operating point; `stop_as` is its number if it must succeed."""
+    told: list[Told] = []
+    try:
+        with _ONE_BLAS_THREAD, collected() as told:
+            return Done(function(*args, **shared), told)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        if stop_as is not None:
+            raise _Stopped(stop_as, error, told) from error
+        return _Failure(error)  # told by the runner, who knows the other points
+
+
+class _OneBlasThread:
+    """One thread of BLAS as long as any thread of the process is within.
+
+    Their number is that of the process: the first one in sets it, and the last one out
+    puts it back.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._n_within = threading.Lock(), 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._n_within:
+                self._limit = _blas().limit(limits=1, user_api="blas")
+                self._limit.__enter__()
+            self._n_within += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._n_within -= 1
+            if not self._n_within:
+                self._limit.__exit__(*error)
+
+
+_ONE_BLAS_THREAD = _OneBlasThread()
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """Found once in every process: the search takes longer than a small step."""
+    return ThreadpoolController()
+
+
+def _done(found: Sequence[Done | _Failure]) -> list[Done | None]:
+    return [result if isinstance(result, Done) else None for result in found]
+
+
+def tell_skipped(found: Sequence[Done | None], kappa: Array) -> None:
+    """Give the warnings of all points: each once, with the points that it came from."""
+    where: dict[Told, list[int]] = {}
+    for k, done in enumerate(found):
+        for told in dict.fromkeys(done.told if done is not None else ()):
+            where.setdefault(told, []).append(k)
+    for (message, category), points in where.items():
+        place = "all operating points"
+        if len(points) < len(kappa):
+            place = ", ".join(place_of(k, kappa) for k in points)
+        warn(message if len(kappa) == 1 else f"{message} (At {place}.)", category)
+
+
+def place_of(number: int, kappa: Array) -> str:
+    return f"operating point {number} (scheduling {label_of(kappa[number])})"
+
+
+def label_of(kappa: Array) -> str:
+    return ", ".join(f"{value:.4g}" for value in kappa)

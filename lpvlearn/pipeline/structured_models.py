@@ -1,0 +1,365 @@
+"""Step 4 at the operating points: all black boxes in one structure.
+
+There the points help one another: the parameters of a neighbour lead out of a wrong
+basin, and branches are tied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import accumulate
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from joblib import effective_n_jobs
+from numpy.typing import NDArray
+from sklearn.base import clone
+
+from ..data.operating_points import OperatingPoints
+from ..exceptions import collected, warn
+from ..lpv.alignment import aligned_models
+from ..lpv.equilibria import points_of_work
+from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
+from ..restructuring.deadline import bounded, time_is_up
+from ..restructuring.minimise_covariance import Estimate
+from ..restructuring.problem import GOOD_FIT, problem_from_models
+from ..structures.structure import GrayBoxStructure
+from .branches import tied_branches
+from .local_models import LocalModel, motions
+from .runner import Done, PointRunner, place_of, tell_skipped
+
+Array = NDArray[np.float64]
+
+_Task = tuple[StateSpace, list[StateSpace], list[Estimate]]
+
+_SWEEPS = 4  # passes over the points: help travels that far from a good one
+
+_NEIGHBOURS = 2  # points that help one: those to either side along one variable
+
+_FIRST_SHARE = 0.75  # of `max_time`, before the points help one another
+
+_BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
+
+
+class StructuredModels(NamedTuple):
+    """Models of one structure at the operating points that did not fail."""
+
+    points: OperatingPoints
+    local: list[LocalModel]  # the black boxes
+    structure: GrayBoxStructure
+    theta: Array  # (n_points, n_params), parameters
+    covariance: Array  # (n_points, n_params, n_params): NaN where not known
+    models: list[StateSpace]
+    restructurers: list[Any]  # fitted; empty without that step
+
+
+def restructure_points(
+    restructurer: Any,
+    local: list[LocalModel],
+    points: OperatingPoints,
+    runner: PointRunner,
+    max_time: float | None = None,
+) -> StructuredModels:
+    """Bring the local models of all operating points into one structure.
+
+    "aligned" or "passthrough": the entries of the balanced models are parameters.
+    `max_time` bounds the seconds of all points: equal shares, known in advance, and
+    what is left of it for the help of neighbours.
+    """
+    began = perf_counter()
+    if isinstance(restructurer, str):
+        # poles on the negative real axis make the order grow in continuous time
+        models = [
+            model.lti.balance(min(model.order, model.lti.order)) for model in local
+        ]
+        kappa = points.kappa if restructurer == "aligned" else None
+        structure, theta = balanced_entries(models, kappa)
+        balanced = [
+            structure.model(row).with_input_delay(model.input_delay)
+            for row, model in zip(theta, models, strict=True)
+        ]
+        unknown = _unknown_covariance(theta)
+        return StructuredModels(points, local, structure, theta, unknown, balanced, [])
+    restructurer = _with_structure(restructurer, local)
+    if max_time is not None:
+        at_once = min(effective_n_jobs(runner.n_jobs), len(local))
+        restructurer = _with_time(
+            restructurer, _FIRST_SHARE * max_time * at_once / len(local)
+        )
+    # What a fit is about: the model, and where they are known its realizations and
+    # estimates. Another norm or a weight is what the user wants minimised.
+    weighed = getattr(restructurer, "norm", None) in ("hinf", "covariance")
+    weighed = weighed and restructurer.frequency_weight is None
+    tasks: list[_Task] = [
+        (model.lti, model.realizations, model.estimates if weighed else [])
+        for model in local
+    ]
+    found = runner.run(
+        "restructuring",
+        _restructure_point,
+        tasks,
+        points.kappa,
+        restructurer=restructurer,
+    )
+    kept = [k for k, done in enumerate(found) if done is not None]
+    first = [done.result for done in found if done is not None]
+    with bounded(None if max_time is None else began + max_time - perf_counter()):
+        better = runner.call(
+            _help_neighbours,
+            first,
+            [tasks[k] for k in kept],
+            points.kappa[kept],
+            restructurer,
+            ignore=["fitted"],
+        )
+    for k, other in zip(kept, better, strict=True):
+        found[k] = other or found[k]
+    tell_skipped(found, points.kappa)
+    helped = [done.result for done in found if done is not None]
+    points, local = points.keep(kept), [local[k] for k in kept]
+    covariances = [
+        _covariance(*pair, runner) for pair in zip(helped, local, strict=True)
+    ]
+    tied = runner.call(
+        _tie_branches,
+        helped,
+        covariances,
+        [tasks[k] for k in kept],
+        points.kappa,
+        restructurer,
+        ignore=["fitted"],
+    )
+    tell_skipped(tied, points.kappa)
+    for k, other in enumerate(tied):
+        if other is not None:
+            helped[k] = other.result
+            covariances[k] = _covariance(helped[k], local[k], runner)
+    theta = np.array([fitted.params_ for fitted in helped])
+    covariance = _unknown_covariance(theta)
+    for P, known in zip(covariance, covariances, strict=True):
+        if known is not None:
+            P[:] = known
+    models = [fitted.lti_ for fitted in helped]
+    return StructuredModels(
+        points, local, helped[0].structure_, theta, covariance, models, helped
+    )
+
+
+def offsets_of_points(found: StructuredModels) -> Array | None:
+    """``[u0, y0, x0]`` of every point, as `LPVStateSpace` has them; None for none."""
+    if not any(model.n_trend and model.rest for model in found.local):
+        return None
+    runs = [run for group in found.points.experiments for run in group]
+    (u, u_scale), (y, y_scale) = motions(runs)
+    rest = [model.rest or (np.zeros_like(u), np.zeros_like(y)) for model in found.local]
+    inputs, outputs = (np.array(values) for values in zip(*rest, strict=True))
+    scales = (u_scale, y_scale)
+    return points_of_work(found.models, found.points.kappa, inputs, outputs, scales)
+
+
+def _covariance(fitted: Any, model: LocalModel, runner: PointRunner) -> Array | None:
+    """Covariance of the parameters at a point, None where it is not known."""
+    known = getattr(fitted, "params_covariance_", None)  # where it tells its own
+    if known is None and model.deviated:
+        known = runner.call(
+            covariance_of_parameters,
+            fitted.structure_,
+            fitted.params_,
+            getattr(fitted, "frequency_weight", None),
+            model.lti,
+            model.deviated,
+        )
+    return known
+
+
+def _unknown_covariance(theta: Array) -> Array:
+    return np.full((*theta.shape, theta.shape[1]), np.nan)
+
+
+def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
+    """One canonical form for all points, of the identified order, where none is given.
+
+    Raises
+    ------
+    ValueError
+        If the models differ in order.
+    """
+    if getattr(restructurer, "structure", "its own") is not None:
+        return restructurer
+    orders = sorted({model.order for model in local})
+    if len(orders) > 1:
+        raise ValueError(
+            "`structure=None` interpolates the parameters of a canonical form and "
+            f"needs local models of one order. Got orders {orders}. Fix the order: "
+            "local=SubspaceLTI(order=...)."
+        )
+    first = local[0].lti
+    form = GrayBoxStructure.observable_canonical(
+        orders[0],
+        first.n_inputs,
+        first.n_outputs,
+        orders[0] == 0 or any(model.lti.D.any() for model in local),
+    )
+    return clone(restructurer).set_params(structure=form)
+
+
+def _with_time(restructurer: Any, seconds: float) -> Any:
+    """The restructurer with a time for every point, where it has no shorter one."""
+    own = restructurer.get_params().get("max_time", 0.0)  # unknown: untouched
+    if own is not None and own <= seconds:
+        return restructurer
+    return clone(restructurer).set_params(max_time=seconds)
+
+
+def _restructure_point(
+    model: StateSpace,
+    realizations: Sequence[StateSpace],
+    estimates: Sequence[Estimate],
+    *,
+    restructurer: Any,
+    **options: Any,
+) -> Any:
+    """A clone of the restructurer, fitted to one local model."""
+    restructurer = clone(restructurer)
+    if len(realizations) > 1:
+        options["realizations"] = realizations
+    if estimates:
+        restructurer.set_params(norm="covariance")
+        options["estimates"] = estimates
+    elif getattr(restructurer, "norm", None) == "covariance":  # it is not known
+        restructurer.set_params(norm="hinf")
+    return restructurer.fit_model(model, **options)
+
+
+def _help_neighbours(
+    fitted: Sequence[Any],
+    tasks: Sequence[_Task],
+    kappa: Array,
+    restructurer: Any,
+) -> list[Done | None]:
+    """Try the parameters of neighbouring points as starts, until nothing improves.
+
+    A point in a wrong basin is one that its neighbours' parameters lead out of. Points
+    that fit well need no help. `fitted` follows from the other arguments. Returns the
+    better fits, None where there is none.
+    """
+    fitted = list(fitted)
+    better: list[Done | None] = [None] * len(fitted)
+    span = np.ptp(kappa, axis=0)
+    scaled = kappa / np.where(span > 0, span, 1.0)
+    distance = np.linalg.norm(scaled[:, None] - scaled[None], axis=2)
+    tried: set[tuple[int, bytes]] = set()
+    for _ in range(_SWEEPS):
+        improved = False
+        for i, task in enumerate(tasks):
+            if fitted[i].fit_error_ <= GOOD_FIT:
+                continue
+            for j in np.argsort(distance[i], kind="stable")[1 : 1 + _NEIGHBOURS]:
+                start = fitted[j].params_
+                key = (i, start.tobytes())
+                if key in tried or time_is_up():
+                    continue
+                tried.add(key)
+                own = fitted[i].fit_error_
+                if fitted[i].start_error(task[0], start) < _BETTER * own:
+                    with collected() as told:
+                        other = _restructure_point(
+                            *task, restructurer=restructurer, starts=[start]
+                        )
+                    if other.fit_error_ < own:  # if its time was enough
+                        fitted[i], better[i] = other, Done(other, told)
+                        improved = True
+        if not improved:
+            break
+    return better
+
+
+def _tie_branches(
+    fitted: Sequence[Any],
+    covariances: Sequence[Array | None],
+    tasks: Sequence[_Task],
+    kappa: Array,
+    restructurer: Any,
+) -> list[Done | None]:
+    """Among equally good parameters of the points, those of one smooth family.
+
+    None where it is what was found. `fitted` follows from the other arguments. Warns
+    where families are nearly as plausible.
+    """
+    structure = fitted[0].structure_
+    weight = getattr(restructurer, "frequency_weight", None)
+    problems = [problem_from_models(structure, [task[0]], weight) for task in tasks]
+    branches, doubts = tied_branches(problems, fitted, covariances, kappa)
+    tied: list[Done | None] = [None] * len(fitted)
+    for k, branch in enumerate(branches):
+        with collected() as told:
+            if branch.start is not None:
+                fitted_there = _restructure_point(
+                    *tasks[k],
+                    restructurer=restructurer,
+                    starts=[branch.start],
+                    search=False,
+                )
+                tied[k] = Done(fitted_there, told)
+            elif branch.places is not None:
+                tied[k] = Done(fitted[k].interchanged(branch.places), told)
+    for doubt in doubts:
+        names = ", ".join(structure.parameter_names[j] for j in doubt.params)
+        warn(
+            f"the parameters {names} may have changed places at "
+            f"{place_of(doubt.point, kappa)}: several values give the same response, "
+            "and those that continue the other points most smoothly are only "
+            f"{100 * doubt.probability:.0f} % likely to be the right ones. Between the "
+            "points the LPV model may be wrong. Add operating points near it, or tell "
+            "the parts apart by structure.with_bounds()."
+        )
+    return tied
+
+
+def covariance_of_parameters(
+    structure: GrayBoxStructure,
+    theta: Array,
+    weight: Any,
+    model: StateSpace,
+    deviated: Sequence[ModelPair],
+) -> Array:
+    """Covariance of gray-box parameters from that of the black box `model`.
+
+    The deviations of the response (`deviated_models`) are carried to the parameters to
+    first order, as the least-squares fit of the response does. `weight` is the
+    `frequency_weight` of `GrayBoxRestructurer`.
+    """
+    problem = problem_from_models(structure, [model], weight)
+    response = problem.response_of
+    changes = [response(above) - response(below) for above, below in deviated]
+    T = problem.parameter_changes(theta, np.array(changes)) / (2.0 * DEVIATION)
+    return T.T @ T
+
+
+def balanced_entries(
+    models: Sequence[StateSpace], kappa: Array | None = None
+) -> tuple[GrayBoxStructure, Array]:
+    """The entries of balanced models as parameters. Orders must agree.
+
+    Aligned with one another over `kappa`; without it their signs only, along the
+    points: the baseline of the paper, of no common state basis.
+    """
+    orders = sorted({model.order for model in models})
+    if len(orders) > 1:
+        raise ValueError(
+            "Without a structure the matrices are interpolated, which needs local "
+            f"models of one order. Got orders {orders}. Fix the order: "
+            "local=SubspaceLTI(order=...)."
+        )
+    if kappa is not None:
+        models = aligned_models(models, kappa)
+    else:
+        models = list(accumulate(models, with_signs_of))
+    first = models[0]
+    direct = any(model.D.any() for model in models)
+    sizes = (orders[0], first.n_inputs, first.n_outputs)
+    structure = GrayBoxStructure.full(*sizes, feedthrough=direct)
+    names = "ABCD" if direct else "ABC"
+    rows = [np.concatenate([getattr(m, M).ravel() for M in names]) for m in models]
+    return structure, np.array(rows)

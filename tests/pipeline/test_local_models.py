@@ -1,0 +1,49 @@
+"""Step 3 at the operating points: plants in a loop."""
+
+import numpy as np
+import pytest
+
+from lpvlearn import (
+    SubspaceLTI,
+)
+from lpvlearn.data.experiments import Experiment
+from lpvlearn.pipeline.local_models import identify_point
+
+STEP = 0.1
+
+
+def loop_record(seed, pole=0.9, n_samples=1500):
+    """A first-order plant with process noise, under feedback one sample late."""
+    r, e = np.random.default_rng(seed).standard_normal((2, n_samples))
+    u, y, x = np.zeros((n_samples, 1)), np.zeros((n_samples, 1)), 0.0
+    for t in range(n_samples):
+        y[t] = x + 0.5 * e[t]
+        u[t] = r[t] - (0.5 * y[t - 1] if t else 0.0)
+        x = pole * x + u[t, 0] + 0.4 * e[t]
+    return Experiment(seed, np.arange(n_samples), u, y)
+
+
+@pytest.mark.parametrize("combine", ["pool", "average"])
+def test_a_plant_in_a_loop_keeps_what_its_own_method_found(combine):
+    records = [loop_record(seed) for seed in range(2)]
+    local = SubspaceLTI(1, feedthrough=False)
+    options = {"sampling_time": STEP, "combine": combine, "discretization": "zoh"}
+    with pytest.warns(UserWarning, match="closed loop.*'pbsid' was taken"):
+        point = identify_point(local, records, efficient=True, **options)
+    n_estimates = 1 if combine == "pool" else 2
+    assert len(point.estimates) == n_estimates
+    for model, pairs in point.estimates:
+        error = np.log(0.9) / STEP - np.log(model.poles()[0].real) / STEP
+        both = [np.log([m.poles()[0].real for m in pair]) / STEP for pair in pairs]
+        std = np.sqrt(sum((a - b) ** 2 for a, b in both)) / 0.02
+        assert 0.01 < std < 0.5 and abs(error) < 3.0 * std
+
+
+def test_a_plant_that_only_its_loop_holds_is_refused_with_the_remedy():
+    options = {"sampling_time": STEP, "combine": "pool", "discretization": "zoh"}
+    local = SubspaceLTI(1, method="pbsid", feedthrough=False)
+    with (
+        pytest.warns(UserWarning, match="unstable.*controller's reference"),
+        pytest.raises(ValueError, match="must be stable.*identify the closed loop"),
+    ):
+        identify_point(local, [loop_record(0, 1.1)], **options)

@@ -1,0 +1,119 @@
+"""A step at several points: failures, and what is told on the way."""
+
+import joblib
+import numpy as np
+import pytest
+from joblib import Memory
+from sklearn.exceptions import ConvergenceWarning
+
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    SubspaceLTI,
+)
+from lpvlearn.exceptions import warn
+from lpvlearn.pipeline.runner import PointRunner
+
+from ..conftest import (
+    spring_pipeline,
+    spring_tables,
+)
+
+
+def runner(memory, **options):
+    return PointRunner(**{"n_jobs": None, "verbose": 0, "on_error": "raise", **options},
+                       memory=memory)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("on_error", "n_jobs"),
+    [("raise", None), ("skip", None), pytest.param("raise", 2, marks=pytest.mark.slow)],
+)
+def test_a_failure_that_all_points_share_names_none(spring, on_error, n_jobs):
+    pipeline = spring_pipeline(
+        local=SubspaceLTI(order=400), on_error=on_error, n_jobs=n_jobs
+    )
+    with pytest.raises(ValueError, match="^`order` must be at most .*400"):
+        pipeline.fit(*spring[:2])
+
+
+def test_different_failures_everywhere_tell_the_first(spring):
+    X, y, _, _ = spring
+    unequal = (X["kappa"] < 0.2) | (X["time"] < 4 + X["kappa"])
+    pipeline = spring_pipeline(local=SubspaceLTI(order=400), on_error="skip")
+    with pytest.raises(
+        ValueError, match="every .* failed. First operating point 0 .*400"
+    ):
+        pipeline.fit(X[unequal], y[unequal])
+
+
+# -- what the points warn of -----------------------------------------------------------
+
+
+def noisy(number):
+    """A step that warns: of what all points share, and of what is its own."""
+    warn("A shared cause.", ConvergenceWarning)
+    warn("A shared cause.", ConvergenceWarning)
+    if number == 1:
+        warn("A cause of its own.")
+    if number == 3:
+        raise ValueError("It fails.")
+    return number
+
+
+def run(n_points, *, verbose=0, n_jobs=None, on_error="raise"):
+    runner = PointRunner(n_jobs, verbose, on_error, Memory(None))
+    arguments = [(k,) for k in range(n_points)]
+    return runner.run("steps", noisy, arguments, np.arange(float(n_points))[:, None])
+
+
+@pytest.mark.parametrize("n_jobs", [None, 2])
+def test_what_points_warn_of_comes_with_their_results(n_jobs):
+    found = run(3, n_jobs=n_jobs)  # a warning would be an error
+    assert [done.result for done in found] == [0, 1, 2]
+    assert [len(done.told) for done in found] == [2, 3, 2]
+
+
+def test_threads_do_not_mix_what_they_warn_of():
+    with joblib.parallel_config("threading"):
+        found = run(3, n_jobs=3)
+    assert [len(done.told) for done in found] == [2, 3, 2]
+
+
+def test_a_failure_still_tells_what_was_warned_of():
+    with pytest.warns(UserWarning) as caught:
+        with pytest.raises(ValueError, match=r"point 3 \(scheduling 3\): It fails\."):
+            run(4)
+    texts = [str(w.message) for w in caught]
+    own = "A cause of its own. (At operating point 1 (scheduling 1).)"
+    assert texts == ["A shared cause. (At all operating points.)", own]
+
+
+def test_a_progress_bar_stays_whole(capsys):
+    """Warnings come after the bar, once, at the points that they are about."""
+    X, y = spring_tables(n_samples=150)
+    poor = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
+    with pytest.warns(ConvergenceWarning, match="comes no nearer") as caught:
+        LocalLPVPipeline(
+            SubspaceLTI(2, horizon=8),
+            GrayBoxRestructurer(poor, n_starts=1),
+            scheduling="kappa",
+            experiment="run",
+            time="time",
+            verbose=1,
+        ).fit(X, y)
+    shown = capsys.readouterr().err
+    assert "restructuring: 100%" in shown and "Warning" not in shown
+    texts = [str(w.message) for w in caught if "no nearer" in str(w.message)]
+    assert len(set(texts)) == len(texts)
+    assert all("(At operating point" in text for text in texts)
+    assert {w.filename for w in caught} == {__file__}
+
+
+@pytest.mark.filterwarnings("ignore:A shared cause", "ignore:A cause of its own")
+def test_a_bar_that_a_failure_ends_is_closed(capsys):
+    with pytest.raises(ValueError, match="It fails"):
+        run(4, verbose=1)
+    shown = capsys.readouterr().err
+    assert "3/4" in shown and shown.endswith("\n")
