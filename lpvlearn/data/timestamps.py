@@ -114,7 +114,8 @@ UNTIMED = Clock(None, 0.0, np.empty(0, dtype=np.intp))  # a table without stamps
 
 def check_time_tol(time_tol: Any) -> float:
     """The argument `time_tol` as a float, or a ValueError that names its limits."""
-    number = isinstance(time_tol, Real) and not isinstance(time_tol, bool)
+    number = isinstance(time_tol, Real)
+    number &= not isinstance(time_tol, bool | np.timedelta64)
     if not number or not 0.0 <= time_tol < _LARGEST_TOL:
         raise ValueError(
             "`time_tol` must be a share of the time step, at least 0 and less than "

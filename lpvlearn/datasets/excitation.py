@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 _MOST_BITS = 10**6  # of a window that is balanced: all of one are held at once
 
-_MOST_STEPS = 10_000  # of integration in a sampling period: 5 s of the arm
+_MOST_STEPS = 2_000  # of integration in a sampling period: 1 s of the arm
 
 _LOUDEST = 1000  # decibels of noise above its signal: its squares are numbers still
 

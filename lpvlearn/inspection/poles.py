@@ -297,6 +297,11 @@ def _grid(model: Any, kappa: ArrayLike | None) -> Array:
 def _pair(prefix: str, kappa: ArrayLike, poles: ArrayLike) -> tuple[Array, Complex]:
     points = as_numbers(f"{prefix}kappa", kappa)
     points = points[:, None] if points.ndim < 2 else points
+    if points.ndim != 2 or points.shape[1] == 0:
+        raise ValueError(
+            f"`{prefix}kappa` must have shape (n_points, n_scheduling). Got "
+            f"{points.shape}."
+        )
     table = as_numbers(f"{prefix}poles", poles, imaginary=True)
     if table.ndim != 2 or len(table) != len(points) or table.size == 0:
         raise ValueError(

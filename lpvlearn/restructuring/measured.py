@@ -31,6 +31,8 @@ Complex = NDArray[np.complex128]
 # two of them often are, up to what the search has still to gain.
 _BESIDE = 1e-3
 
+_MOST_AVERAGES = 10**9  # of a response: no record has more
+
 _SMALLEST = 1e-100  # largest entry of a response, in units that make sense
 
 # A coherence is estimated from few averages: never nearer to one than that
@@ -203,7 +205,7 @@ def read_noise(
             f"Got shape {shape}."
         )
     if coherence is not None:
-        whole_number("n_averages", n_averages, 1)
+        whole_number("n_averages", n_averages, 1, _MOST_AVERAGES)
         open_ = np.maximum(1.0 - values, _LEAST_INCOHERENCE)
         # of an entry that happens to be small, as that of its size over frequency
         size = np.maximum(np.abs(G), _LEAST_INCOHERENCE * np.abs(G).max())

@@ -123,7 +123,7 @@ def test_a_high_degree_in_many_variables_ends_at_once():
 
 
 def test_a_sampling_period_of_ages_is_no_integration():
-    with pytest.raises(ValueError, match="at most 10000 integration steps"):
+    with pytest.raises(ValueError, match="at most 2000 integration steps"):
         FlexibleArm().simulate(np.zeros((3, 2)), 0.5, 1e16)
 
 
@@ -160,6 +160,10 @@ HUGE = np.full((4, 2), 1e308)
         ("PoleDisplay", {"scheduling_label": [[1], [1, 2]]}, "`scheduling_label` must"),
         ("PoleDisplay", {"local_poles": HUGE}, "below 1e\\+150"),
         ("ParameterDisplay.from_estimator", {"names": pd.NaT}, "`names` must"),
+        ("PoleDisplay", {"kappa": np.zeros((4, 0))}, "`kappa` must have shape"),
+        ("FlexibleArm.simulate", {"sampling_time": 7}, "at most 2000 integration"),
+        ("LocalLPVPipeline.fit", {"time_tol": np.timedelta64(1, "s")}, "`time_tol`"),
+        ("GrayBoxRestructurer.fit(coherence)", {"n_averages": 10**400}, "n_averages"),
         ("ErrorDisplay", {"norms": "text"}, "`norms` must be a mapping"),
         ("PolynomialLPV", {"X": HUGE[:, :1]}, "`X` must hold numbers below"),
         ("PolynomialLPV.score", {"y": HUGE}, "`y` must hold numbers below"),
