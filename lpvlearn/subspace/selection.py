@@ -499,10 +499,13 @@ def better_horizon(
         return None
     order, energy = len(model.A), output_energy(records)
     highest = _highest_horizon(records, settings)
+    none = Whitening.none(len(records[0].y))
+    # One that minimises other errors is not to blame for those of simulation.
+    own = fit_once(records, order, horizon, settings, none).candidate
+    residual = min(residual, float(np.sqrt(own.model.loss / energy)))
     for other in (2 * horizon, 4 * horizon, horizon // 2):
         if not 2 <= other <= highest or settings.max_order(other) < order:
             continue
-        none = Whitening.none(len(records[0].y))
         trial = fit_once(records, order, other, settings, none).candidate
         error = float(np.sqrt(trial.model.loss / energy))
         if error < _CLEARLY_BETTER * residual:
