@@ -30,7 +30,7 @@ RELAYS = {
     "message if len(kappa) == 1 else f'{message} (At {place}.)'",
     "f'{path.name}: {error}'",
     "f'{value!r} ({error})'",
-    "f'{_place(k, kappa)}: {error}{skip}'",
+    "f'{place_of(k, kappa)}: {error}{skip}'",
     "f'{_NOT_OURS}{Path(path).name!r}: {error}'",
 }
 
