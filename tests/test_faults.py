@@ -44,10 +44,18 @@ SEARCH = """
 """
 
 
-def begun(command, **options):
-    """A process in a session of its own."""
+def begun(command, preexec_fn=None, **options):
+    """A process in a session of its own, which Ctrl-C ends even in the background."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, start_new_session=True, **pipes, **options)
+
+    def before():  # shells have what they run in the background ignore it
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        if preexec_fn is not None:
+            preexec_fn()
+
+    return subprocess.Popen(
+        command, start_new_session=True, preexec_fn=before, **pipes, **options
+    )
 
 
 def script(fit=ALONE, **options):

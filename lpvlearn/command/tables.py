@@ -404,12 +404,10 @@ def columns_of(option: str, text: str | None, table: pd.DataFrame) -> list[str]:
         if name not in table.columns:
             known = ", ".join(map(repr, table.columns[:_SHOWN]))
             more = ", ..." if len(table.columns) > _SHOWN else ""
-            hint = ""
+            near = _nearest(name, list(table.columns))
+            hint = f" Is it {near!r}?" if near else ""
             if len(table.columns) == 1:
                 hint = " If that is a whole line, tell --separator."
-            near = _nearest(name, list(table.columns))
-            if near:
-                hint = f" Is it {near!r}?"
             raise ValueError(
                 f"{option}: the table has no column {name!r}. Its columns are {known}"
                 f"{more}.{hint}"

@@ -108,7 +108,7 @@ def test_json_gaps_other_csv_and_an_own_folder(folder, tmp_path):
     assert points["n_samples"].tolist() == [294, 300, 300, 300]
     arguments = ["fit", path, *ROLES, "--output", tmp_path / "b"]
     status, _, error = run(*arguments)  # separator and decimal mark are found
-    assert status == 1 and "Identify with --missing split, which" in error
+    assert status == 1 and "identify with --missing split, which cuts" in error
     status, _, error = run(*arguments, "--separator", "|")
     assert status == 1 and "tell --separator" in error
 
