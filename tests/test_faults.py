@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -93,9 +94,9 @@ def written(folder):
 
 def nothing_left(process):
     until(lambda: not session(process), "processes are left")
-    shared = Path("/dev/shm")
+    shared, own = Path("/dev/shm"), re.compile(rf"[-_]{process.pid}[-_]")
     until(
-        lambda: not [f for f in shared.glob("*") if f"{process.pid}" in f.name],
+        lambda: not [f for f in shared.glob("*") if own.search(f.name)],
         "shared memory is left",
     )
 
