@@ -27,9 +27,8 @@ _SHOWN = 20  # columns that a message lists
 
 _HEAD = 200  # lines that are looked at for the layout of a file
 
-_EVEN = (
-    0.8  # share of these that have as many cells as most, where a separator is right
-)
+# Share of these that have as many cells as most, where a separator is right
+_EVEN = 0.8
 
 _BLANKS = r"\s+"
 

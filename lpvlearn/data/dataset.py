@@ -49,7 +49,7 @@ def open_dataset(dataset: Any) -> Any:
         ) from error
 
 
-def experiments_of(dataset: Any, experiment: Hashable) -> Iterator[pd.DataFrame]:
+def tables_by_experiment(dataset: Any, experiment: Hashable) -> Iterator[pd.DataFrame]:
     """The rows of every experiment, one after another; of all, where none is named.
 
     A ValueError where one goes on after another has begun.

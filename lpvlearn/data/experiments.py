@@ -57,7 +57,6 @@ NO_TIME = (  # what a message says where seconds are needed and nothing tells th
     "sampling_time=1 counts time in samples."
 )
 
-
 _ALIKE = 0.6  # likeness (difflib's, its default) from which a name may have been meant
 _N_SHOWN = 10  # names in an error message, lest a wide table fills the screen
 

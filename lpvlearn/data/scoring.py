@@ -29,7 +29,6 @@ _GAIN = 2.0
 # starts in motion that cost more than 10 points were found.)
 _MODE, _CHANCE = 2, 1e-3
 
-
 _SETTLED = 0.99  # share of its energy within which a transient is over
 _WINDOWS = 8  # of that length in a record; of a longer transient the start will do
 

@@ -26,7 +26,7 @@ from sklearn.utils.validation import (
     has_fit_parameter,
 )
 
-from ..data.dataset import experiments_of, kept_on_disk, open_dataset
+from ..data.dataset import kept_on_disk, open_dataset, tables_by_experiment
 from ..data.experiments import (
     NO_TIME,
     Experiment,
@@ -454,10 +454,8 @@ list, default=None
                 f"{', '.join(map(repr, opened.schema.names))}. Got {outputs!r}."
             )
         with TemporaryDirectory(prefix="lpvlearn-") as folder, retold() as told:
-            path, y = (
-                Path(folder) / "numbers",
-                outputs if isinstance(outputs, str) else names,
-            )
+            path = Path(folder) / "numbers"
+            y = outputs if isinstance(outputs, str) else names
             self._fit(lambda: kept_on_disk(self._read_by_part(opened, y), path))
         self.warnings_ = [warning.message for warning in told]
         return self
@@ -472,7 +470,7 @@ list, default=None
     def _read_by_part(self, dataset: Any, outputs: Any) -> Iterator[Experiment]:
         """The experiments of a data set, which all have the step of the first."""
         step = None
-        for table in experiments_of(dataset, self.experiment):
+        for table in tables_by_experiment(dataset, self.experiment):
             X, y = table.drop(columns=outputs), table[outputs]
             for e in self._table(X, y, fitted_step=step):
                 step = e.sampling_time if step is None else step
@@ -501,7 +499,7 @@ list, default=None
             points = local_experiments(experiments, self.scheduling_tol)
             self.sampling_time_ = self._sampling_time(experiments, structure)
 
-        with watch.step("local models", bar=True):  # step 3: a black box at every point
+        with watch.step("local models", bar=True):  # step 3
             local, points = identify_points(
                 self._local(),
                 points,
@@ -513,9 +511,7 @@ list, default=None
                 efficient=self.efficient or efficient,
             )
 
-        with watch.step(
-            "restructuring", bar=True
-        ):  # step 4: all of them in one structure
+        with watch.step("restructuring", bar=True):  # step 4
             found = restructure_points(
                 restructurer, local, points, runner, self.max_time
             )
