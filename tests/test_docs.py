@@ -153,8 +153,9 @@ def test_terms_are_spelled_as_the_list_says():
     found = [
         f"{path.relative_to(root)}: {word[0]!r}, here {spelled}"
         for path in [*pages, *(root / "lpvlearn").rglob("*.py")]
+        for prose in [prose_of(path)]
         for pattern, spelled in TERMS.items()
-        for word in re.finditer(pattern, prose_of(path))
+        for word in re.finditer(pattern, prose)
     ]
     assert found == []
 
