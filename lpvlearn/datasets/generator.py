@@ -40,7 +40,7 @@ X: u1, u2 (joint velocity references, rad/s), kappa (cos(theta2), the scheduling
 variable), experiment (label), time (s). y: y1, y2 (joint rates of the rigid arm with
 the same end-effector, rad/s). X_local, y_local: one new noise-free experiment at each
 operating point. X_sweep, y_sweep: one noise-free experiment in which the elbow turns
-through the whole range.
+through the whole range; X_sweep_down, y_sweep_down: the other way.
 """
 
 
@@ -111,6 +111,8 @@ def make_flexible_arm(
             New noise-free experiments, one at each operating point.
         X_sweep, y_sweep : DataFrame
             Noise-free experiment through the whole range of theta2.
+        X_sweep_down, y_sweep_down : DataFrame
+            The other way: joint 2's reference is mirrored, theta2 starts at 7 pi / 8.
         structure : GrayBoxStructure
             ``arm.structure()``.
         arm : FlexibleArm
@@ -210,19 +212,20 @@ def make_flexible_arm(
         )
 
     # All experiments are integrated together, shorter ones padded with rest.
-    references = np.zeros((2 * n_points + 1, max(n_samples, n_sweep), 2))
+    references = np.zeros((2 * n_points + 2, max(n_samples, n_sweep), 2))
     local = (n_samples, amplitude, clocks, (None, balance(clocks[1])))
     for i in range(n_points):
         references[i, :n_samples] = reference(*local, input_rng)
         references[n_points + i, :n_samples] = reference(*local, local_rng)
     windows = (balance(sweep_clocks[0]), balance(sweep_clocks[1]))
-    references[-1, :n_sweep] = reference(
+    references[-2, :n_sweep] = reference(
         n_sweep, sweep_amplitude, sweep_clocks, windows, sweep_rng
     )
-    references[-1, :n_sweep, 1] += _SWEEP_RATE
+    references[-2, :n_sweep, 1] += _SWEEP_RATE
+    references[-1] = references[-2] * [1.0, -1.0]
     response = arm.simulate(
         references,
-        np.concatenate([theta2, theta2, [_SWEEP_START]]),
+        np.concatenate([theta2, theta2, [_SWEEP_START, np.pi - _SWEEP_START]]),
         sampling_time,
         integration_step=integration_step,
     )
@@ -238,7 +241,8 @@ def make_flexible_arm(
 
     X, y = tables(slice(0, n_points), n_samples, n_repeats, snr_db)
     X_local, y_local = tables(slice(n_points, 2 * n_points), n_samples)
-    X_sweep, y_sweep = tables(slice(2 * n_points, None), n_sweep)
+    X_sweep, y_sweep = tables(slice(-2, -1), n_sweep)
+    X_sweep_down, y_sweep_down = tables(slice(-1, None), n_sweep)
     return Bunch(
         X=X,
         y=y,
@@ -246,6 +250,8 @@ def make_flexible_arm(
         y_local=y_local,
         X_sweep=X_sweep,
         y_sweep=y_sweep,
+        X_sweep_down=X_sweep_down,
+        y_sweep_down=y_sweep_down,
         **describe_arm(arm, theta2, sampling_time),
         DESCR=DESCR.format(
             n_points=n_points,

@@ -30,9 +30,9 @@ from ..pipeline.estimator import Stopwatch
 from ..pipeline.local_models import experiments_of, identify_point
 from ..pipeline.runner import PointRunner
 from ..pipeline.structured_models import balanced_entries
+from ..pipeline.workers import started
 from .tables import (
     ParameterSet,
-    both_sweeps,
     interpolation_table,
     local_table,
     nearest_model,
@@ -123,6 +123,7 @@ def run_paper_experiment(
     PaperExperiment
     """
     watch = Stopwatch(verbose=verbose)
+    ready = started(n_jobs)
     with watch.step("simulation of the arm"):
         data = make_flexible_arm(
             n_realizations=n_realizations, random_state=random_state
@@ -143,6 +144,7 @@ def run_paper_experiment(
         PolynomialLPV(degree),
         **roles,
     ).fit(data.X, data.y)
+    ready()
     watch.seconds |= pipeline.step_times_
     other = "pi-moesp" if method == "po-moesp" else "po-moesp"
     runner = PointRunner(n_jobs, verbose, "raise", Memory(memory, verbose=0))
@@ -177,7 +179,7 @@ def run_paper_experiment(
             "table2": restructuring_table(pipeline, data),
             "table3": interpolation_table(parameters, kappa),
             "table4": validation_table(lpv, data),
-            "momentum": sweeps_table(_of_momenta(pipeline, data), both_sweeps(data)),
+            "momentum": sweeps_table(_of_momenta(pipeline, data), data),
         }
     experiment = PaperExperiment(
         data,

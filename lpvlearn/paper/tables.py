@@ -151,33 +151,25 @@ def validation_table(lpv: dict[str, LPVStateSpace], data: Bunch) -> pd.DataFrame
     return pd.DataFrame(rows, columns=["model", "output", "metric", "ours", "paper"])
 
 
-def both_sweeps(data: Bunch) -> dict[str, Bunch]:
-    """The sweep ("up"), and one the other way.
-
-    That one begins where the first is mirrored to, by joint 2's mirrored reference.
-    """
-    reference = data.X_sweep[["u1", "u2"]].to_numpy() * [1.0, -1.0]
-    start = np.pi - np.arccos(data.X_sweep["kappa"].iloc[0])
-    response = data.arm.simulate(reference, start, data.sampling_time)
-    X = data.X_sweep.assign(u2=reference[:, 1], kappa=response.kappa)
-    down = Bunch(X_sweep=X, y_sweep=response.y, sampling_time=data.sampling_time)
-    return {"up": data, "down": down}
-
-
-def sweeps_table(model: LPVStateSpace, sweeps: dict[str, Bunch]) -> pd.DataFrame:
-    """Fit of an LPV model on sweeps, from rest."""
+def sweeps_table(model: LPVStateSpace, data: Bunch) -> pd.DataFrame:
+    """Fit of an LPV model on the sweep and on the one the other way, from rest."""
+    sweeps = {
+        "up": (data.X_sweep, data.y_sweep),
+        "down": (data.X_sweep_down, data.y_sweep_down),
+    }
     rows = [
         (name, output, metric, value)
-        for name, sweep in sweeps.items()
-        for metric, output, value in _fits(sweep.y_sweep, simulate_sweep(model, sweep))
+        for name, (X, y) in sweeps.items()
+        for metric, output, value in _fits(y, simulate_sweep(model, data, X))
     ]
     return pd.DataFrame(rows, columns=["sweep", "output", "metric", "ours"])
 
 
-def simulate_sweep(model: LPVStateSpace, data: Bunch) -> Array:
-    """Outputs of an LPV model along the validation sweep."""
+def simulate_sweep(
+    model: LPVStateSpace, data: Bunch, X: pd.DataFrame | None = None
+) -> Array:
+    """Outputs of an LPV model along a sweep, the validation's if none is given."""
+    X = data.X_sweep if X is None else X
     return model.simulate(
-        data.X_sweep[["u1", "u2"]].to_numpy(),
-        data.X_sweep["kappa"].to_numpy(),
-        data.sampling_time,
+        X[["u1", "u2"]].to_numpy(), X["kappa"].to_numpy(), data.sampling_time
     )

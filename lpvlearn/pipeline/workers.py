@@ -11,7 +11,7 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import cache
 from typing import Any
 
-from joblib import Parallel, delayed
+from joblib import Parallel, delayed, effective_n_jobs
 
 # A call as `joblib.delayed` writes it down: function, arguments, keywords.
 Task = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
@@ -33,6 +33,24 @@ def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
     """
     watched = (delayed(_in_worker)(os.getpid(), *task) for task in tasks)
     return _guarded(Parallel(n_jobs=n_jobs, return_as="generator")(watched))
+
+
+def started(n_jobs: int | None) -> Callable[[], None]:
+    """Have `n_jobs` processes import what work takes while this one does other things.
+
+    What is returned waits for them.
+    """
+    ready = results_of([delayed(_ready)()] * effective_n_jobs(n_jobs), n_jobs)
+
+    def wait() -> None:
+        for _ in ready:
+            pass
+
+    return wait
+
+
+def _ready() -> None:
+    """Nothing: with this module a process imports the library."""
 
 
 def _guarded(results: Iterator[Any]) -> Iterator[Any]:

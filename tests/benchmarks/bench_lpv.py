@@ -46,7 +46,7 @@ from lpvlearn import (
 )
 from lpvlearn.datasets import FlexibleArm, make_flexible_arm, prbs
 from lpvlearn.exceptions import ExtrapolationWarning
-from lpvlearn.paper.tables import both_sweeps, sweeps_table
+from lpvlearn.paper.tables import sweeps_table
 
 INTERPOLATORS = {
     "AutoLPV": AutoLPV(),
@@ -83,7 +83,6 @@ def bench_arm(n_points: int, seeds: range) -> None:
         ).fit(data.X, data.y)
         forms[pipeline.interpolator_.form_] += 1
         kappa, P = pipeline.operating_points_, pipeline.parameters_covariance_
-        sweeps = both_sweeps(data)
         for name, interpolator in INTERPOLATORS.items():
             known = {} if "pchip" in name or "spline" in name else {"covariance": P}
             interpolator.fit(kappa, pipeline.parameters_.to_numpy(), **known)
@@ -91,12 +90,12 @@ def bench_arm(n_points: int, seeds: range) -> None:
                 model = LPVStateSpace(
                     data.arm.structure(state), interpolator, kappa[[0, -1]]
                 )
-                table = sweeps_table(model, sweeps)
+                table = sweeps_table(model, data)
                 bft = table[table["metric"] == "BFT"]["ours"].to_numpy()
                 fits[state, name].append(bft)
         for name, interpolator in ALIGNED.items():
             turned = LocalLPVPipeline(LOCAL, "aligned", interpolator, **ROLES)
-            table = sweeps_table(turned.fit(data.X, data.y).lpv_, sweeps)
+            table = sweeps_table(turned.fit(data.X, data.y).lpv_, data)
             fits["aligned", name].append(
                 table[table["metric"] == "BFT"]["ours"].to_numpy()
             )
