@@ -51,6 +51,7 @@ class LocalModel:
     lti: StateSpace  # continuous time, balanced
     order: int  # as identified, in discrete time
     horizon: int | None  # of the subspace step, where the estimator tells it
+    costs: dict[int, float] = field(default_factory=dict)  # of orders, by the criterion
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
     deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
     n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
@@ -72,8 +73,8 @@ def identify_points(
     """Local models of the operating points, and which of these did not fail.
 
     The order of the structure replaces ``order="auto"`` of the local estimator; without
-    one, "auto" becomes the highest order that a point takes. Options as in
-    `identify_point`.
+    one, "auto" becomes an order that a point takes: the one with the most evidence of
+    all points. Options as in `identify_point`.
     """
     chooses = local.get_params(deep=False).get("order") == "auto"
     if chooses and isinstance(structure, GrayBoxStructure):
@@ -91,12 +92,29 @@ def identify_points(
         )
 
     found = identify(local)
-    orders = {done.result.order for done in found if done is not None}
-    if chooses and structure is None and len(orders) > 1:
-        found = identify(clone(local).set_params(order=max(orders)))
+    if chooses and structure is None:
+        models = [done.result for done in found if done is not None]
+        if len({model.order for model in models}) > 1:
+            found = identify(clone(local).set_params(order=_common_order(models)))
     tell_skipped(found, points.kappa)
     kept = [k for k, done in enumerate(found) if done is not None]
     return [done.result for done in found if done is not None], points.keep(kept)
+
+
+def _common_order(models: Sequence[LocalModel]) -> int:
+    """The order of least cost to all points together, of those that one of them takes.
+
+    Their records are independent: likelihoods multiply, and a state that one point in
+    nine takes from its noise is not had by all. The highest one where costs are untold.
+    """
+    orders = sorted({model.order for model in models})
+    if not all(model.costs for model in models):
+        return orders[-1]
+    total = dict.fromkeys(orders, 0.0)
+    for costs in (model.costs for model in models):
+        for order in orders:  # beyond those tried, more states bring nothing
+            total[order] += costs.get(min(order, max(costs)), np.inf)
+    return min(orders, key=lambda order: total[order])
 
 
 def identify_point(
@@ -137,6 +155,7 @@ def identify_point(
             lti,
             fitted.lti_.order,
             _horizon(fitted),
+            _costs(fitted, experiments),
             deviated=_all_continuous(pairs, discretization),
             n_trend=_n_trend(fitted),
             rest=_equilibrium(lti, [fitted], experiments),
@@ -174,7 +193,8 @@ def identify_point(
         lti,
         kept[0].lti_.order,
         _horizon(kept[0]),
-        models,
+        _costs(kept[0], realisations[0]),
+        realizations=models,
         estimates=estimates if known else [],
         n_trend=max(map(_n_trend, kept)),
         rest=_equilibrium(lti, kept, experiments),
@@ -455,6 +475,17 @@ def common_delay(
             "local=SubspaceLTI(input_delay=...)."
         )
     return median
+
+
+def _costs(fitted: Any, experiments: Sequence[Experiment]) -> dict[int, float]:
+    """What every order costs an estimator that tells it, above the best one."""
+    table = getattr(fitted, "selection_", None)
+    if table is None or "criterion" not in table:
+        return {}
+    n_values = sum(e.outputs.size for e in experiments if e.outputs is not None)
+    known = table.dropna(subset="criterion")
+    costs = n_values * known["criterion"].to_numpy()
+    return dict(zip(known["order"].tolist(), costs.tolist(), strict=True))
 
 
 def _horizon(fitted: Any) -> int | None:

@@ -1,13 +1,17 @@
 """Step 3 at the operating points: plants in a loop."""
 
-import numpy as np
-import pytest
+import warnings
 
-from lpvlearn import (
-    SubspaceLTI,
-)
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.base import clone
+
+from lpvlearn import LocalLPVPipeline, SubspaceLTI
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.pipeline.local_models import identify_point
+
+from ..conftest import ROLES, spring_tables
 
 STEP = 0.1
 
@@ -47,3 +51,34 @@ def test_a_plant_that_only_its_loop_holds_is_refused_with_the_remedy():
         pytest.raises(ValueError, match="must be stable.*identify the closed loop"),
     ):
         identify_point(local, [loop_record(0, 1.1)], **options)
+
+
+class Restless(SubspaceLTI):
+    """Takes a third state of large outputs, and tells the cost of every order."""
+
+    def fit(self, X, y=None):
+        if self.order != "auto":
+            return super().fit(X, y)
+        large = np.ptp(y) > 10.0
+        found = clone(self).set_params(order=3 if large else 2).fit(X, y)
+        vars(self).update(vars(found) | {"order": "auto"})
+        costs = [9.0, GAIN["third"], 0.0] if large else [9.0, 0.0, 4.0]
+        table = {"order": [1, 2, 3], "criterion": np.array(costs) / len(X)}
+        self.selection_ = pd.DataFrame(table) if GAIN["third"] else None
+        return self
+
+
+GAIN = {"third": 0.0}  # of the third state there; 0: untold
+
+
+@pytest.mark.parametrize(("gain", "order"), [(5.0, 2), (50.0, 3), (0.0, 3)])
+def test_without_a_structure_points_take_the_order_of_most_evidence(
+    gain, order, monkeypatch
+):
+    monkeypatch.setitem(GAIN, "third", gain)
+    X, y = spring_tables(noise=0.01, n_samples=300)
+    y = y.where(X["kappa"] > 0, 1e3 * y)  # the four points need two states
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a state too many may look like anything
+        pipeline = LocalLPVPipeline(Restless(), **ROLES).fit(X, y)
+    assert pipeline.report_["order"].tolist() == [order] * 4
