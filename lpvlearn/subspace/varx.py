@@ -159,16 +159,21 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
     dof -= m
     found = _wilks(y[noisy], _basis(future, rows[c:], _FORESEEN), dof)
     curved = 0.0
-    if found.p_value < _LEVEL:
-        curved = _curved_share(records, past, noisy)
+    if found.p_value < _LEVEL:  # an input that noise reaches at once may tell of it
+        first = 1 if within.p_value < _INSTANTANEOUS else 0
+        curved = _curved_share(records, past, noisy, first)
     innovations = np.sum(y**2, axis=1) / max(dof, 1)
     return Feedback(*found, within.p_value, curved, innovations)
 
 
 def _curved_share(
-    records: Sequence[Record], past: int, noisy: NDArray[np.bool_]
+    records: Sequence[Record], past: int, noisy: NDArray[np.bool_], first: int
 ) -> float:
-    """Share of the innovations that nonlinear terms of the last samples explain."""
+    """Share of the innovations that nonlinear terms of the last samples explain.
+
+    The `first` of these is the sample itself (0), of which inputs are known, or the one
+    before.
+    """
     linear, curved, outputs = [], [], []
     for z in samples_of(records):
         m, n_rows = len(records[0].u), past + 1
@@ -176,7 +181,7 @@ def _curved_share(
         windows = windows.transpose(0, 2, 1)[:, ::-1]  # the newest first
         before = windows[:, 1:].reshape(len(windows), -1)
         linear.append(np.hstack([windows[:, 0, :m], before]))
-        last = linear[-1][:, : m + _N_CURVED * z.shape[1]]
+        last = linear[-1][:, first * m : m + _N_CURVED * z.shape[1]]
         mixed = last[:, :1] * last[:, 1:]
         constant = np.ones((len(last), 1))
         curved.append(np.hstack([np.abs(last), last**2, last**3, mixed, constant]))

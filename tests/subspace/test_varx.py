@@ -121,6 +121,19 @@ def test_a_nonlinearity_is_no_feedback(seed):
     assert not find_feedback(records_of((walk, smooth))).found
 
 
+def test_a_controller_that_answers_at_once_is_found_whatever_its_reference():
+    """Of a binary one, which the input tells of nonlinearly, and so of the noise."""
+    rng = np.random.default_rng(0)
+    r = rng.choice([-1.0, 1.0], 150).repeat(20)
+    u, y, x = np.zeros((3000, 1)), np.zeros((3000, 1)), 0.0
+    for t, e in enumerate(0.1 * rng.standard_normal(3000)):
+        y[t] = x + e
+        u[t] = 2.0 * (r[t] - y[t])
+        x = 0.9 * x + 0.1 * u[t, 0]
+    found = find_feedback(records_of((u, y)))
+    assert found.found and found.instantaneous
+
+
 def test_there_may_be_nothing_to_test():
     rng, t = np.random.default_rng(0), np.arange(500)[:, None]
     sine = np.sin(0.8 * t)  # known from two samples
