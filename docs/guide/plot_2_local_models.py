@@ -306,7 +306,8 @@ local.residual_tests(X, y)
 #   ``time`` column misses, and starts another one after it, with an initial state and a
 #   constant of its own: :ref:`guide_logs`.
 # * ``integrating="angle"`` identifies the rate of an output that integrates, and
-#   integrates the model: see the example of a position servo.
+#   integrates the model: see the example of a position servo. A pipeline without a
+#   structure interpolates the model of the rates, and integrates that.
 # * ``stability="enforce"`` returns a stable model and says in ``stability_loss_`` what
 #   that cost.
 

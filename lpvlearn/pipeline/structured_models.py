@@ -69,12 +69,10 @@ def restructure_points(
     """
     began = perf_counter()
     if isinstance(restructurer, str):
-        # poles on the negative real axis make the order grow in continuous time
-        models = [
-            model.lti.balance(min(model.order, model.lti.order)) for model in local
-        ]
+        integrating = _integrating(local[0].lti)
+        models = [_balanced(model, integrating) for model in local]
         kappa = points.kappa if restructurer == "aligned" else None
-        structure, theta = balanced_entries(models, kappa)
+        structure, theta = balanced_entries(models, kappa, integrating)
         balanced = [
             structure.model(row).with_input_delay(model.input_delay)
             for row, model in zip(theta, models, strict=True)
@@ -337,13 +335,36 @@ def covariance_of_parameters(
     return T.T @ T
 
 
+def _integrating(model: StateSpace) -> list[int]:
+    """Outputs that are states of their own, the last ones, on which nothing depends."""
+    last = model.C[:, ~model.A.any(axis=0)]
+    return np.flatnonzero(last.any(axis=1)).tolist()
+
+
+def _balanced(local: LocalModel, integrating: Sequence[int]) -> StateSpace:
+    """The local model, balanced: that of the rates of outputs that integrate.
+
+    Poles on the negative real axis make the order grow in continuous time.
+    """
+    model, n = local.lti, local.lti.order - len(integrating)
+    C, D = model.C.copy(), model.D.copy()
+    C[integrating], D[integrating] = model.A[n:], model.B[n:]
+    rates = StateSpace(
+        model.A[:n, :n], model.B[:n], C[:, :n], D, input_delay=model.input_delay
+    )
+    return rates.balance(min(local.order - len(integrating), n))
+
+
 def balanced_entries(
-    models: Sequence[StateSpace], kappa: Array | None = None
+    models: Sequence[StateSpace],
+    kappa: Array | None = None,
+    integrating: Sequence[int] = (),
 ) -> tuple[GrayBoxStructure, Array]:
     """The entries of balanced models as parameters. Orders must agree.
 
     Aligned with one another over `kappa`; without it their signs only, along the
-    points: the baseline of the paper, of no common state basis.
+    points: the baseline of the paper, of no common state basis. Outputs `integrating`
+    are integrals of those of the models.
     """
     orders = sorted({model.order for model in models})
     if len(orders) > 1:
@@ -359,7 +380,7 @@ def balanced_entries(
     first = models[0]
     direct = any(model.D.any() for model in models)
     sizes = (orders[0], first.n_inputs, first.n_outputs)
-    structure = GrayBoxStructure.full(*sizes, feedthrough=direct)
+    structure = GrayBoxStructure.full(*sizes, direct, integrating)
     names = "ABCD" if direct else "ABC"
     rows = [np.concatenate([getattr(m, M).ravel() for M in names]) for m in models]
     return structure, np.array(rows)

@@ -31,6 +31,7 @@ from .templates import (
     Entry,
     affine_system,
     full_cells,
+    integrated_cells,
     modal_cells,
     observable_canonical_cells,
 )
@@ -327,20 +328,32 @@ class GrayBoxStructure:
 
     @classmethod
     def full(
-        cls, order: int, n_inputs: int, n_outputs: int, feedthrough: bool = True
+        cls,
+        order: int,
+        n_inputs: int,
+        n_outputs: int,
+        feedthrough: bool = True,
+        integrating: Sequence[int] = (),
     ) -> GrayBoxStructure:
         """Every entry of the matrices is a parameter (row by row: A, B, C, D).
 
-        The arguments are those of :meth:`observable_canonical`.
+        The arguments are those of :meth:`observable_canonical`. Outputs `integrating`,
+        by their places, are integrals of what these matrices say, with a state each
+        behind the others.
 
         Examples
         --------
         >>> GrayBoxStructure.full(1, 1, 1).parameter_names
         ('a1_1', 'b1_1', 'c1_1', 'd1_1')
+        >>> servo = GrayBoxStructure.full(1, 1, 1, feedthrough=False, integrating=[0])
+        >>> servo.model([-2.0, 1.0, 3.0]).poles()
+        array([ 0.+0.j, -2.+0.j])
         """
         A, B, C, D = full_cells(order, n_inputs, n_outputs, feedthrough)
         names = [str(name) for row in (*A, *B, *C, *(D or [])) for name in row]
-        return cls.from_template(A, B, C, D, parameter_names=names)
+        return cls.from_template(
+            *integrated_cells((A, B, C, D), integrating), parameter_names=names
+        )
 
     @classmethod
     def modal(

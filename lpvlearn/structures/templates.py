@@ -314,6 +314,30 @@ def full_cells(
     return _full_block("a", n, n), _full_block("b", n, m), _full_block("c", p, n), D
 
 
+def integrated_cells(
+    blocks: tuple[Cells, Cells, Cells, Cells | None], outputs: Sequence[int]
+) -> tuple[Cells, Cells, Cells, Cells | None]:
+    """Blocks of a system some of whose outputs are the integrals of those of another.
+
+    ``A' = [[A, 0], [C_i, 0]]``, ``B' = [[B], [D_i]]``; the last states are outputs i.
+    """
+    A, B, C, D = blocks
+    most = len(C) - 1
+    outputs = [whole_number("integrating", i, 0, most) for i in dict.fromkeys(outputs)]
+    n_inputs = len((B or D or [[]])[0])
+    free = D or [[0.0] * n_inputs for _ in C]
+    behind = [0.0] * len(outputs)
+    rows: Cells = [[*row, *behind] for row in (*A, *(C[i] for i in outputs))]
+    seen: Cells = [[*row, *behind] for row in C]
+    for place, i in enumerate(outputs):
+        seen[i] = [0.0] * len(rows)
+        seen[i][len(A) + place] = 1.0
+    direct: Cells = [
+        [0.0] * n_inputs if i in outputs else row for i, row in enumerate(free)
+    ]
+    return rows, [*B, *(free[i] for i in outputs)], seen, direct if D else None
+
+
 def _full_block(letter: str, rows: int, columns: int) -> Cells:
     return [[f"{letter}{i + 1}_{j + 1}" for j in range(columns)] for i in range(rows)]
 

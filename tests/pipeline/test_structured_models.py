@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 from sklearn.exceptions import ConvergenceWarning
 
@@ -13,6 +14,7 @@ from lpvlearn import (
     StateSpace,
     SubspaceLTI,
     from_trajectories,
+    make_bft_scorer,
 )
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.pipeline.local_models import LocalModel, identify_point
@@ -204,6 +206,34 @@ def test_an_order_that_grows_in_continuous_time_is_that_of_the_others(
     assert [model.order for model in pipeline.structured_models_] == [2, 2, 2]
     if isinstance(restructurer, GrayBoxRestructurer):
         assert pipeline.report_["structured_BFT"].min() > 60
+
+
+def servo(kappa):
+    """A position, and the current behind it."""
+    A = [[0, 1, 0], [0, -2.0 - kappa, 4.0], [0, -0.5, -8.0]]
+    return StateSpace(A, [[0], [0], [6.0]], [[1, 0, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("restructurer", ["aligned", "passthrough"])
+def test_integrators_need_no_structure(restructurer):
+    rng, runs = np.random.default_rng(3), []
+    for kappa in (0.0, 1.0, 2.0):
+        u = rng.choice([-1.0, 1.0], (60, 1)).repeat(5, axis=0)
+        y = servo(kappa).simulate(u, sampling_time=0.05)
+        runs.append((u, kappa, y + [7.0, 0.0]))  # the position counts from anywhere
+    X, y = from_trajectories(runs, sampling_time=0.05)
+    local = SubspaceLTI(2, integrating=[0], offset=None)
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    pipeline = LocalLPVPipeline(local, restructurer, **roles).fit(X, y)
+    assert [model.order for model in pipeline.structured_models_] == [3] * 3
+    omega = np.array([0.1, 1.0, 5.0])
+    for kappa in (0.0, 1.0, 2.0):
+        model, true = pipeline.lpv_.at(kappa), servo(kappa)
+        assert np.abs(model.poles()).min() == 0.0
+        G, G0 = model.frequency_response(omega), true.frequency_response(omega)
+        assert_allclose(G, G0, rtol=1e-5)
+    scorer = make_bft_scorer(initial_state="estimate")
+    assert scorer(pipeline, X, y) > 99.99
 
 
 def test_one_canonical_form_needs_one_order():

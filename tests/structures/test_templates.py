@@ -238,6 +238,22 @@ def test_full_structure_holds_its_entries_row_by_row(feedthrough):
         assert_array_equal(found, expected)
 
 
+@pytest.mark.parametrize("order", [0, 2])
+def test_outputs_that_integrate_are_those_of_the_full_form_over_s(order):
+    rates = GrayBoxStructure.full(order, 2, 3)
+    theta = np.random.default_rng(1).normal(size=rates.n_params)
+    structure = GrayBoxStructure.full(order, 2, 3, integrating=[2, 0])
+    assert structure.parameter_names == rates.parameter_names
+    omega = np.array([0.3, 4.0])
+    expected = rates.model(theta).frequency_response(omega)
+    expected[:, [0, 2]] /= 1j * omega[:, None, None]
+    found = structure.model(theta).frequency_response(omega)
+    assert_allclose(found, expected, rtol=1e-12)
+    assert structure.order == order + 2
+    with pytest.raises(ValueError, match="`integrating`.*2"):
+        GrayBoxStructure.full(order, 2, 3, integrating=[3])
+
+
 @pytest.mark.parametrize("make", ["observable_canonical", "full"])
 @pytest.mark.parametrize(
     "dimensions, name",
