@@ -5,6 +5,7 @@ A `PointRunner` tells progress and failures, and keeps results in a memory.
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ from .memory import Remembered
 from .workers import results_of
 
 Array = NDArray[np.float64]
+
+# A number of a message, but those in names (H2, p_1, A[0]) and versions
+_NUMBER = re.compile(r"(?<![\w.\[])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w\]]|\.\d)")
 
 _SKIP = " (Mend the experiments there, or leave the point out by on_error='skip'.)"
 
@@ -208,16 +212,33 @@ def _done(found: Sequence[Done | _Failure]) -> list[Done | None]:
 
 
 def tell_skipped(found: Sequence[Done | None], kappa: Array) -> None:
-    """Give the warnings of all points: each once, with the points that it came from."""
-    where: dict[Told, list[int]] = {}
+    """Give the warnings of all points: each once, with the points that it came from.
+
+    Those that differ in numbers alone are one, which tells their ranges.
+    """
+    kinds: dict[tuple[str, type[Warning]], list[tuple[int, str]]] = {}
     for k, done in enumerate(found):
-        for told in dict.fromkeys(done.told if done is not None else ()):
-            where.setdefault(told, []).append(k)
-    for (message, category), points in where.items():
+        for message, category in done.told if done is not None else ():
+            kind = _NUMBER.sub("#", message), category
+            kinds.setdefault(kind, []).append((k, message))
+    for (_, category), told in kinds.items():
+        points = dict.fromkeys(k for k, _ in told)
+        message = _ranges_told([text for _, text in told])
         place = "all operating points"
         if len(points) < len(kappa):
             place = ", ".join(place_of(k, kappa) for k in points)
         warn(message if len(kappa) == 1 else f"{message} (At {place}.)", category)
+
+
+def _ranges_told(texts: Sequence[str]) -> str:
+    """The first of texts that differ in numbers: with the least "to" the largest."""
+    ranges = []
+    for values in zip(*map(_NUMBER.findall, texts), strict=True):
+        least, largest = (end(values, key=float) for end in (min, max))
+        same = float(least) == float(largest)
+        ranges.append(least if same else f"{least} to {largest}")
+    told = iter(ranges)
+    return _NUMBER.sub(lambda _: next(told), texts[0])
 
 
 def place_of(number: int, kappa: Array) -> str:

@@ -12,8 +12,8 @@ from lpvlearn import (
     LocalLPVPipeline,
     SubspaceLTI,
 )
-from lpvlearn.exceptions import warn
-from lpvlearn.pipeline.runner import PointRunner
+from lpvlearn.exceptions import Told, warn
+from lpvlearn.pipeline.runner import Done, PointRunner, tell_skipped
 
 from ..conftest import (
     spring_pipeline,
@@ -90,6 +90,27 @@ def test_a_failure_still_tells_what_was_warned_of():
     assert texts == ["A shared cause. (At all operating points.)", own]
 
 
+def test_what_differs_in_numbers_is_told_once_with_their_ranges():
+    """Names that hold digits (H2, p_3, [1]) are not numbers: these stay apart."""
+    texts = [f"{x} times H2 is far (`p_value_` 1e-{k})." for x, k in
+             ((2.5, 30), (-10, 4), (9.0, 5))]  # fmt: skip
+    names = ["p_1 is open.", "p_2 is open.", "p_2 is open."]
+    found = [
+        Done(None, [Told(text, UserWarning), Told(name, ConvergenceWarning)])
+        for text, name in zip(texts, names, strict=True)
+    ]
+    with pytest.warns(UserWarning) as caught:
+        tell_skipped([*found, None], np.arange(4.0)[:, None])
+    one, two = "operating point 1 (scheduling 1)", "operating point 2 (scheduling 2)"
+    zero = "operating point 0 (scheduling 0)"
+    assert [str(w.message) for w in caught] == [
+        "-10 to 9.0 times H2 is far (`p_value_` 1e-30 to 1e-4). "
+        f"(At {zero}, {one}, {two}.)",
+        f"p_1 is open. (At {zero}.)",
+        f"p_2 is open. (At {one}, {two}.)",
+    ]
+
+
 def test_a_progress_bar_stays_whole(capsys):
     """Warnings come after the bar, once, at the points that they are about."""
     X, y = spring_tables(n_samples=150)
@@ -106,8 +127,7 @@ def test_a_progress_bar_stays_whole(capsys):
     shown = capsys.readouterr().err
     assert "restructuring: 100%" in shown and "Warning" not in shown
     texts = [str(w.message) for w in caught if "no nearer" in str(w.message)]
-    assert len(set(texts)) == len(texts)
-    assert all("(At operating point" in text for text in texts)
+    assert len(texts) == 1 and texts[0].endswith("(At all operating points.)")
     assert {w.filename for w in caught} == {__file__}
 
 
