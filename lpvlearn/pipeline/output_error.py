@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -44,7 +44,7 @@ from ..metrics.scores import bft_score
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
-from ..validation import number, one_of, positive_time, whole_number
+from ..validation import number, one_of, positive_time, units_by_name, whole_number
 from .bands import output_errors
 from .local_models import identify_point
 from .scheduled import ScheduledEstimator
@@ -116,6 +116,9 @@ class OutputErrorLPV(ScheduledEstimator):
     missing : {"raise", "split"}, default="raise"
         What a missing value (NaN), or a hole in time, does: raise an error, or cut the
         experiment there into runs with initial states of their own.
+    units : dict of str to str, default=None
+        Units of columns and parameters, by name, as in `LocalLPVPipeline`, which gives
+        its own. They join those of `start`.
     max_iter : int, default=200
         Largest number of steps tried.
     n_jobs : int, default=None
@@ -126,7 +129,7 @@ class OutputErrorLPV(ScheduledEstimator):
     Attributes
     ----------
     lpv_ : LPVStateSpace
-        The refined model.
+        The refined model. Signals that `start` gives no names have those of the table.
     rate_ : bool
         Whether it has rate terms.
     coefficients_ : ndarray of shape (n_coefficients,)
@@ -220,6 +223,7 @@ class OutputErrorLPV(ScheduledEstimator):
         sampling_time: float | None = None,
         time_tol: float = TIME_TOL,
         missing: str = "raise",
+        units: Mapping[str, str] | None = None,
         max_iter: int = 200,
         n_jobs: int | None = None,
         verbose: int = 0,
@@ -238,6 +242,7 @@ class OutputErrorLPV(ScheduledEstimator):
         self.sampling_time = sampling_time
         self.time_tol = time_tol
         self.missing = missing
+        self.units = units
         self.max_iter = max_iter
         self.n_jobs = n_jobs
         self.verbose = verbose
@@ -276,7 +281,15 @@ class OutputErrorLPV(ScheduledEstimator):
         self._single_output = np.asarray(y).ndim == 1
         self.output_names_, self.n_outputs_ = names, len(names)
         dt = self._sampling_time(experiments)
-        self.refine(self._start(experiments, dt), experiments, dt)
+        start = self._start(experiments, dt)
+        start = replace(
+            start,
+            scheduling_names=start.scheduling_names or as_list(self.scheduling) or None,
+            input_names=start.input_names or experiments[0].input_names,
+            output_names=start.output_names or names,
+            units={**(start.units or {}), **(self.units or {})} or None,
+        )
+        self.refine(start, experiments, dt)
         growth_rates(self.lpv_, grid_over(self.lpv_.scheduling_range, 3), _UNSEEN)
         return self
 
@@ -352,7 +365,6 @@ class OutputErrorLPV(ScheduledEstimator):
             scheduling_range=inner,
             identified_range=identified,
             covariance=self.coefficients_covariance_,
-            output_names=start.output_names or getattr(self, "output_names_", None),
         )
         self.scheduling_range_, self.sampling_time_ = identified, sampling_time
         names = as_list(self.scheduling) or as_list(start.scheduling_names)
@@ -371,9 +383,8 @@ class OutputErrorLPV(ScheduledEstimator):
             for e, record in zip(experiments, records, strict=True)
         ]
         self.report_ = _report(labels, records, before, after)
-        outputs = start.output_names or getattr(self, "output_names_", None)
         self.output_errors_ = output_errors(
-            outputs or range(1, start.n_outputs + 1),
+            start.output_names or range(1, start.n_outputs + 1),
             after,
             left_out_errors(found, records, own, run=run),
         )
@@ -459,19 +470,14 @@ class OutputErrorLPV(ScheduledEstimator):
             form = PolynomialLPV(0)
         grid = grid_over(bounds, _LEVELS)
         constant = clone(form).fit(grid, np.tile(theta, (len(grid), 1)))
-        return LPVStateSpace(
-            structure,
-            constant,
-            bounds,
-            scheduling_names=names or None,
-            input_delay=lti.input_delay,
-        )
+        return LPVStateSpace(structure, constant, bounds, input_delay=lti.input_delay)
 
     def _check_options(self) -> None:
         one_of("rate", self.rate, ("auto", True, False))
         one_of("initial_state", self.initial_state, ("estimate", "rest"))
         one_of("offset", self.offset, (None, "constant"))
         one_of("missing", self.missing, ("raise", "split"))
+        units_by_name(self.units)
         whole_number("max_iter", self.max_iter, 1)
         if not (self.prior is None or isinstance(self.prior, str)):
             number(

@@ -19,6 +19,7 @@ from lpvlearn import (
     bft_score,
 )
 from lpvlearn.exceptions import ExtrapolationWarning
+from lpvlearn.inspection import SimulationDisplay
 
 from ..conftest import (
     ROLES,
@@ -249,6 +250,24 @@ def test_what_it_knows_of_itself(alone):
     assert not hasattr(clone(alone), "lpv_")
 
 
+def test_names_and_units_of_the_table_travel():
+    X, y = sweeps(n=1, n_samples=200)
+    units = {"force": "N", "position": "m", "k": "1/s2"}
+    options = {"rate": False, "max_iter": 1, "units": units}
+    nameless = replace(spring_lpv(), scheduling_names=None, units={"kappa": "1"})
+    own = replace(nameless, input_names=["F"], scheduling_names=["load"])
+    model = OutputErrorLPV(nameless, **ROLES, **options).fit(X, y)
+    frozen = model.lpv_.at(0.7)
+    assert list(frozen.input_names) == ["force"]
+    assert list(frozen.output_names) == list(model.output_errors_.index) == ["position"]
+    assert list(model.lpv_.scheduling_names) == ["kappa"]
+    assert frozen.units == model.lpv_.units == {"kappa": "1", **units}
+    axes = SimulationDisplay.from_estimator(model, X, y).axes_
+    assert axes[0].get_ylabel() == "position (m)"
+    found = OutputErrorLPV(own, **ROLES, **options).fit(X, y).lpv_
+    assert (*found.input_names, *found.scheduling_names) == ("F", "load")
+
+
 def test_leaving_the_range_is_told(alone):
     X, _ = spring_sweep(100)
     with pytest.warns(ExtrapolationWarning, match="'kappa'.*farthest at 2"):
@@ -259,6 +278,7 @@ def test_leaving_the_range_is_told(alone):
     ("options", "message"),
     [
         ({"rate": "yes"}, "`rate` must be"),
+        ({"units": "m"}, "`units` must be"),
         ({"prior": "global"}, "`prior` must be"),
         ({"prior": -1.0}, "`prior` must be"),
         ({"start": "arx"}, "`start` must be"),
