@@ -5,6 +5,7 @@ from .data import (
     ExperimentSplit,
     from_trajectories,
     resample,
+    split_levels,
 )
 from .lpv import AutoLPV, LPVStateSpace, PolynomialLPV, RationalLPV, SplineLPV
 from .metrics import (
@@ -62,6 +63,7 @@ __all__ = [
     "readable_report",
     "resample",
     "save",
+    "split_levels",
     "suggest_operating_point",
     "vaf_score",
     "vaf_scorer",

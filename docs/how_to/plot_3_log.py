@@ -123,11 +123,17 @@ pd.Series(np.ravel(room), index=pd.Index(speeds, name="speed")).round(1)
 # One record of several levels
 # ----------------------------
 # Often there is one long record, in which the scheduling variable was held at one level
-# after another. Each stretch in which it is held becomes an experiment; what is between
-# is left out, or kept as a test of the model::
-#
-#     held = log["speed"].rolling(51, center=True, min_periods=1).std() < 0.01
-#     log["record"] = (held != held.shift()).cumsum()
-#     log = log[held]
-#
-# The window is a second or two, the limit a few times the noise of the variable.
+# after another. :func:`~lpvlearn.split_levels` numbers the stretches in which it is
+# held, each of which becomes an experiment; what is between has the number -1, and is
+# left out, or kept as a test of the model. Here the three records in one:
+
+from lpvlearn import split_levels
+
+long = log.drop(columns="record")
+long["record"] = split_levels(long, "speed", tol=0.02)
+held = long[long["record"] >= 0]
+held.groupby("record")["speed"].agg(["mean", "size"]).round(3)
+
+# %%
+# ``tol`` is how far the variable may range within a stretch, a few times its noise.
+# At the command line it is ``lpvlearn fit --levels``.

@@ -19,6 +19,7 @@ _OPTIONS = (
     (r"missing='split' \(of SubspaceLTI\)|missing='split'", "--missing split"),
     (r"norm='hinf' \(in a pipeline, efficient=False\)", "--hinf"),
     (r"initial_state='estimate'", "--initial-state estimate"),
+    (r"`tol`", "`--levels`"),
     (r"`(inputs|scheduling|experiment|time|order|missing)`", r"`--\1`"),
     (r"`(operating|sampling)_(point|time)`", r"`--\1-\2`"),
 )

@@ -17,11 +17,12 @@ from .. import (
     SubspaceLTI,
     fit_report,
     save,
+    split_levels,
 )
 from .judgement import course, measured_signals, simulation_text
 from .output import whole_folder
 from .structure_file import read_structure
-from .tables import check_table, columns_of, read_tables, with_times
+from .tables import EXPERIMENT, check_table, columns_of, read_tables, with_times
 
 INTERPOLATIONS = {
     "auto": AutoLPV,
@@ -53,6 +54,11 @@ def fit(options: argparse.Namespace) -> None:
             options.experiment, table = found.experiment, found.rows
             outputs = columns_of("--outputs", options.outputs, table)
             roles = _roles(options, table, outputs)
+            if options.levels is not None:
+                table = _held(table, roles, options.levels)
+                judged = found = found._replace(
+                    rows=table, experiment=roles["experiment"]
+                )
             features = _features(table, roles, outputs)
             structure, units = None, found.units
             if options.structure is not None:
@@ -117,6 +123,25 @@ def _roles(
             taken[name] = option
         roles[role] = None if not names else names if role in _SEVERAL else names[0]
     return roles
+
+
+def _held(
+    table: pd.DataFrame, roles: dict[str, Any], tol: float | bool
+) -> pd.DataFrame:
+    """The rows at levels, each level an experiment; the column joins the roles."""
+    if roles["scheduling"] is None:
+        raise ValueError("--levels are those of --scheduling, which names nothing.")
+    numbers = split_levels(
+        table,
+        roles["scheduling"],
+        experiment=roles["experiment"],
+        tol=None if tol is True else tol,
+    )
+    labels = pd.Series(numbers, table.index).map("level {}".format)
+    if roles["experiment"] is not None:
+        labels = table[roles["experiment"]].astype(str) + ", " + labels
+    roles["experiment"] = roles["experiment"] or EXPERIMENT
+    return table.assign(**{roles["experiment"]: labels})[numbers >= 0]
 
 
 def _all_of(roles: dict[str, Any], but: str = "") -> list[str]:

@@ -134,6 +134,15 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
         help="seconds between rows, where no column tells the time",
     )
     add(
+        "--levels",
+        type=float,
+        nargs="?",
+        const=True,
+        metavar="TOL",
+        help="cut records into experiments where the scheduling variables are held, "
+        "within TOL (default 5 %% of their range); what is between is left out",
+    )
+    add(
         "--missing",
         choices=("raise", "split"),
         default="raise",

@@ -1,6 +1,7 @@
 """Tables of experiments: roles of columns, time, operating points, gaps, splits."""
 
 from .experiments import from_trajectories
+from .levels import split_levels
 from .resampling import resample
 from .splits import BlockedTimeSeriesSplit, ExperimentSplit
 
@@ -9,4 +10,5 @@ __all__ = [
     "ExperimentSplit",
     "from_trajectories",
     "resample",
+    "split_levels",
 ]

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 
-from ..conftest import KAPPA, spring_truth
+from ..conftest import KAPPA, spring_tables, spring_truth
 from .conftest import ROLES, run
 
 
@@ -30,6 +30,26 @@ def test_results_are_those_of_the_spring(folder):
     assert "position (m)" in page and "k (1/s2)" in page
     assert len(list((folder / "spring" / "figures").glob("*.svg"))) == 10
     assert [path for path in folder.iterdir() if path.name.startswith(".")] == []
+
+
+def test_one_record_of_levels_is_cut_at_them(folder, tmp_path):
+    X, y = spring_tables(n_samples=300)
+    log = X.join(y).drop(columns="run").assign(time=0.02 * np.arange(len(X)))
+    log.iloc[295:305, log.columns.get_loc("kappa")] += 0.2  # on the way
+    log.to_csv(tmp_path / "long.csv", index=False)
+    roles = [x for x in ROLES if x not in ("--experiment", "run")]
+    options = [*roles, "--levels", "--validation", folder / "sweep.csv"]
+    target = tmp_path / "found"
+    given = ["fit", tmp_path / "long.csv", *options, "--output", target]
+    assert run(*given) == (0, "", "")
+    points = pd.read_csv(target / "points.csv", index_col=0)
+    assert_allclose(points.index, KAPPA)
+    assert points["n_samples"].iloc[0] == 295
+    nothing = [x for x in given[:-2] if x not in ("--scheduling", "kappa")]
+    told = run(*nothing, "--output", tmp_path / "no")
+    assert "--levels are those of --scheduling" in told[2]
+    told = run(*given[:-2], "--levels", "-1", "--output", tmp_path / "no")
+    assert "`--levels` must be a non-negative number" in told[2]
 
 
 def test_a_folder_is_not_written_over_unasked(folder):
