@@ -65,7 +65,7 @@ crane.parameters_.round(3)
 
 # %%
 # No starting value was needed, and the numbers have a meaning: ``k`` should be 9.81
-# divided by the rope length, ``b`` one divided by it. The warnings are right, too: a
+# divided by the rope length, ``b`` one divided by it. The warning is right, too: a
 # real pendulum follows the sine of its angle, and at some points the noise is too small
 # to hide that.
 

@@ -248,12 +248,11 @@ class PoleDisplay:
             if j == 0:
                 legend_above(one, [ring])
         tidy(one)
+        one.update_datalim([(0.0, 0.0)])  # the border of stability is of the picture
         one.autoscale_view()
         size = np.abs(self.poles).max()
         if np.abs(self.poles.imag).max() < _REAL * size:  # else rounding is magnified
             one.set_ylim(-0.25 * size, 0.25 * size)
-        # The border of stability is part of the picture.
-        one.set_xlim(right=max(one.get_xlim()[1], -0.03 * one.get_xlim()[0]))
         one.set_xlabel("Real part (rad/s)")
         one.axvline(0.0, color="0.35", linewidth=0.9, zorder=1)
         one.axhline(0.0, color="0.7", linewidth=0.7, zorder=1)

@@ -6,6 +6,7 @@ import inspect
 import io
 import platform
 import re
+import textwrap
 from collections.abc import Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import date
@@ -229,8 +230,9 @@ class _Page:
             figure.savefig(drawn, format="svg", transparent=True)
         self._n_figures += 1
         if self._folder is not None:
-            words = re.sub(r"[^\w.]+", "_", caption.split(";")[0].split(":")[0])
-            path = self._folder / f"{self._n_figures:02d}_{words[:_NAME]}.svg"
+            words = re.sub(r"[^\w.]+", " ", caption.split(";")[0].split(":")[0])
+            name = "_".join(textwrap.shorten(words, _NAME, placeholder="").split())
+            path = self._folder / f"{self._n_figures:02d}_{name}.svg"
             path.write_text(drawn.getvalue(), encoding="utf-8")
         kind = ' class="wide"' if wide else ""
         scroll = ('<div class="scroll">', "</div>") if wide else ("", "")

@@ -31,8 +31,9 @@ def test_pole_points_are_the_frozen_poles_coloured_by_scheduling():
     assert_allclose(np.sort_complex(drawn), np.sort_complex(poles))
     assert_array_equal(display.points_.get_array(), np.repeat(kappa, 2))
     assert display.local_points_ is None
-    right = display.ax_.get_xlim()[1]
+    left, right = display.ax_.get_xlim()
     assert right > 0  # the border of stability is seen
+    assert left < 1.03 * poles.real.min()  # and no pole on the frame
 
 
 def test_a_model_of_moving_data_is_drawn_without_local_ones():
