@@ -161,9 +161,8 @@ print(f"H-infinity norm {frozen.hinf_norm():.10f}")
 # python-control 0.10.2     1.0413122177      3e-14
 # ========================= ================= =========================
 #
-# Their norms are found by bisection, to the 1e-6 that they are asked for; the one of
-# this library is exact to the last digits, and no other can be larger by more than its
-# tolerance.
+# Their norms are found by bisection, to the 1e-6 that they are asked for; that of this
+# library is exact but for rounding.
 #
 # Keeping it
 # ----------
