@@ -120,8 +120,8 @@ print(len(models), models[0])
 #
 # Another program's opinion
 # -------------------------
-# Before a controller is built on it, let a program that shares no code with this one say
-# what the model is:
+# Before a controller is built on it, let a program that shares no code with this one
+# say what the model is:
 
 frozen = lpv.at(0.4)
 omega = np.logspace(-1, 3, 200)
