@@ -3,13 +3,18 @@
 import os
 import signal
 import threading
+import time
+from functools import partial
 
 import numpy as np
+import pandas as pd
 import pytest
 from joblib import parallel_config
 from sklearn.model_selection import GridSearchCV
 
 from lpvlearn import ExperimentSplit, PolynomialLPV, SubspaceLTI
+from lpvlearn.datasets import make_flexible_arm
+from lpvlearn.paper import experiment, run_paper_experiment
 
 from .conftest import spring_pipeline, spring_tables
 
@@ -17,7 +22,7 @@ distributed = pytest.importorskip("distributed")
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
 
-KILLED_AFTER = 0.7  # seconds of work, a part of what there is
+AT_WORK = 0.2  # seconds, after which a worker is in the middle of a task
 
 
 @pytest.fixture(scope="module")
@@ -40,16 +45,28 @@ def tables():
 
 
 def with_a_worker_killed(client, work):
-    """What `work` returns; meanwhile one of the workers is killed."""
-    first, *_ = before = set(client.run(os.getpid).values())
-    timer = threading.Timer(KILLED_AFTER, os.kill, (first, signal.SIGKILL))
-    timer.start()
+    """What `work` returns; a worker is killed in the middle of a task of it."""
+    workers, killed, ended = client.run(os.getpid), [], threading.Event()
+
+    def kill_when_at_work():
+        while not ended.wait(0.05):
+            busy = [address for address, tasks in client.processing().items() if tasks]
+            if busy:
+                time.sleep(AT_WORK)
+                killed.extend(workers[address] for address in busy[:1])
+                os.kill(killed[0], signal.SIGKILL)
+                return
+
+    killer = threading.Thread(target=kill_when_at_work)
+    killer.start()
     try:
         found = work()
+        assert killed, "the work ended before a worker was killed"
     finally:
-        timer.join()
+        ended.set()
+        killer.join()
     client.wait_for_workers(2)
-    assert set(client.run(os.getpid).values()) != before
+    assert killed[0] not in client.run(os.getpid).values()
     return found
 
 
@@ -64,11 +81,28 @@ def test_a_chain_comes_out_to_the_bit(cluster, tables):
 def test_a_search_comes_out_to_the_bit(cluster, tables):
     cv = ExperimentSplit(3, experiment="run", scheduling="kappa")
     grid = {"interpolator__degree": [1, 2]}
-    search = GridSearchCV(chain(), grid, cv=cv, n_jobs=2)
-    # none is killed: joblib gives every split to one worker, and dask loses it with it
-    with parallel_config(backend="dask", scatter=list(tables)):
-        found = search.fit(*tables).cv_results_
-    alone = GridSearchCV(chain(), grid, cv=cv).fit(*tables).cv_results_
+    splits = list(cv.split(*tables))
+    search = GridSearchCV(chain(), grid, cv=splits, n_jobs=2)
+    # joblib gives a split to one worker, with which it is lost: all have all of these
+    shared = [*tables, *(rows for split in splits for rows in split)]
+    with parallel_config(backend="dask", scatter=shared):
+        found = with_a_worker_killed(cluster, lambda: search.fit(*tables).cv_results_)
+    alone = GridSearchCV(chain(), grid, cv=splits).fit(*tables).cv_results_
     for name in found:
         if name.startswith("split"):
             np.testing.assert_array_equal(found[name], alone[name])
+
+
+def test_the_papers_tables_come_out_to_the_bit(cluster, monkeypatch):
+    """The Monte Carlo of the command, on an arm integrated by steps of 1 ms."""
+    coarse = partial(make_flexible_arm, integration_step=1e-3)
+    monkeypatch.setattr(experiment, "make_flexible_arm", coarse)
+    with parallel_config(backend="dask"):
+        found = with_a_worker_killed(
+            cluster, lambda: run_paper_experiment(2, n_jobs=2).tables
+        )
+    alone = run_paper_experiment(2).tables
+    assert found.pop("timing").shape == alone.pop("timing").shape
+    assert list(found) == list(alone)
+    for name, table in found.items():
+        pd.testing.assert_frame_equal(table, alone[name], check_exact=True)

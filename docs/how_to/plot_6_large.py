@@ -71,10 +71,14 @@ if find_spec("pyarrow"):
 #     client = Client("scheduler:8786")
 #     with parallel_config(backend="dask"):
 #         pipeline.set_params(n_jobs=8).fit(X, y)
-#     with parallel_config(backend="dask", scatter=[X, y]):  # the table, sent once
-#         search.fit(X, y)
 #
 # The figures are those of one process, to the bit. A worker that dies under
-# `LocalLPVPipeline.fit` costs its points anew; under a search joblib and dask lose what
-# that worker alone held, and the search ends with their error: give `n_jobs` to the
-# pipeline, or run it again with `memory`, which keeps what was finished.
+# `LocalLPVPipeline.fit` or `run_paper_experiment` costs its points anew. Under a search
+# joblib gives the rows of a split to one worker, and the search ends in its error where
+# that one dies: send them to all of the workers, with the table::
+#
+#     splits = list(cv.split(X, y))
+#     search = GridSearchCV(pipeline, grid, cv=splits, n_jobs=8)
+#     shared = [X, y, *(rows for split in splits for rows in split)]
+#     with parallel_config(backend="dask", scatter=shared):
+#         search.fit(X, y)
