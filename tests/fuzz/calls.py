@@ -369,6 +369,10 @@ def data_calls(w):
         **table, "time": "time", "sampling_time": 0.03, "experiment": "run",
         "method": "linear", "hold": "auto", "max_gap": 3.0, "antialias": True,
     }  # fmt: skip
+    yield "split_levels", lp.split_levels, {
+        "X": w.X, "scheduling": "kappa", "experiment": "run", "tol": 0.1,
+        "min_samples": 5,
+    }  # fmt: skip
     yield "from_trajectories", lp.from_trajectories, {
         "trajectories": [(w.U, w.K, w.Y), (w.U, w.K, w.Y)], "sampling_time": 0.1,
     }  # fmt: skip
