@@ -95,7 +95,7 @@ class _Kept(NamedTuple):
 
 
 def _kept(key: str, data: bytes) -> _Kept:
-    return _Kept(key, pickle.loads(data))
+    return _Kept(key, pickle.loads(data))  # nosec B301: of a folder that is trusted
 
 
 class _Unknown(Exception):
