@@ -414,16 +414,39 @@ def _fit_together(
         fitted, joint = _refined(joint, records, free)
         if fitted.model.blocks is None:  # it could not be refined
             fitted = None
-    split = _split(joint, fitted, order, subspace.n_columns)
-    if split is None:
-        assert order is not None
+    split, n = _split(joint, fitted, order, subspace.n_columns), subspace.n_columns
+    if split is not None:
+        T, kept = split
+        apart = joint.transformed(T)
+        if fitted is None or kept.all():
+            return _Together(fitted, apart, T, kept)
+        apart = _without_reached_noise(apart, fitted, T, kept, free.direct)
+        if _as_likely(apart, joint, int((~kept).sum()), records, free, n):
+            return _Together(fitted, apart, T, kept)
+    if order is not None and order != len(joint.A):
         joint, fitted = _innovation_form(subspace, order), None
-        split = _Split(np.eye(order), np.ones(order, dtype=bool))
-    T, kept = split
-    joint = joint.transformed(T)
-    if fitted is not None and not kept.all():
-        joint = _without_reached_noise(joint, fitted, T, kept, free.direct)
-    return _Together(fitted, joint, T, kept)
+    whole = np.ones(len(joint.A), dtype=bool)
+    return _Together(fitted, joint, np.eye(len(whole)), whole)
+
+
+def _as_likely(
+    model: _Innovation,
+    whole: _Innovation,
+    n_fewer: int,
+    records: Sequence[Record],
+    free: Freedom,
+    n: int,
+) -> bool:
+    """Whether a model without B of so many states is worth what it loses.
+
+    By Schwarz's criterion, as Wald's statistic has said of the whole model: which is to
+    be trusted where the likelihood is as quadratic as it takes it for.
+    """
+    errors = np.vstack(_predicted(model, records, free)[1])
+    floor = _EXACT * np.mean(np.hstack([r.y for r in records]) ** 2, axis=1)
+    spreads = errors.T @ errors / len(errors), whole.covariance
+    volumes = [np.linalg.slogdet(S + np.diag(floor))[1] for S in spreads]
+    return bool(volumes[0] - volumes[1] < n_fewer * model.B.shape[1] * np.log(n) / n)
 
 
 def _predictor_subspace(
