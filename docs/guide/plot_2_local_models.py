@@ -282,6 +282,10 @@ display = BodeDisplay.from_models(
 #   Constants and drifts of the experiments (``offset``) are estimated there as well.
 # * Say ``feedthrough=False`` unless the controller needs a sample to answer: a
 #   feedthrough and a controller that answers within the sample cannot be told apart.
+# * The warning may be false where channels are not sampled at once: outputs that are
+#   means over the sample to come know the next inputs, too. "auto" then leaves D free,
+#   or takes ``"po-moesp"``, where parts held out speak clearly for it, and says both
+#   figures. Give the outputs a sample later if that is what happened.
 
 in_loop.predictor_.K.round(2)
 

@@ -128,7 +128,8 @@ class SubspaceLTI(
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
         shape (n_outputs, n_inputs) single entries of D. A feedthrough in a closed loop
         can be told only where the controller needs a sample to answer: method="auto"
-        takes ``D = 0`` instead of True where something acts within the sample.
+        takes ``D = 0`` instead of True where something acts within the sample, unless
+        parts held out refute it.
     input_delay : int, array-like of shape (n_inputs,) or "auto", default=0
         Samples by which the inputs, or each of them, act late: ``y[t]`` depends on
         ``u[t - input_delay]`` through D, on earlier inputs through the state. A sampled
@@ -289,7 +290,12 @@ class SubspaceLTI(
     nonlinear terms of the past do not tell more. What minimises the simulation error
     has then a bias that no number of samples removes. A loop through which nothing but
     white noise of the sensors goes does not show; it does no harm with
-    ``feedthrough=False``.
+    ``feedthrough=False``. Channels that are not sampled at once look like a loop. So
+    "auto" looks how the plant of "pbsid" does on parts held out (its growing modes are
+    simulated backward), where inputs seem to explain a quarter of its simulation errors
+    or it is unstable: D is left free, or "po-moesp" taken, where that leaves less than
+    half of the squared errors, or makes a plant stable that is so within its
+    uncertainty.
 
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.

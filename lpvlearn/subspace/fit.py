@@ -23,7 +23,7 @@ from ..data.preparation import (
 from ..exceptions import RankWarning, warn
 from ..validation import is_whole, one_of, positive_time, shown
 from .closed_loop import identify_closed_loop
-from .held_out import HeldOut
+from .held_out import HeldOut, held_out
 from .identification import (
     Candidate,
     ScaledRecords,
@@ -31,6 +31,7 @@ from .identification import (
     centred,
     identify,
     scale_records,
+    validate,
 )
 from .offsets import (
     N_TRENDS,
@@ -43,8 +44,13 @@ from .offsets import (
 from .realization import METHODS
 from .residuals import lacks
 from .selection import PlantFit, Row, Selection, better_horizon, select
-from .signals import shorten
-from .simulation_fit import Freedom, Realization
+from .signals import Record, shorten, thinned
+from .simulation_fit import (
+    Freedom,
+    Realization,
+    simulation_errors,
+    with_initial_states,
+)
 from .statistics import Evidence
 from .varx import Feedback, find_feedback
 
@@ -80,6 +86,7 @@ class Choices(NamedTuple):
             order=known.selection.order,
             horizon=known.selection.horizon,
             method=known.method,
+            feedthrough=self.feedthrough if evidence.free.direct.any() else False,
             refine=refine,
             offset=DETRENDS[evidence.free.n_trend],
         )
@@ -231,6 +238,18 @@ def fit_pairs(
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
+    fitted = _with_constants(pairs, choices, told, known)
+    doubt = None
+    if choices.method == "auto" and fitted.method == "pbsid":
+        fitted, doubt = _believable(pairs, choices, told, fitted)
+    _tell_of_feedback(fitted, choices, doubt, told)
+    return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
+
+
+def _with_constants(
+    pairs: Pairs, choices: Choices, told: set[str], known: LocalFit | None
+) -> LocalFit:
+    """Choose and identify, with constants of the experiments where these matter."""
     n_trend = N_TRENDS[choices.offset]
     # The errors of a rough model are not the noise that constants must stand out of.
     rough = choices.offset == "auto" and choices.refine is False
@@ -244,9 +263,7 @@ def fit_pairs(
         other = _fit(pairs, judged, told, 1, fitted)
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
-    if rough:
-        fitted = _fit(pairs, choices, told, n_trend, fitted)
-    return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
+    return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
 
 
 def _fit(
@@ -273,7 +290,7 @@ def _fit(
         raise TooFewSamples(str(error)) from None
     scaled = scale_records(pairs, n_trend)
     feedback = find_feedback(scaled.records) if known is None else known.feedback
-    settings = _heed(feedback, settings, choices.feedthrough is True, told)
+    settings = _heed(feedback, settings, choices.feedthrough is True)
     if settings.method == "pbsid":
         try:
             plant = identify_closed_loop(scaled, basis, order, horizon, settings)
@@ -344,53 +361,184 @@ def _identify_open_loop(
     )
 
 
-def _heed(
-    feedback: Feedback | None, settings: Settings, by_default: bool, told: set[str]
-) -> Settings:
-    """The settings with their method chosen, and the user told of feedback.
+def _heed(feedback: Feedback | None, settings: Settings, by_default: bool) -> Settings:
+    """The settings with their method chosen; and D, which is free `by_default`.
 
-    `by_default` tells that D is free because nobody said otherwise.
+    Where inputs and outputs depend on each other within the sample, data do not tell a
+    feedthrough from a controller that answers at once: the latter is taken for it.
     """
-    chooses, direct = settings.method == "auto", settings.free.direct
+    if settings.method != "auto":
+        return settings
     if feedback is None or not feedback.found:
-        return settings._replace(method="po-moesp") if chooses else settings
+        return settings._replace(method="po-moesp")
+    free = settings.free
+    if by_default and feedback.instantaneous:
+        free = free._replace(direct=np.zeros_like(free.direct))
+    return settings._replace(method="pbsid", free=free)
+
+
+class _Doubt(NamedTuple):
+    """Why the first model of a closed loop was given up."""
+
+    bft: float  # on parts held out, percent
+    bft_taken: float  # of the model that was taken instead
+    grew: bool  # whether it was unstable
+
+
+def _believable(
+    pairs: Pairs, choices: Choices, told: set[str], first: LocalFit
+) -> tuple[LocalFit, _Doubt | None]:
+    """The first model of a closed loop, or one that refutes it on parts held out.
+
+    These are that with D free where the first has none by default, and the one of
+    "po-moesp". The latter minimises the simulation error, and so does better than the
+    plant itself by what the inputs tell of the noise: that does not refute the plant
+    unless inputs were to be noise more than anything else (`_OF_NOISE`), or the plant
+    is unstable, by no more than chance, and the other is not.
+    """
+    if not _grows(first) and _known_by_inputs(first) < _HINT:
+        return first, None
+    n_trend, free = first.evidence.free.n_trend, first.evidence.free.direct.any()
+    same = choices._replace(offset=DETRENDS[n_trend])
+    best, error = first, _held_out(first, choices)
+    before = error
+    rivals = ["pbsid", "po-moesp"][bool(free) or choices.feedthrough is not True :]
+    for method in rivals if len(error.blocks) else []:
+        try:
+            other = _fit(pairs, same._replace(method=method), told, n_trend, first)
+        except TooFewSamples:
+            continue
+        rival = _held_out(other, choices)
+        better = rival.blocks.sum() < _OF_NOISE * error.blocks.sum()
+        if method == "pbsid":  # data do not tell it apart from the first
+            better |= _grows(best, _CERTAIN) and not _grows(other, _CERTAIN)
+        elif _grows(best) and not _grows(best, _CERTAIN) and not _grows(other):
+            better |= rival.clearly_better_than(error, _DOUBT)
+        if better:
+            best, error = other, rival
+    if best is first:
+        return first, None
+    doubt = _Doubt(before.bft, error.bft, _grows(first))
+    if n_trend and choices.offset == "auto":  # constants are judged anew
+        chosen = choices._replace(method=best.method)
+        best = _with_constants(pairs, chosen, told, best)
+    return best, doubt
+
+
+def _known_by_inputs(fitted: LocalFit) -> float:
+    """Share of the simulation errors that present and past inputs explain."""
+    model, free = fitted.evidence.model, fitted.evidence.free
+    records = thinned(fitted.scaled.records)
+    errors = simulation_errors(with_initial_states(model, records, free), records)
+    known, left = [], []
+    for record, error in zip(records, errors, strict=True):
+        if len(error) >= _N_LAGS:
+            lags = np.lib.stride_tricks.sliding_window_view(record.u, _N_LAGS, axis=1)
+            known.append(lags.swapaxes(0, 1).reshape(len(lags[0]), -1))
+            left.append(error[_N_LAGS - 1 :])
+    n = sum(map(len, left))
+    if n < 2 * _N_LAGS * len(records[0].u):
+        return 1.0  # nothing can be told
+    E, U = np.vstack(left), np.vstack(known)
+    rest = E - U @ np.linalg.lstsq(U, E)[0]
+    share = np.sum(rest**2) / (n - U.shape[1]) / (np.sum(E**2) / n or 1.0)
+    return 1.0 - float(share)
+
+
+def _held_out(fitted: LocalFit, choices: Choices) -> HeldOut:
+    """Errors of a fit's like on parts held out."""
+    evidence, scaled = fitted.evidence, fitted.scaled
+    free, horizon = evidence.free, fitted.selection.horizon
+    settings = Settings(
+        free,
+        fitted.method,
+        choices.refine is not False,
+        choices.enforce_stability,
+        choices.n_noise_states,
+    )
+    if fitted.method != "pbsid":
+        whitening, refined = evidence.whitening, evidence.refined
+        like = Candidate(evidence.model, horizon, whitening, refined)
+        return validate(like, scaled.records, settings)
+
+    def refitted(train: list[Record]) -> Realization:
+        part = scaled._replace(records=train)
+        basis, order = evidence.basis, choices.order
+        return identify_closed_loop(
+            part, basis, order, choices.horizon, settings
+        ).evidence.model
+
+    try:
+        return held_out(refitted, scaled.records, at_rest=not free.initial_states)
+    except ValueError:  # too few samples are left
+        return HeldOut(np.zeros(0), np.nan)
+
+
+def _grows(fitted: LocalFit, deviations: float = 0.0) -> bool:
+    """Whether a pole lies outside the unit circle, by so many standard deviations."""
+    poles = fitted.evidence.state_space(fitted.model, 1.0).poles()
+    growth, spread = np.abs(poles) - 1.0, np.zeros(len(poles))
+    if deviations and (growth > 0.0).any():
+        try:
+            spread = np.abs(fitted.evidence.poles_std())
+        except ValueError:  # it is not known
+            return False
+    return bool((growth > deviations * spread).any())
+
+
+def _tell_of_feedback(
+    fitted: LocalFit, choices: Choices, doubt: _Doubt | None, told: set[str]
+) -> None:
+    """Tell the user of feedback, and what was done about it."""
+    feedback, method = fitted.feedback, choices.method
+    if feedback is None or not feedback.found:
+        return
     what = (
         "The inputs know the noise of the outputs (future inputs explain "
         f"{100.0 * feedback.share:.2g} % of the innovations, p = "
         f"{feedback.p_value:.1g}): the data come from a closed loop. "
     )
-    loop = direct.any() and feedback.instantaneous
-    if not chooses and settings.method != "pbsid":
+    loop = bool(np.any(choices.feedthrough)) and feedback.instantaneous
+    within = (
+        "Inputs and outputs also depend on each other within the sample, and the data "
+        "do not tell a feedthrough from a controller that answers at once"
+    )
+    if method not in ("auto", "pbsid"):
         what += (
-            f"That biases method={settings.method!r} however many samples there are. "
+            f"That biases method={method!r} however many samples there are. "
             "Use method='pbsid', or identify with the controller's reference as input."
         )
-    elif not chooses and loop:
+    elif method == "pbsid" and loop:
         what += (
-            "Inputs and outputs also depend on each other within the sample, and the "
-            "data do not tell a feedthrough from a controller that answers at once. "
+            f"{within}. "
             "Use feedthrough=False unless the controller needs a sample to answer."
         )
-    elif not chooses:
-        return settings
+    elif method == "pbsid":
+        return
+    elif doubt is not None:
+        open_loop = fitted.method == "po-moesp"
+        what += (
+            f"The model of method='pbsid'{' with D = 0' if loop else ''} is "
+            f"{'unstable' if doubt.grew else 'poor'} (its best fit to parts held out "
+            f"is {doubt.bft:.3g} %). Taken was that of "
+            f"{'method=' + repr(fitted.method) if open_loop else 'it with D free'} "
+            f"({doubt.bft_taken:.3g} %), as where inputs and outputs are not sampled "
+            "at once. If a controller makes the inputs"
+            f"{'' if open_loop else ' without a delay of a sample'}, use "
+            f"method='pbsid'{', feedthrough=False' if loop else ''}."
+        )
     else:
         what += "method='pbsid' was taken, which that does not bias."
-        settings = settings._replace(method="pbsid")
-        if loop and by_default:
+        if loop and choices.feedthrough is True:
             what += (
-                " Inputs and outputs also depend on each other within the sample, and "
-                "the data do not tell a feedthrough from a controller that answers at "
-                "once: D = 0 was taken. If the controller needs a sample to answer, "
-                "use method='pbsid', which leaves D free."
+                f" {within}: D = 0 was taken. If the controller needs a sample to "
+                "answer, use method='pbsid', which leaves D free."
             )
-            none = np.zeros_like(direct)
-            settings = settings._replace(free=settings.free._replace(direct=none))
         what += (
             " A model that is only to simulate records of the same loop may do so "
             "better by method='po-moesp'."
         )
     tell(told, "feedback", what)
-    return settings
 
 
 def _with_independent_inputs(pairs: Pairs, told: set[str]) -> tuple[Pairs, Array]:
@@ -446,6 +594,15 @@ _WORSE = 1.2
 _USELESS = 0.9  # share of the outputs' size left unexplained that is reported
 # What is told from tests that take as long as a fit
 TESTS = {"held out", "static gain", "lack"}
+
+# Share of the squared errors of a plant in a loop that must be left of them for another
+# model not to refute it; standard errors by which a lesser one must be better where the
+# plant grows; standard deviations by which a pole does so for certain.
+_OF_NOISE, _DOUBT, _CERTAIN = 0.5, 2.0, 3.0
+
+# Share of its errors that a regression on so many samples of the inputs must explain,
+# for a stable one to be looked at: half of what would refute it.
+_HINT, _N_LAGS = 0.25, 25
 
 _HALF = 0.5  # share of their energy that enforced stability must cost to be reported
 # Share of its fit (one less the relative error) that parts held out must confirm; with

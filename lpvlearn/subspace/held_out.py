@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from ..systems.simulation import estimate_initial_state, free_responses, lti_response
 from .signals import Record, thinned
@@ -88,13 +89,11 @@ def held_out(
                 continue
             begin = 0 if at_rest else start
             u, y = record.u.T[begin:stop], record.y.T[start:stop]
+            trend = record.trend[:, begin:stop]
             with np.errstate(over="ignore", invalid="ignore"):
-                answer = lti_response(model.A, model.B, model.C, model.D, u)
-                error = y - answer[start - begin :]
-                if len(record.trend) or not at_rest:
-                    trend = record.trend[:, begin:stop]
-                    free = free_responses(model.A, W @ model.C, stop - begin, trend)
-                    free = free[start - begin :, :, len(model.A) * at_rest :]
+                answer, free = _answers(model, W, u, trend, at_rest)
+                error, free = y - answer[start - begin :], free[start - begin :]
+                if free.shape[2]:
                     own = estimate_initial_state(free, error @ W.T)
                     error = error - np.linalg.solve(W, (free @ own).T).T
                     # What these unknowns take of the noise is made up for.
@@ -115,6 +114,30 @@ def held_out(
     bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
     residual = float(np.sqrt(np.sum(blocks) / error.size))
     return HeldOut(np.array(blocks), bft if np.isfinite(bft) else 0.0, residual)
+
+
+def _answers(
+    model: Realization, weight: Array, u: Array, trend: Array, at_rest: bool
+) -> tuple[Array, Array]:
+    """Outputs to inputs (n_samples, n_inputs), and weighted ones to what is unknown.
+
+    Modes that grow are simulated backward, from rest at the end: the free responses
+    make up for it, and neither overflows.
+    """
+    A, B, C, D = model[:4]
+    if at_rest or not np.abs(np.linalg.eigvals(A)).max(initial=0.0) > 1.0:
+        free = free_responses(A, weight @ C, len(u), trend)
+        return lti_response(A, B, C, D, u), free[:, :, len(A) * at_rest :]
+    R, Z, k = linalg.schur(A, sort="iuc")
+    X = linalg.solve_sylvester(R[:k, :k], -R[k:, k:], -R[:k, k:])
+    left, right = Z.T[:k] - X @ Z.T[k:], Z[:, :k] @ X + Z[:, k:]
+    back, C_stable, C_growing = linalg.inv(R[k:, k:]), C @ Z[:, :k], C @ right
+    into, seen = back @ Z.T[k:] @ B, C_growing @ back
+    answer = lti_response(R[:k, :k], left @ B, C_stable, D, u)
+    answer += lti_response(back, -into, seen, -C_growing @ into, u[::-1])[::-1]
+    grown = free_responses(back, weight @ seen, len(u))[::-1]
+    free = free_responses(R[:k, :k], weight @ C_stable, len(u), trend)
+    return answer, np.concatenate([grown, free], axis=2)
 
 
 def _cut(u: Array, k: int) -> tuple[int, int]:

@@ -315,6 +315,43 @@ def test_auto_takes_it_where_there_is_feedback():
     assert streamed.method_ == "po-moesp"
 
 
+def sampled_early(seed, n_samples=400):
+    """Outputs that are means over the sample to come, of slow inputs: no feedback."""
+    rng = np.random.default_rng(seed)
+    u = lfilter([1.0], [1.0, -0.9], rng.standard_normal((n_samples + 1, 1)), axis=0)
+    y = lfilter([1.0, -0.6], [1.0, -0.8], u, axis=0)
+    noise = 0.05 * y.std() * rng.standard_normal((n_samples, 1))
+    return u[:-1], 0.5 * (y[:-1] + y[1:]) + noise
+
+
+def test_auto_gives_up_what_parts_held_out_refute():
+    for seed in range(3):
+        (u, y), (u_other, y_other) = sampled_early(seed), sampled_early(seed + 9)
+        with pytest.warns(UserWarning, match="D = 0 is (poor|unstable) .* Taken was"):
+            model = SubspaceLTI().fit(u, y)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of the closed loop
+            rivals = [
+                SubspaceLTI(method="po-moesp").fit(u, y),
+                pbsid(feedthrough=False).fit(u, y),
+            ]
+        first, ordinary, without = (
+            np.std(y_other - m.predict_with_initial_state(u_other, y_other))
+            for m in (model, *rivals)
+        )
+        assert first < min(1.2 * ordinary, 0.7 * without)
+
+
+def test_auto_keeps_a_plant_that_only_the_loop_holds():
+    for delay in (0, 1):
+        rng, drive = np.random.default_rng(0), np.array([0.5, 0.2])
+        loop = closed_loop(rng, 600, UNSTABLE, gain=0.5, delay=delay, drive=drive)
+        with pytest.warns(UserWarning, match="closed loop|unstable"):
+            model = SubspaceLTI().fit(*loop)
+        assert model.method_ == "pbsid" and model.lti_.D.any() == bool(delay)
+        assert_allclose(np.abs(model.lti_.poles()).max(), 1.1, atol=0.03)
+
+
 def test_auto_is_po_moesp_in_open_loop(system):
     u, y = record(system, 500)
     model = SubspaceLTI(5).fit(u, y)

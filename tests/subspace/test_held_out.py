@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import place_poles
 
 from lpvlearn.subspace.held_out import HeldOut, held_out
 from lpvlearn.subspace.signals import Record
@@ -46,6 +47,20 @@ def test_a_piece_begins_where_it_is(rng):
     model = Realization(A, B, np.eye(1, 2), np.zeros((1, 1)), np.zeros((1, 2)), 0.0)
     error = held_out(lambda train: model, [Record.of(u, y)])
     assert error.bft == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize("poles", [(1.4, 0.7), (1.4, -1.2)])
+def test_modes_that_grow_beyond_all_digits_are_simulated(rng, poles):
+    """Of a plant that only a loop holds: ``1.4**100`` is 4e14."""
+    A, B, x = np.diag(poles), np.ones((2, 1)), np.zeros(2)
+    hold = place_poles(A, B, [0.3, 0.5]).gain_matrix
+    u, y, C = rng.standard_normal((400, 1)), np.zeros((400, 1)), np.array([[1.0, 0.5]])
+    for t in range(400):
+        y[t], u[t] = C @ x, u[t] - hold @ x
+        x = A @ x + B @ u[t]
+    model = Realization(A, B, C, np.zeros((1, 1)), np.zeros((1, 2)), 0.0)
+    error = held_out(lambda train: model, [Record.of(u, y)])
+    assert error.residual < 1e-9
 
 
 def test_short_experiments_are_not_held_out(rng):
