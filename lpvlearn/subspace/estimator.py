@@ -619,6 +619,11 @@ class SubspaceLTI(
         >>> model.lti_.poles().round(6)
         array([0.9+0.j])
         """
+        before = getattr(self, "_stream", None)
+        if before is not None:
+            stream = before.with_numbers(X, y, self.__dict__)
+            if stream is not None:
+                return self._go_on(stream)
         options = self.get_params(deep=False)
         choices = check_options(options)
         if self.integrating is not None:
@@ -650,7 +655,6 @@ class SubspaceLTI(
                 "SubspaceLTI requires y to be passed, but the target y is None: `y` "
                 "must hold the outputs of every batch."
             )
-        before = getattr(self, "_stream", None)
         if before is not None:
             before.check_options(options)
         experiments = read_experiments(
@@ -673,8 +677,12 @@ class SubspaceLTI(
         fitted = stream.add(experiments, Table(X).one(self.time, "time"))
         if fitted is not None:
             self._take_up(fitted, stream)
+        return self._go_on(stream)
+
+    def _go_on(self, stream: SampleStream) -> Self:
+        """Have what a stream does not tell yet wait for someone to ask for it."""
         self._stream = stream
-        if stream.waits:  # for someone to ask for the model, see __getattr__
+        if stream.waits and "lti_" in self.__dict__:  # see __getattr__
             known = [name for name in _TAKEN if name in self.__dict__]
             stale = {name: self.__dict__.pop(name) for name in known}
             self._stale = self.__dict__.get("_stale", {}) | stale
@@ -731,13 +739,14 @@ class SubspaceLTI(
     def __getattr__(self, name: str) -> Any:
         """What a stream has not told yet, where small batches wait for it."""
         if name in _TAKEN and "_stale" in self.__dict__:
-            stream = cast(SampleStream, self._stream)
+            stream = cast(SampleStream, self._stream).branch()
             stale = self.__dict__.pop("_stale")
             try:
                 fitted = stream.fit()
             except BaseException:
                 self._stale = stale
                 raise
+            self._stream = stream
             if fitted is None:  # too few samples still
                 self.__dict__.update(stale)
             else:

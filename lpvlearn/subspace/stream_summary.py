@@ -126,6 +126,11 @@ class StreamSummary:
             sum(len(z) for z in samples),
         )
 
+    @property
+    def takes_all_inputs(self) -> bool:
+        """Whether there are none that `add` refuses, as the first were independent."""
+        return self._basis.shape[0] == self._basis.shape[1]
+
     def add(self, piece: Piece) -> None:
         """Take up what follows."""
         if piece.starts:

@@ -615,6 +615,47 @@ def test_branches_of_a_stream_leave_each_other_alone(system):
     assert abs(response(other) - response(whole)).max() > 1e-3
 
 
+def test_single_rows_are_the_stream_of_their_table(system, short_stream):
+    u, y = record(system, 2600)
+    model, row = SubspaceLTI(5, horizon=8), (np.empty((1, 2)), np.empty((1, 2)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a few samples
+        for k in range(2600):
+            row[0][:], row[1][:] = u[k], y[k]  # in the same memory every time
+            model.partial_fit(*row)
+            if k in (700, 1700):  # kept and asked, summarised and asked
+                whole = SubspaceLTI(5, horizon=8).fit(u[: k + 1], y[: k + 1])
+                assert_same_model(model, whole)
+    assert_same_model(model, SubspaceLTI(5, horizon=8).fit(u, y))
+
+
+def test_rows_that_wait_are_checked_and_belong_to_their_branch(system):
+    u, y = record(system, 800)
+    first = SubspaceLTI(5, horizon=8).partial_fit(u[:400], y[:400])
+    first.partial_fit(u[400:401], y[400:401])
+    other, kept = copy.copy(first), pickle.loads(pickle.dumps(first))
+    bad = np.array([[np.nan, 0.0]])
+    refused(first, bad, y[401:402], "Input X contains NaN")
+    refused(first, u[401:402], bad, "Input y contains NaN")
+    refused(first, u[401:402], np.full((1, 2), 1e200), "too large to be squared")
+    refused(first, u[401:402], y[401:402, 0], "Got 1 output.s., after 2")
+    refused(first, u[401:402], y[401:403], "as many rows")
+    refused(first, u[401:402], y[401:403].ravel()[:2], "as many rows")
+    refused(first, u[401:402, :1], y[401:402], "features")
+    refused(first, np.empty((0, 2)), np.empty((0, 2)), "sample")
+    first.horizon = 9
+    refused(first, u[401:402], y[401:402], "`horizon` must stay")
+    first.horizon = 8
+    for k in range(401, 800):
+        first.partial_fit(u[k : k + 1], y[k : k + 1])
+        other.partial_fit(u[k : k + 1], 2 * y[k : k + 1])
+    kept.partial_fit(u[401:].tolist(), y[401:])
+    whole = SubspaceLTI(5, horizon=8).fit(u, y)
+    for one in (first, kept):
+        np.testing.assert_allclose(response(one), response(whole), rtol=1e-9)
+    assert abs(response(other) - response(whole)).max() > 1e-3
+
+
 def test_batches_of_an_iterable_are_a_stream(system):
     u, y = record(system, 900)
     whole = SubspaceLTI(5, horizon=8).fit(u, y)
