@@ -12,7 +12,7 @@ from sklearn.utils import Bunch
 
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..validation import naming_argument, number, real_array, shown
+from ..validation import naming_argument, number, real_array, shown, squarable
 from .excitation import (
     check_count,
     check_rows,
@@ -227,7 +227,7 @@ class UnbalancedDisc:
 
 
 def _finite(name: str, value: ArrayLike) -> Array:
-    array = real_array(name, value)
+    array = squarable(name, real_array(name, value))
     if not np.isfinite(array).all():
         raise ValueError(f"`{name}` must be finite. Got {shown(value)}.")
     return array

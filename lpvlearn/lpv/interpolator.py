@@ -30,6 +30,8 @@ _POINTS = "be a table of finite numbers, shape (n_points, n_scheduling)"
 # measured mean and a range read from a report differ by rounding.
 _RANGE_RTOL = 1e-6
 
+_CLOSE = 1e-8  # of a number: half the least interval about it that digits resolve well
+
 
 class Interpolator(
     VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator, ABC
@@ -367,12 +369,13 @@ def _check_weight(sample_weight: ArrayLike | None, X: Array) -> Array:
 
 
 def domains(scheduling_range: Array) -> Array:
-    """Ends (2, n_scheduling) of the intervals; of width 2 around a constant one."""
+    """Ends (2, n_scheduling) of the intervals; of width 2 around a constant one.
+
+    Where that is none besides so large a number, of a larger one.
+    """
     low, high = scheduling_range
-    constant = low == high
-    return np.array(
-        [np.where(constant, low - 1.0, low), np.where(constant, low + 1.0, high)]
-    )
+    half = np.where(low == high, np.maximum(1.0, _CLOSE * np.abs(low)), 0.0)
+    return np.array([low - half, high + half])
 
 
 def grid_over(scheduling_range: Array, levels: int) -> Array:

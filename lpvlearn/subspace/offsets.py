@@ -163,8 +163,10 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
 
 
 def _criterion(evidence: Evidence) -> float:
-    """That of the orders, of outputs in their units."""
+    """That of the orders, of outputs in their units; minus infinity where one is 0."""
     records = evidence.records
+    if not np.logical_or.reduce([record.y.any(axis=1) for record in records]).all():
+        return -np.inf  # nothing is left of it, and its scale tells nothing
     n_samples = sum(record.u.shape[1] for record in records)
     units = 2.0 * n_samples * float(np.log(evidence.output_scale).sum())
     return units + criterion_of(evidence.model, records, evidence.free)

@@ -177,6 +177,8 @@ HUGE = np.full((4, 2), 1e308)
         ("make_unbalanced_disc", {"duration": 1e6}, "`duration` must be at most"),
         ("make_unbalanced_disc", {"snr_db": -np.inf}, "`snr_db` must be"),
         ("SplineLPV", {"covariance": np.full((4, 2, 2), 1e200)}, "`covariance` must"),
+        ("UnbalancedDisc.acceleration", {"u": -1e308}, "`u` must hold numbers below"),
+        ("vaf_score", {"y_true": [10**400] * 40}, "`y_true` must hold numbers. Got"),
     ],
 )
 def test_what_surveys_found_is_told(name, spoiled, told):
@@ -192,6 +194,11 @@ def test_what_surveys_found_is_right():
     folds = lp.BlockedTimeSeriesSplit(2, max_train_size=2**63)
     assert len(list(folds.split(np.ones((9, 1))))) == 2
     assert lp.parameter_fit([1.0, 2.0], [1.0, 1e120]) < -1e100
+    u, tiny = np.sin(np.arange(60.0) ** 2)[:, None], np.full(60, 5e-324)
+    assert lp.SubspaceLTI().fit(u, tiny).order_ == 0
+    kappa = np.full((4, 3), 1e16)
+    predicted = lp.PolynomialLPV().fit(kappa, np.ones((4, 1))).predict(kappa)
+    np.testing.assert_allclose(predicted, 1.0, rtol=1e-12)
     for score in (lp.bft_score, lp.vaf_score):
         assert score(1e-200 * theta, 1e-200 * theta[::-1]) == score(theta, theta[::-1])
 
