@@ -150,7 +150,7 @@ def read_clock(
     if len(seconds) < 2:
         return UNTIMED
     precision = _float_precision(seconds) * float(np.abs(seconds).max())
-    t = seconds.astype(np.float64)
+    t = seconds.astype(np.float64, copy=False)
     steps = np.diff(t)
     where = f"Time column {column!r} of experiment {experiment!r}"
     if steps.min() <= 0:
@@ -165,7 +165,8 @@ def read_clock(
             f"its samples {k} and {k + 1}. {remedy}"
         )
     missing = missing_after(steps)
-    step, off = float(steps[~missing].mean()), _off_grid(t, missing)
+    kept = steps[~missing] if missing.any() else steps
+    step, off = float(kept.mean()), _off_grid(t, missing)
     unit = _decimal_unit(t)
     # A step is the difference of two rounded stamps: off by one unit of their decimals,
     # and by twice their precision, as long as these are well below the step itself.
@@ -174,7 +175,7 @@ def read_clock(
     # The second condition tells a scatter around one even grid from a clock that
     # changes its pace within the record.
     drift = rounding + len(t) * (_STEP_RTOL * step + 2 * precision) + time_tol * step
-    uneven = np.abs(steps - step)[~missing].max() > single
+    uneven = max(kept.max() - step, step - kept.min()) > single
     if uneven or np.abs(off).max() > drift:
         if uneven and missing.any():  # then it is rather one grid that nothing keeps to
             off = _off_grid(t, np.zeros_like(missing))
@@ -226,13 +227,16 @@ def _off_grid(
 
     Runs are what is between missing samples.
     """
-    run = np.concatenate([[0], np.cumsum(missing)])
     first = np.concatenate([[0], np.flatnonzero(missing) + 1])
-    number, elapsed = (x - x[first][run] for x in (np.arange(len(t)), t))
-    number, elapsed = (
-        x - (np.bincount(run, x) / np.bincount(run))[run] for x in (number, elapsed)
-    )
-    return elapsed - number * (number @ elapsed) / (number @ number)
+    lengths = np.diff(first, append=len(t))
+    number = np.arange(len(t), dtype=float)
+    elapsed = t - (np.repeat(t[first], lengths) if len(first) > 1 else t[0])
+    for x in (number, elapsed):  # in place: records may be long
+        mean = np.add.reduceat(x, first) / lengths
+        x -= np.repeat(mean, lengths) if len(mean) > 1 else mean
+    number *= (number @ elapsed) / (number @ number)
+    elapsed -= number
+    return elapsed
 
 
 def check_unit(step: float | None, fitted: float, column: Hashable) -> None:
@@ -271,10 +275,12 @@ def _decimal_unit(seconds: NDArray[np.float64]) -> float:
     """Unit of the last decimal place that the stamps use, 0 if none."""
     for decimals in range(_MAX_DECIMALS + 1):
         scaled = seconds * 10.0**decimals
-        slop = max(_SLOP, 4 * np.finfo(float).eps * float(np.abs(scaled).max()))
+        largest = max(float(scaled.max()), -float(scaled.min()))
+        slop = max(_SLOP, 4 * np.finfo(float).eps * largest)
         if slop > _LARGEST_SLOP:
             break
-        if np.abs(scaled - np.round(scaled)).max() <= slop:
+        scaled -= np.round(scaled)
+        if max(scaled.max(), -scaled.min()) <= slop:
             return 10.0**-decimals
     return 0.0
 
