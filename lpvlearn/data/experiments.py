@@ -385,9 +385,9 @@ def read_experiments(
         Experiment(
             label=label,
             rows=rows,
-            inputs=U[rows],
-            outputs=None if Y is None else Y[rows],
-            scheduling=None if K is None else K[rows],
+            inputs=_by_channel(U, rows),
+            outputs=None if Y is None else _by_channel(Y, rows),
+            scheduling=None if K is None else _by_channel(K, rows),
             operating_point=operating_point_of(by_point, rows, label),
             sampling_time=clock.step,
             input_names=tuple(names),
@@ -396,6 +396,11 @@ def read_experiments(
         )
         for label, rows, clock in zip(labels, groups, clocks, strict=True)
     ]
+
+
+def _by_channel(values: Array, rows: Indices) -> Array:
+    """Rows of a table, channel after channel in memory, as sums and maxima want it."""
+    return np.take(values.T, rows, axis=1).T
 
 
 def _check_apart(single: Mapping[str, Column | None], inputs: Sequence[Column]) -> None:
@@ -495,17 +500,17 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
             raise ValueError(
                 f"`{argument}` must have rows of one length. Got rows that differ."
             ) from error
+        kind = ValueError if isinstance(error, OverflowError) else type(error)
         flat = entries.ravel()
         k = _first_not_a_number(flat) if entries.dtype.kind in "OSU" else None
         if k is not None and entries.ndim:  # a sparse matrix has none
             at = zip(
                 ("row", "column"), np.unravel_index(k, entries.shape), strict=False
             )
-            raise type(error)(
-                f"`{argument}` must hold numbers. Got {as_scalar(flat[k])!r} at "
+            raise kind(
+                f"`{argument}` must hold numbers. Got {shown(as_scalar(flat[k]))} at "
                 f"{', '.join(f'{axis} {i}' for axis, i in at)}: {error}."
             ) from error
-        kind = ValueError if isinstance(error, OverflowError) else type(error)
         raise kind(
             f"`{argument}` must be a table of real numbers. Got {shown(values)}: "
             f"{error}"
@@ -523,7 +528,7 @@ def as_numbers(argument: str, values: Any, *, imaginary: bool = False) -> NDArra
 
 
 def _numbers(columns: Sequence[Column], n_rows: int, argument: str) -> Array:
-    matrix = np.empty((n_rows, len(columns)))
+    matrix = np.empty((n_rows, len(columns)), order="F")
     for k, column in enumerate(columns):
         matrix[:, k] = column.numbers(argument)
     return matrix

@@ -231,7 +231,7 @@ def fit_pairs(
     looked for again. `TooFewSamples` where an input is constant or the samples are too
     few.
     """
-    # channel after channel in memory: sums and maxima take a tenth of the time
+    # By channel in memory, as tables are read: sums take a tenth of the time.
     pairs = [(np.asfortranarray(u), np.asfortranarray(y)) for u, y in pairs]
     try:
         check_excitation(pairs, names)

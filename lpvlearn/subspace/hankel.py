@@ -57,9 +57,10 @@ def data_factors(
     n_trend: int = 0,
 ) -> Iterator[Array]:
     """`data_factor` of every horizon; one correlation sequence serves them all."""
-    longest = 2 * max(horizons)
+    longest, shared = 2 * max(horizons), None
     records = [without_trend(z, n_trend) for z in records]
-    shared = [correlation_sequence(z, min(longest, len(z))) for z in records]
+    if len(horizons) > 1:
+        shared = [correlation_sequence(z, min(longest, len(z))) for z in records]
     for horizon in horizons:
         yield data_factor(
             records,

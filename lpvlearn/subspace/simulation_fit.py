@@ -40,6 +40,8 @@ from .signals import (
 
 Array = NDArray[np.float64]
 
+_TOGETHER = 64  # experiments whose regressions are kept before they are factored
+
 
 class Freedom(NamedTuple):
     """Which parameters are free besides A, B and C."""
@@ -305,7 +307,10 @@ def _solve_regressions(
         if rank == M.shape[1]:
             loss = float(np.sum((M @ solution - rhs) ** 2))
             return solution[n:], solution[None, :n], loss, 0
-    stacked = _stack_regressions(regressions, n)
+    parts: list[Array] = []
+    for M in regressions:
+        _pool(parts, M, n)
+    stacked = _joined(parts)
     common, rank = scaled_lstsq(stacked[:, :-1], stacked[:, -1])
     loss = float(np.sum((stacked[:, :-1] @ common - stacked[:, -1]) ** 2))
     own = np.empty((len(regressions), n))
@@ -314,12 +319,19 @@ def _solve_regressions(
     return common, own, loss, len(common) - rank
 
 
-def _stack_regressions(regressions: Sequence[Array], n: int) -> Array:
-    """One regression on the common unknowns, the first `n` of each projected out."""
-    reduced = [project_out(M, n) for M in regressions]
-    if len(reduced) == 1:
-        return reduced[0]
-    return triangularize(np.vstack(reduced).T)
+def _pool(parts: list[Array], M: Array, n: int) -> None:
+    """Add a regression to `parts` of one, its first `n` unknowns projected out.
+
+    Of many parts only their triangular factor is kept.
+    """
+    parts.append(project_out(M, n))
+    if len(parts) > _TOGETHER:
+        parts[:] = [_joined(parts)]
+
+
+def _joined(parts: Sequence[Array]) -> Array:
+    """One regression of all parts."""
+    return parts[0] if len(parts) == 1 else triangularize(np.vstack(parts).T)
 
 
 def project_out(M: Array, n: int) -> Array:
@@ -398,16 +410,17 @@ def linearised(
     trends stays, where it costs less. None where responses overflow.
     """
     assert model.blocks is not None
-    parts = []
+    parts: list[Array] = []
     for record, x0 in zip(records, model.initial_states, strict=True):
         driven = np.column_stack([x0, model.B])
         R = signal_factor(model.blocks, record, driven)
         if R is None:
             return None
-        parts.append(jacobian_regression(R, model, driven, free))
-    if keep_one and len(parts) == 1 and not free.n_trend:
-        return parts[0]
-    return _stack_regressions(parts, free.n_own(len(model.A)))
+        regression = jacobian_regression(R, model, driven, free)
+        if keep_one and len(records) == 1 and not free.n_trend:
+            return regression
+        _pool(parts, regression, free.n_own(len(model.A)))
+    return _joined(parts)
 
 
 def _fill_linear(
