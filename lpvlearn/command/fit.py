@@ -130,7 +130,10 @@ def _held(
 ) -> pd.DataFrame:
     """The rows at levels, each level an experiment; the column joins the roles."""
     if roles["scheduling"] is None:
-        raise ValueError("--levels are those of --scheduling, which names nothing.")
+        raise ValueError(
+            "--levels are those of --scheduling, which names nothing: name the column "
+            "that was held at levels, or leave --levels out."
+        )
     numbers = split_levels(
         table,
         roles["scheduling"],
