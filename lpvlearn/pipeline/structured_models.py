@@ -309,8 +309,9 @@ def _tie_branches(
             f"{place_of(doubt.point, kappa)}: several values give the same response, "
             "and those that continue the other points most smoothly are only "
             f"{100 * doubt.probability:.0f} % likely to be the right ones. Between the "
-            "points the LPV model may be wrong. Add operating points near it, or tell "
-            "the parts apart by structure.with_bounds()."
+            "points the LPV model may be wrong. Add operating points near it, tell the "
+            "parts apart by structure.with_bounds(), or fit all experiments together: "
+            "OutputErrorLPV(structure)."
         )
     return tied
 
