@@ -143,6 +143,19 @@ comparison = pd.DataFrame(
 comparison.round(1).head(8)
 
 # %%
+# The choice in a picture: where forms agree, and where they differ most.
+
+shown = list(comparison.drop("truth", axis=1).columns)
+display = ParameterDisplay(
+    kappa,
+    dict.fromkeys(shown, pipeline.parameters_),
+    names=["p2", "p5", "p9"],
+    interpolators=dict(
+        zip(shown, (pipeline.interpolator_, parabola, spline), strict=True)
+    ),
+).plot()
+
+# %%
 # Poles between the points
 # ------------------------
 # The interpolated model is stable at every operating point; between them, look:

@@ -117,6 +117,7 @@ def plot_overview(
             y,
             experiment=experiment,
             initial_state=initial_state,
+            uncertainty=uncertainty and initial_state == "rest",
             units=units,
             ax=axes[4],
         )

@@ -273,7 +273,11 @@ class _Page:
                 shape = (lpv.n_outputs, lpv.n_inputs)
                 with self._axes(f"Gain at operating point {place}", shape) as axes:
                     BodeDisplay.from_estimator(
-                        pipeline, kappa=points[k], units=self._units, ax=axes
+                        pipeline,
+                        kappa=points[k],
+                        uncertainty=lpv.covariance is not None,
+                        units=self._units,
+                        ax=axes,
                     )
 
     def simulations(
@@ -287,6 +291,7 @@ class _Page:
         self.warnings(list(dict.fromkeys(t.message for t in told)), "")
         units = [self._units.get(str(name), "") for name in pipeline.output_names_]
         labels = list(dict.fromkeys(report["experiment"]))
+        banded = initial_state == "rest" and pipeline.lpv_.covariance is not None
         several = Table(X).one(pipeline.experiment, "experiment") is not None
         with self._figures(), collected():  # the same warnings
             for label in labels[:_MOST_FIGURES]:
@@ -299,6 +304,7 @@ class _Page:
                         y,
                         experiment=label if several else None,
                         initial_state=initial_state,
+                        uncertainty=banded,
                         units=units,
                         ax=axes,
                     )

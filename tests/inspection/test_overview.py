@@ -20,6 +20,7 @@ def test_a_page_of_a_pipeline_with_and_without_a_table(noisy, tables):
     assert len(figure.subfigs) == 6
     simulation = figure.subfigs[4].axes[0]
     assert simulation.get_ylabel() == "angle (rad)"
+    assert "± 2 std" in simulation.get_legend_handles_labels()[1][1]
     figure.draw_without_rendering()
 
 

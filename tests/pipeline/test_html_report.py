@@ -74,7 +74,7 @@ def test_page_stands_alone_and_tells_what_the_tables_tell(fitted, spring, tmp_pa
     page, text = page_of(
         fitted, tmp_path / "report.html", X[:600], y[:600], units={"position": "mm"}
     )
-    for words in ("gray-box BFT", "kappa from 0 to 1.5", "sweep", "whiteness"):
+    for words in ("gray-box BFT", "kappa from 0 to 1.5", "sweep", "whiteness", "± 2 std"):
         assert words in text
     assert any("position (mm)" in words for words in page.texts)
     figures = [words for words in page.attributes if words[:2] == ("svg", "role")]
