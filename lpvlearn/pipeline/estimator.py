@@ -516,8 +516,6 @@ list, default=None
             found = restructure_points(
                 restructurer, local, points, runner, self.max_time
             )
-            self.local_models_ = [model.lti for model in found.local]
-            self.structured_models_ = found.models
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
@@ -542,6 +540,10 @@ list, default=None
                 units=self.units,
                 offsets=self._fit_offsets(found),
             )
+            frozen = self.lpv_.silenced().at(kappa[0])
+            names = frozen.input_names, frozen.output_names, frozen.units
+            self.local_models_ = [m.lti.with_names(*names) for m in found.local]
+            self.structured_models_ = [m.with_names(*names) for m in found.models]
             late = self.lpv_.input_delay / self.sampling_time_
             self.input_delay_ = np.round(late).astype(int)
             self.parameters_covariance_ = found.covariance

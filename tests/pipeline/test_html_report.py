@@ -74,7 +74,13 @@ def test_page_stands_alone_and_tells_what_the_tables_tell(fitted, spring, tmp_pa
     page, text = page_of(
         fitted, tmp_path / "report.html", X[:600], y[:600], units={"position": "mm"}
     )
-    for words in ("gray-box BFT", "kappa from 0 to 1.5", "sweep", "whiteness", "± 2 std"):
+    for words in (
+        "gray-box BFT",
+        "kappa from 0 to 1.5",
+        "sweep",
+        "whiteness",
+        "± 2 std",
+    ):
         assert words in text
     assert any("position (mm)" in words for words in page.texts)
     figures = [words for words in page.attributes if words[:2] == ("svg", "role")]
@@ -90,7 +96,13 @@ def test_units_of_the_pipeline_reach_its_pages_pictures_and_files(spring, tmp_pa
     save(pipeline, tmp_path / "model.zip")
     loaded = load(tmp_path / "model.zip")
     assert loaded.lpv_.units == loaded.lpv_.at(0.5).units == units
-    assert loaded.lpv_.at(0.5).input_names == ["force"]
+    for model in (
+        loaded.lpv_.at(0.5),
+        *loaded.local_models_,
+        *loaded.structured_models_,
+    ):
+        assert (model.input_names, model.output_names) == (["force"], ["position"])
+        assert model.units == units
     (tmp_path / "model.zip").unlink()
     text = page_of(loaded, tmp_path / "report.html", X[:300], y[:300])[1]
     for words in ("position (mm)", "k (1/s2)", "κ (kg)", "force (N)"):
