@@ -593,7 +593,7 @@ _WORSE = 1.2
 
 _USELESS = 0.9  # share of the outputs' size left unexplained that is reported
 # What is told from tests that take as long as a fit
-TESTS = {"held out", "static gain", "lack"}
+TESTS = {"held out", "static gain", "decay", "lack"}
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
 # model not to refute it; standard errors by which a lesser one must be better where the
@@ -615,6 +615,8 @@ _ENOUGH = 100  # samples, for parts of them to tell anything
 # A standard deviation of the static gain by the root mean square of the whole response:
 # above it, a gain that is not known matters.
 _OPEN = 0.3
+
+_DECAYS = 2.0  # standard deviations of a pole, for its decay to be known
 
 _ROUNDING = 1e-8  # an integrator's pole may lie this far outside the unit circle
 
@@ -707,6 +709,17 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "over the record or drifts, or the record is too short for it. Give a "
             "lower `order`, leave disturbed parts out, or use offset='linear'.",
         )
+    if _may_last(fitted):
+        tell(
+            told,
+            "decay",
+            "An oscillation of the model does not decay over the longest experiment, "
+            "nor by more than the standard deviation of its poles (`poles_std_`): the "
+            "inputs move too seldom to tell it from something else, as a system that "
+            "is not linear. It may simulate other records poorly. Give a lower "
+            "`order`, or record for longer, with inputs that move more often.",
+        )
+
     gain = fitted.evidence.static_gain()
     if gain is None:
         return
@@ -722,6 +735,19 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "lower `order`; at higher frequencies the model may be right "
             "(`frequency_response_std`).",
         )
+
+
+def _may_last(fitted: LocalFit) -> bool:
+    """Whether the decay of an oscillation of a stable model is not known."""
+    poles = fitted.evidence.state_space(fitted.model, 1.0).poles()
+    longest = max(record.u.shape[1] for record in fitted.scaled.records)
+    decay = 1.0 - np.abs(poles)
+    lasting = (poles.imag != 0.0) & (decay >= 0.0) & (decay * longest < 1.0)
+    try:
+        spread = np.abs(fitted.evidence.poles_std()) if lasting.any() else decay
+    except ValueError:  # it is not known
+        return False
+    return bool((lasting & (decay < _DECAYS * spread)).any())
 
 
 def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:

@@ -323,6 +323,30 @@ def test_a_static_gain_that_is_not_known_is_told():
     assert n_told > 0
 
 
+def swinging(seed, decay):
+    """Two steps and two periods of an oscillation, in noise."""
+    rng, pole = np.random.default_rng(seed), (1.0 - decay) * np.exp(0.05j)
+    u = np.repeat([0.0, 1.0, 0.0], [60, 100, 100])[:, None] + 0.0
+    y = lfilter([0.0, 0.003], np.poly([pole, pole.conj()]).real, u, axis=0)
+    return u, y + 0.3 * rng.standard_normal(u.shape)
+
+
+def test_a_decay_that_is_not_known_is_told():
+    n_told = 0
+    for seed in range(2):
+        for decay in (1e-4, 0.1):
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                model = SubspaceLTI().fit(*swinging(seed, decay))
+            said = any("does not decay" in str(w.message) for w in told)
+            poles = model.lti_.poles()
+            doubtful = 1.0 - np.abs(poles) < 2.0 * np.abs(model.poles_std_)
+            assert said == (doubtful & (poles.imag != 0) & model.lti_.is_stable).any()
+            assert not said or decay < 0.1
+            n_told += said
+    assert n_told > 0
+
+
 def test_a_fit_that_parts_held_out_do_not_confirm_is_told(rng):
     u, y = record(rng, 300)
     y = y + 0.1 * rng.standard_normal(y.shape)
