@@ -1,6 +1,8 @@
 """The house stands: no import upward, scikit-learn only where estimators live."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -67,6 +69,17 @@ def imported_rooms(path: Path) -> set[str]:
 
 def arrows() -> set[tuple[str, str]]:
     return {(room_of(path), room) for path in FILES for room in imported_rooms(path)}
+
+
+def test_rooms_are_entered_when_they_are_asked_for():
+    script = """if True:
+        import sys, lpvlearn
+        assert "numpy" not in sys.modules and {*lpvlearn.__all__} <= {*dir(lpvlearn)}
+        from lpvlearn import StateSpace
+        assert "sklearn" not in sys.modules and lpvlearn.systems and StateSpace
+        assert lpvlearn.StateSpace is StateSpace and not hasattr(lpvlearn, "nothing")
+    """
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT.parent)
 
 
 def test_every_room_has_a_floor():
