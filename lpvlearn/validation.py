@@ -227,7 +227,7 @@ def finite_samples(name: str, value: ArrayLike, width: int) -> Array:
 
 def measured_samples(y: ArrayLike, n_samples: int, width: int) -> Array:
     """Outputs `y` of the samples of `u`, (n_samples, width); NaN where missing."""
-    measured = real_array("y", y)
+    measured = squarable("y", real_array("y", y))
     missing = np.isnan(measured)
     y = finite_samples("y", np.where(missing, 0.0, measured), width)
     if n_samples == 0 or n_samples != len(y):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import convolve1d
 
-from ..validation import flag, number, one_of, positive_time
+from ..validation import SQUARED, flag, number, one_of, positive_time
 from .alignment import align_outputs
 from .experiments import Column, Table, as_list, group_rows, is_table
 from .timestamps import missing_after, time_in_seconds
@@ -84,8 +84,8 @@ def resample(
     Raises
     ------
     ValueError
-        If an option is unknown, a role names no column, a time is repeated, or an
-        experiment has a single sample.
+        If an option is unknown, a role names no column, a time is repeated, an
+        experiment has a single sample, or a value is infinite.
 
     Notes
     -----
@@ -260,9 +260,17 @@ def _looks_held(column: Column, records: Sequence[_Record]) -> bool:
 def _numbers(column: Column) -> Array | None:
     """Values of a column as floats; None of labels and dates."""
     try:
-        return column.numbers("X")
+        values = column.numbers("X")
     except ValueError:
         return None
+    huge = ~(np.abs(values) < SQUARED) & ~np.isnan(values)
+    if huge.any():
+        raise ValueError(
+            f"Column {column.name!r} must hold numbers below {SQUARED:g}, or NaN where "
+            f"one is missing. Got {values[huge][0]} at row {int(np.argmax(huge))}; "
+            "what is no measurement should be missing."
+        )
+    return values
 
 
 def _on_grids(

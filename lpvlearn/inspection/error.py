@@ -336,9 +336,10 @@ class ErrorDisplay:
     def _limit(self, ax: Any) -> None:
         """The axis ends at `_DEPTH` of the highest point."""
         curves = [c for c in (self.error, self.start) if c is not None]
-        top = max(c.max() for c in curves)
-        low = min(c[c > 0].min(initial=np.inf) for c in curves)
-        if np.isfinite(low) and low < _DEPTH * top:
+        shown = np.concatenate(curves)
+        shown = shown[np.isfinite(shown) & (shown > 0)]
+        top = shown.max(initial=0.0)
+        if shown.min(initial=np.inf) < _DEPTH * top:
             ax.set_ylim(_DEPTH * top, 2.0 * top)  # with room for the dots above
 
 

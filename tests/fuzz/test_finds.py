@@ -8,7 +8,7 @@ import pytest
 
 import lpvlearn as lp
 from lpvlearn.datasets import FlexibleArm
-from lpvlearn.inspection import SimulationDisplay
+from lpvlearn.inspection import ErrorDisplay, SimulationDisplay
 from lpvlearn.validation import number, real_array, whole_number
 
 from ..conftest import spring_lpv
@@ -178,6 +178,11 @@ HUGE = np.full((4, 2), 1e308)
         ("make_unbalanced_disc", {"snr_db": -np.inf}, "`snr_db` must be"),
         ("SplineLPV", {"covariance": np.full((4, 2, 2), 1e200)}, "`covariance` must"),
         ("UnbalancedDisc.acceleration", {"u": -1e308}, "`u` must hold numbers below"),
+        (
+            "InnovationModel.estimate_initial_state",
+            {"y": np.full((180, 1), 1e308)},
+            "`y` must hold numbers below",
+        ),
         ("vaf_score", {"y_true": [10**400] * 40}, "`y_true` must hold numbers. Got"),
     ],
 )
@@ -199,8 +204,19 @@ def test_what_surveys_found_is_right():
     kappa = np.full((4, 3), 1e16)
     predicted = lp.PolynomialLPV().fit(kappa, np.ones((4, 1))).predict(kappa)
     np.testing.assert_allclose(predicted, 1.0, rtol=1e-12)
+    frequencies = np.array([1.0, 2.0, 3.0])
+    display = ErrorDisplay(frequencies, np.full(3, np.inf), start=frequencies)
+    assert np.isfinite(display.plot().ax_.get_ylim()).all()
     for score in (lp.bft_score, lp.vaf_score):
         assert score(1e-200 * theta, 1e-200 * theta[::-1]) == score(theta, theta[::-1])
+
+
+@pytest.mark.parametrize("name", ["X", "y"])
+def test_infinity_is_not_resampled(name):
+    call, infinite = calls()["resample"], getattr(world(), name).copy()
+    infinite.iloc[5, 0] = np.inf
+    with pytest.raises(ValueError, match="must hold numbers below.*Got inf at row 5"):
+        call.function(**{**call.arguments, name: infinite})
 
 
 def test_times_of_text_are_refused_by_all():
