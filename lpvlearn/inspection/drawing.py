@@ -141,7 +141,20 @@ def legend_above(
 
 
 def figure_legend(figure: Any, ax: Any, handles: Sequence[Any], own: bool) -> Any:
-    """One legend for several axes: above the figure if it is ours, else within `ax`."""
+    """One legend for several axes: above the figure if it is ours, else within `ax`.
+
+    Beside the title of a part of a figure.
+    """
+    from matplotlib.figure import SubFigure
+
+    if not own and isinstance(figure, SubFigure) and figure.get_suptitle():
+        return figure.legend(
+            handles=list(handles),
+            loc="upper right",
+            ncols=len(handles),
+            frameon=False,
+            fontsize=TEXT_SIZE,
+        )
     if not own:
         legend = ax.legend(handles=list(handles), fontsize=8, framealpha=0.8)
         # A legend wider than its panel would squeeze the panels.

@@ -33,6 +33,8 @@ _DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)  # damping ratios that get a ray
 _N_POINTS, _N_GRID = 101, 500
 
 
+_N_TICKS = 5  # of an axis at most: their labels stand apart in a report, too
+
 _REAL = 1e-6  # imaginary parts, relative to the largest pole, that are rounding
 
 
@@ -254,6 +256,7 @@ class PoleDisplay:
         if np.abs(self.poles.imag).max() < _REAL * size:  # else rounding is magnified
             one.set_ylim(-0.25 * size, 0.25 * size)
         one.set_xlabel("Real part (rad/s)")
+        one.locator_params(axis="x", nbins=_N_TICKS)
         one.axvline(0.0, color="0.35", linewidth=0.9, zorder=1)
         one.axhline(0.0, color="0.7", linewidth=0.7, zorder=1)
         bar = colour_bar(self.figure_, points, one, self.scheduling_labels[j])

@@ -27,6 +27,9 @@ _WORTH, _POOR, _FAR = 5.0, 50.0, 2.0
 
 _LOOKED_AT = 10  # experiments of an operating point: more tell the same of constants
 
+_THROUGH = 1e-7  # percent of the model's norm: errors of an interpolation below that
+# are rounding
+
 _NO_FLOOR = 1e-8  # share of the black box's norm below which a floor is rounding
 
 
@@ -278,9 +281,17 @@ def summarise(
     lines += [
         f"Interpolation: {lpv.interpolator}{form and f' ({form})'}, "
         f"parameter fit (FIT) {fit:.2f} %",
-        f"    H-infinity error {_span(distance)} % of the model's norm, the largest at "
-        f"{_label_of_largest(distance)}",
     ]
+    if distance.max() > _THROUGH:
+        lines.append(
+            f"    H-infinity error {_span(distance)} % of the model's norm, the "
+            f"largest at {_label_of_largest(distance)}"
+        )
+    elif len(kappa) > 1:
+        lines.append(
+            "    through the local models: how good it is between them only data there "
+            "tell"
+        )
     if len(kappa) == 1:
         lines.append("One operating point: the model is time-invariant.")
     shown = [name for name in report.columns if not name.startswith(tuple(hidden))]
