@@ -738,11 +738,16 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
 
 
 def _may_last(fitted: LocalFit) -> bool:
-    """Whether the decay of an oscillation of a stable model is not known."""
+    """Whether the decay of an oscillation of a stable model is not known.
+
+    Of summaries of records nobody knows how long these were.
+    """
     poles = fitted.evidence.state_space(fitted.model, 1.0).poles()
-    longest = max(record.u.shape[1] for record in fitted.scaled.records)
+    lengths = [record.u.shape[1] for record in fitted.scaled.records]
+    if not lengths:
+        return False
     decay = 1.0 - np.abs(poles)
-    lasting = (poles.imag != 0.0) & (decay >= 0.0) & (decay * longest < 1.0)
+    lasting = (poles.imag != 0.0) & (decay >= 0.0) & (decay * max(lengths) < 1.0)
     try:
         spread = np.abs(fitted.evidence.poles_std()) if lasting.any() else decay
     except ValueError:  # it is not known
