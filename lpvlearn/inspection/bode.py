@@ -24,7 +24,7 @@ from .drawing import (
     whole,
     with_unit,
 )
-from .fitted import check_model, models_of, unwrapped, with_others
+from .fitted import check_model, models_of, places_of, unwrapped, with_others
 from .frequency import (
     check_frequencies,
     frequency_label,
@@ -242,7 +242,8 @@ class BodeDisplay:
             shows the local (black-box) and the gray-box model of the operating point
             nearest to `kappa`, and the interpolated model there.
         kappa : float or array-like of shape (n_scheduling,), default=None
-            Scheduling value; needed by the pipeline.
+            Scheduling value; needed by the pipeline. Several of them, of shape
+            (n_points, n_scheduling), draw the family of the interpolated models there.
         others : dict from str to StateSpace, default=None
             Models to compare with, drawn first: the truth, an analytic model.
         omega : array-like of shape (n_freq,), default=None
@@ -376,6 +377,11 @@ def _uncertainty_of(
     owner: Any, own: Mapping[str, StateSpace], kappa: Any, omega: ArrayLike
 ) -> dict[str, NDArray[np.complex128]]:
     """Standard deviations of the responses of an estimator's models, where known."""
+    if hasattr(owner, "lpv_") and np.ndim(kappa) == 2:
+        return {
+            name: owner.lpv_.frequency_response_std(place, omega)
+            for name, place in places_of(owner, kappa).items()
+        }
     if hasattr(owner, "lpv_"):
         std = owner.lpv_.frequency_response_std(kappa, omega)
         return {name: std for name in own if name == "interpolated"}

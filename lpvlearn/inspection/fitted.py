@@ -23,7 +23,8 @@ def models_of(
 ) -> dict[str, StateSpace]:
     """State-space models of a fitted estimator, by name; those of an LPV at `kappa`.
 
-    Of a pipeline the local models of the nearest operating point too.
+    Of a pipeline the local models of the nearest operating point too; at several places
+    (rows of `kappa`) the interpolated models alone.
     """
     estimator = unwrapped(estimator)
     if hasattr(estimator, "lti_"):
@@ -34,6 +35,9 @@ def models_of(
             f"LocalLPVPipeline or OutputErrorLPV. Got {type(estimator).__name__} "
             "without `lti_` or `lpv_`; call fit() first."
         )
+    if kappa is not None and np.ndim(kappa) == 2:
+        places = places_of(estimator, kappa)
+        return {label: estimator.lpv_.at(place) for label, place in places.items()}
     lpv, place = estimator.lpv_, _place(estimator, kappa)
     found = {}
     if hasattr(estimator, "operating_points_"):
@@ -42,6 +46,12 @@ def models_of(
         if estimator.restructurers_:
             found["gray-box"] = estimator.structured_models_[nearest]
     return found | {"interpolated": lpv.at(place)}
+
+
+def places_of(pipeline: Any, kappa: Any) -> dict[str, NDArray[np.float64]]:
+    """Scheduling values, rows of `kappa`, by the text that tells them in a legend."""
+    places = [_place(pipeline, row) for row in as_numbers("kappa", kappa)]
+    return {"at " + ", ".join(f"{value:.6g}" for value in k): k for k in places}
 
 
 def _place(pipeline: Any, kappa: float | ArrayLike | None) -> NDArray[np.float64]:

@@ -136,6 +136,24 @@ def test_bode_draws_the_band_of_an_interpolated_model(noisy):
     assert (error < 4 * display.std["interpolated"]).mean() > 0.9
 
 
+def test_bode_draws_the_family_of_models_at_several_values(noisy):
+    kappa = np.array([[0.0], [0.4], [0.9]])
+    display = BodeDisplay.from_estimator(noisy, kappa=kappa, uncertainty=True)
+    names = ["at 0", "at 0.4", "at 0.9"]
+    assert list(display.responses) == list(display.std) == names
+    alone = BodeDisplay.from_estimator(
+        noisy, kappa=0.4, uncertainty=True, omega=display.omega
+    )
+    for found, one in (
+        (display.responses, alone.responses),
+        (display.std, alone.std),
+    ):
+        np.testing.assert_array_equal(found["at 0.4"], one["interpolated"])
+    assert len(display.axes_[0, 0].collections) == 3
+    with pytest.raises(ValueError, match=r"`kappa` must hold 1 scheduling value"):
+        BodeDisplay.from_estimator(noisy, kappa=[[0.0, 1.0]])
+
+
 def test_bode_divides_a_subplot_into_its_grid(plt):
     figure, (left, right) = plt.subplots(1, 2)
     display = BodeDisplay.from_models({"a": random_model(0)}, ax=right)
