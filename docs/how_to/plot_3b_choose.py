@@ -64,17 +64,13 @@ display = SingularValueDisplay.from_estimator(local)
 # %%
 # Norm
 # ----
-# ===================================== ==============================================
-# What you want                         What to give
-# ===================================== ==============================================
-# parameters that are as exact as the   nothing: ``efficient=True`` weighs the
-# data allow                            response by its uncertainty
-# the largest error at any frequency    ``efficient=False`` (the paper's H-infinity
-# least: a structure that is not quite  optimum), also where a warning tells that the
-# true, or robust control               structure lies far from the black box
-# the mean error over frequency least   ``GrayBoxRestructurer(norm="h2")``
-# some frequencies more than others     ``GrayBoxRestructurer(frequency_weight=...)``
-# ===================================== ==============================================
+# * **Parameters as exact as the data allow**: nothing to give. ``efficient=True``
+#   weighs the response by its uncertainty.
+# * **The largest error at any frequency least**: ``efficient=False``, the paper's
+#   H-infinity optimum; for robust control, and where a warning tells that the structure
+#   lies far from the black box.
+# * **The mean error over frequency least**: ``GrayBoxRestructurer(norm="h2")``.
+# * **Some frequencies more than others**: its ``frequency_weight``.
 
 choices = {
     "efficient": {},
