@@ -51,6 +51,8 @@ N_TRENDS = {"auto": 0, None: 0, "constant": 1, "linear": 2}
 # keeping them. One that is kept costs what an unknown does.
 _SUSPICIOUS, _SIGNIFICANT = 1e-2, 1e-3
 
+_CERTAIN = 30.0  # by which the criterion is better with a chance of 1e-7
+
 _MOSTLY = 0.5  # part of the squared errors; noise of long memory has a quarter at most
 
 _N_TESTED = 20  # experiments that the tests look at; more of them tell the same
@@ -154,12 +156,15 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
 
     By the criterion of the orders. That takes a constant by chance now and then, and is
     enough where fewer states are left: some of them stood for constants, or for what
-    an offset of the inputs is behind an integrator.
+    an offset of the inputs is behind an integrator; and where it is better by what no
+    chance explains. The test of the constants may not see these among slow noise,
+    whose density few samples tell; the criterion knows that noise by its innovations.
     """
-    if not _criterion(other) < _criterion(without):
-        return False
-    fewer = len(other.model.A) < len(without.model.A)
-    return fewer or chance_of_constants(other) < _SIGNIFICANT
+    better = _criterion(without) - _criterion(other)
+    if not better > 0.0 or len(other.model.A) < len(without.model.A):
+        return better > 0.0
+    chance = chance_of_constants(other)
+    return chance < _SIGNIFICANT or (chance < 1.0 and better > _CERTAIN)
 
 
 def _criterion(evidence: Evidence) -> float:
@@ -241,7 +246,7 @@ def _chance(
     # Noise of long memory tells its density at zero no better than few samples do.
     density = spectral_density(autoregression(errors), np.zeros(1))[0].real + rounding
     share = min(1.0, float(np.min(np.diagonal(white) / np.diagonal(density))))
-    return _tail(score, effect, density, share * n_error)
+    return _tail(score, effect, density, max(1.0, share * n_error))
 
 
 def _squares(x: Array) -> float:

@@ -258,6 +258,20 @@ def test_constants_of_the_size_of_the_noise_are_found(pole):
     assert np.mean(errors["auto"]) < 0.7 * np.mean(errors[None])
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_constants_are_seen_through_noise_of_long_memory(seed):
+    """Of another output, too: they are many times what that noise moves."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-3.0, 3.0, 20), 20)[:, None]
+    y = lfilter([0.0, 0.2], [1.0, -0.7], u, axis=0) * [0.05, 1.0]
+    slow = lfilter([0.1], [1.0, -0.995], rng.standard_normal((400, 2)), axis=0)
+    y += slow * [1.0, 3.0] + 0.1 * rng.standard_normal((400, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the gain is hardly known
+        model = SubspaceLTI().fit(u + 100.0, y + [1.0, 180.0])
+    assert model.offset_ == "constant"
+
+
 def test_an_offset_of_an_integrators_input_is_a_line(rng):
     u = rng.standard_normal((300, 1))
     y = np.vstack([[0.0], np.cumsum(u, axis=0)[:-1]]) + 5.0
