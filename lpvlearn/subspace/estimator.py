@@ -624,8 +624,38 @@ class SubspaceLTI(
             stream = before.with_numbers(X, y, self.__dict__)
             if stream is not None:
                 return self._go_on(stream)
-        options = self.get_params(deep=False)
-        choices = check_options(options)
+            before.check_options(self.__dict__)
+        choices: Any = self._choices_of_stream() if before is None else None
+        if y is None:
+            raise ValueError(
+                "SubspaceLTI requires y to be passed, but the target y is None: `y` "
+                "must hold the outputs of every batch."
+            )
+        experiments = read_experiments(
+            self,
+            X,
+            y,
+            sampling_time=self.sampling_time,
+            reset=before is None,
+            allow_missing="Xy" if self.missing == "split" else "",
+        )
+        jitter = 0.0 if before is None else self.time_jitter_
+        self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
+        if before is None:
+            step, options = self._step_of(experiments), self.get_params(deep=False)
+            stream = SampleStream(choices, options, experiments, step)
+            stream.names = _names_of(experiments, y)
+            self._single_output = np.asarray(y).ndim == 1
+        else:
+            stream = before.branch()
+        fitted = stream.add(experiments, Table(X).one(self.time, "time"))
+        if fitted is not None:
+            self._take_up(fitted, stream)
+        return self._go_on(stream)
+
+    def _choices_of_stream(self) -> Choices:
+        """The options, checked, of which a stream takes not all."""
+        choices = check_options(self.get_params(deep=False))
         if self.integrating is not None:
             raise ValueError(
                 "`integrating` must be None in partial_fit. Got "
@@ -649,35 +679,8 @@ class SubspaceLTI(
                 "stands in no feedback loop, leave method='auto'."
             )
         if choices.method == "auto":
-            choices = choices._replace(method="po-moesp")
-        if y is None:
-            raise ValueError(
-                "SubspaceLTI requires y to be passed, but the target y is None: `y` "
-                "must hold the outputs of every batch."
-            )
-        if before is not None:
-            before.check_options(options)
-        experiments = read_experiments(
-            self,
-            X,
-            y,
-            sampling_time=self.sampling_time,
-            reset=before is None,
-            allow_missing="Xy" if self.missing == "split" else "",
-        )
-        jitter = 0.0 if before is None else self.time_jitter_
-        self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
-        if before is None:
-            step = self._step_of(experiments)
-            stream = SampleStream(choices, options, experiments, step)
-            stream.names = _names_of(experiments, y)
-            self._single_output = np.asarray(y).ndim == 1
-        else:
-            stream = before.branch()
-        fitted = stream.add(experiments, Table(X).one(self.time, "time"))
-        if fitted is not None:
-            self._take_up(fitted, stream)
-        return self._go_on(stream)
+            return choices._replace(method="po-moesp")
+        return choices
 
     def _go_on(self, stream: SampleStream) -> Self:
         """Have what a stream does not tell yet wait for someone to ask for it."""

@@ -194,9 +194,9 @@ def subspaces_of(
     factors = data_factors(
         samples, m, widths, past_outputs=past_outputs, n_trend=n_trend
     )
-    return {
-        horizon: observability_subspace(factor, m, ny, horizon, width, method)
-        for (horizon, width), factor in zip(widths.items(), factors, strict=True)
+    return {  # of factors none is kept while the next one is made
+        horizon: observability_subspace(next(factors), m, ny, horizon, width, method)
+        for horizon, width in widths.items()
     }
 
 

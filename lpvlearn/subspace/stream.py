@@ -357,13 +357,12 @@ class SampleStream:
 
     def check_options(self, options: Mapping[str, Any]) -> None:
         """Refuse options other than those the stream began with."""
-        for name, value in options.items():
-            began = self._options[name]
-            if not _same(value, began):
+        for name, began in self._options.items():
+            if not _same(options[name], began):
                 raise ValueError(
                     f"`{name}` must stay as it was when the stream began: "
-                    f"{began!r}. Got {value!r}. Begin anew with `fit`, or go on "
-                    "with a `clone` of the estimator, which knows no samples yet."
+                    f"{began!r}. Got {options[name]!r}. Begin anew with `fit`, or go "
+                    "on with a `clone` of the estimator, which knows no samples yet."
                 )
 
     def add(
