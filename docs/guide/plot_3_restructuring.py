@@ -113,6 +113,13 @@ restructurer.starts_
 # warns with the names of the parameters. ``with_ranges``, ``with_bounds`` or a first
 # guess decide which part has which number.
 #
+# Two parts that noise has merged at a point have no places at all: the parameters there
+# are any, with infinite covariance, and no smooth function goes through them. Then the
+# polynomial is fitted to the black boxes of all points together, each in the
+# coordinates of its own uncertainty:
+# :math:`\min_c \sum_k |z_k(S_k c)|^2`, where :math:`S_k c` are the parameters at point
+# k. It is taken, and told, where the black boxes do not refute it.
+#
 # The norm, and all of its peaks
 # ------------------------------
 # :math:`\gamma > 0` is a singular value of :math:`\Sigma(j\omega)` exactly if the

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -154,6 +155,15 @@ class AutoLPV(Interpolator):
                 "chosen": np.arange(len(found)) == chosen,
             }
         )
+
+    def replaced(self, name: str, form: Interpolator) -> AutoLPV:
+        """A copy that takes another form, on other evidence than the points'."""
+        other = copy(self)
+        other.form_, other.best_estimator_ = name, form
+        rows = self.selection_.assign(chosen=False)
+        rows.loc[len(rows), ["form", "dof", "chosen"]] = name, 0, True
+        other.selection_ = rows.astype(self.selection_.dtypes)
+        return other
 
     def _evaluate(self, kappa: Array) -> Array:
         return self.best_estimator_._evaluate(kappa)

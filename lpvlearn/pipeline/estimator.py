@@ -64,6 +64,7 @@ from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
 from .structured_models import StructuredModels, offsets_of_points, restructure_points
+from .together import through_black_boxes
 
 Array = NDArray[np.float64]
 
@@ -524,6 +525,11 @@ list, default=None
             if has_fit_parameter(interpolator, "covariance"):
                 known["covariance"] = found.covariance
             self.interpolator_ = interpolator.fit(kappa, found.theta, **known)
+            covariance = local_covariance(self.interpolator_, found)
+            models = found  # those whose points of work are the LPV model's
+            together = through_black_boxes(self.interpolator_, found)
+            if together is not None:
+                self.interpolator_, covariance, models = together
             span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
             self.scheduling_range_ = found.points.identified_range
             self.scheduling_names_ = as_list(self.scheduling)
@@ -531,14 +537,14 @@ list, default=None
                 found.structure,
                 self.interpolator_,
                 span,
-                covariance=local_covariance(self.interpolator_, found),
+                covariance=covariance,
                 scheduling_names=self.scheduling_names_ or None,
                 identified_range=self.scheduling_range_,
                 input_delay=common_delay(found.local, kappa, self.sampling_time_),
                 input_names=experiments[0].input_names,
                 output_names=self.output_names_,
                 units=self.units,
-                offsets=self._fit_offsets(found),
+                offsets=self._fit_offsets(models),
             )
             frozen = self.lpv_.silenced().at(kappa[0])
             names = frozen.input_names, frozen.output_names, frozen.units

@@ -70,6 +70,10 @@ _SETTLED = 1e-6
 _DECREASE = 1e-10
 
 
+# Steps over many systems, and the relative decrease of their chi-square that ends them
+_MANY, _ROUGH = 60, 1e-8
+
+
 @dataclass(frozen=True)
 class UncertainResponse:
     """The response of a black box, and the coordinates of its uncertainty."""
@@ -134,6 +138,56 @@ def measured_response(omega: Array, G: Complex, std: Array) -> UncertainResponse
 
 
 @dataclass(frozen=True)
+class UncertainBoxes:
+    """Independent black boxes of one system, in whose uncertainty a structure stands.
+
+    `system` is that of the structure: its black box and weight do not enter.
+    """
+
+    system: ErrorSystem
+    boxes: Sequence[UncertainResponse]
+
+    @classmethod
+    def of(
+        cls,
+        structure: Structure,
+        estimates: Sequence[Estimate],
+        sampling_time: float | None = None,
+        omega: Array | None = None,
+    ) -> UncertainBoxes | None:
+        """Of estimates with their models on either side; None where one has none.
+
+        Where these are in discrete time and the structure (`sampling_time`) is not, it
+        is sampled behind a hold. `omega` are frequencies to tell the models apart at.
+        """
+        first = estimates[0][0]
+        target = Target(first.A, first.B, first.C, first.D, first.sampling_time)
+        if first.sampling_time is not None and sampling_time is None:
+            structure = SampledStructure(structure, first.sampling_time)
+        system = ErrorSystem(structure, target)
+        grid = system.grid if omega is None else omega
+        if first.sampling_time is not None:
+            grid = grid[grid < np.pi / first.sampling_time]
+        found = [uncertain_response(box, pairs, grid) for box, pairs in estimates]
+        boxes = [box for box in found if box is not None]
+        return cls(system, boxes) if len(boxes) == len(found) else None
+
+    @property
+    def n_directions(self) -> int:
+        """Length of `coordinates`."""
+        return sum(box.whitening.shape[0] for box in self.boxes)
+
+    def coordinates(self, theta: Array) -> tuple[Array, Array]:
+        """``z`` of all black boxes, one after another, and its derivatives."""
+        z, J = [], []
+        for box in self.boxes:
+            G, dG = self.system.response_jacobian(theta, box.omega)
+            z.append(box.coordinates(G))
+            J.append(box.derivatives(dG))
+        return np.concatenate(z), np.vstack(J)
+
+
+@dataclass(frozen=True)
 class CovarianceFit:
     """Efficient parameters and what is known about them.
 
@@ -161,27 +215,18 @@ def efficient_parameters(
 ) -> CovarianceFit | None:
     """Parameters of a structure from independent estimates of one system.
 
-    The estimates are those of all experiments, or of each realization of the noise,
-    with their models on either side. Where these are in discrete time and the structure
-    (`sampling_time`) is not, it is sampled behind a hold. None where an uncertainty is
-    not known, or the start does not keep the stability margin. Of models with known
-    poles a margin says nothing: what is `admissible`, and frequencies that see the
-    other poles, are given.
+    The estimates are those of all experiments, or of each realization of the noise, as
+    for `UncertainBoxes`. None where an uncertainty is not known, or the start does not
+    keep the stability margin. Of models with known poles a margin says nothing: what is
+    `admissible`, and frequencies that see the other poles, are given.
     """
-    first = estimates[0][0]
-    target = Target(first.A, first.B, first.C, first.D, first.sampling_time)
-    if first.sampling_time is not None and sampling_time is None:
-        structure = SampledStructure(structure, first.sampling_time)
-    system = ErrorSystem(structure, target)
-    grid = system.grid if omega is None else omega
-    if first.sampling_time is not None:
-        grid = grid[grid < np.pi / first.sampling_time]
-    found = [uncertain_response(box, pairs, grid) for box, pairs in estimates]
-    boxes = [box for box in found if box is not None]
-    if len(boxes) < len(found):
+    found = UncertainBoxes.of(structure, estimates, sampling_time, omega)
+    if found is None:
         return None
-    margin = natural_margin(target)
-    return minimise_covariance(system, start, margin, boxes, admissible=admissible)
+    margin = natural_margin(found.system.target)
+    return minimise_covariance(
+        found.system, start, margin, found.boxes, admissible=admissible
+    )
 
 
 def minimise_covariance(
@@ -222,13 +267,7 @@ def minimise_covariance(
     array([0.2, 0.1])
     """
 
-    def coordinates(theta: Array) -> tuple[Array, Array]:
-        z, J = [], []
-        for box in boxes:
-            G, dG = system.response_jacobian(theta, box.omega)
-            z.append(box.coordinates(G))
-            J.append(box.derivatives(dG))
-        return np.concatenate(z), np.vstack(J)
+    coordinates = UncertainBoxes(system, boxes).coordinates
 
     def residuals(x: Array, _: Any) -> tuple[Array, Callable[..., Array]]:
         if not kept(x[0]):
@@ -266,6 +305,32 @@ def minimise_covariance(
         misfit=misfit,
         converged=remaining <= _SETTLED * max(1.0, misfit),
     )
+
+
+def common_coefficients(
+    systems: Sequence[UncertainBoxes], maps: Array, start: Array
+) -> tuple[Array, float, Array]:
+    """Coefficients whose parameters ``theta_k = maps_k c`` are nearest to all systems.
+
+    They minimise ``sum_k |z_k(maps_k c)|^2``, from a `start`; `maps` have the shape
+    (n_systems, n_params, n_coefficients). Returns c, the cost, and the derivatives of
+    all z there.
+    """
+
+    def coordinates(c: Array) -> tuple[Array, Array]:
+        pairs = [of.coordinates(M @ c) for of, M in zip(systems, maps, strict=True)]
+        slopes = [J @ M for (_, J), M in zip(pairs, maps, strict=True)]
+        return np.concatenate([z for z, _ in pairs]), np.vstack(slopes)
+
+    def residuals(x: Array, _: Any) -> tuple[Array, Callable[..., Array]]:
+        with np.errstate(all="ignore"):  # a step too far is refused
+            z, J = coordinates(x[0])
+        return z[None], lambda _: J[None]
+
+    reached, costs = levenberg_marquardt(
+        residuals, start[None], max_iter=_MANY, tol=_ROUGH, stop=time_is_up
+    )
+    return reached[0], float(costs[0]), coordinates(reached[0])[1]
 
 
 def _linear_analysis(J: Array) -> tuple[Array, Array]:

@@ -1,0 +1,84 @@
+"""A polynomial through the black boxes of all points."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from lpvlearn import AutoLPV, GrayBoxStructure
+from lpvlearn.models.statespace import DEVIATION
+from lpvlearn.pipeline.local_models import LocalModel
+from lpvlearn.pipeline.structured_models import StructuredModels
+from lpvlearn.pipeline.together import fitted_together, through_black_boxes
+
+LAGS = GrayBoxStructure.from_template(
+    [["-a", 0], [0, "-c"]], [["b"], ["d"]], [[1, 1]], parameter_names=list("abcd")
+)
+KAPPA = np.linspace(-1.0, 1.0, 5)[:, None]
+TRUTH = np.array([1.0, 2.0, 4.0, -1.0]) + KAPPA * [0.2, -0.3, 0.5, 0.1]
+STD = 1e-3
+
+
+def estimate(theta, discrete=False):
+    """A black box that knows its poles and gains to 0.1 %, in another state basis."""
+
+    def model(values):
+        found = LAGS.model(values).transform([[2.0, 1.0], [0.0, 3.0]])
+        return found.to_discrete(0.1) if discrete else found
+
+    step = DEVIATION * STD * np.eye(4) * theta
+    return model(theta), [(model(theta + d), model(theta - d)) for d in step]
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_the_polynomial_of_exact_black_boxes_is_found_from_afar(discrete):
+    estimates = [[estimate(theta, discrete)] for theta in TRUTH]
+    start = TRUTH[:, [2, 3, 0, 1]] * [1.5, 1.5, 0.7, 0.7]
+    found = fitted_together(LAGS, estimates, KAPPA, start)
+    assert found.misfit < 1e-6 and found.form.degree == 1
+    values = found.form.predict(KAPPA)
+    if values[0, 0] > values[0, 2]:  # lags in parallel have no order
+        values = values[:, [2, 3, 0, 1]]
+    assert_allclose(values, TRUTH, rtol=1e-5)
+
+
+def test_the_covariance_is_that_of_generalised_least_squares():
+    estimates = [[estimate(theta)] for theta in TRUTH]
+    found = fitted_together(LAGS, estimates, KAPPA, TRUTH)
+    weights = [np.diag((STD * theta) ** -2.0) for theta in TRUTH]
+    S = found.form.sensitivities(KAPPA)
+    information = sum(s.T @ P @ s for s, P in zip(S, weights, strict=True))
+    assert_allclose(found.covariance @ information, np.eye(8), atol=1e-4)
+
+
+def structured(theta, covariance):
+    local = [
+        LocalModel(LAGS.model(row), 2, None, estimates=[estimate(row)]) for row in TRUTH
+    ]
+    models = [LAGS.model(row) for row in theta]
+    points = type("Points", (), {"kappa": KAPPA})
+    return StructuredModels(points, local, LAGS, theta, covariance, models, [None] * 5)
+
+
+def test_it_is_taken_where_a_point_does_not_determine_its_parameters():
+    theta, P = TRUTH.copy(), np.array([np.diag((STD * row) ** 2) for row in TRUTH])
+    sure = AutoLPV().fit(KAPPA, theta, covariance=P)
+    assert through_black_boxes(sure, structured(theta, P)) is None
+    theta[3] = 1.9, 80.0, 2.0, -79.0
+    P[3] = np.diag([np.inf] * 4)
+    lost = AutoLPV().fit(KAPPA, theta, covariance=P)
+    with pytest.warns(UserWarning, match="on no smooth function.*The LPV model takes"):
+        form, covariance, found = through_black_boxes(lost, structured(theta, P))
+    assert form.form_ == "polynomial 1 through the models"
+    assert form.selection_["chosen"].tolist()[-1] and covariance.shape == (8, 8)
+    assert_allclose(form.predict(KAPPA), TRUTH, rtol=1e-4)
+    for model, row in zip(found.models, TRUTH, strict=True):
+        assert (model - LAGS.model(row)).hinf_norm() < 1e-4
+
+
+def test_nothing_is_taken_that_the_black_boxes_refute_or_do_not_know():
+    rng = np.random.default_rng(0)
+    wild = TRUTH * np.exp(rng.normal(size=TRUTH.shape))
+    assert fitted_together(LAGS, [[estimate(t)] for t in wild], KAPPA, wild) is None
+    blind = [[(LAGS.model(theta), [])] for theta in TRUTH]
+    assert fitted_together(LAGS, blind, KAPPA, TRUTH) is None
+    assert fitted_together(LAGS, [[]] * 5, KAPPA, TRUTH) is None
