@@ -100,9 +100,10 @@ def split_levels(
             numbers[rows[start:end]] = n_levels
             n_levels += 1
     if not n_levels:
+        told = ", ".join(f"{limit:.4g}" for limit in limits)
         raise ValueError(
             f"`tol` must leave stretches of `min_samples`={min_samples} rows along "
-            f"which the scheduling variables are held. Got {shown(limits.tolist())}, "
+            f"which the scheduling variables are held. Got {told}, "
             f"within which they stay for {longest} rows at most. Raise `tol` above "
             "their noise, lower `min_samples`, or fit a model to what moves: "
             "OutputErrorLPV()."
