@@ -51,7 +51,9 @@ N_TRENDS = {"auto": 0, None: 0, "constant": 1, "linear": 2}
 # keeping them. One that is kept costs what an unknown does.
 _SUSPICIOUS, _SIGNIFICANT = 1e-2, 1e-3
 
-_CERTAIN = 30.0  # by which the criterion is better with a chance of 1e-7
+# By which the criterion is better with a chance of 1e-7; and the chance by the test of
+# the constants, above which that says more of poor models than of constants.
+_CERTAIN, _LIKELY = 30.0, 0.5
 
 _MOSTLY = 0.5  # part of the squared errors; noise of long memory has a quarter at most
 
@@ -164,7 +166,7 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     if not better > 0.0 or len(other.model.A) < len(without.model.A):
         return better > 0.0
     chance = chance_of_constants(other)
-    return chance < _SIGNIFICANT or (chance < 1.0 and better > _CERTAIN)
+    return chance < _SIGNIFICANT or (chance < _LIKELY and better > _CERTAIN)
 
 
 def _criterion(evidence: Evidence) -> float:

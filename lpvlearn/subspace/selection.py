@@ -411,7 +411,13 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     few = n_values / max(n_values - n_parameters, 1)
     if not np.isfinite(model.loss):
         return np.inf
-    misfit = few * _PRICE * n_parameters
+    # Of many lines of a spectrum one stands out by chance: an oscillation that lasts
+    # for the whole record may be any of them, and costs what the best of them gains.
+    longest = max(record.u.shape[1] for record in records)
+    poles = np.linalg.eigvals(model.A)
+    lasting = (poles.imag > 0.0) & ((1.0 - np.abs(poles)) * longest < 1.0)
+    misfit = 2.0 * np.log(max(0.5 * longest, 1.0)) * int(lasting.sum())
+    misfit += few * _PRICE * n_parameters
     errors = simulation_errors(model, records)
     for i in range(ny):
         noise = autoregression([error[:, [i]] for error in errors])

@@ -6,9 +6,11 @@ from scipy.signal import lfilter
 from lpvlearn.subspace.identification import Settings
 from lpvlearn.subspace.selection import (
     _horizon_grid,
+    criterion_of,
     select,
 )
 from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.simulation_fit import Realization
 
 from ..conftest import modes
 from .conftest import POLES, example, experiment, freedom
@@ -35,6 +37,18 @@ def coloured(seed, n_samples, pole=0.9, level=0.3):
     u, y = experiment(rng, system, n_samples)
     e = lfilter([1.0], [1.0, -pole], rng.standard_normal(y.shape), axis=0)
     return Record.of(u, y + level * y.std(axis=0) * e / e.std(axis=0))
+
+
+def test_an_oscillation_of_any_frequency_costs_the_search_for_it(rng):
+    """The best of n / 2 lines of white noise gains about 2 log(n / 2) by chance."""
+    u, y = rng.standard_normal((2, 400, 1))
+    criteria = []
+    for radius in (0.9999, 0.9):
+        A, B = modes(0.5, radius * np.exp(1.1j)), np.ones((3, 1))
+        C, D, x0 = np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 1)), np.zeros((1, 3))
+        model = Realization(A, B, C, D, x0, 1.0)
+        criteria.append(criterion_of(model, [Record.of(u, y)], freedom(1, 1)))
+    np.testing.assert_allclose(criteria[0] - criteria[1], 2.0 * np.log(200.0))
 
 
 def test_coloured_noise_is_not_taken_for_states():
