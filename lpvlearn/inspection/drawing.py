@@ -263,6 +263,7 @@ def plain_ticks(axis: Any) -> None:
 def is_names(names: Any) -> bool:
     """Whether a value is a list of what may be a name."""
     listed = pd.api.types.is_list_like(names, allow_sets=False)
+    listed = listed and hasattr(names, "__len__")  # an iterator is read once only
     return listed and all(isinstance(name, Hashable) for name in names)
 
 

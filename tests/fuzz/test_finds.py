@@ -160,6 +160,11 @@ HUGE = np.full((4, 2), 1e308)
         ("PoleDisplay", {"scheduling_label": [[1], [1, 2]]}, "`scheduling_label` must"),
         ("PoleDisplay", {"local_poles": HUGE}, "below 1e\\+150"),
         ("ParameterDisplay.from_estimator", {"names": pd.NaT}, "`names` must"),
+        (
+            "ParameterDisplay.from_estimator",
+            {"scheduling_label": iter([])},
+            "`scheduling_label` must hold 1 names",
+        ),
         ("PoleDisplay", {"kappa": np.zeros((4, 0))}, "`kappa` must have shape"),
         ("FlexibleArm.simulate", {"sampling_time": 7}, "at most 2000 integration"),
         ("LocalLPVPipeline.fit", {"time_tol": np.timedelta64(1, "s")}, "`time_tol`"),
