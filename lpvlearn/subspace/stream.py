@@ -284,9 +284,9 @@ class SampleStream:
         self._summary: StreamSummary | None = None
         self._first_residual = np.nan
         self._n_new, self._n_fitted = 0, 0  # samples since, and of, the last attempt
-        # Whether arrays are read as they are: all columns are inputs, by position.
+        # Whether tables are read as they are: all columns are inputs.
         self._plain = all(options[role] is None for role in ROLES)
-        self._plain &= all(isinstance(name, Integral) for name in self._names)
+        self._named = not any(isinstance(name, Integral) for name in self._names)
         self._waiting: list[tuple[Array, Array]] = []  # of which branches share what
         self._n_batches, self._n_waiting = 0, 0  # is before both; samples of ours
 
@@ -317,9 +317,11 @@ class SampleStream:
         """A stream that goes on with a batch, which waits for others to be taken up.
 
         None where there is something to read, to refuse or to do: the batch is not
-        simply inputs and outputs as the first one was, `options` are not those that the
-        stream began with, or enough samples wait.
+        simply inputs and outputs, arrays or tables as the first ones were, `options`
+        are not those that the stream began with, or enough samples wait.
         """
+        if self._named:
+            X, y = _without_labels(X, y, self._names)
         if not (type(X) is type(y) is np.ndarray and X.dtype == y.dtype == np.float64):
             return None
         m, ny = len(self._names), self._n_outputs
@@ -497,6 +499,16 @@ def _n_outputs(experiments: Sequence[Experiment]) -> int:
     outputs = experiments[0].outputs
     assert outputs is not None
     return outputs.shape[1]
+
+
+def _without_labels(X: Any, y: Any, names: Sequence[Hashable]) -> tuple[Any, Any]:
+    """A table of these columns as arrays, where its labels tell nothing; else None."""
+    if type(X) is not pd.DataFrame or tuple(X.columns) != names:
+        return None, None
+    ordered = isinstance(X.index, pd.RangeIndex) and X.index.step > 0
+    if type(y) in (pd.DataFrame, pd.Series) and X.index.equals(y.index):
+        y = y.to_numpy()
+    return (X.to_numpy(), y) if ordered or len(X) == 1 else (None, None)
 
 
 def _same(first: Any, other: Any) -> bool:

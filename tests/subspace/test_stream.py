@@ -615,18 +615,34 @@ def test_branches_of_a_stream_leave_each_other_alone(system):
     assert abs(response(other) - response(whole)).max() > 1e-3
 
 
+@pytest.mark.filterwarnings("ignore")  # of a few samples
 def test_single_rows_are_the_stream_of_their_table(system, short_stream):
     u, y = record(system, 2600)
     model, row = SubspaceLTI(5, horizon=8), (np.empty((1, 2)), np.empty((1, 2)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a few samples
-        for k in range(2600):
-            row[0][:], row[1][:] = u[k], y[k]  # in the same memory every time
-            model.partial_fit(*row)
-            if k in (700, 1700):  # kept and asked, summarised and asked
-                whole = SubspaceLTI(5, horizon=8).fit(u[: k + 1], y[: k + 1])
-                assert_same_model(model, whole)
+    for k in range(2600):
+        row[0][:], row[1][:] = u[k], y[k]  # in the same memory every time
+        model.partial_fit(*row)
+        if k in (700, 1700):  # kept and asked, summarised and asked
+            whole = SubspaceLTI(5, horizon=8).fit(u[: k + 1], y[: k + 1])
+            assert_same_model(model, whole)
     assert_same_model(model, SubspaceLTI(5, horizon=8).fit(u, y))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_single_rows_of_tables_wait_where_their_labels_tell_nothing(system):
+    u, y = record(system, 300)
+    X = pd.DataFrame(u, columns=["a", "b"])
+    model, series = SubspaceLTI(3, horizon=4), pd.Series(y[:, 0], name="p")
+    for k in range(300):
+        model.partial_fit(X[k : k + 1], series[k : k + 1])
+    assert model._stream._n_waiting == 300 - 256  # the model is of the others
+    refused(model, X[["a"]][:1], series[:1], "must have the columns")
+    refused(model, X[:2], series[1:3].set_axis([0, 7]), "must have the row labels")
+    model.partial_fit(X[["b", "a"]], series)
+    twice = pd.concat([X, X], ignore_index=True)
+    whole = SubspaceLTI(3, horizon=4).fit(twice, np.tile(series, 2))
+    assert_same_model(model, whole)
+    assert list(model.lti_.input_names) == ["a", "b"]
 
 
 def test_rows_that_wait_are_checked_and_belong_to_their_branch(system):
