@@ -421,7 +421,8 @@ def _fit_together(
         if fitted is None or kept.all():
             return _Together(fitted, apart, T, kept)
         apart = _without_reached_noise(apart, fitted, T, kept, free.direct)
-        if _as_likely(apart, joint, int((~kept).sum()), records, free, n):
+        fewer = int((~kept).sum())
+        if order is not None or _as_likely(apart, joint, fewer, records, free, n):
             return _Together(fitted, apart, T, kept)
     if order is not None and order != len(joint.A):
         joint, fitted = _innovation_form(subspace, order), None
