@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..validation import number, one_of, real_array
+from ..validation import number, one_of, real_array, squarable
 from .excitation import check_size, steps_of
 from .mechanics import (
     arm_tables,
@@ -440,7 +440,8 @@ def _pair_experiments(
 
     One reference serves several angles and one angle several references.
     """
-    reference = real_array("velocity_reference", velocity_reference)
+    name = "velocity_reference"
+    reference = squarable(name, real_array(name, velocity_reference))
     if reference.ndim not in (2, 3) or reference.shape[-1] != 2:
         raise ValueError(
             "`velocity_reference` must have shape (n_samples, 2) or "

@@ -255,7 +255,7 @@ def _percent(
             "`multioutput` must be 'raw_values', 'uniform_average' or one weight per "
             f"output. Got {multioutput!r}."
         )
-    weights = real_array("multioutput", multioutput)
+    weights = squarable("multioutput", real_array("multioutput", multioutput))
     usable = np.isfinite(weights).all() and (weights >= 0).all() and weights.any()
     if weights.shape != scores.shape or not usable:
         raise ValueError(

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..systems.hinf_norm import PeakSet
 from ..systems.sampling import d2c_tustin
-from ..validation import real_array, shown, whole_number
+from ..validation import real_array, shown, squarable, whole_number
 from .error_system import (
     ErrorSystem,
     Structure,
@@ -126,7 +126,7 @@ def read_frequency_data(
 
     Frequencies (n_freq,) and the response there (n_freq, n_outputs, n_inputs).
     """
-    grid = real_array("omega", omega)
+    grid = squarable("omega", real_array("omega", omega))
     if grid.ndim == 2 and grid.shape[1] == 1:
         grid = grid[:, 0]
     if grid.ndim != 1 or len(grid) == 0:
