@@ -325,6 +325,7 @@ class FlexibleArm:
             exist.
         """
         reference, angles = _pair_experiments(velocity_reference, theta2)
+        sampling_time = check_size("sampling_time", sampling_time)
         single = np.ndim(velocity_reference) == 2 and np.ndim(theta2) == 0
         n = len(angles)
         n_substeps = self._substeps(angles, sampling_time, integration_step)

@@ -107,6 +107,11 @@ class ParameterDisplay:
         units: Mapping[str, str] | None = None,
     ) -> None:
         points = as_numbers("kappa", kappa)
+        if not np.isfinite(points).all():
+            raise ValueError(
+                "`kappa` must be finite scheduling values of the operating points. Got "
+                f"{points[~np.isfinite(points)][0]}."
+            )
         self.kappa = points[:, None] if points.ndim < 2 else points
         n_scheduling = self.kappa.shape[1]
         if n_scheduling > 2:

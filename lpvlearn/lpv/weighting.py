@@ -136,6 +136,8 @@ def _whitening(P: Array, size: Array) -> Array | None:
     open_ = np.isinf(variance)
     P = np.where(open_[:, :, None] | open_[:, None, :], 0.0, P)
     P = P + np.where(open_, (_OPEN * size) ** 2, 0.0)[:, :, None] * np.eye(len(size))
+    if not np.isfinite(P).all():  # of finite variances: no covariance
+        return None
     variance = np.diagonal(P, axis1=1, axis2=2)
     least = _RESOLUTION * size
     if np.median(np.sqrt(variance) / size) < _RESOLUTION:  # no noise, but rounding

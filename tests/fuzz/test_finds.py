@@ -1,6 +1,7 @@
 """What fuzzing found, by class: each was a wrong result, a hang or a riddle."""
 
 from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 import pandas as pd
@@ -8,7 +9,7 @@ import pytest
 
 import lpvlearn as lp
 from lpvlearn.datasets import FlexibleArm
-from lpvlearn.inspection import ErrorDisplay, SimulationDisplay
+from lpvlearn.inspection import ErrorDisplay, ParameterDisplay, SimulationDisplay
 from lpvlearn.validation import number, real_array, whole_number
 
 from ..conftest import spring_lpv
@@ -217,6 +218,20 @@ def test_what_surveys_found_is_right():
     assert np.isfinite(display.plot().ax_.get_ylim()).all()
     for score in (lp.bft_score, lp.vaf_score):
         assert score(1e-200 * theta, 1e-200 * theta[::-1]) == score(theta, theta[::-1])
+
+
+def test_numbers_of_other_kinds_are_numbers_or_refused():
+    arm, reference = FlexibleArm(), np.ones((3, 2))
+    plain = arm.simulate(reference, 1.5, 0.25).y
+    for kind in (np.longdouble, Fraction):
+        assert (arm.simulate(reference, 1.5, kind(0.25)).y == plain).all()
+    kappa, P = np.arange(4.0)[:, None], np.tile(1e-2 * np.eye(2), (4, 1, 1))
+    P[0, 1, 0] = np.inf  # no covariance: none is used
+    theta = np.column_stack([kappa, 1.0 + kappa**2])
+    model = lp.RationalLPV(1, 1).fit(kappa, theta, covariance=P)
+    assert np.isfinite(model.predict(kappa)).all()
+    with pytest.raises(ValueError, match="`kappa` must be finite.*Got nan"):
+        ParameterDisplay(np.full(4, np.nan), {"local": theta})
 
 
 @pytest.mark.parametrize("name", ["X", "y"])
