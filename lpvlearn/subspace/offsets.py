@@ -55,10 +55,6 @@ _SUSPICIOUS, _SIGNIFICANT = 1e-2, 1e-3
 # the constants, above which that says more of poor models than of constants.
 _CERTAIN, _LIKELY = 30.0, 0.5
 
-# Chance of constants that are taken whatever the criterion says: to that, noise of long
-# memory explains them as well.
-_BEYOND_DOUBT = 1e-8
-
 _MOSTLY = 0.5  # part of the squared errors; noise of long memory has a quarter at most
 
 _N_TESTED = 20  # experiments that the tests look at; more of them tell the same
@@ -167,11 +163,9 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     whose density few samples tell; the criterion knows that noise by its innovations.
     """
     better = _criterion(without) - _criterion(other)
-    if better > 0.0 and len(other.model.A) < len(without.model.A):
-        return True
+    if not better > 0.0 or len(other.model.A) < len(without.model.A):
+        return better > 0.0
     chance = chance_of_constants(other)
-    if not better > 0.0:
-        return chance < _BEYOND_DOUBT and len(other.model.A) <= len(without.model.A)
     return chance < _SIGNIFICANT or (chance < _LIKELY and better > _CERTAIN)
 
 

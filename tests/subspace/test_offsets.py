@@ -258,17 +258,6 @@ def test_constants_of_the_size_of_the_noise_are_found(pole):
     assert np.mean(errors["auto"]) < 0.7 * np.mean(errors[None])
 
 
-def test_constants_beyond_doubt_are_taken_though_slow_noise_explains_them(rng):
-    A = modes(0.9 * np.exp(0.4j), 0.95)
-    system = StateSpace(A, B[:, :1], C[:1], sampling_time=1.0)
-    u, noise, levels = (rng.standard_normal((5, n)) for n in (200, 200, 1))
-    y = [system.simulate(one[:, None])[:, 0] for one in u]
-    y = np.ravel(y + np.std(y) * (0.3 * noise + 10.0 * levels))
-    X = np.column_stack([u.ravel(), np.repeat(range(5), 200)])
-    model = SubspaceLTI(3, horizon=10, experiment=1).fit(X, y)
-    assert model.offset_ == "constant"
-
-
 @pytest.mark.parametrize("seed", [0, 2])
 def test_constants_are_seen_through_noise_of_long_memory(seed):
     """Of another output, too: they are many times what that noise moves."""
