@@ -16,12 +16,15 @@ REFERENCE_SEED = 0
 
 _SAMPLING_TIME = 1e-3  # s
 
+_INTEGRATION_STEP = 1e-4  # s: that of the stored files, finer than the default
+
 _N_OPERATING_POINTS = 7  # as the paper
 
 TABLES = {
     "flexible_arm_estimation.csv.gz": ("X", "y"),
     "flexible_arm_local_validation.csv.gz": ("X_local", "y_local"),
     "flexible_arm_sweep.csv.gz": ("X_sweep", "y_sweep"),
+    "flexible_arm_sweep_down.csv.gz": ("X_sweep_down", "y_sweep_down"),
 }
 
 # Seven significant digits resolve y to 1e-4 of its noise.
@@ -159,6 +162,7 @@ def write_reference(folder: Path) -> None:
         n_operating_points=_N_OPERATING_POINTS,
         sampling_time=_SAMPLING_TIME,
         random_state=REFERENCE_SEED,
+        integration_step=_INTEGRATION_STEP,
     )
     for name, (inputs, outputs) in TABLES.items():
         # Adding zero turns -0 into 0; the time of writing would change the bytes.

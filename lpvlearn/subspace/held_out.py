@@ -129,7 +129,9 @@ def _answers(
         free = free_responses(A, weight @ C, len(u), trend)
         return lti_response(A, B, C, D, u), free[:, :, len(A) * at_rest :]
     R, Z, k = linalg.schur(A, sort="iuc")
-    X = linalg.solve_sylvester(R[:k, :k], -R[k:, k:], -R[:k, k:])
+    X = np.zeros((k, len(A) - k))
+    if X.size:  # older versions of scipy refuse an equation without unknowns
+        X = linalg.solve_sylvester(R[:k, :k], -R[k:, k:], -R[:k, k:])
     left, right = Z.T[:k] - X @ Z.T[k:], Z[:, :k] @ X + Z[:, k:]
     back, C_stable, C_growing = linalg.inv(R[k:, k:]), C @ Z[:, :k], C @ right
     into, seen = back @ Z.T[k:] @ B, C_growing @ back
