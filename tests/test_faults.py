@@ -30,7 +30,7 @@ from lpvlearn import GrayBoxRestructurer, LocalLPVPipeline, SubspaceLTI
 from tests.conftest import spring_structure, spring_tables
 
 if __name__ == "__main__":
-    X, y = spring_tables(n_samples=4000)
+    X, y = spring_tables(n_samples={size})
     model = LocalLPVPipeline(
         SubspaceLTI(), GrayBoxRestructurer(spring_structure()), inputs="force",
         scheduling="kappa", experiment="run", time="time", **{options})
@@ -59,8 +59,9 @@ def begun(command, preexec_fn=None, **options):
     )
 
 
-def script(fit=ALONE, **options):
+def script(fit=ALONE, size=4000, **options):
     text = FIT.replace("{options}", repr(options)).replace("{fit}", fit)
+    text = text.replace("{size}", str(size))
     return [sys.executable, "-c", text]
 
 
@@ -160,11 +161,11 @@ def test_a_killed_worker_is_told(tmp_path):
 
 
 def test_two_processes_share_one_memory(tmp_path):
-    both = [begun(script(n_jobs=1, memory=str(tmp_path))) for _ in range(2)]
+    both = [begun(script(size=1000, memory=str(tmp_path))) for _ in range(2)]
     (one, told), (two, _) = (p.communicate(timeout=2 * PATIENCE) for p in both)
     assert [p.returncode for p in both] == [0, 0], told
     assert one == two
-    alone = begun(script(n_jobs=1)).communicate(timeout=2 * PATIENCE)[0]
+    alone = begun(script(size=1000)).communicate(timeout=2 * PATIENCE)[0]
     assert alone == one
 
 
