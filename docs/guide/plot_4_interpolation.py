@@ -145,15 +145,9 @@ comparison.round(1).head(8)
 # %%
 # The choice in a picture: where forms agree, and where they differ most.
 
-shown = list(comparison.drop("truth", axis=1).columns)
-display = ParameterDisplay(
-    kappa,
-    dict.fromkeys(shown, pipeline.parameters_),
-    names=["p2", "p5", "p9"],
-    interpolators=dict(
-        zip(shown, (pipeline.interpolator_, parabola, spline), strict=True)
-    ),
-).plot()
+display = ParameterDisplay.from_estimator(
+    pipeline, forms={"parabola": parabola, "spline": spline}, names=["p2", "p5", "p9"]
+)
 
 # %%
 # Poles between the points

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -218,6 +219,7 @@ class ParameterDisplay:
         pipeline: Any,
         *,
         others: Mapping[str, ArrayLike] | None = None,
+        forms: Mapping[str, Any] | None = None,
         names: Sequence[Hashable] | None = None,
         name: str | None = None,
         uncertainty: bool | None = None,
@@ -235,6 +237,9 @@ class ParameterDisplay:
         others : dict from str to array-like of shape (n_points, n_params), default=None
             Parameters at the same operating points to compare with, drawn as points:
             the truth, an analytic model.
+        forms : dict from str to interpolator, default=None
+            Other interpolations of the same parameters, to see the choice: clones are
+            fitted, with the covariances where they take them. Of one variable.
         names : sequence of str, default=None
             Parameters to draw; None is all.
         name : str, default=None
@@ -262,7 +267,8 @@ class ParameterDisplay:
         ------
         ValueError
             If the pipeline is not fitted or has more than two scheduling variables,
-            `others` has other shapes, or the uncertainty is asked for and not known.
+            `others` has other shapes, there are `forms` in two variables, or the
+            uncertainty is asked for and not known.
         """
         pipeline = fitted_pipeline(pipeline, "parameters_")
         if name is not None:
@@ -279,12 +285,23 @@ class ParameterDisplay:
                 known["curve_std"] = {name: partial(_curve_std, pipeline.lpv_)}
             if np.isfinite(pipeline.parameters_std_).all(axis=None):
                 known["std"] = {name: pipeline.parameters_std_}
-        n_scheduling = pipeline.operating_points_.shape[1]
+        kappa = pipeline.operating_points_
+        n_scheduling = kappa.shape[1]
+        if forms and n_scheduling > 1:
+            raise ValueError(
+                "`forms` must be None for two scheduling variables: maps show one. Got "
+                f"{', '.join(map(repr, forms))}."
+            )
+        drawn = {name: pipeline.interpolator_}
+        for other, form in by_name("forms", forms).items():
+            weighed = "covariance" in signature(form.fit).parameters
+            P = {"covariance": pipeline.parameters_covariance_} if weighed else {}
+            drawn[other] = clone(form).fit(kappa, table, **P)
         display = cls(
-            pipeline.operating_points_,
-            with_others({name: table}, by_name("others", others)),
+            kappa,
+            with_others(dict.fromkeys(drawn, table), by_name("others", others)),
             names=names,
-            interpolators={name: pipeline.interpolator_},
+            interpolators=drawn,
             **known,
             scheduling_label=scheduling_labels(pipeline, n_scheduling, units)
             if scheduling_label is None

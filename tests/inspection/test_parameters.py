@@ -34,6 +34,18 @@ def test_parameters_of_a_pipeline_are_points_and_their_interpolation_a_curve(pip
         )
 
 
+def test_other_forms_are_fitted_to_the_same_points(noisy):
+    line = PolynomialLPV(1)
+    display = ParameterDisplay.from_estimator(noisy, forms={"line": line})
+    assert list(display.curves_) == ["restructured", "line"]
+    kappa, P = noisy.operating_points_, noisy.parameters_covariance_
+    fitted = PolynomialLPV(1).fit(kappa, noisy.parameters_, covariance=P)
+    for k, curve in enumerate(display.curves_["line"]):
+        expected = fitted.predict(curve.get_xdata()[:, None])[:, k]
+        assert_allclose(curve.get_ydata(), expected, rtol=1e-9)
+    assert not hasattr(line, "coef_")
+
+
 def test_names_select_parameters(pipeline):
     display = ParameterDisplay.from_estimator(pipeline, names=["k"])
     assert display.names == ["k"] and len(display.axes_) == 1
