@@ -32,7 +32,6 @@ _DAMPING = (0.1, 0.3, 0.5, 0.7, 0.9)  # damping ratios that get a ray
 # several, so many in all at most, on a grid.
 _N_POINTS, _N_GRID = 101, 500
 
-
 _N_TICKS = 5  # of an axis at most: their labels stand apart in a report, too
 
 _REAL = 1e-6  # imaginary parts, relative to the largest pole, that are rounding

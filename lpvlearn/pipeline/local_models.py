@@ -22,6 +22,7 @@ from ..models.statespace import ModelPair, StateSpace, with_signs_of
 from ..restructuring.known_poles import integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
+from ..subspace.integrating import integrating_flags
 from .runner import Done, PointRunner, label_of, tell_skipped
 
 Array = NDArray[np.float64]
@@ -54,6 +55,7 @@ class LocalModel:
     costs: dict[int, float] = field(default_factory=dict)  # of orders, by the criterion
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
     deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
+    integrating: list[int] = field(default_factory=list)  # outputs: the last states
     n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
     # inputs and outputs at rest, near the experiments; None: not looked for
     rest: tuple[Array, Array] | None = None
@@ -104,10 +106,11 @@ def identify_points(
 def _common_order(models: Sequence[LocalModel]) -> int:
     """The order of least cost to all points together, of those that one of them takes.
 
-    Their records are independent: likelihoods multiply, and a state that one point in
-    nine takes from its noise is not had by all. The highest one where costs are untold.
+    As the estimator counts, without integrators. Their records are independent:
+    likelihoods multiply, and a state that one point in nine takes from its noise is
+    not had by all. The highest one where costs are untold.
     """
-    orders = sorted({model.order for model in models})
+    orders = sorted({model.order - len(model.integrating) for model in models})
     if not all(model.costs for model in models):
         return orders[-1]
     total = dict.fromkeys(orders, 0.0)
@@ -157,6 +160,7 @@ def identify_point(
             _horizon(fitted),
             _costs(fitted, experiments),
             deviated=_all_continuous(pairs, discretization),
+            integrating=_integrating(fitted),
             n_trend=_n_trend(fitted),
             rest=_equilibrium(lti, [fitted], experiments),
         )
@@ -475,6 +479,14 @@ def common_delay(
             "local=SubspaceLTI(input_delay=...)."
         )
     return median
+
+
+def _integrating(fitted: Any) -> list[int]:
+    """Outputs of a fitted estimator that integrate, by their places."""
+    if getattr(fitted, "rates_", None) is None:
+        return []
+    places = range(fitted.lti_.n_outputs)
+    return np.flatnonzero(integrating_flags(fitted.integrating, places)).tolist()
 
 
 def _costs(fitted: Any, experiments: Sequence[Experiment]) -> dict[int, float]:

@@ -27,8 +27,8 @@ _WORTH, _POOR, _FAR = 5.0, 50.0, 2.0
 
 _LOOKED_AT = 10  # experiments of an operating point: more tell the same of constants
 
-_THROUGH = 1e-7  # percent of the model's norm: errors of an interpolation below that
-# are rounding
+# Errors of an interpolation, percent of the model's norm, below which they are rounding
+_THROUGH = 1e-7
 
 _NO_FLOOR = 1e-8  # share of the black box's norm below which a floor is rounding
 
@@ -250,11 +250,12 @@ def summarise(
         if weighed:
             best = 100 * report["relative_hinf_error"]
             misfit = report["chi2"] / report["degrees_of_freedom"].clip(lower=1)
-            lines += [
-                f"    that of the H-infinity optimum {_span(best)} %{spot}",
-                "    in the black box's standard deviations: chi-square per degree of "
-                f"freedom {_span(misfit)}",
-            ]
+            lines.append(f"    that of the H-infinity optimum {_span(best)} %{spot}")
+            if misfit.notna().any():  # none of exact data
+                lines.append(
+                    "    in the black box's standard deviations: chi-square per degree "
+                    f"of freedom {_span(misfit)}"
+                )
         # Without a floor, all of the error remains.
         hidden += (
             ["relative_error"] if has_floor else ["relative_floor", "remaining_error"]
@@ -287,7 +288,7 @@ def summarise(
             f"    H-infinity error {_span(distance)} % of the model's norm, the "
             f"largest at {_label_of_largest(distance)}"
         )
-    elif len(kappa) > 1:
+    elif len(kappa) > 1 and distance.notna().all():  # no norm is where it integrates
         lines.append(
             "    through the local models: how good it is between them only data there "
             "tell"

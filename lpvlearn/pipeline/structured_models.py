@@ -69,8 +69,8 @@ def restructure_points(
     """
     began = perf_counter()
     if isinstance(restructurer, str):
-        integrating = _integrating(local[0].lti)
-        models = [_balanced(model, integrating) for model in local]
+        integrating = local[0].integrating
+        models = [_balanced(model) for model in local]
         kappa = points.kappa if restructurer == "aligned" else None
         structure, theta = balanced_entries(models, kappa, integrating)
         balanced = [
@@ -336,24 +336,18 @@ def covariance_of_parameters(
     return T.T @ T
 
 
-def _integrating(model: StateSpace) -> list[int]:
-    """Outputs that are states of their own, the last ones, on which nothing depends."""
-    last = model.C[:, ~model.A.any(axis=0)]
-    return np.flatnonzero(last.any(axis=1)).tolist()
-
-
-def _balanced(local: LocalModel, integrating: Sequence[int]) -> StateSpace:
+def _balanced(local: LocalModel) -> StateSpace:
     """The local model, balanced: that of the rates of outputs that integrate.
 
     Poles on the negative real axis make the order grow in continuous time.
     """
-    model, n = local.lti, local.lti.order - len(integrating)
-    C, D = model.C.copy(), model.D.copy()
-    C[integrating], D[integrating] = model.A[n:], model.B[n:]
+    model, n_more = local.lti, len(local.integrating)
+    n, C, D = model.order - n_more, model.C.copy(), model.D.copy()
+    C[local.integrating], D[local.integrating] = model.A[n:], model.B[n:]
     rates = StateSpace(
         model.A[:n, :n], model.B[:n], C[:, :n], D, input_delay=model.input_delay
     )
-    return rates.balance(min(local.order - len(integrating), n))
+    return rates.balance(min(local.order - n_more, n))
 
 
 def balanced_entries(

@@ -68,7 +68,8 @@ def through_black_boxes(
         return None
     chi2, dof = form.selection_["chi2"], form.selection_["dof"]
     determined = np.isfinite(found.covariance).all()
-    if determined and (form.form_ != "pchip" or not (chi2 < _NEAR * dof).any()):
+    explained = chi2[form.selection_["chosen"]].notna().all()
+    if determined and (explained or not (chi2 < _NEAR * dof).any()):
         return None
     estimates = [model.estimates for model in found.local]
     kappa = found.points.kappa

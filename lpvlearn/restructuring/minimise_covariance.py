@@ -69,7 +69,6 @@ _SETTLED = 1e-6
 # rounding costs nothing.
 _DECREASE = 1e-10
 
-
 # Steps over many systems, and the relative decrease of their chi-square that ends them
 _MANY, _ROUGH = 60, 1e-8
 

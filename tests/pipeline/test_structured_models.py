@@ -1,5 +1,7 @@
 """Step 4 at the operating points: covariances, what is kept, time that is bounded."""
 
+import warnings
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,6 +13,7 @@ from lpvlearn import (
     GrayBoxRestructurer,
     GrayBoxStructure,
     LocalLPVPipeline,
+    PolynomialLPV,
     StateSpace,
     SubspaceLTI,
     from_trajectories,
@@ -234,6 +237,45 @@ def test_integrators_need_no_structure(restructurer):
         assert_allclose(G, G0, rtol=1e-5)
     scorer = make_bft_scorer(initial_state="estimate")
     assert scorer(pipeline, X, y) > 99.99
+
+
+def test_one_order_with_integrators_is_that_of_all_points():
+    """Two points need a state behind the integrator, the third needs two."""
+    rng, runs = np.random.default_rng(4), []
+    for kappa in (0.0, 1.0, 2.0):
+        u = rng.choice([-1.0, 1.0], (80, 1)).repeat(5, axis=0)
+        model = servo(kappa).A[1:, 1:] if kappa == 2.0 else np.array([[-2.0 - kappa]])
+        n = len(model)
+        A = np.block([[0.0, np.eye(1, n)], [np.zeros((n, 1)), model]])
+        B, C = np.eye(n + 1)[:, -1:], np.eye(1, n + 1)
+        y = StateSpace(A, B, C).simulate(u, sampling_time=0.05)
+        runs.append((u, kappa, y + 1e-4 * y.std() * rng.standard_normal(y.shape)))
+    X, y = from_trajectories(runs, sampling_time=0.05)
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of states too many at the first points
+        pipeline = LocalLPVPipeline(SubspaceLTI(integrating=[0]), **roles).fit(X, y)
+    assert [model.order for model in pipeline.structured_models_] == [3] * 3
+    assert pipeline.report_["local_BFT"].min() > 99.0
+
+
+def test_nothing_is_said_of_distances_between_integrators():
+    rng, runs = np.random.default_rng(5), []
+    structure = GrayBoxStructure.from_template(
+        [[0, 1], [0, -2]], [[0], ["b"]], [[1, 0]]
+    )
+    for kappa in (1.0, 2.0):
+        u = rng.choice([-1.0, 1.0], (60, 1)).repeat(5, axis=0)
+        y = structure.model([kappa]).simulate(u, sampling_time=0.05)
+        runs.append((u, kappa, y + 1e-3 * rng.standard_normal(y.shape)))
+    X, y = from_trajectories(runs, sampling_time=0.05)
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    restructurer = GrayBoxRestructurer(structure)
+    local = SubspaceLTI(integrating=[0])
+    constant = LocalLPVPipeline(local, restructurer, PolynomialLPV(0), **roles)
+    text = constant.fit(X, y).summary()
+    assert "Interpolation: PolynomialLPV(degree=0)" in text
+    assert "through the local models" not in text and "nan" not in text
 
 
 def test_one_canonical_form_needs_one_order():
