@@ -15,6 +15,8 @@ whole only, the correlation of the innovations completely.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from math import log
 from typing import NamedTuple
 
 import numpy as np
@@ -164,6 +166,8 @@ def _weight(errors: Array, free: Freedom) -> Array:
     be zero do not allow.
     """
     n, ny = errors.shape
+    if ny == 1:
+        return np.eye(1)
     size = np.sqrt(np.mean(errors**2, axis=0))
     size = np.maximum(size, size.max() / _LARGEST_RATIO)
     unit = errors / size
@@ -212,7 +216,7 @@ def autoregression(
     weight = 0.0
     for v in errors:
         known = min(len(v), highest + 1)
-        taper = scipy.signal.windows.tukey(len(v) + 2, _TAPERED)[1:-1, None]
+        taper = _taper(len(v))
         lags[:known] += correlation_sequence(taper * v, known)
         weight += float((taper**2).sum())
     lags /= weight
@@ -221,11 +225,13 @@ def autoregression(
     scale[scale == 0.0] = 1.0
     lags = lags / scale[:, None] / scale
     best, best_p, found = np.inf, 0, (np.zeros((ny, 0)), lags[0])
-    for p, (coefficients, covariance) in enumerate(_regressions(lags)):
-        sign, logdet = np.linalg.slogdet(covariance)
+    price = ny * ny * np.log(n_samples) / n_samples
+    regressions = _scalar_regressions if ny == 1 else _regressions
+    for p, (coefficients, covariance) in enumerate(regressions(lags)):
+        sign, logdet = _log_determinant(covariance)
         if not sign > 0.0 or p > best_p + _PATIENCE:  # no noise is left, or no colour
             break
-        criterion = logdet + p * ny * ny * np.log(n_samples) / n_samples
+        criterion = logdet + p * price
         if criterion < best:
             best, best_p, found = criterion, p, (coefficients, covariance)
     coefficients, covariance = found
@@ -235,6 +241,37 @@ def autoregression(
     A = np.eye(n, k=-ny)  # the state holds the last errors
     A[: min(n, ny)] = C[: min(n, ny)]
     return NoiseModel(A, C, np.eye(n, ny), covariance * np.outer(scale, scale))
+
+
+@lru_cache(maxsize=8)
+def _taper(n_samples: int) -> Array:
+    """Weights of the samples of an experiment, (n_samples, 1)."""
+    taper: Array = scipy.signal.windows.tukey(n_samples + 2, _TAPERED)[1:-1, None]
+    return taper
+
+
+def _log_determinant(covariance: Array) -> tuple[float, float]:
+    """Sign and logarithm; of numbers at a tenth of the time of `slogdet`."""
+    if covariance.size > 1:
+        sign, logarithm = np.linalg.slogdet(covariance)
+        return float(sign), float(logarithm)
+    value = covariance.item()
+    return (1.0, log(value)) if value > 0.0 else (0.0, -np.inf)
+
+
+def _scalar_regressions(lags: Array) -> Iterator[tuple[Array, Array]]:
+    """As `_regressions` of one channel, whose predictions back mirror those forth."""
+    r = lags[:, 0, 0]
+    forth, variance = np.zeros(0), float(r[0])
+    yield forth[None], np.array([[variance]])
+    for p in range(len(r) - 1):
+        if variance == 0.0:  # nothing is left to explain
+            return
+        new = float(r[p + 1]) - float(forth @ r[p:0:-1])
+        gain = new / variance
+        forth = np.append(forth - gain * forth[::-1], gain)
+        variance -= gain * new
+        yield forth[None], np.array([[variance]])
 
 
 def _regressions(lags: Array) -> Iterator[tuple[Array, Array]]:

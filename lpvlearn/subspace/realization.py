@@ -157,7 +157,7 @@ def reflect_unstable(A: Array, limit: float = 1.0) -> Array:
     array([[0.5, 0. ],
            [0. , 0.5]])
     """
-    if A.size == 0 or np.abs(linalg.eigvals(A)).max() <= limit:
+    if A.size == 0 or np.abs(np.linalg.eigvals(A)).max() <= limit:
         return A
     # By the real Schur form, because the eigenvectors may be nearly dependent; as
     # 1 / conj(z) = z / |z|**2, a diagonal block is divided by its squared modulus.

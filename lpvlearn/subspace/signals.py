@@ -232,6 +232,23 @@ def signal_factor(
     return lower.T
 
 
+def section_states(blocks: tuple[Array, ...], added: Array) -> Array:
+    """States ``x[t] = A x[t - 1] + added[t]`` from rest, (order, n_samples) both.
+
+    >>> section_states((np.array([[0.5]]),), np.array([[1.0, 0.0, 2.0]]))
+    array([[1.  , 0.5 , 2.25]])
+    """
+    out = np.empty_like(added)
+    for block, part in zip(blocks, block_slices(blocks), strict=True):
+        denominator = _characteristic(block)
+        ahead = scipy.signal.lfilter([1.0], denominator, added[part], axis=1)
+        out[part] = ahead
+        if len(block) == 2:  # z inv(z I - A) = (z^2 I + z (A - 2 s I)) / det(z I - A)
+            rest = block_remainder(block) + 0.5 * denominator[1] * np.eye(2)
+            out[part, 1:] += rest @ ahead[:, :-1]
+    return out
+
+
 class _SectionBank:
     """Filters of all blocks, with the memory that a record in pieces needs.
 

@@ -34,6 +34,7 @@ from .signals import (
     block_remainder,
     block_sections,
     block_slices,
+    section_states,
     signal_factor,
     state_coefficients,
 )
@@ -69,7 +70,7 @@ class Freedom(NamedTuple):
 
     def n_linear(self, order: int) -> int:
         """Number of unknowns that outputs are linear in: the own ones, B and D."""
-        n_d, m = int(self.direct.sum()), self.direct.shape[1]
+        n_d, m = np.count_nonzero(self.direct), self.direct.shape[1]
         return self.n_own(order) + order * m + n_d
 
 
@@ -89,7 +90,12 @@ class Realization(NamedTuple):
     def outputs(self, record: Record, experiment: int) -> Array:
         """Simulated outputs (n_samples, n_outputs) of a record, its trends included."""
         x0 = self.initial_states[experiment]
-        fitted = lti_response(self.A, self.B, self.C, self.D, record.u.T, x0)
+        if self.blocks is None:
+            fitted = lti_response(self.A, self.B, self.C, self.D, record.u.T, x0)
+        else:
+            added = np.column_stack([x0, self.B @ record.u[:, :-1]])
+            states = section_states(self.blocks, added)
+            fitted = (self.C @ states + self.D @ record.u).T
         if len(record.trend):
             fitted += record.trend.T @ self.trends[experiment]
         return fitted
@@ -305,8 +311,8 @@ def _solve_regressions(
         M, rhs = regressions[0][:, :-1], regressions[0][:, -1]
         solution, rank = scaled_lstsq(M, rhs)
         if rank == M.shape[1]:
-            loss = float(np.sum((M @ solution - rhs) ** 2))
-            return solution[n:], solution[None, :n], loss, 0
+            left = M @ solution - rhs
+            return solution[n:], solution[None, :n], float(left @ left), 0
     parts: list[Array] = []
     for M in regressions:
         _pool(parts, M, n)
@@ -429,28 +435,30 @@ def _fill_linear(
     """Fill in the effects of own unknowns, B and the free entries of D."""
     (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
     own, n_states, base = free.n_own(n), free.n_states(n), n * (1 + m)
-    signals = R[:, :base].reshape(k, n, 1 + m).transpose(0, 2, 1)
-    effect = signals[None] @ _output_coefficients(blocks, C)[:, None]
-    out[:, :, :n_states] = effect[:, :, 0, :n_states]
-    trends = R[:, R.shape[1] - free.n_trend :]
-    for i in range(ny):
-        out[i, :, n_states + i : own : ny] = trends
-    by_state = effect[:, :, 1:].transpose(0, 1, 3, 2)
-    out[:, :, own : own + n * m] = by_state.reshape(ny, k, n * m)
-    for column, (i, j) in enumerate(np.argwhere(free.direct), start=own + n * m):
+    signals = R[:, :base].reshape(k, n, 1 + m).swapaxes(1, 2).reshape(k * (1 + m), n)
+    coefficients = _output_coefficients(blocks, C).reshape(n, ny * n)
+    effect = (signals @ coefficients).reshape(k, 1 + m, ny, n).transpose(2, 0, 3, 1)
+    out[:, :, :n_states] = effect[:, :, :n_states, 0]
+    if free.n_trend:
+        trends = R[:, R.shape[1] - free.n_trend :]
+        for i in range(ny):
+            out[i, :, n_states + i : own : ny] = trends
+    out[:, :, own : own + n * m] = effect[..., 1:].reshape(ny, k, n * m)
+    where = zip(*free.direct.nonzero(), strict=True)
+    for column, (i, j) in enumerate(where, start=own + n * m):
         out[i, :, column] = R[:, base + j]
 
 
 def _output_coefficients(blocks: tuple[Array, ...], C: Array) -> Array:
-    """Outputs of every section, in terms of its signals: (n_outputs, order, order).
+    """Outputs of every section, in terms of its signals: (order, n_outputs, order).
 
     ``c x = sum_i coefficient[i, j] b[j] signal[i]`` for a state driven through ``b``:
     rows ``c`` for ``d`` and ``c N`` for ``g``; block diagonal.
     """
     ny, n = C.shape
-    out = np.zeros((ny, n, n))
+    out = np.zeros((n, ny, n))
     for block, part in zip(blocks, block_slices(blocks), strict=True):
-        out[:, part.start, part] = C[:, part]
+        out[part.start, :, part] = C[:, part]
         if len(block) == 2:
-            out[:, part.start + 1, part] = C[:, part] @ block_remainder(block)
+            out[part.start + 1, :, part] = C[:, part] @ block_remainder(block)
     return out
