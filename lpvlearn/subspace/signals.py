@@ -199,15 +199,14 @@ def signal_pieces(
             source[0, 0] = 0.0
             source[1:, 0] = record.u[:, start - 1]
         source[1:, 1:n] = record.u[:, start : stop - 1]
-        first_bank.run([source[:, :n]] * len(blocks), X[:base], last_only=False)
+        first_bank.run(source[:, :n], X[:base].reshape(order, 1 + m, n))
         X[base : base + m] = record.u[:, start:stop]
         X[base + m : base + m + ny] = record.y[:, start:stop]
         if state_map is not None:
             late[:, 0] = last_state
             late[:, 1:n] = state_map @ X[:base, :-1]
             last_state = state_map @ X[:base, -1]
-            parts = [late[part, :n] for part in block_slices(blocks)]
-            second_bank.run(parts, X[base + m + ny : last], last_only=True)
+            second_bank.run_last(late[:, :n], X[base + m + ny : last])
         if n_trend:
             X[last:] = record.trend[:, start:stop]
         yield X
@@ -244,7 +243,7 @@ def section_states(blocks: tuple[Array, ...], added: Array) -> Array:
         ahead = scipy.signal.lfilter([1.0], denominator, added[part], axis=1)
         out[part] = ahead
         if len(block) == 2:  # z inv(z I - A) = (z^2 I + z (A - 2 s I)) / det(z I - A)
-            rest = block_remainder(block) + 0.5 * denominator[1] * np.eye(2)
+            rest = block + denominator[1] * np.eye(2)
             out[part, 1:] += rest @ ahead[:, :-1]
     return out
 
@@ -252,10 +251,12 @@ def section_states(blocks: tuple[Array, ...], added: Array) -> Array:
 class _SectionBank:
     """Filters of all blocks, with the memory that a record in pieces needs.
 
-    `widths` are the numbers of signals that drive each block.
+    `widths` are the numbers of signals that drive each block. These come one sample
+    late.
     """
 
     def __init__(self, blocks: tuple[Array, ...], widths: Sequence[int]) -> None:
+        self._places = block_slices(blocks)
         self._denominators = [_characteristic(block) for block in blocks]
         self._memory = [
             np.zeros((width, len(block)))
@@ -263,40 +264,56 @@ class _SectionBank:
         ]
         self._last: list[Array | float] = [0.0] * len(blocks)
 
-    def run(self, late: Sequence[Array], out: Array, *, last_only: bool) -> None:
-        """Filter the next piece.
+    def run(self, v: Array, out: Array) -> None:
+        """``d`` and, of blocks of two states, ``g`` of every block, one after another.
 
-        `late` is what drives each block, one sample late, (n_signals, n_samples) each.
-        `out` receives, block after block, ``d`` and, of blocks of two states, ``g``;
-        with `last_only` only the last of them: ``d`` of one state, ``g`` of two.
+        The next piece of what drives all of them, (width, n_samples); `out` is
+        (order, width, n_samples).
         """
-        row = 0
-        for i, v in enumerate(late):
-            width, ahead = len(v), self._filter(i, v)
-            first = out[row : row + width]
-            row += width
-            if len(self._denominators[i]) == 2:
-                first[:] = ahead
-            elif last_only:
-                self._delay(i, ahead, first)
-            else:
-                g = out[row : row + width]
-                self._delay(i, ahead, g)
-                np.multiply(g, 0.5 * self._denominators[i][1], out=first)
-                first += ahead
-                row += width
+        for i, part in enumerate(self._places):
+            ahead, d = self._filtered(i, [1.0], v), out[part.start]
+            if part.stop - part.start == 1:
+                d[:] = ahead
+                continue
+            g = out[part.start + 1]
+            g[:, 0], g[:, 1:] = self._last[i], ahead[:, :-1]
+            self._last[i] = ahead[:, -1].copy()
+            np.multiply(g, 0.5 * self._denominators[i][1], out=d)
+            d += ahead
 
-    def _filter(self, i: int, v: Array) -> Array:
-        """``d`` of one state; ``g`` of two, one sample early."""
+    def run_last(self, v: Array, out: Array) -> None:
+        """The last of these of every block, driven by rows of its own.
+
+        `v` and `out` are (order, n_samples).
+        """
+        for i, part in enumerate(self._places):
+            late = [1.0] if part.stop - part.start == 1 else [0.0, 1.0]
+            out[part] = self._filtered(i, late, v[part])
+
+    def _filtered(self, i: int, numerator: list[float], v: Array) -> Array:
         out, self._memory[i] = scipy.signal.lfilter(
-            [1.0], self._denominators[i], v, axis=1, zi=self._memory[i]
+            numerator, self._denominators[i], v, axis=1, zi=self._memory[i]
         )
         return out
 
-    def _delay(self, i: int, ahead: Array, out: Array) -> None:
-        out[:, 0] = self._last[i]
-        out[:, 1:] = ahead[:, :-1]
-        self._last[i] = ahead[:, -1].copy()
+
+class Pairs(NamedTuple):
+    """The blocks of two states, each ``A = s I + N`` with ``s`` half its trace."""
+
+    states: NDArray[np.intp]  # (n_pairs, 2): of every block
+    N: Array  # (n_pairs, 2, 2)
+
+    @classmethod
+    def of(cls, blocks: tuple[Array, ...]) -> Pairs:
+        """Those among some blocks."""
+        parts = zip(block_slices(blocks), blocks, strict=True)
+        pairs = [(part.start, block) for part, block in parts if len(block) == 2]
+        first = np.array([start for start, _ in pairs], dtype=np.intp)
+        N = np.array([block for _, block in pairs]).reshape(-1, 2, 2)
+        half = 0.5 * (N[:, 0, 0] + N[:, 1, 1])
+        N[:, 0, 0] -= half
+        N[:, 1, 1] -= half
+        return cls(first[:, None] + np.arange(2), N)
 
 
 def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
@@ -306,10 +323,12 @@ def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
     """
     n, width = driven.shape
     out = np.zeros((n, n, width))
-    for block, part in zip(blocks, block_slices(blocks), strict=True):
-        out[part, part.start] = driven[part]
-        if len(block) == 2:
-            out[part, part.start + 1] = block_remainder(block) @ driven[part]
+    diagonal = np.arange(n)
+    out[diagonal, diagonal] = driven
+    states, N = Pairs.of(blocks)
+    first, own = states[:, :1], driven[states]
+    out[states, first] = own
+    out[states, first + 1] = N @ own
     return out.reshape(n, n * width)
 
 
@@ -317,15 +336,6 @@ def block_slices(blocks: Sequence[Array]) -> list[slice]:
     """States of every block."""
     stops = accumulate(len(block) for block in blocks)
     return [slice(stop - len(b), stop) for b, stop in zip(blocks, stops, strict=True)]
-
-
-def block_remainder(block: Array) -> Array:
-    """``N = A - s I`` of a block, with ``s`` its trace divided by its size."""
-    if len(block) == 1:
-        return np.zeros((1, 1))
-    (a, b), (c, d) = block.tolist()
-    centre = 0.5 * (a + d)
-    return np.array([[a - centre, b], [c, d - centre]])
 
 
 def _characteristic(block: Array) -> list[float]:

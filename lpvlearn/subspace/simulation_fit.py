@@ -30,8 +30,8 @@ from ..systems.simulation import (
 )
 from .hankel import triangularize
 from .signals import (
+    Pairs,
     Record,
-    block_remainder,
     block_sections,
     block_slices,
     section_states,
@@ -344,7 +344,8 @@ def project_out(M: Array, n: int) -> Array:
     """The columns after the first `n`, without what the first `n` explain."""
     if n == 0:
         return M
-    explained = linalg.orth(M[:, :n] / column_scale(M[:, :n]), RCOND)
+    left, s, _ = np.linalg.svd(M[:, :n] / column_scale(M[:, :n]), full_matrices=False)
+    explained = left[:, s > RCOND * s.max(initial=0.0)]
     return M[:, n:] - explained @ (explained.T @ M[:, n:])
 
 
@@ -358,7 +359,7 @@ def linear_regression(
     """
     (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
     out = np.zeros((ny, k, free.n_linear(n) + 1))
-    _fill_linear(out, R, blocks, C, free)
+    _fill_linear(out, R, Pairs.of(blocks), C, free)
     base = n * (1 + m)
     out[:, :, -1] = R[:, base + m : base + m + ny].T
     return out.reshape(ny * k, -1)
@@ -379,21 +380,27 @@ def jacobian_regression(
     column, base = free.n_linear(n), n * (1 + m)
     size_a = sum(block.size for block in blocks)
     out = np.zeros((ny, k, column + size_a + ny * n + 1))
-    _fill_linear(out, R, blocks, C, free)
+    pairs = Pairs.of(blocks)
+    _fill_linear(out, R, pairs, C, free)
     second = R[:, base + m + ny :]
-    for block, part in zip(blocks, block_slices(blocks), strict=True):
-        # Entry (p, q) of the block drives state p with state q.
-        answer = second[:, part]
+    # Entry (p, q) of a block drives state p with state q.
+    where = column + np.cumsum([0, *(block.size for block in blocks)])
+    for start, block, part in zip(where, blocks, block_slices(blocks), strict=False):
         if len(block) == 1:
-            effect = C[:, None, part, None] * answer[None, :, None, :]
-        else:
-            N = block_remainder(block)
-            g_u = R[:, (part.start + 1) * (1 + m) : part.stop * (1 + m)]
-            first = answer @ N.T + g_u @ driven[part].T
-            effect = C[:, None, part, None] * first[None, :, None, :]
-            effect += (C[:, part] @ N)[:, None, :, None] * answer[None, :, None, :]
-        out[:, :, column : column + block.size] = effect.reshape(ny, k, -1)
-        column += block.size
+            out[:, :, start] = C[:, part] * second[:, part.start]
+    if len(pairs.N):
+        into, own = pairs.states, driven[pairs.states].swapaxes(1, 2)
+        answer = second[:, into].swapaxes(0, 1)  # (n_pairs, k, 2)
+        g_u = R[:, :base].reshape(k, n, 1 + m)[:, into[:, 1]].swapaxes(0, 1)
+        first = answer @ pairs.N.swapaxes(1, 2) + g_u @ own
+        seen = C.T[into].swapaxes(1, 2)[:, :, None, :, None]  # outputs of the states
+        effect = seen * first[:, None, :, None]
+        seen = (C.T[into].swapaxes(1, 2) @ pairs.N)[:, :, None, :, None]
+        effect += seen * answer[:, None, :, None]
+        sizes = [block.size for block in blocks]
+        columns = np.flatnonzero(np.repeat(sizes, sizes) == 4) + column
+        out[:, :, columns] = effect.transpose(1, 2, 0, 3, 4).reshape(ny, k, -1)
+    column += size_a
     states = R[:, :base] @ state_coefficients(blocks, driven).T
     for i in range(ny):
         out[i, :, column + i * n : column + (i + 1) * n] = states
@@ -429,14 +436,12 @@ def linearised(
     return _joined(parts)
 
 
-def _fill_linear(
-    out: Array, R: Array, blocks: tuple[Array, ...], C: Array, free: Freedom
-) -> None:
+def _fill_linear(out: Array, R: Array, pairs: Pairs, C: Array, free: Freedom) -> None:
     """Fill in the effects of own unknowns, B and the free entries of D."""
     (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
     own, n_states, base = free.n_own(n), free.n_states(n), n * (1 + m)
     signals = R[:, :base].reshape(k, n, 1 + m).swapaxes(1, 2).reshape(k * (1 + m), n)
-    coefficients = _output_coefficients(blocks, C).reshape(n, ny * n)
+    coefficients = _output_coefficients(pairs, C).reshape(n, ny * n)
     effect = (signals @ coefficients).reshape(k, 1 + m, ny, n).transpose(2, 0, 3, 1)
     out[:, :, :n_states] = effect[:, :, :n_states, 0]
     if free.n_trend:
@@ -449,7 +454,7 @@ def _fill_linear(
         out[i, :, column] = R[:, base + j]
 
 
-def _output_coefficients(blocks: tuple[Array, ...], C: Array) -> Array:
+def _output_coefficients(pairs: Pairs, C: Array) -> Array:
     """Outputs of every section, in terms of its signals: (order, n_outputs, order).
 
     ``c x = sum_i coefficient[i, j] b[j] signal[i]`` for a state driven through ``b``:
@@ -457,8 +462,10 @@ def _output_coefficients(blocks: tuple[Array, ...], C: Array) -> Array:
     """
     ny, n = C.shape
     out = np.zeros((n, ny, n))
-    for block, part in zip(blocks, block_slices(blocks), strict=True):
-        out[part.start, :, part] = C[:, part]
-        if len(block) == 2:
-            out[part.start + 1, :, part] = C[:, part] @ block_remainder(block)
+    diagonal = np.arange(n)
+    out[diagonal, :, diagonal] = C.T
+    states, N = pairs
+    first, seen = states[:, :1], C.T[states]
+    out[first, :, states] = seen
+    out[first + 1, :, states] = N.swapaxes(1, 2) @ seen
     return out
