@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack, matrix_balance, schur
+from scipy.linalg import LinAlgError, lapack, matrix_balance
 
 Array = NDArray[np.float64]
 
@@ -30,12 +32,39 @@ def gramian_factor(A: Array, B: Array, discrete: bool) -> Array:
     .. [1] S. J. Hammarling, "Numerical solution of the stable, non-negative definite
        Lyapunov equation", IMA Journal of Numerical Analysis 2, 1982.
     """
-    n = len(A)
+    return _factor(_schur(A), B, discrete)
+
+
+class _Schur(NamedTuple):
+    """``A = S Q T Q^H S^-1``, T upper triangular, S diagonal to balance A."""
+
+    scale: Array  # diagonal of S
+    Q: NDArray[np.complex128]
+    T: NDArray[np.complex128]
+
+    def transposed(self) -> _Schur:
+        """That of ``A^T``, states in the reverse order."""
+        T = self.T.T[::-1, ::-1]
+        return _Schur(1.0 / self.scale, self.Q.conj()[:, ::-1], T)
+
+
+def _schur(A: Array) -> _Schur:
+    if len(A) == 0:
+        return _Schur(np.ones(0), np.zeros((0, 0), complex), np.zeros((0, 0), complex))
+    A, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    # `scipy.linalg.schur` asks LAPACK for the size of its work: 60 us instead of 20
+    T, _, _, Q, _, info = lapack.zgees(lambda _: None, A + 0j)
+    if info:
+        raise LinAlgError("the eigenvalues of a state matrix did not converge")
+    return _Schur(scale, Q, T)
+
+
+def _factor(of_A: _Schur, B: Array, discrete: bool) -> Array:
+    """As `gramian_factor`."""
+    scale, Q, T = of_A
+    n, poles = len(T), T.diagonal()
     if n == 0:
         return np.zeros((0, 0))
-    A, (scale, _) = matrix_balance(A, permute=False, separate=True)
-    T, Q = schur(A, output="complex")
-    poles = np.diag(T)
     margin = 1.0 - np.abs(poles) if discrete else -poles.real
     if not (margin > 0).all():
         worst = poles[margin.argmin()]
@@ -84,8 +113,9 @@ def balancing_transformation(
     remaining values are rounding noise (states not controllable or not observable).
     """
     n = len(A)
-    controllable = gramian_factor(A, B, discrete)
-    observable = gramian_factor(A.T, C.T, discrete)
+    of_A = _schur(A)
+    controllable = _factor(of_A, B, discrete)
+    observable = _factor(of_A.transposed(), C.T, discrete)
     U, hankel, Vt = np.linalg.svd(observable.T @ controllable)
     r = int((hankel > _ROUNDING * max(n, 1) * hankel.max(initial=0.0)).sum())
     root = np.sqrt(hankel[:r])
