@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -130,17 +131,72 @@ def version() -> str:
     return str(sys.modules[__name__.split(".")[0]].__version__)
 
 
+# Of columns and labels: what lists, texts and arrays of NumPy give back as it was.
+_PLAIN_DTYPES = ("object", "str", "float64", "int64", "bool")
+
+
+class _Labels(NamedTuple):
+    """Those of the rows or columns of a table."""
+
+    values: list[Any]
+    names: list[Any]
+    dtype: str
+
+    @classmethod
+    def of(cls, index: pd.Index) -> _Labels:
+        return cls(index.tolist(), [*index.names], str(index.dtype))
+
+    def built(self) -> pd.Index:
+        if len(self.names) > 1:
+            return pd.MultiIndex.from_tuples(self.values, names=self.names)
+        return pd.Index(self.values, dtype=self.dtype, name=self.names[0])
+
+
+class _PlainTable(NamedTuple):
+    """A table of pandas as lists, texts and arrays, which formats without code hold."""
+
+    rows: _Labels
+    columns: _Labels
+    dtypes: list[str]
+    values: list[NDArray[Any]]
+
+    @classmethod
+    def of(cls, value: Any) -> Any:
+        """What stands for a value: for a table of numbers and text its parts."""
+        if not isinstance(value, pd.DataFrame):
+            return value
+        rows, columns = _Labels.of(value.index), _Labels.of(value.columns)
+        dtypes = [str(dtype) for dtype in value.dtypes]
+        if not {rows.dtype, columns.dtype, *dtypes} <= {*_PLAIN_DTYPES}:
+            return value
+        arrays = [value.iloc[:, k].to_numpy() for k in range(len(dtypes))]
+        return cls(rows, columns, dtypes, arrays)
+
+    def table(self) -> pd.DataFrame:
+        index, parts = self.rows.built(), zip(self.values, self.dtypes, strict=True)
+        columns = [pd.Series(v, index, dtype) for v, dtype in parts]
+        found = pd.DataFrame(dict(enumerate(columns)), index)
+        return found.set_axis(self.columns.built(), axis=1)
+
+
 class VersionedPickle:
     """What an estimator's pickle tells: the version of this library that wrote it.
 
-    Scikit-learn's estimators tell theirs; what others inherit from it does not.
+    Scikit-learn's estimators tell theirs; what others inherit from it does not. Tables
+    are taken apart, so that skops holds the estimator as well.
     """
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_lpvlearn_version": version()}  # type: ignore[dict-item]
+        state: dict[str, Any] = super().__getstate__()  # type: ignore[assignment]
+        plain = {name: _PlainTable.of(value) for name, value in state.items()}
+        return plain | {"_lpvlearn_version": version()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        own = {k: v for k, v in state.items() if k != "_lpvlearn_version"}
+        own = {
+            name: value.table() if isinstance(value, _PlainTable) else value
+            for name, value in state.items()
+            if name != "_lpvlearn_version"
+        }
         written = state.get("_lpvlearn_version", "0.1.0 or before")
         if written != version():
             warn(

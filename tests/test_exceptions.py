@@ -1,4 +1,6 @@
-"""Warnings point to the line of the user, however deep in the library they arise."""
+"""Warnings point to the user's line; pickles keep the tables of an estimator."""
+
+import pickle
 
 import numpy as np
 import pandas as pd
@@ -51,3 +53,30 @@ def test_predictions_outside_of_the_range_name_the_caller():
     with pytest.warns(ExtrapolationWarning) as caught:
         model.predict([[3.0]])
     assert [w.filename for w in caught] == [__file__]
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        pd.DataFrame({"a": [1.5, np.nan], "b": [1, 2], "c": ["x", "y"]}),
+        pd.DataFrame({"a": [None, 1.0], "b": [True, False]}, index=["r", "s"]),
+        pd.DataFrame([[1.0, 2.0]], columns=["a", "a"]),
+        pd.DataFrame(np.eye(2), pd.MultiIndex.from_product([[0.5], ["u", "v"]])),
+        pd.DataFrame(
+            [[1]], columns=pd.MultiIndex.from_tuples([("a", 1)], names=["p", "q"])
+        ),
+        pd.DataFrame({"a": pd.to_datetime(["2026-01-01"]), "b": [1.0]}),
+        pd.DataFrame({"a": [1.0, 2.0]}, index=pd.Index([3, 4], name="point")),
+        pd.DataFrame({"a": pd.Categorical(["x"], ["x", "y"], ordered=True)}),
+        pd.DataFrame({"a": np.float32([0.1])}),
+        pd.DataFrame(index=["r"]),
+        pd.DataFrame(columns=["a", "b"]),
+        pd.DataFrame(),
+    ],
+    ids=str,
+)
+def test_tables_of_a_pickled_estimator_stay_what_they_are(table):
+    fitted = PolynomialLPV(1)
+    fitted.table_ = table
+    back = pickle.loads(pickle.dumps(fitted))
+    pd.testing.assert_frame_equal(back.table_, table)

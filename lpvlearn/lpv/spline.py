@@ -70,6 +70,15 @@ class SplineLPV(Interpolator):
         self.kind = kind
         self.extrapolation = extrapolation
 
+    def __getstate__(self) -> dict[str, Any]:
+        # The curve is of a class that not every format holds.
+        return {k: v for k, v in super().__getstate__().items() if k != "_curve"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        if hasattr(self, "_theta"):
+            self._draw(self._theta)
+
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
         x, place = np.unique(
             to_unit(kappa, self.scheduling_range_), axis=0, return_inverse=True

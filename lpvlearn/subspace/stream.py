@@ -101,12 +101,13 @@ class StreamClock:
         times = pd.Series(stamps.values).reset_index(drop=True)
         joined, n_before, goes_on = times, 0, True
         if continues and self._tail is not None:
-            joined = pd.concat([self._tail, times], ignore_index=True)
+            before = pd.Series(self._tail).infer_objects()
+            joined = pd.concat([before, times], ignore_index=True)
             n_before = len(self._tail)
             goes_on = self._check_border(joined, stamps.name, label)
         self._check_step(joined, stamps.name, label)
         self._in_first &= continues or self._tail is None
-        self._tail = joined.iloc[-_REMEMBERED:]
+        self._tail = joined.iloc[-_REMEMBERED:].to_numpy()
         if self._in_first and len(joined) > 1:
             seconds = time_in_seconds(joined, stamps.name)
             steps = np.diff(seconds.astype(float))
@@ -145,7 +146,7 @@ class StreamClock:
     def _check_step(self, joined: Any, name: Hashable, label: Hashable) -> None:
         if len(joined) < 2:
             return
-        times = joined.iloc[-_REMEMBERED:]
+        times = joined.iloc[-_REMEMBERED:].to_numpy()
         if self._reference is None:
             self._reference = times
             return
