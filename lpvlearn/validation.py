@@ -136,13 +136,13 @@ def squarable(name: str, array: NDArray[Any]) -> NDArray[Any]:
 
 
 def matrix(name: str, value: ArrayLike) -> Array:
-    """`value` as a new finite matrix; a number or one row may stand for it."""
+    """`value` as a new matrix of numbers with squares; one row may stand for it."""
     array = real_array(name, value)
     if array.ndim < 2:
         array = array.reshape(1, -1) if array.size else np.zeros((0, 0))
     if array.ndim != 2:
         raise ValueError(f"`{name}` must have 2 dimensions. Got shape {array.shape}.")
-    return _finite(name, array, "[{}, {}]")
+    return squarable(name, _finite(name, array, "[{}, {}]"))
 
 
 def _finite(name: str, array: Array, place: str) -> Array:

@@ -21,11 +21,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import matrix_balance
 from scipy.special import factorial
 
 from ..models.statespace import split_delay
 from ..models.system_matrix import blocks
+from ..systems.balancing import in_even_units
 from ..systems.sampling import sample_zoh
 from ..systems.simulation import delayed, state_trajectory
 from ..systems.tabulation import tabulate
@@ -205,7 +205,7 @@ def _units(model: LPVStateSpace, kappa: Array, rates: Array) -> Array:
     some = slice(None, None, max(1, len(kappa) // _LOOKED_AT))
     A = model.structure.matrices(model.parameters(kappa[some]))[0]
     A = np.abs(A + model.rate_part(kappa[some], rates[some])).mean(axis=0)
-    return np.asarray(matrix_balance(A, permute=False, separate=True)[1][0])
+    return in_even_units(A)[1]
 
 
 def _norm(A: Array) -> float:

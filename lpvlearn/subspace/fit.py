@@ -618,7 +618,9 @@ _OPEN = 0.3
 
 _DECAYS = 2.0  # standard deviations of a pole, for its decay to be known
 
-_ROUNDING = 1e-8  # an integrator's pole may lie this far outside the unit circle
+# A pole on the unit circle is found this far outside at most; inside, an enforced one
+# keeps farther away than the second.
+_OUTSIDE, _INSIDE = 1e-8, 1e-9
 
 # A stream fits much worse than its first samples where its error exceeds theirs by
 # this factor, and this share of the outputs' size.
@@ -756,9 +758,10 @@ def _may_last(fitted: LocalFit) -> bool:
 
 
 def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
-    """Tell the user that a model is unstable."""
-    radius = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
-    if radius > 1.0 + _ROUNDING:
+    """Tell the user that a model is unstable, or on the border of that."""
+    moduli = np.abs(np.linalg.eigvals(A))
+    radius = float(moduli.max(initial=0.0))
+    if radius > 1.0 + _OUTSIDE:
         remedy = (
             "Use stability='enforce' for a stable one, another `order`, or a longer "
             "`horizon`."
@@ -774,6 +777,17 @@ def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
             "pole",
             f"The identified model is unstable: a pole has modulus {radius:.6g}. "
             + remedy,
+        )
+    elif radius >= 1.0 - _INSIDE:
+        count = int((moduli >= 1.0 - _INSIDE).sum())
+        tell(
+            told,
+            "border",
+            f"The identified model is on the border of stability: {count} of its poles "
+            "have modulus 1, to rounding, as those of integrators and of undamped "
+            "oscillations. Its outputs may grow without end, and no chain of local "
+            "models takes it. Name outputs that integrate in `integrating`; otherwise "
+            "use stability='enforce', or another `order`.",
         )
 
 

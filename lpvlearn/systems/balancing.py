@@ -6,13 +6,28 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, lapack, matrix_balance
+from scipy.linalg import LinAlgError, lapack
 
 Array = NDArray[np.float64]
 
 # Hankel singular values below this, relative to the largest and per state, are rounding
 # noise: with factors of the Gramians they are computed to some hundred units of it.
 _ROUNDING = 1e-13
+
+_SMALLEST = 1e-200  # of units: what is divided by a smaller one may overflow
+
+
+def in_even_units(A: Array) -> tuple[Array, Array]:
+    """A in units of the states that make its rows and columns alike, and these units.
+
+    SciPy's `matrix_balance` without its integers, which cannot hold units beyond 2^63.
+
+    >>> in_even_units(np.array([[0.0, 2.0**99], [-(2.0**-99), -1.0]]))[0]
+    array([[ 0.,  1.],
+           [-1., -1.]])
+    """
+    even, _, _, units, _ = lapack.dgebal(A, scale=True, permute=False)
+    return even, units
 
 
 def gramian_factor(A: Array, B: Array, discrete: bool) -> Array:
@@ -51,7 +66,7 @@ class _Schur(NamedTuple):
 def _schur(A: Array) -> _Schur:
     if len(A) == 0:
         return _Schur(np.ones(0), np.zeros((0, 0), complex), np.zeros((0, 0), complex))
-    A, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    A, scale = in_even_units(A)
     # `scipy.linalg.schur` asks LAPACK for the size of its work: 60 us instead of 20
     T, _, _, Q, _, info = lapack.zgees(lambda _: None, A + 0j)
     if info:
@@ -68,8 +83,13 @@ def _factor(of_A: _Schur, B: Array, discrete: bool) -> Array:
     margin = 1.0 - np.abs(poles) if discrete else -poles.real
     if not (margin > 0).all():
         worst = poles[margin.argmin()]
-        raise ValueError(f"a Gramian needs a stable model. Got a pole at {worst:.4g}.")
+        raise ValueError(
+            "`A` must be stable, beyond rounding, for a Gramian. Got a pole at "
+            f"{worst:.4g}."
+        )
     F = Q.conj().T @ (B / scale[:, None])
+    unit = float(np.abs(F).max(initial=_SMALLEST))
+    F /= unit  # lest squares overflow
     L = np.zeros((n, n), dtype=complex)
     # Column k from the last input direction that state k receives; what is left of
     # the earlier states is a Lyapunov equation of order k, with the input F[:k].
@@ -96,7 +116,7 @@ def _factor(of_A: _Schur, B: Array, discrete: bool) -> Array:
     # W is real, so the real and imaginary parts side by side are a factor too.
     side_by_side = np.hstack([factor.real, factor.imag])
     R = np.asarray(np.linalg.qr(side_by_side.T, mode="r"))
-    return scale[:, None] * R.T
+    return unit * scale[:, None] * R.T
 
 
 def _triangular(U: NDArray, rhs: NDArray) -> NDArray:
@@ -116,7 +136,14 @@ def balancing_transformation(
     of_A = _schur(A)
     controllable = _factor(of_A, B, discrete)
     observable = _factor(of_A.transposed(), C.T, discrete)
-    U, hankel, Vt = np.linalg.svd(observable.T @ controllable)
+    with np.errstate(over="ignore", invalid="ignore"):
+        product = observable.T @ controllable
+    if not np.isfinite(product).all():
+        raise ValueError(
+            "`A`, `B` and `C` must have Hankel singular values that are numbers. Got "
+            "some beyond all: take other units."
+        )
+    U, hankel, Vt = np.linalg.svd(product)
     r = int((hankel > _ROUNDING * max(n, 1) * hankel.max(initial=0.0)).sum())
     root = np.sqrt(hankel[:r])
     left = (U[:, :r] / root).T @ observable.T

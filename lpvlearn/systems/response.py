@@ -70,9 +70,13 @@ def _exponent(M: NDArray) -> int:
 
 def times_power(M: NDArray, exponent: int) -> NDArray:
     """``M 2^exponent``, whose power may be beyond all numbers where M 2^e is not."""
-    third = exponent // 3
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        return np.asarray(M * 2.0**third * 2.0**third * 2.0 ** (exponent - 2 * third))
+    found = np.array(M)
+    # part by part: a complex infinity times a number is none
+    parts = (found.real, found.imag) if np.iscomplexobj(found) else (found,)
+    with np.errstate(over="ignore", under="ignore"):
+        for part in parts:
+            np.ldexp(part, exponent, out=part)
+    return found
 
 
 def frequency_response(
@@ -258,6 +262,15 @@ class FrequencyEngine:
             G[:, :, part] = self._solved_stack(self.points(omega[part]))
         return G
 
+    def _solved_or_infinite(self, omega: NDArray) -> NDArray:
+        try:
+            return self.solved(omega)
+        except np.linalg.LinAlgError:  # one of them is a pole, to rounding
+            if len(omega) == 1:
+                return np.full((*self.D.shape, 1), np.inf, complex)
+            halves = np.array_split(omega, 2)
+            return np.concatenate([*map(self._solved_or_infinite, halves)], axis=2)
+
     def _solved_stack(self, x: NDArray) -> NDArray:
         M = np.empty((len(x), self.order, self.order), complex)
         M[:] = -self.F
@@ -328,7 +341,7 @@ class FrequencyEngine:
         size = np.sqrt((found.real**2 + found.imag**2).sum((0, 1)))
         lost = self.uncertainty(omega) > _ACCURACY * size
         if lost.any():
-            found[:, :, lost] = self.solved(omega[lost])
+            found[:, :, lost] = self._solved_or_infinite(omega[lost])
         G[:, :, regular] = found
         return G
 

@@ -6,8 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import matrix_balance, schur, solve_sylvester, sqrtm
+from scipy.linalg import schur, solve_sylvester, sqrtm
 from scipy.special import factorial
+
+from .balancing import in_even_units
 
 Array = NDArray[Any]
 
@@ -126,7 +128,7 @@ def d2c_zoh(A: Array, B: Array, C: Array, dt: float) -> Held:
     n = len(A)
     if n == 0:
         return Held(A.copy(), B.copy(), C.copy(), np.empty(0))
-    A, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    A, scale = in_even_units(A)
     poles = np.linalg.eigvals(A)
     size = np.abs(poles)
     if _has_eigenvalue(A, poles, 0.0, tol=_AT_ORIGIN):

@@ -31,10 +31,14 @@ class Cost:
     """CPU seconds of a block, and its peak of memory (MB) beyond what was there.
 
     Of memory that is not a file's: the system takes pages of files when it needs them.
+    What was there is told when the object is made.
     """
 
+    def __init__(self):
+        self._before = _status("RssAnon")
+
     def __enter__(self):
-        self._before = self._peak = _status("RssAnon")
+        self._peak = self._before
         self._ended = threading.Event()
         self._watch = threading.Thread(target=self._look)
         self._watch.start()
@@ -180,8 +184,11 @@ def prediction(n_samples):
     return f"{cost.seconds:6.2f} s  {cost.megabytes / _size(X):5.1f} tables"
 
 
-def dataset(megabytes):
-    """fit_dataset of so many MB: 20 points, experiments of 62,500 rows."""
+def dataset(megabytes, combine="pool"):
+    """fit_dataset of so many MB: 20 points, experiments of 62,500 rows.
+
+    Memory is what is beyond a process without data.
+    """
     import shutil
 
     import pandas as pd
@@ -191,6 +198,7 @@ def dataset(megabytes):
     from lpvlearn import LocalLPVPipeline, PolynomialLPV, SubspaceLTI
     from tests.conftest import ROLES, spring_lpv
 
+    cost = Cost()
     n, per_run = int(float(megabytes) * 2**20 / 40), 62_500
     n_runs = max(20, n // per_run)
     folder = Path(tempfile.mkdtemp(prefix="growth-"))
@@ -207,8 +215,10 @@ def dataset(megabytes):
             table = pa.Table.from_pandas(pd.DataFrame(columns), preserve_index=False)
             pq.write_table(table, folder / f"{run:06}.parquet")
         local = SubspaceLTI(2, horizon=10, feedthrough=False)
-        pipeline = LocalLPVPipeline(local, "passthrough", PolynomialLPV(2), **ROLES)
-        with Cost() as cost:
+        pipeline = LocalLPVPipeline(
+            local, "passthrough", PolynomialLPV(2), combine=combine, **ROLES
+        )
+        with cost:
             pipeline.fit_dataset(folder, "y")
     finally:
         shutil.rmtree(folder)
@@ -217,6 +227,11 @@ def dataset(megabytes):
         f"{n_runs} experiments, {size:.0f} MB in memory: {cost.seconds:6.1f} s  "
         f"{cost.megabytes:5.0f} MB"
     )
+
+
+def averaged(megabytes):
+    """The same by models of single experiments, those of a point averaged."""
+    return dataset(megabytes, "average")
 
 
 def stream(n_rows):
@@ -265,6 +280,7 @@ MEASURES = {
     prediction: (1_000_000,),
     stream: (1e6, 1e7),
     dataset: (100, 1000),
+    averaged: (100, 1000),
     imports: (
         "import sklearn.linear_model",
         "import lpvlearn",

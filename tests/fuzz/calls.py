@@ -690,6 +690,7 @@ OPEN = {
     "start_error": ("infinity",),
     "from_trajectories": ("NaN", "infinity"),
     "resample": ("NaN",),
+    "properties": ("infinity in result[3]",),  # of a pole on the border, to rounding
 }
 
 

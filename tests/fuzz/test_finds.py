@@ -193,6 +193,12 @@ HUGE = np.full((4, 2), 1e308)
             "`y` must hold numbers below",
         ),
         ("vaf_score", {"y_true": [10**400] * 40}, "`y_true` must hold numbers. Got"),
+        ("StateSpace.properties", {"A": 1e200 * np.eye(2)}, "`A` must hold numbers be"),
+        (
+            "StateSpace.properties",
+            {"A": [[0.0, 1.0], [-1e100, -1.0]], "sampling_time": None},
+            "`A` must be stable, beyond rounding",
+        ),
     ],
 )
 def test_what_surveys_found_is_told(name, spoiled, told):
@@ -218,6 +224,22 @@ def test_what_surveys_found_is_right():
     assert np.isfinite(display.plot().ax_.get_ylim()).all()
     for score in (lp.bft_score, lp.vaf_score):
         assert score(1e-200 * theta, 1e-200 * theta[::-1]) == score(theta, theta[::-1])
+
+
+@pytest.mark.parametrize("size", [1.0, 1e100, 1e149])
+def test_gains_at_a_pole_of_rounding_are_infinite(size):
+    model = lp.StateSpace(np.full((2, 2), size), [[0], [1]], [[1, 0]], None, 0.1)
+    assert np.isinf(model.dc_gain()) == (size > 1.0)
+    assert np.isinf(lp.StateSpace(0, size, size).frequency_response([0.0])).all()
+
+
+@pytest.mark.parametrize("size", [1e-100, 1e100, 1e149])
+def test_states_of_other_units_are_balanced_alike(size):
+    plain = lp.StateSpace([[0, 1], [-4, -1]], [[0], [1]], [[1, 0]])
+    model = lp.StateSpace([[0, size], [-4 / size, -1]], [[0], [1]], [[1 / size, 0]])
+    np.testing.assert_allclose(
+        model.hankel_singular_values(), plain.hankel_singular_values(), rtol=1e-12
+    )
 
 
 def test_numbers_of_other_kinds_are_numbers_or_refused():

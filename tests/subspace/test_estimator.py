@@ -1,7 +1,5 @@
 """SubspaceLTI: a scikit-learn estimator that simulates, chooses and teaches."""
 
-import warnings
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -208,9 +206,7 @@ def test_pure_gain_and_pure_delay(rng):
 def test_integrator_is_identified(rng):
     u = rng.standard_normal((500, 1))
     y = np.vstack([[0.0], np.cumsum(u, axis=0)[:-1]])
-    with warnings.catch_warnings():
-        # Rounding decides on which side of the unit circle the pole lies.
-        warnings.simplefilter("ignore", UserWarning)
+    with pytest.warns(UserWarning, match="on the border of stability: 1 of its poles"):
         model = SubspaceLTI(1).fit(u, y)
     np.testing.assert_allclose(model.lti_.poles(), [1.0], atol=1e-7)
     np.testing.assert_allclose(model.predict(u), y, atol=1e-4)

@@ -192,7 +192,9 @@ def test_repeated_poles_and_lightly_damped_modes():
     [([[1.0]], False), ([[0.0]], False), ([[1.0]], True), ([[-2.0]], True)],
 )
 def test_unstable_models_have_no_gramian(A, discrete):
-    with pytest.raises(ValueError, match="stable model. Got a pole at"):
+    with pytest.raises(
+        ValueError, match="stable, beyond rounding, for a Gramian. Got a pole"
+    ):
         gramian_factor(np.array(A), np.ones((1, 1)), discrete)
 
 
