@@ -20,7 +20,8 @@ ROOT = str(Path(lpvlearn.__file__).parent)
 HERE = str(Path(__file__).parent)
 
 GOOD = ("right", "warned", "taught")
-SECONDS = 20  # after which a call hangs
+# After which a call hangs: of the processor, and of any clock (it waits, or is asleep).
+SECONDS, WAITED = 20, 300
 
 # Who may refuse a table beside this library: it stands on scikit-learn's checks.
 CHECKS = ("sklearn/utils", "sklearn/base.py", "sklearn/metrics/_regression.py")
@@ -56,16 +57,30 @@ def outcome_of_spoiled(call, spoiled):
     A value that is no number is right where the call's documentation says so. Files go
     to a folder that does not last.
     """
-    before = signal.signal(signal.SIGALRM, _ring)
+
+    def in_time():
+        with _ringing():
+            return call.function(**{**call.arguments, **spoiled})
+
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        signal.alarm(SECONDS)
-        try:
-            found = outcome_of(lambda: call.function(**{**call.arguments, **spoiled}))
-        finally:
-            signal.alarm(0)
-            signal.signal(signal.SIGALRM, before)
+        found = outcome_of(in_time)
     open = found.kind == "not finite" and found.detail.startswith(call.open)
     return Outcome("right", found.detail) if open else found
+
+
+@contextlib.contextmanager
+def _ringing():
+    """Raise `Hangs` in a block that goes on for too long."""
+    clocks = {signal.SIGPROF: signal.ITIMER_PROF, signal.SIGALRM: signal.ITIMER_REAL}
+    before = {number: signal.signal(number, _ring) for number in clocks}
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, WAITED)
+    try:
+        yield
+    finally:
+        for number, clock in clocks.items():
+            signal.setitimer(clock, 0)
+            signal.signal(number, before[number])
 
 
 def _ring(*_):
