@@ -783,9 +783,9 @@ def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
         tell(
             told,
             "border",
-            f"The identified model is on the border of stability: {count} of its poles "
-            "have modulus 1, to rounding, as those of integrators and of undamped "
-            "oscillations. Its outputs may grow without end, and no chain of local "
+            "The identified model is on the border of stability, by integrators or "
+            f"undamped oscillations: {count} of its poles at modulus 1, to rounding. "
+            "Its outputs may grow without end, and no chain of local "
             "models takes it. Name outputs that integrate in `integrating`; otherwise "
             "use stability='enforce', or another `order`.",
         )

@@ -9,9 +9,11 @@ from lpvlearn.subspace.hankel import (
     _past_future_rows,
     _pooled_gram,
     _qr_factor,
+    _reordered,
     cholesky_factor,
     correlation_sequence,
     data_factor,
+    data_factors,
     stack_factors,
     triangularize,
 )
@@ -31,7 +33,7 @@ def test_gram_by_recursion_equals_the_product_of_the_hankel_matrix(rng, shape, n
     z = rng.standard_normal(shape)
     H = _hankel_matrix(z, n_rows)
     assert H.shape == (n_rows * shape[1], shape[0] - n_rows + 1)
-    np.testing.assert_allclose(_hankel_gram(z, n_rows), H @ H.T, atol=1e-12)
+    np.testing.assert_allclose(_hankel_gram([z], n_rows), H @ H.T, atol=1e-12)
 
 
 def test_hankel_columns_stack_consecutive_samples(rng):
@@ -123,11 +125,25 @@ def test_triangular_factor_has_the_gram_of_the_data(rng):
 
 
 def test_known_correlations_serve_every_horizon(rng):
-    records = [rng.standard_normal((n, 3)) for n in (200, 150)]
-    known = [correlation_sequence(z, 40) for z in records]
-    for horizon in (2, 11, 20):
-        np.testing.assert_allclose(
-            data_factor(records, 2, horizon, correlations=known),
-            data_factor(records, 2, horizon),
-            atol=1e-9,
-        )
+    records = [rng.standard_normal((n, 3)) for n in (200, 150, 30)]
+    factors = data_factors(records, 2, (2, 11, 20))  # the third for the first alone
+    for horizon, factor in zip((2, 11, 20), factors, strict=True):
+        np.testing.assert_allclose(factor, data_factor(records, 2, horizon), atol=1e-9)
+
+
+@pytest.mark.parametrize("n_trend", [0, 1, 2])
+def test_one_recursion_serves_all_experiments(rng, n_trend):
+    records = [rng.standard_normal((20 + k % 30, 3)) for k in range(150)]
+    each = [_hankel_gram([z], 20, n_trend=n_trend) for z in records]
+    found = _hankel_gram(records, 20, n_trend=n_trend)
+    np.testing.assert_allclose(found, sum(each), atol=1e-12 * found.max())
+    assert (found == found.T).all()
+
+
+@pytest.mark.parametrize("n_kept", [150, 149])
+def test_a_gram_is_reordered_in_its_place(rng, n_kept):
+    gram, rows = rng.standard_normal((150, 150)), rng.permutation(150)[:n_kept]
+    expected = gram[np.ix_(rows, rows)]
+    found = _reordered(gram, rows)
+    np.testing.assert_array_equal(found, expected)
+    assert np.shares_memory(found, gram) == (n_kept == 150)

@@ -51,7 +51,9 @@ def test_a_motor_is_identified_exactly_with_its_integrator():
     )
     again = pickle.loads(pickle.dumps(local))
     np.testing.assert_array_equal(again.predict(u), local.predict(u))
-    with pytest.warns(UserWarning, match=r"border of stability: 1 .* `integrating`"):
+    with pytest.warns(
+        UserWarning, match=r"border of stability, .*: 1 of .* `integrating`"
+    ):
         plain = local.set_params(integrating=None, order=2).fit(u, y)
     assert not hasattr(plain, "rates_")
 

@@ -275,10 +275,12 @@ def test_constants_are_seen_through_noise_of_long_memory(seed):
 def test_an_offset_of_an_integrators_input_is_a_line(rng):
     u = rng.standard_normal((300, 1))
     y = np.vstack([[0.0], np.cumsum(u, axis=0)[:-1]]) + 5.0
-    model = SubspaceLTI(1, horizon=5).fit(u, y)
+    with pytest.warns(UserWarning, match="on the border of stability"):
+        model = SubspaceLTI(1, horizon=5).fit(u, y)
     assert model.offset_ is None  # the initial state has it
     np.testing.assert_allclose(model.lti_.poles(), 1.0, atol=1e-6)
-    biased = SubspaceLTI(1, horizon=5, offset="linear").fit(u + 0.3, y)
+    with pytest.warns(UserWarning, match="on the border of stability"):
+        biased = SubspaceLTI(1, horizon=5, offset="linear").fit(u + 0.3, y)
     np.testing.assert_allclose(biased.lti_.poles(), 1.0, atol=1e-6)
     np.testing.assert_allclose(biased.lti_.B @ biased.lti_.C, 1.0, atol=1e-6)
     np.testing.assert_allclose(biased.output_drift_, -0.3, atol=1e-6)
