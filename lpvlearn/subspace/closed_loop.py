@@ -66,10 +66,10 @@ from ..models.innovation import (
 from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import estimate_initial_state, state_trajectory
 from .hankel import hankel_factor
-from .identification import STABLE_MARGIN, ScaledRecords, Settings
+from .identification import REFITS, STABLE_MARGIN, ScaledRecords, Settings
 from .noise import Whitening
 from .realization import reflect_unstable
-from .refinement import refine_simulation
+from .refinement import MAX_ITER, refine_simulation
 from .selection import PlantFit, Row, Selection
 from .signals import Record, output_energy, shorten
 from .simulation_fit import (
@@ -289,6 +289,15 @@ class ClosedLoopEvidence(Evidence):
             return np.zeros((0, 0))  # no parameters
         known = _knowledge(self.fitted, self.joint, self.transform, self.kept, direct)
         return known.plant
+
+    def of_others(self, records: Sequence[Record]) -> Realization:
+        """The model, noise included, that other records would have given.
+
+        By few steps from this one: to be simulated through records held out.
+        """
+        A, B, C, D, *_ = _refined(self.joint, records, self.free, REFITS)[1]
+        states = np.zeros((len(records), len(A)))
+        return Realization(A, B, C, D, states, np.inf)
 
     @cached_property
     def one_step(self) -> Evidence:
@@ -564,7 +573,10 @@ def _criteria(errors: Sequence[Array], subspace: _Subspace) -> Array:
 
 
 def _refined(
-    model: _Innovation, records: Sequence[Record], free: Freedom
+    model: _Innovation,
+    records: Sequence[Record],
+    free: Freedom,
+    max_iter: int = MAX_ITER,
 ) -> tuple[_Predictor, _Innovation]:
     r"""Minimise the one-step prediction error, weighted by the innovation covariance.
 
@@ -592,7 +604,7 @@ def _refined(
     predictor = free._replace(direct=allowed)
     weighted = linalg.solve_triangular(root, C, lower=True)
     start = simulation_fit(A - K @ C, weighted, driven, predictor)
-    found = refine_simulation(start, driven, predictor)
+    found = refine_simulation(start, driven, predictor, max_iter)
     heads, share = shorten(driven)
     fitted = _Predictor(found, heads, predictor, root, share)
     joint = fitted.innovation(found, covariance)

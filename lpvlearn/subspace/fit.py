@@ -7,7 +7,7 @@ and with them where these matter, and what is wrong with it told.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from ..data.preparation import (
 )
 from ..exceptions import RankWarning, warn
 from ..validation import is_whole, one_of, positive_time, shown
-from .closed_loop import identify_closed_loop
+from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .held_out import HeldOut, held_out
 from .identification import (
     Candidate,
@@ -461,12 +461,17 @@ def _held_out(fitted: LocalFit, choices: Choices) -> HeldOut:
         like = Candidate(evidence.model, horizon, whitening, refined)
         return validate(like, scaled.records, settings)
 
-    def refitted(train: list[Record]) -> Realization:
-        part = scaled._replace(records=train)
-        basis, order = evidence.basis, choices.order
-        return identify_closed_loop(
-            part, basis, order, choices.horizon, settings
-        ).evidence.model
+    refitted: Callable[[list[Record]], Realization]
+    if isinstance(evidence, ClosedLoopEvidence) and evidence.refined:
+        refitted = evidence.of_others
+    else:
+
+        def refitted(train: list[Record]) -> Realization:
+            part = scaled._replace(records=train)
+            basis, order = evidence.basis, choices.order
+            return identify_closed_loop(
+                part, basis, order, choices.horizon, settings
+            ).evidence.model
 
     try:
         return held_out(refitted, scaled.records, at_rest=not free.initial_states)

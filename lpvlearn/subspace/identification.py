@@ -304,7 +304,7 @@ def restarted(
     return simulation_fit(model.A, whitening.model(model).C, white, free)
 
 
-_REFITS = 4  # steps to the minimum without some samples, from that with them
+REFITS = 4  # steps to the minimum without some samples, from that with them
 
 
 def _refitted(
@@ -318,7 +318,7 @@ def _refitted(
     lengths, order = [r.u.shape[1] for r in white], len(candidate.model.A)
     if candidate.refined or settings.max_horizon(lengths) < candidate.horizon:
         model = restarted(candidate.model, whitening, white, free)
-        model = refine_simulation(model, white, free, _REFITS)
+        model = refine_simulation(model, white, free, REFITS)
     else:
         width = {candidate.horizon: order + settings.n_noise_states}
         spaces = subspaces_of(white, width, settings.method)

@@ -65,7 +65,7 @@ _EXPLAINED = 1e-6
 
 _RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refinement`
 _ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
-_FAR = 10.0  # standard deviations between the mean of a channel and zero
+_FAR = 3.0  # standard deviations between the mean of a channel and zero
 _SLOW = 3.0  # time constants per experiment of a mode that may stand for a constant
 
 
@@ -141,16 +141,31 @@ def may_have_constants(evidence: Evidence) -> bool:
     They show in its errors, or a slow mode may stand for them; where a channel is far
     from zero, nothing but its mean may have been fitted.
     """
-    if _is_far([np.vstack((r.u, r.y)) for r in evidence.records]):
+    if _is_far(evidence.records):
         return True
     return _has_slow_mode(evidence) or chance_of_constants(evidence) < _SUSPICIOUS
 
 
-def _is_far(parts: Sequence[Array]) -> bool:
-    """Whether means are next to all there is of a channel, (n_channels, n_samples)."""
+def _is_far(records: Sequence[Record]) -> bool:
+    """Whether means are next to all there is of a channel."""
+    level, motion = _levels([np.vstack((r.u, r.y)) for r in records])
+    return bool((np.abs(level) > _FAR * motion).any())
+
+
+def _stays_far(records: Sequence[Record]) -> bool:
+    """Whether outputs, where these are far from zero, begin far from it as well."""
+    level, motion = _levels([r.y for r in records])
+    far = np.abs(level) > _FAR * motion
+    begins = np.min([np.abs(r.y[:, 0]) for r in records], axis=0)
+    return _is_far(records) and bool((begins > 0.5 * np.abs(level))[far].all())
+
+
+def _levels(parts: Sequence[Array]) -> tuple[Array, Array]:
+    """Size of the means of every channel, and of its motion about them."""
+    n = sum(part.shape[1] for part in parts)
     level = sum(part.shape[1] * part.mean(axis=1) ** 2 for part in parts)
     motion = sum(part.shape[1] * part.var(axis=1) for part in parts)
-    return bool((level > _FAR**2 * motion).any())
+    return np.sqrt(level / n), np.sqrt(motion / n)
 
 
 def constants_matter(without: Evidence, other: Evidence) -> bool:
@@ -161,12 +176,21 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     an offset of the inputs is behind an integrator; and where it is better by what no
     chance explains. The test of the constants may not see these among slow noise,
     whose density few samples tell; the criterion knows that noise by its innovations.
+
+    Signals that are far from zero all the time hardly rest there. Without constants the
+    static gain or a slow mode follows their means, which the criterion hardly minds and
+    little excitation does not refute. They are left out where their test takes them for
+    zero, or the criterion says that the model with them is a poor one: the other is one
+    with zeros.
     """
     better = _criterion(without) - _criterion(other)
-    if not better > 0.0 or len(other.model.A) < len(without.model.A):
-        return better > 0.0
+    if better > 0.0 and len(other.model.A) < len(without.model.A):
+        return True
+    far = _stays_far(without.records)
+    if not better > (-_CERTAIN if far else 0.0):
+        return False
     chance = chance_of_constants(other)
-    return chance < _SIGNIFICANT or (chance < _LIKELY and better > _CERTAIN)
+    return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > _CERTAIN))
 
 
 def _criterion(evidence: Evidence) -> float:
