@@ -70,7 +70,7 @@ def _schur(A: Array) -> _Schur:
     # `scipy.linalg.schur` asks LAPACK for the size of its work: 60 us instead of 20
     T, _, _, Q, _, info = lapack.zgees(lambda _: None, A + 0j)
     if info:
-        raise LinAlgError("the eigenvalues of a state matrix did not converge")
+        raise LinAlgError("eigenvalues of `A` did not converge: take other units.")
     return _Schur(scale, Q, T)
 
 
