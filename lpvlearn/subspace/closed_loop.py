@@ -69,7 +69,7 @@ from .hankel import hankel_factor
 from .identification import REFITS, STABLE_MARGIN, ScaledRecords, Settings
 from .noise import Whitening
 from .realization import reflect_unstable
-from .refinement import MAX_ITER, refine_simulation
+from .refinement import refine_simulation
 from .selection import PlantFit, Row, Selection
 from .signals import Record, output_energy, shorten
 from .simulation_fit import (
@@ -576,7 +576,7 @@ def _refined(
     model: _Innovation,
     records: Sequence[Record],
     free: Freedom,
-    max_iter: int = MAX_ITER,
+    max_iter: int | None = None,
 ) -> tuple[_Predictor, _Innovation]:
     r"""Minimise the one-step prediction error, weighted by the innovation covariance.
 

@@ -257,7 +257,7 @@ def fit_once(
             other = restarted(start, whitening, white, settings.free)
             if other.loss < model.loss and not settings.enforce_stability:
                 model = other
-        model = refine_simulation(model, white, settings.free)
+        model = refine_simulation(model, white, settings.free, patient=True)
     model = _of_records(model, records, whitening, settings.free)
     candidate = Candidate(model, horizon, whitening, settings.refine)
     return Fitted(candidate, subspace.singular_values)
@@ -276,10 +276,10 @@ def refit(
     one_each = len(white) == len(start.initial_states) == 1 and not free.n_trend
     if one_each and start.blocks is not None:
         model = whitening.model(start)._replace(loss=np.inf)
-        model = refine_simulation(model, white, free, fitted=False)
+        model = refine_simulation(model, white, free, fitted=False, patient=True)
     else:
         model = restarted(start, whitening, white, free)
-        model = refine_simulation(model, white, free)
+        model = refine_simulation(model, white, free, patient=True)
     model = _of_records(model, records, whitening, settings.free)
     return Fitted(Candidate(model, horizon, whitening, True), np.zeros(0))
 

@@ -13,7 +13,7 @@ freedom that a change of basis leaves is removed by taking the minimum-norm step
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,9 @@ from .simulation_fit import Freedom, Realization, block_fit, linearised, moved_m
 
 Array = NDArray[np.float64]
 
-MAX_ITER = 20  # steps; from a subspace model a handful does
+# Steps: from a subspace model a handful does, but along the valley of lags that are
+# hardly told apart
+_MAX_ITER, _MANY = 20, 100
 
 # Directions of the step that the data do not determine: the choice of basis, mostly.
 _RCOND = 1e-9
@@ -43,17 +45,20 @@ _ROUNDING = 1e-22  # share of the outputs' energy below which the error is round
 _STABLE_RADIUS = 1.0 - 1e-8  # of the circle that steps keep all poles in, once they are
 
 # Damping of the steps tried in turn, relative to the largest squared singular value:
-# from the hardly determined directions to ever more of them, at last down the gradient.
-_DAMPINGS = (1e-4, 1e-2, 1e-1, 1.0)
+# the whole step, then from the hardly determined directions to ever more of them, at
+# last down the gradient. A valley is followed by steps that leave only the former out.
+_DAMPINGS = (0.0, 1e-4, 1e-2, 1e-1, 1.0)
+_FINE_DAMPINGS = (0.0, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
 
 
 def refine_simulation(
     model: Realization,
     records: Sequence[Record],
     free: Freedom,
-    max_iter: int = MAX_ITER,
+    max_iter: int | None = None,
     *,
     fitted: bool = True,
+    patient: bool = False,
 ) -> Realization:
     """Minimise the simulation error by Gauss-Newton steps with damping.
 
@@ -61,7 +66,8 @@ def refine_simulation(
     channel by channel, or where it is not `fitted` on one that is like this single
     record. Only steps that reduce the error are taken; a stable model stays
     stable. A model without section form (poles of high multiplicity), of order 0, or
-    whose simulation overflows is returned as it is.
+    whose simulation overflows is returned as it is. `patient` goes on along valleys:
+    of orders that are compared, too high a one would follow slow noise there.
 
     The steps end where one more could not gain what a hundredth of the noise on
     each parameter costs. What is left after a step follows from how far the decrease
@@ -72,7 +78,9 @@ def refine_simulation(
         return model
     energy = output_energy(records)
     n_values = sum(record.y.size for record in records)
-    for _ in range(max_iter):
+    dampings = _FINE_DAMPINGS if patient else _DAMPINGS
+    level = 0  # of the damping: a valley is not left at the next step
+    for _ in range(max_iter or (_MANY if patient else _MAX_ITER)):
         if model.loss <= _ROUNDING * energy or model.blocks is None:
             return model
         regression = linearised(model, records, free, keep_one=True)
@@ -87,11 +95,14 @@ def refine_simulation(
         negligible = _NEGLIGIBLE * model.loss * rank / n_values
         if predicted <= negligible:
             return model
-        improved = _accepted(model, records, free, step, jacobian, residual)
+        steps = _trial_steps(step, jacobian, residual, dampings[max(level - 1, 0) :])
+        improved = _accepted(model, records, free, steps)
         if improved is None:
             return model
-        miss = predicted - (model.loss - improved.loss)
-        model = improved
+        tried, better = improved
+        level = max(level - 1, 0) + tried if patient else 0
+        miss = predicted - (model.loss - better.loss)
+        model = better
         left = _MISS_WEIGHT * miss**2 / predicted + _LEAST_LEFT * predicted
         if left <= negligible:
             return model
@@ -102,26 +113,27 @@ def _accepted(
     model: Realization,
     records: Sequence[Record],
     free: Freedom,
-    step: Array,
-    jacobian: Array,
-    residual: Array,
-) -> Realization | None:
-    """The first of ever shorter steps that reduces the error."""
+    steps: Iterable[Array],
+) -> tuple[int, Realization] | None:
+    """The first of ever shorter steps that reduces the error, and its number."""
     radius = max(_STABLE_RADIUS, _spectral_radius(model.blocks or ()))
-    for trial_step in _trial_steps(step, jacobian, residual):
+    for number, trial_step in enumerate(steps):
         moved = moved_model(model, trial_step, free)
         blocks = moved.blocks or ()
         if _spectral_radius(blocks) > radius:
             continue
         trial = block_fit(blocks, moved.C, records, free)
         if trial.loss < model.loss:
-            return trial
+            return number, trial
     return None
 
 
-def _trial_steps(step: Array, jacobian: Array, residual: Array) -> Iterator[Array]:
-    """The whole step, then damped ones."""
-    yield step
+def _trial_steps(
+    step: Array, jacobian: Array, residual: Array, dampings: Sequence[float]
+) -> Iterator[Array]:
+    """The whole step, where it is not to be damped, then damped ones."""
+    if dampings[0] == 0.0:
+        yield step
     scale = column_scale(jacobian)
     left, s, right = linalg.svd(  # by the driver that always converges
         jacobian / scale,
@@ -132,9 +144,10 @@ def _trial_steps(step: Array, jacobian: Array, residual: Array) -> Iterator[Arra
     kept = s > _RCOND * s[0]
     left, s, right = left[:, kept], s[kept], right[kept]
     projected = left.T @ residual
-    for damping in _DAMPINGS:
-        gain = s / (s**2 + damping * s[0] ** 2)
-        yield (right.T @ (gain * projected)) / scale
+    for damping in dampings:
+        if damping > 0.0:
+            gain = s / (s**2 + damping * s[0] ** 2)
+            yield (right.T @ (gain * projected)) / scale
 
 
 def _spectral_radius(blocks: Sequence[Array]) -> float:

@@ -38,7 +38,7 @@ from .identification import (
 )
 from .noise import Whitening, autoregression
 from .realization import ObservabilitySubspace
-from .refinement import MAX_ITER, refine_simulation
+from .refinement import refine_simulation
 from .signals import Record, output_energy, thinned
 from .simulation_fit import (
     Freedom,
@@ -366,7 +366,7 @@ def _try_orders(
     records: Sequence[Record],
     whitening: Whitening,
     settings: Settings,
-    max_iter: int = MAX_ITER,
+    max_iter: int | None = None,
 ) -> list[_Tried]:
     """Every order in turn on whitened records, until further states gain nothing."""
     records = whitening.records(records, settings.free)

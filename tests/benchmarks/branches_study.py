@@ -1,6 +1,7 @@
 """Whether interchangeable parts keep their places from one operating point to the next.
 
     python tests/benchmarks/branches_study.py [--families 200] [--first 0] [--snr 40]
+        [--horizon 3]
 
 Random families of structures with two to four interchangeable parts: modes, real poles,
 lags in series, an actuator and a sensor about a mode. Their parameters are polynomials
@@ -137,7 +138,9 @@ def family(seed: int) -> FamilyProblem:
             return problem
 
 
-def identified(problem: FamilyProblem, snr: float, seed: int) -> LocalLPVPipeline:
+def identified(
+    problem: FamilyProblem, snr: float, seed: int, horizon: int | None = None
+) -> LocalLPVPipeline:
     rng = np.random.default_rng([seed, 5])
     structure, kappa = problem.structure, problem.kappa
     poles = np.concatenate([structure.model(problem.truth(k)).poles() for k in kappa])
@@ -150,7 +153,11 @@ def identified(problem: FamilyProblem, snr: float, seed: int) -> LocalLPVPipelin
         noise = 10 ** (-snr / 20) * y.std() * rng.standard_normal(y.shape)
         runs.append((u, k, y + noise))
     return LocalLPVPipeline(
-        SubspaceLTI(structure.order, feedthrough=False, horizon=structure.order * 3),
+        SubspaceLTI(
+            structure.order,
+            feedthrough=False,
+            horizon="auto" if horizon is None else horizon * structure.order,
+        ),
         GrayBoxRestructurer(structure, random_state=seed),
         scheduling="kappa",
         experiment="experiment",
@@ -191,13 +198,14 @@ def main() -> None:
     parser.add_argument("--families", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--snr", type=float, default=40.0)
+    parser.add_argument("--horizon", type=int, help="samples per state; by choice")
     options = parser.parse_args()
     table: dict[str, list[tuple[bool, bool, bool, float]]] = {k: [] for k in KINDS}
     for seed in range(options.first, options.first + options.families):
         problem, start = family(seed), time.process_time()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            pipeline = identified(problem, options.snr, seed)
+            pipeline = identified(problem, options.snr, seed, options.horizon)
         seconds = time.process_time() - start
         told = bool(caught)  # of places, or of what the data do not determine
         kappa = problem.kappa

@@ -210,7 +210,7 @@ def test_a_given_horizon_that_ends_in_a_poor_minimum_warns():
     y = y + 0.03 * y.std(axis=0) * rng.standard_normal(y.shape)
     options = {"method": "pi-moesp", "feedthrough": False}
     with pytest.warns(UserWarning, match="ends in a poor model"):
-        SubspaceLTI(6, horizon=12, **options).fit(u, y)
+        SubspaceLTI(6, horizon=6, **options).fit(u, y)
     SubspaceLTI(6, **options).fit(u, y)  # the automatic one is silent
 
 

@@ -52,3 +52,26 @@ def test_refinement_stops_at_a_stationary_point_of_the_simulation_error(rng):
             start.A - h * dA, start.C - h * dC
         )
         assert abs(slope) < max(0.1 * abs(start_slope), 1e-4 * model.loss)
+
+
+def test_steps_go_on_along_the_valley_of_lags_that_are_hardly_told_apart():
+    """From a pole that no lag has to the minimum near the true model."""
+    poles = [0.58, 0.85, 0.936, 0.956]
+    C, free = np.eye(1, 4, 3), freedom(1, 1)
+    lags = np.diag(poles) + np.diag(1.0 - np.array(poles[1:]), -1)
+    system = lags, (1.0 - poles[0]) * np.eye(4, 1), C, np.zeros((1, 1))
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        u = rng.choice([-1.0, 1.0], (200, 1)).repeat(4, axis=0)
+        u = u + 0.5 * rng.standard_normal(u.shape)
+        y = lti_response(*system, u)
+        y = y / y.std() + 0.01 * rng.standard_normal(y.shape)
+        records = [Record(u.T.copy(), y.T.copy())]
+        starts = (lags, C), (modes(-0.5, 0.87, 0.93, 0.958), np.ones((1, 4)))
+        near, far = (
+            refine_simulation(
+                simulation_fit(*start, records, free), records, free, patient=True
+            )
+            for start in starts
+        )
+        assert far.loss < 1.001 * near.loss
