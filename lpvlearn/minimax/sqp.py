@@ -9,6 +9,7 @@ maxima merge, or a new one rises, only these are smooth.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,7 @@ _FIRST_CURVATURE = (
 )
 _SHOULDER = 1e-9  # rounding of a singular value beside the objective
 _SAME = 1e-6  # relative distance of frequencies that are the same
+_MOVED = 1e-2  # the same of a local maximum before and after a step
 _SURPRISE = 0.2  # part of the decrease that a peak between the frequencies took away
 
 
@@ -108,8 +110,7 @@ def minimax_sqp(
         if linear <= tol or radius < _SHORTEST:
             converged = True
             break
-        d, high = _corrected(problem, y, local, d, radius)
-        trial = problem.peaks(y + d) if high < f else None
+        d, high, trial = _tried(problem, y, local, d, radius)
         ratio = -1.0
         if trial is not None and predicted > 0:
             ratio = (f - trial.top) / f / predicted
@@ -184,10 +185,63 @@ class _Local:
         return linear, linear - 0.5 * float(d @ self.H @ d)
 
 
+class _Trial(NamedTuple):
+    end: Array  # of the step, relative to where it begins
+    high: float  # highest value of the entries there
+    peaks: Peaks | None  # there; None where an entry is not below the objective
+
+
+def _tried(
+    problem: MinimaxProblem, y: Array, local: _Local, d: Array, radius: float
+) -> _Trial:
+    """The step's end, bent by the curvature of the entries, and what is there.
+
+    First by the entries at their own frequencies. Where local maxima then stand higher
+    beside these, they are followed, and the step is corrected for what that adds.
+    """
+    f = local.entries.top
+    d, end, ends = _corrected(problem, y, local, d, radius)
+    found = _followed(problem, y, local, end, ends)
+    for _ in range(_CORRECTIONS):
+        top = float(ends.max())
+        if found.peaks is None or found.high <= top + _SURPRISE * (f - top):
+            break
+        step = local.step(radius, _risen(local.entries, ends, found.peaks), d)
+        if step is None:
+            break
+        d, end = step[0], local.end(step[0])
+        ends = problem.values(y + end, local.entries.frequencies)
+        new = _followed(problem, y, local, end, ends)
+        if new.peaks is None or not new.peaks.top < found.peaks.top:
+            break
+        found = new
+    return found
+
+
+def _followed(
+    problem: MinimaxProblem, y: Array, local: _Local, end: Array, ends: Array
+) -> _Trial:
+    high, entries = float(ends.max()), local.entries
+    peaks = problem.peaks(y + end) if high < entries.top else None
+    if peaks is not None:
+        high = float(_risen(entries, ends, peaks).max())
+    return _Trial(end, high, peaks)
+
+
+def _risen(entries: Peaks, ends: Array, peaks: Peaks) -> Array:
+    """Values `ends` of the entries, those that move at the maxima they have become."""
+    moving = entries.moving
+    same = _near(entries.frequencies[moving], peaks.frequencies, _MOVED)
+    risen = ends.copy()
+    tops = np.where(same, peaks.values, 0.0).max(1, initial=0.0)
+    risen[moving] = np.maximum(ends[moving], tops)
+    return risen
+
+
 def _corrected(
     problem: MinimaxProblem, y: Array, local: _Local, d: Array, radius: float
-) -> tuple[Array, float]:
-    """The step's end, bent by the curvature of the entries, and their highest value."""
+) -> tuple[Array, Array, Array]:
+    """The step, its end, and the entries there, bent by the curvature of these."""
     omega, f = local.entries.frequencies, local.entries.top
     end = local.end(d)
     ends = problem.values(y + end, omega)
@@ -205,7 +259,7 @@ def _corrected(
         d, end, ends = step[0], new_end, new
         if gain < _WORTHWHILE * (f - float(ends.max())):
             break
-    return end, float(ends.max())
+    return d, end, ends
 
 
 def _local_model(
@@ -260,9 +314,11 @@ def _local_model(
 
 def _among(omega: Array, known: Array) -> NDArray[np.bool_]:
     """Which frequencies are, nearly, among the known ones."""
-    if known.size == 0 or omega.size == 0:
-        return np.zeros(len(omega), bool)
+    return np.asarray(_near(omega, known, _SAME).any(1))
+
+
+def _near(omega: Array, known: Array, part: float) -> NDArray[np.bool_]:
+    """Which known frequencies are the same but for a part of them, (k, n_known)."""
     with np.errstate(invalid="ignore"):  # inf - inf
-        apart = np.abs(omega[:, None] - known)
-        near = apart <= _SAME * np.abs(known)
-    return ((omega[:, None] == known) | near & np.isfinite(known)).any(1)
+        near = np.abs(omega[:, None] - known) <= part * np.abs(known)
+    return (omega[:, None] == known) | near & np.isfinite(known)

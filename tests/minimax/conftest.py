@@ -1,5 +1,7 @@
 """Minimax problems whose solutions are known."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lpvlearn.minimax.problem import MinimaxProblem, Peaks
@@ -61,4 +63,44 @@ def charalambous_bandler():
             lambda y: 2 * np.eye(2),
             lambda y: f3(y) * np.array([[1.0, -1.0], [-1.0, 1.0]]),
         ],
+    )
+
+
+def with_narrow_peaks(problem, sharpness):
+    """The same maxima as peaks over a frequency, along which they move with y.
+
+    ``phi_i(y, w) = phi_i(y) - sharpness (w - w_i(y))^2``.
+    """
+    turn = np.array([0.3, -0.2])
+
+    def places(y):
+        return 100.0 + 10.0 * np.arange(3) + turn @ y
+
+    def nearest(y, w):
+        k = np.abs(w[:, None] - places(y)).argmin(1)
+        return k, w - places(y)[k]
+
+    def peaks(y):
+        return replace(problem.peaks(y), frequencies=places(y))
+
+    def samples(y, w):
+        (k, off), found = nearest(y, w), problem.peaks(y)
+        return Peaks(
+            found.values[k] - sharpness * off**2,
+            w,
+            found.gradients[k] + 2.0 * sharpness * off[:, None] * turn,
+            np.zeros(len(w), bool),
+        )
+
+    def hessians(y, w, moving):
+        H = problem.hessians(y, nearest(y, w)[0] + 1.0, moving)
+        still = ~moving[:, None, None]
+        return H - 2.0 * sharpness * still * np.outer(turn, turn)
+
+    return replace(
+        problem,
+        peaks=peaks,
+        samples=samples,
+        values=lambda y, w: samples(y, w).values,
+        hessians=hessians,
     )
