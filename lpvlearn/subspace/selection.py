@@ -186,7 +186,8 @@ def select(
         chosen = _search(records, None, horizon, by_evidence)
         order = chosen.order
         rows = [row for row in chosen.rows if row.order != order]
-    spaces = _spaces(records, order, order, horizon, settings)
+    wanted = _Range(range(order, order + 1), horizon, {})
+    spaces = _look_up(wanted, order, records, settings)
     starts = _starts(order, spaces, records, settings)
     best = _best_horizon(starts, settings.refine)
     tried = _Tried(order, best, starts[best], 0.0, starts)
@@ -198,6 +199,8 @@ class _Range(NamedTuple):
 
     orders: range
     horizon: int | None
+    # of the records as they are, for orders up to the highest: by horizon, as found
+    spaces: dict[int, ObservabilitySubspace]
 
 
 def _search(
@@ -208,7 +211,7 @@ def _search(
     if highest is None:
         horizons = [horizon] if horizon else _horizons(records, 0, settings)
         highest = _highest_order(records, horizons, settings)
-    wanted = _Range(range(order or 0, highest + 1), horizon)
+    wanted = _Range(range(order or 0, highest + 1), horizon, {})
     pilot = _pilot(records, wanted, settings)
     whitening = _noise_of(pilot, records, wanted, settings)
     tried = _try_orders(wanted, records, whitening, settings)
@@ -241,8 +244,9 @@ def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realiza
     """A model whose errors are the noise, or little else: outputs are weighted."""
     free, whitening = settings.free, Whitening.none(len(records[0].y))
     order = max(wanted.orders[0], min(wanted.orders[-1], _PILOT_ORDER))
-    wanted = wanted._replace(orders=range(order, order + 1))
-    tried = _try_orders(wanted, records, whitening, settings, _PILOT_STEPS)
+    only = wanted._replace(orders=range(order, order + 1))
+    _look_up(wanted, order, records, settings)
+    tried = _try_orders(only, records, whitening, settings, _PILOT_STEPS)
     model = tried[0].model
     for _ in range(_WEIGHINGS if len(records[0].y) > 1 else 0):
         errors = simulation_errors(model, records)
@@ -304,18 +308,17 @@ def _rows(
     return rows
 
 
-def _spaces(
-    records: Sequence[Record],
-    lowest: int,
-    highest: int,
-    horizon: int | None,
-    settings: Settings,
+def _look_up(
+    wanted: _Range, lowest: int, records: Sequence[Record], settings: Settings
 ) -> dict[int, ObservabilitySubspace]:
-    """Subspaces of every horizon to try."""
+    """Subspaces of every horizon that shows the lowest order, known ones or new."""
+    horizon, width = wanted.horizon, wanted.orders[-1] + settings.n_noise_states
     horizons = [horizon] if horizon else _horizons(records, lowest, settings)
-    width = highest + settings.n_noise_states
-    widths = {h: min(width, settings.max_order(h)) for h in horizons}
-    return subspaces_of(records, widths, settings.method)
+    new = [h for h in horizons if h not in wanted.spaces]
+    if new:
+        widths = {h: min(width, settings.max_order(h)) for h in new}
+        wanted.spaces.update(subspaces_of(records, widths, settings.method))
+    return {h: wanted.spaces[h] for h in horizons}
 
 
 def _horizons(records: Sequence[Record], order: int, settings: Settings) -> list[int]:
@@ -369,9 +372,13 @@ def _try_orders(
     max_iter: int | None = None,
 ) -> list[_Tried]:
     """Every order in turn on whitened records, until further states gain nothing."""
-    records = whitening.records(records, settings.free)
-    orders, horizon = wanted
-    spaces = _spaces(records, orders[0], orders[-1], horizon, settings)
+    orders = wanted.orders
+    if not whitening.is_none:
+        records, wanted = (
+            whitening.records(records, settings.free),
+            wanted._replace(spaces={}),
+        )
+    spaces = _look_up(wanted, orders[0], records, settings)
     tried: list[_Tried] = []
     best, stale = np.inf, 0
     energy = output_energy(records)
