@@ -44,7 +44,7 @@ from .offsets import (
 from .realization import METHODS
 from .residuals import lacks
 from .selection import PlantFit, Row, Selection, better_horizon, select
-from .signals import Record, shorten, thinned
+from .signals import Record, SharedSignals, shorten, thinned
 from .simulation_fit import (
     Freedom,
     Realization,
@@ -199,6 +199,7 @@ class LocalFit(NamedTuple):
     offsets: Offsets  # of the experiments, what `detrend` subtracted among them
     first_model: Realization  # of `scaled`, the samples that were fitted as one table:
     scaled: ScaledRecords  # all of them, or the first ones of a long table or a stream
+    signals: SharedSignals  # of this model and samples like these
 
     def follows(self, order: int, settings: Settings) -> bool:
         """Whether it leads to a model of other samples with these settings."""
@@ -212,7 +213,7 @@ class LocalFit(NamedTuple):
         evidence, horizon = self.evidence, self.selection.horizon
         ratio = evidence.output_scale / output_scale
         model = evidence.model._replace(C=evidence.model.C * ratio[:, None])
-        return Candidate(model, horizon, evidence.whitening, True)
+        return Candidate(model, horizon, evidence.whitening, True, self.signals)
 
 
 def fit_pairs(
@@ -312,6 +313,7 @@ def _fit(
         offsets,
         evidence.model,
         scaled,
+        SharedSignals(),
     )
 
 

@@ -24,7 +24,7 @@ from .realization import (
     reflect_unstable,
 )
 from .refinement import refine_simulation
-from .signals import Record, output_energy, shorten
+from .signals import Record, SharedSignals, output_energy, shorten
 from .simulation_fit import (
     Freedom,
     Realization,
@@ -125,6 +125,7 @@ class Candidate(NamedTuple):
     horizon: int
     whitening: Whitening  # of the errors whose squares it minimises
     refined: bool
+    signals: SharedSignals | None = None  # of other records that it is near to
 
 
 class Identified(NamedTuple):
@@ -270,13 +271,19 @@ def refit(
     settings: Settings,
     whitening: Whitening,
     start: Realization,
+    signals: SharedSignals | None = None,
 ) -> Fitted:
-    """As `fit_once`, from a model that is near: the subspace is not asked."""
+    """As `fit_once`, from a model that is near: the subspace is not asked.
+
+    `signals` are those of the `start` and other records.
+    """
     white, free = whitening.records(records, settings.free), settings.free
     one_each = len(white) == len(start.initial_states) == 1 and not free.n_trend
     if one_each and start.blocks is not None:
         model = whitening.model(start)._replace(loss=np.inf)
-        model = refine_simulation(model, white, free, fitted=False, patient=True)
+        model = refine_simulation(
+            model, white, free, fitted=False, patient=True, signals=signals
+        )
     else:
         model = restarted(start, whitening, white, free)
         model = refine_simulation(model, white, free, patient=True)
@@ -351,7 +358,8 @@ def identify(
     as_found = settings._replace(enforce_stability=False)
     first, start = (none, None) if known is None else (known.whitening, known.model)
     fit: Callable[..., Fitted] = refit if near else fit_once
-    fitted = fit(records, order, horizon, as_found, first, start)
+    shared = {"signals": known.signals} if near and known is not None else {}
+    fitted = fit(records, order, horizon, as_found, first, start, **shared)
     chosen = fitted.candidate
     filtered = known is not None or len(records[0].y) == 1
     some, errors = shorten(records)[0], None

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.least_squares import column_scale, scaled_lstsq
-from .signals import Record, output_energy
+from .signals import Record, SharedSignals, output_energy
 from .simulation_fit import Freedom, Realization, block_fit, linearised, moved_model
 
 Array = NDArray[np.float64]
@@ -59,15 +59,17 @@ def refine_simulation(
     *,
     fitted: bool = True,
     patient: bool = False,
+    signals: SharedSignals | None = None,
 ) -> Realization:
     """Minimise the simulation error by Gauss-Newton steps with damping.
 
     Starts from a model of `simulation_fit` on these records, scaled to comparable size
     channel by channel, or where it is not `fitted` on one that is like this single
-    record. Only steps that reduce the error are taken; a stable model stays
-    stable. A model without section form (poles of high multiplicity), of order 0, or
-    whose simulation overflows is returned as it is. `patient` goes on along valleys:
-    of orders that are compared, too high a one would follow slow noise there.
+    record, `signals` then those of the model and inputs that it shares with others.
+    Only steps that reduce the error are taken; a stable model stays stable. A model
+    without section form (poles of high multiplicity), of order 0, or whose simulation
+    overflows is returned as it is. `patient` goes on along valleys: of orders that are
+    compared, too high a one would follow slow noise there.
 
     The steps end where one more could not gain what a hundredth of the noise on
     each parameter costs. What is left after a step follows from how far the decrease
@@ -83,7 +85,9 @@ def refine_simulation(
     for _ in range(max_iter or (_MANY if patient else _MAX_ITER)):
         if model.loss <= _ROUNDING * energy or model.blocks is None:
             return model
-        regression = linearised(model, records, free, keep_one=True)
+        regression = linearised(
+            model, records, free, keep_one=True, signals=None if fitted else signals
+        )
         if regression is None:
             return model
         jacobian, residual = regression[:, :-1], regression[:, -1]

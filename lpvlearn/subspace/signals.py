@@ -248,6 +248,41 @@ def section_states(blocks: tuple[Array, ...], added: Array) -> Array:
     return out
 
 
+class SharedSignals:
+    """Factors of records that differ in their outputs, as realizations of noise do.
+
+    Of one model and one input the signals, and the products of them, are those of the
+    record before; only products with the outputs are new.
+    """
+
+    def __init__(self) -> None:
+        self._of: tuple[Array, ...] = ()
+        self._known = np.zeros((0, 0)), np.zeros((0, 0))
+
+    def factor(
+        self, blocks: tuple[Array, ...], record: Record, driven: Array
+    ) -> Array | None:
+        """As `signal_factor`, which it asks for what does not fit into a piece."""
+        (m, n_samples), (ny, order) = record.u.shape, (len(record.y), len(driven))
+        first = order * (1 + m) + m  # row of the outputs
+        if n_samples > _PIECE or len(record.trend):
+            return signal_factor(blocks, record, driven)
+        of = (*blocks, driven, record.u)
+        if len(of) != len(self._of) or not all(map(np.array_equal, of, self._of)):
+            with np.errstate(over="ignore", invalid="ignore"):
+                (X,) = signal_pieces(blocks, record, driven)
+                self._of, self._known = of, (X, X @ X.T)
+        X, gram = self._known[0], self._known[1].copy()
+        X[first : first + ny] = record.y
+        with np.errstate(over="ignore", invalid="ignore"):
+            gram[first : first + ny] = products = record.y @ X.T
+        gram[:, first : first + ny] = products.T
+        if not gram.diagonal().max() < _LARGEST:
+            return None
+        lower = cholesky_factor(gram)
+        return (stack_factors([X]) if lower is None else lower).T
+
+
 class _SectionBank:
     """Filters of all blocks, with the memory that a record in pieces needs.
 

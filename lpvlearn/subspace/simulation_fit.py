@@ -32,6 +32,7 @@ from .hankel import triangularize
 from .signals import (
     Pairs,
     Record,
+    SharedSignals,
     block_sections,
     block_slices,
     section_states,
@@ -415,18 +416,21 @@ def linearised(
     free: Freedom,
     *,
     keep_one: bool = False,
+    signals: SharedSignals | None = None,
 ) -> Array | None:
     """Simulation error of all experiments, linearised at a model in section form.
 
     A regression as `jacobian_regression`, but without the own unknowns, which are
     projected out; with `keep_one` the initial state of a single experiment without
-    trends stays, where it costs less. None where responses overflow.
+    trends stays, where it costs less. None where responses overflow. `signals` are
+    those of other records with this model and inputs.
     """
     assert model.blocks is not None
+    factor = signal_factor if signals is None else signals.factor
     parts: list[Array] = []
     for record, x0 in zip(records, model.initial_states, strict=True):
         driven = np.column_stack([x0, model.B])
-        R = signal_factor(model.blocks, record, driven)
+        R = factor(model.blocks, record, driven)
         if R is None:
             return None
         regression = jacobian_regression(R, model, driven, free)

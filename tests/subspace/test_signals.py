@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from lpvlearn.subspace.signals import Record, block_sections, signal_pieces
+from lpvlearn.subspace.signals import (
+    Record,
+    SharedSignals,
+    block_sections,
+    section_states,
+    signal_factor,
+    signal_pieces,
+)
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
@@ -35,3 +42,42 @@ def test_sections_span_free_and_forced_responses(rng, A):
 
 def test_poles_of_high_multiplicity_have_no_sections():
     assert block_sections(np.eye(4, k=1) + 0.5 * np.eye(4)) is None
+
+
+@pytest.mark.parametrize("poles", [[0.5], [0.9, 0.2], [0.9, 0.8 + 0.3j, 0.6 + 0.6j]])
+def test_states_of_sections_follow_the_recursion(rng, poles):
+    A = modes(*poles)
+    n = len(A)
+    basis = rng.standard_normal((n, n))
+    blocks, T = block_sections(basis @ A @ np.linalg.inv(basis))
+    added = rng.standard_normal((n, 60))
+    states, x = T @ section_states(blocks, np.linalg.solve(T, added)), np.zeros(n)
+    for found, step in zip(states.T, added.T, strict=True):
+        x = basis @ A @ np.linalg.solve(basis, x) + step
+        np.testing.assert_allclose(found, x, rtol=1e-9, atol=1e-9)
+
+
+def test_realizations_share_the_factors_of_their_input(rng):
+    signals, blocks = SharedSignals(), block_sections(modes(*POLES)).blocks
+    n = len(modes(*POLES))
+    for u in rng.standard_normal((2, 2, 300)):
+        for driven in rng.standard_normal((2, n, 3)):
+            for y in rng.standard_normal((3, 2, 300)):
+                record = Record(u, y)
+                own = signal_factor(blocks, record, driven)
+                shared = signals.factor(blocks, record, driven)
+                np.testing.assert_allclose(shared, own, rtol=1e-9, atol=1e-9)
+
+
+def test_shared_signals_of_collinear_inputs_keep_their_digits(rng):
+    u, y = np.ones((1, 200)), rng.standard_normal((1, 200))
+    record, blocks = Record(np.vstack([u, u]), y), (np.array([[0.5]]),)
+    driven = np.ones((1, 3))
+    R = SharedSignals().factor(blocks, record, driven)
+    expected = signal_factor(blocks, record, driven)
+    np.testing.assert_allclose(R.T @ R, expected.T @ expected, rtol=1e-9, atol=1e-9)
+
+
+def test_shared_signals_that_overflow_have_no_factor(rng):
+    record, blocks = Record(*rng.standard_normal((2, 1, 3000))), (np.array([[2.0]]),)
+    assert SharedSignals().factor(blocks, record, np.ones((1, 2))) is None
