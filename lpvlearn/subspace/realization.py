@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..systems.least_squares import scaled_lstsq
+from ..systems.least_squares import rank_lstsq, scaled_lstsq
 from .simulation_fit import Freedom
 
 Array = NDArray[np.float64]
@@ -26,6 +26,8 @@ METHODS = ("po-moesp", "pi-moesp", "n4sid", "cva")
 # unexcited directions in data without noise; so are eigenvalues of the future outputs'
 # covariance, their squares but for rounding, below the second.
 _UNEXCITED, _UNEXCITED_POWER = 1e-10, 1e-12
+
+_EPSILON = float(np.finfo(float).eps)  # below it a direction is rounding
 
 # Squaring (eigenvectors of L32 L32.T) is exact enough above this ratio of the last
 # wanted to the first singular value; below it the SVD is used.
@@ -138,12 +140,7 @@ def shift_invariant_pair(
     leading = basis[:, :order]
     if order == 0:
         return np.zeros((0, 0)), np.zeros((n_outputs, 0))
-    A = linalg.lstsq(
-        leading[:-n_outputs],
-        leading[n_outputs:],
-        lapack_driver="gelsy",
-        check_finite=False,
-    )[0]
+    A = rank_lstsq(leading[:-n_outputs], leading[n_outputs:], _EPSILON)[0]
     return np.ascontiguousarray(A), leading[:n_outputs].copy()
 
 

@@ -35,19 +35,28 @@ def scaled_lstsq(M: Array, rhs: Array, rcond: float = RCOND) -> tuple[Array, int
     `rhs` may have one column per run; a direction whose relative singular value is
     below `rcond` counts as undetermined. Also returns the rank.
     """
+    scale = column_scale(M)
+    solution, rank = rank_lstsq(M / scale, rhs, rcond)
+    return (solution.T / scale).T, rank
+
+
+def rank_lstsq(M: Array, rhs: Array, rcond: float) -> tuple[Array, int]:
+    """As `scaled_lstsq`, columns as they are.
+
+    `scipy.linalg.lstsq` with LAPACK's driver by complete orthogonal factors, but for
+    25 us that it takes to call.
+    """
     n_rows, n = M.shape
     if M.size == 0:
         return np.zeros((n, *rhs.shape[1:])), 0
-    scale = column_scale(M)
     columns = rhs.reshape(n_rows, -1)
     if n_rows < n:  # LAPACK returns the solution there
         columns = np.concatenate([columns, np.zeros((n - n_rows, columns.shape[1]))])
-    # `scipy.linalg.lstsq`, with this driver, takes 25 us more
     n_work = 3 * n + _LARGEST_BLOCK * (n + 1 + columns.shape[1])
     _, solution, _, rank, _ = lapack.dgelsy(
-        M / scale, columns, np.zeros(n, np.int32), rcond, n_work
+        M, columns, np.zeros(n, np.int32), rcond, n_work
     )
-    return (solution[:n].reshape(n, *rhs.shape[1:]).T / scale).T, int(rank)
+    return solution[:n].reshape(n, *rhs.shape[1:]), int(rank)
 
 
 def column_scale(M: Array) -> Array:
