@@ -32,6 +32,7 @@ from .identification import (
     Settings,
     fit_once,
     realize,
+    refit,
     restarted,
     subspaces_of,
     validate,
@@ -67,7 +68,9 @@ _PILOT_ORDER, _PILOT_STEPS = 8, 3
 
 _WEIGHINGS = 4  # of the outputs, with the pilot: each brings a clean one nearer by ten
 
-_MORE_ROUNDS = 1  # of all orders: with the noise of the first choice
+# Fits of an order by the noise that it leaves; orders beyond the best one, up or down,
+# of which this is asked.
+_MORE_ROUNDS, _PATIENCE_BY_NOISE = 2, 2
 
 # Of a parameter, in squared standard deviations of its estimate: two of them. Akaike's
 # price of 2 takes a superfluous state in one fit of ten, Schwarz's of log(n) leaves
@@ -215,29 +218,75 @@ def _search(
     pilot = _pilot(records, wanted, settings)
     whitening = _noise_of(pilot, records, wanted, settings)
     tried = _try_orders(wanted, records, whitening, settings)
-    best = min(tried, key=lambda one: one.criterion)
-    for _ in range(_MORE_ROUNDS):
-        model = _unwhitened(best.model, whitening, records, settings)
-        again = _noise_of(model, records, wanted, settings)
-        if again.is_close_to(whitening):
-            break
-        whitening = again
-        tried = _try_orders(wanted, records, whitening, settings)
-        best = min(tried, key=lambda one: one.criterion)
-    candidates = {
-        one.order: Candidate(whitening.undone(one.model), one.horizon, whitening, True)
-        for one in tried
-    }
-    errors = {best.order: validate(candidates[best.order], records, settings)}
-    chosen = best.order
-    for order in (best.order - step for step in _LOWER):
+    orders = _judged(tried, whitening, records, wanted, settings)
+    best = min(orders.values(), key=lambda one: one.criterion).order
+    candidates = {order: one.candidate for order, one in orders.items()}
+    errors = {best: validate(candidates[best], records, settings)}
+    chosen = best
+    for order in (best - step for step in _LOWER):
         if order in candidates:
             errors[order] = validate(candidates[order], records, settings)
             if errors[order].clearly_better_than(errors[chosen], _DOUBT):
                 chosen = order
     white = whitening.records(records, settings.free)
+    tried = [one._replace(criterion=orders[one.order].criterion) for one in tried]
     rows, found = _rows(tried, white, errors), candidates[chosen]
     return Selection(chosen, found.horizon, rows, found, errors[chosen])
+
+
+class _Judged(NamedTuple):
+    """One order, and the criterion of its model by the noise that this leaves."""
+
+    order: int
+    candidate: Candidate
+    criterion: float
+
+
+def _judged(
+    tried: Sequence[_Tried],
+    whitening: Whitening,
+    records: list[Record],
+    wanted: _Range,
+    settings: Settings,
+) -> dict[int, _Judged]:
+    """All orders, those about the best one fitted again by the noise of each.
+
+    The noise of one model for all favours orders like its own: what states too many
+    took of slow noise, those that leave it would have to follow.
+    """
+    found = {}
+    for one in tried:
+        model = _unwhitened(one.model, whitening, records, settings)
+        candidate = Candidate(model, one.horizon, whitening, True)
+        found[one.order] = _judge(one.order, candidate, records, settings)
+    first = min(found.values(), key=lambda one: one.criterion).order
+    for step in (-1, 1):
+        order, best, stale = first if step < 0 else first + 1, np.inf, 0
+        while order in found and stale <= _PATIENCE_BY_NOISE:
+            candidate = found[order].candidate
+            for _ in range(_MORE_ROUNDS):
+                noise = _noise_of(candidate.model, records, wanted, settings)
+                if noise.is_close_to(candidate.whitening):
+                    break
+                horizon, start = candidate.horizon, candidate.model
+                fitted = refit(records, order, horizon, settings, noise, start)
+                candidate = fitted.candidate
+            found[order] = _judge(order, candidate, records, settings)
+            stale = 0 if found[order].criterion < best else stale + 1
+            best = min(best, found[order].criterion)
+            order += step
+    return found
+
+
+def _judge(
+    order: int, candidate: Candidate, records: list[Record], settings: Settings
+) -> _Judged:
+    """The criterion of a model, in samples weighted but not filtered."""
+    weighted = Whitening(np.ones(1), candidate.whitening.weight)
+    model, free = weighted.model(candidate.model), settings.free
+    records = weighted.records(records, free)
+    model = with_initial_states(model, records, free)
+    return _Judged(order, candidate, criterion_of(model, records, free))
 
 
 def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realization:
