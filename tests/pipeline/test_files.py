@@ -123,7 +123,7 @@ def fitted():
 
 def lti_models():
     late = stable_model(1, sampling_time=0.1).with_input_delay([0, 3])
-    extreme = StateSpace([[-0.0, 5e-324], [1e308, -1.0]], np.ones((2, 1)), [[0.1, 0]])
+    extreme = StateSpace([[-0.0, 5e-324], [1e149, -1.0]], np.ones((2, 1)), [[0.1, 0]])
     gain = StateSpace([], [], [], [[1 / 3, 2.0]], True)
     transposed = StateSpace(np.asfortranarray(late.A), late.B, late.C, late.D)
     return [stable_model(0), late, extreme, gain, transposed]
