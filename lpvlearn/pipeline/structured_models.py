@@ -339,15 +339,17 @@ def covariance_of_parameters(
 def _balanced(local: LocalModel) -> StateSpace:
     """The local model, balanced: that of the rates of outputs that integrate.
 
+    Its derivatives do not see the states on which nothing else depends, ``A v = 0``.
     Poles on the negative real axis make the order grow in continuous time.
     """
-    model, n_more = local.lti, len(local.integrating)
-    n, C, D = model.order - n_more, model.C.copy(), model.D.copy()
-    C[local.integrating], D[local.integrating] = model.A[n:], model.B[n:]
-    rates = StateSpace(
-        model.A[:n, :n], model.B[:n], C[:, :n], D, input_delay=model.input_delay
-    )
-    return rates.balance(min(local.order - n_more, n))
+    model, integrating = local.lti, local.integrating
+    C, D = model.C.copy(), model.D.copy()
+    C[integrating], D[integrating] = C[integrating] @ model.A, C[integrating] @ model.B
+    n = model.order - len(integrating)
+    seen = np.linalg.svd(model.A)[2][:n].T
+    A, B = seen.T @ model.A @ seen, seen.T @ model.B
+    rates = StateSpace(A, B, C @ seen, D, input_delay=model.input_delay)
+    return rates.balance(min(local.order - len(integrating), n))
 
 
 def balanced_entries(
