@@ -97,7 +97,7 @@ class Sections(NamedTuple):
 
 
 def block_sections(A: Array) -> Sections | None:
-    """Split a state matrix into sections of one or two states.
+    """Split a state matrix into sections of two states, and one of one at the front.
 
     None where the transformation is too ill conditioned: a pole of multiplicity three
     or more, or a repeated complex pair.
@@ -335,20 +335,18 @@ class _SectionBank:
 class Pairs(NamedTuple):
     """The blocks of two states, each ``A = s I + N`` with ``s`` half its trace."""
 
-    states: NDArray[np.intp]  # (n_pairs, 2): of every block
+    first: int  # state of them all, behind the blocks of one
     N: Array  # (n_pairs, 2, 2)
 
     @classmethod
     def of(cls, blocks: tuple[Array, ...]) -> Pairs:
         """Those among some blocks."""
-        parts = zip(block_slices(blocks), blocks, strict=True)
-        pairs = [(part.start, block) for part, block in parts if len(block) == 2]
-        first = np.array([start for start, _ in pairs], dtype=np.intp)
-        N = np.array([block for _, block in pairs]).reshape(-1, 2, 2)
+        first = sum(len(block) == 1 for block in blocks)
+        N = np.array(blocks[first:]).reshape(-1, 2, 2)
         half = 0.5 * (N[:, 0, 0] + N[:, 1, 1])
         N[:, 0, 0] -= half
         N[:, 1, 1] -= half
-        return cls(first[:, None] + np.arange(2), N)
+        return cls(first, N)
 
 
 def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
@@ -358,12 +356,13 @@ def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
     """
     n, width = driven.shape
     out = np.zeros((n, n, width))
-    diagonal = np.arange(n)
-    out[diagonal, diagonal] = driven
-    states, N = Pairs.of(blocks)
-    first, own = states[:, :1], driven[states]
-    out[states, first] = own
-    out[states, first + 1] = N @ own
+    start, N = Pairs.of(blocks)
+    own = driven[start:].reshape(-1, 2, width)
+    turned = N @ own
+    out[range(start), range(start)] = driven[:start]
+    for k, row in enumerate(range(start, n, 2)):
+        out[row : row + 2, row] = own[k]
+        out[row : row + 2, row + 1] = turned[k]
     return out.reshape(n, n * width)
 
 

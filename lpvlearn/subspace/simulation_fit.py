@@ -16,6 +16,7 @@ entries of D, the blocks of A (row-major) and C, as in the columns of the Jacobi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -136,8 +137,9 @@ def parameter_slices(model: Realization, free: Freedom) -> list[slice]:
     """Where the entries of every block of A stand among the parameters."""
     assert model.blocks is not None
     sizes = [block.size for block in model.blocks]
-    stops = model.B.size + int(free.direct.sum()) + np.cumsum(sizes, dtype=int)
-    return [slice(stop - size, stop) for stop, size in zip(stops, sizes, strict=True)]
+    first = model.B.size + np.count_nonzero(free.direct)
+    stops = accumulate(sizes, initial=first)
+    return [slice(stop, stop + size) for stop, size in zip(stops, sizes, strict=False)]
 
 
 def moved_model(model: Realization, change: Array, free: Freedom) -> Realization:
@@ -146,7 +148,7 @@ def moved_model(model: Realization, change: Array, free: Freedom) -> Realization
     Own unknowns may stand before the parameters, as in `linearised`: they are ignored.
     """
     assert model.blocks is not None
-    n_b, n_d, n_c = model.B.size, int(free.direct.sum()), model.C.size
+    n_b, n_d, n_c = model.B.size, np.count_nonzero(free.direct), model.C.size
     n_a = sum(block.size for block in model.blocks)
     change = change[len(change) - (n_b + n_d + n_a + n_c) :]
     D = model.D.copy()
@@ -385,22 +387,18 @@ def jacobian_regression(
     _fill_linear(out, R, pairs, C, free)
     second = R[:, base + m + ny :]
     # Entry (p, q) of a block drives state p with state q.
-    where = column + np.cumsum([0, *(block.size for block in blocks)])
-    for start, block, part in zip(where, blocks, block_slices(blocks), strict=False):
-        if len(block) == 1:
-            out[:, :, start] = C[:, part] * second[:, part.start]
-    if len(pairs.N):
-        into, own = pairs.states, driven[pairs.states].swapaxes(1, 2)
-        answer = second[:, into].swapaxes(0, 1)  # (n_pairs, k, 2)
-        g_u = R[:, :base].reshape(k, n, 1 + m)[:, into[:, 1]].swapaxes(0, 1)
-        first = answer @ pairs.N.swapaxes(1, 2) + g_u @ own
-        seen = C.T[into].swapaxes(1, 2)[:, :, None, :, None]  # outputs of the states
-        effect = seen * first[:, None, :, None]
-        seen = (C.T[into].swapaxes(1, 2) @ pairs.N)[:, :, None, :, None]
-        effect += seen * answer[:, None, :, None]
-        sizes = [block.size for block in blocks]
-        columns = np.flatnonzero(np.repeat(sizes, sizes) == 4) + column
-        out[:, :, columns] = effect.transpose(1, 2, 0, 3, 4).reshape(ny, k, -1)
+    start, N = pairs
+    for i in range(start):
+        out[:, :, column + i] = C[:, [i]] * second[:, i]
+    own = driven[start:].reshape(-1, 2, 1 + m).swapaxes(1, 2)
+    answer = second[:, start : start + 2 * len(N)].reshape(k, -1, 2).swapaxes(0, 1)
+    signals = R[:, :base].reshape(k, n, 1 + m)
+    first = answer @ N.swapaxes(1, 2) + signals[:, start + 1 :: 2].swapaxes(0, 1) @ own
+    seen = C[:, start:].reshape(ny, -1, 2).swapaxes(0, 1)  # (n_pairs, n_outputs, 2)
+    effect = seen[:, :, None, :, None] * first[:, None, :, None]
+    effect += (seen @ N)[:, :, None, :, None] * answer[:, None, :, None]
+    entries = out[:, :, column + start : column + size_a]
+    entries[:] = effect.transpose(1, 2, 0, 3, 4).reshape(entries.shape)
     column += size_a
     states = R[:, :base] @ state_coefficients(blocks, driven).T
     for i in range(ny):
@@ -466,10 +464,11 @@ def _output_coefficients(pairs: Pairs, C: Array) -> Array:
     """
     ny, n = C.shape
     out = np.zeros((n, ny, n))
-    diagonal = np.arange(n)
-    out[diagonal, :, diagonal] = C.T
-    states, N = pairs
-    first, seen = states[:, :1], C.T[states]
-    out[first, :, states] = seen
-    out[first + 1, :, states] = N.swapaxes(1, 2) @ seen
+    start, N = pairs
+    turned = C[:, start:].reshape(ny, -1, 2).swapaxes(0, 1) @ N
+    for i in range(start):
+        out[i, :, i] = C[:, i]
+    for k, i in enumerate(range(start, n, 2)):
+        out[i, :, i : i + 2] = C[:, i : i + 2]
+        out[i + 1, :, i : i + 2] = turned[k]
     return out
