@@ -314,7 +314,7 @@ def test_a_static_gain_that_is_not_known_is_told():
     for seed in range(4):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            model = SubspaceLTI(offset=None).fit(*slow_in_slow_noise(seed))
+            model = SubspaceLTI(2, offset=None).fit(*slow_in_slow_noise(seed))
         gain = model._evidence.static_gain()
         response = model.lti_.frequency_response([0.0])[0].real
         np.testing.assert_allclose(gain.value, response, rtol=1e-9)
