@@ -4,8 +4,8 @@ Errors are whitened first by the noise in those of a pilot model (`noise`), so t
 their sum of squares is a likelihood. Each order is then fitted at the horizon whose
 start is best, or from the model of the order below with one state more for what that
 leaves, whichever gives less: more states never fit worse. A criterion like Akaike's
-weighs the likelihood against the number of parameters. The noise is estimated again
-from the choice, and the orders are compared once more where it has changed.
+weighs the likelihood against the number of parameters. In the end the orders about the
+best one are fitted again, each by the noise that it leaves itself.
 
 The criterion trusts that the system is what the models are. Simulation of parts held
 out does not (`held_out`): it may lower the order.
@@ -68,16 +68,14 @@ _PILOT_ORDER, _PILOT_STEPS = 8, 3
 
 _WEIGHINGS = 4  # of the outputs, with the pilot: each brings a clean one nearer by ten
 
-# Fits of an order by the noise that it leaves; orders beyond the best one, up or down,
-# of which this is asked.
-_MORE_ROUNDS, _PATIENCE_BY_NOISE = 2, 2
+_MORE_ROUNDS = 2  # of an order about the best: with the noise that it leaves itself
 
 # Of a parameter, in squared standard deviations of its estimate: two of them. Akaike's
 # price of 2 takes a superfluous state in one fit of ten, Schwarz's of log(n) leaves
 # out states of a few thousand noisy samples that would improve the simulation.
 _PRICE = 4.0
 
-_PATIENCE = 3  # orders tried beyond the one with the best criterion so far
+_PATIENCE = 3  # orders tried on either side of the one with the best criterion so far
 
 _EXACT = 1e-18  # share of the outputs' energy (an error of 1e-9) that is rounding
 
@@ -262,7 +260,7 @@ def _judged(
     first = min(found.values(), key=lambda one: one.criterion).order
     for step in (-1, 1):
         order, best, stale = first if step < 0 else first + 1, np.inf, 0
-        while order in found and stale <= _PATIENCE_BY_NOISE:
+        while order in found and stale <= _PATIENCE:
             candidate = found[order].candidate
             for _ in range(_MORE_ROUNDS):
                 noise = _noise_of(candidate.model, records, wanted, settings)

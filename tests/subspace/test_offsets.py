@@ -329,6 +329,28 @@ def test_constants_are_found_far_from_zero(rng, level):
     assert error_of(model) < 0.1
 
 
+@pytest.mark.parametrize("level", [6.0, None])
+def test_constants_of_what_stays_far_from_zero_are_taken_in_slow_noise(level):
+    """The gain explains means as well, at 1.5 instead of 2: the noise hides that.
+
+    From rest at zero there are none, and zero is a point of the answer.
+    """
+    taken, gains = 0, []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.standard_normal(50), 8)
+        y = 0.5 * lfilter([0.44], [1.0, -0.9], rng.standard_normal(400))
+        if level is None:
+            y += lfilter([0.0, 0.2], [1.0, -0.9], u + 4.0)
+        else:
+            y += lfilter([0.0, 0.2], [1.0, -0.9], u) + level
+        model = SubspaceLTI(1, horizon=6).fit(u[:, None] + 4.0, y)
+        taken += model.offset_ is not None
+        gains.append(model.lti_.dc_gain().item())
+    assert taken == (0 if level is None else 6)
+    np.testing.assert_allclose(np.mean(gains), 2.0, atol=0.2)
+
+
 def test_prediction_warns_where_constants_differ(rng):
     X, y = table(rng, noise=0.1)
     model = SubspaceLTI(3, horizon=6, **options()).fit(X, y)

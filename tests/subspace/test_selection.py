@@ -1,6 +1,7 @@
 """The choice of order and horizon, in its parts."""
 
 import numpy as np
+import pytest
 from scipy.signal import lfilter
 
 from lpvlearn.subspace.identification import Settings
@@ -11,6 +12,7 @@ from lpvlearn.subspace.selection import (
 )
 from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import Realization
+from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
 from .conftest import POLES, example, experiment, freedom
@@ -57,6 +59,26 @@ def test_coloured_noise_is_not_taken_for_states():
         for seed in range(6)
     ]
     assert sum(order == 3 for order in orders) >= 5 and max(orders) <= 4
+
+
+@pytest.mark.slow
+def test_noise_that_a_rich_pilot_followed_is_found_by_the_order_itself():
+    """Many channels, few samples: states too many take slow noise for answers."""
+    orders = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        A = np.diag([0.8, 0.93, 0.975])
+        B, C = rng.standard_normal((3, 5)), rng.standard_normal((3, 3))
+        B *= np.sqrt(1.0 - np.diag(A) ** 2)[:, None]
+        u = np.repeat(rng.standard_normal((24, 5)), 5, axis=0)
+        y = lti_response(A, B, C, np.zeros((3, 5)), u)
+        white = rng.standard_normal((220, 3))
+        e = lfilter([0.436], [1.0, -0.9], white, axis=0)[100:]
+        y += 0.1 * y.std(axis=0) * e
+        u, y = (z / np.sqrt(np.mean(z**2, axis=0)) for z in (u, y))
+        chosen = select([Record.of(u, y)], None, None, Settings(freedom(3, 5)))
+        orders.append(chosen.order)
+    assert sum(order == 3 for order in orders) >= 4 and max(orders) <= 4
 
 
 def test_losses_do_not_rise_with_the_order():
