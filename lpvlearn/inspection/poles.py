@@ -95,6 +95,11 @@ class PoleDisplay:
         if local_poles is not None and local_kappa is not None:
             pair = _pair("local_", local_kappa, local_poles)
             self.local_kappa, self.local_poles = pair
+            if pair[0].shape[1] != self.kappa.shape[1]:
+                raise ValueError(
+                    f"`local_kappa` must have as many columns as `kappa` has, "
+                    f"{self.kappa.shape[1]}. Got {pair[0].shape[1]}."
+                )
         self.scheduling_labels = labels_of(scheduling_label, self.kappa.shape[1])
 
     @classmethod
