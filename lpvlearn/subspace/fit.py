@@ -44,12 +44,10 @@ from .offsets import (
 from .realization import METHODS
 from .residuals import lacks
 from .selection import PlantFit, Row, Selection, better_horizon, select
-from .signals import Record, SharedSignals, shorten, thinned
+from .signals import Record, SharedSignals, shorten
 from .simulation_fit import (
     Freedom,
     Realization,
-    simulation_errors,
-    with_initial_states,
 )
 from .statistics import Evidence
 from .varx import Feedback, find_feedback
@@ -241,7 +239,7 @@ def fit_pairs(
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = _with_constants(pairs, choices, told, known)
     doubt = None
-    if choices.method == "auto" and fitted.method == "pbsid":
+    if fitted.method == "pbsid" and (choices.method == "auto" or not choices.order):
         fitted, doubt = _believable(pairs, choices, told, fitted)
     _tell_of_feedback(fitted, choices, doubt, told)
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
@@ -392,32 +390,52 @@ def _believable(
 ) -> tuple[LocalFit, _Doubt | None]:
     """The first model of a closed loop, or one that refutes it on parts held out.
 
-    These are that with D free where the first has none by default, and the one of
-    "po-moesp". The latter minimises the simulation error, and so does better than the
-    plant itself by what the inputs tell of the noise: that does not refute the plant
-    unless inputs were to be noise more than anything else (`_OF_NOISE`), or the plant
-    is unstable, by no more than chance, and the other is not.
+    Its like of the order that "po-moesp" takes is one: prediction, by which the order
+    in a loop is chosen, hardly sees of a plant what outputs tell themselves. Where the
+    method is free, that with D free where the first has none by default is another, and
+    the model of "po-moesp". The latter minimises the simulation error, and so does
+    better than the plant itself by what the inputs tell of the noise: that does not
+    refute the plant unless inputs were to be noise more than anything else
+    (`_OF_NOISE`), or the plant is unstable, by no more than chance, and the other is
+    not.
     """
-    if not _grows(first) and _known_by_inputs(first) < _HINT:
-        return first, None
-    n_trend, free = first.evidence.free.n_trend, first.evidence.free.direct.any()
+    n_trend = first.evidence.free.n_trend
+    without_d = not first.evidence.free.direct.any()
     same = choices._replace(offset=DETRENDS[n_trend])
+
+    def rival(**chosen: Any) -> tuple[LocalFit, HeldOut]:
+        chosen_so = same._replace(**chosen)
+        other = _fit(pairs, chosen_so, told, n_trend, first)
+        return other, _held_out(other, chosen_so)
+
     best, error = first, _held_out(first, choices)
     before = error
-    rivals = ["pbsid", "po-moesp"][bool(free) or choices.feedthrough is not True :]
-    for method in rivals if len(error.blocks) else []:
-        try:
-            other = _fit(pairs, same._replace(method=method), told, n_trend, first)
-        except TooFewSamples:
-            continue
-        rival = _held_out(other, choices)
-        better = rival.blocks.sum() < _OF_NOISE * error.blocks.sum()
-        if method == "pbsid":  # data do not tell it apart from the first
-            better |= _grows(best, _CERTAIN) and not _grows(other, _CERTAIN)
-        elif _grows(best) and not _grows(best, _CERTAIN) and not _grows(other):
-            better |= rival.clearly_better_than(error, _DOUBT)
+    try:
+        if not len(error.blocks):
+            return first, None
+        open_loop, of_that = rival(method="po-moesp")
+        if (order := open_loop.selection.order) != first.selection.order:
+            free = False if without_d else choices.feedthrough
+            other, found = rival(method="pbsid", order=order, feedthrough=free)
+            if found.clearly_better_than(error, _DOUBT):
+                tried = other.selection.among(first.selection)
+                first = best = other._replace(selection=tried)
+                before = error = found
+        if choices.method != "auto":
+            return first, None
+        if without_d and choices.feedthrough is not False:
+            other, found = rival(method="pbsid")
+            better = found.total < _OF_NOISE * error.total
+            # data do not tell it apart from the first
+            if better or _grows(best, _CERTAIN) and not _grows(other, _CERTAIN):
+                best, error = other, found
+        better = of_that.total < _OF_NOISE * error.total
+        if _grows(best) and not _grows(best, _CERTAIN) and not _grows(open_loop):
+            better |= of_that.clearly_better_than(error, _DOUBT)
         if better:
-            best, error = other, rival
+            best, error = open_loop, of_that
+    except TooFewSamples:
+        pass
     if best is first:
         return first, None
     doubt = _Doubt(before.bft, error.bft, _grows(first))
@@ -425,26 +443,6 @@ def _believable(
         chosen = choices._replace(method=best.method)
         best = _with_constants(pairs, chosen, told, best)
     return best, doubt
-
-
-def _known_by_inputs(fitted: LocalFit) -> float:
-    """Share of the simulation errors that present and past inputs explain."""
-    model, free = fitted.evidence.model, fitted.evidence.free
-    records = thinned(fitted.scaled.records)
-    errors = simulation_errors(with_initial_states(model, records, free), records)
-    known, left = [], []
-    for record, error in zip(records, errors, strict=True):
-        if len(error) >= _N_LAGS:
-            lags = np.lib.stride_tricks.sliding_window_view(record.u, _N_LAGS, axis=1)
-            known.append(lags.swapaxes(0, 1).reshape(len(lags[0]), -1))
-            left.append(error[_N_LAGS - 1 :])
-    n = sum(map(len, left))
-    if n < 2 * _N_LAGS * len(records[0].u):
-        return 1.0  # nothing can be told
-    E, U = np.vstack(left), np.vstack(known)
-    rest = E - U @ np.linalg.lstsq(U, E)[0]
-    share = np.sum(rest**2) / (n - U.shape[1]) / (np.sum(E**2) / n or 1.0)
-    return 1.0 - float(share)
 
 
 def _held_out(fitted: LocalFit, choices: Choices) -> HeldOut:
@@ -606,10 +604,6 @@ TESTS = {"held out", "static gain", "decay", "lack"}
 # model not to refute it; standard errors by which a lesser one must be better where the
 # plant grows; standard deviations by which a pole does so for certain.
 _OF_NOISE, _DOUBT, _CERTAIN = 0.5, 2.0, 3.0
-
-# Share of its errors that a regression on so many samples of the inputs must explain,
-# for a stable one to be looked at: half of what would refute it.
-_HINT, _N_LAGS = 0.25, 25
 
 _HALF = 0.5  # share of their energy that enforced stability must cost to be reported
 # Share of its fit (one less the relative error) that parts held out must confirm; with

@@ -43,15 +43,20 @@ class HeldOut(NamedTuple):
     bft: float  # best fit, percent, mean over outputs; NaN where nothing is held out
     residual: float = np.nan  # root mean square, in units of the scaled records
 
+    @property
+    def total(self) -> float:
+        """Of all blocks; infinite where nothing is held out."""
+        return float(self.blocks.sum()) if len(self.blocks) else np.inf
+
     def clearly_better_than(self, other: HeldOut, standard_errors: float) -> bool:
         """Whether errors are less, by more than chance and by enough to matter.
 
         Chance is so many standard errors of the difference. Of half the errors it is
         not asked: a model that loses the system now and then makes them large as well.
         """
-        total = other.blocks.sum()
-        if not np.isfinite(total):
-            return bool(np.isfinite(self.blocks.sum()))
+        total = other.total
+        if not (np.isfinite(total) and np.isfinite(self.total)):
+            return bool(np.isfinite(self.total))
         gap = other.blocks - self.blocks
         chance = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
         least = min(standard_errors * chance, _MUCH * total)

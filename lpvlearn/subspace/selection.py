@@ -120,6 +120,11 @@ class Selection:
     candidate: Candidate | None = None  # the choice, of thinned records
     held_out: HeldOut | None = None  # its errors
 
+    def among(self, others: Selection) -> Selection:
+        """The choice among what others tried."""
+        rest = [row for row in others.rows if row.order != self.order]
+        return replace(self, rows=sorted([*self.rows, *rest]))
+
     @cached_property
     def table(self) -> pd.DataFrame:
         """One row per candidate, and which of them was chosen."""

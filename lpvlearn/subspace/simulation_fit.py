@@ -137,7 +137,7 @@ def parameter_slices(model: Realization, free: Freedom) -> list[slice]:
     """Where the entries of every block of A stand among the parameters."""
     assert model.blocks is not None
     sizes = [block.size for block in model.blocks]
-    first = model.B.size + np.count_nonzero(free.direct)
+    first = model.B.size + int(np.count_nonzero(free.direct))
     stops = accumulate(sizes, initial=first)
     return [slice(stop, stop + size) for stop, size in zip(stops, sizes, strict=False)]
 

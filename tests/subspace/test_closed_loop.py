@@ -342,6 +342,42 @@ def test_auto_gives_up_what_parts_held_out_refute():
         assert first < min(1.2 * ordinary, 0.7 * without)
 
 
+def slow_plant_in_a_loop(seed, n_samples=1000):
+    """What outputs tell of themselves one step ahead, and its response."""
+    rng = np.random.default_rng(seed)
+    a, b = np.poly([0.9, 0.6, 0.3, 0.2]), np.array([0.0, 0.02, 0.05, 0.03, 0.01])
+    r = np.repeat(rng.choice([-1.0, 1.0], n_samples // 10), 10)
+    noise = 0.3 * lfilter([1.0], [1.0, -0.9], rng.standard_normal(n_samples))
+    u, x, y = np.zeros((3, n_samples))
+    for t in range(n_samples):
+        back = np.arange(1, min(4, t) + 1)
+        x[t] = b[back] @ u[t - back] - a[back] @ x[t - back]
+        y[t] = x[t] + noise[t]
+        u[t] = r[t] - 0.8 * y[t]
+    omega = np.linspace(0.02, 1.0, 40)
+    delay = np.exp(-1j * omega)
+    response = np.polyval(b[::-1], delay) / np.polyval(a[::-1], delay)
+    return u[:, None], y[:, None], omega, response
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_order_in_a_loop_is_one_that_simulates(seed):
+    u, y, omega, truth = slow_plant_in_a_loop(seed)
+
+    def error(model):
+        response = model.lti_.frequency_response(omega).ravel()
+        return np.linalg.norm(response - truth) / np.linalg.norm(truth)
+
+    model = pbsid(feedthrough=False).fit(u, y)
+    table = model.selection_
+    assert table["order"][table["chosen"]].tolist() == [model.order_]
+    predicts_best = int(table["order"][table["criterion"].idxmin()])
+    with pytest.warns(UserWarning, match="unstable"):
+        other = pbsid(predicts_best, feedthrough=False).fit(u, y)
+    assert error(other) > 1.0
+    assert error(model) < 0.15
+
+
 def test_auto_keeps_a_plant_that_only_the_loop_holds():
     for delay in (0, 1):
         rng, drive = np.random.default_rng(0), np.array([0.5, 0.2])
