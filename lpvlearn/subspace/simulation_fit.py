@@ -138,8 +138,8 @@ def parameter_slices(model: Realization, free: Freedom) -> list[slice]:
     assert model.blocks is not None
     sizes = [block.size for block in model.blocks]
     first = model.B.size + int(np.count_nonzero(free.direct))
-    stops = accumulate(sizes, initial=first)
-    return [slice(stop, stop + size) for stop, size in zip(stops, sizes, strict=False)]
+    starts = accumulate(sizes, initial=first)
+    return [slice(a, a + size) for a, size in zip(starts, sizes, strict=False)]
 
 
 def moved_model(model: Realization, change: Array, free: Freedom) -> Realization:
