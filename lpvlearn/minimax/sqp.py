@@ -231,7 +231,13 @@ def _followed(
 def _risen(entries: Peaks, ends: Array, peaks: Peaks) -> Array:
     """Values `ends` of the entries, those that move at the maxima they have become."""
     moving = entries.moving
+    if not moving.any():
+        return ends
     same = _near(entries.frequencies[moving], peaks.frequencies, _MOVED)
+    with np.errstate(invalid="ignore"):  # inf - inf
+        apart = np.abs(entries.frequencies[moving][:, None] - peaks.frequencies)
+    nearest = np.where(np.isnan(apart), 0.0, apart).argmin(0)  # of two close ones
+    same &= nearest == np.arange(moving.sum())[:, None]
     risen = ends.copy()
     tops = np.where(same, peaks.values, 0.0).max(1, initial=0.0)
     risen[moving] = np.maximum(ends[moving], tops)

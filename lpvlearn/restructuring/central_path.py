@@ -162,7 +162,7 @@ class Barrier:
         by_level = -2.0 * mu * (flat @ np.real(P2).T.ravel())
         level_curvature = mu / tau * float((s / (tau - s) ** 2).sum())
         # dE C and C^H dX C, whose Gram matrices are the terms of first derivatives
-        dEC = geometry.by_parameter(geometry.products @ (at.R @ C))
+        dEC = (C.swapaxes(1, 2)[:, None] @ geometry.changes).reshape(-1, q)
         Z = ((Ch @ Eh) @ dEC.reshape(k, p, m * q)).reshape(k, m, m, q)
         dX = (Z + Z.conj().swapaxes(1, 2)).reshape(-1, q)
         first = np.sqrt(2.0) * dEC

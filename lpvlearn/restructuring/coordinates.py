@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.balancing import balancing_transformation
-from .error_system import ErrorSystem
+from .error_system import ErrorSystem, derivatives
 from .limits import Limits, within_bounds
 from .similarity import linear_equations, nearest_parameters, scaled_problem
 
@@ -69,8 +69,7 @@ class ResponseGeometry:
     by `size` (root mean square), and the logarithms whose gradients are the rows of
     `pull` (those of distances to bounds) by less than about `_REACH`. `S` holds the
     derivatives of the system matrix, `L` that of the point `at` behind the weight, and
-    `products` ``L S_j`` (k, n_outputs * n_params, n + n_inputs): the error changes by
-    ``L S_j R``.
+    `changes` those of the error (k, n_outputs, n_inputs, n_params), ``L S_j R``.
     """
 
     def __init__(
@@ -89,9 +88,9 @@ class ResponseGeometry:
         k, p, _ = self.L.shape
         q, m = len(self.S), self.at.R.shape[2]
         self._shape = (k, p, m)
-        self.products = np.tensordot(self.L, self.S, axes=(2, 1)).reshape(k, p * q, -1)
-        J = self.by_parameter(self.products @ self.at.R)
-        J = np.concatenate([J.real, J.imag]) / np.sqrt(k)
+        self.changes = derivatives(self.L, self.S, self.at.R)
+        flat = self.changes.reshape(-1, q)
+        J = np.concatenate([flat.real, flat.imag]) / np.sqrt(k)
         metric = J / size
         if pull is not None:
             metric = np.concatenate([metric, pull / _REACH])
@@ -104,12 +103,6 @@ class ResponseGeometry:
         self.inverse = (V * s).T * unit
         self._J = J @ self.T
         self._gram = self._J.T @ self._J + _DAMPING * size**2 * np.eye(q)
-
-    def by_parameter(self, X: Complex) -> Complex:
-        """(k, n_outputs * n_params, m) as (k * n_outputs * m, n_params)."""
-        k, p, m = self._shape
-        q = len(self.S)
-        return X.reshape(k, p, q, m).swapaxes(2, 3).reshape(-1, q)
 
     def _solve(self, g: Array) -> Array:
         return np.asarray(np.linalg.solve(self._gram, g))
@@ -141,7 +134,8 @@ class ResponseGeometry:
         ``d2E_ij = L S_i Phi S_j R``, its mirror image, and what bends the structure.
         """
         q, n = len(self.S), self.n
-        mixed = np.real(np.tensordot(P, self.at.Phi, axes=(0, 0)))  # (b, a, c, d)
+        Phi = np.concatenate([self.at.Phi.real, -self.at.Phi.imag])
+        mixed = np.tensordot(np.concatenate([P.real, P.imag]), Phi, axes=(0, 0))
         mixed = mixed.transpose(1, 2, 3, 0).reshape(P.shape[2] * n, n * P.shape[1])
         H = self.S[:, :, :n].reshape(q, -1) @ mixed @ self.S[:, :n].reshape(q, -1).T
         H = H + H.T

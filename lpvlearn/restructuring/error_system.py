@@ -163,9 +163,15 @@ def derivatives(L: Complex, S: Array, R: Complex) -> Complex:
         entries = (S[j, a, b] * R.swapaxes(1, 2)[:, :, b])[:, None] * L[:, :, None, a]
         one_each = len(j) == len(S)
         return entries if one_each else np.add.reduceat(entries, starts[:-1], axis=3)
-    # contract the short axes first: (k, p, a) (j, a, b) -> (k, p, j, b)
-    left = np.tensordot(L, S, axes=(2, 1)).reshape(k, p * len(S), -1)
-    return (left @ R).reshape(k, p, len(S), -1).swapaxes(2, 3)
+    # contract the short axes first, (k, p, a) (j, a, b) -> (k, p, j, b), real and
+    # imaginary parts apart: S is real, which halves the work
+    m = R.shape[2]
+    left = np.tensordot(np.stack([L.real, L.imag]), S, axes=(3, 1))
+    parts = left.reshape(2, k, p * len(S), -1) @ np.concatenate([R.real, R.imag], 2)
+    changes = np.empty((k, p * len(S), m), complex)
+    changes.real = parts[0, :, :, :m] - parts[1, :, :, m:]
+    changes.imag = parts[0, :, :, m:] + parts[1, :, :, :m]
+    return changes.reshape(k, p, len(S), m).swapaxes(2, 3)
 
 
 def remembering(f: Callable[[NDArray], Any], points: int = 4) -> Callable[..., Any]:

@@ -88,8 +88,8 @@ class Limits:
         A = system.split(structure.system_matrix(theta))[0]
         poles, V = np.linalg.eig(A)
         W = np.linalg.pinv(V)
-        dA = structure.jacobian(theta)[:, :n, :n]
-        d = np.einsum("ia,jab,bi->ij", W, dA, V)
+        dA = structure.jacobian(theta)[:, :n, :n].reshape(len(theta), n * n)
+        d = (W[:, :, None] * V.T[:, None]).reshape(n, n * n) @ dA.T  # w_i dA_j v_i
         size = np.abs(poles)
         if system.dt is not None:
             safe = np.where(poles == 0, 1.0, poles)

@@ -34,7 +34,7 @@ _MAX_CAPS = 12  # frequencies at which the cap is a constraint: the last ones me
 
 # depths at which peaks that move are looked for below high constant ones
 _HARD_STEPS = (0.99, 0.9999)
-_STATIONARY = 1e-8  # shortest subgradient of an optimum, relative to the objective
+_STATIONARY = 1e-5  # shortest subgradient of an optimum, relative to the objective
 NEARLY = 1e-3  # stationarity up to which no more is said
 SADDLE = -1e-4  # second-order measure below which a stationary point is a saddle
 _ESCAPES = 4  # from one saddle to the next
@@ -44,6 +44,8 @@ _LOWER = 1e-9  # relative decrease that leaves a saddle
 # mu at the end of a round on the central path, and iterations of the solver from there;
 # the next round if these do not converge
 _ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
+# Of so many parameters an end too early costs more than the path to a better one.
+_MANY, _MANY_ROUNDS = 100, ((1e-6, 100), (1e-8, 60))
 _BUNDLE_PACE = 10  # as many iterations of a first-order method
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
 _PROGRESS = 1e-9  # a round that converged and brings less is the last one
@@ -265,7 +267,8 @@ def _from_least_squares(
     history, floor = list(path.history), 0.0
     pace = 1 if solver is minimax_sqp else _BUNDLE_PACE
     best: tuple[Array, MinimaxResult] | None = None
-    for mu_end, solver_iter in _ROUNDS:
+    rounds = _ROUNDS if len(path.theta) < _MANY else _MANY_ROUNDS
+    for mu_end, solver_iter in rounds:
         path = _followed(
             system,
             path,
