@@ -44,7 +44,8 @@ _LOWER = 1e-9  # relative decrease that leaves a saddle
 # mu at the end of a round on the central path, and iterations of the solver from there;
 # the next round if these do not converge
 _ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
-# Of so many parameters an end too early costs more than the path to a better one.
+# Of so many parameters an end too early costs more than the path to a better one, and
+# a further one brings no digit of the norm that the parameters hold.
 _MANY, _MANY_ROUNDS = 100, ((1e-6, 100), (1e-8, 60))
 _BUNDLE_PACE = 10  # as many iterations of a first-order method
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
@@ -267,7 +268,8 @@ def _from_least_squares(
     history, floor = list(path.history), 0.0
     pace = 1 if solver is minimax_sqp else _BUNDLE_PACE
     best: tuple[Array, MinimaxResult] | None = None
-    rounds = _ROUNDS if len(path.theta) < _MANY else _MANY_ROUNDS
+    many = len(path.theta) >= _MANY
+    rounds, proof = (_MANY_ROUNDS, NEARLY) if many else (_ROUNDS, _STATIONARY)
     for mu_end, solver_iter in rounds:
         path = _followed(
             system,
@@ -293,7 +295,7 @@ def _from_least_squares(
         top = np.inf if best is None else best[1].peaks.top
         if best is None or result.peaks.top < top:
             best = theta, result
-        settled = result.stationarity <= _STATIONARY and result.converged
+        settled = result.stationarity <= proof and result.converged
         settled |= best[1].peaks.top <= options["negligible"]
         idle = result.converged and best[1].peaks.top >= (1.0 - _PROGRESS) * top
         if settled or idle or used >= max_iter or time_is_up():
