@@ -27,7 +27,7 @@ from ..data.experiments import (
 from ..data.preparation import DETRENDS, read_runs, remove_trends, split_at_gaps
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL
-from ..exceptions import VersionedPickle, all_or_nothing, warn
+from ..exceptions import VersionedPickle, all_or_nothing, collected, warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
 from ..systems.simulation import (
@@ -53,6 +53,8 @@ from .integrating import (
     integrated,
     integrating_flags,
     rates_of,
+    simulates_worse,
+    sums_of,
 )
 from .offsets import N_TRENDS
 from .residuals import (
@@ -175,8 +177,10 @@ class SubspaceLTI(
         Outputs with an integrator, as the position of a motor: by the columns of y or
         their positions, True for all. Their rates ``(y[k+1] - y[k]) / dt`` are
         identified in their place (`rates_`), and integrated: `lti_` has a pole at one
-        for each, beside the `order` states of the model of the rates. Levels of these
-        outputs are initial states; `offset` finds none.
+        for each, beside the `order` states of the model of the rates. Where all
+        outputs integrate it is fitted to these, by sums of the inputs: differences
+        have more of the noise. Levels of these outputs are initial states; `offset`
+        finds none.
     time_tol : float, default=0.01
         Largest deviation of a time stamp from an even grid, relative to the step. For
         more, see `resample`.
@@ -535,9 +539,12 @@ class SubspaceLTI(
             operating_point=None,
         )
         self.rates_ = inner = rate_model.fit(table, rates)
-        self.lti_: StateSpace = integrated(inner.lti_, flags)
+        best = inner
+        if flags.all() and inner.method_ != "pbsid":
+            best = self._of_sums(experiments, inner)
+        self.lti_: StateSpace = integrated(best.lti_, flags)
         self._name(*_names_of(experiments, y))
-        self._evidence: Any = RateEvidence(inner.deviated_models(), flags, m)
+        self._evidence: Any = RateEvidence(best.deviated_models(), flags, m)
         self.input_delay_, self.order_ = self.lti_.input_delay, self.lti_.order
         self.horizon_, self.method_ = inner.horizon_, inner.method_
         self.selection_, self.residual_ = inner.selection_, inner.residual_
@@ -550,6 +557,27 @@ class SubspaceLTI(
         self.output_offset_ = inner.output_offset_
         self.output_drift_ = inner.output_drift_
         return self
+
+    def _of_sums(self, experiments: Sequence[Experiment], rates: Self) -> Self:
+        """The model of the rates from the outputs themselves, by sums of the inputs.
+
+        Their differences have noise that no autoregression describes: the estimates
+        would be poorer, and their deviations too large. If the model simulates the
+        outputs worse for all that, `rates` is returned.
+        """
+        step = float(rates.lti_.sampling_time or 1.0)
+        table, y = as_table(sums_of(experiments, step))
+        sums = clone(rates).set_params(
+            order=rates.order_, offset="constant", method=rates.method_
+        )
+        try:
+            with collected():  # said of the rates
+                sums.fit(table, y)
+        except ValueError:  # too few samples for a constant
+            return rates
+        grows = rates.lti_.is_stable and not sums.lti_.is_stable
+        worse = simulates_worse(sums._evidence, sums.lti_, rates.lti_)
+        return rates if grows or worse else sums
 
     @all_or_nothing
     def partial_fit(self, X: Any, y: Any) -> Self:

@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 
 from ..data.experiments import Experiment
 from ..models.statespace import ModelPair, StateSpace
-from .simulation_fit import Freedom
+from .simulation_fit import Freedom, simulation_fit
+from .statistics import Evidence
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+_WORSE = 1.05  # of squared errors: those that are whitened are the least, not these
 
 
 def integrating_flags(integrating: Any, names: Sequence[Any]) -> Flags:
@@ -69,6 +72,19 @@ def rates_of(
     return found
 
 
+def sums_of(experiments: Sequence[Experiment], step: float) -> list[Experiment]:
+    """The experiments with the sums of their inputs, of the outputs' rates.
+
+    With ``U[k] = step (u[0] + ... + u[k - 1])`` outputs that integrate ``G u`` are
+    ``G U``, a constant and a transient.
+    """
+    zero = np.zeros((1, experiments[0].inputs.shape[1]))
+    return [
+        replace(e, inputs=step * np.cumsum(np.vstack([zero, e.inputs[:-1]]), axis=0))
+        for e in experiments
+    ]
+
+
 def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:
     """Inputs with a last column that tells the experiments apart, and outputs."""
     u = np.vstack([e.inputs for e in experiments])
@@ -99,6 +115,16 @@ def integrated(model: StateSpace, flags: Flags) -> StateSpace:
     C = np.hstack([np.where(own, model.C, 0.0), E.T])
     D = np.where(own, model.D, 0.0)
     return StateSpace(A, B, C, D, model.sampling_time, input_delay=model.input_delay)
+
+
+def simulates_worse(evidence: Evidence, model: StateSpace, other: StateSpace) -> bool:
+    """Whether the poles and outputs of a model explain records worse than another's."""
+
+    def loss(of: StateSpace) -> float:
+        C = of.C / evidence.output_scale[:, None]
+        return simulation_fit(of.A, C, evidence.records, evidence.free).loss
+
+    return loss(model) > _WORSE * loss(other)
 
 
 class RateEvidence:

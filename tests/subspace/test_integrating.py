@@ -14,6 +14,7 @@ from lpvlearn import (
     SubspaceLTI,
     from_trajectories,
 )
+from lpvlearn.models.statespace import DEVIATION
 from lpvlearn.pipeline.local_models import _integrating_outputs
 
 STEP = 0.02
@@ -93,6 +94,28 @@ def test_what_is_known_of_the_rates_is_asked_of_them():
         SubspaceLTI(1, integrating=[0], offset="constant").fit(u, y)
     pairs = local.deviated_models()
     assert pairs and all(abs(m.poles() - 1.0).min() < 1e-12 for m in pairs[0])
+
+
+def test_deviations_of_integrated_models_are_those_of_the_estimates():
+    """White noise on an angle is that of its model; its rates have it differenced."""
+    found = {"angle": [], "rates": []}
+    told = []
+    for seed in range(30):
+        u, y = record(noise=0.01, seed=seed, n=500)
+        local = SubspaceLTI(1, horizon=5, sampling_time=STEP, integrating=True)
+        local.fit(u, y["angle"])
+
+        def pole(model):
+            return float(model.poles().real.min())
+
+        found["angle"].append(pole(local.lti_))
+        found["rates"].append(pole(local.rates_.lti_))
+        changes = [pole(a) - pole(b) for a, b in local.deviated_models()]
+        told.append(np.linalg.norm(changes) / (2.0 * DEVIATION))
+    spread = np.std(found["angle"])
+    assert spread < 0.85 * np.std(found["rates"])
+    assert 0.7 * spread < np.median(told) < 1.5 * spread
+    assert abs(np.mean(found["angle"]) - np.exp(-3.0 * STEP)) < 3.0 * spread / 30**0.5
 
 
 INERTIA = (1.0, 2.0, 3.0)
