@@ -255,8 +255,10 @@ def _with_constants(
     judged = choices._replace(refine="simulation") if rough else choices
     fitted = _fit(pairs, judged, told, n_trend, known)
     # A slow mode of the noise, which outputs drive, stands for constants only too well;
-    # so does one of a model that has to start at rest.
+    # so does one of a model that has to start at rest. In the errors of a poor model of
+    # a given order nothing stands out.
     hides = fitted.method == "pbsid" or not choices.initial_states
+    hides |= choices.order is not None and fitted.residual > _HARDLY
     tested = fitted.evidence.one_step
     if choices.offset == "auto" and (hides or may_have_constants(tested)):
         other = _fit(pairs, judged, told, 1, fitted)
@@ -596,7 +598,10 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
 # times as large as theirs; between realizations of noise it varies by a few per cent.
 _WORSE = 1.2
 
-_USELESS = 0.9  # share of the outputs' size left unexplained that is reported
+# Shares of the outputs' size left unexplained: that is reported; and that constants may
+# be the reason of
+_USELESS, _HARDLY = 0.9, 0.4
+
 # What is told from tests that take as long as a fit
 TESTS = {"held out", "static gain", "decay", "lack"}
 
