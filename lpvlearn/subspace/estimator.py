@@ -168,8 +168,9 @@ class SubspaceLTI(
         state: a constant, as signals have that are not measured from a point of rest,
         or a constant and a drift. None: the outputs are zero at rest at input zero.
         "auto" takes constants of all experiments where the criterion of `order` is the
-        better for them and they are significant, or save states; else (and with
-        `detrend`, which has dealt with them) none.
+        better for them and they are significant, or save states, and where signals that
+        stay three standard deviations or more from zero do not refute them; else (and
+        with `detrend`, which has dealt with them) none.
     missing : {"raise", "split"}, default="raise"
         "split" ends an experiment before a sample with NaN, or a row that the `time`
         column misses, and starts another after it, with an initial state of its own.
