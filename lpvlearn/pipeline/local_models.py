@@ -390,19 +390,28 @@ def _bare(experiment: Experiment) -> Experiment:
     )
 
 
+def _far_from_zero(records: Sequence[Array]) -> bool:
+    """Whether a channel stands far from zero, as to how it moves over all records."""
+    n = sum(map(len, records))
+    mean = sum(v.sum(axis=0) for v in records) / n
+    variance = sum(((v - mean) ** 2).sum(axis=0) for v in records) / n
+    return bool((np.abs(mean) > _OFFSET * np.sqrt(variance)).any())
+
+
 def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
     """What to try first if the model turns out unstable: offsets make it so."""
-    outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
-    if len(outputs) > len(experiments) and not np.ptp(outputs, axis=0).any():
+    inputs = [e.inputs for e in experiments]
+    outputs = [e.outputs for e in experiments if e.outputs is not None]
+    still = all((y == outputs[0][0]).all() for y in outputs)
+    if sum(map(len, outputs)) > len(experiments) and still:
         raise ValueError(
-            f"An output must vary. Got {outputs[0].tolist()} throughout: no dynamics "
-            "can be identified from it."
+            f"An output must vary. Got {outputs[0][0].tolist()} throughout: no "
+            "dynamics can be identified from it."
         )
-    inputs = np.vstack([e.inputs for e in experiments])
     far = [
         (name, place)
         for name, place, values in (("outputs", "y", outputs), ("inputs", "X", inputs))
-        if (np.abs(values.mean(axis=0)) > _OFFSET * values.std(axis=0)).any()
+        if _far_from_zero(values)
     ]
     if not far:
         return "Try "
