@@ -22,6 +22,7 @@ from ..validation import (
     matrix,
     measured_samples,
     shown,
+    squarable,
     state_vector,
     whole_number,
 )
@@ -249,7 +250,7 @@ class InnovationModel:
             behind the errors of one-step prediction. The inputs in transit follow, and
             the multiples of the trends: signal by signal, output by output.
         """
-        u = finite_samples("u", u, self.lti.n_inputs)
+        u = squarable("u", finite_samples("u", u, self.lti.n_inputs))
         y = measured_samples(y, len(u), self.lti.n_outputs)
         if trend is not None:
             trend = matrix("trend", trend)

@@ -30,6 +30,7 @@ from ..validation import (
     names_of,
     one_of,
     positive_time,
+    squarable,
     state_vector,
     units_by_name,
     whole_number,
@@ -396,7 +397,7 @@ class StateSpace:
                 "`estimate_initial_state` needs a discrete-time model. Got "
                 f"{self}. Convert with to_discrete(sampling_time) first."
             )
-        u = finite_samples("u", u, self.n_inputs)
+        u = squarable("u", finite_samples("u", u, self.n_inputs))
         y = measured_samples(y, len(u), self.n_outputs)
         error = y - self.simulate(u)
         with np.errstate(over="ignore", invalid="ignore"):  # which is told instead

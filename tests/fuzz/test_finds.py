@@ -159,6 +159,11 @@ HUGE = np.full((4, 2), 1e308)
         ("SubspaceLTI.fit", {"inputs": [[1], [1, 2]]}, "column"),
         ("SubspaceLTI.fit(arrays)", {"order": np.timedelta64(1, "s")}, "`order` must"),
         ("PoleDisplay", {"scheduling_label": [[1], [1, 2]]}, "`scheduling_label` must"),
+        (
+            "InnovationModel.estimate_initial_state",
+            {"u": np.full((60, 1), -1e308)},
+            "`u` must hold numbers below",
+        ),
         ("PoleDisplay", {"local_kappa": np.ones((4, 2))}, "`local_kappa` must have as"),
         ("PoleDisplay", {"local_poles": HUGE}, "below 1e\\+150"),
         ("ParameterDisplay.from_estimator", {"names": pd.NaT}, "`names` must"),
