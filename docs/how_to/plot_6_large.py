@@ -34,13 +34,17 @@ local = SubspaceLTI(2, inputs=[0], experiment=1).fit_batches(batches())
 local.lti_.poles().round(3)
 
 # %%
+# 450 million such rows, 10 GB, took 206 s of one processor and 36 MB (:ref:`trust`).
+#
 # A data set on the disk
 # ----------------------
 # :meth:`LocalLPVPipeline.fit_dataset <lpvlearn.LocalLPVPipeline.fit_dataset>` reads
 # parquet files, or a folder of them, experiment by experiment; it wants pyarrow
 # (``pip install "lpvlearn[tables]"``). The rows of an experiment follow each other, in
 # the order of time; the other columns keep their roles. What `fit` finds in the whole
-# table, it finds too. Memory is that of the largest operating point.
+# table, it finds too. Memory is that of the largest operating point, with
+# ``combine="average"`` of the largest experiment; 999 MB of parquet
+# files, in 20 points of 50 MB, took 22 s and 216 MB.
 
 import tempfile
 from importlib.util import find_spec
