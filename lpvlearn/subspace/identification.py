@@ -272,21 +272,24 @@ def refit(
     whitening: Whitening,
     start: Realization,
     signals: SharedSignals | None = None,
+    *,
+    patient: bool = True,
 ) -> Fitted:
     """As `fit_once`, from a model that is near: the subspace is not asked.
 
-    `signals` are those of the `start` and other records.
+    `signals` are those of the `start` and other records, `patient` is as in
+    `refine_simulation`.
     """
     white, free = whitening.records(records, settings.free), settings.free
     one_each = len(white) == len(start.initial_states) == 1 and not free.n_trend
     if one_each and start.blocks is not None:
         model = whitening.model(start)._replace(loss=np.inf)
         model = refine_simulation(
-            model, white, free, fitted=False, patient=True, signals=signals
+            model, white, free, fitted=False, patient=patient, signals=signals
         )
     else:
         model = restarted(start, whitening, white, free)
-        model = refine_simulation(model, white, free, patient=True)
+        model = refine_simulation(model, white, free, patient=patient)
     model = _of_records(model, records, whitening, settings.free)
     return Fitted(Candidate(model, horizon, whitening, True), np.zeros(0))
 

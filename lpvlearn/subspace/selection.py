@@ -271,9 +271,8 @@ def _judged(
                 noise = _noise_of(candidate.model, records, wanted, settings)
                 if noise.is_close_to(candidate.whitening):
                     break
-                horizon, start = candidate.horizon, candidate.model
-                fitted = refit(records, order, horizon, settings, noise, start)
-                candidate = fitted.candidate
+                known = candidate.horizon, settings, noise, candidate.model
+                candidate = refit(records, order, *known, patient=False).candidate
             found[order] = _judge(order, candidate, records, settings)
             stale = 0 if found[order].criterion < best else stale + 1
             best = min(best, found[order].criterion)
