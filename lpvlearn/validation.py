@@ -154,10 +154,16 @@ def _finite(name: str, array: Array, place: str) -> Array:
     return array
 
 
+def verbosity(value: Any) -> None:
+    """Refuse a `verbose` that is neither a boolean nor an integer of at least 0."""
+    if not isinstance(value, bool):
+        whole_number("verbose", value, 0)
+
+
 def positive_time(name: str, value: Any) -> float:
     """`value` as a positive finite float, or a ValueError that names it."""
-    rule = f"a positive number of seconds, at most {_LONGEST:g}"
-    return number(name, value, rule, above=0.0, high=_LONGEST)
+    rule = f"a positive number of seconds, {1 / _LONGEST:g} to {_LONGEST:g}"
+    return number(name, value, rule, low=1 / _LONGEST, high=_LONGEST)
 
 
 def is_whole(value: Any) -> bool:

@@ -112,6 +112,8 @@ class SimulationDisplay:
                 f"`time` must have shape ({len(self.y_true)},), a value for each row "
                 f"of `y_true`. Got {self.time.shape}."
             )
+        if not np.isfinite(self.time).all():
+            raise ValueError("`time` must be finite. Leave rows without time out.")
         self.predictions = {
             name: read_outputs(y)[0]
             for name, y in by_name("predictions", predictions).items()

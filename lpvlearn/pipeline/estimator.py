@@ -50,7 +50,7 @@ from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
-from ..validation import one_of, positive_time, units_by_name, whole_number
+from ..validation import one_of, positive_time, units_by_name, verbosity
 from .html_report import html_report
 from .local_models import common_delay, identify_points
 from .output_error import (
@@ -741,8 +741,7 @@ list, default=None
             )
         if self.max_time is not None:
             positive_time("max_time", self.max_time)
-        if not isinstance(self.verbose, bool):
-            whole_number("verbose", self.verbose, 0)
+        verbosity(self.verbose)
         if self.n_jobs is not None and (
             not isinstance(self.n_jobs, Integral) or self.n_jobs == 0
         ):

@@ -44,7 +44,14 @@ from ..metrics.scores import bft_score
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
-from ..validation import number, one_of, positive_time, units_by_name, whole_number
+from ..validation import (
+    number,
+    one_of,
+    positive_time,
+    units_by_name,
+    verbosity,
+    whole_number,
+)
 from .bands import output_errors
 from .local_models import identify_point
 from .scheduled import ScheduledEstimator
@@ -478,6 +485,7 @@ class OutputErrorLPV(ScheduledEstimator):
         one_of("offset", self.offset, (None, "constant"))
         one_of("missing", self.missing, ("raise", "split"))
         units_by_name(self.units)
+        verbosity(self.verbose)
         whole_number("max_iter", self.max_iter, 1)
         if not (self.prior is None or isinstance(self.prior, str)):
             number(

@@ -366,9 +366,9 @@ def balanced_entries(
     orders = sorted({model.order for model in models})
     if len(orders) > 1:
         raise ValueError(
-            "Without a structure the matrices are interpolated, which needs local "
-            f"models of one order. Got orders {orders}. Fix the order: "
-            "local=SubspaceLTI(order=...)."
+            "`local` must give models of one order, whose matrices are interpolated "
+            f"without a structure. Got orders {orders} of what inputs move and outputs "
+            f"show. Ask for the least: local=SubspaceLTI(order={orders[0]})."
         )
     if kappa is not None:
         models = aligned_models(models, kappa)

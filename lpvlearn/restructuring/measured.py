@@ -197,7 +197,7 @@ def read_noise(
         values = values[:, None, None]
     k, p, m = G.shape
     known = values.ndim == 3 and values.shape in ((k, 1, 1), G.shape)
-    least, most = (_SMALLEST, 1 / _SMALLEST) if coherence is None else (0.0, 1.0)
+    least, most = _SMALLEST, 1 / _SMALLEST if coherence is None else 1.0
     if not known or not ((values > least) & (values <= most)).all():
         rule = f"above {least:g}, and {most:g} at most"
         raise ValueError(

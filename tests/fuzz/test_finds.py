@@ -187,7 +187,7 @@ HUGE = np.full((4, 2), 1e308)
         ("vaf_score", {"multioutput": [1e308, 1e308]}, "`multioutput` must hold"),
         ("FlexibleArm.simulate", {"velocity_reference": [[1e200, 0.0]]}, "must hold n"),
         ("fit_report(pipeline)", {"y": np.full((180, 1), 1e308)}, "`y` must hold"),
-        ("from_trajectories", {"sampling_time": 1e308}, "at most 1e\\+100"),
+        ("from_trajectories", {"sampling_time": 1e308}, "1e-100 to 1e\\+100"),
         ("make_flexible_arm", {"n_realizations": 10**6}, "`n_realizations`.*rows"),
         ("make_unbalanced_disc", {"duration": 1e6}, "`duration` must be at most"),
         ("make_unbalanced_disc", {"snr_db": -np.inf}, "`snr_db` must be"),
@@ -260,6 +260,18 @@ def test_numbers_of_other_kinds_are_numbers_or_refused():
     assert np.isfinite(model.predict(kappa)).all()
     with pytest.raises(ValueError, match="`kappa` must be finite.*Got nan"):
         ParameterDisplay(np.full(4, np.nan), {"local": theta})
+
+
+def test_what_no_number_can_stand_for_is_refused():
+    y = np.ones((3, 1))
+    with pytest.raises(ValueError, match="`time` must be finite"):
+        SimulationDisplay([0.0, 1.0, np.nan], y, {"model": y})
+    for make in (lp.OutputErrorLPV, lp.LocalLPVPipeline):
+        for verbose in (pd.Series([1, 2]), -1):
+            with pytest.raises(ValueError, match="`verbose` must be an integer"):
+                make(verbose=verbose, scheduling="kappa").fit(world().X, world().y)
+    with pytest.raises(ValueError, match="`sampling_time` must be a positive number"):
+        lp.SubspaceLTI(sampling_time=5e-324).fit(world().X, world().y)
 
 
 @pytest.mark.parametrize("name", ["X", "y"])

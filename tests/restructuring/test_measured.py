@@ -210,7 +210,7 @@ def test_a_coherence_is_a_noise():
         ({"noise": [0.1]}, r"`noise` must have shape \(5,\) or \(5, 2, 3\).*\(1,\)"),
         ({"noise": np.zeros(5)}, "`noise` must have.*values above 1e-100"),
         ({"noise": np.full(5, np.nan)}, "`noise` must have"),
-        ({"coherence": np.full(5, 1.1), "n_averages": 4}, "`coherence`.*above 0"),
+        ({"coherence": np.full(5, 1.1), "n_averages": 4}, "`coherence`.*above 1e-100"),
         ({"coherence": np.full(5, 0.9)}, "`n_averages` must be an integer"),
         ({"coherence": np.ones(5), "noise": np.ones(5)}, "give one of them"),
     ],
