@@ -186,7 +186,7 @@ def make_flexible_arm(
     sweep_clocks = _clock_samples("sweep_clock", sweep_clock, sampling_time)
     if balance_time is not None:
         balance_time = number(
-            "balance_time", balance_time, "positive or None", above=0.0
+            "balance_time", balance_time, "positive or None", above=0.0, high=1e100
         )
 
     input_rng, noise_rng, local_rng, sweep_rng = spawn_generators(random_state, 4)

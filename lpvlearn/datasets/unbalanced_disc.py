@@ -207,7 +207,7 @@ class UnbalancedDisc:
             ) from None
         fastest = self.omega0 + self.gamma + self.Fc / _SLIDING
         n_steps = steps_of(sampling_time, integration_step, _LONGEST_STEP / fastest)
-        h = sampling_time / n_steps
+        h = float(sampling_time) / n_steps
         x, v = np.broadcast_to(start, shape).astype(float), np.zeros(shape)
         angle, rate = np.empty((2, *shape, u.shape[-1]))
         for k in range(u.shape[-1]):

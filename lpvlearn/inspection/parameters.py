@@ -115,7 +115,7 @@ class ParameterDisplay:
             )
         self.kappa = points[:, None] if points.ndim < 2 else points
         n_scheduling = self.kappa.shape[1]
-        if n_scheduling > 2:
+        if n_scheduling not in (1, 2):
             raise ValueError(
                 "ParameterDisplay needs one or two scheduling variables as its axes. "
                 f"Got {n_scheduling}. Fix all but two: take the operating points and "

@@ -314,4 +314,9 @@ def _pair(prefix: str, kappa: ArrayLike, poles: ArrayLike) -> tuple[Array, Compl
             f"`{prefix}poles` must have shape ({len(points)}, order), a row for each "
             f"value of `{prefix}kappa`. Got {table.shape}."
         )
+    if not np.isfinite(points).all() or np.isinf(table).any():
+        raise ValueError(
+            f"`{prefix}kappa` and `{prefix}poles` must be finite. Leave other points "
+            "out; poles that a point does not have may be NaN."
+        )
     return points, table

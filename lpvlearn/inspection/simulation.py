@@ -113,7 +113,10 @@ class SimulationDisplay:
                 f"of `y_true`. Got {self.time.shape}."
             )
         if not np.isfinite(self.time).all():
-            raise ValueError("`time` must be finite. Leave rows without time out.")
+            raise ValueError(
+                "`time` must be finite. Got "
+                f"{self.time[~np.isfinite(self.time)][0]}. Leave such rows out."
+            )
         self.predictions = {
             name: read_outputs(y)[0]
             for name, y in by_name("predictions", predictions).items()

@@ -25,6 +25,8 @@ _OPEN = 1e6  # standard deviation of a parameter that is not determined, in its 
 
 _ROUNDING = 1e-13  # of parameters that are zero, relative to the largest one
 
+_LEAST = 1e-150  # deviations below have no squares
+
 _SINGULAR = 1e-12  # eigenvalue of a correlation matrix that is zero up to rounding
 
 # Per degree of freedom: the covariances are those of local models to first order. (The
@@ -144,6 +146,8 @@ def _whitening(P: Array, size: Array) -> Array | None:
         least = np.maximum(least, _ROUNDING * size.max())
     deviation = np.sqrt(variance + least**2)
     P = P + np.diag(least**2)
+    if not deviation.min() > _LEAST:
+        return None
     correlation = P / deviation[:, :, None] / deviation[:, None, :]
     if np.linalg.eigvalsh(correlation).min() < _SINGULAR:
         return None

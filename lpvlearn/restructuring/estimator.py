@@ -906,7 +906,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         ValueError
             When a value is too large to be squared, or shapes do not fit.
         """
-        squarable("y", real_array("y", y))
+        if squarable("y", real_array("y", y)).size == 0:
+            raise ValueError("`y` must hold a row for each frequency. Got none.")
         return float(super().score(X, y, sample_weight))
 
     def __sklearn_tags__(self) -> Any:

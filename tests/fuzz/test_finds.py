@@ -9,7 +9,12 @@ import pytest
 
 import lpvlearn as lp
 from lpvlearn.datasets import FlexibleArm
-from lpvlearn.inspection import ErrorDisplay, ParameterDisplay, SimulationDisplay
+from lpvlearn.inspection import (
+    ErrorDisplay,
+    ParameterDisplay,
+    PoleDisplay,
+    SimulationDisplay,
+)
 from lpvlearn.validation import number, real_array, whole_number
 
 from ..conftest import spring_lpv
@@ -266,6 +271,13 @@ def test_what_no_number_can_stand_for_is_refused():
     y = np.ones((3, 1))
     with pytest.raises(ValueError, match="`time` must be finite"):
         SimulationDisplay([0.0, 1.0, np.nan], y, {"model": y})
+    with pytest.raises(ValueError, match="`kappa` and `poles` must be finite"):
+        PoleDisplay([0.0, 1.0], np.full((2, 1), -np.inf))
+    with pytest.raises(ValueError, match="one or two scheduling variables .* Got 0"):
+        ParameterDisplay(np.ones((4, 0)), {"local": np.ones((4, 1))})
+    empty = pd.DataFrame()
+    with pytest.raises(ValueError, match="`y` must hold a row for each frequency"):
+        world().restructurer.score(empty, empty)
     for make in (lp.OutputErrorLPV, lp.LocalLPVPipeline):
         for verbose in (pd.Series([1, 2]), -1):
             with pytest.raises(ValueError, match="`verbose` must be an integer"):
