@@ -28,11 +28,7 @@ from ..lpv.auto import AutoLPV
 from ..lpv.interpolator import grid_over
 from ..lpv.polynomial import PolynomialLPV, resolvable_powers
 from ..restructuring.deadline import time_is_up
-from ..restructuring.minimise_covariance import (
-    Estimate,
-    UncertainBoxes,
-    common_coefficients,
-)
+from ..restructuring.minimise_covariance import UncertainBoxes, common_coefficients
 from ..structures.structure import GrayBoxStructure
 from .structured_models import StructuredModels
 
@@ -62,18 +58,24 @@ def through_black_boxes(
 
     With the covariance of its coefficients, and the models of the points that it has.
     None where the form that goes through the parameters is to be kept: it is the user's
-    choice, all are determined and some form explains them, or none is near.
+    choice, all are determined and some form explains them, the black boxes too, or none
+    is near.
     """
     if not isinstance(form, AutoLPV) or not found.restructurers:
         return None
     chi2, dof = form.selection_["chi2"], form.selection_["dof"]
     determined = np.isfinite(found.covariance).all()
     explained = chi2[form.selection_["chosen"]].notna().all()
-    if determined and (explained or not (chi2 < _NEAR * dof).any()):
+    if determined and not explained and not (chi2 < _NEAR * dof).any():
         return None
+    kappa, structure = found.points.kappa, found.structure
     estimates = [model.estimates for model in found.local]
-    kappa = found.points.kappa
-    together = fitted_together(found.structure, estimates, kappa, found.theta)
+    boxes = [UncertainBoxes.of(structure, own) if own else None for own in estimates]
+    if determined and explained:
+        own, there = _misfit(boxes, found.theta), _misfit(boxes, form.predict(kappa))
+        if not own < _FAR or there < _FAR:
+            return None
+    together = fitted_together(structure, boxes, kappa, found.theta)
     if together is None:
         return None
     warn(
@@ -90,18 +92,25 @@ def through_black_boxes(
     return chosen, together.covariance, found._replace(models=models)
 
 
+def _misfit(boxes: Sequence[UncertainBoxes | None], theta: Array) -> float:
+    """Chi-square per value of parameters, by black boxes of known uncertainty."""
+    pairs = zip(boxes, theta, strict=True)
+    z = [box.coordinates(row)[0] for box, row in pairs if box is not None]
+    return float(np.mean(np.concatenate(z) ** 2)) if z else np.nan
+
+
 def fitted_together(
     structure: GrayBoxStructure,
-    estimates: Sequence[Sequence[Estimate]],
+    boxes: Sequence[UncertainBoxes | None],
     kappa: Array,
     theta: Array,
 ) -> Together | None:
     """The polynomial in `kappa` that explains the black boxes of the points best.
 
-    `estimates` are those of every point, `theta` (n_points, n_params) its parameters.
-    None where an uncertainty is not known, or no polynomial explains them.
+    `boxes` are those of every point, None of an uncertainty that is not known, `theta`
+    (n_points, n_params) its parameters. None where too few are known, or no polynomial
+    explains them.
     """
-    boxes = [UncertainBoxes.of(structure, own) if own else None for own in estimates]
     known = [box for box in boxes if box is not None]
     if len(known) < _FEWEST:
         return None

@@ -9,6 +9,7 @@ from lpvlearn.models.statespace import DEVIATION
 from lpvlearn.pipeline.local_models import LocalModel
 from lpvlearn.pipeline.structured_models import StructuredModels
 from lpvlearn.pipeline.together import fitted_together, through_black_boxes
+from lpvlearn.restructuring.minimise_covariance import UncertainBoxes
 
 LAGS = GrayBoxStructure.from_template(
     [["-a", 0], [0, "-c"]], [["b"], ["d"]], [[1, 1]], parameter_names=list("abcd")
@@ -29,11 +30,15 @@ def estimate(theta, discrete=False):
     return model(theta), [(model(theta + d), model(theta - d)) for d in step]
 
 
+def boxes(estimates):
+    return [UncertainBoxes.of(LAGS, own) for own in estimates]
+
+
 @pytest.mark.parametrize("discrete", [False, True])
 def test_the_polynomial_of_exact_black_boxes_is_found_from_afar(discrete):
     estimates = [[estimate(theta, discrete)] for theta in TRUTH]
     start = TRUTH[:, [2, 3, 0, 1]] * [1.5, 1.5, 0.7, 0.7]
-    found = fitted_together(LAGS, estimates, KAPPA, start)
+    found = fitted_together(LAGS, boxes(estimates), KAPPA, start)
     assert found.misfit < 1e-6 and found.form.degree == 1
     values = found.form.predict(KAPPA)
     if values[0, 0] > values[0, 2]:  # lags in parallel have no order
@@ -43,7 +48,7 @@ def test_the_polynomial_of_exact_black_boxes_is_found_from_afar(discrete):
 
 def test_the_covariance_is_that_of_generalised_least_squares():
     estimates = [[estimate(theta)] for theta in TRUTH]
-    found = fitted_together(LAGS, estimates, KAPPA, TRUTH)
+    found = fitted_together(LAGS, boxes(estimates), KAPPA, TRUTH)
     weights = [np.diag((STD * theta) ** -2.0) for theta in TRUTH]
     S = found.form.sensitivities(KAPPA)
     information = sum(s.T @ P @ s for s, P in zip(S, weights, strict=True))
@@ -78,7 +83,18 @@ def test_it_is_taken_where_a_point_does_not_determine_its_parameters():
 def test_nothing_is_taken_that_the_black_boxes_refute_or_do_not_know():
     rng = np.random.default_rng(0)
     wild = TRUTH * np.exp(rng.normal(size=TRUTH.shape))
-    assert fitted_together(LAGS, [[estimate(t)] for t in wild], KAPPA, wild) is None
+    refuted = boxes([[estimate(t)] for t in wild])
+    assert fitted_together(LAGS, refuted, KAPPA, wild) is None
     blind = [[(LAGS.model(theta), [])] for theta in TRUTH]
-    assert fitted_together(LAGS, blind, KAPPA, TRUTH) is None
-    assert fitted_together(LAGS, [[]] * 5, KAPPA, TRUTH) is None
+    assert fitted_together(LAGS, boxes(blind), KAPPA, TRUTH) is None
+    assert fitted_together(LAGS, [None] * 5, KAPPA, TRUTH) is None
+
+
+def test_a_form_that_the_black_boxes_refute_is_not_kept():
+    """It is as near to the parameters as a covariance asks that tells too little."""
+    P = np.tile(0.2 * np.eye(4), (5, 1, 1))
+    rough = AutoLPV().fit(KAPPA, TRUTH, covariance=P)
+    assert rough.form_ == "polynomial 0"
+    with pytest.warns(UserWarning, match="on no smooth function.*The LPV model takes"):
+        form, _, _ = through_black_boxes(rough, structured(TRUTH, P))
+    assert_allclose(form.predict(KAPPA), TRUTH, rtol=1e-5)
