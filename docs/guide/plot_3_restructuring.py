@@ -118,7 +118,9 @@ restructurer.starts_
 # polynomial is fitted to the black boxes of all points together, each in the
 # coordinates of its own uncertainty:
 # :math:`\min_c \sum_k |z_k(S_k c)|^2`, where :math:`S_k c` are the parameters at point
-# k. It is taken, and told, where the black boxes do not refute it.
+# k. It is taken, and told, where the black boxes do not refute it. So it is where they
+# refute the form through the parameters: the covariance of these tells of small
+# changes, and what data hardly tell apart changes by large ones.
 #
 # The norm, and all of its peaks
 # ------------------------------

@@ -208,7 +208,8 @@ HUGE = np.full((4, 2), 1e308)
         (
             "StateSpace.properties",
             {"A": [[0.0, 1.0], [-1e100, -1.0]], "sampling_time": None},
-            "`A` must be stable, beyond rounding",
+            # LAPACK finds them or does not, by its version
+            "`A` must be stable, beyond rounding|eigenvalues of `A` did not converge",
         ),
     ],
 )
