@@ -142,10 +142,11 @@ def matrix(name: str, value: ArrayLike) -> Array:
         array = array.reshape(1, -1) if array.size else np.zeros((0, 0))
     if array.ndim != 2:
         raise ValueError(f"`{name}` must have 2 dimensions. Got shape {array.shape}.")
-    return squarable(name, _finite(name, array, "[{}, {}]"))
+    return squarable(name, all_finite(name, array, "[{}, {}]"))
 
 
-def _finite(name: str, array: Array, place: str) -> Array:
+def all_finite(name: str, array: Array, place: str) -> Array:
+    """The array, or a ValueError that tells what stands at which `place`."""
     finite = np.isfinite(array)
     if not finite.all():
         at = tuple(np.argwhere(~finite)[0])
@@ -228,7 +229,7 @@ def finite_samples(name: str, value: ArrayLike, width: int) -> Array:
             f"`{name}` must have shape (n_samples, {width}). Got {array.shape}."
         )
     channel = "input" if name == "u" else "output"
-    return _finite(name, array, f"sample {{}}, {channel} {{}}")
+    return all_finite(name, array, f"sample {{}}, {channel} {{}}")
 
 
 def measured_samples(y: ArrayLike, n_samples: int, width: int) -> Array:

@@ -23,6 +23,7 @@ from sklearn.utils.validation import check_array, check_consistent_length, valid
 from ..exceptions import DivergenceError
 from ..validation import (
     SQUARED,
+    all_finite,
     complex_array,
     is_whole,
     positive_time,
@@ -517,14 +518,18 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
         ) from error
 
 
-def as_numbers(argument: str, values: Any, *, imaginary: bool = False) -> NDArray[Any]:
+def as_numbers(
+    argument: str, values: Any, *, imaginary: bool = False, finite: bool = False
+) -> NDArray[Any]:
     """Numbers in an array of any shape, a single one in a vector.
 
     Raises a ValueError about the `argument` where one is not a real number, or where it
-    may be `imaginary`, no number, or too large for its square to be one.
+    may be `imaginary`, no number, or too large for its square to be one, or where all
+    have to be, not `finite`.
     """
     read = complex_array if imaginary else real_array
-    return squarable(argument, np.atleast_1d(read(argument, values)))
+    array = squarable(argument, np.atleast_1d(read(argument, values)))
+    return all_finite(argument, array, "row {}") if finite else array
 
 
 def _numbers(columns: Sequence[Column], n_rows: int, argument: str) -> Array:

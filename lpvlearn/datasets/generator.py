@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 # The paper's sweep goes from the first of its operating points to the last in 3 s.
 _SWEEP_START, _SWEEP_RATE = np.pi / 8, (6 * np.pi / 8) / 3
 
+_LONGEST = 1e100  # s: what balances is divided by other times
+
 INPUTS, OUTPUTS = ["u1", "u2"], ["y1", "y2"]
 
 DESCR = """\
@@ -186,7 +188,7 @@ def make_flexible_arm(
     sweep_clocks = _clock_samples("sweep_clock", sweep_clock, sampling_time)
     if balance_time is not None:
         balance_time = number(
-            "balance_time", balance_time, "positive or None", above=0.0, high=1e100
+            "balance_time", balance_time, "positive or None", above=0.0, high=_LONGEST
         )
 
     input_rng, noise_rng, local_rng, sweep_rng = spawn_generators(random_state, 4)

@@ -107,12 +107,7 @@ class ParameterDisplay:
         scheduling_label: str | Sequence[str] = "κ",
         units: Mapping[str, str] | None = None,
     ) -> None:
-        points = as_numbers("kappa", kappa)
-        if not np.isfinite(points).all():
-            raise ValueError(
-                "`kappa` must be finite scheduling values of the operating points. Got "
-                f"{points[~np.isfinite(points)][0]}."
-            )
+        points = as_numbers("kappa", kappa, finite=True)
         self.kappa = points[:, None] if points.ndim < 2 else points
         n_scheduling = self.kappa.shape[1]
         if n_scheduling not in (1, 2):

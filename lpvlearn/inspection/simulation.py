@@ -106,16 +106,11 @@ class SimulationDisplay:
     ) -> None:
         self.y_true, names = read_outputs(y_true)
         n_outputs = self.y_true.shape[1]
-        self.time = as_numbers("time", time)
+        self.time = as_numbers("time", time, finite=True)
         if self.time.shape != (len(self.y_true),):
             raise ValueError(
                 f"`time` must have shape ({len(self.y_true)},), a value for each row "
                 f"of `y_true`. Got {self.time.shape}."
-            )
-        if not np.isfinite(self.time).all():
-            raise ValueError(
-                "`time` must be finite. Got "
-                f"{self.time[~np.isfinite(self.time)][0]}. Leave such rows out."
             )
         self.predictions = {
             name: read_outputs(y)[0]

@@ -55,7 +55,7 @@ class LocalModel:
     costs: dict[int, float] = field(default_factory=dict)  # of orders, by the criterion
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
     deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
-    integrating: list[int] = field(default_factory=list)  # outputs: the last states
+    integrating: list[int] = field(default_factory=list)  # outputs, by place
     n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
     # inputs and outputs at rest, near the experiments; None: not looked for
     rest: tuple[Array, Array] | None = None

@@ -45,10 +45,7 @@ from .realization import METHODS
 from .residuals import lacks
 from .selection import PlantFit, Row, Selection, better_horizon, select
 from .signals import Record, SharedSignals, shorten
-from .simulation_fit import (
-    Freedom,
-    Realization,
-)
+from .simulation_fit import Freedom, Realization
 from .statistics import Evidence
 from .varx import Feedback, find_feedback
 
@@ -239,7 +236,7 @@ def fit_pairs(
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = _with_constants(pairs, choices, told, known)
     doubt = None
-    if fitted.method == "pbsid" and (choices.method == "auto" or not choices.order):
+    if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
         fitted, doubt = _believable(pairs, choices, told, fitted)
     _tell_of_feedback(fitted, choices, doubt, told)
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))

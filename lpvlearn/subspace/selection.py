@@ -296,7 +296,7 @@ def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realiza
     free, whitening = settings.free, Whitening.none(len(records[0].y))
     order = max(wanted.orders[0], min(wanted.orders[-1], _PILOT_ORDER))
     only = wanted._replace(orders=range(order, order + 1))
-    _look_up(wanted, order, records, settings)
+    _look_up(wanted, order, records, settings)  # for the orders to come as well
     tried = _try_orders(only, records, whitening, settings, _PILOT_STEPS)
     model = tried[0].model
     for _ in range(_WEIGHINGS if len(records[0].y) > 1 else 0):
@@ -425,10 +425,8 @@ def _try_orders(
     """Every order in turn on whitened records, until further states gain nothing."""
     orders = wanted.orders
     if not whitening.is_none:
-        records, wanted = (
-            whitening.records(records, settings.free),
-            wanted._replace(spaces={}),
-        )
+        records = whitening.records(records, settings.free)
+        wanted = wanted._replace(spaces={})
     spaces = _look_up(wanted, orders[0], records, settings)
     tried: list[_Tried] = []
     best, stale = np.inf, 0
