@@ -88,8 +88,9 @@ def _factor(of_A: _Schur, B: Array, discrete: bool) -> Array:
             f"{worst:.4g}."
         )
     F = Q.conj().T @ (B / scale[:, None])
-    unit = float(np.abs(F).max(initial=_SMALLEST))
-    F /= unit  # lest squares overflow
+    # lest squares overflow; by a power of two, which rounds nothing
+    unit = float(np.ldexp(1.0, np.frexp(np.abs(F).max(initial=_SMALLEST))[1]))
+    F /= unit
     L = np.zeros((n, n), dtype=complex)
     # Column k from the last input direction that state k receives; what is left of
     # the earlier states is a Lyapunov equation of order k, with the input F[:k].
