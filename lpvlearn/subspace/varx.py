@@ -51,6 +51,10 @@ _INSTANTANEOUS = 0.01  # p-value below which something acts within the sample
 # beforehand: sines, or values that are held.
 _FORESEEN = 1e-3
 
+# An innovation stands out where it is so many times the median magnitude (4 standard
+# deviations of Gaussian noise), and beyond most others of its output
+_OUTLYING, _MOST = 6.0, 0.95
+
 _DEPENDENT = 1e-9  # part of a regressor below which it is rounding
 
 # Innovations, relative to the outputs, too small to do harm or to be told from rounding
@@ -157,39 +161,53 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
     y, future = (x - (x @ present) @ present.T for x in (y, future))
     noisy = np.linalg.norm(y, axis=1) > _NOISE_FREE * np.linalg.norm(rows[m:c], axis=1)
     dof -= m
-    found = _wilks(y[noisy], _basis(future, rows[c:], _FORESEEN), dof)
-    curved = 0.0
+    found, curved = _wilks(y[noisy], _basis(future, rows[c:], _FORESEEN), dof), 0.0
     if found.p_value < _LEVEL:  # an input that noise reaches at once may tell of it
         first = 1 if within.p_value < _INSTANTANEOUS else 0
-        curved = _curved_share(records, past, noisy, first)
+        of_most, curved = _of_most(records, past, noisy, first)
+        found = max(found, of_most)
     innovations = np.sum(y**2, axis=1) / max(dof, 1)
     return Feedback(*found, within.p_value, curved, innovations)
 
 
-def _curved_share(
+def _of_most(
     records: Sequence[Record], past: int, noisy: NDArray[np.bool_], first: int
-) -> float:
-    """Share of the innovations that nonlinear terms of the last samples explain.
+) -> tuple[_Correlated, float]:
+    """What most samples tell of feedback, and what a nonlinearity explains.
 
-    The `first` of these is the sample itself (0), of which inputs are known, or the one
-    before.
+    Spikes on two channels make a correlation of their own: the first value is the test
+    of those samples whose innovations do not stand out. The second is the share of the
+    innovations that nonlinear terms of the last samples explain, of which the `first`
+    is the sample itself (0), of which inputs are known, or the one before.
     """
-    linear, curved, outputs = [], [], []
+    linear, curved, outputs, ahead = [], [], [], []
     for z in samples_of(records):
-        m, n_rows = len(records[0].u), past + 1
+        m, n_rows = len(records[0].u), past + 1 + _N_FUTURE
         windows = np.lib.stride_tricks.sliding_window_view(z, n_rows, axis=0)
-        windows = windows.transpose(0, 2, 1)[:, ::-1]  # the newest first
+        windows = windows.transpose(0, 2, 1)
+        future, windows = windows[:, past + 1 :, :m], windows[:, past::-1]
+        constant = np.ones((len(windows), 1))
         before = windows[:, 1:].reshape(len(windows), -1)
-        linear.append(np.hstack([windows[:, 0, :m], before]))
+        linear.append(np.hstack([windows[:, 0, :m], before, constant]))
         last = linear[-1][:, first * m : m + _N_CURVED * z.shape[1]]
         mixed = last[:, :1] * last[:, 1:]
-        constant = np.ones((len(last), 1))
-        curved.append(np.hstack([np.abs(last), last**2, last**3, mixed, constant]))
+        curved.append(np.hstack([np.abs(last), last**2, last**3, mixed]))
         outputs.append(windows[:, 0, m:][:, noisy])
-    L, N, Y = (np.vstack(parts).T for parts in (linear, curved, outputs))
+        ahead.append(future.reshape(len(future), -1))
+    L, N, Y, F = (np.vstack(parts).T for parts in (linear, curved, outputs, ahead))
     Q = _basis(L, L, _DEPENDENT)
-    Y, left = (x - (x @ Q) @ Q.T for x in (Y, N))
-    return _wilks(Y, _basis(left, N, _FORESEEN), len(Q) - Q.shape[1]).share
+    left = np.abs(Y - (Y @ Q) @ Q.T)
+    half, most = np.quantile(left, (0.5, _MOST), axis=1, keepdims=True)
+    common = (left <= np.maximum(_OUTLYING * half, most)).all(axis=0)
+    feedback = _explained(L[:, common], Y[:, common], F[:, common])
+    return feedback, _explained(L, Y, N).share
+
+
+def _explained(known: Array, rows: Array, terms: Array) -> _Correlated:
+    """Test whether terms explain rows, given what is known of both."""
+    Q = _basis(known, known, _DEPENDENT)
+    rows, left = (x - (x @ Q) @ Q.T for x in (rows, terms))
+    return _wilks(rows, _basis(left, terms, _FORESEEN), len(Q) - Q.shape[1])
 
 
 def _some(records: Sequence[Record]) -> list[Record]:

@@ -121,6 +121,18 @@ def test_a_nonlinearity_is_no_feedback(seed):
     assert not find_feedback(records_of((walk, smooth))).found
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_spikes_on_two_channels_are_no_feedback(seed):
+    rng = np.random.default_rng(seed)
+    u = np.repeat([0.0, 1.0, 0.0, 1.0], 250)[:, None]
+    y = lfilter([0.0, 0.1], [1.0, -0.9], u, axis=0)
+    y += 0.02 * rng.standard_normal(y.shape)
+    at = rng.choice(900, 6, replace=False)
+    y[at] -= 0.8
+    u[at + 1] -= 1.0
+    assert not find_feedback(records_of((u, y))).found
+
+
 def test_a_controller_that_answers_at_once_is_found_whatever_its_reference():
     """Of a binary one, which the input tells of nonlinearly, and so of the noise."""
     rng = np.random.default_rng(0)
