@@ -1,12 +1,12 @@
 """Simulation of parts of the samples that a model has not seen.
 
 Each experiment is cut into pieces of equal length, and every piece but the first is
-held out once: the model is fitted again without it, from where it was, and simulated
-through it from the state (and the constant) that suits it best. Those that the samples
-before tell would be no measure of a model: what moves a system besides its inputs adds
-up behind an integrator. What a likelihood says rests on its noise model being right;
-this does not, and so has the last word where a system is not quite what the models can
-be.
+held out once; of several short ones, whole experiments are. The model is fitted again
+without it, from where it was, and simulated through it from the state (and the
+constant) that suits it best. Those that the samples before tell would be no measure of
+a model: what moves a system besides its inputs adds up behind an integrator. What a
+likelihood says rests on its noise model being right; this does not, and so has the last
+word where a system is not quite what the models can be.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ _N_PIECES = 3  # held out in turn: a whole number of refits, and most samples st
 _N_BLOCKS = 5  # of a piece: sums over time whose spread tells that of their total
 
 _MOST = 0.7  # share of an input's motion without which nothing can be said of it
+
+_LONG = 80  # samples of an experiment whose pieces tell more than an initial state
 
 _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 
@@ -81,12 +83,12 @@ def held_out(
     errors, outputs = [], []
     records = thinned(records)
     for k in range(1, _N_PIECES + 1):
-        cuts = [_cut(record.u, k) for record in records]
+        cuts = _cuts(records, k)
         train = [
             Record(*(signals[:, part].copy() for signals in record))
             for record, (start, stop) in zip(records, cuts, strict=True)
             for part in (slice(0, start), slice(stop, None))
-            if part == slice(0, start) or record.u.shape[1] - stop >= _TOO_SHORT
+            if 0 < start == part.stop or record.u.shape[1] - stop >= _TOO_SHORT
         ]
         model = refitted(train)
         for record, (start, stop) in zip(records, cuts, strict=True):
@@ -145,6 +147,21 @@ def _answers(
     grown = free_responses(back, weight @ seen, len(u))[::-1]
     free = free_responses(R[:k, :k], weight @ C_stable, len(u), trend)
     return answer, np.concatenate([grown, free], axis=2)
+
+
+def _cuts(records: Sequence[Record], k: int) -> list[tuple[int, int]]:
+    """Start and end of what is held out of every experiment the k-th time.
+
+    Of short ones whole experiments, the longest half in turn: the initial state would
+    take up a piece of a few samples.
+    """
+    lengths = np.array([record.u.shape[1] for record in records])
+    if len(records) < 2 * _N_PIECES or np.median(lengths) >= _LONG:
+        return [_cut(record.u, k) for record in records]
+    longest = np.argsort(-lengths, kind="stable")[: len(lengths) // 2]
+    out = np.isin(np.arange(len(lengths)), longest[k - 1 :: _N_PIECES])
+    starts = np.where(out, 0, lengths)
+    return list(zip(starts.tolist(), lengths.tolist(), strict=True))
 
 
 def _cut(u: Array, k: int) -> tuple[int, int]:

@@ -62,6 +62,10 @@ _MAX_ROWS = 1000
 # and the criterion, which is one of many samples, would be trusted too far.
 _MAX_ORDER, _VALUES_PER_PARAMETER = 20, 3
 
+# So many values for each initial state of other experiments than the first, by those
+# for a parameter: what many unknowns gain by chance is known well.
+_OF_OTHERS = 0.5
+
 # Order and refinement steps of the pilot, whose errors are to be noise and not lack of
 # states; it is not to fit the noise itself.
 _PILOT_ORDER, _PILOT_STEPS = 8, 3
@@ -74,6 +78,10 @@ _MORE_ROUNDS = 2  # of an order about the best: with the noise that it leaves it
 # price of 2 takes a superfluous state in one fit of ten, Schwarz's of log(n) leaves
 # out states of a few thousand noisy samples that would improve the simulation.
 _PRICE = 4.0
+
+# Samples of the longest experiment for each lag of the noise: in short ones initial
+# states are why errors correlate.
+_SAMPLES_PER_LAG = 16
 
 _PATIENCE = 3  # orders tried on either side of the one with the best criterion so far
 
@@ -410,7 +418,7 @@ def _highest_order(
     ny, m = settings.free.direct.shape
     n_values = sum(record.y.size for record in records)
     affordable = n_values / _VALUES_PER_PARAMETER - m * ny
-    affordable /= m + ny + len(records)
+    affordable /= m + ny + 1 + _OF_OTHERS * (len(records) - 1)
     by_horizon = max(settings.max_order(h) for h in horizons)
     return int(np.clip(affordable, 0, min(_MAX_ORDER, by_horizon)))
 
@@ -462,8 +470,9 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     n, (ny, m) = len(model.A), free.direct.shape
     n_values = sum(record.y.size for record in records)
     n_samples = n_values // ny
-    own = len(model.initial_states) * free.n_own(n)
-    n_parameters = n * (m + ny) + int(free.direct.sum()) + own
+    own = free.n_own(n)
+    n_parameters = n * (m + ny) + int(free.direct.sum())
+    n_parameters += len(model.initial_states) * own
     few = n_values / max(n_values - n_parameters, 1)
     if not np.isfinite(model.loss):
         return np.inf
@@ -475,8 +484,9 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     misfit = 2.0 * np.log(max(0.5 * longest, 1.0)) * int(lasting.sum())
     misfit += few * _PRICE * n_parameters
     errors = simulation_errors(model, records)
+    lags = longest // _SAMPLES_PER_LAG
     for i in range(ny):
-        noise = autoregression([error[:, [i]] for error in errors])
+        noise = autoregression([error[:, [i]] for error in errors], highest=lags)
         power = sum(float(record.y[i] @ record.y[i]) for record in records) / n_samples
         variance = max(float(noise.covariance[0, 0]), _EXACT * power) or 1.0
         misfit += n_samples * np.log(variance) + _PRICE * len(noise.A)

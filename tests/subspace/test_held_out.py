@@ -71,6 +71,20 @@ def test_short_experiments_are_not_held_out(rng):
     assert len(error.blocks) == 0 and np.isnan(error.bft)
 
 
+def test_of_short_experiments_whole_ones_are_held_out(rng):
+    system = example(rng, modes(*POLES))
+    lengths = (12, 30, 20, 11, 40, 25, 9, 35)
+    records = [Record.of(*experiment(rng, system, n)) for n in lengths]
+    model, out = Realization(*system, np.zeros((8, 6)), 0.0), []
+
+    def refitted(train):
+        out.append(set(lengths) - {record.u.shape[1] for record in train})
+        return model
+
+    assert held_out(refitted, records).residual < 1e-9
+    assert out == [{40, 25}, {35}, {30}]
+
+
 def test_a_difference_counts_where_it_is_neither_chance_nor_small(rng):
     noise = 1.0 + 0.1 * rng.standard_normal(15)
     base = HeldOut(noise, 0.0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from lpvlearn import SubspaceLTI
 from lpvlearn.subspace.identification import Settings
 from lpvlearn.subspace.selection import (
     _horizon_grid,
@@ -113,3 +114,18 @@ def test_a_given_horizon_bounds_the_orders_that_are_tried():
         assert chosen.horizon == horizon
         assert chosen.order <= settings.max_order(horizon)
     assert chosen.order == 3
+
+
+def test_many_short_experiments_tell_the_order():
+    """Every twentieth output is missing at random, which leaves some 20 in a row."""
+    rng, A = np.random.default_rng(0), modes(0.95 * np.exp(0.3j), 0.8)
+    system = A, np.ones((3, 1)), np.ones((1, 3)), np.zeros((1, 1))
+    u = rng.standard_normal((1000, 1))
+    y = lti_response(*system, u)
+    y += 0.1 * y.std() * rng.standard_normal(y.shape)
+    y[rng.choice(1000, 50, replace=False)] = np.nan
+    model = SubspaceLTI(missing="split").fit(u, y)
+    assert model.order_ == 3
+    exact = lti_response(*system, u)
+    error = exact - model.lti_.simulate(u)
+    assert np.linalg.norm(error) < 0.03 * np.linalg.norm(exact)
