@@ -59,6 +59,14 @@ NO_TIME = (  # what a message says where seconds are needed and nothing tells th
 )
 
 _ALIKE = 0.6  # likeness (difflib's, its default) from which a name may have been meant
+# What to do about an array of so many dimensions
+_RESHAPED = {
+    1: "Reshape your data: `.reshape(-1, 1)` makes a single column of it, "
+    "`.reshape(1, -1)` a single sample.",
+    3: "Several experiments stand below each other in one table, with a column that "
+    "tells them apart: name it as `experiment`.",
+}
+
 _N_SHOWN = 10  # names in an error message, lest a wide table fills the screen
 
 # What else to do about a missing value, in a fit and in a simulation.
@@ -498,8 +506,10 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
         try:
             entries = np.asarray(values)
         except ValueError:
+            tables = all(np.ndim(part) == 2 for part in values)
             raise ValueError(
-                f"`{argument}` must have rows of one length. Got rows that differ."
+                f"`{argument}` must have rows of one length. Got "
+                + (f"several tables. {_RESHAPED[3]}" if tables else "rows that differ.")
             ) from error
         kind = ValueError if isinstance(error, OverflowError) else type(error)
         flat = entries.ravel()
@@ -512,6 +522,12 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
                 f"`{argument}` must hold numbers. Got {shown(as_scalar(flat[k]))} at "
                 f"{', '.join(f'{axis} {i}' for axis, i in at)}: {error}."
             ) from error
+        if entries.ndim in _RESHAPED:
+            raise ValueError(
+                f"`{argument}` must be a table with a row for each sample, shape "
+                f"(n_samples, n_columns). Got shape {entries.shape}. "
+                f"{_RESHAPED[entries.ndim]}"
+            ) from None
         raise kind(
             f"`{argument}` must be a table of real numbers. Got {shown(values)}: "
             f"{error}"
