@@ -110,7 +110,9 @@ pole(split)
 
 # %%
 # In a pipeline it is an option of the local models:
-# ``LocalLPVPipeline(SubspaceLTI(missing="split"), ...)``. Resampling bridges gaps of up
+# ``LocalLPVPipeline(SubspaceLTI(missing="split"), ...)``. It is the remedy for *spikes*
+# as well, which a fit tells of where they make much of its errors: write NaN in place
+# of what the sensor got wrong. Resampling bridges gaps of up
 # to ``max_gap`` steps, and writes NaN into longer ones, for ``missing="split"``.
 #
 # Scores, reports and pictures leave out what was not measured, and say how much that

@@ -42,7 +42,7 @@ from .offsets import (
     with_levels,
 )
 from .realization import METHODS
-from .residuals import lacks
+from .residuals import find_spikes, lacks
 from .selection import PlantFit, Row, Selection, better_horizon, select
 from .signals import Record, SharedSignals, shorten
 from .simulation_fit import Freedom, Realization
@@ -678,6 +678,7 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
         )
+    _warn_of_spikes(fitted, told)
     choice_is_told = TESTS <= told or residual > _USELESS
     if fitted.selection.held_out is not None and not choice_is_told:
         _warn_about_choice(fitted, fitted.selection.held_out, told)
@@ -696,6 +697,24 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             f"a nonlinearity. Try {remedy}, `input_delay`, or, if the system is "
             "nonlinear, smaller inputs; `residual_tests` tells which input it is.",
         )
+
+
+def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
+    """Tell of samples that a sensor may have got wrong: the model follows them."""
+    spikes = None if "spikes" in told else find_spikes(fitted.evidence)
+    if spikes is None:
+        return
+    several = len(fitted.evidence.records) > 1
+    tell(
+        told,
+        "spikes",
+        f"{spikes.n_found} sample(s) of output {spikes.output + 1} stand far out of the "
+        f"errors of the model and make {100.0 * spikes.share:.0f} % of their squares; "
+        f"the farthest is sample {spikes.sample}"
+        f"{f' of experiment {spikes.experiment}' if several else ''}, counted from 0. "
+        "If a sensor got them wrong, they spoil the model: replace them by NaN and use "
+        "missing='split'.",
+    )
 
 
 def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> None:

@@ -82,6 +82,11 @@ _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligi
 # the output, and so improbable by chance; it is looked for in so many samples.
 _MUCH, _MUCH_OF_OUTPUT, _CERTAIN, _MAX_SAMPLES = 0.1, 0.01, 1e-8, 4_096
 
+# A spike is so many times what half of the errors stay within (8 standard deviations of
+# Gaussian noise); spikes are told that make this share of the squared errors, in no
+# more than this share of the samples: others may be what the noise is.
+_SPIKE, _MUCH_OF_SPIKES, _FEW = 12.0, 0.25, 0.05
+
 # Lags by which it is seen at little cost that errors are no larger than need be.
 _N_SCREEN = 10
 
@@ -440,6 +445,49 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
         for i in suspects
         for test in tests[i]
     )
+
+
+class Spikes(NamedTuple):
+    """Errors of one output that stand out of the others."""
+
+    output: int
+    experiment: int  # of the highest of them
+    sample: int  # in that experiment
+    n_found: int
+    share: float  # of the squared errors of the output
+
+
+def find_spikes(evidence: Evidence) -> Spikes | None:
+    """Errors of single samples that make much of those of an output, if any do.
+
+    They stand out of the line between their neighbours, near which coloured noise and
+    what a model lacks stay.
+    """
+    whole = evidence.one_step
+    if len(whole.model.initial_states) != len(whole.records):
+        return None  # of samples that are not kept
+    errors = simulation_errors(whole.model, whole.records)
+    if not all(np.isfinite(e).all() for e in errors):
+        return None
+    bends = [np.zeros_like(e) for e in errors]  # none at the ends of experiments
+    for bend, e in zip(bends, errors, strict=True):
+        bend[1:-1] = np.abs(e[1:-1] - 0.5 * (e[:-2] + e[2:]))
+    size, ends = np.vstack(bends), np.cumsum([len(e) for e in errors])
+    peaks = (size >= np.roll(size, 1, axis=0)) & (size >= np.roll(size, -1, axis=0))
+    size *= peaks & (size > _SPIKE * np.median(size, axis=0))
+    count, taken = np.sum(size > 0.0, axis=0), np.sum(size**2, axis=0)
+    total = sum((e**2).sum(axis=0) for e in errors)
+    power = sum((record.y**2).sum(axis=1) for record in whole.records)
+    share = taken / np.where(total > _MUCH_OF_OUTPUT**4 * power, total, np.inf)
+    share[count > _FEW * len(size)] = 0.0
+    output = int(np.argmax(share))
+    if not share[output] > _MUCH_OF_SPIKES:
+        return None
+    at = int(np.argmax(size[:, output]))
+    k = int(np.searchsorted(ends, at, side="right"))
+    sample = at - (int(ends[k - 1]) if k else 0)
+    most = min(float(share[output]), 1.0)
+    return Spikes(output, k, sample, int(count[output]), most)
 
 
 def _predicted_variances(errors: Sequence[Array]) -> Array:

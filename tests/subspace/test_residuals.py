@@ -455,6 +455,22 @@ def test_a_fit_tells_of_missing_states():
     SubspaceLTI(4, horizon=12).fit(u, y)  # silently
 
 
+def test_spikes_are_told_and_where_the_farthest_is():
+    rng = np.random.default_rng(3)
+    u = rng.standard_normal((600, 2))
+    y = lfilter([0.0, 1.0], [1.0, -0.8], u, axis=0)
+    for noise in (coloured(rng, 1200, 0.9), rng.laplace(size=1200)):
+        SubspaceLTI(2, horizon=8).fit(u, y + 0.1 * noise.reshape(y.shape))  # silently
+    y += 0.1 * rng.standard_normal(y.shape)
+    y[[50, 350, 431], 1] += [3.0, -2.0, 4.0]
+    runs = np.repeat([0.0, 1.0], 300)[:, None]
+    expected = r"3 sample.* of output 2 .*sample 131 of experiment 1,.*missing='split'"
+    with pytest.warns(UserWarning, match=expected):
+        SubspaceLTI(2, horizon=8, experiment=2).fit(np.hstack([u, runs]), y)
+    y[[50, 350, 431], 1] = np.nan
+    SubspaceLTI(2, horizon=8, missing="split").fit(u, y)  # silently
+
+
 def test_a_small_lack_is_not_told():
     """Neither next to the noise, nor next to the output."""
     rng = np.random.default_rng(1)
