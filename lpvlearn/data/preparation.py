@@ -28,6 +28,10 @@ DETRENDS = (None, "constant", "linear")  # by the number of signals in a trend
 # ratios of singular values below 1e-8, well above the first.
 _COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 
+# A signal is held for so many samples where this share of so many intervals between its
+# changes are multiples of them.
+_HELD, _ENOUGH_CHANGES = 0.95, 20
+
 
 def read_runs(
     estimator: Any,
@@ -216,3 +220,19 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
             "out of `inputs`; a column that is no input needs its role (`scheduling=`, "
             "`operating_point=`, `experiment=`)."
         )
+
+
+def held_for(signals: Sequence[Array]) -> int:
+    """Samples for which a signal, (n_samples,) per experiment, is held: 1 if it is not.
+
+    >>> held_for([np.repeat(np.arange(30.0), 3)])
+    3
+    """
+    changes = [np.flatnonzero(np.diff(signal)) for signal in signals]
+    gaps = np.concatenate([np.diff(at) for at in changes])
+    if len(gaps) < _ENOUGH_CHANGES:
+        return 1
+    shares = [np.mean(gaps % k == 0) for k in range(2, int(np.median(gaps)) + 1)]
+    return 1 + max(
+        (k for k, share in enumerate(shares, 1) if share >= _HELD), default=0
+    )

@@ -17,6 +17,7 @@ from ..data.preparation import (
     DETRENDS,
     Pairs,
     check_excitation,
+    held_for,
     independent_inputs,
     remove_trends,
 )
@@ -239,7 +240,24 @@ def fit_pairs(
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
         fitted, doubt = _believable(pairs, choices, told, fitted)
     _tell_of_feedback(fitted, choices, doubt, told)
+    if fitted.selection.order and "held" not in told:
+        _tell_of_held_outputs(pairs, told)
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
+
+
+def _tell_of_held_outputs(pairs: Pairs, told: set[str]) -> None:
+    """Tell of outputs that are sampled more slowly than the table."""
+    held = [held_for([y[:, i] for _, y in pairs]) for i in range(pairs[0][1].shape[1])]
+    slowest = max(held)
+    if slowest > 1:
+        tell(
+            told,
+            "held",
+            f"Output {held.index(slowest) + 1} keeps its values for {slowest} samples: "
+            "it was sampled more slowly than the table, and held in between as the "
+            f"response of no linear system is. Take one row of every {slowest} (the "
+            "first of each value), or `resample`.",
+        )
 
 
 def _with_constants(
@@ -704,11 +722,11 @@ def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
     spikes = None if "spikes" in told else find_spikes(fitted.evidence)
     if spikes is None:
         return
-    several = len(fitted.evidence.records) > 1
+    several, n = len(fitted.evidence.records) > 1, spikes.n_found
     tell(
         told,
         "spikes",
-        f"{spikes.n_found} sample(s) of output {spikes.output + 1} stand far out of the "
+        f"{n} sample(s) of output {spikes.output + 1} stand far out of the "
         f"errors of the model and make {100.0 * spikes.share:.0f} % of their squares; "
         f"the farthest is sample {spikes.sample}"
         f"{f' of experiment {spikes.experiment}' if several else ''}, counted from 0. "

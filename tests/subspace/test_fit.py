@@ -333,6 +333,16 @@ def swinging(seed, decay):
     return u, y + 0.3 * rng.standard_normal(u.shape)
 
 
+def test_outputs_sampled_more_slowly_than_the_table_are_told():
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.standard_normal((150, 1)), 4, axis=0)
+    y = lfilter([0.0, 0.2], [1.0, -0.8], u, axis=0)
+    SubspaceLTI().fit(u, np.round(y * 20.0) / 20.0)  # silently: coarse, not held
+    SubspaceLTI().fit(u, 2.0 * u)  # of no memory: held as its input is
+    with pytest.warns(UserWarning, match="Output 1 keeps its values for 3 samples"):
+        SubspaceLTI().fit(u, np.repeat(y[::3], 3, axis=0))
+
+
 def test_a_decay_that_is_not_known_is_told():
     n_told = 0
     for seed in range(2):
