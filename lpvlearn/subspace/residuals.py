@@ -392,11 +392,17 @@ def input_tests(
             parts.append((white[start + n_lags : len(e) - n_lags].T, u[start:]))
         n = sum(white.shape[1] for white, _ in parts)
         columns = _factor(parts, n_rows)
+        size = np.linalg.norm(columns, axis=0)
+        columns /= np.where(size > 0.0, size, 1.0)
         n_own = columns.shape[1] - 1 - n_rows * m
         starts = n_own + m * np.array([0, n_lags, n_lags + 1, n_rows])
         for found, first, stop in zip(tests, starts[:-1], starts[1:], strict=True):
-            added = [np.arange(first + j, stop, m) for j in range(m)]
-            found.append([_f_test(columns, first, part, n) for part in added])
+            Q = _basis(columns[:, :first])
+            left = columns - Q @ (Q.T @ columns)
+            left -= Q @ (Q.T @ left)  # once more: what is left may be small
+            added = [left[:, first + j : stop : m] for j in range(m)]
+            dof = n - Q.shape[1]
+            found.append([_f_test(part, left[:, -1], dof) for part in added])
     return tests
 
 
@@ -560,24 +566,13 @@ def _whitening_filters(errors: Sequence[Array]) -> list[Array]:
     return [np.concatenate([[1.0], -model.C[0]]) for model in models]
 
 
-def _f_test(
-    columns: Array, n_base: int, added: NDArray[np.intp], n: int
-) -> ResidualTest:
-    """What added columns explain of the last one, beyond the first `n_base`.
-
-    `columns` is a triangular factor of `n` rows.
-    """
-    Q = _basis(columns[:, :n_base])
-    target, new = columns[:, -1], columns[:, added]
-    target = target - Q @ (Q.T @ target)
-    size = np.linalg.norm(new, axis=0)
-    for _ in range(2):  # once more: what is left may be small
-        new = new - Q @ (Q.T @ new)
-    P = _basis(new[:, np.linalg.norm(new, axis=0) > _DEPENDENT * size])
+def _f_test(added: Array, target: Array, dof: int) -> ResidualTest:
+    """What added columns explain of a target of so many degrees of freedom."""
+    P = _basis(added)
     explained = P.T @ target
     left = target - P @ explained
     q = P.shape[1]
-    error = n - Q.shape[1] - q
+    error = dof - q
     if q == 0 or error < 1 or not target.any():
         return ResidualTest(0.0, q, 1.0)
     loss = max(float(left @ left), np.finfo(float).tiny)
@@ -586,13 +581,10 @@ def _f_test(
 
 
 def _basis(columns: Array) -> Array:
-    """Orthonormal basis of the independent columns."""
-    if not columns.shape[1]:
-        return columns
-    size = np.linalg.norm(columns, axis=0)
-    size[size == 0.0] = 1.0
-    Q, R, _ = linalg.qr(
-        columns / size, mode="economic", pivoting=True, check_finite=False
-    )
-    pivots = np.abs(np.diagonal(R))
-    return Q[:, pivots > _DEPENDENT * pivots[0]]
+    """Orthonormal basis of the directions in which columns of size one are not small.
+
+    By singular values: which columns a pivoted factorization leaves out turns on
+    rounding where some are combinations of others, and so would what it spans.
+    """
+    U, sizes, _ = linalg.svd(columns, full_matrices=False, check_finite=False)
+    return U[:, sizes > _DEPENDENT]

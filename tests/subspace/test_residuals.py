@@ -255,6 +255,22 @@ def test_sensitivities_are_spanned_by_every_pole_taken_twice():
             assert_allclose(Q @ (Q.T @ change), change, atol=1e-6)
 
 
+def test_p_values_do_not_turn_on_rounding():
+    """Errors that change by 1e-14, where regressors are combinations of others."""
+    rng = np.random.default_rng(8)
+    poles = np.array([0.99, 0.83, 0.6 + 0.45j, 0.6 - 0.45j])
+    u, white = held(rng, 600), rng.standard_normal(600)
+    e = lfilter([1.0], [1.0, -0.8], white)[:, None]
+    direct = np.ones((1, 1), dtype=bool)
+    expected = input_tests([e], [u], 25, Fitted(poles, direct, np.eye(1)[None]))
+    for _ in range(4):
+        near = Fitted(poles * (1.0 + 1e-14 * rng.random()), direct, np.eye(1)[None])
+        found = input_tests([e * (1.0 + 1e-14 * rng.random(e.shape))], [u], 25, near)
+        for ours, theirs in zip(found, expected, strict=True):
+            assert ours[0][0].dof == theirs[0][0].dof
+            assert_allclose(ours[0][0].p_value, theirs[0][0].p_value, rtol=1e-9)
+
+
 def p_values_of_fits(pole, errors, n_runs):
     """Fits tested on their samples; and where these are not recognised."""
     A, b, c, d = modes(0.9, 0.6 * np.exp(1.0j)), np.ones((3, 1)), np.ones((1, 3)), 0.5
