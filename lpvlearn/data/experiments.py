@@ -187,6 +187,8 @@ class Table:
     """
 
     def __init__(self, X: Any, argument: str = "X") -> None:
+        if isinstance(X, np.matrix):  # of which a column is a matrix again
+            X = np.asarray(X)
         X = X if is_table(X) or hasattr(X, "dtype") else np.asarray(X, object)
         if len(X.shape) != 2:
             raise ValueError(

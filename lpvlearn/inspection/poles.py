@@ -314,9 +314,11 @@ def _pair(prefix: str, kappa: ArrayLike, poles: ArrayLike) -> tuple[Array, Compl
             f"`{prefix}poles` must have shape ({len(points)}, order), a row for each "
             f"value of `{prefix}kappa`. Got {table.shape}."
         )
-    if not np.isfinite(points).all() or np.isinf(table).any():
+    bad = ~np.isfinite(points).all(axis=1) | np.isinf(table).any(axis=1)
+    if bad.any():
         raise ValueError(
-            f"`{prefix}kappa` and `{prefix}poles` must be finite. Leave other points "
-            "out; poles that a point does not have may be NaN."
+            f"`{prefix}kappa` and `{prefix}poles` must be finite. Got {points[bad][0]} "
+            f"and {table[bad][0]}. Leave such points out; poles that a point does not "
+            "have may be NaN."
         )
     return points, table

@@ -104,7 +104,8 @@ class SimulationDisplay:
         time_label: str = "Time (s)",
         true_name: str = "measured",
     ) -> None:
-        self.y_true, names = read_outputs(y_true)
+        outputs, names = read_outputs(y_true)
+        self.y_true = as_numbers("y_true", outputs)
         n_outputs = self.y_true.shape[1]
         self.time = as_numbers("time", time, finite=True)
         if self.time.shape != (len(self.y_true),):
@@ -113,7 +114,7 @@ class SimulationDisplay:
                 f"of `y_true`. Got {self.time.shape}."
             )
         self.predictions = {
-            name: read_outputs(y)[0]
+            name: as_numbers("predictions", read_outputs(y)[0])
             for name, y in by_name("predictions", predictions).items()
         }
         self.true_name = true_name = str(true_name)
@@ -131,7 +132,8 @@ class SimulationDisplay:
                 )
             self.bft_[name] = bft_score(self.y_true, y_pred, multioutput="raw_values")
         self.std = {
-            name: read_outputs(own)[0] for name, own in by_name("std", std).items()
+            name: as_numbers("std", read_outputs(own)[0])
+            for name, own in by_name("std", std).items()
         }
         for name, own in self.std.items():
             if name not in self.predictions or own.shape != self.y_true.shape:
@@ -182,8 +184,8 @@ class SimulationDisplay:
         Raises
         ------
         ValueError
-            If shapes differ, a value is infinite, a simulation is NaN where there is a
-            measurement, or `zoom` holds no samples.
+            If shapes differ, a value is infinite or huge, a simulation is NaN where
+            there is a measurement, or `zoom` holds no samples.
         """
         named = y_pred if isinstance(y_pred, Mapping) else {"simulated": y_pred}
         display = cls(

@@ -238,7 +238,7 @@ def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
         return None
     # on the unit circle, by the bilinear map whose quarter turn is in the middle
     positive = omega[omega > 0]
-    centre = float(np.exp(0.5 * np.log(positive.min() * positive.max())))
+    centre = float(np.sqrt(positive.min()) * np.sqrt(positive.max()))
     z = (centre + 1j * omega) / (centre - 1j * omega)
     # what the inputs leave of [G; z G; z^2 G; ...] spans the observability matrix
     powers = z ** np.arange(rows)[:, None]
@@ -292,7 +292,7 @@ def stable_realization(omega: Array, G: Complex, order: int) -> Target | None:
     if order == 0:
         return None
     p, positive = G.shape[1], omega[omega > 0]
-    rate = float(np.exp(0.5 * np.log(positive.min() * positive.max())))
+    rate = float(np.sqrt(positive.min()) * np.sqrt(positive.max()))
     return _with_poles(omega, G, -rate * np.eye(p), np.eye(p))
 
 

@@ -119,7 +119,7 @@ class FunctionMap(StructureMap):
         This changes the warning filters for a moment, which are those of all threads:
         it belongs where a structure is made, not where it is fitted.
         """
-        theta = np.where(self.typical == 0.0, 1.0, self.typical)
+        theta = np.where(np.abs(self.typical) > _NO_SIZE, self.typical, 1.0)
         try:
             with _FILTERS, warnings.catch_warnings():
                 warnings.simplefilter("error", ComplexWarning)

@@ -22,7 +22,7 @@ from ..data.preparation import (
     remove_trends,
 )
 from ..exceptions import RankWarning, warn
-from ..validation import is_whole, one_of, positive_time, shown
+from ..validation import is_whole, one_of, positive_time, real_array, shown
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .held_out import HeldOut, held_out
 from .identification import (
@@ -116,12 +116,7 @@ def check_options(options: Mapping[str, Any]) -> Choices:
     one_of("detrend", options["detrend"], DETRENDS)
     one_of("offset", options["offset"], tuple(N_TRENDS))
     one_of("refine", options["refine"], (*REFINEMENTS, True, False))
-    feedthrough = options["feedthrough"]
-    if np.ndim(feedthrough) == 0 and feedthrough not in (True, False):
-        raise ValueError(
-            "`feedthrough` must be True, False or a table of them, shape (n_outputs, "
-            f"n_inputs). Got {feedthrough!r}."
-        )
+    _feedthrough(options["feedthrough"])
     if options["sampling_time"] is not None:
         positive_time("sampling_time", options["sampling_time"])
     if options["initial_state"] == "rest" and options["missing"] == "split":
@@ -156,19 +151,32 @@ def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:
     return int(value)
 
 
+def _feedthrough(value: Any) -> NDArray[np.bool_]:
+    """The option as one or a table of booleans."""
+    try:
+        mask = real_array("feedthrough", value)
+    except ValueError:
+        mask = np.full(1, np.nan)
+    if not np.isin(mask, (0.0, 1.0)).all():
+        raise ValueError(
+            "`feedthrough` must be True, False or a table of them, shape (n_outputs, "
+            f"n_inputs). Got {shown(value)}."
+        )
+    return mask.astype(bool)
+
+
 def _feedthrough_mask(
     feedthrough: Any, n_outputs: int, n_inputs: int, rank: int
 ) -> NDArray[np.bool_]:
     """Free entries of D for the independent inputs, (n_outputs, rank)."""
-    mask = np.asarray(feedthrough)
+    mask = _feedthrough(feedthrough)
     if mask.ndim == 0:
-        return np.full((n_outputs, rank), bool(feedthrough))
+        return np.full((n_outputs, rank), mask)
     if mask.shape != (n_outputs, n_inputs):
         raise ValueError(
             "`feedthrough` must be True, False or a table of shape (n_outputs, "
             f"n_inputs) = ({n_outputs}, {n_inputs}). Got shape {mask.shape}."
         )
-    mask = mask.astype(bool)
     if rank == n_inputs or mask.all() or not mask.any():
         return mask[:, :rank]
     raise ValueError(

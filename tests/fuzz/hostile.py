@@ -41,7 +41,7 @@ SCALARS = (
         np.uint64(2**64 - 1),
     ),
     *(np.bool_(True), np.str_("x"), np.bytes_(b"x"), np.complex64(1j)),
-    *(np.datetime64("2020-01-01"), np.datetime64("NaT"), np.timedelta64(1, "s")),
+    *(np.datetime64("2020-01-01"), np.datetime64("NaT", "s"), np.timedelta64(1, "s")),
 )
 
 CONTAINERS = (

@@ -211,6 +211,23 @@ HUGE = np.full((4, 2), 1e308)
             # LAPACK finds them or does not, by its version
             "`A` must be stable, beyond rounding|eigenvalues of `A` did not converge",
         ),
+        ("SubspaceLTI.fit", {"feedthrough": pd.NA}, "`feedthrough` must be True"),
+        ("SubspaceLTI.fit", {"feedthrough": [[1], [1, 2]]}, "`feedthrough` must be T"),
+        (
+            "PoleDisplay",
+            {"poles": np.full((4, 2), np.inf)},
+            "must be finite. Got .0.*inf",
+        ),
+        (
+            "SimulationDisplay",
+            {"y_true": HUGE[:, :1]},
+            "`y_true` must hold numbers below",
+        ),
+        (
+            "GrayBoxRestructurer.fit(noise)",
+            {"omega": [1e-201, 1e-200, 1e-199]},
+            "no stable starting point",
+        ),
     ],
 )
 def test_what_surveys_found_is_told(name, spoiled, told):
@@ -234,6 +251,16 @@ def test_what_surveys_found_is_right():
     frequencies = np.array([1.0, 2.0, 3.0])
     display = ErrorDisplay(frequencies, np.full(3, np.inf), start=frequencies)
     assert np.isfinite(display.plot().ax_.get_ylim()).all()
+    columns = np.column_stack([np.repeat([0.0, 1.0, 2.0], 9), np.arange(27.0)])
+    folds = lp.BlockedTimeSeriesSplit(2, experiment=0)
+    for ours, theirs in zip(
+        folds.split(columns.view(np.matrix)), folds.split(columns), strict=True
+    ):
+        assert all((a == b).all() for a, b in zip(ours, theirs, strict=True))
+    tiny = lp.GrayBoxStructure.from_function(
+        lambda t: ([[-t[0]]], [[t[1]]], [[1.0]]), [1e-320, 1.0]
+    )
+    assert (tiny.jacobian([2.0, 3.0]).ravel() == [-1, 0, 0, 0, 0, 1, 0, 0]).all()
     for score in (lp.bft_score, lp.vaf_score):
         assert score(1e-200 * theta, 1e-200 * theta[::-1]) == score(theta, theta[::-1])
 
