@@ -1,5 +1,6 @@
 """A valid call of every public name, of which a test spoils an argument or two."""
 
+import contextlib
 import tempfile
 import warnings
 from functools import cache
@@ -56,10 +57,17 @@ def world():
         pipeline = spring_pipeline(local=told).fit(X, y)
         restructurer = lp.GrayBoxRestructurer(spring_structure(), norm="h2")
         restructurer.fit_model(spring_lpv().at(0.5))
+        refined = lp.OutputErrorLPV(
+            spring_lpv(), **TABLE_ROLES, scheduling="kappa", max_iter=1
+        ).fit(X, y)
     slow = lp.StateSpace([[0, 1], [-4, -1]], [[0], [1]], [[1, 0]])
     fast = slow.to_discrete(0.1)
     noise = models.NoiseModel([[0.5]], [[1.0]], [[0.3]], [[1.0]])
+    parquet = Path(tempfile.mkdtemp()) / "part.parquet"
+    with contextlib.suppress(ImportError):  # without pyarrow
+        X.join(y).to_parquet(parquet)
     return SimpleNamespace(
+        parquet=parquet,
         X=X,
         y=y,
         U=X[["force"]].to_numpy()[:60],
@@ -68,6 +76,7 @@ def world():
         quick=quick,
         subspace=subspace,
         pipeline=pipeline,
+        refined=refined,
         restructurer=restructurer,
         slow=slow,
         fast=fast,
@@ -145,6 +154,10 @@ def lti_calls(w):
     C, D = np.array([[1.0, 0.0]]), np.array([[0.0]])
     yield "StateSpace", lp.StateSpace, {
         "A": A, "B": B, "C": C, "D": D, "sampling_time": 0.1, "input_delay": 1,
+        "input_names": ["u"], "output_names": ["y"], "units": {"y": "m"},
+    }  # fmt: skip
+    yield "StateSpace.with_names", w.slow.with_names, {
+        "input_names": ["u"], "output_names": ["y"], "units": {"y": "m"},
     }  # fmt: skip
     for name, model in {"slow": w.slow, "fast": w.fast}.items():
         own = f"StateSpace({name})."
@@ -204,7 +217,8 @@ def structure_calls(w):
     make, cells = lp.GrayBoxStructure, [["0", "1"], ["-k", "-c"]]
     yield "GrayBoxStructure", make, {
         "order": 2, "map": w.structure.map, "parameter_names": ["b", "c", "k"],
-        "initial": np.array(THETA),
+        "initial": np.array(THETA), "lower": np.zeros(3), "upper": np.full(3, 99.0),
+        "ranges": np.array([[1.0] * 3, [99.0] * 3]),
     }  # fmt: skip
     yield "GrayBoxStructure.from_template", make.from_template, {
         "A": cells, "B": [["0"], ["b"]], "C": [[1, 0]], "D": [[0.0]],
@@ -214,6 +228,7 @@ def structure_calls(w):
     yield "GrayBoxStructure.from_function", make.from_function, {
         "function": lambda t: ([[-t[0]]], [[t[1]]], [[1.0]]),
         "initial": np.array([1.0, 2.0]), "parameter_names": ["a", "b"],
+        "jacobian": None,
     }  # fmt: skip
     yield "GrayBoxStructure.mechanical", make.mechanical, {
         "M": [["m"]], "D": [["c"]], "K": [["k"]], "F": [[1.0]], "outputs": "position",
@@ -221,16 +236,21 @@ def structure_calls(w):
         "parameter_names": ["c", "k", "m"],
     }  # fmt: skip
     sizes = {"n_inputs": 1, "n_outputs": 2, "feedthrough": True}
-    yield "GrayBoxStructure.full", make.full, {"order": 2, **sizes}
+    yield "GrayBoxStructure.full", make.full, {
+        "order": 2, **sizes, "integrating": [0],
+    }  # fmt: skip
     yield "GrayBoxStructure.observable_canonical", make.observable_canonical, {
         "order": 2, **sizes,
     }  # fmt: skip
     yield "GrayBoxStructure.modal", make.modal, {
         "n_modes": 1, **sizes, "n_real": 1, "normalize": "input",
     }  # fmt: skip
-    for name in ("matrices", "model", "jacobian", "system_matrix", "check_params"):
+    for name in ("matrices", "jacobian", "system_matrix", "check_params"):
         call = getattr(w.structure, name)
         yield f"GrayBoxStructure.{name}", call, {"theta": np.array(THETA)}
+    yield "GrayBoxStructure.model", w.structure.model, {
+        "theta": np.array(THETA), "sampling_time": 0.1,
+    }  # fmt: skip
     for name, value in {
         "fix": {"k": 40.0},
         "with_bounds": {"k": (1.0, 50.0)},
@@ -258,7 +278,8 @@ def restructuring_calls(w):
         ).fit(omega, frf, sample_weight).params_
     ), {"omega": w.omega, "frf": frf, "sample_weight": np.ones(3), **options,
         "norm": "hinf",
-        "init": THETA, "random_state": 0}  # fmt: skip
+        "init": THETA, "random_state": 0, "solver": "sqp", "max_time": 10.0,
+        "known_poles": None}  # fmt: skip
     noisy = {"omega": w.omega, "frf": frf, "noise": np.full(3, 1e-3)}
     known = lp.GrayBoxRestructurer(w.structure, norm="covariance", init=THETA)
     yield "GrayBoxRestructurer.fit(noise)", (
@@ -273,13 +294,21 @@ def restructuring_calls(w):
         lambda confidence: clone(known).fit(**noisy).confidence_intervals(confidence)
     ), {"confidence": 0.9}  # fmt: skip
     yield "GrayBoxRestructurer.fit_model", (
-        lambda model, **o: lp.GrayBoxRestructurer(**{**options, **o})
-        .fit_model(model).params_
+        lambda model, starts, realizations, search, **o: lp.GrayBoxRestructurer(
+            **{**options, **o}
+        ).fit_model(
+            model, starts=starts, realizations=realizations, search=search
+        ).params_
     ), {"model": w.lpv.at(0.5), "structure": w.structure, **options, "init": THETA,
-        "solver": "sqp", "random_state": 0, "frequency_weight": None}  # fmt: skip
+        "solver": "sqp", "random_state": 0, "frequency_weight": None,
+        "max_time": 10.0, "known_poles": None,
+        "starts": [np.array(THETA)], "realizations": [w.lpv.at(0.5), w.lpv.at(0.6)],
+        "search": True}  # fmt: skip
     r = w.restructurer
     yield "GrayBoxRestructurer.predict", r.predict, {"omega": w.omega}
-    yield "GrayBoxRestructurer.score", r.score, {"X": w.omega, "y": frf}
+    yield "GrayBoxRestructurer.score", r.score, {
+        "X": w.omega, "y": frf, "sample_weight": np.ones(3),
+    }  # fmt: skip
     yield (
         "GrayBoxRestructurer.interchanged",
         (lambda places: r.interchanged(places).params_),
@@ -300,7 +329,15 @@ def lpv_calls(w):
     for name, make, options in (
         ("PolynomialLPV", lp.PolynomialLPV, {"degree": 1, "basis": "chebyshev"}),
         ("SplineLPV", lp.SplineLPV, {"kind": "pchip"}),
-        ("RationalLPV", lp.RationalLPV, {"degree": 1, "denominator": 1}),
+        (
+            "RationalLPV",
+            lp.RationalLPV,
+            {
+                "degree": 1,
+                "denominator": 1,
+                "terms": "total",
+            },
+        ),
         ("AutoLPV", lp.AutoLPV, {"criterion": "aic"}),
     ):
         yield name, fit_interpolator(make), {
@@ -309,12 +346,17 @@ def lpv_calls(w):
         fitted = make().fit(w.kappa, w.theta)
         for method in ("predict", "sensitivities"):
             yield f"{name}.{method}", getattr(fitted, method), {"X": w.kappa}
-        yield f"{name}.score", fitted.score, {"X": w.kappa, "y": w.theta}
+        yield f"{name}.score", fitted.score, {
+            "X": w.kappa, "y": w.theta, "sample_weight": np.ones(4),
+        }  # fmt: skip
         yield (
             f"{name}.with_coefficients",
             fitted.with_coefficients,
             {"coefficients": fitted.coefficients()},
         )
+    yield "PolynomialLPV.fit(weights)", (
+        lambda **a: lp.PolynomialLPV().fit(**a).predict(w.kappa)
+    ), {"X": w.kappa, "y": w.theta, "sample_weight": np.ones(4)}  # fmt: skip
     grid = np.array(np.meshgrid([0.0, 1, 2], [0.0, 1, 2], [0.0, 1])).reshape(3, -1).T
     yield "PolynomialLPV(3 variables)", fit_interpolator(lp.PolynomialLPV), {
         "X": grid, "y": grid, "degree": 1,
@@ -324,7 +366,8 @@ def lpv_calls(w):
         "structure": w.structure, "interpolator": model.interpolator,
         "scheduling_range": np.array([[0.0], [1.5]]), "scheduling_names": ["kappa"],
         "identified_range": np.array([[0.0], [1.5]]), "input_delay": 0,
-        "input_names": ["u"], "output_names": ["y"],
+        "input_names": ["u"], "output_names": ["y"], "covariance": np.eye(9),
+        "units": {"kappa": "m"},
     }  # fmt: skip
     yield "LPVStateSpace.simulate", model.simulate, {
         "u": w.U, "scheduling": w.K, "sampling_time": 0.02,
@@ -334,8 +377,12 @@ def lpv_calls(w):
         "scheduling": w.K, "sampling_time": 0.02,
     }  # fmt: skip
     fitted = w.pipeline.lpv_
-    for method in ("at", "input_offset", "output_offset", "state_offset"):
+    for method in ("input_offset", "output_offset", "state_offset"):
         yield f"LPVStateSpace.{method}", getattr(model, method), {"kappa": 0.5}
+    yield "LPVStateSpace.at", model.at, {"kappa": 0.5, "rate": 0.0}
+    yield "LPVStateSpace.rest_and_free_responses", model.rest_and_free_responses, {
+        "u": w.U, "scheduling": w.K, "sampling_time": 0.02,
+    }  # fmt: skip
     for method in ("parameters", "frozen_poles", "parameter_deviations"):
         yield f"LPVStateSpace.{method}", getattr(fitted, method), {"kappa": w.kappa}
     yield "LPVStateSpace.parameters(std)", fitted.parameters, {
@@ -353,6 +400,9 @@ def lpv_calls(w):
         lambda points: to_mat(model, points),
         {"points": w.kappa},
     )
+    yield "LPVStateSpace.to_mat(path)", model.to_mat, {
+        "path": tempfile.mktemp(".mat"), "points": w.kappa,
+    }  # fmt: skip
     yield "MatrixCoefficients.at", model.coefficients().at, {"kappa": 0.5}
     yield "LinearFractionalModel.at", model.lfr().at, {"kappa": 0.5}
     yield "LinearFractionalModel.delta", model.lfr().delta, {"kappa": 0.5}
@@ -384,8 +434,15 @@ def data_calls(w):
     yield "ExperimentSplit", splitting(lp.ExperimentSplit), {
         **table, "n_splits": 3, "experiment": "run", "scheduling": "kappa",
         "hold_out": "experiment", "interior": False, "test_on": "held_out",
-        "shuffle": True, "random_state": 0,
+        "shuffle": True, "random_state": 0, "operating_point": None,
     }  # fmt: skip
+    for name, split in {
+        "ExperimentSplit": lp.ExperimentSplit(3),
+        "BlockedTimeSeriesSplit": lp.BlockedTimeSeriesSplit(3),
+    }.items():
+        yield f"{name}.split", (
+            lambda X, groups, split=split: [*map(list, split.split(X, None, groups))]
+        ), {"X": w.X, "groups": w.X["run"].to_numpy()}  # fmt: skip
     yield (
         "ExperimentSplit.get_n_splits",
         (lp.ExperimentSplit(3, experiment="run").get_n_splits),
@@ -431,6 +488,7 @@ def score_calls(w):
     yield "compare_models", lp.compare_models, {
         "models": {"a": w.pipeline, "b": w.lpv}, **table, "initial_state": "rest",
         "burn_in": 2, "scheduling": "kappa", "experiment": "run", "time": "time",
+        "inputs": "force",
     }  # fmt: skip
     yield (
         "readable_report",
@@ -448,6 +506,7 @@ def estimator_calls(w):
     }  # fmt: skip
     yield "SubspaceLTI.fit", fitting(lp.SubspaceLTI), {
         **table, **quick, **more, **TABLE_ROLES, "scheduling": "kappa",
+        "operating_point": None,
     }  # fmt: skip
     short = w.X.iloc[:60].drop(columns=["run"]), w.y.iloc[:60]
     yield "SubspaceLTI.fit(one experiment)", fitting(lp.SubspaceLTI, **QUICK), {
@@ -456,14 +515,30 @@ def estimator_calls(w):
     yield "SubspaceLTI.fit(arrays)", fitting(lp.SubspaceLTI, **QUICK), {
         "X": w.U, "y": w.Y, "order": 2,
     }  # fmt: skip
+    yield "SubspaceLTI.fit(automatic)", fitting(lp.SubspaceLTI), {
+        "X": w.U, "y": w.Y, "order": "auto", "method": "auto", "horizon": "auto",
+        "refine": "auto", "offset": "auto", "n_noise_states": "auto",
+        "input_delay": "auto", "feedthrough": np.array([[True]]),
+    }  # fmt: skip
+    yield "SubspaceLTI.fit(closed loop)", fitting(
+        lp.SubspaceLTI, order=2, method="pbsid", **TABLE_ROLES
+    ), {**table, "stability": "enforce", "offset": None,
+        "missing": "split"}  # fmt: skip
+    yield "SubspaceLTI.fit(integrating)", fitting(
+        lp.SubspaceLTI, **QUICK, **TABLE_ROLES
+    ), {**table, "integrating": True}  # fmt: skip
+    runs = lp.SubspaceLTI(**QUICK, **TABLE_ROLES)
+    yield "SubspaceLTI.fit_each", clone(runs).fit_each, table
+    yield "SubspaceLTI.fit_batches", clone(runs).fit_batches, {"batches": [(w.X, w.y)]}
+    yield "SubspaceLTI.set_output", clone(runs).set_output, {"transform": "pandas"}
     yield "SubspaceLTI.partial_fit", streaming, {
         **table, "X_next": w.X.assign(run=w.X["run"] + "b"),
         "y_next": w.y, "order": 2, "horizon": 5, "missing": "raise",
     }  # fmt: skip
     m = w.subspace
     yield "SubspaceLTI.predict", m.predict, {"X": w.X}
-    for name in ("predict_with_initial_state", "score"):
-        yield f"SubspaceLTI.{name}", getattr(m, name), table
+    yield "SubspaceLTI.predict_with_initial_state", m.predict_with_initial_state, table
+    yield "SubspaceLTI.score", m.score, {**table, "sample_weight": np.ones(len(w.X))}
     yield "SubspaceLTI.predict_ahead", m.predict_ahead, {
         **table, "steps": 2, "initial_state": "estimate",
     }  # fmt: skip
@@ -483,15 +558,24 @@ def pipeline_calls(w):
         "refiner": None, "operating_point": None, "scheduling_tol": 0.01,
         "sampling_time": 0.02, "time_tol": 0.01, "combine": "pool",
         "discretization": "zoh", "offsets": None, "efficient": True,
-        "on_error": "raise", "verbose": 0}  # fmt: skip
+        "on_error": "raise", "verbose": 0, "max_time": 10.0, "memory": None,
+        "units": {"kappa": "m"}}  # fmt: skip
     yield "LocalLPVPipeline.fit(parts)", fitting(lp.LocalLPVPipeline, **ROLES), {
         **table, "local": w.quick, "restructurer": "passthrough",
         "interpolator": lp.PolynomialLPV(1),
     }  # fmt: skip
     p = w.pipeline
     yield "LocalLPVPipeline.predict", p.predict, {"X": w.X, "return_std": False}
-    for name in ("predict_with_initial_state", "score"):
-        yield f"LocalLPVPipeline.{name}", getattr(p, name), table
+    yield "LocalLPVPipeline.predict_with_initial_state", (
+        p.predict_with_initial_state
+    ), table  # fmt: skip
+    yield "LocalLPVPipeline.score", p.score, {
+        **table, "sample_weight": np.ones(len(w.X)),
+    }  # fmt: skip
+    if w.parquet.exists():
+        yield "LocalLPVPipeline.fit_dataset", clone(p).fit_dataset, {
+            "dataset": w.parquet, "outputs": ["position"],
+        }  # fmt: skip
     for name in ("split_experiments", "prediction_std"):
         yield f"LocalLPVPipeline.{name}", getattr(p, name), {"X": w.X}
     yield "suggest_operating_point", lp.suggest_operating_point, {
@@ -501,12 +585,18 @@ def pipeline_calls(w):
         **table, **TABLE_ROLES, "scheduling": "kappa", "start": w.lpv, "rate": False,
         "prior": None, "initial_state": "rest", "offset": None, "missing": "raise",
         "sampling_time": 0.02, "time_tol": 0.01, "max_iter": 2, "verbose": 0,
+        "interpolator": None, "local": None, "units": None,
     }  # fmt: skip
+    yield "OutputErrorLPV.predict", w.refined.predict, {"X": w.X, "return_std": False}
+    yield "OutputErrorLPV.predict_with_initial_state", (
+        w.refined.predict_with_initial_state
+    ), table  # fmt: skip
     yield "save", saved_and_loaded, {"model": w.pipeline}
     yield "save(path)", lp.save, {"model": w.slow, "path": tempfile.mktemp(".lpv")}
     yield "load", lp.load, {"path": GOLDEN, "function": None}
     yield "LocalLPVPipeline.to_html_report", lambda **a: html(p, **a), {
         **table, "initial_state": "rest", "title": "T", "units": {"position": "m"},
+        "figures": None,
     }  # fmt: skip
 
 
@@ -566,14 +656,15 @@ def display_calls(w):
     labels = {"output_names": ["y"], "input_names": ["u"]}
     yield "BodeDisplay", constructed(i.BodeDisplay), {
         "omega": w.omega, "responses": {"a": G}, "std": {"a": 0.1 * G}, **labels,
-        "frequency_label": "f",
+        "frequency_label": "f", "units": {"y": "m"},
     }  # fmt: skip
     yield "BodeDisplay.from_models", drawing(i.BodeDisplay.from_models), {
         "models": {"a": w.slow}, "omega": w.omega, **labels, "phase": True,
+        "units": {"y": "m"}, "std": None, "ax": None,
     }  # fmt: skip
     yield "BodeDisplay.from_estimator", drawing(i.BodeDisplay.from_estimator), {
         "estimator": w.pipeline, "kappa": 0.5, "others": {"b": w.slow},
-        "omega": w.omega, "uncertainty": True,
+        "omega": w.omega, "uncertainty": True, "units": {"y": "m"}, "phase": False,
     }  # fmt: skip
     yield "ErrorDisplay", constructed(i.ErrorDisplay), {
         "omega": w.omega, "error": w.omega, "start": w.omega, "floor": 0.1,
@@ -583,23 +674,28 @@ def display_calls(w):
     model = w.lpv.at(0.5)
     yield "ErrorDisplay.from_models", drawing(i.ErrorDisplay.from_models), {
         "gray_box": model, "black_box": w.lpv.at(0.6), "omega": w.omega, "floor": 0.1,
+        "start": w.lpv.at(0.7), "active_frequencies": w.omega[:1],
     }  # fmt: skip
     yield "ErrorDisplay.from_estimator", drawing(i.ErrorDisplay.from_estimator), {
         "restructurer": w.restructurer, "model": model, "start": None,
-        "omega": w.omega,
+        "omega": w.omega, "kappa": None, "ax": None,
     }  # fmt: skip
+    line = lp.PolynomialLPV(1).fit(w.kappa, w.theta)
     yield "ParameterDisplay", constructed(i.ParameterDisplay), {
         "kappa": w.kappa, "parameters": {"a": w.theta}, "names": ["k", "c"],
-        "std": {"a": 0.1 * w.theta}, "scheduling_label": "x",
+        "std": {"a": 0.1 * w.theta}, "scheduling_label": "x", "units": {"k": "N"},
+        "interpolators": {"a": line}, "curve_std": None,
     }  # fmt: skip
     yield "ParameterDisplay.from_parameters", drawing(
         i.ParameterDisplay.from_parameters
     ), {"kappa": w.kappa, "parameters": {"a": w.theta}, "names": ["k", "c"],
-        "interpolator": lp.PolynomialLPV(1), "n_columns": 2}  # fmt: skip
+        "interpolator": lp.PolynomialLPV(1), "n_columns": 2, "units": {"k": "N"},
+        "scheduling_label": "x", "ax": None}  # fmt: skip
     yield "ParameterDisplay.from_estimator", drawing(
         i.ParameterDisplay.from_estimator
     ), {"pipeline": w.pipeline, "names": ["k"], "name": "n", "uncertainty": True,
-        "scheduling_label": "s", "n_columns": 2}  # fmt: skip
+        "scheduling_label": "s", "n_columns": 2, "others": None, "forms": None,
+        "units": {"k": "N"}}  # fmt: skip
     poles = w.lpv.frozen_poles(w.kappa)
     yield "PoleDisplay", constructed(i.PoleDisplay), {
         "kappa": w.kappa, "poles": poles, "local_kappa": w.kappa, "local_poles": poles,
@@ -609,7 +705,8 @@ def display_calls(w):
         "model": w.lpv, "kappa": w.kappa, "damping": True, "scheduling_label": "s",
     }  # fmt: skip
     yield "PoleDisplay.from_estimator", drawing(i.PoleDisplay.from_estimator), {
-        "pipeline": w.pipeline, "kappa": w.kappa, "damping": False,
+        "pipeline": w.pipeline, "kappa": w.kappa, "damping": False, "units": None,
+        "scheduling_label": "s", "ax": None,
     }  # fmt: skip
     yield "ResidualDisplay", constructed(i.ResidualDisplay), {
         "errors": Y, "inputs": w.U, "n_lags": 5, "confidence": 0.9, **labels,
@@ -618,7 +715,7 @@ def display_calls(w):
     yield "ResidualDisplay.from_estimator", drawing(
         i.ResidualDisplay.from_estimator
     ), {"estimator": w.subspace, "X": w.X, "y": w.y, "errors": "simulation",
-        "n_lags": 5}  # fmt: skip
+        "n_lags": 5, "confidence": 0.9}  # fmt: skip
     yield (
         "ResidualDisplay.from_residuals",
         drawing(i.ResidualDisplay.from_residuals),
@@ -628,15 +725,17 @@ def display_calls(w):
     yield "SimulationDisplay", constructed(i.SimulationDisplay), {
         "time": time, "y_true": Y, "predictions": {"a": 0.9 * Y}, "units": ["m"],
         "std": {"a": 0.1 + 0 * Y}, "output_names": ["y"], "time_label": "t",
+        "true_name": "n",
     }  # fmt: skip
     yield "SimulationDisplay.from_predictions", drawing(
         i.SimulationDisplay.from_predictions
     ), {"time": time, "y_true": Y, "y_pred": 0.9 * Y, "zoom": [1.0, 2.0],
-        "output_names": ["y"]}  # fmt: skip
+        "output_names": ["y"], "units": "m", "true_name": "n"}  # fmt: skip
     yield "SimulationDisplay.from_estimator", drawing(
         i.SimulationDisplay.from_estimator
     ), {"estimator": w.pipeline, "X": w.X, "y": w.y, "experiment": "p0r0",
-        "initial_state": "rest", "name": "n", "units": "m"}  # fmt: skip
+        "initial_state": "rest", "name": "n", "units": "m", "uncertainty": False,
+        "zoom": [0.0, 1.0]}  # fmt: skip
     values = np.array([3.0, 1.0, 0.1])
     yield "SingularValueDisplay", constructed(i.SingularValueDisplay), {
         "singular_values": values, "order": 2,
@@ -658,6 +757,21 @@ def display_calls(w):
     yield "UncertaintyDisplay.from_estimator", drawing(
         i.UncertaintyDisplay.from_estimator
     ), {"pipeline": w.pipeline, "omega": w.omega, "units": {"kappa": "m"}}  # fmt: skip
+    plots = {
+        i.BodeDisplay.from_models({"a": w.slow}): {"phase": True, "n_std": 2.0},
+        i.ErrorDisplay(w.omega, w.omega): {},
+        i.ParameterDisplay(w.kappa, {"a": w.theta}): {"n_columns": 2, "n_std": 2.0},
+        i.PoleDisplay(w.kappa, poles): {"damping": True},
+        i.ResidualDisplay(Y, w.U): {},
+        i.SimulationDisplay(time, Y, {"a": 0.9 * Y}): {
+            "zoom": [1.0, 2.0], "n_std": 2.0,
+        },
+        i.SingularValueDisplay(values): {"n_shown": 3},
+    }  # fmt: skip
+    plt.close("all")
+    for display, options in plots.items():
+        name = f"{type(display).__name__}.plot"
+        yield name, drawing(display.plot), {"ax": None, **options}
     yield "plot_overview", i.plot_overview, {
         "pipeline": w.pipeline, "X": w.X, "y": w.y, "experiment": "p0r0",
         "units": {"position": "m"},

@@ -78,7 +78,21 @@ CONTAINERS = (
     pd.Index([1.0, 2.0]),
 )
 
-ANY = st.sampled_from((*NUMBERS, *SCALARS, *CONTAINERS))
+VALUES = (*NUMBERS, *SCALARS, *CONTAINERS)
+ANY = st.sampled_from(VALUES)
+
+# Options of one function or another: valid ones lead to other code.
+WORDS = (
+    *("auto", "all", "local", "default", "rest", "estimate", "raise", "split", "skip"),
+    *("n4sid", "cva", "pi-moesp", "po-moesp", "pbsid", "simulation", "prediction"),
+    *("warn", "enforce", "constant", "linear", "pool", "average", "zoh", "tustin"),
+    *("hinf", "linf", "h2", "covariance", "similarity", "random", "sqp", "bundle"),
+    *("power", "chebyshev", "legendre", "total", "tensor", "pchip", "cubic", "aic"),
+    *("bic", "clip", "error", "ignore", "raw_values", "uniform_average", "pandas"),
+    *("variance_weighted", "passthrough", "held_out", "experiment", "uncertainty"),
+    *("neighbour_gap", "operating_point", "position", "velocity", "acceleration"),
+    *("momentum", "rate", "flux", "input", "output", "force", "kappa", "run", "time"),
+)
 
 SPECIAL = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e200, 1e-320, 5e-324, 0.0, 1e16)
 
@@ -273,6 +287,8 @@ def hostile(value):
         return st.one_of(hostile_array(array), hostile_array(array), ANY)
     if isinstance(value, int | float) and not isinstance(value, bool):
         return st.one_of(st.sampled_from(NUMBERS), ANY)
+    if isinstance(value, str):
+        return st.one_of(st.sampled_from(WORDS), ANY)
     return ANY
 
 

@@ -2,8 +2,9 @@
 
     python -m tests.fuzz.survey 10000 --seed 1
 
-`--only` asks for calls whose name holds a text. Every find is a line of JSON in
-`--output`; finds of one place are printed once.
+`--each` puts every value of a list in the place of every argument instead. `--only`
+asks for calls whose name holds a text. Every find is a line of JSON in `--output`;
+finds of one place are printed once.
 """
 
 import argparse
@@ -17,7 +18,7 @@ import matplotlib
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
 from .calls import calls, shares
-from .hostile import spoiled
+from .hostile import VALUES, WORDS, spoiled
 from .outcomes import GOOD, outcome_of_spoiled
 
 BYTES = 8 << 30  # of memory: a call that asks for more fails, and this machine does not
@@ -45,9 +46,21 @@ def survey(name, n_cases, start):
     return cases
 
 
+def sweep(name):
+    """As `survey`, of every listed value in the place of every argument."""
+    call, cases = calls()[name], []
+    for argument, valid in call.arguments.items():
+        for value in (*VALUES, *WORDS) if isinstance(valid, str) else VALUES:
+            found = outcome_of_spoiled(call, {argument: value})
+            told = {argument: f"{value!r:.200} <{type(value).__name__}>"}
+            cases.append((name, found, told))
+    return cases
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("cases", type=int)
+    parser.add_argument("cases", type=int, nargs="?", default=10_000)
+    parser.add_argument("--each", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="")
     parser.add_argument("--output", default=None)
@@ -58,7 +71,7 @@ def main():
     cases = []
     for name, number in shares(asked.cases).items():
         if number and asked.only in name:
-            cases += survey(name, number, asked.seed)
+            cases += sweep(name) if asked.each else survey(name, number, asked.seed)
     counts = collections.Counter(found.kind for _, found, _ in cases)
     print(f"{len(cases)} cases in {time.process_time() - start:.0f} s of CPU:")
     for kind, count in counts.most_common():
