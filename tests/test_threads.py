@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, delayed, parallel_config
+from scipy import linalg
 from sklearn.base import clone
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import lpvlearn
-from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace, SubspaceLTI
 
 from .conftest import spring_pipeline, spring_tables
 
@@ -46,6 +47,24 @@ def test_threads_agree_with_a_serial_fit_and_put_back_the_threads_of_blas():
         assert blas_threads() == before
     for fitted in found:
         np.testing.assert_array_equal(fitted.parameters_.to_numpy(), expected)
+
+
+def test_a_local_fit_has_one_thread_of_blas_and_puts_back_what_it_found(monkeypatch):
+    seen, X = [], np.random.default_rng(0).standard_normal((200, 1))
+    y = np.cumsum(X, axis=0) * 0.5 ** np.arange(200)[:, None]
+    original = linalg.svd
+
+    def svd(*args, **options):
+        seen.append(blas_threads())
+        return original(*args, **options)
+
+    monkeypatch.setattr(linalg, "svd", svd)
+    with threadpool_limits(2, user_api="blas"):
+        before = blas_threads()
+        model = SubspaceLTI(1, horizon=5).fit(X, y)
+        model.residual_tests(X, y)
+        assert blas_threads() == before
+    assert seen and all(n == 1 for threads in seen for n in threads)
 
 
 def test_no_code_that_a_fit_runs_changes_the_filters(monkeypatch):

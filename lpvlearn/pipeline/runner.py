@@ -6,18 +6,16 @@ A `PointRunner` tells progress and failures, and keeps results in a memory.
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import Memory, delayed
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
 
 from ..exceptions import Told, collected, warn
+from ..subspace.threads import one_blas_thread
 from .memory import Remembered
 from .workers import results_of
 
@@ -166,45 +164,12 @@ def _attempt(
     """Run a step at one operating point; `stop_as` is its number if it must succeed."""
     told: list[Told] = []
     try:
-        with _ONE_BLAS_THREAD, collected() as told:
+        with one_blas_thread, collected() as told:
             return Done(function(*args, **shared), told)
     except (ValueError, np.linalg.LinAlgError) as error:
         if stop_as is not None:
             raise _Stopped(stop_as, error, told) from error
         return _Failure(error)  # told by the runner, who knows the other points
-
-
-class _OneBlasThread:
-    """One thread of BLAS as long as any thread of the process is within.
-
-    Their number is that of the process: the first one in sets it, and the last one out
-    puts it back.
-    """
-
-    def __init__(self) -> None:
-        self._lock, self._n_within = threading.Lock(), 0
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if not self._n_within:
-                self._limit = _blas().limit(limits=1, user_api="blas")
-                self._limit.__enter__()
-            self._n_within += 1
-
-    def __exit__(self, *error: object) -> None:
-        with self._lock:
-            self._n_within -= 1
-            if not self._n_within:
-                self._limit.__exit__(*error)
-
-
-_ONE_BLAS_THREAD = _OneBlasThread()
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    """Found once in every process: the search takes longer than a small step."""
-    return ThreadpoolController()
 
 
 def _done(found: Sequence[Done | _Failure]) -> list[Done | None]:

@@ -66,6 +66,7 @@ from .residuals import (
 )
 from .selection import selection_text
 from .stream import SampleStream, fit_as_stream
+from .threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -482,6 +483,7 @@ class SubspaceLTI(
             model._name(*_names_of(experiments, y))
         return [first, *others]
 
+    @one_blas_thread
     def _identify(
         self,
         experiments: list[Experiment],
@@ -789,6 +791,7 @@ class SubspaceLTI(
         self._take(fitted, stream.step, stream.delay)
         self._name(*stream.names)
 
+    @one_blas_thread
     def _delay_of(self, experiments: list[Experiment], choices: Choices) -> Delay:
         """Delays in samples, given or found."""
         first = experiments[0]

@@ -55,6 +55,7 @@ from .noise import autoregression
 from .signals import thinned
 from .simulation_fit import simulation_errors, with_initial_states
 from .statistics import Evidence
+from .threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -372,6 +373,7 @@ def whiteness_tests(
     ]
 
 
+@one_blas_thread
 def input_tests(
     errors: Sequence[Array],
     inputs: Sequence[Array],

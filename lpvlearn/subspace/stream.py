@@ -46,6 +46,7 @@ from .fit import (
     warn_about_pole,
 )
 from .stream_summary import Piece, StreamSummary
+from .threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -457,6 +458,7 @@ class SampleStream:
         self._label, self._open, self._in_transit = ordered[-1].label, unbroken, transit
         return out
 
+    @one_blas_thread
     def _fit_kept(self, left: Sequence[Piece]) -> tuple[LocalFit | None, list[Piece]]:
         """Fit while all samples are still there; what they leave no room for."""
         buffer, choices, left = self._buffer, self._choices, list(left)
@@ -487,6 +489,7 @@ class SampleStream:
             self._buffer = SampleBuffer(gaps=False)
         return fitted, left
 
+    @one_blas_thread
     def _fit_summaries(self, summary: StreamSummary) -> LocalFit:
         fitted = summary.fit()
         warn_about_pole(fitted.model.A, self._told)

@@ -1,0 +1,47 @@
+"""One thread of BLAS while small matrices are worked on.
+
+Between the many small products and factorizations of a fit, threads of BLAS wait for
+each other, spinning: of two threads a fit takes up to 50 times the processor's time of
+one, and more where other programs want the processor, too.
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ContextDecorator
+from functools import cache
+
+from threadpoolctl import ThreadpoolController
+
+
+class _OneBlasThread(ContextDecorator):
+    """One thread of BLAS as long as any thread of the process is within.
+
+    Their number is that of the process: the first one in sets it, and the last one out
+    puts it back.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._n_within = threading.Lock(), 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._n_within:
+                self._limit = _blas().limit(limits=1, user_api="blas")
+                self._limit.__enter__()
+            self._n_within += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._n_within -= 1
+            if not self._n_within:
+                self._limit.__exit__(*error)
+
+
+one_blas_thread = _OneBlasThread()
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """Found once in every process: the search takes longer than a small step."""
+    return ThreadpoolController()
