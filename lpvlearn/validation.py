@@ -155,6 +155,18 @@ def all_finite(name: str, array: Array, place: str) -> Array:
     return array
 
 
+def weights(value: Any, n: int, of: str = "row") -> Array:
+    """`sample_weight` as a vector of `n` weights, or a ValueError."""
+    found = real_array("sample_weight", value)
+    good = found.shape == (n,) and (found >= 0.0).all() and (found < SQUARED).all()
+    if not good or not found.any():
+        raise ValueError(
+            f"`sample_weight` must hold {n} weights, one for each {of}: finite, not "
+            f"negative and not all zero. Got {shown(value)}."
+        )
+    return found
+
+
 def verbosity(value: Any) -> None:
     """Refuse a `verbose` that is neither a boolean nor an integer of at least 0."""
     if not isinstance(value, bool):

@@ -10,7 +10,7 @@ from scipy.special import fdtrc
 from sklearn.metrics import r2_score
 
 from ..exceptions import collected, warn
-from ..validation import real_array, shown, squarable
+from ..validation import squarable, weights
 from .alignment import align_outputs
 from .experiments import read_outputs
 
@@ -52,16 +52,8 @@ def score_from_rest(
         )
     weight = None
     if sample_weight is not None:
-        weight = real_array("sample_weight", sample_weight)
-        if (
-            weight.shape != known.shape
-            or not (np.isfinite(weight) & (weight >= 0)).all()
-        ):
-            raise ValueError(
-                f"`sample_weight` must hold {len(measured)} finite numbers, 0 or more, "
-                f"one for each row. Got {shown(sample_weight)}."
-            )
-        weight = weight[known]
+        weight = weights(sample_weight, len(measured))[known]
+        weights(weight, len(weight), "measured row")
     squarable("y", measured[known])
     score = r2_score(measured[known], simulated[known], sample_weight=weight)
     warn_of_motion(estimator, X, y, simulated)

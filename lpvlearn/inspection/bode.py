@@ -192,7 +192,7 @@ class BodeDisplay:
         )
         for name, model in models.items():
             check_model(f"models[{name!r}]", model, hint=hint)
-        if std and omega is None:
+        if by_name("std", std) and omega is None:
             raise ValueError(
                 "`omega` must be given with `std`, which belongs to frequencies. Got "
                 "None."

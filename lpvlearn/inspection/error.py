@@ -148,6 +148,8 @@ class ErrorDisplay:
         """
         check_model("gray_box", gray_box)
         check_model("black_box", black_box)
+        if start is not None:
+            check_model("start", start)
         difference = gray_box - black_box
         active = _vector("active_frequencies", active_frequencies)
         marked = np.minimum(active, nyquist_frequency(difference))

@@ -10,14 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.utils.validation import (
-    check_array,
-    check_consistent_length,
     check_is_fitted,
     validate_data,
 )
 
 from ..exceptions import ExtrapolationWarning, VersionedPickle, all_or_nothing, warn
-from ..validation import SQUARED, naming_argument, one_of, real_array, squarable
+from ..validation import (
+    SQUARED,
+    naming_argument,
+    one_of,
+    real_array,
+    squarable,
+    weights,
+)
 from .weighting import WeightedPoints, is_chance, weighted_points
 
 Array = NDArray[np.float64]
@@ -131,7 +136,9 @@ class Interpolator(
         ValueError
             When a value is too large to be squared, or shapes do not fit.
         """
-        squarable("y", real_array("y", y))
+        y = squarable("y", real_array("y", y))
+        if sample_weight is not None:
+            sample_weight = weights(sample_weight, len(np.atleast_1d(y)), "point")
         return float(super().score(X, y, sample_weight))
 
     def coefficients(self) -> Array:
@@ -317,7 +324,9 @@ class Interpolator(
             kappa, params = validate_data(
                 self, X, y, dtype=np.float64, multi_output=True, y_numeric=True
             )
-        weight = _check_weight(sample_weight, kappa)
+        weight = np.ones(len(kappa))
+        if sample_weight is not None:
+            weight = weights(sample_weight, len(kappa), "point")
         self._single_parameter = params.ndim == 1
         theta = real_array("y", params).reshape(len(kappa), -1)
         squarable("X", kappa), squarable("y", theta)
@@ -347,25 +356,6 @@ def carried_by_terms(outer: Array, terms: Array) -> Array:
     each = terms[:, :, None] if terms.ndim == 2 else terms
     carried = outer[:, :, None, :] * each[:, None]
     return carried.reshape(*outer.shape[:2], -1)
-
-
-def _check_weight(sample_weight: ArrayLike | None, X: Array) -> Array:
-    if sample_weight is None:
-        return np.ones(len(X))
-    weight = check_array(
-        sample_weight, dtype=np.float64, ensure_2d=False, input_name="sample_weight"
-    )
-    if weight.ndim != 1:
-        raise ValueError(
-            f"`sample_weight` must be one-dimensional. Got shape {weight.shape}."
-        )
-    check_consistent_length(X, weight)
-    if weight.min() < 0 or weight.max() == 0:
-        raise ValueError(
-            "`sample_weight` must be non-negative and not all zero. Got values from "
-            f"{weight.min():g} to {weight.max():g}."
-        )
-    return weight
 
 
 def domains(scheduling_range: Array) -> Array:

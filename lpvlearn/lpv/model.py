@@ -692,6 +692,11 @@ class LPVStateSpace:
         u = finite_samples("u", u, self.n_inputs)
         delay, n = self._samples_of_delay(dt), self.order
         kappa = self._scheduling(scheduling)
+        if len(u) != len(kappa):
+            raise ValueError(
+                "`u` and `scheduling` must have as many rows. Got "
+                f"{len(u)} and {len(kappa)}."
+            )
         u0, _, x0 = self.silenced()._point_of_work(kappa[:1])
         x, before = x0.sum(axis=0), np.repeat(u0.sum(axis=0), delay)
         if initial_state is not None:

@@ -514,9 +514,8 @@ list, default=None
             )
 
         with watch.step("restructuring", bar=True):  # step 4
-            found = restructure_points(
-                restructurer, local, points, runner, self.max_time
-            )
+            limit = None if self.max_time is None else float(self.max_time)
+            found = restructure_points(restructurer, local, points, runner, limit)
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa

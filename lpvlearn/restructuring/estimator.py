@@ -35,6 +35,7 @@ from ..validation import (
     share,
     shown,
     squarable,
+    weights,
     whole_number,
 )
 from .deadline import bounded, time_is_up
@@ -642,8 +643,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         """
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
-        with bounded(self.max_time):
+        with bounded(self._seconds()):
             self._searched(problem, given, estimates, uncertainty, only_given)
+
+    def _seconds(self) -> float:
+        """`max_time`, which is checked, as a float; infinity for None."""
+        return np.inf if self.max_time is None else float(self.max_time)
 
     def _searched(
         self,
@@ -657,8 +662,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         with naming_argument("random_state", rule, self.random_state):
             seed = check_random_state(self.random_state).randint(2**31)
         enough = max(EXACT_FIT, _NOISY * uncertainty)
-        share = None if self.max_time is None else _SEARCH_SHARE * self.max_time
-        with bounded(share):
+        with bounded(_SEARCH_SHARE * self._seconds()):
             problem, fits = starts_of(
                 problem, self.init, self.n_starts, given, seed, only_given, enough
             )
@@ -906,8 +910,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         ValueError
             When a value is too large to be squared, or shapes do not fit.
         """
-        if squarable("y", real_array("y", y)).size == 0:
+        y = squarable("y", real_array("y", y))
+        if y.size == 0:
             raise ValueError("`y` must hold a row for each frequency. Got none.")
+        if sample_weight is not None:
+            sample_weight = weights(sample_weight, len(np.atleast_1d(y)), "frequency")
         return float(super().score(X, y, sample_weight))
 
     def __sklearn_tags__(self) -> Any:

@@ -14,7 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..systems.hinf_norm import PeakSet
 from ..systems.sampling import d2c_tustin
-from ..validation import real_array, shown, squarable, whole_number
+from ..validation import (
+    complex_array,
+    real_array,
+    shown,
+    squarable,
+    whole_number,
+)
 from .error_system import (
     ErrorSystem,
     Structure,
@@ -141,15 +147,14 @@ def read_frequency_data(
         )
     if len(np.unique(grid)) != len(grid):
         raise ValueError(f"`omega` must hold every frequency once. Got {shown(omega)}.")
-    table = np.asarray(frf)
+    G = complex_array("frf", frf)
     entries = n_outputs * n_inputs
-    if np.iscomplexobj(table):
-        if table.size != len(grid) * entries or table.shape[:1] != grid.shape:
+    if np.iscomplexobj(frf):
+        if G.size != len(grid) * entries or G.shape[:1] != grid.shape:
             raise ValueError(
                 f"complex `frf` must have shape ({len(grid)}, {n_outputs}, "
-                f"{n_inputs}). Got {table.shape}."
+                f"{n_inputs}). Got {G.shape}."
             )
-        G = table
     else:
         table = real_array("frf", frf)
         if table.shape != (len(grid), 2 * entries):

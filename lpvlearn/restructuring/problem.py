@@ -20,7 +20,7 @@ from scipy.linalg import block_diag, qr
 from ..models.statespace import DEVIATION, StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
-from ..validation import real_array
+from ..validation import weights
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, series
 from .known_poles import Division, divide
@@ -512,15 +512,7 @@ def problem_from_response(
         own = filter_.frequency_response(grid)
         W = own if own.shape == W.shape else own * W  # one for all outputs
     if sample_weight is not None:
-        scale = real_array("sample_weight", sample_weight).reshape(-1)
-        known = scale.shape == grid.shape and np.isfinite(scale).all()
-        if not known or scale.min() < 0 or scale.max() == 0:
-            raise ValueError(
-                f"`sample_weight` must hold {len(grid)} finite weights, one for each "
-                "frequency, not negative and not all zero. Got shape "
-                f"{np.shape(sample_weight)}."
-            )
-        W = W * scale[:, None, None]
+        W = W * weights(sample_weight, len(grid), "frequency")[:, None, None]
     std = read_noise(noise, coherence, n_averages, G)
     whole, nothing = structure, Target(*(np.zeros((0, 0)),) * 4)
     low, high = grid[grid > 0].min(), grid.max()

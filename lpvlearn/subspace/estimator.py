@@ -36,7 +36,7 @@ from ..systems.simulation import (
     trend_signals,
     with_transit,
 )
-from ..validation import frequencies, input_delays, one_of
+from ..validation import frequencies, input_delays, naming_argument, one_of
 from .delay import Delay, find_delays, with_late_inputs
 from .fit import (
     TESTS,
@@ -756,7 +756,9 @@ class SubspaceLTI(
         self._stream = None
         for name in (*_TAKEN, "_stale", "rates_"):
             self.__dict__.pop(name, None)
-        for number, batch in enumerate(batches):
+        with naming_argument("batches", "be an iterable of pairs (X, y)", batches):
+            numbered = enumerate(batches)
+        for number, batch in numbered:
             if not isinstance(batch, tuple | list) or len(batch) != 2:
                 raise ValueError(
                     "`batches` must be an iterable of pairs (X, y). Got "
