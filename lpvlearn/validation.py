@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -153,6 +155,14 @@ def all_finite(name: str, array: Array, place: str) -> Array:
         where = place.format(*at)
         raise ValueError(f"`{name}` must be finite. Got {array[at]} at {where}.")
     return array
+
+
+def file_name(value: Any, argument: str = "path", kind: str = "file") -> Path:
+    """The absolute path that a user names a file or folder by, or a ValueError."""
+    name = os.fspath(value) if isinstance(value, str | os.PathLike) else ""
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise ValueError(f"`{argument}` must name a {kind}. Got {shown(value)}.")
+    return Path(name).absolute()
 
 
 def weights(value: Any, n: int, of: str = "row") -> Array:

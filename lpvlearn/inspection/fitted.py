@@ -35,7 +35,7 @@ def models_of(
             f"LocalLPVPipeline or OutputErrorLPV. Got {type(estimator).__name__} "
             "without `lti_` or `lpv_`; call fit() first."
         )
-    if kappa is not None and np.ndim(kappa) == 2:
+    if kappa is not None and as_numbers("kappa", kappa).ndim == 2:
         places = places_of(estimator, kappa)
         return {label: estimator.lpv_.at(place) for label, place in places.items()}
     lpv, place = estimator.lpv_, _place(estimator, kappa)

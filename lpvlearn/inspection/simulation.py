@@ -357,8 +357,9 @@ class SimulationDisplay:
         if zoom is None:
             return np.ones(len(self.time), dtype=bool)
         edges = as_numbers("zoom", zoom).ravel()
-        shown = (self.time >= edges[0]) & (self.time <= edges[-1])
-        if len(edges) != 2 or shown.sum() < 2:
+        first, last = edges if len(edges) == 2 else (np.inf, np.inf)
+        shown = (self.time >= first) & (self.time <= last)
+        if shown.sum() < 2:
             raise ValueError(
                 "`zoom` must be (t_start, t_stop) with at least 2 samples between, "
                 f"within {self.time[0]:g} to {self.time[-1]:g}. Got {zoom}."

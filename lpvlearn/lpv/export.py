@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Hashable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..models.statespace import StateSpace
+from ..validation import file_name
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def write_mat(path: str | os.PathLike[str], grid: Grid) -> None:
         for what, texts in (("Name", map(str, names)), ("Unit", units)):
             cells = np.array([[text] for text in texts], dtype=object)
             content[f"{side}{what}"] = cells
-    target = Path(path)
+    target = file_name(path)
     part = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         with part.open("wb") as file:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..validation import shown
+
 Array = NDArray[np.float64]
 
 Blocks = tuple[Array, Array, Array, Array]
@@ -30,6 +32,10 @@ def stack_system(
     `shape` is order, n_inputs, n_outputs. A ValueError about the function `source`
     that returned the blocks, if one has another shape.
     """
+    if not isinstance(blocks, Sequence) or len(blocks) not in (3, 4):
+        raise ValueError(
+            f"`{source}` must return (A, B, C) or (A, B, C, D). Got {shown(blocks)}."
+        )
     n, m, p = shape
     given = [np.asarray(block) for block in blocks if block is not None]
     S = np.zeros((*lead, n + p, n + m), np.result_type(float, *given))

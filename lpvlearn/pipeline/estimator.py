@@ -50,7 +50,13 @@ from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
-from ..validation import one_of, positive_time, units_by_name, verbosity
+from ..validation import (
+    file_name,
+    one_of,
+    positive_time,
+    units_by_name,
+    verbosity,
+)
 from .html_report import html_report
 from .local_models import common_delay, identify_points
 from .output_error import (
@@ -627,6 +633,8 @@ list, default=None
         The figures of parameters and poles need one scheduling variable, or two.
         """
         by_name = self.units if units is None else units_by_name(units)
+        folder = None if figures is None else file_name(figures, "figures", "folder")
+        place = file_name(path)
         with Stopwatch(verbose=self.verbose).step("figures of the report"):
             page = html_report(
                 self,
@@ -636,9 +644,8 @@ list, default=None
                 initial_state=initial_state,
                 title=title,
                 units=by_name or {},
-                figures=None if figures is None else Path(figures),
+                figures=folder,
             )
-        place = Path(path)
         part = place.with_name(f".{place.name}.part")
         part.write_text(page, encoding="utf-8")
         part.replace(place)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
 from ..exceptions import version
-from ..validation import shown
+from ..validation import file_name, shown
 from .schema import CLASSES, Form, after_loading, before_saving, forms_of
 
 SCHEMA = 1  # raised when a file of today could be misread by the code of tomorrow
@@ -129,7 +129,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
         raise ValueError(
             f"`model` must be one that `load` can build anew. Got {error}."
         ) from error
-    _replace(Path(os.path.realpath(_path(path))), buffer.getbuffer())
+    _replace(Path(os.path.realpath(file_name(path))), buffer.getbuffer())
 
 
 def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
@@ -179,7 +179,7 @@ def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
     >>> load(path, function=decay).model([4.0]).A
     array([[-0.25]])
     """
-    data = _path(path).read_bytes()
+    data = file_name(path).read_bytes()
     try:
         members = _members(data)
         del data
@@ -188,12 +188,6 @@ def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
         raise ValueError(str(error)) from None
     except Exception as error:  # whatever damage may lead to
         raise ValueError(f"{_NOT_OURS}{Path(path).name!r}: {error}") from error
-
-
-def _path(path: Any) -> Path:
-    if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
-        raise ValueError(f"`path` must be the name of a file. Got {shown(path)}.")
-    return Path(path)
 
 
 class _Told(Exception):

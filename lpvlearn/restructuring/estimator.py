@@ -27,6 +27,7 @@ from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..validation import (
+    flag,
     naming_argument,
     number,
     one_of,
@@ -327,7 +328,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             )
         lists = {"starts": starts, "realizations": realizations, "estimates": estimates}
         for name, value in lists.items():
-            if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str):
+            listed = isinstance(value, Sequence) and not isinstance(value, str)
+            if not listed and not (isinstance(value, np.ndarray) and value.ndim):
                 raise ValueError(
                     f"`{name}` must be a list. Got {type(value).__name__}; put a "
                     "single one in brackets."
@@ -341,7 +343,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 )
         problem = self._problem(model)
         given = [problem.structure.check_params(s) for s in starts]
-        if not search and not given:
+        if not flag("search", search) and not given:
             raise ValueError(
                 "`starts` must hold parameters where `search` is False: nothing else "
                 "is begun from. Got none."

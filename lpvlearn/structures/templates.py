@@ -19,7 +19,15 @@ from unicodedata import normalize
 import numpy as np
 from numpy.typing import NDArray
 
-from ..validation import flag, names_of, number, one_of, shown, whole_number
+from ..validation import (
+    flag,
+    has_one_axis,
+    names_of,
+    number,
+    one_of,
+    shown,
+    whole_number,
+)
 from .map import AffineMap
 
 Array = NDArray[np.float64]
@@ -322,8 +330,13 @@ def integrated_cells(
     ``A' = [[A, 0], [C_i, 0]]``, ``B' = [[B], [D_i]]``; the last states are outputs i.
     """
     A, B, C, D = blocks
-    most = len(C) - 1
-    outputs = [whole_number("integrating", i, 0, most) for i in dict.fromkeys(outputs)]
+    if not has_one_axis(outputs):
+        raise ValueError(
+            "`integrating` must be a list of positions of outputs. Got "
+            f"{shown(outputs)}."
+        )
+    places = [whole_number("integrating", i, 0, len(C) - 1) for i in outputs]
+    outputs = list(dict.fromkeys(places))
     n_inputs = len((B or D or [[]])[0])
     free = D or [[0.0] * n_inputs for _ in C]
     behind = [0.0] * len(outputs)

@@ -585,7 +585,7 @@ def _f_test(added: Array, target: Array, dof: int) -> ResidualTest:
 def _basis(columns: Array) -> Array:
     """Orthonormal basis of the directions in which columns of size one are not small.
 
-    By singular values: which columns a pivoted factorization leaves out turns on
+    By singular values: which columns a pivoted factorisation leaves out turns on
     rounding where some are combinations of others, and so would what it spans.
     """
     U, sizes, _ = linalg.svd(columns, full_matrices=False, check_finite=False)

@@ -1,6 +1,6 @@
 """One thread of BLAS while small matrices are worked on.
 
-Between the many small products and factorizations of a fit, threads of BLAS wait for
+Between the many small products and factorisations of a fit, threads of BLAS wait for
 each other, spinning: of two threads a fit takes up to 50 times the processor's time of
 one, and more where other programs want the processor, too.
 """

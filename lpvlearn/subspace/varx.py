@@ -139,6 +139,10 @@ def past_window(
 def find_feedback(records: Sequence[Record]) -> Feedback | None:
     """Test of feedback; None where the samples are too few.
 
+    Nothing is found where they carry no longer past than they choose: they might choose
+    a longer one, and what acted before is left in the innovations, of which future
+    inputs tell that follow the same past.
+
     Every channel may have a constant of its own in every experiment.
 
     Canonical correlations of the innovations with future inputs, given present and past
@@ -154,6 +158,7 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
     n = n_windows(records, longest + _N_FUTURE)
     rows = factor[longest * c :]
     past = _chosen_past(rows[:c], n, 1, longest, np.ones(m, dtype=bool))
+    long_enough = past < longest or longest * c >= _MAX_ROWS - _N_FUTURE * m
     u, y, future = np.split(rows[:, past * c :], [m, c])
     dof = n - past * c
     within = _wilks(y, _basis(u, rows[:m], _FORESEEN), dof)
@@ -161,7 +166,8 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
     y, future = (x - (x @ present) @ present.T for x in (y, future))
     noisy = np.linalg.norm(y, axis=1) > _NOISE_FREE * np.linalg.norm(rows[m:c], axis=1)
     dof -= m
-    found, curved = _wilks(y[noisy], _basis(future, rows[c:], _FORESEEN), dof), 0.0
+    ahead = _basis(future, rows[c:], _FORESEEN)
+    found, curved = _wilks(y[noisy & long_enough], ahead, dof), 0.0
     if found.p_value < _LEVEL:  # an input that noise reaches at once may tell of it
         first = 1 if within.p_value < _INSTANTANEOUS else 0
         of_most, curved = _of_most(records, past, noisy, first)

@@ -158,6 +158,15 @@ def test_there_may_be_nothing_to_test():
     assert find_feedback(records_of((u[:20], u[:20] + 1.0))) is None
 
 
+def test_a_past_that_is_cut_off_is_no_feedback():
+    """Short records of a system whose memory is longer than they can carry."""
+    rng, p_values = np.random.default_rng(11), []
+    for _ in range(100):
+        u, y = open_loop(rng, 60, "held", order=5, pole=0.8)
+        p_values.append(find_feedback(records_of((u, y))).p_value)
+    assert min(p_values) > 1e-4  # of 7, were such a past trusted
+
+
 def test_the_past_is_as_long_as_the_memory():
     rng = np.random.default_rng(2)
     u, e = rng.standard_normal((2, 4000, 1))
