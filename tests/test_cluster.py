@@ -4,7 +4,6 @@ import os
 import signal
 import threading
 import time
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -13,8 +12,7 @@ from joblib import parallel_config
 from sklearn.model_selection import GridSearchCV
 
 from lpvlearn import ExperimentSplit, PolynomialLPV, SubspaceLTI
-from lpvlearn.datasets import make_flexible_arm
-from lpvlearn.paper import experiment, run_paper_experiment
+from lpvlearn.paper import run_paper_experiment
 
 from .conftest import spring_pipeline, spring_tables
 
@@ -93,10 +91,8 @@ def test_a_search_comes_out_to_the_bit(cluster, tables):
             np.testing.assert_array_equal(found[name], alone[name])
 
 
-def test_the_papers_tables_come_out_to_the_bit(cluster, monkeypatch):
-    """The Monte Carlo of the command, on an arm integrated by steps of 1 ms."""
-    coarse = partial(make_flexible_arm, integration_step=1e-3)
-    monkeypatch.setattr(experiment, "make_flexible_arm", coarse)
+def test_the_papers_tables_come_out_to_the_bit(cluster):
+    """The Monte Carlo of the command."""
     with parallel_config(backend="dask"):
         found = with_a_worker_killed(
             cluster, lambda: run_paper_experiment(2, n_jobs=2).tables

@@ -57,7 +57,7 @@ def make_flexible_arm(
     amplitude: float = 0.1,
     clock: ArrayLike = (0.02, 0.01),
     balance_time: float | None = 0.5,
-    integration_step: float = 5e-4,
+    integration_step: float | None = None,
     sweep_duration: float = 3.0,
     sweep_amplitude: float = 1.87,
     sweep_clock: float = 0.005,
@@ -94,8 +94,8 @@ def make_flexible_arm(
         Window in s over which the binary reference of joint 2 integrates to zero, in
         the sweep that of both joints (None: independent bits). In local experiments
         the bits of joint 1 are always independent.
-    integration_step : float, default=5e-4
-        Largest Runge-Kutta step in s.
+    integration_step : float or None, default=None
+        Largest step of the integration in s, as of :meth:`FlexibleArm.simulate`.
     sweep_duration, sweep_amplitude, sweep_clock : float, default=3.0, 1.87, 0.005
         Length (s), amplitude (rad/s) and bit time (s) of the validation sweep, in
         which joint 2 turns by a ramp of (6 pi / 8) / 3 rad/s from theta2 = pi / 8.

@@ -460,9 +460,7 @@ def test_points_left_out_choose_the_degree_that_the_sweep_confirms(tmp_path):
 @EXTRAPOLATES
 def test_on_the_arm_models_that_lack_a_point_choose_what_the_sweep_confirms(tmp_path):
     """Shorter and fewer experiments than in tests/benchmarks/choose_degree.py."""
-    arm = make_flexible_arm(
-        5, duration=1.0, sweep_duration=1.5, integration_step=5e-4, random_state=0
-    )
+    arm = make_flexible_arm(5, duration=1.0, sweep_duration=1.5, random_state=0)
     columns = {"scheduling": "kappa", "experiment": "experiment"}
     pipeline = LocalLPVPipeline(
         SubspaceLTI(6, horizon=40, feedthrough=False),

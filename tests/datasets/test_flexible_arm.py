@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.integrate
 
 from lpvlearn.datasets import (
     FlexibleArm,
@@ -11,16 +12,24 @@ from lpvlearn.datasets import (
 from .conftest import ANGLES, COARSE, LOPSIDED
 
 
-def test_integration_converges_with_order_four():
-    reference = prbs(100, 2, amplitude=0.5, clock=5, random_state=0)
+def test_steps_of_any_length_give_what_another_method_does():
+    arm, start = LOPSIDED, np.array([0.0, 1.0, 0.0, 0.0])
+    reference = prbs(60, 2, amplitude=0.5, clock=4, random_state=0)
 
-    def end(step):
-        response = FlexibleArm().simulate(reference, 1.0, 2e-3, integration_step=step)
-        return response.q[-1]
+    def derivative(_, x, u):
+        q, qdot = x[:4], x[4:]
+        torques = arm.gains * (u - qdot[:2])
+        pushed = arm.forces(q, qdot) + np.append(torques, [0.0, 0.0])
+        return np.append(qdot, np.linalg.solve(arm.mass_matrix(q), pushed))
 
-    exact = end(1.25e-4)
-    errors = [np.abs(end(step) - exact).max() for step in (2e-3, 1e-3)]
-    assert 12 < errors[0] / errors[1] < 20
+    x, rates = np.append(start, np.zeros(4)), []
+    for u in reference:
+        rates.append(x[4:])
+        exact = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12, "args": (u,)}
+        x = scipy.integrate.solve_ivp(derivative, (0.0, 2e-3), x, **exact).y[:, -1]
+    for step, error in ((5e-4, 1e-10), (2e-3, 1e-10), (None, 1e-8), (1e-2, 1e-5)):
+        found = arm.simulate(reference, 1.0, 2e-3, integration_step=step)
+        assert np.abs(found.qdot - rates).max() < error * np.abs(rates).max()
 
 
 def test_batch_equals_single_simulations():
@@ -165,6 +174,7 @@ def test_bad_parameters_of_the_arm(parameters, message):
         (np.zeros((5, 2)), 0.0, {}, "`theta2` must stay away from multiples of pi"),
         (np.zeros((5, 2)), 1.0, {"sampling_time": 0.0}, "`sampling_time` must be"),
         (np.zeros((5, 2)), 1.0, {"integration_step": -1.0}, "`integration_step` must"),
+        (np.full((99, 2), 1e9), 1.0, {}, "`velocity_reference` must be small enough"),
         (
             np.zeros((5, 2)),
             1.0,

@@ -7,14 +7,11 @@ from lpvlearn.datasets import (
     make_flexible_arm,
 )
 
-from .conftest import COARSE
-
 SMALL = {
     "n_operating_points": 3,
     "n_realizations": 2,
     "duration": 0.1,
     "sweep_duration": 0.15,
-    **COARSE,
 }
 
 
@@ -65,12 +62,12 @@ def test_local_validation_is_new_and_noise_free():
     data = make_flexible_arm(**{**SMALL, "n_realizations": 1}, random_state=0)
     assert not np.array_equal(data.X["u1"], data.X_local["u1"])
     reference = data.X_local[["u1", "u2"]].to_numpy().reshape(3, 100, 2)
-    y = data.arm.simulate(reference, data.theta2, 1e-3, **COARSE).y
+    y = data.arm.simulate(reference, data.theta2, 1e-3).y
     np.testing.assert_allclose(data.y_local, y.reshape(-1, 2), rtol=1e-9, atol=1e-12)
 
 
 def test_local_experiments_are_local_and_linear():
-    data = make_flexible_arm(n_operating_points=3, random_state=0, **COARSE)
+    data = make_flexible_arm(n_operating_points=3, random_state=0)
     groups = data.X_local.groupby("experiment")
     assert (groups["kappa"].max() - groups["kappa"].min()).max() < 0.03
     for label, rows in groups:
@@ -83,9 +80,7 @@ def test_local_experiments_are_local_and_linear():
 
 
 def test_sweep_visits_the_range_of_the_operating_points():
-    data = make_flexible_arm(
-        n_operating_points=1, duration=0.1, random_state=0, **COARSE
-    )
+    data = make_flexible_arm(n_operating_points=1, duration=0.1, random_state=0)
     theta2 = np.arccos(data.X_sweep["kappa"])
     assert theta2.iloc[0] == pytest.approx(np.pi / 8)
     assert theta2.min() > np.pi / 9 and 6.5 * np.pi / 8 < theta2.max() < 7.1 * np.pi / 8
