@@ -42,6 +42,8 @@ def complex_array(name: str, value: Any) -> NDArray[np.complex128]:
 
 def _numbers(name: str, value: Any, dtype: np.dtype[Any], kinds: str) -> NDArray[Any]:
     try:
+        if type(value) is np.ndarray and value.dtype == dtype:
+            return value.copy()
         array = np.asarray(value)
         fits = array.dtype.kind in ("biufc" if dtype.kind == "c" else "biuf")
         if array.dtype.kind == "O" and array.ndim:
@@ -140,6 +142,8 @@ def squarable(name: str, array: NDArray[Any]) -> NDArray[Any]:
 def matrix(name: str, value: ArrayLike) -> Array:
     """`value` as a new matrix of numbers with squares; one row may stand for it."""
     array = real_array(name, value)
+    if array.ndim == 2 and np.abs(array).max(initial=0.0) < SQUARED:
+        return array
     if array.ndim < 2:
         array = array.reshape(1, -1) if array.size else np.zeros((0, 0))
     if array.ndim != 2:

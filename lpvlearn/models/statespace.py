@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..exceptions import finite_simulation, warn
-from ..systems.balancing import align_signs, balancing_transformation
+from ..systems.balancing import Balancing, align_signs, balancing_transformations
 from ..systems.hinf_norm import hinf_norm
 from ..systems.response import frequency_response
 from ..systems.sampling import c2d_tustin, d2c_tustin, d2c_zoh, sample_zoh_late
@@ -546,7 +546,7 @@ class StateSpace:
         >>> StateSpace(-2, 2, 1).hankel_singular_values()
         array([0.5])
         """
-        return self._balancing("hankel_singular_values")[0]
+        return _balancings("hankel_singular_values", [self])[0].hankel
 
     def balance(self, order: int | None = None) -> StateSpace:
         """Balanced realisation: both Gramians equal and diagonal.
@@ -568,26 +568,17 @@ class StateSpace:
         >>> model.balance(order=1)
         StateSpace(order=1, n_inputs=1, n_outputs=1, continuous time)
         """
-        _, left, right = self._balancing("balance")
+        own = _balancings("balance", [self])[0]
         if order is not None:
             order = whole_number("order", order, 0, self.order)
-        left, right = left[:order], right[:, :order]
+        return self._projected(own.left[:order], own.right[:, :order])
+
+    def _projected(self, left: Array, right: Array) -> StateSpace:
+        """What is left of the states, with signs by which inputs push them up."""
         A, B, C = left @ self.A @ right, left @ self.B, self.C @ right
         signs = np.where(B.sum(1) < 0, -1.0, 1.0)
         A, B, C = signs[:, None] * A * signs, signs[:, None] * B, C * signs
         return self._of(A, B, C, self.D, self.sampling_time, self.input_delay)
-
-    def _balancing(self, what: str) -> tuple[Array, Array, Array]:
-        """Hankel singular values and projections of a stable model, for `what`."""
-        poles = self.poles()
-        growth = self._growth(poles)
-        if not (growth < 0).all():
-            raise ValueError(
-                f"`{what}` needs a stable model. Got a pole at "
-                f"{poles[growth.argmax()]:.4g}."
-            )
-        discrete = not self.is_continuous
-        return balancing_transformation(self.A, self.B, self.C, discrete)
 
     def to_discrete(self, sampling_time: float, method: str = "zoh") -> StateSpace:
         """Sample a continuous-time model.
@@ -744,6 +735,29 @@ class StateSpace:
 # large against rounding.
 ModelPair = tuple[StateSpace, StateSpace]
 DEVIATION = 1e-2
+
+
+def balanced_models(models: Sequence[StateSpace]) -> list[StateSpace]:
+    """`StateSpace.balance` of models of one size, in continuous or in discrete time."""
+    found = _balancings("balance", models)
+    return [
+        model._projected(own.left, own.right)
+        for model, own in zip(models, found, strict=True)
+    ]
+
+
+def _balancings(what: str, models: Sequence[StateSpace]) -> list[Balancing]:
+    """Hankel singular values and projections of stable models, for `what`."""
+    for model in models:
+        poles = model.poles()
+        growth = model._growth(poles)
+        if not (growth < 0).all():
+            raise ValueError(
+                f"`{what}` needs a stable model. Got a pole at "
+                f"{poles[growth.argmax()]:.4g}."
+            )
+    A, B, C = (np.array([getattr(model, M) for model in models]) for M in "ABC")
+    return balancing_transformations(A, B, C, not models[0].is_continuous)
 
 
 def with_signs_of(reference: StateSpace, model: StateSpace) -> StateSpace:

@@ -18,7 +18,12 @@ from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
 from ..data.preparation import DETRENDS
 from ..exceptions import collected, warn
-from ..models.statespace import ModelPair, StateSpace, with_signs_of
+from ..models.statespace import (
+    ModelPair,
+    StateSpace,
+    balanced_models,
+    with_signs_of,
+)
 from ..restructuring.known_poles import integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
@@ -150,7 +155,7 @@ def identify_point(
             advice = _HELD + advice
         rates = getattr(fitted, "rates_", None)
         if rates is None:
-            lti = _continuous(fitted.lti_, discretization, advice)
+            lti = _continuous(fitted.lti_, discretization, advice).balance()
         else:  # stable but for the integrators
             _continuous(rates.lti_, discretization, advice)
             lti = fitted.lti_.to_continuous(discretization)
@@ -190,8 +195,8 @@ def identify_point(
             f"{len(failures)} of {len(labels)} realisations were left out of the "
             f"average; the first, {failures[0][0]!r}: {failures[0][1]}"
         )
-    lowest = min(model.order for model in models)  # where none grew
-    models = [model for model in models if model.order == lowest]
+    models = _of_lowest_order(models)  # where none grew
+    models = _of_lowest_order(balanced_models(models))  # nor lost what is rounding
     known, lti = all(pairs for _, pairs in estimates), _average(models)
     return LocalModel(
         lti,
@@ -373,6 +378,11 @@ def _column_names(inputs: Sequence[Hashable], n_inputs: int) -> list[str]:
     return [*names, label]
 
 
+def _of_lowest_order(models: Sequence[StateSpace]) -> list[StateSpace]:
+    lowest = min(model.order for model in models)
+    return [model for model in models if model.order == lowest]
+
+
 def _average(models: Sequence[StateSpace]) -> StateSpace:
     """Average balanced models of one order, state signs aligned to the first."""
     aligned = [with_signs_of(models[0], model) for model in models]
@@ -444,7 +454,7 @@ def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpa
             "that order has: what becomes of the point is the nearest one. A shorter "
             "sampling time or a lower `order` avoids it."
         )
-    return lti.balance()
+    return lti
 
 
 def _integrating_outputs(lti: StateSpace) -> str:

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 from lpvlearn import StateSpace
+from lpvlearn.models.statespace import balanced_models
 from lpvlearn.systems.balancing import (
     align_signs,
     balancing_transformation,
@@ -45,6 +46,16 @@ def test_factor_solves_the_lyapunov_equation(seed, order, n_inputs, discrete):
     left = A @ W @ A.T - W if discrete else A @ W + W @ A.T
     size = np.abs(W).max() * max(1.0, np.abs(A).max()) + np.abs(B).max() ** 2
     assert np.abs(left + B @ B.T).max() <= 1e-12 * size
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_models_are_balanced_together_as_one_by_one(discrete):
+    models = [random_model(seed, 5, 2, 3, discrete=discrete) for seed in range(4)]
+    for model, together in zip(models, balanced_models(models), strict=True):
+        alone = model.balance()
+        for name in "ABC":
+            one, other = getattr(alone, name), getattr(together, name)
+            assert_allclose(other, one, rtol=1e-10, atol=1e-12 * np.abs(one).max())
 
 
 @pytest.mark.parametrize("discrete", [False, True])
