@@ -7,21 +7,20 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import joblib
-import pandas as pd
 
-from .command import __version__, add_commands
+from .command import __version__
 from .command.ending import status_of
-from .command.judgement import course
 from .command.output import whole_folder
-from .paper import (
-    PaperExperiment,
-    run_paper_experiment,
-    save_figures,
-    tables_text,
-)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from .paper import PaperExperiment
 
 _MAX_JOBS = 7  # one for each operating point of the paper
 
@@ -47,7 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--version", action="version", version=f"%(prog)s {__version__}"
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    add_commands(commands)
+    if given[0] != "paper":  # which has processes to wake first
+        from .command.parsers import add_commands
+
+        add_commands(commands)
     _add_paper(
         commands.add_parser("paper", help="the paper's experiment", description=_PAPER)
     )
@@ -104,12 +106,14 @@ def _add_paper(parser: argparse.ArgumentParser) -> None:
 
 
 def _paper(options: argparse.Namespace) -> None:
+    n_jobs = options.jobs or min(_MAX_JOBS, joblib.cpu_count())
     with (
         whole_folder(options.output, overwrite=True) as folder,
         _points_done(options.output, options.resume) as memory,
-        course() as told,
-        told.step("experiment", bar=True),
+        _woken(n_jobs),
     ):
+        from .command.judgement import course
+        from .paper import run_paper_experiment, save_figures, tables_text
 
         def save(experiment: PaperExperiment) -> None:
             _save_tables(experiment.tables, folder)
@@ -119,16 +123,17 @@ def _paper(options: argparse.Namespace) -> None:
                 matplotlib.use("agg")  # there may be no screen
                 save_figures(experiment, folder)
 
-        experiment = run_paper_experiment(
-            options.realizations,
-            options.degree,
-            method=options.method,
-            random_state=options.seed,
-            n_jobs=options.jobs or min(_MAX_JOBS, joblib.cpu_count()),
-            memory=memory,
-            verbose=1,
-            meanwhile=save,
-        )
+        with course() as told, told.step("experiment", bar=True):
+            experiment = run_paper_experiment(
+                options.realizations,
+                options.degree,
+                method=options.method,
+                random_state=options.seed,
+                n_jobs=n_jobs,
+                memory=memory,
+                verbose=1,
+                meanwhile=save,
+            )
         _save_tables(experiment.tables, folder)
         n_figures = len(list(folder.glob("*.png")))
     print(tables_text(experiment))
@@ -138,6 +143,21 @@ def _paper(options: argparse.Namespace) -> None:
         f"\n{len(experiment.tables)} tables (csv) and {n_figures} figures (png) are in "
         f"{options.output}/"
     )
+
+
+@contextmanager
+def _woken(n_jobs: int) -> Iterator[None]:
+    """The processes of the paper enter the library while this one does, too."""
+    wake = joblib.delayed(_enter)("lpvlearn.pipeline")
+    awake = joblib.Parallel(n_jobs, return_as="generator")(n_jobs * [wake])
+    try:
+        yield
+    finally:
+        list(awake)
+
+
+def _enter(room: str) -> None:
+    import_module(room)
 
 
 def _save_tables(tables: dict[str, pd.DataFrame], folder: Path) -> None:
