@@ -19,7 +19,7 @@ Complex = NDArray[np.complex128]
 _POWERS, _REWEIGHTED = (2, 4, 8, 16, 32, 64, 128, 256), 6
 _NOTHING = 1e-6  # smaller parts of the maximum weigh alike: nothing
 _FAR = 10.0  # times the maximum: a power of it is the limit of a float
-_HALVINGS = 12  # of a step that does not lower the sum
+_LENGTHS = 0.5 ** np.arange(12)[:, None, None, None]  # of a step, till the sum falls
 _SLOW = 5e-2  # relative decrease of the sum that the next power may as well have
 
 _DECADES = 1.5  # channels whose sizes differ by less are left as they are
@@ -126,15 +126,17 @@ def least_maximum(E: Complex, J: Complex) -> Array:
             b = np.concatenate([rest.real, rest.imag])
             step, total = scaled_lstsq(A, b)[0], np.sum(share**power)
             change = J @ step
-            for length in 0.5 ** np.arange(_HALVINGS):
-                trial = _squares(now.E - length * change)
-                new = np.sum(np.minimum(trial.s / top, _FAR) ** power)
-                if new < total:
-                    break
-            else:
+            product = now.E @ change.conj().swapaxes(1, 2)
+            cross = product + product.conj().swapaxes(1, 2)
+            M = now.M - _LENGTHS * (cross - _LENGTHS * _square(change))
+            sizes = np.minimum(_singular_values(M) / top, _FAR)
+            sums = np.sum(sizes**power, axis=(1, 2))
+            lower = np.flatnonzero(sums < total)
+            if len(lower) == 0:
                 break
-            d, now = d - length * step, trial
-            if new > (1.0 - _SLOW) * total:
+            length = _LENGTHS[lower[0]].item()
+            d, now = d - length * step, _squares(now.E - length * change)
+            if sums[lower[0]] > (1.0 - _SLOW) * total:
                 break
     return d
 
@@ -159,11 +161,21 @@ class _Squares(NamedTuple):
 
 
 def _squares(E: Complex) -> _Squares:
-    M = E @ E.conj().swapaxes(1, 2)
-    if M.shape[1] != 2:
+    M = _square(E)
+    return _Squares(E, M, _singular_values(M))
+
+
+def _square(E: Complex) -> Complex:
+    return E @ E.conj().swapaxes(1, 2)
+
+
+def _singular_values(M: Complex) -> Array:
+    """Those of matrices (..., p, m) by their squares ``M = E E^H``."""
+    if M.shape[-1] != 2:
         values = np.linalg.eigvalsh(M)
     else:  # many times as fast as LAPACK, matrix by matrix
-        middle = 0.5 * (M[:, 0, 0] + M[:, 1, 1]).real
-        radius = np.hypot(0.5 * (M[:, 0, 0] - M[:, 1, 1]).real, np.abs(M[:, 0, 1]))
-        values = np.stack([middle - radius, middle + radius], axis=1)
-    return _Squares(E, M, np.sqrt(np.maximum(values, 0.0)))
+        middle = 0.5 * (M[..., 0, 0] + M[..., 1, 1]).real
+        half = 0.5 * (M[..., 0, 0] - M[..., 1, 1]).real
+        radius = np.hypot(half, np.abs(M[..., 0, 1]))
+        values = np.stack([middle - radius, middle + radius], axis=-1)
+    return np.sqrt(np.maximum(values, 0.0))
