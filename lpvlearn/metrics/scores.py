@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import read_outputs
-from ..validation import real_array, shown, squarable
+from ..validation import SQUARED, real_array, shown, squarable
+
+_SMALL = 1e-100  # beside larger numbers, what squares lose is nothing
 
 _WORST = -1e300  # of a fit, of which the percentage is a number still
 
@@ -196,7 +198,7 @@ def _read_pair(
                 f"column {column}; a simulation that diverges comes from an unstable "
                 "model."
             )
-    return true, np.where(unknown, np.nan, pred)
+    return true, np.where(unknown, np.nan, pred) if unknown.any() else pred
 
 
 def _check_measured(true: NDArray[np.float64]) -> None:
@@ -213,6 +215,10 @@ def _centred(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Subtract the mean of each column, exactly zero where it does not vary."""
     # The rounded mean of equal numbers may differ from them in the last digit.
     known = ~np.isnan(values)
+    if known.all():
+        moved = values - values.sum(axis=0) / len(values)
+        moved[:, values.max(axis=0) == values.min(axis=0)] = 0.0
+        return moved
     count = np.maximum(known.sum(axis=0), 1)
     with np.errstate(over="ignore"):
         mean = np.where(known, values, 0.0).sum(axis=0) / count
@@ -222,6 +228,8 @@ def _centred(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _norm(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    if _SMALL < np.abs(values).max(initial=0.0) < SQUARED:
+        return np.asarray(np.linalg.norm(values, axis=0))
     known = np.nan_to_num(values, posinf=np.inf)
     size = np.frexp(np.abs(known).max(initial=0.0))[1]  # whose squares are numbers
     with np.errstate(over="ignore"):

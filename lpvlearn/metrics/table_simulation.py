@@ -77,19 +77,21 @@ def fit_of(
         if all(np.array_equal(u, inputs[0]) for u in inputs[1:]):
             inputs = inputs[:1]
         u = delayed(np.stack(inputs, axis=-1), sampled.input_delay)
-        y = np.stack([_outputs(e, model.n_outputs) for e in part], axis=-1)
         x = state_trajectory(
             sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
         )
-        forced = sampled.C @ x + sampled.D @ u
         free = free_responses(
             sampled.A, sampled.C, length, trend_signals(length, n_trend)
         )
         free = with_transit(free, sampled.B, sampled.D, sampled.input_delay)
-        found = forced + free @ estimate_initial_state(free, y - forced)
-        true.append(np.moveaxis(y, -1, 0).reshape(-1, model.n_outputs))
-        simulated.append(np.moveaxis(found, -1, 0).reshape(-1, model.n_outputs))
-    return float(bft_score(np.vstack(true), np.vstack(simulated)))
+        # channel by channel in memory, as experiments are: (n_outputs, n_runs, length)
+        forced = (sampled.C @ x + sampled.D @ u).transpose(1, 2, 0)
+        y = np.stack([_outputs(e, model.n_outputs).T for e in part], axis=1)
+        own = estimate_initial_state(free, (y - forced).transpose(2, 0, 1))
+        found = forced + own.T @ free.transpose(1, 2, 0)
+        true.append(y.reshape(model.n_outputs, -1))
+        simulated.append(found.reshape(model.n_outputs, -1))
+    return float(bft_score(np.hstack(true).T, np.hstack(simulated).T))
 
 
 def simulate_experiments(

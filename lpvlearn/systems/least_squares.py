@@ -50,6 +50,10 @@ def rank_lstsq(M: Array, rhs: Array, rcond: float) -> tuple[Array, int]:
     if M.size == 0:
         return np.zeros((n, *rhs.shape[1:])), 0
     columns = rhs.reshape(n_rows, -1)
+    if columns.shape[1] > n and n_rows > 2 * n:  # LAPACK would turn every one of them
+        Q, R = np.linalg.qr(M)
+        solution, rank = rank_lstsq(R, Q.T @ columns, rcond)
+        return solution.reshape(n, *rhs.shape[1:]), rank
     if n_rows < n:  # LAPACK returns the solution there
         columns = np.concatenate([columns, np.zeros((n - n_rows, columns.shape[1]))])
     n_work = 3 * n + _LARGEST_BLOCK * (n + 1 + columns.shape[1])
