@@ -16,7 +16,7 @@ REFERENCE_SEED = 0
 
 _SAMPLING_TIME = 1e-3  # s
 
-_INTEGRATION_STEP = 1e-3  # s: that of the stored files, exact to rounding
+_INTEGRATION_STEP = 1e-3  # s: exact to the rounding of the stored files
 
 _N_OPERATING_POINTS = 7  # as the paper
 
