@@ -665,10 +665,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             seed = check_random_state(self.random_state).randint(2**31)
         enough = max(EXACT_FIT, _NOISY * uncertainty)
         with bounded(_SEARCH_SHARE * self._seconds()):
-            problem, fits = starts_of(
+            found = starts_of(
                 problem, self.init, self.n_starts, given, seed, only_given, enough
             )
             hurried = time_is_up()
+        problem, fits = found.problem, found.fits
         errors = [fit.relative_error for fit in fits]
         self.starts_ = pd.DataFrame({"relative_error": errors})
         self.fit_error_, self.start_params_ = errors[0], fits[0].x
@@ -676,8 +677,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self._describe(problem, result, floor)
         if self.norm == "covariance":
             self._weigh(problem, estimates)
-        searched = isinstance(self.init, str) and not only_given
-        self._warn(problem, result, enough, searched, hurried)
+        doubted = isinstance(self.init, str) and not only_given and not found.certain
+        self._warn(problem, result, enough, doubted, hurried)
 
     def _minimise(
         self, problem: RestructuringProblem, fits: list[LeastSquaresResult]
@@ -797,13 +798,13 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         problem: RestructuringProblem,
         result: MinimaxResult,
         enough: float,
-        searched: bool,
+        doubted: bool,
         hurried: bool,
     ) -> None:
         """Warn of a search that did not converge, a poor fit, and open parameters.
 
-        And of one fit that no other confirms, where starts were `searched` for and its
-        error is not `enough`, or of a search that was `hurried`.
+        And of a `doubted` fit, at which one round of starts alone ended, or of a search
+        that was `hurried`.
         """
         errors = self.starts_["relative_error"].to_numpy()
         timed_out = hurried and errors[0] > enough
@@ -816,7 +817,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "or give `init`.",
                 ConvergenceWarning,
             )
-            searched = False  # no more can be said of the starts
+            doubted = False  # no more can be said of the starts
         elif not result.converged:
             spent = self.n_iter_ >= self.max_iter
             warn(
@@ -830,12 +831,15 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 ConvergenceWarning,
             )
         together = int((errors <= errors[0] * (1.0 + _AGREE)).sum())
-        if searched and len(errors) > 1 == together and errors[0] > enough:
+        proven = self.error_ <= problem.lower_bound * (1.0 + _PROVEN)
+        if doubted and not proven:
+            beyond = errors[together:]
             warn(
-                f"one of {len(errors)} fits from different starts alone ended at the "
-                f"best one, of the relative error {errors[0]:.2g} (the next one "
-                f"{errors[1]:.2g}): it may not be the best there is. Raise `n_starts`, "
-                "or give `init`, to confirm it.",
+                f"one round of starts alone ended at the best fit, {together} of "
+                f"{len(errors)}, of the relative error {errors[0]:.2g}"
+                + (f" (the next one {beyond[0]:.2g})" if len(beyond) else "")
+                + ": it may not be the best there is. Raise `n_starts`, or give "
+                "`init`, to confirm it.",
                 ConvergenceWarning,
             )
         if self.convergence_ == "saddle":

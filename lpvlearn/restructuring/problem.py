@@ -48,7 +48,6 @@ EXACT_FIT = 1e-8  # and one that is rounding: nothing is better
 AGREEING = 2  # starts that end at the best fit: it is taken for the best there is
 _LONGER = 3  # times as many fits where the best one is good, but no other ends there
 _SAME_COST = 1e-4  # relative difference of the costs of fits in one basin: it is 1e-6
-_DISTINCT = 1e-6  # relative distance of candidates that would end in the same fit
 
 # A measured response does not tell how slowly modes may decay: they must be stable, by
 # a rate that no response down to the lowest frequency could show.
@@ -135,16 +134,19 @@ class RestructuringProblem:
         return fit._replace(relative_error=error)
 
     def best_fits(
-        self, candidates: Array, n_fits: int, enough: float = EXACT_FIT
+        self,
+        candidates: Array,
+        n_fits: int,
+        enough: float = EXACT_FIT,
+        known: Sequence[LeastSquaresResult] = (),
     ) -> list[LeastSquaresResult]:
-        """Least-squares fits from the best distinct candidates, until one is certain.
+        """Least-squares fits from the best candidates, until one is certain.
 
         That is one of a relative error of at most `enough`, or a good one at which
-        several end, which as many more may look for. They are ranked by the error of
-        their response, not of their parameters.
+        several end, `known` ones among them, which as many more may look for. They are
+        ranked by the error of their response, not of their parameters.
         """
-        system, structure = self.system, self.structure
-        candidates = np.clip(candidates, structure.lower, structure.upper)
+        system = self.system
         usable = [theta for theta in candidates if self.is_stable(theta)]
         if not usable:
             return []
@@ -153,11 +155,11 @@ class RestructuringProblem:
         scale = 1.0 if scaling is None else scaling
         differences = [system.response(x, self.omega) - self.response for x in usable]
         errors = [np.linalg.norm(scale * (W @ dG)) for dG in differences]
-        thetas = _distinct(np.array(usable)[np.argsort(errors, kind="stable")])
+        thetas = np.array(usable)[np.argsort(errors, kind="stable")]
         fits: list[LeastSquaresResult] = []
         for number, theta in enumerate(thetas[: _LONGER * n_fits]):
             best = min((f.relative_error for f in fits), default=np.inf)
-            together = agreeing(fits)
+            together = agreeing([*known, *fits])
             if best <= enough or best <= GOOD_FIT and together >= AGREEING:
                 break
             if best > GOOD_FIT and number >= n_fits:
@@ -324,16 +326,6 @@ def agreeing(fits: Sequence[LeastSquaresResult]) -> int:
     """How many of the fits end at the best one, told by their costs."""
     least = min((fit.cost for fit in fits), default=0.0)
     return sum(fit.cost <= least * (1.0 + _SAME_COST) for fit in fits)
-
-
-def _distinct(thetas: Array) -> Array:
-    """The rows that differ from all rows before them."""
-    kept: list[Array] = []
-    for theta in thetas:
-        least = _DISTINCT * np.linalg.norm(theta)
-        if all(np.linalg.norm(theta - other) > least for other in kept):
-            kept.append(theta)
-    return np.array(kept)
 
 
 def problem_from_models(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,7 @@ from .error_system import Target, frequency_grid, model_derivatives
 from .least_squares import LeastSquaresResult, channel_scaling
 from .limits import growth
 from .parts import start_by_parts
-from .problem import EXACT_FIT, GOOD_FIT, RestructuringProblem, agreeing
+from .problem import AGREEING, EXACT_FIT, RestructuringProblem, agreeing
 from .similarity import scaled_problem, similarity_starts
 
 Array = NDArray[np.float64]
@@ -43,6 +43,8 @@ _COST = attrgetter("cost")  # by which fits are sorted
 _ROUNDS = 3  # more starts; then a smoother response; then both, thoroughly
 _N_FITS = 3  # of a round, from the best candidates: their ranking is seldom far off
 _SAME = 1e-4  # relative difference of the costs of fits in one basin: they end at 1e-6
+
+_DISTINCT = 1e-6  # relative distance of candidates that would end in the same fit
 
 # A structure slower than the black box lets expect is searched for with that part of
 # the stability margin: it must be stable still.
@@ -69,6 +71,17 @@ _N_QUICK = 3  # seeds of the second round
 _QUICK = {"shifts": (1.0, 0.2, 0.05, 0.0), "n_points": 18, "max_iter": 16}
 
 
+class Search(NamedTuple):
+    """Least-squares fits, the problem that they solve, and what is known of the best.
+
+    It is `certain` where rounds of starts agree on it, or nothing can be better.
+    """
+
+    problem: RestructuringProblem
+    fits: list[LeastSquaresResult]  # by ascending cost
+    certain: bool
+
+
 def search(
     problem: RestructuringProblem,
     init: str | ArrayLike,
@@ -77,8 +90,8 @@ def search(
     seed: int,
     only_given: bool = False,
     enough: float = EXACT_FIT,
-) -> tuple[RestructuringProblem, list[LeastSquaresResult]]:
-    """Least-squares fits, by ascending cost, and the problem that they solve.
+) -> Search:
+    """Least-squares fits from many starts, or only from `given` ones.
 
     Where no model of the structure decays as fast as the black box lets expect, its
     stability margin is given up. The options are those of `GrayBoxRestructurer`;
@@ -89,13 +102,14 @@ def search(
     for share in (1.0, _LEAST_MARGIN):
         problem = replace(problem, margin=share * problem.margin)
         if only_given:
-            found = problem.best_fits(np.array(given), len(given))
-            fits = sorted(found, key=_COST)
+            lower, upper = problem.structure.lower, problem.structure.upper
+            found = problem.best_fits(np.clip(given, lower, upper), len(given))
+            fits, certain = sorted(found, key=_COST), False
         else:
             rng = np.random.default_rng(seed)
-            fits = _rounds(problem, guess, n_starts, given, rng, enough)
+            fits, certain = _rounds(problem, guess, n_starts, given, rng, enough)
         if fits:
-            return problem, fits
+            return Search(problem, fits, certain)
     silent = _without_effect(problem, np.random.default_rng(seed))
     if silent:
         raise ValueError(
@@ -131,26 +145,49 @@ def _rounds(
     given: list[Array],
     rng: np.random.Generator,
     enough: float,
-) -> list[LeastSquaresResult]:
-    """Rounds of candidates and fits, until one is certain; by ascending cost."""
-    n_fits = _N_FITS + len(given)
+) -> tuple[list[LeastSquaresResult], bool]:
+    """Rounds of candidates and fits, until two agree, and whether they do.
+
+    One fit of a relative error of `enough` needs no other. Starts of one round have
+    much in common, which may mislead all of them.
+    """
+    structure, n_fits = problem.structure, _N_FITS + len(given)
+    linear = structure.order == 0 and structure.is_affine  # one optimum
+    tried = np.zeros((0, structure.n_params))
     fits: list[LeastSquaresResult] = []
+    ends: list[LeastSquaresResult] = []  # the best fit of every round
+    best, certain = np.inf, False
     for number in range(_ROUNDS):
-        candidates = _candidates(problem, guess, n_starts, number, rng)
-        if number == 0:
-            candidates = np.vstack([*given, candidates])
-        elif len(candidates) == 0:
+        found = _candidates(problem, guess, n_starts, number, rng)
+        found = np.clip(np.vstack([*given, found]), structure.lower, structure.upper)
+        new = _distinct(found, tried)
+        if len(new) == 0 and fits:  # the only start there is
+            around = drawn_around(fits[0].x, n_starts, rng)
+            new = np.clip(around, structure.lower, structure.upper)
+        if len(new) == 0:
             break
-        more = problem.best_fits(candidates, n_fits, enough)
+        tried = np.vstack([tried, new])
+        more = problem.best_fits(new, n_fits, enough, ends)
+        ends += sorted(more, key=_COST)[:1]
         fits = sorted(fits + more, key=_COST)
         best = fits[0].relative_error if fits else np.inf
-        if best <= enough or (fits and time_is_up()):
+        certain = linear or best <= enough or agreeing(ends) >= AGREEING
+        if certain and best <= max(_FAR_FIT, enough) or (fits and time_is_up()):
             break
-        # the structure comes no nearer: different starts end at the same best cost
-        least = 2 if number or best <= GOOD_FIT else n_fits
-        if best <= _FAR_FIT and agreeing(fits) >= least:
-            break
-    return hopped_fits(problem, fits, rng) if fits and best > _HOP_FIT else fits
+    if fits and best > _HOP_FIT:
+        fits = hopped_fits(problem, fits, rng)
+        certain = certain or agreeing(fits) >= AGREEING
+    return fits, certain
+
+
+def _distinct(thetas: Array, others: Array) -> Array:
+    """The rows that differ from all rows before them, and from all `others`."""
+    kept = len(others)
+    for theta in thetas:
+        least = _DISTINCT * np.linalg.norm(theta)
+        if not (np.linalg.norm(others - theta, axis=1) <= least).any():
+            others = np.vstack([others, theta])
+    return others[kept:]
 
 
 def hopped_fits(
@@ -208,7 +245,7 @@ def _candidates(
     found = np.vstack(rows)
     if smoother:
         continued = continuation_candidates(structure, box, found, rng)
-        found = continued if len(continued) else found
+        found = np.vstack([found, continued])
     elif number == 2 and guess is None and structure.order > 0:
         more = continuation_candidates(structure, box, found, rng, thorough=True)
         found = np.vstack([found, more])
@@ -343,13 +380,13 @@ def continuation_candidates(
     """Fits of the blurred response, carried to the response; see `continuation`.
 
     Seeds are given parameters, stable or not, and random ones of a natural size where
-    bounds or ranges tell signs. Continuous time only.
+    bounds or ranges tell signs.
 
     A `thorough` call takes more seeds and smaller steps, and positive parameters where
     no sign is known, as physical ones are.
     """
     nothing = np.zeros((0, structure.n_params))
-    if box is None or box.dt is not None or len(box.A) == 0:
+    if box is None or len(box.A) == 0:
         return nothing
     count = _N_CONTINUED if thorough else _N_QUICK
     lower, upper, ranges = structure.lower, structure.upper, structure.ranges

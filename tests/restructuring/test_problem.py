@@ -13,6 +13,7 @@ from lpvlearn.restructuring.problem import (
     agreeing,
     problem_from_models,
 )
+from lpvlearn.restructuring.starts import Search
 
 from ..conftest import spring_structure
 from .conftest import CASES, disguised, far_fit, off_structure
@@ -314,22 +315,22 @@ def test_fits_end_where_two_agree_or_the_error_is_the_black_boxs_own():
     assert len(problem.best_fits(starts, 3, enough=3e-3)) == 1
 
 
-def test_one_fit_that_no_other_confirms_is_told(monkeypatch):
+def test_a_fit_that_no_other_round_confirms_is_told(monkeypatch):
     structure = spring_structure()
     truth = structure.model([30.0, 1.2, 50.0])
     box = off_structure(truth, np.random.default_rng(0), 3e-4)
 
-    def lonely(problem, *_):
+    def search(problem, *_):
         fit = problem.fit(structure.check_params({"b": 30.0, "c": 1.2, "k": 50.0}))
         other = fit._replace(cost=4 * fit.cost, relative_error=2 * fit.relative_error)
-        return problem, [fit, other]
+        return Search(problem, [fit, other], certain)
 
-    monkeypatch.setattr(estimator_module, "starts_of", lonely)
-    with pytest.warns(ConvergenceWarning, match="one of 2 fits .* alone"):
+    monkeypatch.setattr(estimator_module, "starts_of", search)
+    certain = False
+    with pytest.warns(ConvergenceWarning, match="one round .* alone .* 1 of 2"):
         GrayBoxRestructurer(structure).fit_model(box)
-    GrayBoxRestructurer(structure).fit_model(  # known to be no better: nothing is told
-        box, realizations=[box, truth]
-    )
+    certain = True  # nothing is told
+    GrayBoxRestructurer(structure).fit_model(box)
 
 
 @pytest.mark.parametrize(

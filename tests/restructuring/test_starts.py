@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn.restructuring import starts
 from lpvlearn.restructuring.problem import problem_from_models
 from lpvlearn.restructuring.starts import continuation_candidates, hopped_fits
 
@@ -72,3 +73,55 @@ def test_what_keeps_a_search_from_starting_is_told():
     unstable = unstable.with_bounds({"a": (2, 3)})
     with pytest.raises(ValueError, match="no stable starting point.*discrete time"):
         GrayBoxRestructurer(unstable).fit_model(StateSpace(0.5, 3, 1, None, 1.0))
+
+
+@pytest.fixture
+def rooms():
+    """Five nodes of known capacities, heat in at two; and the truth."""
+    L = [
+        ["g1 + g4 + g5", "-g1", 0, 0, "-g4"],
+        ["-g1", "g1 + g2 + g3", "-g2", "-g3", 0],
+        [0, "-g2", "g2", 0, 0],
+        [0, "-g3", 0, "g3", 0],
+        ["-g4", 0, 0, 0, "g4 + g6"],
+    ]
+    ends, E = np.eye(5)[[0, 4]].tolist(), np.diag([0.85, 0.6, 1.04, 1.95, 1.09])
+    A = [[f"-({entry})" for entry in row] for row in L]
+    structure = GrayBoxStructure.from_template(A, np.transpose(ends), ends, E=E)
+    structure = structure.with_bounds({f"g{i + 1}": (0, None) for i in range(6)})
+    return structure, np.array([2.29, 0.8, 0.51, 0.82, 0.59, 0.58])
+
+
+WRONG = np.array([2.38, 0.19, 1.0, 0.83, 0.59, 0.58])  # g2 and g3 change places
+
+
+def test_starts_of_one_round_that_agree_on_a_wrong_basin_are_not_trusted(
+    rooms, monkeypatch
+):
+    structure, truth = rooms
+    draw = starts._candidates
+
+    def misleading(problem, guess, n_starts, number, rng):
+        drawn = draw(problem, guess, n_starts, number, rng)
+        return WRONG * [[1.0], [1.01]] if number == 0 else drawn
+
+    monkeypatch.setattr(starts, "_candidates", misleading)
+    box = structure.model(truth).balance()
+    found = GrayBoxRestructurer(structure).fit_model(box)
+    errors = found.starts_["relative_error"]
+    assert (np.isclose(errors, 1.9e-3, rtol=0.05)).sum() == 2
+    np.testing.assert_allclose(found.params_, truth, rtol=1e-6)
+    # where the error is the black box's own, one round is enough
+    problem = problem_from_models(structure, [box], None)
+    fits = starts.search(problem, "similarity", 16, [], 0, enough=3e-3).fits
+    assert len(fits) == 1 and fits[0].relative_error > 1e-3
+
+
+def test_a_discrete_black_box_is_blurred_alike():
+    structure = GrayBoxStructure.observable_canonical(2)
+    truth = np.array([0.95, -1.9, 0.2, 0.1])
+    box = target_of(structure.model(truth, 0.1))
+    rng = np.random.default_rng(0)
+    seeds = truth * np.exp(0.3 * rng.normal(size=(3, 4)))
+    found = continuation_candidates(structure, box, seeds, rng)
+    assert np.isclose(found, truth, rtol=1e-3).all(1).any()
