@@ -164,7 +164,7 @@ class Geodesics:
 
     def curvature(self, gradient: Array) -> Array:
         """What the bend of the geodesics adds to a Hessian of that gradient."""
-        local = np.asarray(np.linalg.solve(self._local.T, gradient))
+        local = self._geometry.T.T @ (self._inverse.T @ gradient)
         normal = -self._geometry.tangential(local)
         return self._local.T @ self._geometry.second_derivatives(normal) @ self._local
 

@@ -7,6 +7,7 @@ solvers; what a constant peak leaves free is chosen by the remaining error.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -157,9 +158,10 @@ class HinfObjective:
     def values(self, y: Array, omega: Array) -> Array:
         """Singular values at fixed frequencies, infinite where there is no model."""
         theta = self.theta(y)
-        if not np.isfinite(self.system.poles(theta)).all():
-            return np.full(len(omega), np.inf)
-        return self.system.values(theta, omega)
+        if np.isfinite(self.system.poles(theta)).all():
+            with suppress(np.linalg.LinAlgError):  # a pole at one of the frequencies
+                return self.system.values(theta, omega)
+        return np.full(len(omega), np.inf)
 
     def hessians(self, y: Array, omega: Array, moving: Flags) -> Array:
         """Second derivatives of the peaks in the coordinates y."""

@@ -684,7 +684,7 @@ class Identifiability:
             for row in _sparse_rows(Vt[rank:] / unit)
         )
         # errors of the response are alike at all frequencies
-        usual = max(float(np.linalg.norm(level)), 1e-300)
+        usual = float(max(np.linalg.norm(level), _DIGITS * np.linalg.norm(J))) or 1.0
         unit, s, Vt = _scaled_svd(J / usual)
         inverse = (Vt / np.maximum(s, 1e-150)[:, None]).T / unit[:, None]
         gains = np.linalg.norm(inverse, axis=1)

@@ -134,3 +134,28 @@ def test_how_far_a_search_converged_is_said():
     with pytest.warns(ConvergenceWarning, match="ended at `max_iter`=0"):
         fitted = GrayBoxRestructurer(lag, max_iter=0).fit_model(box)
     assert fitted.convergence_ == "no"
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.filterwarnings("ignore:the response determines")
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("dt", [None, 0.1])
+def test_a_gain_whose_sign_is_wrong_vanishes(seed, dt):
+    """A sensor's sign is turned: on the way lags stand, and poles are at zero."""
+    n, own = 1 + seed, "-a" if dt is None else "1 - a"
+    A = [[0] * n for _ in range(n)]
+    for i in range(n):
+        A[i][i] = f"{own}{i}"
+        if i:
+            A[i][i - 1] = f"c{i}"
+    structure = GrayBoxStructure.from_template(
+        A, [["g"], *[[0]] * (n - 1)], np.eye(n)[-1:].tolist()
+    )
+    truth = np.random.default_rng(seed).uniform(0.1, 0.9, structure.n_params)
+    box = structure.model(truth, dt)
+    turned = StateSpace(box.A, box.B, -box.C, sampling_time=dt)
+    positive = dict.fromkeys(structure.parameter_names, (0, None))
+    restructurer = GrayBoxRestructurer(structure.with_bounds(positive), max_iter=200)
+    found = restructurer.fit_model(turned)
+    assert 0.9 < found.relative_error_ <= 1.0 + 1e-9
+    assert found.lti_.is_stable
