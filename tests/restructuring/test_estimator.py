@@ -460,7 +460,7 @@ ERRORS = [
         lambda: GrayBoxRestructurer(spring_structure()).fit(
             [1.0], [[1.0, 0.0]], sample_weight=[-1.0]
         ),
-        "`sample_weight` must hold 1 finite weights",
+        "`sample_weight` must hold 1 weights, one for each frequency",
     ),
     (
         lambda: GrayBoxRestructurer().fit([1.0, 2.0], [[1.0, 0.0], [1.0, 0.0]]),
