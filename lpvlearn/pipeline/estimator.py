@@ -29,6 +29,7 @@ from sklearn.utils.validation import (
 from ..data.dataset import kept_on_disk, open_dataset, tables_by_experiment
 from ..data.experiments import (
     NO_TIME,
+    ROLES,
     Experiment,
     as_list,
     read_outputs,
@@ -54,6 +55,7 @@ from ..validation import (
     file_name,
     one_of,
     positive_time,
+    shown,
     units_by_name,
     verbosity,
 )
@@ -738,6 +740,13 @@ list, default=None
         one_of("combine", self.combine, ("pool", "average"))
         one_of("discretization", self.discretization, ("zoh", "tustin"))
         one_of("on_error", self.on_error, ("raise", "skip"))
+        for role in ROLES:
+            given = getattr(self.local, role, None)
+            if given is not None and getattr(self, role) is None:
+                raise ValueError(
+                    f"`{role}` must be given to LocalLPVPipeline, which reads the "
+                    f"table. Got it as an option of `local` alone: {shown(given)}."
+                )
         one_of("offsets", self.offsets, ("auto", None))
         one_of("efficient", self.efficient, (True, False))
         units_by_name(self.units)
@@ -810,7 +819,7 @@ def _check_channels(
         return
     has = f"`structure` has {structure.n_outputs} outputs and {structure.n_inputs} "
     if structure.n_inputs != len(inputs):
-        shown = ", ".join(map(repr, inputs))
+        found = ", ".join(map(repr, inputs))
         how = (
             "as named in `inputs`"
             if named is not None
@@ -821,13 +830,13 @@ def _check_channels(
             )
         )
         raise ValueError(
-            f"{has}inputs; `X` has {len(inputs)} input column(s), {shown}, {how}. They "
+            f"{has}inputs; `X` has {len(inputs)} input column(s), {found}, {how}. They "
             "must agree: list the inputs of the structure in `inputs`."
         )
     if structure.n_outputs != len(outputs):
-        shown = ", ".join(map(repr, outputs))
+        found = ", ".join(map(repr, outputs))
         raise ValueError(
-            f"{has}inputs; `y` has {len(outputs)} column(s), {shown}. They must agree: "
+            f"{has}inputs; `y` has {len(outputs)} column(s), {found}. They must agree: "
             "give the outputs of the structure alone, in its order."
         )
 

@@ -281,6 +281,7 @@ ERRORS = [
     ({"combine": "sum"}, "`combine` must be 'pool' or 'average'"),
     ({"discretization": "euler"}, "`discretization` must be 'zoh' or"),
     ({"on_error": "ignore"}, "`on_error` must be 'raise' or"),
+    ({"local": SubspaceLTI(inputs=[0])}, "`inputs` must be given to LocalLPVPipe"),
     ({"restructurer": "none"}, "`restructurer` must be an estimator"),
     ({"scheduling": "theta"}, "theta"),
     ({"sampling_time": 0.5}, "sampling"),
