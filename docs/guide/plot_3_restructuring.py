@@ -94,12 +94,12 @@ restructurer = GrayBoxRestructurer(structure).fit_model(black_box)
 restructurer.starts_
 
 # %%
-# Relative errors of the fits, best first. The search ends where two starts agree on a
-# good fit, or where its error is the black box's own: rounding, or the noise that
-# `realizations` or `estimates` tell of. Wrong basins exist, and their fits end further
-# from the black box; that is why there are many starts, and a best fit that only one of
-# several reached is warned of. A pipeline has one more means against them: every point
-# is fitted also from its neighbours' parameters, until nothing improves.
+# Relative errors of the fits, best first. The search ends where two rounds of different
+# starts agree on a fit, or where its error is the black box's own: rounding, or the
+# noise that `realizations` or `estimates` tell of. Wrong basins exist, and their fits
+# end further from the black box; that is why there are many starts, and a best fit that
+# one round alone reached is warned of. A pipeline has one more means against them:
+# every point is fitted also from its neighbours' parameters, until nothing improves.
 #
 # Parts that may change places
 # ----------------------------

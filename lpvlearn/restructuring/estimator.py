@@ -227,7 +227,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     -----
     Candidates come from similarity transformations that solve the equations without
     parameters exactly (Eq. (34)); the best ones in frequency response start
-    least-squares fits. From there a smooth path of minimisers leads to the least
+    least-squares fits. The best one is trusted where its error is the black box's own
+    (rounding, or the uncertainty that is given), or where the next round, of other
+    starts, ends there, too. From there a smooth path of minimisers leads to the least
     maximum over frequency (:mod:`~lpvlearn.restructuring.central_path`); the solver
     ends it.
 
