@@ -129,6 +129,8 @@ class ParameterDisplay:
         )
         self.interpolators = by_name("interpolators", interpolators)
         self.curve_std = by_name("curve_std", curve_std)
+        _check_can("interpolators", self.interpolators, "predict")
+        _check_can("curve_std", self.curve_std, "__call__")
 
     def _table(self, argument: str, table: Any) -> Array:
         if hasattr(table, "columns"):
@@ -282,13 +284,15 @@ class ParameterDisplay:
                 known["std"] = {name: pipeline.parameters_std_}
         kappa = pipeline.operating_points_
         n_scheduling = kappa.shape[1]
-        if forms and n_scheduling > 1:
+        others_of_form = by_name("forms", forms)
+        if others_of_form and n_scheduling > 1:
             raise ValueError(
                 "`forms` must be None for two scheduling variables: maps show one. Got "
-                f"{', '.join(map(repr, forms))}."
+                f"{', '.join(map(repr, others_of_form))}."
             )
+        _check_can("forms", others_of_form, "fit")
         drawn = {name: pipeline.interpolator_}
-        for other, form in by_name("forms", forms).items():
+        for other, form in others_of_form.items():
             weighed = "covariance" in signature(form.fit).parameters
             P = {"covariance": pipeline.parameters_covariance_} if weighed else {}
             drawn[other] = clone(form).fit(kappa, table, **P)
@@ -468,6 +472,19 @@ def _limits(kappa: Array) -> Array:
     """Lowest and highest value of each variable, a little apart where they agree."""
     low, high = kappa.min(axis=0), kappa.max(axis=0)
     return np.column_stack([low, np.where(high > low, high, low + 1.0)])
+
+
+def _check_can(argument: str, named: Mapping[str, Any], method: str) -> None:
+    """Refuse things to draw, by name, that lack a method, or are classes."""
+    for name, value in named.items():
+        if isinstance(value, type) or not callable(getattr(value, method, None)):
+            kind = (
+                "a function" if method == "__call__" else f"an object with {method}()"
+            )
+            raise ValueError(
+                f"`{argument}` must hold {kind} for each name. Got "
+                f"{type(value).__name__} for {name!r}."
+            )
 
 
 def _curve_std(lpv: Any, kappa: Array) -> Array:

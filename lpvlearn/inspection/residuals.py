@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from ..data.alignment import align_outputs
-from ..data.experiments import as_numbers, is_table, read_outputs
+from ..data.experiments import Table, as_numbers, read_outputs
 from ..data.preparation import read_runs
 from ..subspace import SubspaceLTI
 from ..subspace.residuals import (
@@ -205,7 +205,7 @@ class ResidualDisplay:
         if isinstance(estimator, SubspaceLTI):
             residuals = estimator._residuals(X, y, errors)
         elif simulates and hasattr(estimator, "predict_with_initial_state"):
-            X = X if is_table(X) else np.asarray(X)
+            X = Table(X).X
             y = align_outputs(X, y)
             outputs, names = read_outputs(y)
             simulated = estimator.predict_with_initial_state(X, y)

@@ -14,7 +14,6 @@ from ..data.experiments import (
     Table,
     as_numbers,
     fitted_roles,
-    is_table,
     read_outputs,
 )
 from ..data.timestamps import time_in_seconds
@@ -265,7 +264,7 @@ class SimulationDisplay:
                 f"split_experiments(X). Got {type(estimator).__name__}; simulate with "
                 "it and use from_predictions()."
             )
-        X = X if is_table(X) else np.asarray(X)
+        X = Table(X).X
         outputs, names = read_outputs(align_outputs(X, y))
         rows = _rows_of(estimator, X, experiment)
         part = X.iloc[rows] if hasattr(X, "iloc") else X[rows]
@@ -386,14 +385,19 @@ def _rows_of(estimator: Any, X: Any, label: Hashable) -> NDArray[np.intp]:
             f"experiment. Got {label!r}."
         )
     labels = column.labels([rows[0] for rows in groups])
-    if not isinstance(label, Hashable) or label not in labels:
+    places = dict(zip(labels, groups, strict=True))
+    try:
+        rows = places.get(label)
+    except TypeError:  # no label at all
+        rows = None
+    if rows is None:
         shown = ", ".join(map(repr, labels[:10]))
         shown += ", ..." if len(labels) > 10 else ""
         raise ValueError(
             f"`experiment` must be the label of an experiment in X: {shown}. Got "
             f"{label!r}."
         )
-    return groups[labels.index(label)]
+    return rows
 
 
 def _time_of(estimator: Any, table: Table) -> tuple[Array, str]:

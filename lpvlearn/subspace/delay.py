@@ -144,6 +144,9 @@ def find_delays(
     delay = np.where(answers < 0, 0, np.maximum(answers - ~direct, 0))
     if not delay.any():
         return delay
+    if settings.method != "pbsid":
+        lengths = [len(u) - int(delay.max()) for u, _ in pairs]
+        settings.check_size(lengths, order, horizon)
     settings = settings._replace(
         free=settings.free._replace(initial_states=True),
         refine=True,

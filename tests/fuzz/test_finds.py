@@ -212,6 +212,45 @@ HUGE = np.full((4, 2), 1e308)
             "`A` must be stable, beyond rounding|eigenvalues of `A` did not converge",
         ),
         ("SubspaceLTI.fit", {"feedthrough": pd.NA}, "`feedthrough` must be True"),
+        ("SubspaceLTI.fit(automatic)", {"order": 10**6}, "`order` must be at most"),
+        ("SubspaceLTI.fit(automatic)", {"horizon": 10**6}, "`horizon` must be at most"),
+        ("GrayBoxRestructurer.fit", {"frf": [[1], [1, 2]]}, "`frf` must hold"),
+        ("GrayBoxRestructurer.fit_model", {"search": pd.NA}, "`search` must be True"),
+        (
+            "GrayBoxRestructurer.fit_model",
+            {"starts": np.array(3.0)},
+            "`starts` must be",
+        ),
+        (
+            "GrayBoxRestructurer.score",
+            {"sample_weight": 0},
+            "`sample_weight` must hold 3",
+        ),
+        (
+            "PolynomialLPV.fit(weights)",
+            {"sample_weight": ["a"]},
+            "`sample_weight` must",
+        ),
+        (
+            "SubspaceLTI.score",
+            {"sample_weight": [1.0]},
+            "`sample_weight` must hold 180",
+        ),
+        ("LPVStateSpace.rest_and_free_responses", {"u": [1.0]}, "`u` and `scheduling`"),
+        ("GrayBoxStructure.full", {"integrating": 0}, "`integrating` must be a list"),
+        ("GrayBoxStructure.from_function", {"jacobian": len}, "`jacobian` must return"),
+        ("GrayBoxStructure.from_function", {"jacobian": 1}, "`jacobian` must be a fun"),
+        ("LPVStateSpace.to_mat(path)", {"path": 0}, "`path` must name a file"),
+        ("BodeDisplay.from_models", {"std": np.array([])}, "`std` must be a dict"),
+        ("BodeDisplay.from_estimator", {"kappa": [[1], [1, 2]]}, "`kappa` must hold"),
+        ("ErrorDisplay.from_models", {"start": 0}, "`start` must be a StateSpace"),
+        ("ParameterDisplay.from_estimator", {"forms": {"k": "v"}}, "`forms` must hold"),
+        (
+            "SimulationDisplay.from_estimator",
+            {"experiment": pd.NA},
+            "`experiment` must",
+        ),
+        ("SimulationDisplay.from_estimator", {"zoom": []}, "`zoom` must be"),
         ("SubspaceLTI.fit", {"feedthrough": [[1], [1, 2]]}, "`feedthrough` must be T"),
         (
             "PoleDisplay",
@@ -293,6 +332,14 @@ def test_numbers_of_other_kinds_are_numbers_or_refused():
     assert np.isfinite(model.predict(kappa)).all()
     with pytest.raises(ValueError, match="`kappa` must be finite.*Got nan"):
         ParameterDisplay(np.full(4, np.nan), {"local": theta})
+
+
+def test_limits_of_time_are_numbers_of_any_kind():
+    call = calls()["GrayBoxRestructurer.fit"]
+    for seconds in (Decimal("9.5"), np.float16(9)):
+        call.function(**{**call.arguments, "max_time": seconds})
+    with pytest.raises(TypeError, match="`batches` must be an iterable of pairs"):
+        lp.SubspaceLTI().fit_batches(0)
 
 
 def test_what_no_number_can_stand_for_is_refused():
