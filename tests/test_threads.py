@@ -50,8 +50,8 @@ def test_threads_agree_with_a_serial_fit_and_put_back_the_threads_of_blas():
 
 
 def test_a_local_fit_has_one_thread_of_blas_and_puts_back_what_it_found(monkeypatch):
-    seen, X = [], np.random.default_rng(0).standard_normal((200, 1))
-    y = np.cumsum(X, axis=0) * 0.5 ** np.arange(200)[:, None]
+    seen, (X, e) = [], np.random.default_rng(0).standard_normal((2, 200, 1))
+    y = StateSpace(0.9, 1, 1, None, 1.0).simulate(X) + 0.1 * e
     original = linalg.svd
 
     def svd(*args, **options):
