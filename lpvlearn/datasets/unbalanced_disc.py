@@ -191,7 +191,8 @@ class UnbalancedDisc:
         ValueError
             If shapes do not fit or a number is out of its range.
         """
-        u, start = real_array("voltage", voltage), _finite("theta", theta)
+        u = squarable("voltage", real_array("voltage", voltage))
+        start = _finite("theta", theta)
         if u.ndim not in (1, 2) or start.ndim > 1 or not np.isfinite(u).all():
             raise ValueError(
                 "`voltage` must be finite, of shape (n_samples,) or (n_experiments, "

@@ -123,7 +123,7 @@ def weighted_points(
         P = P[used]
     theta = theta[used]
     spread, size = theta.std(axis=0), np.abs(theta).max(axis=0)
-    size = np.where(size > 0, size, 1.0)
+    size = np.where(size > np.finfo(float).tiny, size, 1.0)
     scale = np.where(spread > _RESOLUTION * size, spread, size)
     whitening = None if P is None else _whitening(P, size)
     return WeightedPoints(theta, np.sqrt(weight[used]), scale, P, whitening)

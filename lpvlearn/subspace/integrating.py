@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..data.experiments import Experiment
 from ..models.statespace import ModelPair, StateSpace
+from ..validation import has_one_axis, is_whole, shown
 from .simulation_fit import Freedom, simulation_fit
 from .statistics import Evidence
 
@@ -35,20 +36,21 @@ def integrating_flags(integrating: Any, names: Sequence[Any]) -> Flags:
     """
     if integrating is True:
         return np.ones(len(names), bool)
-    many = list | tuple | np.ndarray | pd.Index
-    given = list(integrating) if isinstance(integrating, many) else [integrating]
-    flags, known = np.zeros(len(names), bool), list(names)
+    given = list(integrating) if has_one_axis(integrating) else [integrating]
+    flags, known = np.zeros(len(names), bool), {n: k for k, n in enumerate(names)}
     for one in given or [None]:
-        whole = isinstance(one, int | np.integer) and not isinstance(one, bool)
-        if np.ndim(one) == 0 and not isinstance(one, bool) and one in known:
-            flags[known.index(one)] = True
-        elif whole and 0 <= one < len(known):
-            flags[one] = True
-        else:
+        try:
+            place = None if isinstance(one, bool) else known.get(one)
+        except TypeError:  # what is no name
+            place = None
+        if place is None and is_whole(one) and 0 <= one < len(flags):
+            place = int(one)
+        if place is None:
             raise ValueError(
                 "`integrating` must be None, True, or name outputs by the columns of "
-                f"y, {known}, or their positions. Got {one!r}."
+                f"y, {list(names)}, or their positions. Got {shown(one)}."
             )
+        flags[place] = True
     return flags
 
 

@@ -241,6 +241,16 @@ HUGE = np.full((4, 2), 1e308)
         ("GrayBoxStructure.from_function", {"jacobian": len}, "`jacobian` must return"),
         ("GrayBoxStructure.from_function", {"jacobian": 1}, "`jacobian` must be a fun"),
         ("LPVStateSpace.to_mat(path)", {"path": 0}, "`path` must name a file"),
+        (
+            "SubspaceLTI.fit(integrating)",
+            {"integrating": pd.NA},
+            "`integrating` must be",
+        ),
+        (
+            "UnbalancedDisc.simulate",
+            {"voltage": [-1e308, 0.0]},
+            "`voltage` must hold n",
+        ),
         ("BodeDisplay.from_models", {"std": np.array([])}, "`std` must be a dict"),
         ("BodeDisplay.from_estimator", {"kappa": [[1], [1, 2]]}, "`kappa` must hold"),
         ("ErrorDisplay.from_models", {"start": 0}, "`start` must be a StateSpace"),
@@ -332,6 +342,12 @@ def test_numbers_of_other_kinds_are_numbers_or_refused():
     assert np.isfinite(model.predict(kappa)).all()
     with pytest.raises(ValueError, match="`kappa` must be finite.*Got nan"):
         ParameterDisplay(np.full(4, np.nan), {"local": theta})
+
+
+def test_parameters_near_the_smallest_number_are_interpolated():
+    call = calls()["RationalLPV"]
+    tiny = np.full((4, 2), 5e-324)
+    assert np.isfinite(call.function(**{**call.arguments, "y": tiny})).all()
 
 
 def test_limits_of_time_are_numbers_of_any_kind():
