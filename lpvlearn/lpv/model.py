@@ -692,10 +692,10 @@ class LPVStateSpace:
         u = finite_samples("u", u, self.n_inputs)
         delay, n = self._samples_of_delay(dt), self.order
         kappa = self._scheduling(scheduling)
-        if len(u) != len(kappa):
+        if len(kappa) != len(u):
             raise ValueError(
-                "`u` and `scheduling` must have as many rows. Got "
-                f"{len(u)} and {len(kappa)}."
+                f"`scheduling` must have one row for each of the {len(u)} samples of "
+                f"`u`. Got {len(kappa)}."
             )
         u0, _, x0 = self.silenced()._point_of_work(kappa[:1])
         x, before = x0.sum(axis=0), np.repeat(u0.sum(axis=0), delay)
@@ -995,11 +995,6 @@ class LPVStateSpace:
         more than the model has is the part that the offsets have.
         """
         dt = positive_time("sampling_time", dt)
-        if len(kappa) != len(u):
-            raise ValueError(
-                f"`scheduling` must have one row for each of the {len(u)} samples of "
-                f"`u`. Got {len(kappa)}."
-            )
         self._tell_extrapolation(kappa)
         model = self.silenced()  # not once more, of the nodes of the table
         path = kappa

@@ -261,10 +261,14 @@ KAPPA = np.arange(4.0)[:, None]
         ({}, (KAPPA.ravel(), KAPPA), ["Expected 2D array", "reshape(-1, 1)"]),
         ({}, (KAPPA, KAPPA[:3]), ["inconsistent", "[4, 3]"]),
         ({}, (KAPPA, [0, 1, np.nan, 3]), ["y contains NaN"]),
-        ({}, (KAPPA, KAPPA, [1, 1, 1, -1]), ["`sample_weight`", "-1 to 1"]),
+        ({}, (KAPPA, KAPPA, [1, 1, 1, -1]), ["`sample_weight`", "not negative", "-1]"]),
         ({}, (KAPPA, KAPPA, [0, 0, 0, 0]), ["`sample_weight`", "not all zero"]),
-        ({}, (KAPPA, KAPPA, [[1], [1], [1], [1]]), ["`sample_weight`", "(4, 1)"]),
-        ({}, (KAPPA, KAPPA, [1, 1]), ["inconsistent", "[4, 2]"]),
+        (
+            {},
+            (KAPPA, KAPPA, [[1], [1], [1], [1]]),
+            ["`sample_weight`", "must hold 4 weights", "[[1],"],
+        ),
+        ({}, (KAPPA, KAPPA, [1, 1]), ["must hold 4 weights", "[1, 1]"]),
     ],
 )
 def test_bad_calls_raise_and_name_the_cause(params, args, words):
