@@ -26,6 +26,7 @@ from ..validation import (
     all_finite,
     complex_array,
     is_whole,
+    naming_argument,
     positive_time,
     real_array,
     shown,
@@ -617,7 +618,9 @@ def group_rows(
         raise ValueError("X must hold at least one sample. Got 0.")
     if column is None:
         return [0], [np.arange(n_rows)]
-    codes, uniques = pd.factorize(pd.Series(column.values))
+    rule = "hold one label in each row"
+    with naming_argument(str(column.name), rule, column.values):
+        codes, uniques = pd.factorize(pd.Series(column.values))
     if (codes < 0).any():
         raise ValueError(
             f"`experiment` column {column.name!r} must label every row. Got a missing "
@@ -634,7 +637,9 @@ def operating_point_of(
     """The one value that the operating-point column has in an experiment."""
     if column is None:
         return None
-    values = pd.unique(pd.Series(column.values).iloc[rows])
+    rule = "hold one label in each row"
+    with naming_argument(str(column.name), rule, column.values):
+        values = pd.unique(pd.Series(column.values).iloc[rows])
     if len(values) > 1 or pd.isna(values[0]):
         raise ValueError(
             f"`operating_point` column {column.name!r} must hold one value per "

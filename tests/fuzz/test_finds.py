@@ -344,6 +344,14 @@ def test_numbers_of_other_kinds_are_numbers_or_refused():
         ParameterDisplay(np.full(4, np.nan), {"local": theta})
 
 
+def test_what_is_no_label_is_told():
+    X = world().X
+    groups = X["run"].to_numpy().copy()
+    groups[3] = np.zeros(2)
+    with pytest.raises(TypeError, match="`groups` must hold one label in each row"):
+        list(lp.ExperimentSplit(3).split(X, None, groups))
+
+
 def test_parameters_near_the_smallest_number_are_interpolated():
     call = calls()["RationalLPV"]
     tiny = np.full((4, 2), 5e-324)
