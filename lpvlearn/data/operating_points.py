@@ -29,6 +29,10 @@ _PARTS, _SWEEP = 10, 0.8
 # range over the points: what moves further has seen several of the models.
 _MAX_SPREAD = 0.25
 
+# A variable that is constant but for so many steps, of more than this share of its
+# range over the points and with so many samples for each, is at several points.
+_FEW_STEPS, _STEP, _STILL = 3, 0.05, 10
+
 _ROUNDING = 1e-6  # of scheduling values, relative to the range they are compared with
 _CLOSE = 0.01  # share of the range within which means are one point, if not more
 _MANY_VARIABLES = 4  # beyond, a triangulation has too many edges: the nearest points do
@@ -104,7 +108,7 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
     Its spread (maximum minus minimum) is compared with its range over the operating
     points `kappa`. Where that is zero: with its largest magnitude, and only if the
     variable travels; noise and oscillations about one point have no scale to compare
-    with.
+    with. One that stands still but for a few steps is at several points.
     """
     extent = np.ptp(kappa, axis=0)
     for run in experiments:
@@ -129,6 +133,18 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
                 f"{_MAX_SPREAD:g} times the {compared} ({scale[worst]:.4g}). Keep such "
                 "a record for validation, cut it into local experiments, or refine the "
                 f"model with it: refiner=OutputErrorLPV().{several}"
+            )
+        changes = np.count_nonzero(np.diff(run.scheduling, axis=0), axis=0)
+        steps = (changes > 0) & (changes <= min(_FEW_STEPS, len(run.rows) // _STILL))
+        steps &= (extent > 0) & (spread > _STEP * extent)
+        if steps.any():
+            k = int(steps.argmax())
+            first, last = run.scheduling[[0, -1], k]
+            raise ValueError(
+                f"Experiment {run.label!r} must be at one operating point. Got a "
+                f"scheduling variable {k + 1} that steps from {first:.4g} to "
+                f"{last:.4g} within it: name the column that tells experiments apart "
+                "by `experiment`, or cut the record by `split_levels`."
             )
 
 

@@ -86,6 +86,21 @@ def test_local_experiments_pass_and_sweeps_raise():
         _check_local(sweep, kappa)
 
 
+def test_a_step_to_another_point_is_not_local_however_near_it_is():
+    runs = _runs([0.0, 1.0, 2.0])
+    stepping = np.repeat([0.0, 0.2], 50)[:, None]
+    drifting = np.repeat([0.0, 0.02], 50)[:, None]
+    for scheduling, is_local in ((stepping, False), (drifting, True)):
+        first = replace(runs[0], scheduling=scheduling, rows=np.arange(100))
+        changed = [first, *runs[1:]]
+        _, kappa = group_operating_points(changed)
+        if is_local:
+            _check_local(changed, kappa)
+        else:
+            with pytest.raises(ValueError, match="steps from 0 to 0.2.*split_levels"):
+                _check_local(changed, kappa)
+
+
 def test_a_single_sweep_is_not_local():
     (run,) = runs = _runs([1.0], spread=1.0)
     with pytest.raises(ValueError, match="must be local"):
