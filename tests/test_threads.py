@@ -33,7 +33,8 @@ def in_threads(pipeline, X, y):
 
 
 def blas_threads():
-    return [pool["num_threads"] for pool in threadpool_info()]
+    pools = [pool for pool in threadpool_info() if pool["user_api"] == "blas"]
+    return [pool["num_threads"] for pool in pools]
 
 
 def test_threads_agree_with_a_serial_fit_and_put_back_the_threads_of_blas():

@@ -236,7 +236,11 @@ HUGE = np.full((4, 2), 1e308)
             {"sample_weight": [1.0]},
             "`sample_weight` must hold 180",
         ),
-        ("LPVStateSpace.rest_and_free_responses", {"u": [1.0]}, "`u` and `scheduling`"),
+        (
+            "LPVStateSpace.rest_and_free_responses",
+            {"u": [1.0]},
+            "`scheduling` must have",
+        ),
         ("GrayBoxStructure.full", {"integrating": 0}, "`integrating` must be a list"),
         ("GrayBoxStructure.from_function", {"jacobian": len}, "`jacobian` must return"),
         ("GrayBoxStructure.from_function", {"jacobian": 1}, "`jacobian` must be a fun"),
