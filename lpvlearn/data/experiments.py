@@ -60,6 +60,7 @@ NO_TIME = (  # what a message says where seconds are needed and nothing tells th
 )
 
 _ALIKE = 0.6  # likeness (difflib's, its default) from which a name may have been meant
+
 # What to do about an array of so many dimensions
 _RESHAPED = {
     1: "Reshape your data: `.reshape(-1, 1)` makes a single column of it, "

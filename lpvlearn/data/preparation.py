@@ -29,8 +29,8 @@ DETRENDS = (None, "constant", "linear")  # by the number of signals in a trend
 _COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 
 # A signal is held for so many samples where this share of so many intervals between its
-# changes are multiples of them.
-_HELD, _ENOUGH_CHANGES = 0.95, 20
+# changes are multiples of them; longer ones than the last are not looked for.
+_HELD, _ENOUGH_CHANGES, _LONGEST_HELD = 0.95, 20, 1000
 
 
 def read_runs(
@@ -232,7 +232,5 @@ def held_for(signals: Sequence[Array]) -> int:
     gaps = np.concatenate([np.diff(at) for at in changes])
     if len(gaps) < _ENOUGH_CHANGES:
         return 1
-    shares = [np.mean(gaps % k == 0) for k in range(2, int(np.median(gaps)) + 1)]
-    return 1 + max(
-        (k for k, share in enumerate(shares, 1) if share >= _HELD), default=0
-    )
+    longest = min(int(np.median(gaps)), _LONGEST_HELD)
+    return next(k for k in range(longest, 0, -1) if np.mean(gaps % k == 0) >= _HELD)
