@@ -394,7 +394,7 @@ def _heed(feedback: Feedback | None, settings: Settings, by_default: bool) -> Se
     """
     if settings.method != "auto":
         return settings
-    if feedback is None or not feedback.found:
+    if feedback is None or not feedback.found or feedback.cut_off:
         return settings._replace(method="po-moesp")
     free = settings.free
     if by_default and feedback.instantaneous:
@@ -545,6 +545,12 @@ def _tell_of_feedback(
         )
     elif method == "pbsid":
         return
+    elif feedback.cut_off:
+        what += (
+            "They are too few for the past that method='pbsid' needs: that of "
+            "method='po-moesp' was taken, which feedback biases. Record for longer, or "
+            "identify with the controller's reference as input."
+        )
     elif doubt is not None:
         open_loop = fitted.method == "po-moesp"
         what += (
