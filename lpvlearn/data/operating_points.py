@@ -15,7 +15,7 @@ from scipy.spatial import Delaunay, QhullError
 from scipy.spatial.distance import cdist
 
 from ..exceptions import warn
-from ..validation import shown
+from ..validation import shown, squarable
 from .experiments import Experiment, as_numbers
 
 Array = NDArray[np.float64]
@@ -201,6 +201,9 @@ def group_operating_points(
     signals = [run.scheduling for run in experiments if run.scheduling is not None]
     means = None
     if len(signals) == len(experiments):
+        rows = squarable("scheduling", np.vstack(signals))
+        if np.isinf(rows).any():
+            raise ValueError("`scheduling` must be finite. Got inf in its columns.")
         means = np.array([signal.mean(axis=0) for signal in signals])
     if all(run.operating_point is not None for run in experiments):
         group, _ = pd.factorize(

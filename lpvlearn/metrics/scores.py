@@ -12,6 +12,8 @@ from ..validation import SQUARED, real_array, shown, squarable
 
 _SMALL = 1e-100  # beside larger numbers, what squares lose is nothing
 
+_LESS = -600  # power of two by which numbers without a square have one: all are ratios
+
 _WORST = -1e300  # of a fit, of which the percentage is a number still
 
 Multioutput = Literal["raw_values", "uniform_average"] | ArrayLike
@@ -198,7 +200,10 @@ def _read_pair(
                 f"column {column}; a simulation that diverges comes from an unstable "
                 "model."
             )
-    return true, np.where(unknown, np.nan, pred) if unknown.any() else pred
+    pred = np.where(unknown, np.nan, pred) if unknown.any() else pred
+    if max(np.nanmax(np.abs(x), initial=0.0) for x in (true, pred)) >= SQUARED:
+        true, pred = np.ldexp(true, _LESS), np.ldexp(pred, _LESS)
+    return true, pred
 
 
 def _check_measured(true: NDArray[np.float64]) -> None:
@@ -220,8 +225,7 @@ def _centred(values: NDArray[np.float64]) -> NDArray[np.float64]:
         moved[:, values.max(axis=0) == values.min(axis=0)] = 0.0
         return moved
     count = np.maximum(known.sum(axis=0), 1)
-    with np.errstate(over="ignore"):
-        mean = np.where(known, values, 0.0).sum(axis=0) / count
+    mean = np.where(known, values, 0.0).sum(axis=0) / count
     highest = np.where(known, values, -np.inf).max(axis=0)
     lowest = np.where(known, values, np.inf).min(axis=0)
     return np.where(known & (highest == lowest), 0.0, values - mean)

@@ -316,6 +316,15 @@ def test_what_surveys_found_is_right():
     assert (tiny.jacobian([2.0, 3.0]).ravel() == [-1, 0, 0, 0, 0, 1, 0, 0]).all()
     for score in (lp.bft_score, lp.vaf_score):
         assert score(1e-200 * theta, 1e-200 * theta[::-1]) == score(theta, theta[::-1])
+        assert score([1e308, 0.9e308], [-1e308, -0.9e308]) == 0.0
+        assert score([1e308, -1e308, 0.0], [1e308, -1e308, 0.0]) == 100.0
+
+
+@pytest.mark.parametrize("value", [np.inf, 1e308])
+def test_scheduling_beyond_arithmetic_is_told_of_splits(value):
+    X = np.column_stack([np.ones(9), np.full(9, value), np.repeat([0, 1, 2], 3)])
+    with pytest.raises(ValueError, match="`scheduling` must"):
+        list(lp.ExperimentSplit(3, experiment=2, scheduling=1).split(X))
 
 
 @pytest.mark.parametrize("size", [1.0, 1e100, 1e149])
