@@ -281,15 +281,15 @@ class GrayBoxStructure:
         model = StateSpace(A, B, C, given[3] if len(given) == 4 else None)
         dimensions = model.order, model.n_inputs, model.n_outputs
         map = FunctionMap(function, jacobian, dimensions, start)
-        if jacobian is not None and not callable(jacobian):
+        if jacobian is None:
+            map = map.checked()
+        elif callable(jacobian):
+            map.jacobian(start)  # its shapes are told of here, not in a fit
+        else:
             raise ValueError(
                 "`jacobian` must be a function of the parameters, or None. Got "
                 f"{shown(jacobian)}."
             )
-        if jacobian is not None:
-            map.jacobian(start)  # its shapes are told of here, not in a fit
-        else:
-            map = map.checked()
         return cls(model.order, map, names, initial=start)
 
     @classmethod

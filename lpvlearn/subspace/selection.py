@@ -470,9 +470,8 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     n, (ny, m) = len(model.A), free.direct.shape
     n_values = sum(record.y.size for record in records)
     n_samples = n_values // ny
-    own = free.n_own(n)
-    n_parameters = n * (m + ny) + int(free.direct.sum())
-    n_parameters += len(model.initial_states) * own
+    own = len(model.initial_states) * free.n_own(n)
+    n_parameters = n * (m + ny) + int(free.direct.sum()) + own
     few = n_values / max(n_values - n_parameters, 1)
     if not np.isfinite(model.loss):
         return np.inf
