@@ -204,13 +204,13 @@ def _of_most(
     left = np.abs(Y - (Y @ Q) @ Q.T)
     half, most = np.quantile(left, (0.5, _MOST), axis=1, keepdims=True)
     common = (left <= np.maximum(_OUTLYING * half, most)).all(axis=0)
-    feedback = _explained(L[:, common], Y[:, common], F[:, common])
-    return feedback, _explained(L, Y, N).share
+    some = _basis(L[:, common], L[:, common], _DEPENDENT)
+    feedback = _explained(some, Y[:, common], F[:, common])
+    return feedback, _explained(Q, Y, N).share
 
 
-def _explained(known: Array, rows: Array, terms: Array) -> _Correlated:
-    """Test whether terms explain rows, given what is known of both."""
-    Q = _basis(known, known, _DEPENDENT)
+def _explained(Q: Array, rows: Array, terms: Array) -> _Correlated:
+    """Test whether terms explain rows beyond what lies in orthonormal columns Q."""
     rows, left = (x - (x @ Q) @ Q.T for x in (rows, terms))
     return _wilks(rows, _basis(left, terms, _FORESEEN), len(Q) - Q.shape[1])
 
