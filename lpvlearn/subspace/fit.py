@@ -647,8 +647,8 @@ _CONFIRMED = 0.5
 _ENOUGH = 100  # samples, for parts of them to tell anything
 
 
-# A standard deviation of the static gain by the root mean square of the whole response:
-# above it, a gain that is not known matters.
+# A standard deviation of the static gain by the root mean square of the response of its
+# output to all inputs as they move: above it, a gain that is not known matters.
 _OPEN = 0.3
 
 _DECAYS = 2.0  # standard deviations of a pole, for its decay to be known

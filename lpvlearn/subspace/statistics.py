@@ -57,7 +57,7 @@ class StaticGain(NamedTuple):
 
     value: Array
     std: Array
-    size: Array  # root mean square of the response over all frequencies
+    size: Array  # root mean square of the output's response, per unit of the input
 
 
 class Known(NamedTuple):
@@ -289,7 +289,8 @@ class Evidence:
         lti = self.state_space(self.model, 1.0)
         response = lti.frequency_response(np.linspace(0.0, np.pi, _N_FREQUENCIES))
         std = self.frequency_response_std(np.zeros(1))[0].real
-        size = np.sqrt(np.mean(np.abs(response) ** 2, axis=0))
+        power = np.mean(np.abs(response * self.input_scale) ** 2, axis=0)
+        size = np.sqrt(power.sum(axis=1, keepdims=True)) / self.input_scale
         return StaticGain(response[0].real, std, size)
 
     def _frequency_jacobian(self, omega: Array) -> NDArray[np.complex128]:

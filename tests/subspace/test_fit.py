@@ -325,6 +325,26 @@ def test_a_static_gain_that_is_not_known_is_told():
     assert n_told > 0
 
 
+def test_inputs_that_do_not_reach_an_output_need_no_static_gain():
+    n_unknown = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        u = rng.choice([-1.0, 1.0], (500, 2))
+        y = np.column_stack(
+            [
+                lfilter([0.0, 0.5], [1.0, -0.9], u[:, 0]),
+                lfilter([0.0, 0.3], [1.0, 0.7], u[:, 1]),
+            ]
+        )
+        y += 0.1 * rng.standard_normal(y.shape)
+        model = SubspaceLTI(2, offset=None).fit(u, y)  # silently
+        gain = model._evidence.static_gain()
+        across = gain.std > np.abs(gain.value)
+        assert not across.diagonal().any()
+        n_unknown += across.sum()
+    assert n_unknown > 0
+
+
 def swinging(seed, decay):
     """Two steps and two periods of an oscillation, in noise."""
     rng, pole = np.random.default_rng(seed), (1.0 - decay) * np.exp(0.05j)
