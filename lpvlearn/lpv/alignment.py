@@ -2,13 +2,24 @@
 
 Balanced models have a basis that is unique up to signs where their singular values
 differ, and up to rotations where these come together: neighbours are turned to one
-another. The states x and x_r of a model and of its reference answer the same white
-input with the covariance X, and their outputs weigh initial states alike by Y:
+another, by the orthogonal T that brings the matrices of a model nearest to those of its
+reference (subscript r), which is what interpolation between them asks for:
 
-    A X + X A_r^T + B B_r^T = 0,    A^T Y + Y A_r + C^T C_r = 0.
+    min over T of   (|D S^(1/2)|^2 + |S^(1/2) D|^2) / w + |T^T B - B_r|^2 + |C T - C_r|^2,
+    D = T^T A T - A_r,    w^2 = tr(A_r S A_r^T) / tr(S).
 
-The rotation T whose x = T x_r agrees best with both is the polar factor of X + Y (an
-orthogonal Procrustes problem). Neighbours are those of a minimum spanning tree.
+S is the reference's mean Gramian, which weighs states by what inputs move of them and
+outputs show, and w its mean rate: all terms are energies by time.
+
+The minimum is sought from the rotations that agree best with the correlation of the two
+states: under one white input, and in the outputs of initial states, forgotten at a rate s,
+
+    (A - s) X + X (A_r - s)^T + B B_r^T = 0,    (A - s)^T Y + Y (A_r - s) + C^T C_r = 0,
+
+of which the polar factor of X + Y is the nearest T (an orthogonal Procrustes problem).
+Modes whose frequency differs by more than their decay lose their correlation without s;
+with much of it, only what inputs and outputs meet at once counts. Neighbours are those of
+a minimum spanning tree.
 """
 
 from __future__ import annotations
@@ -17,7 +28,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_sylvester, svd
+from scipy.linalg import eigh, solve_sylvester, svd
+from scipy.optimize import least_squares
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
@@ -27,6 +39,11 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int32]
 
 _APART = 1e-9  # of points at one place: a graph takes a distance of zero for none
+
+# Rates at which states are forgotten, by the modulus of the reference's fastest pole.
+_FORGOTTEN = (0.0, 1e-3, 1e-2, 0.1, 1.0)
+
+_STEPS = 100  # neighbours take ten; models that are no neighbours have no nearest basis
 
 
 def aligned_models(models: Sequence[StateSpace], kappa: Array) -> list[StateSpace]:
@@ -61,7 +78,7 @@ def spanning_tree(kappa: Array, *, outward: bool = True) -> tuple[Rows, Rows]:
 
 
 def rotation_to(model: StateSpace, reference: StateSpace) -> Array:
-    """Orthogonal T by which the model's state is nearest to that of the reference.
+    """Orthogonal T by which the model's matrices are nearest to the reference's.
 
     Examples
     --------
@@ -72,7 +89,82 @@ def rotation_to(model: StateSpace, reference: StateSpace) -> Array:
     array([[ 0.,  1.],
            [-1.,  0.]])
     """
-    X = solve_sylvester(model.A, reference.A.T, -model.B @ reference.B.T)
-    Y = solve_sylvester(model.A.T, reference.A, -model.C.T @ reference.C)
-    U, _, V = svd(X + Y)
-    return np.asarray(U @ V)
+    distance = _Distance(model, reference)
+    fastest = np.abs(reference.poles()).max(initial=0.0)
+    starts = []
+    for share in _FORGOTTEN:
+        U, _, V = svd(_correlation(model, reference, share * fastest))
+        starts.append(np.asarray(U @ V))
+    lengths = [np.linalg.norm(distance.residuals(T)) for T in starts]
+    return distance.nearest(starts[int(np.argmin(lengths))])
+
+
+def _correlation(model: StateSpace, reference: StateSpace, rate: float) -> Array:
+    """X + Y of the states of two models that forget at a rate."""
+    forget = rate * np.eye(model.order)
+    A, A_r = model.A - forget, reference.A - forget
+    X = solve_sylvester(A, A_r.T, -model.B @ reference.B.T)
+    Y = solve_sylvester(A.T, A_r, -model.C.T @ reference.C)
+    return np.asarray(X + Y)
+
+
+class _Distance:
+    """What is minimised, as residuals of rotations T = T_0 (I - K)^-1 (I + K).
+
+    K is skew-symmetric, with the unknowns k above its diagonal (Cayley's transform).
+    """
+
+    def __init__(self, model: StateSpace, reference: StateSpace) -> None:
+        self.model, self.reference = model, reference
+        gramian = _correlation(reference, reference, 0.0) / 2.0
+        energy, basis = eigh((gramian + gramian.T) / 2.0)
+        root = basis * np.sqrt(np.maximum(energy, 0.0)) @ basis.T
+        rate = np.linalg.norm(reference.A @ root) / (np.linalg.norm(root) or 1.0)
+        self.root = root / np.sqrt(rate)
+        self.above = np.triu_indices(model.order, 1)
+
+    def nearest(self, start: Array) -> Array:
+        """T at the minimum that a start leads to."""
+        n_unknowns = len(self.above[0])
+        if not n_unknowns:
+            return start
+        found = least_squares(
+            lambda k: self.residuals(start @ self._turn(k)[0]),
+            np.zeros(n_unknowns),
+            lambda k: self._jacobian(start, k),
+            method="lm",
+            max_nfev=_STEPS,
+        )
+        return np.asarray(start @ self._turn(found.x)[0])
+
+    def residuals(self, T: Array) -> Array:
+        model, reference = self.model, self.reference
+        return self._stacked(
+            T.T @ model.A @ T - reference.A,
+            T.T @ model.B - reference.B,
+            model.C @ T - reference.C,
+        )
+
+    def _stacked(self, A: Array, B: Array, C: Array) -> Array:
+        """Differences (..., rows, columns) as rows of residuals, weighed."""
+        parts = (A @ self.root, self.root @ A, B, C)
+        return np.concatenate([M.reshape(*M.shape[:-2], -1) for M in parts], axis=-1)
+
+    def _turn(self, k: Array) -> tuple[Array, Array]:
+        """(I - K)^-1 (I + K), and (I - K)^-1."""
+        K = np.zeros_like(self.root)
+        K[self.above] = k
+        K -= K.T
+        eye = np.eye(len(K))
+        inverse = np.linalg.inv(eye - K)
+        return inverse @ (eye + K), inverse
+
+    def _jacobian(self, start: Array, k: Array) -> Array:
+        """A change of K turns T on by the skew W = 2 (I + K)^-1 dK (I - K)^-1."""
+        turn, inverse = self._turn(k)
+        T = start @ turn
+        A, B, C = T.T @ self.model.A @ T, T.T @ self.model.B, self.model.C @ T
+        row, column = self.above
+        half = inverse[row][:, :, None] * inverse[column][:, None, :]
+        W = 2.0 * (half - half.swapaxes(1, 2))
+        return self._stacked(A @ W - W @ A, -W @ B, C @ W).T

@@ -143,7 +143,7 @@ class LocalLPVPipeline(ScheduledEstimator):
     restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
         Step 4. Without a structure, "aligned" (None) interpolates the entries of
         the balanced local models, each turned to its neighbour by the rotation that
-        brings their states nearest; "passthrough" those whose signs alone agree, the
+        brings their matrices nearest; "passthrough" those whose signs alone agree, the
         paper's baseline. ``GrayBoxRestructurer()`` is the observable canonical form.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters

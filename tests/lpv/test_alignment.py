@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace
-from lpvlearn.lpv.alignment import aligned_models, rotation_to
+from lpvlearn.lpv.alignment import _Distance, aligned_models, rotation_to
 
 from ..conftest import modes, stable_model
 
@@ -43,6 +43,43 @@ def test_a_model_and_itself_turned_agree(order):
     back = other.transform(T.T)
     for block in "ABC":
         assert_allclose(getattr(back, block), getattr(model, block), atol=1e-8)
+
+
+def test_the_derivatives_are_those_of_the_residuals():
+    model, reference = (stable_model(seed, 4).balance() for seed in (1, 2))
+    distance = _Distance(model, reference)
+    rng = np.random.default_rng(0)
+    start = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    k, step = rng.normal(size=6), 1e-6
+
+    def residuals(k):
+        return distance.residuals(start @ distance._turn(k)[0])
+
+    changes = [residuals(k + e) - residuals(k - e) for e in step * np.eye(6)]
+    J = distance._jacobian(start, k)
+    assert_allclose(J, np.array(changes).T / (2 * step), atol=1e-8)
+
+
+@pytest.mark.parametrize("damping", [0.1, 0.01, 0.001])
+def test_modes_whose_frequency_moves_by_more_than_they_decay(damping):
+    """Between neighbours the matrices of one physical basis are as near as in it."""
+    points = np.linspace(0.0, 1.0, 4)[:, None]
+    models = []
+    for x in points[:, 0]:
+        A = modes(*[(-damping + 1j) * w for w in (5.0 + 5.0 * x, 20.0 - 6.0 * x)])
+        B, C = [[0.0], [1.0], [0.0], [0.6 + x]], [[1.0, 0.0, -0.7, 0.0]]
+        models.append(StateSpace(A, B, C).balance())
+    A = np.array([model.A for model in aligned_models(turned(models, 8), points)])
+    middle = np.linalg.eigvals((A[1:] + A[:-1]) / 2.0)
+    x = (points[1:] + points[:-1]) / 2.0
+    slow, fast = 5.0 + 5.0 * x, 20.0 - 6.0 * x
+    found = np.sort(np.abs(middle.imag), axis=1)
+    assert_allclose(found, np.hstack([slow, slow, fast, fast]), rtol=0.02)
+
+
+def test_models_without_states_have_nothing_to_turn():
+    gain = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[2.0]])
+    assert aligned_models([gain, gain], np.array([[0.0], [1.0]]))[1].order == 0
 
 
 def test_equal_singular_values_leave_nothing_open():
