@@ -131,8 +131,9 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
                 f"Experiment {run.label!r} must be local. Got a scheduling variable "
                 f"{worst + 1} that spreads over {spread[worst]:.4g}, more than "
                 f"{_MAX_SPREAD:g} times the {compared} ({scale[worst]:.4g}). Keep such "
-                "a record for validation, cut it into local experiments, or refine the "
-                f"model with it: refiner=OutputErrorLPV().{several}"
+                "a record for validation, cut it into local experiments, put the mean "
+                "of the variable in its place where it only moves about one point, or "
+                f"refine the model with it: refiner=OutputErrorLPV().{several}"
             )
         changes = np.count_nonzero(np.diff(run.scheduling, axis=0), axis=0)
         steps = (changes > 0) & (changes <= min(_FEW_STEPS, len(run.rows) // _STILL))

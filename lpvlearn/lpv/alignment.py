@@ -5,21 +5,22 @@ differ, and up to rotations where these come together: neighbours are turned to 
 another, by the orthogonal T that brings the matrices of a model nearest to those of its
 reference (subscript r), which is what interpolation between them asks for:
 
-    min over T of   (|D S^(1/2)|^2 + |S^(1/2) D|^2) / w + |T^T B - B_r|^2 + |C T - C_r|^2,
+    min over T:  (|D S^(1/2)|^2 + |S^(1/2) D|^2) / w + |T^T B - B_r|^2 + |C T - C_r|^2,
     D = T^T A T - A_r,    w^2 = tr(A_r S A_r^T) / tr(S).
 
 S is the reference's mean Gramian, which weighs states by what inputs move of them and
 outputs show, and w its mean rate: all terms are energies by time.
 
 The minimum is sought from the rotations that agree best with the correlation of the two
-states: under one white input, and in the outputs of initial states, forgotten at a rate s,
+states, under one white input and in the outputs of initial states, both forgotten at a
+rate s:
 
     (A - s) X + X (A_r - s)^T + B B_r^T = 0,    (A - s)^T Y + Y (A_r - s) + C^T C_r = 0,
 
 of which the polar factor of X + Y is the nearest T (an orthogonal Procrustes problem).
 Modes whose frequency differs by more than their decay lose their correlation without s;
-with much of it, only what inputs and outputs meet at once counts. Neighbours are those of
-a minimum spanning tree.
+with much of it, only what inputs and outputs meet at once counts. Neighbours are those
+of a minimum spanning tree.
 """
 
 from __future__ import annotations
