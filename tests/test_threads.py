@@ -5,13 +5,20 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pytest
 from joblib import Parallel, delayed, parallel_config
-from scipy import linalg
 from sklearn.base import clone
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import lpvlearn
-from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace, SubspaceLTI
+from lpvlearn import (
+    AutoLPV,
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    StateSpace,
+    SubspaceLTI,
+    gap,
+)
 
 from .conftest import spring_pipeline, spring_tables
 
@@ -50,20 +57,52 @@ def test_threads_agree_with_a_serial_fit_and_put_back_the_threads_of_blas():
         np.testing.assert_array_equal(fitted.parameters_.to_numpy(), expected)
 
 
-def test_a_local_fit_has_one_thread_of_blas_and_puts_back_what_it_found(monkeypatch):
-    seen, (X, e) = [], np.random.default_rng(0).standard_normal((2, 200, 1))
+def local_fit():
+    X, e = np.random.default_rng(0).standard_normal((2, 200, 1))
     y = StateSpace(0.9, 1, 1, None, 1.0).simulate(X) + 0.1 * e
-    original = linalg.svd
+    SubspaceLTI(1, horizon=5).fit(X, y).residual_tests(X, y)
 
-    def svd(*args, **options):
-        seen.append(blas_threads())
-        return original(*args, **options)
 
-    monkeypatch.setattr(linalg, "svd", svd)
+def restructuring():
+    structure = GrayBoxStructure.from_template(A=[["-a"]], B=[[1]], C=[["c"]])
+    GrayBoxRestructurer(structure).fit_model(StateSpace(-2, 3, 4))
+
+
+def interpolation():
+    kappa = np.linspace(0.0, 1.0, 5)[:, None]
+    AutoLPV().fit(kappa, np.sin(kappa), covariance=np.full((5, 1, 1), 1e-4))
+
+
+def chain():
+    spring_pipeline().fit(*spring_tables(n_samples=100, kappas=(0.0, 1.0)))
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        local_fit,
+        restructuring,
+        interpolation,
+        chain,
+        lambda: gap(StateSpace(-2, 3, 4), StateSpace(-3, 3, 4)),
+    ],
+    ids=["local fit", "restructuring", "interpolation", "chain", "gap"],
+)
+def test_small_matrices_have_one_thread_of_blas_which_is_put_back(work, monkeypatch):
+    seen = []
+
+    def watched(original):
+        def watch(*args, **options):
+            seen.append(blas_threads())
+            return original(*args, **options)
+
+        return watch
+
+    for name in ("eigvals", "svd", "solve", "lstsq", "qr"):
+        monkeypatch.setattr(np.linalg, name, watched(getattr(np.linalg, name)))
     with threadpool_limits(2, user_api="blas"):
         before = blas_threads()
-        model = SubspaceLTI(1, horizon=5).fit(X, y)
-        model.residual_tests(X, y)
+        work()
         assert blas_threads() == before
     assert seen and all(n == 1 for threads in seen for n in threads)
 

@@ -15,6 +15,7 @@ from sklearn.utils.validation import (
 )
 
 from ..exceptions import ExtrapolationWarning, VersionedPickle, all_or_nothing, warn
+from ..systems.threads import one_blas_thread
 from ..validation import (
     SQUARED,
     naming_argument,
@@ -56,6 +57,7 @@ class Interpolator(
     extrapolation: str
 
     @all_or_nothing
+    @one_blas_thread
     def fit(
         self, X: ArrayLike, y: ArrayLike, covariance: ArrayLike | None = None
     ) -> Self:

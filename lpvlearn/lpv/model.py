@@ -25,6 +25,7 @@ from ..structures.structure import GrayBoxStructure
 from ..systems.sampling import sample_zoh
 from ..systems.simulation import delayed, state_trajectory
 from ..systems.tabulation import tabulate
+from ..systems.threads import one_blas_thread
 from ..validation import (
     finite_samples,
     flag,
@@ -580,6 +581,7 @@ class LPVStateSpace:
         """
         return sorted_poles(self.structure.matrices(self.parameters(kappa))[0])
 
+    @one_blas_thread
     def simulate(
         self,
         u: ArrayLike,

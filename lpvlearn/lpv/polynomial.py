@@ -10,6 +10,7 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike, NDArray
 
 from ..exceptions import RankWarning, all_or_nothing, warn
+from ..systems.threads import one_blas_thread
 from ..validation import one_of, whole_number
 from .interpolator import Interpolator, carried_by_terms, domains, to_unit
 from .weighting import WeightedPoints
@@ -115,6 +116,7 @@ class PolynomialLPV(Interpolator):
         self.extrapolation = extrapolation
 
     @all_or_nothing
+    @one_blas_thread
     def fit(  # type: ignore[override]  # scikit-learn has weights in third place
         self,
         X: ArrayLike,

@@ -20,6 +20,7 @@ from ..exceptions import warn
 from ..systems.hinf_norm import linf_norm
 from ..systems.response import equilibrated, frequency_response
 from ..systems.sampling import d2c_tustin
+from ..systems.threads import one_blas_thread
 from .statespace import StateSpace
 
 Array = NDArray[np.float64]
@@ -29,6 +30,7 @@ _LOST = 1e-4  # error of coprime factors, of which the gap has no more digits
 _ORTHOGONAL = 1.0 - 1e-12  # a norm of 1 but for rounding: somewhere the graphs are
 
 
+@one_blas_thread
 def gap(G1: StateSpace, G2: StateSpace) -> float:
     r"""The nu-gap: how far two models are apart for whoever closes a loop around them.
 

@@ -51,6 +51,7 @@ from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
+from ..systems.threads import one_blas_thread
 from ..validation import (
     file_name,
     one_of,
@@ -486,6 +487,7 @@ list, default=None
                 step = e.sampling_time if step is None else step
                 yield e
 
+    @one_blas_thread
     def _fit(self, read: Callable[[], list[Experiment]]) -> None:
         self._check_options()
         steps = {"local": self.local, "restructurer": self.restructurer}

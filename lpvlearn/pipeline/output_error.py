@@ -44,6 +44,7 @@ from ..metrics.scores import bft_score
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
+from ..systems.threads import one_blas_thread
 from ..validation import (
     number,
     one_of,
@@ -255,6 +256,7 @@ class OutputErrorLPV(ScheduledEstimator):
         self.verbose = verbose
 
     @all_or_nothing
+    @one_blas_thread
     def fit(self, X: Any, y: Any) -> OutputErrorLPV:
         """Fit the model to the experiments of a table.
 

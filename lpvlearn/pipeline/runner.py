@@ -15,7 +15,7 @@ from joblib import Memory, delayed
 from numpy.typing import NDArray
 
 from ..exceptions import Told, collected, warn
-from ..subspace.threads import one_blas_thread
+from ..systems.threads import one_blas_thread
 from .memory import Remembered
 from .workers import results_of
 

@@ -26,6 +26,7 @@ from ..exceptions import RankWarning, VersionedPickle, all_or_nothing, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
+from ..systems.threads import one_blas_thread
 from ..validation import (
     flag,
     naming_argument,
@@ -284,6 +285,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
 
     # -- fitting -------------------------------------------------------------------
 
+    @one_blas_thread
     def fit_model(
         self,
         model: StateSpace | Sequence[StateSpace],
@@ -366,6 +368,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self.covariance_degrees_of_freedom_ = len(seen) - 1.0
         return self
 
+    @one_blas_thread
     def fit(
         self,
         omega: ArrayLike,

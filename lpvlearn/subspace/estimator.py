@@ -36,6 +36,7 @@ from ..systems.simulation import (
     trend_signals,
     with_transit,
 )
+from ..systems.threads import one_blas_thread
 from ..validation import frequencies, input_delays, naming_argument, one_of
 from .delay import Delay, find_delays, with_late_inputs
 from .fit import (
@@ -66,7 +67,6 @@ from .residuals import (
 )
 from .selection import selection_text
 from .stream import SampleStream, fit_as_stream
-from .threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -891,6 +891,7 @@ class SubspaceLTI(
             )
         return self._in_table(self._read(X, None), X, self._simulated)
 
+    @one_blas_thread
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
         """Simulate the outputs from initial states estimated on measured outputs.
 
@@ -941,6 +942,7 @@ class SubspaceLTI(
         """
         return score_from_rest(self, X, y, sample_weight)
 
+    @one_blas_thread
     def predict_ahead(
         self, X: Any, y: Any, steps: int = 1, *, initial_state: str = "estimate"
     ) -> Array:
@@ -977,6 +979,7 @@ class SubspaceLTI(
 
         return self._in_table(experiments, X, predicted)
 
+    @one_blas_thread
     def residual_tests(
         self,
         X: Any,

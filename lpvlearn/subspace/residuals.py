@@ -48,6 +48,7 @@ from ..systems.simulation import (
     free_responses,
     trend_signals,
 )
+from ..systems.threads import one_blas_thread
 from ..validation import one_of, share, whole_number
 from .hankel import cholesky_factor, correlation_sequence, stack_factors
 from .identification import centred
@@ -55,7 +56,6 @@ from .noise import autoregression
 from .signals import thinned
 from .simulation_fit import simulation_errors, with_initial_states
 from .statistics import Evidence
-from .threads import one_blas_thread
 
 Array = NDArray[np.float64]
 

@@ -33,6 +33,7 @@ from ..data.preparation import (
     unbroken_runs,
 )
 from ..data.timestamps import TIME_TOL, Clock, read_clock, time_in_seconds
+from ..systems.threads import one_blas_thread
 from ..validation import SQUARED, input_delays
 from .delay import late_inputs
 from .fit import (
@@ -46,7 +47,6 @@ from .fit import (
     warn_about_pole,
 )
 from .stream_summary import Piece, StreamSummary
-from .threads import one_blas_thread
 
 Array = NDArray[np.float64]
 

@@ -26,6 +26,7 @@ from scipy.linalg import lapack
 
 from .peaks import TENTHS, Peak, PeakRefiner, sigma_max
 from .response import FrequencyEngine, scaled_system, times_power
+from .threads import one_blas_thread
 
 _EPS = float(np.finfo(float).eps)
 
@@ -67,6 +68,7 @@ class PeakSet:
     values: NDArray  # the largest singular values there, descending
 
 
+@one_blas_thread
 def linf_norm(
     A: NDArray,
     B: NDArray,

@@ -1,8 +1,9 @@
 """One thread of BLAS while small matrices are worked on.
 
-Between the many small products and factorisations of a fit, threads of BLAS wait for
-each other, spinning: of two threads a fit takes up to 50 times the processor's time of
-one, and more where other programs want the processor, too.
+Between the many small products and factorisations of a fit or a norm, threads of BLAS
+wait for each other, spinning: two of them take up to 50 times the processor's time of
+one, and more where other programs want the processor, too. Public methods that work on
+small matrices for long hold one thread while they run.
 """
 
 from __future__ import annotations
