@@ -167,8 +167,9 @@ def as_list(keys: Any) -> list[Any]:
     """The columns with a role, as a list; empty for None."""
     if keys is None:
         return []
-    array = isinstance(keys, np.ndarray) and keys.ndim
-    return list(keys) if array or isinstance(keys, (list, tuple, pd.Index)) else [keys]
+    if isinstance(keys, (np.ndarray, pd.Index, pd.Series)):
+        return np.ravel(keys).tolist()
+    return list(keys) if isinstance(keys, (list, tuple)) else [keys]
 
 
 def is_table(X: Any) -> bool:

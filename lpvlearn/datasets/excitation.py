@@ -10,7 +10,14 @@ from numpy.random import Generator, RandomState
 from numpy.typing import NDArray
 from sklearn.utils import check_random_state
 
-from ..validation import naming_argument, number, real_array, shown, whole_number
+from ..validation import (
+    naming_argument,
+    number,
+    positive_time,
+    real_array,
+    shown,
+    whole_number,
+)
 
 Array = NDArray[np.float64]
 
@@ -124,7 +131,7 @@ def spawn_generators(
 
 def samples_of(name: str, duration: float, sampling_time: float) -> int:
     """Number of samples in a duration."""
-    dt = check_size("sampling_time", sampling_time)
+    dt = positive_time("sampling_time", sampling_time)
     rule = f"finite and at least `sampling_time` ({dt} s)"
     return check_count(name, float(np.rint(number(name, duration, rule, low=dt) / dt)))
 
@@ -171,7 +178,7 @@ def decibels(name: str, value: Any) -> float:
 
 def steps_of(sampling_time: Any, integration_step: Any, longest: float = np.inf) -> int:
     """Equal steps of a sampling period, each at most that and the `longest`."""
-    dt = check_size("sampling_time", sampling_time)
+    dt = positive_time("sampling_time", sampling_time)
     step = min(check_size("integration_step", integration_step), longest)
     if dt > _MOST_STEPS * step:
         raise ValueError(

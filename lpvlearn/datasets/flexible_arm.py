@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
-from ..validation import number, one_of, real_array, squarable
+from ..validation import number, one_of, positive_time, real_array, squarable
 from .excitation import check_size, steps_of
 from .mechanics import (
     arm_tables,
@@ -327,7 +327,7 @@ class FlexibleArm:
             folded), where y does not exist.
         """
         reference, angles = _pair_experiments(velocity_reference, theta2)
-        sampling_time = check_size("sampling_time", sampling_time)
+        sampling_time = positive_time("sampling_time", sampling_time)
         single = np.ndim(velocity_reference) == 2 and np.ndim(theta2) == 0
         n = len(angles)
         step = self._step(angles, sampling_time, integration_step)

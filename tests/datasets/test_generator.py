@@ -100,7 +100,7 @@ def test_scalar_clock_and_independent_bits():
         ({"n_realizations": 1.5}, "`n_realizations` must be an integer"),
         ({"snr_db": np.nan}, "`snr_db` must be a number"),
         ({"duration": 0.0}, "`duration` must be finite and at least"),
-        ({"sampling_time": -1.0}, "`sampling_time` must be finite and positive"),
+        ({"sampling_time": -1.0}, "`sampling_time` must be a positive number"),
         ({"clock": 0.0}, "`clock` must be a positive multiple"),
         ({"clock": 0.0015}, "`clock` must be a positive multiple"),
         ({"clock": (0.01, 0.01, 0.01)}, "`clock` must be one time"),

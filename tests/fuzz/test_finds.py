@@ -396,6 +396,8 @@ def test_what_no_number_can_stand_for_is_refused():
                 make(verbose=verbose, scheduling="kappa").fit(world().X, world().y)
     with pytest.raises(ValueError, match="`sampling_time` must be a positive number"):
         lp.SubspaceLTI(sampling_time=5e-324).fit(world().X, world().y)
+    with pytest.raises(ValueError, match="`sampling_time` must be a positive number"):
+        FlexibleArm().simulate(np.zeros((3, 2)), 1.0, sampling_time=5e-324)
 
 
 @pytest.mark.parametrize("name", ["X", "y"])
