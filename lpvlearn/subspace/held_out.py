@@ -35,7 +35,7 @@ _LONG = 80  # samples of an experiment whose pieces tell more than an initial st
 _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 
 # By which an error must be less to matter, and by which it is so beyond doubt.
-_SHARE, _MUCH = 0.03, 0.5
+MATTERS, _MUCH = 0.03, 0.5
 
 
 class HeldOut(NamedTuple):
@@ -50,8 +50,10 @@ class HeldOut(NamedTuple):
         """Of all blocks; infinite where nothing is held out."""
         return float(self.blocks.sum()) if len(self.blocks) else np.inf
 
-    def clearly_better_than(self, other: HeldOut, standard_errors: float) -> bool:
-        """Whether errors are less, by more than chance and by enough to matter.
+    def clearly_better_than(
+        self, other: HeldOut, standard_errors: float, share: float = MATTERS
+    ) -> bool:
+        """Whether errors are less, by more than chance and by a share that matters.
 
         Chance is so many standard errors of the difference. Of half the errors it is
         not asked: a model that loses the system now and then makes them large as well.
@@ -62,7 +64,7 @@ class HeldOut(NamedTuple):
         gap = other.blocks - self.blocks
         chance = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
         least = min(standard_errors * chance, _MUCH * total)
-        return bool(gap.sum() > max(least, _SHARE * total))
+        return bool(gap.sum() > max(least, share * total))
 
 
 def held_out(

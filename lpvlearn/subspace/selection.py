@@ -8,7 +8,8 @@ weighs the likelihood against the number of parameters. In the end the orders ab
 best one are fitted again, each by the noise that it leaves itself.
 
 The criterion trusts that the system is what the models are. Simulation of parts held
-out does not (`held_out`): it may lower the order.
+out does not (`held_out`): it may lower the order, and decides among orders which the
+criterion hardly tells apart, as noise that follows the inputs and a further state are.
 
 A horizon that was given is not questioned but by `better_horizon`, after the fit.
 """
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from .hankel import correlation_sequence
-from .held_out import HeldOut
+from .held_out import MATTERS, HeldOut
 from .identification import (
     Candidate,
     Settings,
@@ -230,14 +231,16 @@ def _search(
     whitening = _noise_of(pilot, records, wanted, settings)
     tried = _try_orders(wanted, records, whitening, settings)
     orders = _judged(tried, whitening, records, wanted, settings)
-    best = min(orders.values(), key=lambda one: one.criterion).order
+    least = min(orders.values(), key=lambda one: one.criterion)
+    chosen = best = least.order
     candidates = {order: one.candidate for order, one in orders.items()}
     errors = {best: validate(candidates[best], records, settings)}
-    chosen = best
-    for order in (best - step for step in _LOWER):
+    close = [k for k, one in orders.items() if one.criterion < least.criterion + _PRICE]
+    for order in [k for k in close if k > best] + [best - step for step in _LOWER]:
         if order in candidates:
             errors[order] = validate(candidates[order], records, settings)
-            if errors[order].clearly_better_than(errors[chosen], _DOUBT):
+            share = 0.0 if order > best else MATTERS
+            if errors[order].clearly_better_than(errors[chosen], _DOUBT, share):
                 chosen = order
     white = whitening.records(records, settings.free)
     tried = [one._replace(criterion=orders[one.order].criterion) for one in tried]

@@ -82,6 +82,26 @@ def test_noise_that_a_rich_pilot_followed_is_found_by_the_order_itself():
     assert sum(order == 3 for order in orders) >= 4 and max(orders) <= 4
 
 
+def test_parts_held_out_decide_where_the_criterion_hardly_does():
+    n_close = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        system = example(rng, modes(0.6 * np.exp(0.5j), 0.7 * np.exp(0.7j)), 1, 1)
+        u = np.sign(rng.standard_normal((80, 1))).repeat(3, axis=0)
+        y = lti_response(*system, u)
+        y = y + y.std() * rng.standard_normal(y.shape)
+        chosen = select([Record.of(u, y)], None, None, Settings(freedom(1, 1)))
+        table = chosen.table.dropna(subset="criterion").set_index("order")
+        least = table["criterion"].idxmin()
+        gap = len(y) * (table["criterion"] - table["criterion"].min())
+        close = table[(gap < 4.0) & (table.index >= least)]["validation_bft"]
+        assert close.notna().all()
+        n_close += len(close) - 1
+        if chosen.order > least:
+            assert close[chosen.order] > close[least]
+    assert n_close > 0
+
+
 def test_losses_do_not_rise_with_the_order():
     chosen = select([coloured(1, 300)], None, None, Settings(freedom(2, 1)))
     table = chosen.table.dropna(subset="criterion").set_index("order")["criterion"]
