@@ -9,17 +9,20 @@ small matrices for long hold one thread while they run.
 from __future__ import annotations
 
 import threading
-from contextlib import ContextDecorator
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Any, TypeVar, cast
 
 from threadpoolctl import ThreadpoolController
 
+Function = TypeVar("Function", bound=Callable[..., Any])
 
-class _OneBlasThread(ContextDecorator):
+
+class _OneBlasThread:
     """One thread of BLAS as long as any thread of the process is within.
 
     Their number is that of the process: the first one in sets it, and the last one out
-    puts it back.
+    puts it back. A context, and a decorator.
     """
 
     def __init__(self) -> None:
@@ -37,6 +40,15 @@ class _OneBlasThread(ContextDecorator):
             self._n_within -= 1
             if not self._n_within:
                 self._limit.__exit__(*error)
+
+    def __call__(self, function: Function) -> Function:
+        # Not that of contextlib: a warning's place is the first outside this library
+        @wraps(function)
+        def within(*args: Any, **options: Any) -> Any:
+            with self:
+                return function(*args, **options)
+
+        return cast(Function, within)
 
 
 one_blas_thread = _OneBlasThread()
