@@ -167,6 +167,7 @@ def _covariance(fitted: Any, model: LocalModel, runner: PointRunner) -> Array | 
             getattr(fitted, "frequency_weight", None),
             model.lti,
             model.deviated,
+            getattr(fitted, "norm", "hinf"),
         )
     return known
 
@@ -322,17 +323,18 @@ def covariance_of_parameters(
     weight: Any,
     model: StateSpace,
     deviated: Sequence[ModelPair],
+    norm: str = "hinf",
 ) -> Array:
     """Covariance of gray-box parameters from that of the black box `model`.
 
     The deviations of the response (`deviated_models`) are carried to the parameters to
-    first order, as the least-squares fit of the response does. `weight` is the
-    `frequency_weight` of `GrayBoxRestructurer`.
+    first order, as the minimisation of that norm does, for "hinf" as the least-squares
+    fit of the response. `weight` is the `frequency_weight` of `GrayBoxRestructurer`.
     """
     problem = problem_from_models(structure, [model], weight)
     response = problem.response_of
     changes = [response(above) - response(below) for above, below in deviated]
-    T = problem.parameter_changes(theta, np.array(changes)) / (2.0 * DEVIATION)
+    T = problem.parameter_changes(theta, np.array(changes), norm) / (2.0 * DEVIATION)
     return T.T @ T
 
 

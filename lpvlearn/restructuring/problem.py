@@ -37,6 +37,7 @@ from .measured import (
     read_noise,
     stable_realization,
 )
+from .similarity import bilinear_changes
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -200,16 +201,19 @@ class RestructuringProblem:
         names = self.structure.parameter_names
         return Identifiability.from_jacobian(J * sizes, names, level)
 
-    def parameter_changes(
-        self, theta: Array, dG: Complex, counts: Array | None = None
-    ) -> Array:
-        """First-order changes of the parameters with the black box's response.
+    def parameter_changes(self, theta: Array, dG: Complex, norm: str) -> Array:
+        """First-order changes, (r, n_params), with the black box's response.
 
-        Minimising the weighted mean square error, ``d theta = Re(K dG)`` with
-        ``K = (J^T J)^-1 J^H W`` in real arithmetic. `dG` (r, k, n_outputs, n_inputs)
-        are changes of the response; several black boxes change alike. A frequency
-        counts `counts` (k,) times.
+        Of the parameters that minimise Eq. (7) for the norm "similarity", else the
+        weighted mean square error, ``d theta = Re(K dG)`` with
+        ``K = (J^T J)^-1 J^H W`` in real arithmetic, over the grid or, for "h2", over
+        frequencies as its integral counts them. `dG` (r, k, n_outputs, n_inputs) are
+        changes of the response; several black boxes change alike.
         """
+        if norm == "similarity":
+            assert self.box is not None  # it was minimised
+            return bilinear_changes(self.structure, self.box, theta, self.omega, dG)
+        counts = np.gradient(self.omega) if norm == "h2" else None
         W = self._weighted[0]
         if counts is not None:
             W = np.sqrt(counts)[:, None, None] * W
@@ -302,12 +306,10 @@ class RestructuringProblem:
         """Covariance of the parameters that minimise `norm`, from draws of the noise.
 
         In the linearised structure: the least maximum for "hinf", which is not linear
-        in the noise, else least squares, for "h2" over frequencies as its integral
-        counts them.
+        in the noise, else as `parameter_changes`.
         """
         if norm != "hinf":
-            counts = np.gradient(self.omega) if norm == "h2" else None
-            changes = self.parameter_changes(theta, noise, counts)
+            changes = self.parameter_changes(theta, noise, norm)
         else:
             W = self._weighted[0]
             WJ = np.einsum("kpq,kqmj->kpmj", W, self._free_jacobian(theta))

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
+from scipy.linalg import block_diag, null_space
 from scipy.optimize import least_squares
 
 from ..minimax.problem import MinimaxResult, Peaks
-from ..systems.least_squares import Residuals, levenberg_marquardt
+from ..systems.least_squares import Residuals, levenberg_marquardt, scaled_lstsq
 from .deadline import time_is_up
-from .error_system import Structure, Target
+from .error_system import Structure, Target, derivatives, response_point
 
 Array = NDArray[Any]
 
@@ -209,89 +209,117 @@ def _distances(
     return residuals
 
 
-def bilinear_fit(
-    problem: AffineProblem,
-    theta: Array,
-    max_iter: int,
-    bounds: tuple[Array, Array],
-) -> tuple[Array, float, int, bool]:
-    """Minimise Eq. (7) over parameters and similarity from given parameters.
+class _BilinearEquations:
+    """``S0 diag(T, I) - diag(T, I) S(theta)`` over ``x = [vec T, theta]``, Eq. (7).
 
-    ``|A T - T A(theta)|_F^2 + |B - T B(theta)|_F^2 + |C T - C(theta)|_F^2``, where T
-    takes the structured state to that of the black box. The cost is quadratic in T for
-    given parameters, which starts T, and quadratic in the parameters for given T.
-
-    Returns the parameters, the square root of the cost, iterations, and whether these
-    converged.
+    T takes the structured state to that of the black box, of the system matrix S0; the
+    last block, ``D - D(theta)``, is for parameters of a feedthrough. Time and the
+    states of the structure are scaled.
     """
-    n = len(problem.A)
-    eye = np.eye(n)
 
-    def blocks(theta: Array) -> tuple[Array, Array, Array]:
-        S = problem.offset + np.tensordot(theta, problem.basis, axes=1)
-        return S[:n, :n], S[:n, n:], S[n:, :n]
+    def __init__(self, structure: Structure, box: Target | None, theta: Array) -> None:
+        """A ValueError where the structure is not affine or of another order."""
+        offset = getattr(structure, "offset", None)
+        if offset is None or box is None or len(box.A) != structure.order:
+            raise ValueError(
+                "`norm='similarity'` needs an affine structure of the order of the "
+                f"black box, as Eq. (7) does. Got {structure} and order "
+                f"{'unknown' if box is None else len(box.A)}."
+            )
+        poles = np.abs(np.linalg.eigvals(box.A))
+        discrete = box.dt is not None
+        self.rate = 1.0 if discrete else max(float(poles.max(initial=0.0)), 1e-300)
+        basis = structure.jacobian(theta)
+        problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, self.rate)
+        self.offset, self.basis = problem.offset, problem.basis
+        self.box = Target(problem.A, problem.B, problem.C, problem.D, box.dt)
+        self.S0 = np.block([[problem.A, problem.B], [problem.C, problem.D]])
+        self.n, (self.p, self.m) = structure.order, box.D.shape
 
-    def residuals(x: Array) -> Array:
-        T = x[: n * n].reshape(n, n)
-        A, B, C = blocks(x[n * n :])
-        parts = (problem.A @ T - T @ A, problem.B - T @ B, problem.C @ T - C)
-        return np.concatenate([part.ravel() for part in parts])
+    def start(self, theta: Array) -> Array:
+        """The best T of given parameters, in which the cost is quadratic."""
+        in_T = self.n**2
+        x = np.concatenate([np.zeros(in_T), theta])
+        J, r = self.jacobian(x)[:, :in_T], self.residuals(x)
+        x[:in_T] = -np.linalg.lstsq(J, r, rcond=None)[0]
+        return x
 
-    def jacobian(x: Array) -> Array:
-        T = x[: n * n].reshape(n, n)
-        A, B, _ = blocks(x[n * n :])
-        in_T = np.vstack(
-            [
-                np.kron(problem.A, eye) - np.kron(eye, A.T),
-                -np.kron(eye, B.T),
-                np.kron(problem.C, eye),
-            ]
-        )
-        q = len(problem.basis)
-        in_theta = np.hstack(
-            [
-                -(T @ problem.basis[:, :n, :n]).reshape(q, -1),
-                -(T @ problem.basis[:, :n, n:]).reshape(q, -1),
-                -problem.basis[:, n:, :n].reshape(q, -1),
-            ]
-        ).T
-        return np.hstack([in_T, in_theta])
+    def sides(self, x: Array) -> tuple[Array, Array]:
+        """``diag(T, I)`` for rows (outputs) and columns (inputs)."""
+        T = x[: self.n**2].reshape(self.n, self.n)
+        return block_diag(T, np.eye(self.p)), block_diag(T, np.eye(self.m))
 
-    x = np.concatenate([np.zeros(n * n), theta])
-    J = jacobian(x)[:, : n * n]
-    rhs = residuals(x)
-    x[: n * n] = -np.linalg.lstsq(J, rhs, rcond=None)[0]
-    free = np.full(n * n, np.inf)
-    limits = (np.append(-free, bounds[0]), np.append(free, bounds[1]))
-    x = np.clip(x, *limits)
-    found = least_squares(
-        residuals, x, jacobian, bounds=limits, x_scale="jac", max_nfev=max_iter
-    )
-    return found.x[n * n :], np.sqrt(2.0 * found.cost), found.nfev, found.status > 0
+    def _system(self, x: Array) -> Array:
+        return self.offset + np.tensordot(x[self.n**2 :], self.basis, axes=1)
+
+    def residuals(self, x: Array) -> Array:
+        left, right = self.sides(x)
+        return (self.S0 @ right - left @ self._system(x)).ravel()
+
+    def jacobian(self, x: Array) -> Array:
+        n, S = self.n, self._system(x)
+        in_T, k = np.zeros((n, n, *S.shape)), np.arange(n)
+        in_T[:, k, :, k] += self.S0[:, :n].T
+        in_T[k, :, k] -= S[:n]
+        in_theta = -self.sides(x)[0] @ self.basis
+        return np.vstack([J.reshape(-1, S.size) for J in (in_T, in_theta)]).T
 
 
 def minimise_bilinear(
     structure: Structure, box: Target | None, theta: Array, max_iter: int
 ) -> tuple[Array, MinimaxResult]:
-    """Minimise Eq. (7) from given parameters, time and states scaled.
+    """Minimise Eq. (7) over parameters and similarity, from given parameters.
 
-    A ValueError where the structure is not affine or of another order than the box.
+    ``|A T - T A(theta)|_F^2 + |B - T B(theta)|_F^2 + |C T - C(theta)|_F^2``, and
+    ``|D - D(theta)|_F^2``, for an affine structure of the black box's order. The value
+    is the square root.
     """
-    offset = getattr(structure, "offset", None)
-    if offset is None or box is None or len(box.A) != structure.order:
-        raise ValueError(
-            "`norm='similarity'` needs an affine structure of the order of the black "
-            f"box, as Eq. (7) does. Got {structure} and order "
-            f"{'unknown' if box is None else len(box.A)}."
-        )
-    poles = np.abs(np.linalg.eigvals(box.A))
-    rate = 1.0 if box.dt is not None else max(float(poles.max(initial=0.0)), 1e-300)
-    basis = structure.jacobian(theta)
-    problem = scaled_problem(box.A, box.B, box.C, box.D, offset, basis, rate)
-    theta, cost, n_iter, done = bilinear_fit(
-        problem, theta, max(max_iter, 1), (structure.lower, structure.upper)
+    equations = _BilinearEquations(structure, box, theta)
+    free = np.full(equations.n**2, np.inf)
+    limits = np.append(-free, structure.lower), np.append(free, structure.upper)
+    found = least_squares(
+        equations.residuals,
+        np.clip(equations.start(theta), *limits),
+        equations.jacobian,
+        bounds=limits,
+        x_scale="jac",
+        max_nfev=max(max_iter, 1),
     )
+    theta, active = found.x[equations.n**2 :], found.active_mask[equations.n**2 :]
+    theta = np.select(  # the steps end a rounding error inside
+        [active < 0, active > 0], [structure.lower, structure.upper], theta
+    )
+    cost = np.sqrt(2.0 * found.cost)
     peaks = Peaks(
         np.array([cost]), np.zeros(0), np.zeros((1, len(theta))), np.zeros(1) > 0
     )
-    return theta, MinimaxResult(theta, peaks, np.nan, np.nan, done, n_iter)
+    done = found.status > 0
+    return theta, MinimaxResult(theta, peaks, np.nan, np.nan, done, found.nfev)
+
+
+def bilinear_changes(
+    structure: Structure, box: Target, theta: Array, omega: Array, dG: Array
+) -> Array:
+    """First-order changes of the minimiser of Eq. (7) with the black box's response.
+
+    `dG` has the shape (r, k, n_outputs, n_inputs). Of the changes of the black box with
+    that response, ``dG = L dS0 R``, the least ones are taken: any other turns its state
+    basis, which T follows. Parameters that their bounds hold do not change.
+    """
+    equations = _BilinearEquations(structure, box, theta)
+    S0 = equations.S0
+    at = response_point(equations.box, omega / equations.rate)
+    entries = np.eye(S0.size).reshape(-1, *S0.shape)
+    K = derivatives(at.L, entries, at.R).reshape(-1, S0.size)
+    parts = dG.reshape(len(dG), -1).T
+    dS0 = scaled_lstsq(
+        np.vstack([K.real, K.imag]), np.vstack([parts.real, parts.imag])
+    )[0]
+    x = equations.start(theta)
+    moved = dS0.T.reshape(-1, *S0.shape) @ equations.sides(x)[1]
+    held = (theta <= structure.lower) | (theta >= structure.upper)
+    J = np.where(
+        np.append(np.zeros(equations.n**2) > 0, held), 0.0, equations.jacobian(x)
+    )
+    dx = -scaled_lstsq(J, moved.reshape(len(dG), -1).T)[0]
+    return np.asarray(dx[equations.n**2 :].T)

@@ -276,7 +276,7 @@ def test_covariance_of_the_parameters_predicts_their_spread():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("norm", ["hinf", "h2"])
+@pytest.mark.parametrize("norm", ["hinf", "h2", "similarity"])
 def test_the_covariance_is_that_of_the_norm_that_was_minimised(norm):
     structure, params = CASES["heat_exchanger"]
     theta = structure.check_params(params)
@@ -317,7 +317,7 @@ def test_confidence_intervals_are_those_of_student():
         fitted.fit_model(mean).confidence_intervals()
 
 
-@pytest.mark.parametrize("norm", ["hinf", "h2"])
+@pytest.mark.parametrize("norm", ["hinf", "h2", "similarity"])
 def test_a_parameter_at_its_bound_has_no_variance(norm, rough):
     bounded = LAG.with_bounds({"a": (2.5, None)})
     runs = [StateSpace(-2 + e, 3, 1) for e in (-0.1, 0.0, 0.1)]
