@@ -276,8 +276,13 @@ class RestructuringProblem:
         return float(np.sqrt(squares / len(self.omega))) / self._weighted[2]
 
     def response_of(self, model: StateSpace) -> Complex:
-        """Response of a model at the frequencies, without delays and known poles."""
-        G = model.with_input_delay(0).frequency_response(self.omega)
+        """Response of a model at the frequencies, as the black box is compared.
+
+        Without delay, known poles, and feedthrough where the structure has none.
+        """
+        D = self.whole.feedthrough_of(model.D)
+        compared = StateSpace(model.A, model.B, model.C, D, model.sampling_time)
+        G = compared.frequency_response(self.omega)
         return G if self.division is None else self.division.weight(self.omega) * G
 
     def _weighted_response(self, model: StateSpace) -> Complex:

@@ -318,6 +318,14 @@ def test_confidence_intervals_are_those_of_student():
 
 
 @pytest.mark.parametrize("norm", ["hinf", "h2", "similarity"])
+def test_noise_of_a_feedthrough_that_is_dropped_moves_no_parameter(norm):
+    runs = [StateSpace(-2, 3, 1, e) for e in (-0.1, 0.0, 0.1)]
+    fitted = GrayBoxRestructurer(LAG, norm=norm)
+    fitted.fit_model(runs[1], realizations=runs)
+    assert_allclose(fitted.params_covariance_, 0.0, atol=1e-20)
+
+
+@pytest.mark.parametrize("norm", ["hinf", "h2", "similarity"])
 def test_a_parameter_at_its_bound_has_no_variance(norm, rough):
     bounded = LAG.with_bounds({"a": (2.5, None)})
     runs = [StateSpace(-2 + e, 3, 1) for e in (-0.1, 0.0, 0.1)]
