@@ -14,12 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
 
 from ..structures.map import AffineMap
 from ..structures.mechanical import ImplicitMap
 from ..structures.structure import GrayBoxStructure, drawn_around
 from ..systems.balancing import balancing_transformation
 from .continuation import continued_fits
+from .coordinates import CanonicalForm
 from .deadline import time_is_up
 from .error_system import Target, frequency_grid, model_derivatives
 from .least_squares import LeastSquaresResult, channel_scaling
@@ -158,7 +160,9 @@ def _rounds(
     ends: list[LeastSquaresResult] = []  # the best fit of every round
     best, certain = np.inf, False
     for number in range(_ROUNDS):
-        found = _candidates(problem, guess, n_starts, number, rng)
+        found = _reduced_otherwise(problem, fits, number)
+        if found is None:
+            found = _candidates(problem, guess, n_starts, number, rng)
         found = np.clip(np.vstack([*given, found]), structure.lower, structure.upper)
         new = _distinct(found, tried)
         if len(new) == 0 and fits:  # the only start there is
@@ -250,6 +254,42 @@ def _candidates(
         more = continuation_candidates(structure, box, found, rng, thorough=True)
         found = np.vstack([found, more])
     return found
+
+
+def _reduced_otherwise(
+    problem: RestructuringProblem, fits: list[LeastSquaresResult], number: int
+) -> Array | None:
+    """Later starts of a form that can be any model of its order, (1, n_params).
+
+    The first round begins at the balanced truncation of the black box, the second one
+    at its singular perturbation, exact at zero frequency: what is left out is in
+    equilibrium, ``0 = A21 x1 + A22 x2 + B2 u`` (in discrete time x2 for 0). The third
+    one truncates what is balanced behind an integrator. None for other structures, and
+    where no states are left out.
+    """
+    box, n = problem.box, problem.structure.order
+    form = CanonicalForm.of(problem.system, fits[0].x) if number and fits else None
+    if form is None or box is None:
+        return None
+    still = 0.0 if box.dt is None else np.eye(len(box.A))
+    S = np.block([[box.A - still, box.B], [box.C, box.D]])
+    B = box.B if number == 1 else np.asarray(np.linalg.solve(box.A - still, box.B))
+    _, left, right = balancing_transformation(
+        box.A, B.astype(float), box.C, discrete=box.dt is not None
+    )
+    if len(left) <= n:
+        return None
+    S = block_diag(left, np.eye(len(box.C))) @ S
+    S = S @ block_diag(right, np.eye(box.B.shape[1]))
+    fast = slice(n, len(left))
+    if number == 1:
+        S = S - S[:, fast] @ np.linalg.solve(S[fast, fast], S[fast])
+    S = np.delete(np.delete(S, fast, 0), fast, 1)
+    if box.dt is not None:
+        S[:n, :n] += np.eye(n)
+    S[n:, n:] = problem.structure.feedthrough_of(S[n:, n:])
+    theta = form.parameters(S)
+    return None if theta is None else theta[None]
 
 
 def _mean_rate(rates: Array) -> float:

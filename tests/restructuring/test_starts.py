@@ -9,7 +9,7 @@ from lpvlearn.restructuring.problem import problem_from_models
 from lpvlearn.restructuring.starts import continuation_candidates, hopped_fits
 
 from ..conftest import spring_structure
-from .conftest import target_of
+from .conftest import stable_model, target_of
 
 
 def two_modes():
@@ -125,3 +125,24 @@ def test_a_discrete_black_box_is_blurred_alike():
     seeds = truth * np.exp(0.3 * rng.normal(size=(3, 4)))
     found = continuation_candidates(structure, box, seeds, rng)
     assert np.isclose(found, truth, rtol=1e-3).all(1).any()
+
+
+@pytest.mark.parametrize("dt", [None, 0.1])
+def test_later_starts_of_a_canonical_form_are_other_reductions(dt):
+    """The singular perturbation keeps the static gain; all are stable."""
+    rng = np.random.default_rng(0)
+    box = stable_model(rng, 7, 2, 2, dt, feedthrough=True)
+    form = GrayBoxStructure.observable_canonical(4, 2, 2, True)
+    problem = problem_from_models(form, [box], None)
+    first = problem.best_fits(starts._candidates(problem, None, 16, 0, rng), 3)
+    assert starts._reduced_otherwise(problem, first, 0) is None
+    models = [
+        problem.model(starts._reduced_otherwise(problem, first, number)[0])
+        for number in (1, 2)
+    ]
+    assert all(model.is_stable for model in models)
+    gains = [m.frequency_response([0.0])[0] for m in (models[0], box)]
+    np.testing.assert_allclose(*gains, rtol=1e-6)
+    spring = problem_from_models(spring_structure(), [two_modes()], None)
+    fits = [spring.fit(np.array([1.0, 0.1, 1.0]))]
+    assert starts._reduced_otherwise(spring, fits, 1) is None
