@@ -151,7 +151,8 @@ class MinimaxProblem:
     peaks: Callable[[Array], Peaks | None]  # of y; None where it is not admissible
     samples: Callable[[Array, Array], Peaks]  # the values at fixed frequencies
     values: Callable[[Array, Array], Array]  # without gradients; inf for no model
-    hessians: Callable[[Array, Array, Flags], Array]  # (y, frequencies, moving)
+    # of the sum with non-negative weights: (y, weights, frequencies, moving)
+    hessian: Callable[[Array, Array, Array, Flags], Array]
     constraints: Callable[[Array], tuple[Array, Array]]  # c(y) <= 0 and gradients
     grid: Array = field(default_factory=lambda: np.zeros(0))  # watched beside the peaks
     curve: Callable[[Array], Curve] | None = None  # of y; by default straight steps
@@ -245,8 +246,8 @@ def certificate(
     c, dc = constraints
     binding = dc[c >= _BINDING]
     distance, weights = shortest_in_hull(G, binding)
-    hessians = problem.hessians(y, peaks.frequencies[active], peaks.moving[active])
-    L = np.tensordot(weights, hessians, axes=1) / f
+    where = peaks.frequencies[active], peaks.moving[active]
+    L = problem.hessian(y, weights, *where) / f
     Z = tangent_spaces(G[weights > ACTIVE_MULTIPLIER], binding)[1]
     if Z.shape[1] == 0:
         return Certificate(distance, np.inf)

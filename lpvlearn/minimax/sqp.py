@@ -305,10 +305,8 @@ def _local_model(
         if not active.any():
             return first
         weights = multipliers[active] / multipliers[active].sum()
-        hessians = problem.hessians(
-            y, entries.frequencies[active], entries.moving[active]
-        )
-        L = np.tensordot(weights, hessians, axes=1) / f
+        where = entries.frequencies[active], entries.moving[active]
+        L = problem.hessian(y, weights, *where) / f
         if curve is not None:
             L = L + curve.curvature(weights @ G[active])
         H = convexified(L, G[active], dc[mu > ACTIVE_MULTIPLIER])

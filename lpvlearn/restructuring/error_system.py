@@ -410,60 +410,54 @@ class ErrorSystem:
                     same &= moved <= most
         return same
 
-    def hessians(self, theta: Array, omega: Array, moving: NDArray[np.bool_]) -> Array:
-        """Second derivatives of the singular values at the given frequencies.
+    def hessian(
+        self, theta: Array, weights: Array, omega: Array, moving: NDArray[np.bool_]
+    ) -> Array:
+        """Second derivative of the weighted sum of the singular values.
 
         Where `moving`, the frequency is a local maximum that follows the parameters,
-        ``H = sigma_tt - sigma_tw sigma_tw^T / sigma_ww``; (k, n_params, n_params).
+        ``H = sigma_tt - sigma_tw sigma_tw^T / sigma_ww``. The `weights` (k,) are not
+        negative.
         """
-        q = self.structure.n_params
-        joint = self.joint_hessians(theta, omega)
-        out = joint[:, :q, :q].copy()
-        for k in range(len(omega)):
-            row, ww = joint[k, :q, q], joint[k, q, q]
-            if moving[k] and ww < 0:
-                out[k] -= np.outer(row, row) / ww
-        return out
-
-    def joint_hessians(self, theta: Array, omega: Array) -> Array:
-        """Hessians of sigma in theta and omega, (k, n_params + 1, n_params + 1)."""
         q, n = self.structure.n_params, self.n
         S = self.structure.jacobian(theta)
         curvature = self.structure.curvature(theta)
-        p, m = self.n_outputs, self.n_inputs
-        _, s1, s2 = laplace_variable(omega, self.dt)
+        _, s1, s2 = (s[:, None, None] for s in laplace_variable(omega, self.dt))
         G0, G0_1, G0_2 = self._target_derivatives(omega)
         at = self.point(theta, omega)
-        E = at.G - G0
-        _, B, C, _ = self.split(self.structure.system_matrix(theta))
+        E, Phi, PB = at.G - G0, at.Phi, at.R[:, :n]
+        once = at.L[:, :, :n] @ PB  # C Phi^2 B
+        first = -s1 * once - G0_1
+        second = 2.0 * s1**2 * (at.L[:, :, :n] @ Phi @ PB) - s2 * once - G0_2
         W, W1, W2 = self.weight_response(omega)
         U, sigma, Vh = np.linalg.svd(W @ E)
-        out = np.empty((len(omega), q + 1, q + 1))
-        for k in range(len(omega)):
-            u, v = U[k, :, 0], Vh[k, 0].conj()
-            Phi, L, R = at.Phi[k], at.L[k], at.R[k]
-            uW, uW1 = u.conj() @ W[k], u.conj() @ W1[k]
-            left, right = uW @ L, R @ v
-            dE = np.empty((q + 1, p, m), complex)
-            dE[:q] = W[k] @ L @ S @ R
-            first, second = _frequency_derivatives(Phi, B, C, s1[k], s2[k])
-            first, second = first - G0_1[k], second - G0_2[k]
-            dE[q] = W1[k] @ E[k] + W[k] @ first
-            # u^H (d2E) v: pairs of parameters, parameter and frequency, frequency
-            mixed = (left @ S)[:, :n] @ Phi @ (S[:, :n] @ right).T
-            d2 = np.zeros((q + 1, q + 1), complex)
-            d2[:q, :q] = mixed + mixed.T
-            if curvature is not None:
-                d2[:q, :q] += np.einsum("a,ijab,b->ij", left, curvature, right)
-            dleft = uW1 @ L
-            dleft[:n] -= s1[k] * (left[:n] @ Phi)
-            dright = -s1[k] * (Phi @ right[:n])
-            cross = (dleft @ S) @ right + (left @ S[:, :, :n]) @ dright
-            d2[:q, q] = d2[q, :q] = cross
-            bend = u.conj() @ W2[k] @ E[k] + 2.0 * (uW1 @ first) + uW @ second
-            d2[q, q] = bend @ v
-            out[k] = np.real(d2) + _coupling(dE, U[k], sigma[k], Vh[k])
-        return out
+        u, v = U[:, :, :1].conj().swapaxes(1, 2), Vh[:, :1].conj().swapaxes(1, 2)
+        # u^H (d2E) v: pairs of parameters, parameter and frequency, frequency
+        left, right = (u @ W @ at.L)[:, 0], (at.R @ v)[:, :, 0]
+        before = np.tensordot(left, S[:, :, :n], axes=(1, 1))  # (k, q, n)
+        after = np.tensordot(right, S, axes=(1, 2))  # (k, q, n + p)
+        pairs = (weights[:, None, None] * before) @ Phi
+        H = np.real(np.tensordot(pairs, after[:, :, :n], axes=((0, 2), (0, 2))))
+        H = H + H.T
+        if curvature is not None:
+            both = np.real((weights * left.T) @ right)
+            H += np.tensordot(curvature, both, axes=2)
+        dleft = (u @ W1 @ at.L)[:, 0]
+        dleft[:, :n] -= ((s1 * left[:, None, :n]) @ Phi)[:, 0]
+        dright = -s1 * (Phi @ right[:, :n, None])
+        cross = (after @ dleft[:, :, None] + before @ dright)[:, :, 0]
+        bend = (u @ (W2 @ E + 2.0 * (W1 @ first) + W @ second) @ v)[:, 0, 0]
+        # through the other singular values
+        dE = derivatives(W @ at.L, S, at.R)
+        c = _couplings(dE, U, sigma, Vh)
+        along = _couplings((W1 @ E + W @ first)[..., None], U, sigma, Vh)
+        flat = (np.sqrt(weights)[:, None, None] * c).reshape(-1, q)
+        H += np.real(flat.conj().T @ flat)
+        tw = np.real(cross + (along.conj() * c).sum(1))
+        ww = np.real(bend) + np.sum(np.abs(along[:, :, 0]) ** 2, axis=1)
+        turning = moving & (ww < 0)
+        tw, ww = tw[turning], ww[turning]
+        return np.asarray(H - (weights[turning] / ww * tw.T) @ tw)
 
 
 def vanishing_weight(system: ErrorSystem, omega: float) -> Target | None:
@@ -488,41 +482,21 @@ def vanishing_weight(system: ErrorSystem, omega: float) -> Target | None:
     return Target(-c * one, c * one, one, 0 * one)
 
 
-def _frequency_derivatives(
-    Phi: Complex, B: Array, C: Array, s1: complex, s2: complex
-) -> tuple[Complex, Complex]:
-    """First and second derivative of ``C (s I - A)^-1 B`` along the frequency."""
-    X = Phi @ (Phi @ B)
-    return -s1 * (C @ X), 2.0 * s1**2 * (C @ (Phi @ X)) - s2 * (C @ X)
-
-
-def _coupling(dE: Complex, U: Complex, sigma: Array, Vh: Complex) -> Array:
-    """Second-order term of the largest singular value through the other ones.
+def _couplings(dE: Complex, U: Complex, sigma: Array, Vh: Complex) -> Complex:
+    """What couples the largest singular value to the other ones, (k, r, q).
 
     sigma is an eigenvalue of ``[[0, E], [E^H, 0]]``, whose other eigenvalues are
-    ``+-sigma_a`` and zeros: ``2 Re sum_a conj(c_a) c_a^T / (sigma - lambda_a)``.
+    ``+-sigma_a`` and zeros: changes `dE` (k, p, m, q) add to its second derivative
+    ``2 Re sum_a conj(c_a) c_a^T / (sigma - lambda_a)``, of which each row has its root.
     """
-    p, m = dE.shape[1:]
-    r = len(sigma)
-    Ev = dE @ Vh[0].conj()  # (q, p)
-    uE = U[:, 0].conj() @ dE  # (q, m)
-    a = Ev @ U.conj()  # u_a^H dE v
-    b = (uE @ Vh.conj().T).conj()  # v_a^H dE^H u
-    total = np.zeros((len(dE), len(dE)))
-    floor = _GAP * sigma[0]
-    for i in range(max(p, m)):
-        if i < r:
-            terms = [
-                ((a[:, i] + b[:, i]) / 2.0, sigma[i]),
-                ((a[:, i] - b[:, i]) / 2.0, -sigma[i]),
-            ]
-        elif p > m:
-            terms = [(a[:, i] / np.sqrt(2.0), 0.0)]
-        else:
-            terms = [(b[:, i] / np.sqrt(2.0), 0.0)]
-        if i == 0:
-            terms = terms[1:]
-        for c, value in terms:
-            gap = max(sigma[0] - value, floor)
-            total += 2.0 * np.real(np.outer(c.conj(), c)) / gap
-    return total
+    p, m = dE.shape[1:3]
+    r = min(p, m)
+    Ev = np.einsum("kpmj,km->kpj", dE, Vh[:, 0].conj())
+    uE = np.einsum("kpmj,kp->kmj", dE, U[:, :, 0].conj())
+    a = U.conj().swapaxes(1, 2) @ Ev  # u_a^H dE v
+    b = (Vh.conj() @ uE).conj()  # v_a^H dE^H u
+    rest = (a if p > m else b)[:, r:] * np.sqrt(2.0)
+    c = np.concatenate([a[:, 1:r] + b[:, 1:r], a[:, :r] - b[:, :r], rest], axis=1)
+    others = np.concatenate([sigma[:, 1:], -sigma, np.zeros(rest.shape[:2])], axis=1)
+    gap = np.maximum(sigma[:, :1] - others, _GAP * sigma[:, :1])
+    return np.asarray(c * np.sqrt(0.5 / gap)[:, :, None])

@@ -163,9 +163,9 @@ class HinfObjective:
                 return self.system.values(theta, omega)
         return np.full(len(omega), np.inf)
 
-    def hessians(self, y: Array, omega: Array, moving: Flags) -> Array:
-        """Second derivatives of the peaks in the coordinates y."""
-        H = self.system.hessians(self.theta(y), omega, moving)
+    def hessian(self, y: Array, weights: Array, omega: Array, moving: Flags) -> Array:
+        """Second derivative of the weighted sum of the peaks in the coordinates y."""
+        H = self.system.hessian(self.theta(y), weights, omega, moving)
         return self.T.T @ H @ self.T
 
     def constraints(self, y: Array) -> tuple[Array, Array]:
@@ -191,7 +191,7 @@ class HinfObjective:
             self.peaks,
             self.samples,
             self.values,
-            self.hessians,
+            self.hessian,
             self.constraints,
             self.system.grid,
             self.curve,

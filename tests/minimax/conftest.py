@@ -29,8 +29,9 @@ def problem_of(functions, gradients, hessians, constraint=None):
     def at(y, frequencies):
         return samples(y, frequencies).values
 
-    def second(y, frequencies, moving):
-        return np.array([hessians[int(k) - 1](y) for k in frequencies])
+    def second(y, weights, frequencies, moving):
+        parts = [hessians[int(k) - 1](y) for k in frequencies]
+        return np.tensordot(weights, parts, axes=1)
 
     def constraints(y):
         if constraint is None:
@@ -92,15 +93,14 @@ def with_narrow_peaks(problem, sharpness):
             np.zeros(len(w), bool),
         )
 
-    def hessians(y, w, moving):
-        H = problem.hessians(y, nearest(y, w)[0] + 1.0, moving)
-        still = ~moving[:, None, None]
-        return H - 2.0 * sharpness * still * np.outer(turn, turn)
+    def hessian(y, weights, w, moving):
+        H = problem.hessian(y, weights, nearest(y, w)[0] + 1.0, moving)
+        return H - 2.0 * sharpness * weights[~moving].sum() * np.outer(turn, turn)
 
     return replace(
         problem,
         peaks=peaks,
         samples=samples,
         values=lambda y, w: samples(y, w).values,
-        hessians=hessians,
+        hessian=hessian,
     )
