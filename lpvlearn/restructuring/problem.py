@@ -58,6 +58,7 @@ _LEAST_DECAY = 1e-4
 # their derivatives are exact to about 1e-13, behind resolvents less so.
 _RANK_TOLERANCE = 1e-9
 _DIGITS = 1e-12  # of a response, that are lost where its terms cancel
+_ROUNDING = 1e-10  # relative change of a response that is none: a step's end
 
 # Parameters whose own size changes the response by a smaller part are next to zero; and
 # the part of a promised change that tells a linear response.
@@ -229,10 +230,17 @@ class RestructuringProblem:
         return np.asarray(np.einsum("jkpm,rkpm->rj", K.conj(), dG).real)
 
     def _free_jacobian(self, theta: Array) -> Complex:
-        """Derivative of the response; zero by parameters that their bounds hold."""
-        J = self.system.response_jacobian(theta, self.omega)[1]
+        """Derivative of the response; zero by parameters that their bounds hold.
+
+        That is where the way to the bound changes the response by rounding.
+        """
+        G, J = self.system.response_jacobian(theta, self.omega)
         lower, upper = self.structure.lower, self.structure.upper
-        return np.where((theta <= lower) | (theta >= upper), 0.0, J)
+        way = np.minimum(theta - lower, upper - theta)
+        effect = np.linalg.norm(J.reshape(-1, len(theta)), axis=0)
+        with np.errstate(invalid="ignore"):  # no bound, and no effect
+            held = way * effect <= _ROUNDING * np.linalg.norm(G)
+        return np.where(held, 0.0, J)
 
     def check_realizations(self, models: Sequence[Any]) -> None:
         """Refuse what cannot be the realizations that the black box is the mean of."""
