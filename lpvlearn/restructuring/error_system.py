@@ -309,9 +309,19 @@ class ErrorSystem:
 
     def _target_response(self, omega: Array) -> Complex:
         """``G0`` at the frequencies, shape (k, n_outputs, n_inputs)."""
-        t = self.target
-        s = laplace_variable(omega, self.dt)[0]
-        return t.C @ resolvent(t.A, s) @ t.B + t.D
+        known = np.isin(omega, self.grid)
+        G = np.empty((len(omega), self.n_outputs, self.n_inputs), complex)
+        G[known] = self._target_on_grid[np.searchsorted(self.grid, omega[known])]
+        G[~known] = self._target_at(omega[~known])
+        return G
+
+    @cached_property
+    def _target_on_grid(self) -> Complex:
+        return self._target_at(self.grid)
+
+    def _target_at(self, omega: Array) -> Complex:
+        t, s = self.target, laplace_variable(omega, self.dt)[0]
+        return np.asarray(t.C @ resolvent(t.A, s) @ t.B + t.D)
 
     def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
         return model_derivatives(self.target, omega)
