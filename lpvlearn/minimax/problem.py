@@ -50,6 +50,10 @@ def epigraph_step(
     Returns the step, the multipliers of the peaks (not negative, they add up to one at
     a stationary point) and those of the constraints; None where there is no solution.
     """
+    # Rows that stay below another one in all of the box bind nothing
+    reach = radius * np.abs(G).sum(1)
+    high = values + reach >= (values - reach).max()
+    full, values, G = len(values), values[high], G[high]
     q, k, c = len(H), len(values), len(constraint_values)
     P = np.zeros((q + 1, q + 1))
     P[:q, :q] = H
@@ -74,7 +78,9 @@ def epigraph_step(
     if tol > _PRIMAL and (A @ x - upper[q + 1 :]).max() > _BROKEN * -x[q]:
         return None
     multipliers = np.maximum(np.asarray(info["lam"])[q + 1 :], 0.0)
-    return np.asarray(x[:q]), multipliers[:k], multipliers[k:]
+    of_peaks = np.zeros(full)
+    of_peaks[high] = multipliers[:k]
+    return np.asarray(x[:q]), of_peaks, multipliers[k:]
 
 
 def shortest_in_hull(G: Array, normals: Array | None = None) -> tuple[float, Array]:

@@ -109,3 +109,14 @@ def test_shortest_vector_in_a_hull():
     assert shortest_in_hull(triangle)[0] < 1e-12
     assert shortest_in_hull(1e-9 * triangle)[0] < 1e-20
     assert np.isclose(shortest_in_hull(np.array([[3.0, 4.0]]))[0], 5.0)
+
+
+def test_a_peak_out_of_reach_changes_no_step():
+    rng = np.random.default_rng(0)
+    H, values, G = np.eye(3), -rng.random(4) / 10, rng.normal(size=(4, 3))
+    none = np.zeros(0), np.zeros((0, 3))
+    d, multipliers, _ = epigraph_step(H, values, G, *none, 0.1)
+    low = np.append(values, values.min() - 0.2 * np.abs(G).sum(1).max())
+    again, more, _ = epigraph_step(H, low, np.vstack([G, G[:1]]), *none, 0.1)
+    np.testing.assert_array_equal(again, d)
+    np.testing.assert_array_equal(more, np.append(multipliers, 0.0))
