@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.balancing import balancing_transformation
-from .error_system import ErrorSystem, derivatives
+from .error_system import ErrorSystem, Target, derivatives
+from .least_squares import fit_frequency_response
 from .limits import Limits, within_bounds
 from .similarity import linear_equations, nearest_parameters, scaled_problem
 
@@ -35,6 +36,7 @@ _REACH = 2.0  # change of the logarithm of a distance to a bound in a unit step
 _DAMPING = 1e-5  # of the acceleration along directions that the response hardly sees
 _BENT = 1.0  # part of a step that its bend may be at most
 _EXACT = 1e-7  # relative residual of a realisation in a canonical form
+_REFINEMENTS = 10  # steps that give such parameters their digits: three will mostly do
 _NUDGE = 1e-2  # relative change of all entries that makes a model a generic one
 _MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
 _SAME_NORM = 1e-5  # relative difference that rounding may make: 3e-7 for 24 states
@@ -297,6 +299,25 @@ class CanonicalForm:
         exact = np.linalg.norm(rest) <= _EXACT * np.linalg.norm(d)
         return theta if exact else None
 
+    def refined(self, S: Array, omega: Array) -> Array | None:
+        """The same, fitted to the model's response once more.
+
+        A realisation of 24 states has lost all but three of the digits, of which the
+        form holds seven.
+        """
+        theta, n = self.parameters(S), self.structure.order
+        if theta is None:
+            return None
+        model = Target(S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:], self.dt)
+        fit = fit_frequency_response(
+            ErrorSystem(self.structure, model),
+            theta,
+            omega,
+            admissible=lambda x: bool(np.isfinite(x).all()),
+            max_iter=_REFINEMENTS,
+        )
+        return theta if fit is None else fit.x
+
 
 @dataclass(frozen=True)
 class View:
@@ -325,7 +346,7 @@ def view_at(
     inner = system.restructured(chart)
 
     def back(z: Array) -> Array | None:
-        found = form.parameters(chart.system_matrix(z))
+        found = form.refined(chart.system_matrix(z), system.grid)
         if found is None:
             return None
         there, here = system.peaks(found).norm, inner.peaks(z).norm

@@ -191,3 +191,18 @@ def test_a_model_that_is_not_minimal_has_no_chart():
     model = StateSpace(np.diag([-1.0, -2.0]), [[1.0], [0.0]], [[1.0, 1.0]])
     with pytest.raises(ValueError, match="not minimal"):
         LocalChart(matrix_of(model), 2, None, False)
+
+
+def test_a_canonical_form_of_many_states_keeps_digits_that_it_holds():
+    box = stable_model(np.random.default_rng(1), 12, 1, 1)
+    structure = GrayBoxStructure.observable_canonical(12, 1, 1)
+    system = ErrorSystem(structure, target_of(box))
+    form = CanonicalForm(structure, None)
+    errors = [
+        np.abs(system.weighted_error(theta, system.grid)).max()
+        for theta in (
+            form.parameters(matrix_of(box)),
+            form.refined(matrix_of(box), system.grid),
+        )
+    ]
+    assert errors[1] < 0.01 * errors[0]
