@@ -66,7 +66,9 @@ def through_black_boxes(
     chi2, dof = form.selection_["chi2"], form.selection_["dof"]
     determined = np.isfinite(found.covariance).all()
     explained = chi2[form.selection_["chosen"]].notna().all()
-    if determined and not explained and not (chi2 < _NEAR * dof).any():
+    compared = chi2.notna().any()  # by covariances that tell apart
+    near = (chi2 < _NEAR * dof).any()
+    if determined and compared and not explained and not near:
         return None
     kappa, structure = found.points.kappa, found.structure
     estimates = [model.estimates for model in found.local]
@@ -116,11 +118,15 @@ def fitted_together(
         return None
     places = kappa[[box is not None for box in boxes]]
     some = np.linspace(0, len(theta) - 1, min(_STARTS, len(theta))).astype(int)
-    constant = [_fitted(known, places, theta[[k] * len(places)], 0) for k in some]
-    constant.sort(key=lambda found: found.cost)
+    starts = []
+    for k in some:
+        constant = _fitted(known, places, theta[[k] * len(places)], 0)
+        starts.append(_fitted(known, places, constant.form.predict(places), 1))
+    # far from all black boxes, the constant ones are alike
+    starts.sort(key=lambda found: found.cost)
     n_values = sum(box.n_directions for box in known)
     best, least = None, np.inf
-    for found in constant[:_KEPT]:
+    for found in starts[:_KEPT]:
         for degree in _DEGREES:
             n_terms = len(resolvable_powers(degree, places))
             n = n_terms * structure.n_params

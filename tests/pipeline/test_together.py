@@ -64,12 +64,13 @@ def structured(theta, covariance):
     return StructuredModels(points, local, LAGS, theta, covariance, models, [None] * 5)
 
 
-def test_it_is_taken_where_a_point_does_not_determine_its_parameters():
+@pytest.mark.parametrize("unknown", [np.diag([np.inf] * 4), np.full((4, 4), 1e8)])
+def test_it_is_taken_where_a_point_does_not_determine_its_parameters(unknown):
     theta, P = TRUTH.copy(), np.array([np.diag((STD * row) ** 2) for row in TRUTH])
     sure = AutoLPV().fit(KAPPA, theta, covariance=P)
     assert through_black_boxes(sure, structured(theta, P)) is None
     theta[3] = 1.9, 80.0, 2.0, -79.0
-    P[3] = np.diag([np.inf] * 4)
+    P[3] = unknown
     lost = AutoLPV().fit(KAPPA, theta, covariance=P)
     with pytest.warns(UserWarning, match="on no smooth function.*The LPV model takes"):
         form, covariance, found = through_black_boxes(lost, structured(theta, P))
