@@ -166,7 +166,7 @@ def estimates(records: Sequence[Record], case: Case) -> Iterator[tuple[str, Esti
                 for above, below in fits[0].deviated_models()
             ]
             covariance = covariance_of_parameters(
-                STRUCTURE, found.params_, None, black_box, pairs
+                STRUCTURE, found.params_, None, black_box, pairs, norm
             )
         yield norm, Estimate(found.params_, covariance)
         if norm == "hinf":
