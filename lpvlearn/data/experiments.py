@@ -167,7 +167,7 @@ def as_list(keys: Any) -> list[Any]:
     """The columns with a role, as a list; empty for None."""
     if keys is None:
         return []
-    if isinstance(keys, (np.ndarray, pd.Index, pd.Series)):
+    if isinstance(keys, (np.ndarray, pd.Index, pd.Series, pd.DataFrame)):
         return np.ravel(keys).tolist()
     return list(keys) if isinstance(keys, (list, tuple)) else [keys]
 

@@ -83,6 +83,11 @@ def prbs(
         check_count("n_samples", n_samples),
         check_count("n_channels", n_channels),
     )
+    if n_samples * n_channels > _MOST:
+        raise ValueError(
+            f"`n_samples` times `n_channels` must be at most {_MOST:g}. Got "
+            f"{float(n_samples) * n_channels:.4g}."
+        )
     clock, amplitude = check_count("clock", clock), check_size("amplitude", amplitude)
     if balance is not None:
         balance = whole_number("balance", balance, 2, _MOST_BITS)

@@ -381,8 +381,9 @@ def test_bad_trajectories_raise(trajectories, words):
 @pytest.mark.parametrize(
     "names",
     [["a", "b"], ("a", "b"), np.array(["a", "b"]), pd.Index(["a", "b"]),
-     pd.Series(["a", "b"], index=[3, 5]), np.array([["a"], ["b"]], dtype=object)],
-    ids=["list", "tuple", "array", "index", "series", "column"],
+     pd.Series(["a", "b"], index=[3, 5]), pd.DataFrame(["a", "b"]),
+     np.array([["a"], ["b"]], dtype=object)],
+    ids=["list", "tuple", "array", "index", "series", "table", "column"],
 )  # fmt: skip
 def test_names_of_columns_in_any_container_are_a_list(names):
     assert as_list(names) == ["a", "b"]

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 import lpvlearn as lp
-from lpvlearn.datasets import FlexibleArm
+from lpvlearn.datasets import FlexibleArm, prbs
 from lpvlearn.inspection import (
     ErrorDisplay,
     ParameterDisplay,
@@ -421,3 +421,8 @@ def test_an_output_error_model_that_grows_within_its_range_is_told():
             w.lpv, inputs="force", scheduling="time", experiment="kappa", time="time",
             max_iter=2,
         ).fit(w.X, w.y)  # fmt: skip
+
+
+def test_sequences_that_no_memory_holds_are_refused():
+    with pytest.raises(ValueError, match="`n_samples` .* `n_channels`"):
+        prbs(1_000_000, n_channels=1_000_000)
