@@ -219,6 +219,10 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 # * ``offset="linear"`` adds a drift (``output_drift_``, per second). It is also what a
 #   system that *integrates* needs: its answer to an offset of the input is a straight
 #   line. A constant of its output is a matter of the initial state.
+# * A load that comes or goes, or a sensor that moves, shifts the level within an
+#   experiment. A slow mode would explain it, and simulate other records by what it made
+#   up. ``"auto"`` looks for such shifts, which no regression on the past foresees, ends
+#   the experiment there and begins another, with a warning that says where.
 # * ``offset=None`` says that outputs are zero at rest at input zero, and that every
 #   constant tells something of the static gain.
 # * ``detrend="constant"`` or ``"linear"`` subtracts means or straight lines from inputs

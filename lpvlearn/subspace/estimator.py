@@ -171,7 +171,9 @@ class SubspaceLTI(
         "auto" takes constants of all experiments where the criterion of `order` is the
         better for them and they are significant, or save states, and where signals that
         stay three standard deviations or more from zero do not refute them; else (and
-        with `detrend`, which has dealt with them) none.
+        with `detrend`, which has dealt with them) none. Where levels shift within an
+        experiment, by a load or a sensor that moved, "auto" ends it there and begins
+        another, with a warning, if the criterion is clearly better for that.
     missing : {"raise", "split"}, default="raise"
         "split" ends an experiment before a sample with NaN, or a row that the `time`
         column misses, and starts another after it, with an initial state of its own.
@@ -207,10 +209,10 @@ class SubspaceLTI(
     singular_values_ : ndarray of shape (horizon_ * n_outputs,)
         Of the estimated observability subspace, descending.
     initial_states_ : ndarray of shape (n_experiments, order_)
-        Initial state of every experiment, in the order of first appearance; after
-        `partial_fit` of a long stream, of its last stretch only. With delays and
-        ``initial_state="estimate"``, that of the first sample with known inputs, number
-        ``max(input_delay_)``.
+        Initial state of every experiment, in the order of first appearance (a run
+        between two gaps, or two shifts of level, is one); after `partial_fit` of a long
+        stream, of its last stretch only. With delays and ``initial_state="estimate"``,
+        that of the first sample with known inputs, number ``max(input_delay_)``.
     input_delay_ : ndarray of shape (n_inputs,)
         Samples, as found or given; also that of `lti_`.
     selection_ : DataFrame
@@ -235,9 +237,9 @@ class SubspaceLTI(
     offset_ : {None, "constant", "linear"}
         What was estimated.
     input_offset_ : ndarray of shape (n_experiments, n_inputs)
-        Mean of the inputs of every experiment (a run between two gaps is one); zero
-        without `offset_` and `detrend`, with ``initial_state="rest"``, and where the
-        static gain is infinite: a mode slower than the longest experiment.
+        Mean of the inputs of every experiment, as of `initial_states_`; zero without
+        `offset_` and `detrend`, with ``initial_state="rest"``, and where the static
+        gain is infinite: a mode slower than the longest experiment.
     output_offset_ : ndarray of shape (n_experiments, n_outputs)
         Where the outputs rest at these inputs: but for transients and drifts
         ``y - output_offset_ = G (u - input_offset_)``. With `detrend` their means, to

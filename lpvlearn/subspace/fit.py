@@ -40,11 +40,13 @@ from .offsets import (
     attributed,
     constants_matter,
     may_have_constants,
+    shifts_matter,
     with_levels,
 )
 from .realization import METHODS
 from .residuals import find_spikes, lacks
 from .selection import PlantFit, Row, Selection, better_horizon, select
+from .shifts import cut_at, find_shifts
 from .signals import Record, SharedSignals, shorten
 from .simulation_fit import Freedom, Realization
 from .statistics import Evidence
@@ -244,12 +246,17 @@ def fit_pairs(
         raise TooFewSamples(str(error)) from None
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = _with_constants(pairs, choices, told, known)
+    # The errors of a rough model are not the noise that shifts must stand out of.
+    if choices.offset == "auto" and choices.initial_states and choices.refine:
+        pairs, fitted = _without_shifts(pairs, choices, told, fitted)
     doubt = None
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
         fitted, doubt = _believable(pairs, choices, told, fitted)
     _tell_of_feedback(fitted, choices, doubt, told)
     if fitted.selection.order and "held" not in told:
         _tell_of_held_outputs(pairs, told)
+    if detrend is None:
+        return fitted
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
 
 
@@ -288,6 +295,40 @@ def _with_constants(
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
+
+
+def _without_shifts(
+    pairs: Pairs, choices: Choices, told: set[str], whole: LocalFit
+) -> tuple[Pairs, LocalFit]:
+    """Cut the experiments where levels shift, if that explains them clearly better."""
+    feedback = whole.feedback
+    if feedback is None:
+        return pairs, whole
+    shifts = find_shifts(whole.scaled.records, feedback.regression)
+    if not any(shifts):
+        return pairs, whole
+    parts = cut_at(pairs, shifts)
+    try:
+        fitted = _fit(parts, choices, told, 1, whole)
+    except TooFewSamples:
+        return pairs, whole
+    if not shifts_matter(whole.evidence.one_step, fitted.evidence.one_step):
+        return pairs, whole
+    samples = "; ".join(
+        f"{', '.join(map(str, cuts))}{f' of experiment {k}' if len(pairs) > 1 else ''}"
+        for k, cuts in enumerate(shifts)
+        if cuts
+    )
+    tell(
+        told,
+        "shifts",
+        f"The outputs shift at sample(s) {samples}, counted from 0, by what the inputs "
+        "do not explain: a load came or went, a sensor moved, or the system is not "
+        "linear. What lies between was fitted as experiments of their own, each with "
+        "its constant (`output_offset_`). Give a load that you know as an input; "
+        "offset='constant' or None fits the whole.",
+    )
+    return parts, fitted
 
 
 def _fit(

@@ -193,6 +193,11 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > _CERTAIN))
 
 
+def shifts_matter(whole: Evidence, parts: Evidence) -> bool:
+    """Whether the criterion is better by what no chance explains for cut records."""
+    return _criterion(whole) - _criterion(parts) > _CERTAIN
+
+
 def _criterion(evidence: Evidence) -> float:
     """That of the orders, of outputs in their units; minus infinity where one is 0."""
     records = evidence.records

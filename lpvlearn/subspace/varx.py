@@ -25,10 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
+from ..systems.least_squares import scaled_lstsq
 from .hankel import hankel_factor, without_trend
 from .signals import Record, thinned
 
 Array = NDArray[np.float64]
+
+Regression = Array  # (past + 1, n_outputs, n_inputs + n_outputs): P of ``P(q) z = w``
 
 # Samples per regressor of the longest past window that is tried: beyond that the small
 # sample term of the criterion exceeds what any lag could gain.
@@ -71,6 +74,7 @@ class Feedback(NamedTuple):
     curved: float  # share that nonlinear terms of the past explain
     innovations: Array  # (n_outputs,), their variances
     cut_off: bool = False  # whether the samples carry no longer past than they chose
+    regression: Regression | None = None  # of outputs on inputs and the past
 
     @property
     def found(self) -> bool:
@@ -90,11 +94,12 @@ class Feedback(NamedTuple):
         return self.p_instantaneous < _INSTANTANEOUS
 
 
-def samples_of(records: Sequence[Record]) -> list[Array]:
-    """Rows ``[u, y]`` of every record, less its trends."""
+def samples_of(records: Sequence[Record], least: int = 0) -> list[Array]:
+    """Rows ``[u, y]`` of every record, less its trends, of which there be `least`."""
     return [
         without_trend(
-            np.ascontiguousarray(np.vstack((record.u, record.y)).T), len(record.trend)
+            np.ascontiguousarray(np.vstack((record.u, record.y)).T),
+            max(least, len(record.trend)),
         )
         for record in records
     ]
@@ -172,7 +177,33 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
         of_most, curved = _of_most(records, past, noisy, first)
         found = max(found, of_most)
     innovations = np.sum(y**2, axis=1) / max(dof, 1)
-    return Feedback(*found, within.p_value, curved, innovations, cut_off)
+    regression = _coefficients(factor, past, longest, m, ny)
+    return Feedback(*found, within.p_value, curved, innovations, cut_off, regression)
+
+
+def regression_of(records: Sequence[Record]) -> Regression | None:
+    """The VARX of samples, of as long a past as they need; None for too few."""
+    records = _some(records)
+    m, ny = len(records[0].u), len(records[0].y)
+    longest = longest_past(records, _MAX_ROWS - _N_FUTURE * m, _N_FUTURE)
+    if longest == 0:
+        return None
+    factor, direct = _newest_first(records, longest, 0), np.ones(m, dtype=bool)
+    n = n_windows(records, longest)
+    past = _chosen_past(factor[longest * (m + ny) :], n, 1, longest, direct)
+    return _coefficients(factor, past, longest, m, ny)
+
+
+def _coefficients(factor: Array, past: int, longest: int, m: int, ny: int) -> Array:
+    """P of the innovations, from a factor of the newest of `longest` samples first."""
+    c = m + ny
+    u, y = np.split(factor[longest * c : (longest + 1) * c], [m])
+    known = np.vstack([u, factor[: past * c]])
+    direct, before = np.split(scaled_lstsq(known.T, y.T, _DEPENDENT)[0], [m])
+    P = np.zeros((past + 1, ny, c))
+    P[0] = np.hstack([-direct.T, np.eye(ny)])
+    P[1:] = -before.reshape(past, c, ny).swapaxes(1, 2)
+    return P
 
 
 def _of_most(
