@@ -154,12 +154,16 @@ def _answers(
 def _cuts(records: Sequence[Record], k: int) -> list[tuple[int, int]]:
     """Start and end of what is held out of every experiment the k-th time.
 
-    Of short ones whole experiments, the longest half in turn: the initial state would
-    take up a piece of a few samples.
+    The initial state would take up a piece of a few samples: short experiments beside
+    long ones are not cut, and of many short ones the longest half is held out in turn.
     """
     lengths = np.array([record.u.shape[1] for record in records])
     if len(records) < 2 * _N_PIECES or np.median(lengths) >= _LONG:
-        return [_cut(record.u, k) for record in records]
+        whole = (lengths < _LONG) & (lengths.max() >= _LONG)
+        return [
+            (n, n) if kept else _cut(record.u, k)
+            for record, n, kept in zip(records, lengths.tolist(), whole, strict=True)
+        ]
     longest = np.argsort(-lengths, kind="stable")[: len(lengths) // 2]
     out = np.isin(np.arange(len(lengths)), longest[k - 1 :: _N_PIECES])
     starts = np.where(out, 0, lengths)

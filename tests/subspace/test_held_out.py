@@ -34,6 +34,22 @@ def test_errors_are_those_of_the_pieces_alone(rng):
     assert error.blocks[:-5].sum() < 1e-15
 
 
+def test_a_short_experiment_beside_a_long_one_is_not_cut(rng):
+    """A few samples tell no more than the state that they begin from."""
+    system = example(rng, modes(*POLES))
+    model = Realization(*system, np.zeros((2, 6)), 0.0)
+    long, short = (Record.of(*experiment(rng, system, n, noise=0.1)) for n in (400, 12))
+    kept = []
+
+    def refitted(train):
+        kept.append(train[-1].u.shape[1])
+        return model
+
+    both = held_out(refitted, [long, short])
+    assert kept == [12, 12, 12]
+    np.testing.assert_array_equal(both.blocks, held_out(refitted, [long]).blocks)
+
+
 def test_a_piece_begins_where_it_is(rng):
     """Not where the samples before, and what has moved a system since, lead."""
     A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
