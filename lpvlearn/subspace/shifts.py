@@ -38,8 +38,8 @@ from .varx import Regression, regression_of, samples_of
 Array = NDArray[np.float64]
 
 # Standard deviations that a shift is above zero: of a thousand normal numbers one is
-# above 5 in two thousand records.
-_STANDS_OUT = 5.0
+# in a record of 150. The criterion of the models has the last word.
+_STANDS_OUT = 4.5
 
 _MOST = 20  # changes looked for: more of them are what the noise is
 
