@@ -692,7 +692,9 @@ _ENOUGH = 100  # samples, for parts of them to tell anything
 # output to all inputs as they move: above it, a gain that is not known matters.
 _OPEN = 0.3
 
-_DECAYS = 2.0  # standard deviations of a pole, for its decay to be known
+# Standard deviations of a pole, for its decay to be known; and one over the longest
+# experiment that matters: an integrator is known better.
+_DECAYS, _MATTERS = 2.0, 0.1
 
 # A pole on the unit circle is found this far outside at most; inside, an enforced one
 # keeps farther away than the second.
@@ -810,11 +812,12 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
         tell(
             told,
             "decay",
-            "An oscillation of the model does not decay over the longest experiment, "
-            "nor by more than the standard deviation of its poles (`poles_std_`): the "
-            "inputs move too seldom to tell it from something else, as a system that "
-            "is not linear. It may simulate other records poorly. Give a lower "
-            "`order`, or record for longer, with inputs that move more often.",
+            "A mode of the model does not decay over the longest experiment, nor by "
+            "more than the standard deviation of its poles (`poles_std_`). It may be "
+            "an integrator (name its outputs in `integrating`), stand for a drift that "
+            "the inputs do not explain, or for a system that is not linear: it may "
+            "simulate other records poorly. Give a lower `order`, or record for "
+            "longer, with inputs that move more often.",
         )
 
     gain = fitted.evidence.static_gain()
@@ -835,7 +838,7 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
 
 
 def _may_last(fitted: LocalFit) -> bool:
-    """Whether the decay of an oscillation of a stable model is not known.
+    """Whether the decay of a mode of a stable model is not known.
 
     Of summaries of records nobody knows how long these were.
     """
@@ -844,12 +847,13 @@ def _may_last(fitted: LocalFit) -> bool:
     if not lengths:
         return False
     decay = 1.0 - np.abs(poles)
-    lasting = (poles.imag != 0.0) & (decay >= 0.0) & (decay * max(lengths) < 1.0)
+    lasting = (decay >= 0.0) & (decay * max(lengths) < 1.0)
     try:
         spread = np.abs(fitted.evidence.poles_std()) if lasting.any() else decay
     except ValueError:  # it is not known
         return False
-    return bool((lasting & (decay < _DECAYS * spread)).any())
+    unknown = (decay < _DECAYS * spread) & (spread * max(lengths) > _MATTERS)
+    return bool((lasting & unknown).any())
 
 
 def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:

@@ -391,3 +391,23 @@ def test_a_fit_that_parts_held_out_do_not_confirm_is_told(rng):
             warnings.simplefilter("always")
             warn_about(poor, set())
         assert sum("far worse" in str(w.message) for w in told) == expected
+
+
+def test_a_mode_whose_decay_is_not_known_is_told():
+    """Beside noise that drifts; a slow pole that is known is none of these."""
+    told = []
+    for seed, drift in ((1, 0.0), (3, 0.3), (7, 0.3), (9, 0.3)):
+        rng = np.random.default_rng(seed)
+        u, e = rng.standard_normal((2, 400, 1))
+        y = lfilter([0.0, 1.1, -0.8], np.poly([0.9999, 0.7]), u, axis=0)
+        y += drift * np.cumsum(e, axis=0) + 0.003 * e
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model = SubspaceLTI(offset=None).fit(u, y)
+        decay = 1.0 - np.abs(model.lti_.poles())
+        spread = np.abs(model.poles_std_)
+        lasts = (decay >= 0.0) & (decay * 400 < 1.0)
+        unknown = lasts & (decay < 2.0 * spread) & (spread * 400 > 0.1)
+        told.append(any("A mode of the model" in str(w.message) for w in caught))
+        assert told[-1] == unknown.any() and (drift or lasts.any())
+    assert any(told) and not told[0]
