@@ -35,6 +35,7 @@ from .identification import (
     validate,
 )
 from .offsets import (
+    CERTAIN,
     N_TRENDS,
     Offsets,
     attributed,
@@ -47,7 +48,7 @@ from .realization import METHODS
 from .residuals import find_spikes, lacks
 from .selection import PlantFit, Row, Selection, better_horizon, select
 from .shifts import cut_at, find_shifts
-from .signals import Record, SharedSignals, shorten
+from .signals import Record, SharedSignals, shorten, thinned
 from .simulation_fit import Freedom, Realization
 from .statistics import Evidence
 from .varx import Feedback, find_feedback
@@ -673,7 +674,7 @@ _WORSE = 1.2
 _USELESS, _HARDLY = 0.9, 0.4
 
 # What is told from tests that take as long as a fit
-TESTS = {"held out", "static gain", "decay", "lack"}
+TESTS = {"held out", "orders", "static gain", "decay", "lack"}
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
 # model not to refute it; standard errors by which a lesser one must be better where the
@@ -808,6 +809,16 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "over the record or drifts, or the record is too short for it. Give a "
             "lower `order`, leave disturbed parts out, or use offset='linear'.",
         )
+    if _disputed(fitted):
+        tell(
+            told,
+            "orders",
+            "Parts held out took fewer states than the likelihood asks for, by more "
+            "than chance explains (`selection_`): the system is not quite linear, or "
+            "changes over the record, or its inputs move too seldom for parts to tell. "
+            "Compare both orders on another record, or give one with inputs that move "
+            "more often, and less far if the system is not linear.",
+        )
     if _may_last(fitted):
         tell(
             told,
@@ -835,6 +846,17 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "lower `order`; at higher frequencies the model may be right "
             "(`frequency_response_std`).",
         )
+
+
+def _disputed(fitted: LocalFit) -> bool:
+    """Whether the criterion speaks clearly against the order that was taken."""
+    records, selection = fitted.scaled.records, fitted.selection
+    n_values = sum(record.y.size for record in thinned(records)) if records else 0
+    chosen = selection.order, selection.horizon
+    return any(
+        row[:2] == chosen and row.criterion * n_values > CERTAIN
+        for row in selection.rows
+    )
 
 
 def _may_last(fitted: LocalFit) -> bool:

@@ -53,7 +53,7 @@ _SUSPICIOUS, _SIGNIFICANT = 1e-2, 1e-3
 
 # By which the criterion is better with a chance of 1e-7; and the chance by the test of
 # the constants, above which that says more of poor models than of constants.
-_CERTAIN, _LIKELY = 30.0, 0.5
+CERTAIN, _LIKELY = 30.0, 0.5
 
 _MOSTLY = 0.5  # part of the squared errors; noise of long memory has a quarter at most
 
@@ -187,15 +187,15 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     if better > 0.0 and len(other.model.A) < len(without.model.A):
         return True
     far = _stays_far(without.records)
-    if not better > (-_CERTAIN if far else 0.0):
+    if not better > (-CERTAIN if far else 0.0):
         return False
     chance = chance_of_constants(other)
-    return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > _CERTAIN))
+    return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > CERTAIN))
 
 
 def shifts_matter(whole: Evidence, parts: Evidence) -> bool:
     """Whether the criterion is better by what no chance explains for cut records."""
-    return _criterion(whole) - _criterion(parts) > _CERTAIN
+    return _criterion(whole) - _criterion(parts) > CERTAIN
 
 
 def _criterion(evidence: Evidence) -> float:

@@ -411,3 +411,21 @@ def test_a_mode_whose_decay_is_not_known_is_told():
         told.append(any("A mode of the model" in str(w.message) for w in caught))
         assert told[-1] == unknown.any() and (drift or lasts.any())
     assert any(told) and not told[0]
+
+
+def test_an_order_that_the_likelihood_disputes_is_told(rng):
+    """By more than 30: of a chance of 1e-7."""
+    u, e = rng.standard_normal((2, 300, 1))
+    y = lfilter([0.0, 1.0], [1.0, -0.7], u, axis=0) + 0.1 * e
+    fitted = fit_pairs([(u, y)], check_options(SubspaceLTI().get_params()), set())
+    chosen = fitted.selection.order, fitted.selection.horizon
+    for excess in (29.0, 31.0):
+        rows = [
+            row._replace(criterion=excess / 300) if row[:2] == chosen else row
+            for row in fitted.selection.rows
+        ]
+        disputed = fitted._replace(selection=replace(fitted.selection, rows=rows))
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            warn_about(disputed, set())
+        assert [str(w.message)[:14] for w in told] == ["Parts held out"] * (excess > 30)
