@@ -194,8 +194,12 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
 
 
 def shifts_matter(whole: Evidence, parts: Evidence) -> bool:
-    """Whether the criterion is better by what no chance explains for cut records."""
-    return _criterion(whole) - _criterion(parts) > CERTAIN
+    """Whether the criterion is better by what no chance explains for cut records.
+
+    As for as many samples: those about the cuts are left out.
+    """
+    n, kept = (sum(r.u.shape[1] for r in e.records) for e in (whole, parts))
+    return _criterion(whole) - n / kept * _criterion(parts) > CERTAIN
 
 
 def _criterion(evidence: Evidence) -> float:

@@ -24,7 +24,6 @@ series", Journal of the American Statistical Association 88, 1993.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -52,6 +51,8 @@ _LEAST = 0.1  # of the energy of a shift, that a constant of the record does not
 # Samples after the first past of a record in which its start may still be felt, and
 # between two shifts that are told apart (no fewer than the past).
 _START, _APART = 20, 10
+
+_ABOUT = 5  # samples to either side of a shift in which it may have begun
 
 _OF_NORMAL = 0.6745  # median magnitude of a normal number
 _ROUNDING = 1e-5  # innovations of scaled outputs that are no noise
@@ -169,14 +170,22 @@ def _statistics(w: Array, shape: Array, lasts: bool) -> tuple[Array, Array]:
 
 
 def cut_at(pairs: Pairs, shifts: Sequence[Sequence[int]]) -> Pairs:
-    """Experiments that end where levels shift, and begin anew.
+    """Experiments that end before levels shift, and begin anew after that.
 
-    >>> u = np.zeros((9, 1))
-    >>> [len(part) for part, _ in cut_at([(u, u), (u, u)], [[2, 6], []])]
-    [2, 4, 3, 9]
+    Where a load shifts is known to some samples: one at the end of an experiment would
+    be taken for a mode that grows.
+
+    >>> u = np.zeros((60, 1))
+    >>> [len(part) for part, _ in cut_at([(u, u), (u, u)], [[20, 50], []])]
+    [15, 20, 5, 60]
     """
     return [
         (u[start:stop], y[start:stop])
         for (u, y), cuts in zip(pairs, shifts, strict=True)
-        for start, stop in pairwise([0, *cuts, len(u)])
+        for start, stop in zip(
+            [0, *(k + _ABOUT for k in cuts)],
+            [*(k - _ABOUT for k in cuts), len(u)],
+            strict=True,
+        )
+        if stop > start
     ]

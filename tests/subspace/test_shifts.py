@@ -95,9 +95,10 @@ def test_a_record_is_cut_as_by_hand():
         found = SubspaceLTI().fit(u, y)
     parts = cut_at([(u, y)], [[400, 640]])
     X = np.vstack(
-        [np.column_stack([u, np.full(len(u), k)]) for k, (u, _) in enumerate(parts)]
+        [np.hstack([u, np.full_like(u, k)]) for k, (u, _) in enumerate(parts)]
     )
-    by_hand = SubspaceLTI(experiment=1, offset="constant").fit(X, y)
+    outputs = np.vstack([y for _, y in parts])
+    by_hand = SubspaceLTI(experiment=1, offset="constant").fit(X, outputs)
     assert found.offset_ == "constant" and found.offsets_differ_
     assert_allclose(found.lti_.A, by_hand.lti_.A, atol=1e-9)
     assert_allclose(found.output_offset_, by_hand.output_offset_, atol=1e-9)
