@@ -118,15 +118,24 @@ def fitted_together(
         return None
     places = kappa[[box is not None for box in boxes]]
     some = np.linspace(0, len(theta) - 1, min(_STARTS, len(theta))).astype(int)
-    starts = []
-    for k in some:
-        constant = _fitted(known, places, theta[[k] * len(places)], 0)
-        starts.append(_fitted(known, places, constant.form.predict(places), 1))
-    # far from all black boxes, the constant ones are alike
-    starts.sort(key=lambda found: found.cost)
+    starts = [_fitted(known, places, theta[[k] * len(places)], 0) for k in some]
+    best = _best_of(structure, known, places, starts)
+    if best is None:  # far from all black boxes, constant parameters are alike
+        lines = [_fitted(known, places, one.form.predict(places), 1) for one in starts]
+        best = _best_of(structure, known, places, lines)
+    return best
+
+
+def _best_of(
+    structure: GrayBoxStructure,
+    known: Sequence[UncertainBoxes],
+    places: Array,
+    starts: Sequence[_Found],
+) -> Together | None:
+    """The polynomial of any degree that the best starts lead to."""
     n_values = sum(box.n_directions for box in known)
     best, least = None, np.inf
-    for found in starts[:_KEPT]:
+    for found in sorted(starts, key=lambda found: found.cost)[:_KEPT]:
         for degree in _DEGREES:
             n_terms = len(resolvable_powers(degree, places))
             n = n_terms * structure.n_params
