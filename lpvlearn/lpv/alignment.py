@@ -90,6 +90,8 @@ def rotation_to(model: StateSpace, reference: StateSpace) -> Array:
     array([[ 0.,  1.],
            [-1.,  0.]])
     """
+    if not model.order:
+        return np.zeros((0, 0))
     distance = _Distance(model, reference)
     fastest = np.abs(reference.poles()).max(initial=0.0)
     starts = []
@@ -120,7 +122,7 @@ class _Distance:
         gramian = _correlation(reference, reference, 0.0) / 2.0
         energy, basis = eigh((gramian + gramian.T) / 2.0)
         root = basis * np.sqrt(np.maximum(energy, 0.0)) @ basis.T
-        rate = np.linalg.norm(reference.A @ root) / (np.linalg.norm(root) or 1.0)
+        rate = np.linalg.norm(reference.A @ root) / np.linalg.norm(root)
         self.root = root / np.sqrt(rate)
         self.above = np.triu_indices(model.order, 1)
 
