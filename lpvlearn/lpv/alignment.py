@@ -93,7 +93,7 @@ def rotation_to(model: StateSpace, reference: StateSpace) -> Array:
     if not model.order:
         return np.zeros((0, 0))
     distance = _Distance(model, reference)
-    fastest = np.abs(reference.poles()).max(initial=0.0)
+    fastest = np.abs(reference.poles()).max()
     starts = []
     for share in _FORGOTTEN:
         U, _, V = svd(_correlation(model, reference, share * fastest))
