@@ -8,11 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
+from joblib import delayed
 
 from lpvlearn.__main__ import main
+from lpvlearn.pipeline.workers import results_of
 
 pytestmark = [
     pytest.mark.slow,
@@ -158,6 +161,23 @@ def test_a_killed_worker_is_told(tmp_path):
     assert process.returncode == 1
     assert "RuntimeError: A worker process was killed" in told
     nothing_left(process)
+
+
+def half_a_result():
+    """End this process while it sends its result."""
+
+    def send(connection, data):
+        os.write(connection.fileno(), data[: len(data) // 2])
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    Connection._send = send
+    return bytes(10**5)
+
+
+def test_a_worker_killed_in_the_middle_of_its_result_is_told():
+    tasks = [delayed(half_a_result)(), delayed(time.sleep)(0)]
+    with pytest.raises(RuntimeError, match="A worker process was killed"):
+        list(results_of(tasks, n_jobs=2))
 
 
 def test_two_processes_share_one_memory(tmp_path):

@@ -12,11 +12,12 @@ from functools import cache
 from typing import Any
 
 from joblib import Parallel, delayed, effective_n_jobs
+from joblib.externals.loky import reusable_executor
 
 # A call as `joblib.delayed` writes it down: function, arguments, keywords.
 Task = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
 
-_WATCH = 0.5  # seconds between two looks at the process that started a worker
+_WATCH = 0.5  # seconds between two looks at other processes
 
 _KILLED = (
     "A worker process was killed before its work was done, most often for want of "
@@ -54,10 +55,34 @@ def _ready() -> None:
 
 
 def _guarded(results: Iterator[Any]) -> Iterator[Any]:
+    done = threading.Event()
+    threading.Thread(target=_watch_workers, args=(done,), daemon=True).start()
     try:
         yield from results
     except BrokenProcessPool as error:
         raise RuntimeError(_KILLED) from error
+    finally:
+        done.set()
+
+
+def _watch_workers(done: threading.Event) -> None:
+    """Break a pool of which a worker is dead for longer than Loky takes to see it.
+
+    Killed in the middle of a result, it leaves Loky waiting for the rest of that, which
+    has an end only when nobody holds the end of the pipe that is written to.
+    """
+    executor = reusable_executor._executor
+    results = executor and executor._result_queue
+    seen_dead = False
+    while results is not None and not done.wait(_WATCH):
+        workers = list(executor._processes.values())
+        dead = any(not worker.is_alive() for worker in workers)
+        if dead and seen_dead and executor._flags.broken is None:
+            for worker in workers:
+                worker.terminate()
+            results._writer.close()
+            return
+        seen_dead = dead
 
 
 def _in_worker(
