@@ -124,7 +124,7 @@ class _Search:
         t = self.target
         s = shift * self.high + 1j * omega
         self.s = np.asarray(s if t.dt is None else np.exp(s * t.dt), dtype=complex)
-        self.G0 = t.C @ resolvent(t.A, self.s) @ t.B + t.D
+        self.G0 = t.C @ resolvent(t.A, self.s, t.B) + t.D
         size = np.abs(self.G0)
         top = size.max(0)
         if shift == 0:

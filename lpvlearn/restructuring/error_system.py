@@ -71,15 +71,16 @@ def laplace_variable(
     return z, 1j * dt * z, -(dt**2) * z
 
 
-def resolvent(A: Array, s: Complex) -> Complex:
-    """``(s I - A)^-1`` for every `s`; zero at infinity."""
-    finite = np.isfinite(s)
-    M = np.where(finite, s, 0.0)[:, None, None] * np.eye(len(A)) - A
-    if not finite.all():
-        M[~finite] = np.eye(len(A))
-    inverse: Complex = np.linalg.inv(M.astype(complex))
-    inverse[~finite] = 0.0
-    return inverse
+def resolvent(A: Array, s: Complex, B: Array | None = None) -> Complex:
+    """``(s I - A)^-1``, or ``(s I - A)^-1 B``, for every `s`; zero at infinity."""
+    finite, n = np.isfinite(s), len(A)
+    M = np.empty((len(s), n, n), complex)
+    M[:] = -A
+    M.reshape(len(s), n * n)[:, :: n + 1] += np.where(finite, s, 0.0)[:, None]
+    M[~finite] = np.eye(n)
+    X = np.asarray(np.linalg.inv(M) if B is None else np.linalg.solve(M, B), complex)
+    X[~finite] = 0.0
+    return X
 
 
 def model_derivatives(model: Target, omega: Array) -> tuple[Complex, Complex, Complex]:
@@ -321,7 +322,7 @@ class ErrorSystem:
 
     def _target_at(self, omega: Array) -> Complex:
         t, s = self.target, laplace_variable(omega, self.dt)[0]
-        return np.asarray(t.C @ resolvent(t.A, s) @ t.B + t.D)
+        return np.asarray(t.C @ resolvent(t.A, s, t.B) + t.D)
 
     def _target_derivatives(self, omega: Array) -> tuple[Complex, Complex, Complex]:
         return model_derivatives(self.target, omega)
@@ -330,7 +331,7 @@ class ErrorSystem:
         """Response of the gray-box model, shape (k, n_outputs, n_inputs)."""
         A, B, C, D = self.split(self.structure.system_matrix(theta))
         s = laplace_variable(omega, self.dt)[0]
-        return C @ resolvent(A, s) @ B + D
+        return C @ resolvent(A, s, B) + D
 
     def response_jacobian(self, theta: Array, omega: Array) -> tuple[Complex, Complex]:
         """Response and its derivatives, shapes (k, p, m) and (k, p, m, n_params)."""

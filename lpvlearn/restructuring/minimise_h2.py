@@ -87,8 +87,8 @@ def minimise_h2(
     limits = Limits(system, margin)
     J, gradient = squared_h2(system, theta)
     history: list[dict[str, float]] = []
-    n_iter, slope = 0, 0.0
-    for _ in range(_ROUNDS):
+    n_iter, slope, known = 0, 0.0, np.inf
+    for left in range(_ROUNDS, -1, -1):
         if negligible**2 >= J:
             slope = 0.0
             break
@@ -96,7 +96,9 @@ def minimise_h2(
         slope = _slope(
             gradient[active] @ T / J, *_scaled_limits(limits, theta, active, T)
         )
-        if slope <= tol or n_iter >= max_iter or time_is_up():
+        idle = J >= known * (1.0 - _PROGRESS)
+        done = slope <= tol or idle or n_iter >= max_iter
+        if done or left == 0 or time_is_up():
             break
         known, start = J, theta
         theta, steps = _quasi_newton(
@@ -106,8 +108,6 @@ def minimise_h2(
         J, gradient = squared_h2(system, theta)
         if not J < known:
             theta, (J, gradient) = start, squared_h2(system, start)
-        if J >= known * (1.0 - _PROGRESS):
-            break
     peaks = Peaks(
         np.array([np.sqrt(J)]), np.zeros(0), gradient[None], np.zeros(1, bool)
     )
