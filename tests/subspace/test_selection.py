@@ -62,6 +62,20 @@ def test_coloured_noise_is_not_taken_for_states():
     assert sum(order == 3 for order in orders) >= 5 and max(orders) <= 4
 
 
+def test_states_that_took_slow_noise_are_given_up_by_the_noise_without_them():
+    """A mode of the pilot and a faster noise hold each other; another search frees."""
+    orders, poles = [], (0.9 * np.exp(1.2j), 0.85 * np.exp(2.0j), 0.8 * np.exp(0.8j))
+    for seed in (5, 6, 8, 9):
+        rng = np.random.default_rng(seed)
+        system = example(rng, modes(*poles), 1, 1)
+        u = np.sign(rng.standard_normal((72, 1))).repeat(3, axis=0)
+        y = lti_response(*system, u)
+        e = lfilter([0.436], [1.0, -0.9], rng.standard_normal((416, 1)), axis=0)[200:]
+        record = Record.of(u, y + 0.15 * y.std(axis=0) * e)
+        orders.append(select([record], None, None, Settings(freedom(1, 1))).order)
+    assert orders == [6, 6, 6, 6]
+
+
 @pytest.mark.slow
 def test_noise_that_a_rich_pilot_followed_is_found_by_the_order_itself():
     """Many channels, few samples: states too many take slow noise for answers."""
