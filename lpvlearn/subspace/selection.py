@@ -24,9 +24,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg
 
+from ..systems.simulation import estimate_initial_state, free_responses
 from .hankel import correlation_sequence
 from .held_out import MATTERS, HeldOut
 from .identification import (
@@ -497,14 +499,47 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     lasting = (poles.imag > 0.0) & ((1.0 - np.abs(poles)) * longest < 1.0)
     misfit = 2.0 * np.log(max(0.5 * longest, 1.0)) * int(lasting.sum())
     misfit += few * _PRICE * n_parameters
-    errors = simulation_errors(model, records)
-    lags = longest // _SAMPLES_PER_LAG
-    for i in range(ny):
-        noise = autoregression([error[:, [i]] for error in errors], highest=lags)
+    noise = _innovations(model, records, free, longest // _SAMPLES_PER_LAG)
+    for i, (variance, n_lags) in enumerate(noise):
         power = sum(float(record.y[i] @ record.y[i]) for record in records) / n_samples
-        variance = max(float(noise.covariance[0, 0]), _EXACT * power) or 1.0
-        misfit += n_samples * np.log(variance) + _PRICE * len(noise.A)
+        variance = max(variance, _EXACT * power) or 1.0
+        misfit += n_samples * np.log(variance) + _PRICE * n_lags
     return float(misfit)
+
+
+def _innovations(
+    model: Realization, records: Sequence[Record], free: Freedom, highest: int
+) -> list[tuple[float, int]]:
+    """Variance and number of lags of the noise of every output.
+
+    The own unknowns are those that make the least of the innovations: of slow noise,
+    what makes the least of the errors leaves large ones in the first samples.
+    """
+    errors = simulation_errors(model, records)
+    first = len(model.A) - free.n_states(len(model.A))
+    filters, sizes = [], []
+    for i in range(len(model.C)):
+        parts = [error[:, [i]] for error in errors]
+        noise = autoregression(parts, highest=highest)
+        filters.append(np.append(1.0, -noise.C[0]))
+        sizes.append(np.sqrt(noise.covariance[0, 0]) or 1.0)
+    lost, squares, n_samples = max(map(len, filters)) - 1, np.zeros(len(sizes)), 0
+    for record, error in zip(records, errors, strict=True):
+        if len(error) <= 2 * lost:
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            unknown = free_responses(model.A, model.C, len(error), record.trend)
+        unknown = unknown[:, :, first:]
+        unknown = unknown[:, :, np.isfinite(unknown).all(axis=(0, 1))]
+        signals = np.concatenate([error[:, :, None], unknown], axis=2)
+        for i, (f, size) in enumerate(zip(filters, sizes, strict=True)):
+            signals[:, i] = scipy.signal.lfilter(f, size, signals[:, i], axis=0)
+        white, unknown = signals[lost:, :, 0], signals[lost:, :, 1:]
+        white = white - unknown @ estimate_initial_state(unknown, white)
+        squares += (white**2).sum(axis=0)
+        n_samples += len(white)
+    variances = np.array(sizes) ** 2 * squares / n_samples
+    return [(float(v), len(f) - 1) for v, f in zip(variances, filters, strict=True)]
 
 
 def _with_more_states(
