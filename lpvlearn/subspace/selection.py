@@ -492,12 +492,12 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     few = n_values / max(n_values - n_parameters, 1)
     if not np.isfinite(model.loss):
         return np.inf
-    # Of many lines of a spectrum one stands out by chance: an oscillation that lasts
-    # for the whole record may be any of them, and costs what the best of them gains.
+    # Of many lines of a spectrum one stands out by chance: an oscillation may be any of
+    # as many as its decay tells apart, and costs what the best of them gains.
     longest = max(record.u.shape[1] for record in records)
     poles = np.linalg.eigvals(model.A)
-    lasting = (poles.imag > 0.0) & ((1.0 - np.abs(poles)) * longest < 1.0)
-    misfit = 2.0 * np.log(max(0.5 * longest, 1.0)) * int(lasting.sum())
+    decay = np.maximum(1.0 - np.abs(poles[poles.imag > 0.0]), 2.0 / longest)
+    misfit = -2.0 * float(np.log(decay).sum())
     misfit += few * _PRICE * n_parameters
     noise = _innovations(model, records, free, longest // _SAMPLES_PER_LAG)
     for i, (variance, n_lags) in enumerate(noise):
