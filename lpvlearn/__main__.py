@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import atexit
+import gc
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -54,6 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         commands.add_parser("paper", help="the paper's experiment", description=_PAPER)
     )
     options = parser.parse_args(given)
+    atexit.register(gc.freeze)  # no cycles are looked for in what ends anyway
     status: int = options.run(options)
     return status
 
@@ -112,6 +115,7 @@ def _paper(options: argparse.Namespace) -> None:
         _points_done(options.output, options.resume) as memory,
         _woken(n_jobs),
     ):
+        _enter("lpvlearn.paper")
         from .command.judgement import course
         from .paper import run_paper_experiment, save_figures, tables_text
 
@@ -147,9 +151,9 @@ def _paper(options: argparse.Namespace) -> None:
 
 @contextmanager
 def _woken(n_jobs: int) -> Iterator[None]:
-    """The processes of the paper enter the library while this one does, too."""
+    """Other processes enter the library while this one does, one core for each."""
     wake = joblib.delayed(_enter)("lpvlearn.pipeline")
-    awake = joblib.Parallel(n_jobs, return_as="generator")(n_jobs * [wake])
+    awake = joblib.Parallel(n_jobs, return_as="generator")((n_jobs - 1) * [wake])
     try:
         yield
     finally:
@@ -157,7 +161,10 @@ def _woken(n_jobs: int) -> Iterator[None]:
 
 
 def _enter(room: str) -> None:
+    """Import a room; none of it is garbage that need be looked for meanwhile."""
+    gc.disable()
     import_module(room)
+    gc.enable()
 
 
 def _save_tables(tables: dict[str, pd.DataFrame], folder: Path) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..exceptions import Told, collected, warn
 from ..systems.threads import one_blas_thread
 from .memory import Remembered
-from .workers import results_of
+from .workers import ALL_BUT_ONE, QUEUED, results_of
 
 Array = NDArray[np.float64]
 
@@ -54,27 +54,31 @@ class PointRunner:
         A failure names the point (by `kappa`), unless another one fails in the same
         words: the cause is an option then.
         """
-        return self.start(what, function, arguments, kappa, **shared)()
+        return self._start(QUEUED, what, function, arguments, kappa, **shared)()
 
-    def start(
+    def start(self, *args: Any, **shared: Any) -> Callable[[], list[Done | None]]:
+        """As `run`, whose results a call of what is returned waits for.
+
+        Other processes are at work in the meantime, one of `n_jobs` is this one.
+        """
+        return self._start(ALL_BUT_ONE, *args, **shared)
+
+    def _start(
         self,
+        sent: str,
         what: str,
         function: Callable[..., Any],
         arguments: Sequence[tuple[Any, ...]],
         kappa: Array,
         **shared: Any,
     ) -> Callable[[], list[Done | None]]:
-        """As `run`, whose results a call of what is returned waits for.
-
-        Other processes are at work in the meantime.
-        """
         kept = self._remembered(function)
         stop = self.on_error == "raise"
         tasks = (
             delayed(_attempt)(kept, args, shared, k if stop else None)
             for k, args in enumerate(arguments)
         )
-        results = results_of(tasks, self.n_jobs)
+        results = results_of(tasks, self.n_jobs, sent)
 
         def again(k: int) -> Any:
             return _attempt(kept, arguments[k], shared, None)

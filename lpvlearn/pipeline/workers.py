@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import threading
@@ -9,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 from joblib import Parallel, delayed, effective_n_jobs
@@ -16,6 +18,10 @@ from joblib.externals.loky import reusable_executor
 
 # A call as `joblib.delayed` writes it down: function, arguments, keywords.
 Task = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+
+# Tasks that processes have at a time, done or waiting: their next ones as well, or all
+# but one process, whose core is left to the one that sends them.
+QUEUED, ALL_BUT_ONE = "2 * n_jobs", "n_jobs - 1"
 
 _WATCH = 0.5  # seconds between two looks at other processes
 
@@ -26,14 +32,17 @@ _KILLED = (
 )
 
 
-def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
+def results_of(
+    tasks: Iterable[Task], n_jobs: int | None, sent: str = QUEUED
+) -> Iterator[Any]:
     """Results of tasks in their order, as they come, from `n_jobs` processes.
 
-    These are at work from now on. Raises a RuntimeError where one of them is killed
-    from outside.
+    These are at work from now on, and have `sent` tasks at a time. Raises a
+    RuntimeError where one of them is killed from outside.
     """
     watched = (delayed(_in_worker)(os.getpid(), *task) for task in tasks)
-    return _guarded(Parallel(n_jobs=n_jobs, return_as="generator")(watched))
+    parallel = Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch=sent)
+    return _guarded(parallel(watched))
 
 
 def started(n_jobs: int | None) -> Callable[[], None]:
@@ -51,7 +60,8 @@ def started(n_jobs: int | None) -> Callable[[], None]:
 
 
 def _ready() -> None:
-    """Nothing: with this module a process imports the library."""
+    """With this module a process imports the library, here what SciPy puts off."""
+    import_module("scipy.signal")
 
 
 def _guarded(results: Iterator[Any]) -> Iterator[Any]:
@@ -99,11 +109,13 @@ def _in_worker(
 
 @cache
 def _end_with_parent(parent: int) -> None:
-    """Have this process end when the one that started it, and asks, has.
+    """Have this process end when the one that started it, and asks, has, and at once.
 
     Loky's wait for more work for minutes when that one was killed, and what they share
-    with it stays in memory.
+    with it stays in memory. Modules are frozen: an end that looks for cycles in them
+    takes a quarter of a second, for which the other process waits.
     """
+    gc.freeze()
 
     def watch() -> None:
         while os.getppid() == parent:

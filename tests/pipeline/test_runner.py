@@ -1,5 +1,7 @@
 """A step at several points: failures, and what is told on the way."""
 
+import time
+
 import joblib
 import numpy as np
 import pytest
@@ -46,6 +48,23 @@ def test_different_failures_everywhere_tell_the_first(spring):
         ValueError, match="every .* failed. First operating point 0 .*400"
     ):
         pipeline.fit(X[unequal], y[unequal])
+
+
+def now_and_soon(_):
+    """When this began, and when it ended."""
+    began = time.time()
+    time.sleep(0.05)
+    return began, time.time()
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_steps_begun_leave_one_process_to_the_one_that_waits(n_jobs):
+    arguments, kappa = [(k,) for k in range(4)], np.arange(4.0)[:, None]
+    wait = runner(Memory(None), n_jobs=n_jobs).start(
+        "steps", now_and_soon, arguments, kappa
+    )
+    times = np.array([done.result for done in wait()])
+    assert (times[1:, 0] >= times[:-1, 1]).all()
 
 
 # -- what the points warn of -----------------------------------------------------------
