@@ -445,7 +445,9 @@ class ParameterDisplay:
                     self.curves_[name].append(curve)
 
     def _dress(self, ax: Any, name: str, lowest: bool) -> None:
-        from matplotlib.ticker import MaxNLocator, ScalarFormatter
+        from matplotlib.ticker import MaxNLocator
+
+        from .numbers import ShortNumbers
 
         tidy(ax)
         title = with_unit(name, units_of([name], self.units)[0])
@@ -458,9 +460,7 @@ class ParameterDisplay:
             ax.grid(False)
             return
         ax.margins(0.08, 0.12)
-        formatter = ScalarFormatter(useMathText=True, useOffset=False)
-        formatter.set_powerlimits((-3, 4))
-        ax.yaxis.set_major_formatter(formatter)
+        ax.yaxis.set_major_formatter(ShortNumbers())
         low, high = ax.dataLim.y0, ax.dataLim.y1
         size = max(abs(low), abs(high))
         # Else the axis magnifies rounding errors of a constant.

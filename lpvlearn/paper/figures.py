@@ -24,6 +24,8 @@ _TRUE = "arm, without noise"  # what the validation data are
 
 _DOTS_PER_INCH = 130  # 1040 pixels wide
 
+_COMPRESSION = {"compress_level": 3}  # in two thirds of the time, 4 % larger
+
 _TITLE_SIZE = 10.0  # points
 
 # The arm's dynamics, 0.7 to 120 rad/s, and up to 1e4 rad/s as in the paper.
@@ -66,7 +68,8 @@ def save_figures(experiment: PaperExperiment, directory: Path) -> list[Path]:
         path = directory / f"figure{number:02d}.png"
         figure.set_dpi(_DOTS_PER_INCH)
         with path.open("wb") as file:
-            FigureCanvasAgg(figure).print_png(file)  # drawn once, by savefig thrice
+            # drawn once, by savefig thrice
+            FigureCanvasAgg(figure).print_png(file, pil_kwargs=_COMPRESSION)
         plt.close(figure)
         paths.append(path)
     return paths

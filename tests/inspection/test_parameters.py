@@ -79,6 +79,16 @@ def test_an_interpolator_is_fitted_to_each_set_and_left_alone():
     assert_allclose(display.curves_["line"][0].get_ydata(), 2 * fine, atol=1e-12)
 
 
+def test_numbers_have_a_common_power_of_ten_and_are_no_formulas():
+    values = np.array([[-2e4], [-1.6e4]])
+    display = ParameterDisplay.from_parameters([[0.0], [1.0]], {"own": values})
+    display.figure_.canvas.draw()
+    axis = display.axes_.flat[0].yaxis
+    assert "10^{4}" in axis.get_offset_text().get_text()
+    labels = [label.get_text() for label in axis.get_ticklabels()]
+    assert min(map(float, [one.replace("−", "-") for one in labels])) >= -3
+
+
 def test_a_constant_parameter_is_drawn_flat():
     theta = 5 + 1e-12 * np.arange(4.0)[:, None]
     low, high = (
