@@ -570,6 +570,8 @@ def _check_finite(
     remedy: str,
 ) -> None:
     """Refuse infinity, and NaN where it may not be, naming the first."""
+    if matrix.max(initial=0.0) < SQUARED and matrix.min(initial=0.0) > -SQUARED:
+        return
     finite = (np.abs(matrix) < SQUARED) | (allow_missing & np.isnan(matrix))
     if finite.all():
         return

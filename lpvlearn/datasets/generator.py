@@ -293,7 +293,7 @@ def _input_table(
     }
     table["experiment"] = np.repeat(np.arange(n_labels), n_samples)
     table["time"] = np.tile(np.arange(n_samples) * sampling_time, n_labels)
-    return pd.DataFrame(table)
+    return pd.DataFrame(table, copy=False)
 
 
 def _clock_samples(
