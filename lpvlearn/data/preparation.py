@@ -230,7 +230,8 @@ def held_for(signals: Sequence[Array]) -> int:
     """
     changes = [np.flatnonzero(np.diff(signal)) for signal in signals]
     gaps = np.concatenate([np.diff(at) for at in changes])
-    if len(gaps) < _ENOUGH_CHANGES:
+    # Were half of the gaps 2 or more, they would not fit into the samples.
+    if len(gaps) < _ENOUGH_CHANGES or 1.5 * len(gaps) > sum(map(len, signals)):
         return 1
     longest = min(int(np.median(gaps)), _LONGEST_HELD)
     return next(k for k in range(longest, 0, -1) if np.mean(gaps % k == 0) >= _HELD)
