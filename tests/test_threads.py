@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from joblib import Parallel, delayed, parallel_config
 from sklearn.base import clone
-from threadpoolctl import threadpool_info, threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 import lpvlearn
 from lpvlearn import (
@@ -39,9 +39,11 @@ def in_threads(pipeline, X, y):
         return [*found, clone(pipeline).set_params(n_jobs=3).fit(X, y)]
 
 
+POOLS = ThreadpoolController().select(user_api="blas").lib_controllers
+
+
 def blas_threads():
-    pools = [pool for pool in threadpool_info() if pool["user_api"] == "blas"]
-    return [pool["num_threads"] for pool in pools]
+    return [pool.num_threads for pool in POOLS]
 
 
 def test_threads_agree_with_a_serial_fit_and_put_back_the_threads_of_blas():
