@@ -13,6 +13,7 @@ from lpvlearn.systems.balancing import (
     align_signs,
     balancing_transformation,
     gramian_factor,
+    in_even_units,
 )
 
 from ..conftest import stable_model
@@ -170,6 +171,12 @@ def test_a_model_without_any_response_has_order_zero():
     assert silent.balance().order == 0
     assert silent.balance(1).dc_gain() == 3.0
     assert_allclose(silent.hankel_singular_values(), 0.0)
+
+
+def test_no_states_have_even_units_in_silence(capfd):
+    even, units = in_even_units(np.zeros((0, 0)))
+    assert even.shape == (0, 0) and units.shape == (0,)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_balancing_twice_changes_nothing():
