@@ -41,7 +41,7 @@ from .identification import (
     subspaces_of,
     validate,
 )
-from .noise import Whitening, autoregression
+from .noise import Whitening, autoregression, taper
 from .realization import ObservabilitySubspace
 from .refinement import refine_simulation
 from .signals import Record, output_energy, thinned
@@ -513,7 +513,9 @@ def _innovations(
     """Variance and number of lags of the noise of every output.
 
     The own unknowns are those that make the least of the innovations: of slow noise,
-    what makes the least of the errors leaves large ones in the first samples.
+    what makes the least of the errors leaves large ones in the first samples. These,
+    and the last, count for less: a transient that an experiment begins with tells of
+    modes, and next to nothing of how they answer to the inputs.
     """
     errors = simulation_errors(model, records)
     first = len(model.A) - free.n_states(len(model.A))
@@ -523,7 +525,7 @@ def _innovations(
         noise = autoregression(parts, highest=highest)
         filters.append(np.append(1.0, -noise.C[0]))
         sizes.append(np.sqrt(noise.covariance[0, 0]) or 1.0)
-    lost, squares, n_samples = max(map(len, filters)) - 1, np.zeros(len(sizes)), 0
+    lost, squares, n_samples = max(map(len, filters)) - 1, np.zeros(len(sizes)), 0.0
     for record, error in zip(records, errors, strict=True):
         if len(error) <= 2 * lost:
             continue
@@ -534,10 +536,12 @@ def _innovations(
         signals = np.concatenate([error[:, :, None], unknown], axis=2)
         for i, (f, size) in enumerate(zip(filters, sizes, strict=True)):
             signals[:, i] = scipy.signal.lfilter(f, size, signals[:, i], axis=0)
-        white, unknown = signals[lost:, :, 0], signals[lost:, :, 1:]
+        weights = taper(len(error))[lost:]
+        signals = signals[lost:] * weights[:, :, None]
+        white, unknown = signals[:, :, 0], signals[:, :, 1:]
         white = white - unknown @ estimate_initial_state(unknown, white)
         squares += (white**2).sum(axis=0)
-        n_samples += len(white)
+        n_samples += float((weights**2).sum())
     variances = np.array(sizes) ** 2 * squares / n_samples
     return [(float(v), len(f) - 1) for v, f in zip(variances, filters, strict=True)]
 
