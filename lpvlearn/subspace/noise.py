@@ -216,9 +216,9 @@ def autoregression(
     weight = 0.0
     for v in errors:
         known = min(len(v), highest + 1)
-        weights = taper(len(v))
-        lags[:known] += correlation_sequence(weights * v, known)
-        weight += float((weights**2).sum())
+        taper = _taper(len(v))
+        lags[:known] += correlation_sequence(taper * v, known)
+        weight += float((taper**2).sum())
     lags /= weight
     # Channels of very different size must not spoil the determinants.
     scale = np.sqrt(np.maximum(np.diagonal(lags[0]), 0.0))
@@ -244,10 +244,10 @@ def autoregression(
 
 
 @lru_cache(maxsize=8)
-def taper(n_samples: int) -> Array:
+def _taper(n_samples: int) -> Array:
     """Weights of the samples of an experiment, (n_samples, 1)."""
-    weights: Array = scipy.signal.windows.tukey(n_samples + 2, _TAPERED)[1:-1, None]
-    return weights
+    taper: Array = scipy.signal.windows.tukey(n_samples + 2, _TAPERED)[1:-1, None]
+    return taper
 
 
 def _log_determinant(covariance: Array) -> tuple[float, float]:
