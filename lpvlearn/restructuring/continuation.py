@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.least_squares import levenberg_marquardt
-from ..systems.response import pole_grid, pole_rates
+from ..systems.response import pole_grid, pole_rates, resolvent
 from .deadline import time_is_up
-from .error_system import Structure, Target, derivatives, resolvent
+from .error_system import Structure, Target, derivatives
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

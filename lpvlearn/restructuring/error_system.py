@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.hinf_norm import PeakSet, linf_norm
-from ..systems.response import pole_grid, pole_rates
+from ..systems.response import pole_grid, pole_rates, resolvent
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -69,18 +69,6 @@ def laplace_variable(
         return s, zero + 1j, zero
     z = np.exp(1j * omega * dt)
     return z, 1j * dt * z, -(dt**2) * z
-
-
-def resolvent(A: Array, s: Complex, B: Array | None = None) -> Complex:
-    """``(s I - A)^-1``, or ``(s I - A)^-1 B``, for every `s`; zero at infinity."""
-    finite, n = np.isfinite(s), len(A)
-    M = np.empty((len(s), n, n), complex)
-    M[:] = -A
-    M.reshape(len(s), n * n)[:, :: n + 1] += np.where(finite, s, 0.0)[:, None]
-    M[~finite] = np.eye(n)
-    X = np.asarray(np.linalg.inv(M) if B is None else np.linalg.solve(M, B), complex)
-    X[~finite] = 0.0
-    return X
 
 
 def model_derivatives(model: Target, omega: Array) -> tuple[Complex, Complex, Complex]:

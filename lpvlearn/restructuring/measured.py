@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..systems.hinf_norm import PeakSet
+from ..systems.response import resolvent
 from ..systems.sampling import d2c_tustin
 from ..validation import (
     complex_array,
@@ -27,7 +28,6 @@ from .error_system import (
     Target,
     laplace_variable,
     model_derivatives,
-    resolvent,
 )
 
 Array = NDArray[np.float64]

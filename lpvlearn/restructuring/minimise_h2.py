@@ -97,17 +97,15 @@ def minimise_h2(
             gradient[active] @ T / J, *_scaled_limits(limits, theta, active, T)
         )
         idle = J >= known * (1.0 - _PROGRESS)
-        done = slope <= tol or idle or n_iter >= max_iter
-        if done or left == 0 or time_is_up():
+        if slope <= tol or idle or not left or n_iter >= max_iter or time_is_up():
             break
-        known, start = J, theta
-        theta, steps = _quasi_newton(
+        end, steps = _quasi_newton(
             system, limits, theta, J, active, T, max_iter - n_iter, history
         )
         n_iter += steps
-        J, gradient = squared_h2(system, theta)
-        if not J < known:
-            theta, (J, gradient) = start, squared_h2(system, start)
+        known, found = J, squared_h2(system, end)
+        if found[0] < known:
+            theta, (J, gradient) = end, found
     peaks = Peaks(
         np.array([np.sqrt(J)]), np.zeros(0), gradient[None], np.zeros(1, bool)
     )

@@ -26,6 +26,7 @@ from scipy import linalg
 
 from ..models.innovation import NoiseModel
 from ..systems.balancing import balancing_transformation
+from ..systems.response import resolvent
 from .hankel import correlation_sequence
 from .signals import Record
 from .simulation_fit import Freedom, Realization
@@ -347,6 +348,5 @@ def spectral_density(model: NoiseModel, omega: Array) -> NDArray[np.complex128]:
             weights = 1.0 / (z[:, None] - poles)
             H = H + np.einsum("oi,fi,ij->foj", model.C @ vectors, weights, left)
         else:
-            resolvent = z[:, None, None] * np.eye(n) - model.A
-            H = H + model.C @ np.linalg.solve(resolvent, model.K + 0j)
+            H = H + model.C @ resolvent(model.A, z, model.K)
     return H @ model.covariance @ H.conj().transpose(0, 2, 1)

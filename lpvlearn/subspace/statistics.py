@@ -29,6 +29,7 @@ from scipy import fft
 
 from ..models.innovation import InnovationModel, NoiseModel
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
+from ..systems.response import resolvent
 from .noise import Whitening, autoregression, reduced_noise_model, spectral_density
 from .signals import Record, block_slices, signal_pieces
 from .simulation_fit import (
@@ -398,13 +399,13 @@ def _frequency_response_jacobian(
     Shape (n_freq, n_outputs, n_inputs, n_parameters); `omega` in radians per sample.
     """
     assert model.blocks is not None
-    (ny, n), m = model.C.shape, model.B.shape[1]
+    ny, m = len(model.C), model.B.shape[1]
     z = np.exp(1j * np.asarray(omega))
-    resolvent = np.linalg.inv(z[:, None, None] * np.eye(n) - model.A)
+    inverse = resolvent(model.A, z)
     # Axes: frequency, output, input, and two that tell the parameters apart.
-    to_output = (model.C @ resolvent)[:, :, None, :, None]
-    from_input = (resolvent @ model.B).transpose(0, 2, 1)[:, None, :, None, :]
-    by_parameter = [to_output * np.eye(m)[:, None, :]]
+    to_output = (model.C @ inverse)[:, :, None, :, None]
+    from_input = (inverse @ model.B).transpose(0, 2, 1)[:, None, :, None, :]
+    by_parameter: list[NDArray] = [to_output * np.eye(m)[:, None, :]]
     by_direct = np.zeros((len(z), ny, m, 1, int(free.direct.sum())))
     i, j = np.nonzero(free.direct)
     by_direct[:, i, j, 0, np.arange(len(i))] = 1.0

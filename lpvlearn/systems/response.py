@@ -365,6 +365,20 @@ def equilibrated(
     return scaled, B / scale[:, None], C * scale
 
 
+def resolvent(
+    A: NDArray, s: NDArray, B: NDArray | None = None
+) -> NDArray[np.complex128]:
+    """``(s I - A)^-1``, or ``(s I - A)^-1 B``, for every `s`; zero at infinity."""
+    finite, n = np.isfinite(s), len(A)
+    M = np.empty((len(s), n, n), complex)
+    M[:] = -A
+    M.reshape(len(s), n * n)[:, :: n + 1] += np.where(finite, s, 0.0)[:, None]
+    M[~finite] = np.eye(n)
+    X = np.asarray(np.linalg.inv(M) if B is None else np.linalg.solve(M, B), complex)
+    X[~finite] = 0.0
+    return X
+
+
 def pole_rates(poles: NDArray, dt: float | None) -> NDArray[np.complex128]:
     """Poles in rad/s: those of a sampled model by the logarithm."""
     poles = np.asarray(poles, dtype=complex)

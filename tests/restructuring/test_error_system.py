@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.error_system import ErrorSystem, Target, resolvent
+from lpvlearn.restructuring.error_system import ErrorSystem, Target
 from lpvlearn.restructuring.measured import MeasuredErrorSystem
 
 from .conftest import stable_model as sampled_model
@@ -134,10 +134,6 @@ def test_response_jacobian_is_the_derivative_of_the_response():
         np.testing.assert_allclose(
             J[..., j], numeric / (2 * h), atol=1e-7 * np.abs(J).max()
         )
-
-
-def test_resolvent_vanishes_at_infinity():
-    assert not resolvent(np.eye(2), np.array([np.inf + 0j])).any()
 
 
 def test_measured_error_is_the_maximum_over_the_grid():

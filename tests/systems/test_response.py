@@ -13,6 +13,7 @@ from lpvlearn.systems.response import (
     frequency_response,
     pole_grid,
     pole_rates,
+    resolvent,
 )
 
 from .conftest import random_system
@@ -29,6 +30,10 @@ def jordan_chain(n: int = 6) -> Matrices:
 def solved_at(system: Matrices, x: complex) -> NDArray:
     A, B, C, D = system
     return C @ np.linalg.solve(x * np.eye(len(A)) - A, B.astype(complex)) + D
+
+
+def test_resolvent_vanishes_at_infinity() -> None:
+    assert not resolvent(np.eye(2), np.array([np.inf + 0j])).any()
 
 
 def test_continuous_response_is_the_resolvent_formula() -> None:
