@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
 from numbers import Integral, Real
@@ -67,6 +67,17 @@ def _is_number(value: Any) -> bool:
     calls it."""
     real = isinstance(value, Real | Decimal | np.bool_)
     return real and not isinstance(value, np.timedelta64)
+
+
+def first_not_a_number(values: Iterable[Any]) -> int | None:
+    """Place of the first value that is neither a real number nor missing."""
+    for row, value in enumerate(values):
+        try:
+            float("j" if np.iscomplexobj(value) else value)
+        except (TypeError, ValueError, OverflowError):
+            if value is not pd.NA and value is not None:
+                return row
+    return None
 
 
 def number(

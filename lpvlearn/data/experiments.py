@@ -8,7 +8,7 @@ else by a level of the index, else by its position.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -25,6 +25,7 @@ from ..validation import (
     SQUARED,
     all_finite,
     complex_array,
+    first_not_a_number,
     is_whole,
     naming_argument,
     positive_time,
@@ -114,7 +115,7 @@ class Column:
                 return series.to_numpy(dtype=np.float64, na_value=np.nan)
             except (TypeError, ValueError, OverflowError):
                 pass
-        first = 0 if kind in "mM" else _first_not_a_number(series) or 0
+        first = 0 if kind in "mM" else first_not_a_number(series) or 0
         remedy = "Mend the value, or leave the column out."
         if argument == "X":
             remedy = (
@@ -123,7 +124,7 @@ class Column:
             )
         raise ValueError(
             f"Column {self.name!r} of {argument} must hold numbers. Got "
-            f"{series.iloc[first]!r} at row {first}. {remedy}"
+            f"{shown(series.iloc[first])} at row {first}. {remedy}"
         )
 
     def labels(self, rows: Sequence[int]) -> list[Hashable]:
@@ -146,16 +147,6 @@ def _did_you_mean(key: Any, names: Sequence[Any]) -> str:
 def _listed(names: Sequence[Any]) -> str:
     """The first of the names, for a message."""
     return ", ".join(map(repr, names[:_N_SHOWN])) + ", ..." * (len(names) > _N_SHOWN)
-
-
-def _first_not_a_number(values: Iterable[Any]) -> int | None:
-    for row, value in enumerate(values):
-        try:
-            float("j" if np.iscomplexobj(value) else value)
-        except (TypeError, ValueError, OverflowError):
-            if value is not pd.NA and value is not None:
-                return row
-    return None
 
 
 def _keys(role: str, value: Any) -> list[Any]:
@@ -518,7 +509,7 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
             ) from error
         kind = ValueError if isinstance(error, OverflowError) else type(error)
         flat = entries.ravel()
-        k = _first_not_a_number(flat) if entries.dtype.kind in "OSU" else None
+        k = first_not_a_number(flat) if entries.dtype.kind in "OSU" else None
         if k is not None and entries.ndim:  # a sparse matrix has none
             at = zip(
                 ("row", "column"), np.unravel_index(k, entries.shape), strict=False

@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..exceptions import warn
+from ..validation import first_not_a_number, shown
 
 Indices = NDArray[np.intp]
 
@@ -85,9 +86,8 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
                 _raise_bad_time(column, int(np.argmax(text)), series)
         try:
             seconds = series.to_numpy(dtype=np.float64, na_value=np.nan)
-        except (TypeError, ValueError):
-            numbers = pd.to_numeric(series, errors="coerce")
-            _raise_bad_time(column, int(np.argmax(numbers.isna())), series)
+        except (TypeError, ValueError, OverflowError):
+            _raise_bad_time(column, first_not_a_number(series) or 0, series)
     finite = np.abs(seconds) < _LATEST
     if not finite.all():
         _raise_bad_time(column, int(np.argmin(finite)), series)
@@ -288,5 +288,5 @@ def _decimal_unit(seconds: NDArray[np.float64]) -> float:
 def _raise_bad_time(column: Hashable, row: int, series: pd.Series) -> NoReturn:
     raise ValueError(
         f"Time column {column!r} must hold finite numbers (seconds) or datetimes. Got "
-        f"{series.iloc[row]!r} at row {row}; convert text with pandas.to_datetime."
+        f"{shown(series.iloc[row])} at row {row}; convert text with pandas.to_datetime."
     )

@@ -458,8 +458,8 @@ list, default=None
         >>> pipeline.fit_dataset("runs/", outputs="angle")  # doctest: +SKIP
         """
         opened, names = open_dataset(dataset), as_list(outputs)
-        missing = [name for name in names if name not in opened.schema.names]
-        if missing or not names:
+        known = set(opened.schema.names)
+        if not names or not all(isinstance(n, str) and n in known for n in names):
             raise ValueError(
                 "`outputs` must name columns of the dataset, which has "
                 f"{', '.join(map(repr, opened.schema.names))}. Got {outputs!r}."

@@ -414,6 +414,22 @@ def test_times_of_text_are_refused_by_all():
         call.function(**{**call.arguments, "X": X})
 
 
+@pytest.mark.parametrize("digits", [400, 5000])
+def test_times_beyond_floats_are_refused_at_their_row(digits):
+    X = world().X.astype({"time": object})
+    X.iloc[2, X.columns.get_loc("time")] = 10**digits
+    with pytest.raises(ValueError, match="finite numbers .* Got .* at row 2"):
+        calls()["resample"].function(**{**calls()["resample"].arguments, "X": X})
+
+
+def test_a_missing_name_names_no_column_of_a_dataset(tmp_path):
+    arrow = pytest.importorskip("pyarrow.parquet")
+    table = pytest.importorskip("pyarrow").Table.from_pandas(world().X)
+    arrow.write_table(table, tmp_path / "runs.parquet")
+    with pytest.raises(ValueError, match="`outputs` must name columns .* Got <NA>"):
+        lp.LocalLPVPipeline().fit_dataset(tmp_path / "runs.parquet", outputs=pd.NA)
+
+
 def test_an_output_error_model_that_grows_within_its_range_is_told():
     w = world()
     with pytest.warns(UserWarning, match="unstable at values within.*`?No experiment"):
