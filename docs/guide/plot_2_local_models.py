@@ -62,11 +62,12 @@ local.lti_
 # Order and horizon
 # -----------------
 # Every order is fitted to the record, with its errors whitened, and a criterion like
-# Akaike's weighs what a state gains against the parameters that it takes. The choice,
-# and a few lower orders, then simulate parts of the record that were held out; a lower
-# one that does so clearly better is taken instead. For each order the best horizon, the
-# error before the polishing steps, the criterion above the best one, and how well the
-# parts held out are predicted, where that was looked at:
+# Akaike's weighs what a state gains against the parameters that it takes. The choice, a
+# few lower orders, and higher ones that the criterion hardly tells from it, then
+# simulate parts of the record that were held out; one that does so clearly better is
+# taken instead. For each order the best horizon, the error before the polishing steps,
+# the criterion above the best one, and how well the parts held out are predicted, where
+# that was looked at:
 
 table = local.selection_.dropna(subset="criterion").set_index("order")
 table.round({"error": 4, "criterion": 4, "validation_bft": 2})

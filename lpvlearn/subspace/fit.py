@@ -478,7 +478,7 @@ def _believable(
     best, error = first, _held_out(first, choices)
     before = error
     try:
-        if not len(error.blocks):
+        if not error.parts:
             return first, None
         open_loop, of_that = rival(method="po-moesp")
         if (order := open_loop.selection.order) != first.selection.order:
@@ -543,7 +543,7 @@ def _held_out(fitted: LocalFit, choices: Choices) -> HeldOut:
     try:
         return held_out(refitted, scaled.records, at_rest=not free.initial_states)
     except ValueError:  # too few samples are left
-        return HeldOut(np.zeros(0), np.nan)
+        return HeldOut([], np.nan)
 
 
 def _grows(fitted: LocalFit, deviations: float = 0.0) -> bool:

@@ -38,33 +38,53 @@ _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 MATTERS, _MUCH = 0.03, 0.5
 
 
+class Part(NamedTuple):
+    """Samples held out: errors of simulation from rest, and what is unknown in them."""
+
+    error: Array  # (n_samples, n_outputs)
+    free: Array  # (n_samples, n_outputs, n_unknowns): responses to own unknowns
+    weight: Array  # (n_outputs, n_outputs): of the errors of which these make the least
+
+    def without(self, free: Array) -> Array:
+        """Errors that no combination of responses explains."""
+        W = self.weight
+        M = np.einsum("ij,tjk->tik", W, free)
+        error = self.error @ W.T
+        error = error - M @ estimate_initial_state(M, error)
+        return np.linalg.solve(W, error.T).T
+
+
 class HeldOut(NamedTuple):
     """Simulation errors on parts held out."""
 
-    blocks: Array  # (n_blocks,): sums of squares over consecutive blocks of time
+    parts: list[Part]
     bft: float  # best fit, percent, mean over outputs; NaN where nothing is held out
+    total: float = np.inf  # sum of squares; infinite where nothing is held out
     residual: float = np.nan  # root mean square, in units of the scaled records
-
-    @property
-    def total(self) -> float:
-        """Of all blocks; infinite where nothing is held out."""
-        return float(self.blocks.sum()) if len(self.blocks) else np.inf
 
     def clearly_better_than(
         self, other: HeldOut, standard_errors: float, share: float = MATTERS
     ) -> bool:
         """Whether errors are less, by more than chance and by a share that matters.
 
-        Chance is so many standard errors of the difference. Of half the errors it is
-        not asked: a model that loses the system now and then makes them large as well.
+        Compared is what the unknowns of neither model explain: slow noise looks like
+        the free response of a slow mode. Chance is so many standard errors of the
+        difference. Of half the errors it is not asked: a model that loses the system
+        now and then makes them large as well.
         """
-        total = other.total
-        if not (np.isfinite(total) and np.isfinite(self.total)):
+        if not (np.isfinite(other.total) and np.isfinite(self.total)):
             return bool(np.isfinite(self.total))
-        gap = other.blocks - self.blocks
-        chance = gap.std(ddof=1) * np.sqrt(len(gap)) if len(gap) > 1 else 0.0
+        total, gaps = 0.0, []
+        for mine, others in zip(self.parts, other.parts, strict=True):
+            free = np.concatenate([mine.free, others.free], axis=2)
+            errors = others.without(free) ** 2
+            gap = errors - mine._replace(weight=others.weight).without(free) ** 2
+            total += float(errors.sum())
+            blocks = np.array_split(gap, min(_N_BLOCKS, len(gap)))
+            gaps += [float(block.sum()) for block in blocks]
+        chance = np.std(gaps, ddof=1) * np.sqrt(len(gaps)) if len(gaps) > 1 else 0.0
         least = min(standard_errors * chance, _MUCH * total)
-        return bool(gap.sum() > max(least, share * total))
+        return bool(np.sum(gaps) > max(least, share * total))
 
 
 def held_out(
@@ -81,7 +101,7 @@ def held_out(
     to find.
     """
     W = np.eye(len(records[0].y)) if weight is None else weight
-    blocks: list[float] = []
+    parts: list[Part] = []
     errors, outputs = [], []
     records = thinned(records)
     for k in range(1, _N_PIECES + 1):
@@ -100,42 +120,39 @@ def held_out(
             u, y = record.u.T[begin:stop], record.y.T[start:stop]
             trend = record.trend[:, begin:stop]
             with np.errstate(over="ignore", invalid="ignore"):
-                answer, free = _answers(model, W, u, trend, at_rest)
-                error, free = y - answer[start - begin :], free[start - begin :]
-                if free.shape[2]:
-                    own = estimate_initial_state(free, error @ W.T)
-                    error = error - np.linalg.solve(W, (free @ own).T).T
-                    # What these unknowns take of the noise is made up for.
-                    spare = error.size - own.size
-                    error *= np.sqrt(error.size / spare) if spare > 0 else np.nan
+                answer, free = _answers(model, u, trend, at_rest)
+                part = Part(y - answer[start - begin :], free[start - begin :], W)
+                error = part.without(part.free)
+                # What these unknowns take of the noise is made up for.
+                spare = error.size - free.shape[2]
+                error *= np.sqrt(error.size / spare) if spare > 0 else np.nan
+            parts.append(part)
             errors.append(error)
             outputs.append(y)
-            with np.errstate(over="ignore", invalid="ignore"):
-                parts = np.array_split(error, min(_N_BLOCKS, len(error)))
-                blocks += [float((part**2).sum()) for part in parts]
     if not errors:
-        return HeldOut(np.zeros(0), np.nan)
+        return HeldOut([], np.nan)
     error, output = np.vstack(errors), np.vstack(outputs)
     spread = np.sqrt(((output - output.mean(axis=0)) ** 2).sum(axis=0))
     spread[spread == 0.0] = 1.0
     with np.errstate(over="ignore", invalid="ignore"):
-        miss = np.sqrt((error**2).sum(axis=0)) / spread
-    bft = 100.0 * float(np.maximum(1.0 - miss, 0.0).mean())
-    residual = float(np.sqrt(np.sum(blocks) / error.size))
-    return HeldOut(np.array(blocks), bft if np.isfinite(bft) else 0.0, residual)
+        squares = (error**2).sum(axis=0)
+        bft = 100.0 * float(np.maximum(1.0 - np.sqrt(squares) / spread, 0.0).mean())
+        total = float(squares.sum())
+    bft = bft if np.isfinite(bft) else 0.0
+    return HeldOut(parts, bft, total, float(np.sqrt(total / error.size)))
 
 
 def _answers(
-    model: Realization, weight: Array, u: Array, trend: Array, at_rest: bool
+    model: Realization, u: Array, trend: Array, at_rest: bool
 ) -> tuple[Array, Array]:
-    """Outputs to inputs (n_samples, n_inputs), and weighted ones to what is unknown.
+    """Outputs to inputs (n_samples, n_inputs), and to what is unknown.
 
     Modes that grow are simulated backward, from rest at the end: the free responses
     make up for it, and neither overflows.
     """
     A, B, C, D = model[:4]
     if at_rest or not np.abs(np.linalg.eigvals(A)).max(initial=0.0) > 1.0:
-        free = free_responses(A, weight @ C, len(u), trend)
+        free = free_responses(A, C, len(u), trend)
         return lti_response(A, B, C, D, u), free[:, :, len(A) * at_rest :]
     R, Z, k = linalg.schur(A, sort="iuc")
     X = np.zeros((k, len(A) - k))
@@ -146,8 +163,8 @@ def _answers(
     into, seen = back @ Z.T[k:] @ B, C_growing @ back
     answer = lti_response(R[:k, :k], left @ B, C_stable, D, u)
     answer += lti_response(back, -into, seen, -C_growing @ into, u[::-1])[::-1]
-    grown = free_responses(back, weight @ seen, len(u))[::-1]
-    free = free_responses(R[:k, :k], weight @ C_stable, len(u), trend)
+    grown = free_responses(back, seen, len(u))[::-1]
+    free = free_responses(R[:k, :k], C_stable, len(u), trend)
     return answer, np.concatenate([grown, free], axis=2)
 
 

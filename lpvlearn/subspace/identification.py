@@ -314,7 +314,7 @@ def restarted(
     return simulation_fit(model.A, whitening.model(model).C, white, free)
 
 
-REFITS = 4  # steps to the minimum without some samples, from that with them
+REFITS = 12  # steps to the minimum without some samples, from that with them
 
 
 def _refitted(

@@ -217,9 +217,9 @@ def autoregression(
     weight = 0.0
     for v in errors:
         known = min(len(v), highest + 1)
-        taper = _taper(len(v))
-        lags[:known] += correlation_sequence(taper * v, known)
-        weight += float((taper**2).sum())
+        weights = taper(len(v))
+        lags[:known] += correlation_sequence(weights * v, known)
+        weight += float((weights**2).sum())
     lags /= weight
     # Channels of very different size must not spoil the determinants.
     scale = np.sqrt(np.maximum(np.diagonal(lags[0]), 0.0))
@@ -245,10 +245,10 @@ def autoregression(
 
 
 @lru_cache(maxsize=8)
-def _taper(n_samples: int) -> Array:
+def taper(n_samples: int) -> Array:
     """Weights of the samples of an experiment, (n_samples, 1)."""
-    taper: Array = scipy.signal.windows.tukey(n_samples + 2, _TAPERED)[1:-1, None]
-    return taper
+    weights: Array = scipy.signal.windows.tukey(n_samples + 2, _TAPERED)[1:-1, None]
+    return weights
 
 
 def _log_determinant(covariance: Array) -> tuple[float, float]:

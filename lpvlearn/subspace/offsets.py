@@ -194,12 +194,15 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
 
 
 def shifts_matter(whole: Evidence, parts: Evidence) -> bool:
-    """Whether the criterion is better by what no chance explains for cut records.
+    """Whether cut records have other constants, and no chance explains the better fit.
 
-    As for as many samples: those about the cuts are left out.
+    The criterion is that of as many samples: those about the cuts are left out, and
+    glitches with them, which are no shifts.
     """
     n, kept = (sum(r.u.shape[1] for r in e.records) for e in (whole, parts))
-    return _criterion(whole) - n / kept * _criterion(parts) > CERTAIN
+    if not _criterion(whole) - n / kept * _criterion(parts) > CERTAIN:
+        return False
+    return chance_of_constants(parts, equal=True) < _SIGNIFICANT
 
 
 def _criterion(evidence: Evidence) -> float:

@@ -5,7 +5,8 @@ their sum of squares is a likelihood. Each order is then fitted at the horizon w
 start is best, or from the model of the order below with one state more for what that
 leaves, whichever gives less: more states never fit worse. A criterion like Akaike's
 weighs the likelihood against the number of parameters. In the end the orders about the
-best one are fitted again, each by the noise that it leaves itself.
+best one are fitted again, each by the noise that it leaves itself, and looked for anew
+by that of the best.
 
 The criterion trusts that the system is what the models are. Simulation of parts held
 out does not (`held_out`): it may lower the order, and decides among orders which the
@@ -23,9 +24,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg
 
+from ..systems.simulation import estimate_initial_state, free_responses
 from .hankel import correlation_sequence
 from .held_out import MATTERS, HeldOut
 from .identification import (
@@ -38,7 +41,7 @@ from .identification import (
     subspaces_of,
     validate,
 )
-from .noise import Whitening, autoregression
+from .noise import Whitening, autoregression, taper
 from .realization import ObservabilitySubspace
 from .refinement import refine_simulation
 from .signals import Record, output_energy, thinned
@@ -75,6 +78,8 @@ _WEIGHINGS = 4  # of the outputs, with the pilot: each brings a clean one nearer
 
 _MORE_ROUNDS = 2  # of an order about the best: with the noise that it leaves itself
 
+_SEARCHES = 2  # for the order: by the noise of the pilot, and by that of its best model
+
 # Of a parameter, in squared standard deviations of its estimate: two of them. Akaike's
 # price of 2 takes a superfluous state in one fit of ten, Schwarz's of log(n) leaves
 # out states of a few thousand noisy samples that would improve the simulation.
@@ -97,7 +102,7 @@ _AS_GOOD = 0.999  # share of the loss of the order below that more states must b
 # Horizon for the states that an order adds to the one below.
 _SHORT_HORIZON = 10
 
-_DOUBT = 1.0  # standard errors by which a lower order must be better
+_DOUBT = 1.0  # standard errors by which another order must be better
 
 # How far below the choice other orders are simulated on parts held out.
 _LOWER = (1, 2, 4, 8, 16)
@@ -176,10 +181,9 @@ class _Tried(NamedTuple):
     """One order, at the horizon that suits it best."""
 
     order: int
-    horizon: int
-    model: Realization  # of whitened records
+    candidate: Candidate  # its model that of whitened records, until it is judged
     criterion: float
-    starts: dict[int, Realization]  # by horizon, before refinement
+    errors: dict[int, float]  # by horizon, relative, of the model before refinement
 
 
 def select(
@@ -205,8 +209,12 @@ def select(
     spaces = _look_up(wanted, order, records, settings)
     starts = _starts(order, spaces, records, settings)
     best = _best_horizon(starts, settings.refine)
-    tried = _Tried(order, best, starts[best], 0.0, starts)
-    return Selection(order, best, sorted(rows + _rows([tried], records, {})))
+    errors = _relative_errors(starts, records)
+    rows += [
+        Row(order, h, error, 0.0 if h == best else np.nan, np.nan)
+        for h, error in errors.items()
+    ]
+    return Selection(order, best, sorted(rows))
 
 
 class _Range(NamedTuple):
@@ -228,41 +236,39 @@ def _search(
         highest = _highest_order(records, horizons, settings)
     wanted = _Range(range(order or 0, highest + 1), horizon, {})
     pilot = _pilot(records, wanted, settings)
-    whitening = _noise_of(pilot, records, wanted, settings)
-    tried = _try_orders(wanted, records, whitening, settings)
-    orders = _judged(tried, whitening, records, wanted, settings)
-    least = min(orders.values(), key=lambda one: one.criterion)
+    noise, span = _noise_of(pilot, records, wanted, settings), wanted
+    orders: dict[int, _Tried] = {}
+    for _ in range(_SEARCHES):
+        tried = _try_orders(span, records, noise, settings)
+        if not tried:  # what the filter leaves of short experiments is too short
+            break
+        for one in _judged(tried, records, wanted, settings):
+            if one.order not in orders or one.criterion < orders[one.order].criterion:
+                orders[one.order] = one
+        least = min(orders.values(), key=lambda one: one.criterion)
+        again = least.candidate.whitening
+        if again.is_close_to(noise):
+            break
+        first = max(wanted.orders[0], least.order - _PATIENCE)
+        last = min(wanted.orders[-1], least.order + _PATIENCE)
+        noise, span = again, wanted._replace(orders=range(first, last + 1))
     chosen = best = least.order
-    candidates = {order: one.candidate for order, one in orders.items()}
-    errors = {best: validate(candidates[best], records, settings)}
+    errors = {best: validate(least.candidate, records, settings)}
     close = [k for k, one in orders.items() if one.criterion < least.criterion + _PRICE]
     for order in [k for k in close if k > best] + [best - step for step in _LOWER]:
-        if order in candidates:
-            errors[order] = validate(candidates[order], records, settings)
+        if order in orders:
+            errors[order] = validate(orders[order].candidate, records, settings)
             share = 0.0 if order > best else MATTERS
             if errors[order].clearly_better_than(errors[chosen], _DOUBT, share):
                 chosen = order
-    white = whitening.records(records, settings.free)
-    tried = [one._replace(criterion=orders[one.order].criterion) for one in tried]
-    rows, found = _rows(tried, white, errors), candidates[chosen]
-    return Selection(chosen, found.horizon, rows, found, errors[chosen])
-
-
-class _Judged(NamedTuple):
-    """One order, and the criterion of its model by the noise that this leaves."""
-
-    order: int
-    candidate: Candidate
-    criterion: float
+    candidate = orders[chosen].candidate
+    rows = _rows(orders, records, errors)
+    return Selection(chosen, candidate.horizon, rows, candidate, errors[chosen])
 
 
 def _judged(
-    tried: Sequence[_Tried],
-    whitening: Whitening,
-    records: list[Record],
-    wanted: _Range,
-    settings: Settings,
-) -> dict[int, _Judged]:
+    tried: Sequence[_Tried], records: list[Record], wanted: _Range, settings: Settings
+) -> list[_Tried]:
     """All orders, those about the best one fitted again by the noise of each.
 
     The noise of one model for all favours orders like its own: what states too many
@@ -270,9 +276,10 @@ def _judged(
     """
     found = {}
     for one in tried:
-        model = _unwhitened(one.model, whitening, records, settings)
-        candidate = Candidate(model, one.horizon, whitening, True)
-        found[one.order] = _judge(one.order, candidate, records, settings)
+        candidate = one.candidate
+        model = _unwhitened(candidate.model, candidate.whitening, records, settings)
+        candidate = candidate._replace(model=model)
+        found[one.order] = _judge(one, candidate, records, settings)
     first = min(found.values(), key=lambda one: one.criterion).order
     for step in (-1, 1):
         order, best, stale = first if step < 0 else first + 1, np.inf, 0
@@ -284,22 +291,23 @@ def _judged(
                     break
                 known = candidate.horizon, settings, noise, candidate.model
                 candidate = refit(records, order, *known, patient=False).candidate
-            found[order] = _judge(order, candidate, records, settings)
+            found[order] = _judge(found[order], candidate, records, settings)
             stale = 0 if found[order].criterion < best else stale + 1
             best = min(best, found[order].criterion)
             order += step
-    return found
+    return list(found.values())
 
 
 def _judge(
-    order: int, candidate: Candidate, records: list[Record], settings: Settings
-) -> _Judged:
-    """The criterion of a model, in samples weighted but not filtered."""
+    one: _Tried, candidate: Candidate, records: list[Record], settings: Settings
+) -> _Tried:
+    """A model of the records, its criterion in samples weighted but not filtered."""
     weighted = Whitening(np.ones(1), candidate.whitening.weight)
     model, free = weighted.model(candidate.model), settings.free
     records = weighted.records(records, free)
     model = with_initial_states(model, records, free)
-    return _Judged(order, candidate, criterion_of(model, records, free))
+    criterion = criterion_of(model, records, free)
+    return one._replace(candidate=candidate, criterion=criterion)
 
 
 def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realization:
@@ -309,7 +317,7 @@ def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realiza
     only = wanted._replace(orders=range(order, order + 1))
     _look_up(wanted, order, records, settings)  # for the orders to come as well
     tried = _try_orders(only, records, whitening, settings, _PILOT_STEPS)
-    model = tried[0].model
+    model = tried[0].candidate.model
     for _ in range(_WEIGHINGS if len(records[0].y) > 1 else 0):
         errors = simulation_errors(model, records)
         again = Whitening.of(errors, free, filtered=False)
@@ -347,27 +355,30 @@ def _noise_of(
 
 
 def _rows(
-    tried: Sequence[_Tried], white: Sequence[Record], held_out: Mapping[int, HeldOut]
+    orders: Mapping[int, _Tried],
+    records: Sequence[Record],
+    errors: Mapping[int, HeldOut],
 ) -> list[Row]:
-    """Of all horizons of every order, tried on whitened records."""
-    energy = output_energy(white) or 1.0
-    least = min(one.criterion for one in tried)
-    n_values = sum(record.y.size for record in white)
+    """Of all horizons of every order."""
+    least = min(one.criterion for one in orders.values())
+    n_values = sum(record.y.size for record in records)
     rows = []
-    for one in tried:
-        for horizon, start in one.starts.items():
-            is_best = horizon == one.horizon
-            known = is_best and one.order in held_out
-            rows.append(
-                Row(
-                    one.order,
-                    horizon,
-                    float(np.sqrt(start.loss / energy)),
-                    (one.criterion - least) / n_values if is_best else np.nan,
-                    held_out[one.order].bft if known else np.nan,
-                )
-            )
+    for order, one in sorted(orders.items()):
+        above = (one.criterion - least) / n_values
+        bft = errors[order].bft if order in errors else np.nan
+        for horizon, error in one.errors.items():
+            is_best = horizon == one.candidate.horizon
+            known = (above, bft) if is_best else (np.nan, np.nan)
+            rows.append(Row(order, horizon, error, *known))
     return rows
+
+
+def _relative_errors(
+    starts: Mapping[int, Realization], records: Sequence[Record]
+) -> dict[int, float]:
+    """Simulation errors by horizon, root mean square relative to the outputs."""
+    energy = output_energy(records) or 1.0
+    return {h: float(np.sqrt(start.loss / energy)) for h, start in starts.items()}
 
 
 def _look_up(
@@ -449,12 +460,15 @@ def _try_orders(
         horizon = _best_horizon(starts, refine=True)
         start = starts[horizon]
         model = refine_simulation(start, records, settings.free, max_iter)
-        if tried and model.loss > _AS_GOOD * tried[-1].model.loss:
-            other = _with_more_states(tried[-1].model, records, settings)
+        below = tried[-1].candidate.model if tried else None
+        if below is not None and model.loss > _AS_GOOD * below.loss:
+            other = _with_more_states(below, records, settings)
             if other is not None and other.loss < model.loss:
                 model = other
         criterion = criterion_of(model, records, settings.free)
-        tried.append(_Tried(order, horizon, model, criterion, starts))
+        candidate = Candidate(model, horizon, whitening, True)
+        errors = _relative_errors(starts, records)
+        tried.append(_Tried(order, candidate, criterion, errors))
         stale = 0 if criterion < best else stale + 1
         best = min(best, criterion)
         if stale > _PATIENCE or model.loss <= _EXACT * energy:
@@ -478,21 +492,58 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     few = n_values / max(n_values - n_parameters, 1)
     if not np.isfinite(model.loss):
         return np.inf
-    # Of many lines of a spectrum one stands out by chance: an oscillation that lasts
-    # for the whole record may be any of them, and costs what the best of them gains.
+    # Of many lines of a spectrum one stands out by chance: an oscillation may be any of
+    # as many as its decay tells apart, and costs what the best of them gains.
     longest = max(record.u.shape[1] for record in records)
     poles = np.linalg.eigvals(model.A)
-    lasting = (poles.imag > 0.0) & ((1.0 - np.abs(poles)) * longest < 1.0)
-    misfit = 2.0 * np.log(max(0.5 * longest, 1.0)) * int(lasting.sum())
+    decay = np.maximum(1.0 - np.abs(poles[poles.imag > 0.0]), 2.0 / longest)
+    misfit = -2.0 * float(np.log(decay).sum())
     misfit += few * _PRICE * n_parameters
-    errors = simulation_errors(model, records)
-    lags = longest // _SAMPLES_PER_LAG
-    for i in range(ny):
-        noise = autoregression([error[:, [i]] for error in errors], highest=lags)
+    noise = _innovations(model, records, free, longest // _SAMPLES_PER_LAG)
+    for i, (variance, n_lags) in enumerate(noise):
         power = sum(float(record.y[i] @ record.y[i]) for record in records) / n_samples
-        variance = max(float(noise.covariance[0, 0]), _EXACT * power) or 1.0
-        misfit += n_samples * np.log(variance) + _PRICE * len(noise.A)
+        variance = max(variance, _EXACT * power) or 1.0
+        misfit += n_samples * np.log(variance) + _PRICE * n_lags
     return float(misfit)
+
+
+def _innovations(
+    model: Realization, records: Sequence[Record], free: Freedom, highest: int
+) -> list[tuple[float, int]]:
+    """Variance and number of lags of the noise of every output.
+
+    The own unknowns are those that make the least of the innovations: of slow noise,
+    what makes the least of the errors leaves large ones in the first samples. These,
+    and the last, count for less: a transient that an experiment begins with tells of
+    modes, and next to nothing of how they answer to the inputs.
+    """
+    errors = simulation_errors(model, records)
+    first = len(model.A) - free.n_states(len(model.A))
+    filters, sizes = [], []
+    for i in range(len(model.C)):
+        parts = [error[:, [i]] for error in errors]
+        noise = autoregression(parts, highest=highest)
+        filters.append(np.append(1.0, -noise.C[0]))
+        sizes.append(np.sqrt(noise.covariance[0, 0]) or 1.0)
+    lost, squares, n_samples = max(map(len, filters)) - 1, np.zeros(len(sizes)), 0.0
+    for record, error in zip(records, errors, strict=True):
+        if len(error) <= 2 * lost:
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            unknown = free_responses(model.A, model.C, len(error), record.trend)
+        unknown = unknown[:, :, first:]
+        unknown = unknown[:, :, np.isfinite(unknown).all(axis=(0, 1))]
+        signals = np.concatenate([error[:, :, None], unknown], axis=2)
+        for i, (f, size) in enumerate(zip(filters, sizes, strict=True)):
+            signals[:, i] = scipy.signal.lfilter(f, size, signals[:, i], axis=0)
+        weights = taper(len(error))[lost:]
+        signals = signals[lost:] * weights[:, :, None]
+        white, unknown = signals[:, :, 0], signals[:, :, 1:]
+        white = white - unknown @ estimate_initial_state(unknown, white)
+        squares += (white**2).sum(axis=0)
+        n_samples += float((weights**2).sum())
+    variances = np.array(sizes) ** 2 * squares / n_samples
+    return [(float(v), len(f) - 1) for v, f in zip(variances, filters, strict=True)]
 
 
 def _with_more_states(

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.signal import place_poles
+from scipy import linalg
+from scipy.signal import lfilter, place_poles
 
-from lpvlearn.subspace.held_out import HeldOut, held_out
+from lpvlearn.subspace.held_out import HeldOut, Part, held_out
 from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import Realization
 
@@ -24,14 +25,15 @@ def test_errors_are_those_of_the_pieces_alone(rng):
 
     error = held_out(refitted, [Record.of(u, y)])
     assert lengths == [[100, 200], [200, 100], [300]]
-    assert error.blocks.shape == (15,) and error.blocks.sum() < 1e-15
+    assert len(error.parts) == 3 and error.total < 1e-15
     assert error.bft == pytest.approx(100.0)
     noise = rng.standard_normal((100, 2))
     y[300:] += noise
     error = held_out(refitted, [Record.of(u, y)])
     # What the state of the piece takes of the noise is made up for.
-    assert error.blocks[-5:].sum() == pytest.approx((noise**2).sum(), rel=0.05)
-    assert error.blocks[:-5].sum() < 1e-15
+    assert error.total == pytest.approx((noise**2).sum(), rel=0.05)
+    first, second, third = (part.without(part.free) for part in error.parts)
+    assert max(np.abs(first).max(), np.abs(second).max()) < 1e-8 < np.abs(third).max()
 
 
 def test_a_short_experiment_beside_a_long_one_is_not_cut(rng):
@@ -47,7 +49,7 @@ def test_a_short_experiment_beside_a_long_one_is_not_cut(rng):
 
     both = held_out(refitted, [long, short])
     assert kept == [12, 12, 12]
-    np.testing.assert_array_equal(both.blocks, held_out(refitted, [long]).blocks)
+    assert both.total == held_out(refitted, [long]).total
 
 
 def test_a_piece_begins_where_it_is(rng):
@@ -84,7 +86,7 @@ def test_short_experiments_are_not_held_out(rng):
     records = [Record.of(*experiment(rng, system, 7)) for _ in range(3)]
     model = Realization(*system, np.zeros((3, 6)), 0.0)
     error = held_out(lambda train: model, records)
-    assert len(error.blocks) == 0 and np.isnan(error.bft)
+    assert not error.parts and np.isinf(error.total) and np.isnan(error.bft)
 
 
 def test_of_short_experiments_whole_ones_are_held_out(rng):
@@ -101,16 +103,44 @@ def test_of_short_experiments_whole_ones_are_held_out(rng):
     assert out == [{40, 25}, {35}, {30}]
 
 
+def errors_of(*blocks):
+    """Parts held out of errors given, a block of ten samples for each."""
+    error = np.concatenate([np.full((10, 1), block) for block in blocks])
+    parts = [
+        Part(e, np.zeros((*e.shape, 0)), np.eye(1)) for e in error.reshape(-1, 50, 1)
+    ]
+    return HeldOut(parts, 0.0, float((error**2).sum()))
+
+
 def test_a_difference_counts_where_it_is_neither_chance_nor_small(rng):
     noise = 1.0 + 0.1 * rng.standard_normal(15)
-    base = HeldOut(noise, 0.0)
-    assert HeldOut(0.9 * noise, 0.0).clearly_better_than(base, 2.0)
-    assert not HeldOut(0.99 * noise, 0.0).clearly_better_than(base, 2.0)
-    mixed = noise * np.where(np.arange(15) % 2, 0.2, 1.6)
-    assert not HeldOut(mixed, 0.0).clearly_better_than(base, 2.0)
-    diverged = HeldOut(np.full(15, np.nan), 0.0)
+    base = errors_of(*noise)
+    assert errors_of(*(0.9 * noise)).clearly_better_than(base, 2.0)
+    assert not errors_of(*(0.99 * noise)).clearly_better_than(base, 2.0)
+    mixed = noise * np.where(np.arange(15) % 2, 0.2, 1.3)
+    assert not errors_of(*mixed).clearly_better_than(base, 2.0)
+    diverged = errors_of(*np.full(15, np.nan))
     assert base.clearly_better_than(diverged, 2.0)
     assert not diverged.clearly_better_than(base, 2.0)
+
+
+def test_a_slow_mode_gains_nothing_by_what_it_takes_of_slow_noise(rng):
+    """With no input to it, it simulates as the model without it does."""
+    A, B, C, D = example(rng, modes(0.6, 0.8 * np.exp(0.9j)), 1, 1)
+    u, y = experiment(rng, (A, B, C, D), 400)
+    y = y + lfilter([1.0], [1.0, -0.95], rng.standard_normal(y.shape), axis=0)
+    more = linalg.block_diag(A, 0.99), np.vstack([B, [[0.0]]]), np.hstack([C, [[1.0]]])
+    plain, slow = (
+        held_out(lambda train, m=m: m, [Record.of(u, y)])
+        for m in (
+            Realization(A, B, C, D, np.zeros((1, 3)), 0.0),
+            Realization(*more, D, np.zeros((1, 4)), 0.0),
+        )
+    )
+    assert slow.total < 0.9 * plain.total
+    slack = 1e-9  # rounding, as a share of the errors
+    assert not slow.clearly_better_than(plain, 0.0, slack)
+    assert not plain.clearly_better_than(slow, 0.0, slack)
 
 
 def test_what_moves_in_one_piece_alone_is_not_held_out(rng):
