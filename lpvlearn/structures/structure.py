@@ -18,11 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..models.statespace import StateSpace
 from ..models.system_matrix import Blocks, blocks
 from ..validation import (
+    SQUARED,
     has_one_axis,
     named_values,
     names_of,
     real_array,
     shown,
+    squarable,
     whole_number,
 )
 from .map import AffineMap, FramedMap, FunctionMap, StructureMap
@@ -481,7 +483,7 @@ class GrayBoxStructure:
         Parameters
         ----------
         bounds : mapping from name to (lower, upper)
-            None, or an infinity, where there is no bound.
+            None, an infinity or a number from 1e150, where there is no bound.
 
         Returns
         -------
@@ -502,14 +504,15 @@ class GrayBoxStructure:
         """
         lower, upper = self.lower.copy(), self.upper.copy()
         for j, name, (low, high) in self._intervals("bounds", bounds):
-            lower[j] = -np.inf if low is None else low
-            upper[j] = np.inf if high is None else high
+            lower[j] = -np.inf if low is None or low <= -SQUARED else low
+            upper[j] = np.inf if high is None or high >= SQUARED else high
             if not lower[j] < upper[j]:
                 raise ValueError(
                     f"`bounds` of {name!r} must have the lower one below the upper "
                     f"one. Got ({lower[j]:g}, {upper[j]:g}). A parameter of one value "
                     "is fixed: structure.fix()."
                 )
+        squarable("bounds", np.array([lower, upper]))
         return self._changed(lower=lower, upper=upper)._agreeing()
 
     def with_ranges(self, ranges: Mapping[str, Interval]) -> GrayBoxStructure:
@@ -548,7 +551,7 @@ class GrayBoxStructure:
                     "structure.with_bounds()."
                 )
             table[:, j] = low, high
-        return self._changed(ranges=table)._agreeing()
+        return self._changed(ranges=squarable("ranges", table))._agreeing()
 
     def fix(self, values: Mapping[str, float]) -> GrayBoxStructure:
         """The structure with some parameters at known values.
@@ -744,7 +747,7 @@ class GrayBoxStructure:
                 f"`theta` must be {self.n_params} finite values "
                 f"({some}{', ...' if self.n_params > 4 else ''}). Got {vector}."
             )
-        return vector
+        return squarable("theta", vector)
 
     @property
     def reference(self) -> Array:

@@ -430,6 +430,22 @@ def test_a_missing_name_names_no_column_of_a_dataset(tmp_path):
         lp.LocalLPVPipeline().fit_dataset(tmp_path / "runs.parquet", outputs=pd.NA)
 
 
+def test_parameters_are_squarable_and_bounds_beyond_are_none():
+    model = lp.StateSpace([[-1.0]], [[2.0]], [[1.0]])
+    lag = lp.GrayBoxStructure.from_template([["-a"]], [["b"]], [[1.0]])
+    for init in ({"a": 1.0, "b": 1e200}, {"a": 1e308, "b": -1e308}):
+        with pytest.raises(ValueError, match="must hold numbers below 1e.150"):
+            lp.GrayBoxRestructurer(lag, init=init).fit_model(model)
+    with pytest.raises(ValueError, match="`bounds` must hold numbers below 1e.150"):
+        lag.with_bounds({"a": (1e300, None)})
+    with pytest.raises(ValueError, match="`ranges` must hold numbers below 1e.150"):
+        lag.with_ranges({"a": (1.0, 1e300)})
+    free = lag.with_bounds({"a": (-1e308, 1e308)})
+    assert not free.is_bounded
+    fitted = lp.GrayBoxRestructurer(free).fit_model(model)
+    np.testing.assert_allclose(fitted.params_, [1.0, 2.0])
+
+
 def test_an_output_error_model_that_grows_within_its_range_is_told():
     w = world()
     with pytest.warns(UserWarning, match="unstable at values within.*`?No experiment"):
