@@ -124,6 +124,7 @@ def _or_as_it_is(change, draw, value):
         ValueError,
         ArithmeticError,
         LookupError,
+        NotImplementedError,
         AttributeError,
         ImportError,
     ):
