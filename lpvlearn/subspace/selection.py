@@ -205,9 +205,8 @@ def select(
         chosen = _search(records, None, horizon, by_evidence)
         order = chosen.order
         rows = [row for row in chosen.rows if row.order != order]
-    wanted = _Range(range(order, order + 1), horizon, {})
-    spaces = _look_up(wanted, order, records, settings)
-    starts = _starts(order, spaces, records, settings)
+    wanted = _Range(range(order, order + 1), horizon, {}, {})
+    starts = _starts(wanted, order, records, settings)
     best = _best_horizon(starts, settings.refine)
     errors = _relative_errors(starts, records)
     rows += [
@@ -224,6 +223,7 @@ class _Range(NamedTuple):
     horizon: int | None
     # of the records as they are, for orders up to the highest: by horizon, as found
     spaces: dict[int, ObservabilitySubspace]
+    starts: dict[tuple[int, int], Realization]  # by order and horizon, as found
 
 
 def _search(
@@ -234,7 +234,7 @@ def _search(
     if highest is None:
         horizons = [horizon] if horizon else _horizons(records, 0, settings)
         highest = _highest_order(records, horizons, settings)
-    wanted = _Range(range(order or 0, highest + 1), horizon, {})
+    wanted = _Range(range(order or 0, highest + 1), horizon, {}, {})
     pilot = _pilot(records, wanted, settings)
     noise, span = _noise_of(pilot, records, wanted, settings), wanted
     orders: dict[int, _Tried] = {}
@@ -448,13 +448,12 @@ def _try_orders(
     orders = wanted.orders
     if not whitening.is_none:
         records = whitening.records(records, settings.free)
-        wanted = wanted._replace(spaces={})
-    spaces = _look_up(wanted, orders[0], records, settings)
+        wanted = wanted._replace(spaces={}, starts={})
     tried: list[_Tried] = []
     best, stale = np.inf, 0
     energy = output_energy(records)
     for order in orders:
-        starts = _starts(order, spaces, records, settings)
+        starts = _starts(wanted, order, records, settings)
         if not starts:
             break
         horizon = _best_horizon(starts, refine=True)
@@ -568,17 +567,17 @@ def _with_more_states(
 
 
 def _starts(
-    order: int,
-    spaces: Mapping[int, ObservabilitySubspace],
-    records: Sequence[Record],
-    settings: Settings,
+    wanted: _Range, order: int, records: Sequence[Record], settings: Settings
 ) -> dict[int, Realization]:
     """Model of an order, before refinement, from every horizon that can show it."""
-    return {
-        horizon: realize(space, records, order, settings)
-        for horizon, space in spaces.items()
-        if order <= settings.max_order(horizon)
-    }
+    starts = {}
+    for horizon, space in _look_up(wanted, wanted.orders[0], records, settings).items():
+        if order <= settings.max_order(horizon):
+            if (order, horizon) not in wanted.starts:
+                found = realize(space, records, order, settings)
+                wanted.starts[order, horizon] = found
+            starts[horizon] = wanted.starts[order, horizon]
+    return starts
 
 
 def _best_horizon(starts: Mapping[int, Realization], refine: bool) -> int:
