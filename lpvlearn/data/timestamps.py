@@ -81,7 +81,7 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
         if kind == "c":
             _raise_bad_time(column, 0, series)
         if kind == "O":
-            text = series.map(lambda value: isinstance(value, str | bytes))
+            text = np.array([isinstance(value, str | bytes) for value in series])
             if text.any():  # which NumPy reads, and nothing else adds to
                 _raise_bad_time(column, int(np.argmax(text)), series)
         try:

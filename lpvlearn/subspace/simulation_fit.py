@@ -299,7 +299,8 @@ def _realization(
 def _overflowing(A: Array, C: Array, records: Sequence[Record]) -> Realization:
     m, (ny, n) = len(records[0].u), C.shape
     zero = np.zeros((n, m)), np.zeros((ny, m)), np.zeros((len(records), n))
-    return Realization(A, zero[0], C, zero[1], zero[2], np.inf)
+    trends = np.zeros((len(records), len(records[0].trend), ny))
+    return Realization(A, zero[0], C, zero[1], zero[2], np.inf, trends=trends)
 
 
 def _solve_regressions(

@@ -422,6 +422,19 @@ def test_times_beyond_floats_are_refused_at_their_row(digits):
         calls()["resample"].function(**{**calls()["resample"].arguments, "X": X})
 
 
+def test_times_of_text_are_refused_where_they_are_categories():
+    X = world().X.iloc[:1].astype({"time": str}).astype({"time": "category"})
+    call = calls()["SubspaceLTI.predict"]
+    with pytest.raises(ValueError, match="convert text"):
+        call.function(**{**call.arguments, "X": X})
+
+
+def test_a_constant_of_any_size_is_found():
+    u = np.random.default_rng(0).standard_normal((180, 1))
+    model = lp.SubspaceLTI().fit(u, np.full((180, 1), 1e16))
+    np.testing.assert_allclose(model.predict(u), 1e16)
+
+
 def test_a_missing_name_names_no_column_of_a_dataset(tmp_path):
     arrow = pytest.importorskip("pyarrow.parquet")
     table = pytest.importorskip("pyarrow").Table.from_pandas(world().X)
