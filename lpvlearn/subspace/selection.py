@@ -78,8 +78,6 @@ _WEIGHINGS = 4  # of the outputs, with the pilot: each brings a clean one nearer
 
 _MORE_ROUNDS = 2  # of an order about the best: with the noise that it leaves itself
 
-_SEARCHES = 2  # for the order: by the noise of the pilot, and by that of its best model
-
 # Of a parameter, in squared standard deviations of its estimate: two of them. Akaike's
 # price of 2 takes a superfluous state in one fit of ten, Schwarz's of log(n) leaves
 # out states of a few thousand noisy samples that would improve the simulation.
@@ -236,22 +234,19 @@ def _search(
         highest = _highest_order(records, horizons, settings)
     wanted = _Range(range(order or 0, highest + 1), horizon, {}, {})
     pilot = _pilot(records, wanted, settings)
-    noise, span = _noise_of(pilot, records, wanted, settings), wanted
-    orders: dict[int, _Tried] = {}
-    for _ in range(_SEARCHES):
-        tried = _try_orders(span, records, noise, settings)
-        if not tried:  # what the filter leaves of short experiments is too short
-            break
-        for one in _judged(tried, records, wanted, settings):
-            if one.order not in orders or one.criterion < orders[one.order].criterion:
-                orders[one.order] = one
-        least = min(orders.values(), key=lambda one: one.criterion)
-        again = least.candidate.whitening
-        if again.is_close_to(noise):
-            break
+    noise = _noise_of(pilot, records, wanted, settings)
+    found = _judged(_try_orders(wanted, records, noise, settings), records, settings)
+    orders = _by_own_noise(found, records, wanted, settings)
+    least = min(orders.values(), key=_criterion)
+    again = least.candidate.whitening
+    if not again.is_close_to(noise):
         first = max(wanted.orders[0], least.order - _PATIENCE)
         last = min(wanted.orders[-1], least.order + _PATIENCE)
-        noise, span = again, wanted._replace(orders=range(first, last + 1))
+        about = wanted._replace(orders=range(first, last + 1))
+        found = _judged(_try_orders(about, records, again, settings), records, settings)
+        for k, one in found.items():
+            orders[k] = min(orders.get(k, one), one, key=_criterion)
+        least = min(orders.values(), key=_criterion)
     chosen = best = least.order
     errors = {best: validate(least.candidate, records, settings)}
     close = [k for k, one in orders.items() if one.criterion < least.criterion + _PRICE]
@@ -266,21 +261,36 @@ def _search(
     return Selection(chosen, candidate.horizon, rows, candidate, errors[chosen])
 
 
-def _judged(
-    tried: Sequence[_Tried], records: list[Record], wanted: _Range, settings: Settings
-) -> list[_Tried]:
-    """All orders, those about the best one fitted again by the noise of each.
+def _criterion(one: _Tried) -> float:
+    return one.criterion
 
-    The noise of one model for all favours orders like its own: what states too many
-    took of slow noise, those that leave it would have to follow.
-    """
+
+def _judged(
+    tried: Sequence[_Tried], records: list[Record], settings: Settings
+) -> dict[int, _Tried]:
+    """By order: models of the records, and their criteria in these."""
     found = {}
     for one in tried:
         candidate = one.candidate
         model = _unwhitened(candidate.model, candidate.whitening, records, settings)
         candidate = candidate._replace(model=model)
         found[one.order] = _judge(one, candidate, records, settings)
-    first = min(found.values(), key=lambda one: one.criterion).order
+    return found
+
+
+def _by_own_noise(
+    found: Mapping[int, _Tried],
+    records: list[Record],
+    wanted: _Range,
+    settings: Settings,
+) -> dict[int, _Tried]:
+    """All orders, those about the best one fitted again by the noise of each.
+
+    The noise of one model for all favours orders like its own: what states too many
+    took of slow noise, those that leave it would have to follow.
+    """
+    found = dict(found)
+    first = min(found.values(), key=_criterion).order
     for step in (-1, 1):
         order, best, stale = first if step < 0 else first + 1, np.inf, 0
         while order in found and stale <= _PATIENCE:
@@ -295,7 +305,7 @@ def _judged(
             stale = 0 if found[order].criterion < best else stale + 1
             best = min(best, found[order].criterion)
             order += step
-    return list(found.values())
+    return found
 
 
 def _judge(
