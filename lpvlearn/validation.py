@@ -57,7 +57,7 @@ def _numbers(name: str, value: Any, dtype: np.dtype[Any], kinds: str) -> NDArray
             if np.ma.isMaskedArray(value):
                 found[np.ma.getmaskarray(value)] = np.nan
             return found
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, ArithmeticError):
         pass
     raise ValueError(f"`{name}` must hold {kinds} numbers only. Got {shown(value)}.")
 
@@ -74,7 +74,7 @@ def first_not_a_number(values: Iterable[Any]) -> int | None:
     for row, value in enumerate(values):
         try:
             float("j" if np.iscomplexobj(value) else value)
-        except (TypeError, ValueError, OverflowError):
+        except (TypeError, ValueError, ArithmeticError):
             if value is not pd.NA and value is not None:
                 return row
     return None

@@ -113,7 +113,7 @@ class Column:
         if kind not in "mM" and not imaginary:  # dates would be nanoseconds
             try:
                 return series.to_numpy(dtype=np.float64, na_value=np.nan)
-            except (TypeError, ValueError, OverflowError):
+            except (TypeError, ValueError, ArithmeticError):
                 pass
         first = 0 if kind in "mM" else first_not_a_number(series) or 0
         remedy = "Mend the value, or leave the column out."
@@ -498,7 +498,7 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
         return check_array(
             values, ensure_all_finite=False, input_name=argument, **options
         )
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, ArithmeticError) as error:
         try:
             entries = np.asarray(values)
         except ValueError:
@@ -507,7 +507,7 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
                 f"`{argument}` must have rows of one length. Got "
                 + (f"several tables. {_RESHAPED[3]}" if tables else "rows that differ.")
             ) from error
-        kind = ValueError if isinstance(error, OverflowError) else type(error)
+        kind = ValueError if isinstance(error, ArithmeticError) else type(error)
         flat = entries.ravel()
         k = first_not_a_number(flat) if entries.dtype.kind in "OSU" else None
         if k is not None and entries.ndim:  # a sparse matrix has none

@@ -86,7 +86,7 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
                 _raise_bad_time(column, int(np.argmax(text)), series)
         try:
             seconds = series.to_numpy(dtype=np.float64, na_value=np.nan)
-        except (TypeError, ValueError, OverflowError):
+        except (TypeError, ValueError, ArithmeticError):
             _raise_bad_time(column, first_not_a_number(series) or 0, series)
     finite = np.abs(seconds) < _LATEST
     if not finite.all():

@@ -32,6 +32,7 @@ NO_NUMBERS = {
     "an integer beyond floats": [10**400],
     "an integer of too many digits to be shown": 10**5000,
     "a signalling NaN": Decimal("sNaN"),
+    "a signalling NaN among objects": np.array([Decimal("sNaN"), 1], object),
     "a missing scalar": None,
     "pandas' missing scalar": pd.NA,
     "rows of several lengths": [[1.0], [1.0, 2.0]],
