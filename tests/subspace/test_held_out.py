@@ -143,6 +143,21 @@ def test_a_slow_mode_gains_nothing_by_what_it_takes_of_slow_noise(rng):
     assert not plain.clearly_better_than(slow, 0.0, slack)
 
 
+def test_what_common_unknowns_hide_is_not_forgotten():
+    """Less than a period: a light mode's free response is as its answer to inputs."""
+    wave = np.sin(0.1 * np.arange(40.0))[:, None]
+    hum = 0.1 * np.cos(2.0 * np.arange(40.0))[:, None]
+    none, weight = np.zeros((40, 1, 0)), np.eye(1)
+    for size, better in ((0.1, True), (1.0, False)):  # of the wave that it lacks
+        without = Part(0.5 * hum + size * wave, none, weight)
+        light = Part(hum, wave[:, :, None], weight)
+        mine, others = (
+            HeldOut([part], np.nan, float((part.without(part.free) ** 2).sum()))
+            for part in (without, light)
+        )
+        assert mine.clearly_better_than(others, 0.0) == better
+
+
 def test_what_moves_in_one_piece_alone_is_not_held_out(rng):
     system = example(rng, modes(*POLES))
     u, y = experiment(rng, system, 400)
