@@ -299,10 +299,13 @@ class _Trial:
     def whitened(self, delay: Delay, order: int) -> _Trial:
         """The trial of samples filtered alike, so that noise becomes nearly white.
 
-        One filter for all inputs and outputs leaves the system as it is.
+        One filter for all inputs and outputs leaves the system as it is. Of samples
+        too few for the order nothing is known of the noise.
         """
         errors = self.errors(delay, _Size(order, True), 0)
         size = np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0))
+        if not np.isfinite(size).all():
+            return self
         size[size == 0.0] = 1.0
         model = autoregression(
             [e[:, [i]] / size[i] for e in errors for i in range(len(size))]
@@ -377,4 +380,4 @@ class _Trial:
 
     def _evidence(self, loss: float, best: float) -> float:
         """Twice the logarithm of the ratio of two likelihoods."""
-        return self.n_values * float(np.log(loss / best))
+        return self.n_values * float(np.log(loss) - np.log(best))

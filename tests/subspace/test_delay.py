@@ -342,6 +342,15 @@ def test_few_samples_tell_of_no_delay(n_samples):
     np.testing.assert_array_equal(find_delays([(u, y)], settings, None, None), [0])
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_few_samples_of_a_system_leak_no_numerical_warnings():
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        u, noise = rng.standard_normal((2, 20, 1))
+        truth = stable_model(seed, 2, 1, 1, sampling_time=1.0)
+        SubspaceLTI(input_delay="auto").fit(u, truth.simulate(u) + 0.1 * noise)
+
+
 def test_first_answers_need_evidence_for_each_input():
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=(600, 3)), rng.normal(size=(600, 2))
