@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from contextlib import suppress
 from numbers import Real
 from typing import Any, NamedTuple, NoReturn
 
@@ -66,7 +67,9 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
     A float32 column stays float32: its rounding is part of the guard's tolerance.
     Raises a ValueError on what is neither a finite number nor a date, naming `column`.
     """
-    series = pd.Series(values).infer_objects()
+    series = pd.Series(values)
+    with suppress(OverflowError):  # of integers beyond floats, in older versions
+        series = series.infer_objects()
     kind = getattr(series.dtype, "kind", "O")
     if kind in "mM":
         if series.isna().any():
