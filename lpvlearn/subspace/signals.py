@@ -38,6 +38,11 @@ _MAX_SAMPLES = 30_000
 
 _FOR_A_CHOICE = 12_000  # samples: it needs fewer than an estimate
 
+Places = NDArray[np.intp]  # of experiments
+
+# Samples of an experiment up to which several are worked on together.
+_SHORT = 256
+
 _LARGEST = 1e200  # squares of responses beyond it would overflow
 
 
@@ -231,6 +236,77 @@ def signal_factor(
     return lower.T
 
 
+def signal_factors(
+    blocks: tuple[Array, ...],
+    records: Sequence[Record],
+    driven: Array | None = None,
+) -> Iterator[tuple[Places, Array | None]]:
+    """Factors of all records, those of short ones of like length together.
+
+    Their places, and (n_records, k, n_signals) with the Gramians of the signals; None
+    where they overflow. `driven` is (n_records, order, 1 + n_inputs).
+    """
+    lengths = np.array([record.u.shape[1] for record in records])
+    groups: list[list[int]] = []
+    for i in np.argsort(lengths, kind="stable").tolist():
+        n = int(lengths[i])
+        if not groups or n > _SHORT or (len(groups[-1]) + 1) * n > _PIECE:
+            groups.append([])
+        groups[-1].append(i)
+    for group in groups:
+        some = [records[i] for i in group]
+        if len(group) > 1:
+            own = None if driven is None else driven[group]
+            yield np.array(group), _short_factors(blocks, some, own)
+        else:
+            own = None if driven is None else driven[group[0]]
+            R = signal_factor(blocks, some[0], own)
+            yield np.array(group), None if R is None else R[None]
+
+
+def _short_factors(
+    blocks: tuple[Array, ...], records: Sequence[Record], driven: Array | None
+) -> Array | None:
+    """Rows of the `signal_pieces` of records, each in a piece, or their factors.
+
+    Behind the end of a record they are zero.
+    """
+    (m, _), ny, n_trend = records[0].u.shape, len(records[0].y), len(records[0].trend)
+    order, n_records = sum(len(block) for block in blocks), len(records)
+    lengths = [record.u.shape[1] for record in records]
+    longest, base = max(lengths), order * (1 + m)
+    second = 0 if driven is None else order
+    X = np.zeros((base + m + ny + second + n_trend, n_records, longest))
+    after = X[base + m + ny + second :]
+    for i, (record, n) in enumerate(zip(records, lengths, strict=True)):
+        X[base : base + m, i, :n], X[base + m : base + m + ny, i, :n] = record[:2]
+        if n_trend:
+            after[:, i, :n] = record.trend
+    source = np.zeros((1 + m, n_records, longest))
+    source[0, :, 0] = 1.0
+    source[1:, :, 1:] = X[base : base + m, :, :-1]
+    width = (1 + m) * n_records
+    with np.errstate(over="ignore", invalid="ignore"):
+        _SectionBank(blocks, [width] * len(blocks)).run(
+            source.reshape(width, longest), X[:base].reshape(order, width, longest)
+        )
+        if driven is not None:
+            late = np.zeros((order, n_records, longest))
+            states = state_coefficients(blocks, driven) @ X[:base].swapaxes(0, 1)
+            late[:, :, 1:] = states.swapaxes(0, 1)[:, :, :-1]
+            widths = [len(block) * n_records for block in blocks]
+            answers = X[base + m + ny : base + m + ny + second]
+            _SectionBank(blocks, widths).run_last(late, answers)
+        for i, n in enumerate(lengths):
+            X[:, i, n:] = 0.0
+        rows = X.transpose(1, 2, 0)
+        if not np.einsum("its,its->is", rows, rows).max(initial=0.0) < _LARGEST:
+            return None
+        if longest <= len(X):
+            return rows.copy()
+        return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
 def section_states(blocks: tuple[Array, ...], added: Array) -> Array:
     """States ``x[t] = A x[t - 1] + added[t]`` from rest, (order, n_samples) both.
 
@@ -258,6 +334,13 @@ class SharedSignals:
     def __init__(self) -> None:
         self._of: tuple[Array, ...] = ()
         self._known = np.zeros((0, 0)), np.zeros((0, 0))
+
+    def factors(
+        self, blocks: tuple[Array, ...], records: Sequence[Record], driven: Array
+    ) -> Iterator[tuple[Places, Array | None]]:
+        """As `signal_factors`, of a single record."""
+        R = self.factor(blocks, records[0], driven[0])
+        yield np.zeros(1, int), None if R is None else R[None]
 
     def factor(
         self, blocks: tuple[Array, ...], record: Record, driven: Array
@@ -319,11 +402,12 @@ class _SectionBank:
     def run_last(self, v: Array, out: Array) -> None:
         """The last of these of every block, driven by rows of its own.
 
-        `v` and `out` are (order, n_samples).
+        `v` and `out` are (order, ..., n_samples).
         """
         for i, part in enumerate(self._places):
             late = [1.0] if part.stop - part.start == 1 else [0.0, 1.0]
-            out[part] = self._filtered(i, late, v[part])
+            own = v[part].reshape(-1, v.shape[-1])
+            out[part] = self._filtered(i, late, own).reshape(v[part].shape)
 
     def _filtered(self, i: int, numerator: list[float], v: Array) -> Array:
         out, self._memory[i] = scipy.signal.lfilter(
@@ -350,20 +434,20 @@ class Pairs(NamedTuple):
 
 
 def state_coefficients(blocks: tuple[Array, ...], driven: Array) -> Array:
-    """States in terms of the section signals, (order, order * (1 + n_inputs)).
+    """States in terms of the section signals, (..., order, order * (1 + n_inputs)).
 
-    `driven` is ``[x0, B]``.
+    `driven` is ``[x0, B]``, (..., order, 1 + n_inputs).
     """
-    n, width = driven.shape
-    out = np.zeros((n, n, width))
+    *several, n, width = driven.shape
+    out = np.zeros((*several, n, n, width))
     start, N = Pairs.of(blocks)
-    own = driven[start:].reshape(-1, 2, width)
+    own = driven[..., start:, :].reshape(*several, len(N), 2, width)
     turned = N @ own
-    out[range(start), range(start)] = driven[:start]
+    out[..., range(start), range(start), :] = driven[..., :start, :]
     for k, row in enumerate(range(start, n, 2)):
-        out[row : row + 2, row] = own[k]
-        out[row : row + 2, row + 1] = turned[k]
-    return out.reshape(n, n * width)
+        out[..., row : row + 2, row, :] = own[..., k, :, :]
+        out[..., row : row + 2, row + 1, :] = turned[..., k, :, :]
+    return out.reshape(*several, n, n * width)
 
 
 def block_slices(blocks: Sequence[Array]) -> list[slice]:

@@ -32,18 +32,23 @@ from ..systems.simulation import (
 from .hankel import triangularize
 from .signals import (
     Pairs,
+    Places,
     Record,
     SharedSignals,
     block_sections,
     block_slices,
     section_states,
-    signal_factor,
+    signal_factors,
     state_coefficients,
 )
 
 Array = NDArray[np.float64]
 
-_TOGETHER = 64  # experiments whose regressions are kept before they are factored
+_TOGETHER = 4096  # rows of regressions that are kept before they are factored
+
+
+# Places of experiments, and their regressions (n_experiments, n_rows, n_columns).
+Regressions = tuple[Places, Array]
 
 
 class Freedom(NamedTuple):
@@ -192,10 +197,11 @@ def simulation_fit(
     if sections is not None:
         return block_fit(sections.blocks, C @ sections.transform, records, free)
     with np.errstate(over="ignore", invalid="ignore"):
-        factors = [_general_regression(A, C, r, free) for r in records]
-    if not all(np.isfinite(factor).all() for factor in factors):
+        found = [_general_regression(A, C, r, free) for r in records]
+    if not all(np.isfinite(M).all() for M in found):
         return _overflowing(A, C, records)
-    return _realization(A, C, factors, free, None)
+    regressions = [(np.array([i]), M[None]) for i, M in enumerate(found)]
+    return _realization(A, C, regressions, free, None)
 
 
 def block_fit(
@@ -203,13 +209,12 @@ def block_fit(
 ) -> Realization:
     """As `simulation_fit`, for a state matrix in section form."""
     A = _block_diagonal(blocks)
-    factors = []
-    for record in records:
-        R = signal_factor(blocks, record)
+    regressions = []
+    for where, R in signal_factors(blocks, records):
         if R is None:
             return _overflowing(A, C, records)
-        factors.append(linear_regression(R, blocks, C, free))
-    return _realization(A, C, factors, free, blocks)
+        regressions.append((where, linear_regression(R, blocks, C, free)))
+    return _realization(A, C, regressions, free, blocks)
 
 
 def simulation_errors(model: Realization, records: Sequence[Record]) -> list[Array]:
@@ -283,12 +288,12 @@ def _general_regression(A: Array, C: Array, record: Record, free: Freedom) -> Ar
 def _realization(
     A: Array,
     C: Array,
-    factors: Sequence[Array],
+    regressions: Sequence[Regressions],
     free: Freedom,
     blocks: tuple[Array, ...] | None,
 ) -> Realization:
     n, m = len(A), free.direct.shape[1]
-    common, own, loss, deficit = _solve_regressions(factors, free.n_own(n))
+    common, own, loss, deficit = _solve_regressions(regressions, free.n_own(n))
     states, trends = free.own_parts(own, n)
     D = np.zeros(free.direct.shape)
     D[free.direct] = common[n * m :]
@@ -304,38 +309,41 @@ def _overflowing(A: Array, C: Array, records: Sequence[Record]) -> Realization:
 
 
 def _solve_regressions(
-    regressions: Sequence[Array], n: int
+    regressions: Sequence[Regressions], n: int
 ) -> tuple[Array, Array, float, int]:
     """Common unknowns, own ones (n_experiments, n), loss and rank deficit.
 
     The first `n` columns of a regression belong to the own unknowns of its experiment,
     the last is the right-hand side. The deficit is that of the common unknowns.
     """
-    if len(regressions) == 1:
-        M, rhs = regressions[0][:, :-1], regressions[0][:, -1]
+    n_experiments = sum(len(where) for where, _ in regressions)
+    if n_experiments == 1:
+        M, rhs = regressions[0][1][0, :, :-1], regressions[0][1][0, :, -1]
         solution, rank = scaled_lstsq(M, rhs)
         if rank == M.shape[1]:
             left = M @ solution - rhs
             return solution[n:], solution[None, :n], float(left @ left), 0
     parts: list[Array] = []
-    for M in regressions:
-        _pool(parts, M, n)
+    for _, several in regressions:
+        _pool(parts, several, n)
     stacked = _joined(parts)
     common, rank = scaled_lstsq(stacked[:, :-1], stacked[:, -1])
     loss = float(np.sum((stacked[:, :-1] @ common - stacked[:, -1]) ** 2))
-    own = np.empty((len(regressions), n))
-    for e, M in enumerate(regressions):
-        own[e] = scaled_lstsq(M[:, :n], M[:, -1] - M[:, n:-1] @ common)[0]
+    own = np.empty((n_experiments, n))
+    for where, several in regressions:
+        for i, M in zip(where, several, strict=True):
+            own[i] = scaled_lstsq(M[:, :n], M[:, -1] - M[:, n:-1] @ common)[0]
     return common, own, loss, len(common) - rank
 
 
-def _pool(parts: list[Array], M: Array, n: int) -> None:
-    """Add a regression to `parts` of one, its first `n` unknowns projected out.
+def _pool(parts: list[Array], several: Array, n: int) -> None:
+    """Add regressions to `parts` of one, their first `n` unknowns projected out.
 
-    Of many parts only their triangular factor is kept.
+    Of many rows only the triangular factor is kept.
     """
-    parts.append(project_out(M, n))
-    if len(parts) > _TOGETHER:
+    rest = project_out(several, n)
+    parts.append(rest.reshape(-1, rest.shape[-1]))
+    if len(parts) > 1 and sum(map(len, parts)) > _TOGETHER:
         parts[:] = [_joined(parts)]
 
 
@@ -345,12 +353,18 @@ def _joined(parts: Sequence[Array]) -> Array:
 
 
 def project_out(M: Array, n: int) -> Array:
-    """The columns after the first `n`, without what the first `n` explain."""
+    """The columns after the first `n`, without what the first `n` explain.
+
+    Of one regression, or of several (n_experiments, n_rows, n_columns).
+    """
     if n == 0:
         return M
-    left, s, _ = np.linalg.svd(M[:, :n] / column_scale(M[:, :n]), full_matrices=False)
-    explained = left[:, s > RCOND * s.max(initial=0.0)]
-    return M[:, n:] - explained @ (explained.T @ M[:, n:])
+    own, rest = M[..., :n], M[..., n:]
+    scaled = own / column_scale(own)[..., None, :]
+    left, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    kept = s > RCOND * s.max(axis=-1, initial=0.0, keepdims=True)
+    explained = left * kept[..., None, :]
+    return rest - explained @ (explained.swapaxes(-1, -2) @ rest)
 
 
 def linear_regression(
@@ -358,15 +372,23 @@ def linear_regression(
 ) -> Array:
     """Regression of the outputs on own unknowns, B and D, with A and C given.
 
-    `R` (k, n_signals) comes from `signal_factor`. Rows: outputs times k; columns:
+    `R` (..., k, n_signals) comes from `signal_factors`. Rows: outputs times k; columns:
     own unknowns (`Freedom.n_own`), B (state-major), free entries of D, output.
     """
-    (ny, n), m, k = C.shape, free.direct.shape[1], len(R)
-    out = np.zeros((ny, k, free.n_linear(n) + 1))
-    _fill_linear(out, R, Pairs.of(blocks), C, free)
+    (ny, n), m = C.shape, free.direct.shape[1]
+    rows = R.reshape(-1, R.shape[-1])
+    out = np.zeros((ny, len(rows), free.n_linear(n) + 1))
+    _fill_linear(out, rows, Pairs.of(blocks), C, free)
     base = n * (1 + m)
-    out[:, :, -1] = R[:, base + m : base + m + ny].T
-    return out.reshape(ny * k, -1)
+    out[:, :, -1] = rows[:, base + m : base + m + ny].T
+    return _by_experiment(out, R.shape[:-1])
+
+
+def _by_experiment(out: Array, shape: tuple[int, ...]) -> Array:
+    """From (n_outputs, n_rows, n_columns), rows those of `shape` (..., k)."""
+    ny, _, columns = out.shape
+    split = np.moveaxis(out.reshape(ny, *shape, columns), 0, -3)
+    return split.reshape(*shape[:-1], ny * shape[-1], columns)
 
 
 def jacobian_regression(
@@ -374,15 +396,20 @@ def jacobian_regression(
 ) -> Array:
     """Regression of the simulation error on changes of all parameters.
 
-    `R` (k, n_signals) comes from `signal_factor`, with second responses of the model,
-    in section form, with ``driven = [x0, B]``. Rows: outputs times k; columns: own
-    unknowns, then the parameters, then the simulation error, trends not taken off.
+    `R` (..., k, n_signals) comes from `signal_factors`, with second responses of the
+    model, in section form, with ``driven = [x0, B]``, (..., order, 1 + n_inputs). Rows:
+    outputs times k; columns: own unknowns, then the parameters, then the simulation
+    error, trends not taken off.
     """
     blocks, C, D = model.blocks, model.C, model.D
     assert blocks is not None
-    (ny, n), m, k = C.shape, D.shape[1], len(R)
+    (ny, n), m, shape = C.shape, D.shape[1], R.shape[:-1]
     column, base = free.n_linear(n), n * (1 + m)
     size_a = sum(block.size for block in blocks)
+    R = R.reshape(-1, R.shape[-1])
+    k, n_experiments = len(R), int(np.prod(shape[:-1]))
+    driven = driven.reshape(n_experiments, n, 1 + m)
+    each = n_experiments, shape[-1]
     out = np.zeros((ny, k, column + size_a + ny * n + 1))
     pairs = Pairs.of(blocks)
     _fill_linear(out, R, pairs, C, free)
@@ -391,22 +418,26 @@ def jacobian_regression(
     start, N = pairs
     for i in range(start):
         out[:, :, column + i] = C[:, [i]] * second[:, i]
-    own = driven[start:].reshape(-1, 2, 1 + m).swapaxes(1, 2)
-    answer = second[:, start : start + 2 * len(N)].reshape(k, -1, 2).swapaxes(0, 1)
-    signals = R[:, :base].reshape(k, n, 1 + m)
-    first = answer @ N.swapaxes(1, 2) + signals[:, start + 1 :: 2].swapaxes(0, 1) @ own
+    own = driven[:, start:].reshape(n_experiments, len(N), 2, 1 + m)
+    own = own.transpose(1, 0, 3, 2)
+    answer = second[:, start : start + 2 * len(N)].reshape(k, len(N), 2)
+    answer = answer.swapaxes(0, 1)
+    signals = R[:, :base].reshape(*each, n, 1 + m)
+    late = signals[:, :, start + 1 :: 2].transpose(2, 0, 1, 3) @ own
+    first = answer @ N.swapaxes(1, 2) + late.reshape(answer.shape)
     seen = C[:, start:].reshape(ny, -1, 2).swapaxes(0, 1)  # (n_pairs, n_outputs, 2)
     effect = seen[:, :, None, :, None] * first[:, None, :, None]
     effect += (seen @ N)[:, :, None, :, None] * answer[:, None, :, None]
     entries = out[:, :, column + start : column + size_a]
     entries[:] = effect.transpose(1, 2, 0, 3, 4).reshape(entries.shape)
     column += size_a
-    states = R[:, :base] @ state_coefficients(blocks, driven).T
+    coefficients = state_coefficients(blocks, driven).swapaxes(1, 2)
+    states = (R[:, :base].reshape(*each, base) @ coefficients).reshape(k, n)
     for i in range(ny):
         out[i, :, column + i * n : column + (i + 1) * n] = states
     fitted = states @ C.T + R[:, base : base + m] @ D.T
     out[:, :, -1] = (R[:, base + m : base + m + ny] - fitted).T
-    return out.reshape(ny * k, -1)
+    return _by_experiment(out, shape)
 
 
 def linearised(
@@ -425,17 +456,17 @@ def linearised(
     those of other records with this model and inputs.
     """
     assert model.blocks is not None
-    factor = signal_factor if signals is None else signals.factor
+    factors = signal_factors if signals is None else signals.factors
+    B = np.broadcast_to(model.B, (len(records), *model.B.shape))
+    driven = np.concatenate([model.initial_states[:, :, None], B], axis=2)
     parts: list[Array] = []
-    for record, x0 in zip(records, model.initial_states, strict=True):
-        driven = np.column_stack([x0, model.B])
-        R = factor(model.blocks, record, driven)
+    for where, R in factors(model.blocks, records, driven):
         if R is None:
             return None
-        regression = jacobian_regression(R, model, driven, free)
+        several = jacobian_regression(R, model, driven[where], free)
         if keep_one and len(records) == 1 and not free.n_trend:
-            return regression
-        _pool(parts, regression, free.n_own(len(model.A)))
+            return several[0]
+        _pool(parts, several, free.n_own(len(model.A)))
     return _joined(parts)
 
 

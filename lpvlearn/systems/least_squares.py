@@ -64,8 +64,8 @@ def rank_lstsq(M: Array, rhs: Array, rcond: float) -> tuple[Array, int]:
 
 
 def column_scale(M: Array) -> Array:
-    """Norm of every column; 1 for a column of zeros."""
-    scale = np.sqrt(np.einsum("ij,ij->j", M, M))
+    """Norm of every column of matrices; 1 for a column of zeros."""
+    scale = np.sqrt(np.einsum("...ij,...ij->...j", M, M))
     scale[scale == 0.0] = 1.0
     return scale
 

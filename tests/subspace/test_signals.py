@@ -9,6 +9,7 @@ from lpvlearn.subspace.signals import (
     block_sections,
     section_states,
     signal_factor,
+    signal_factors,
     signal_pieces,
 )
 from lpvlearn.systems.simulation import lti_response
@@ -76,6 +77,36 @@ def test_shared_signals_of_collinear_inputs_keep_their_digits(rng):
     R = SharedSignals().factor(blocks, record, driven)
     expected = signal_factor(blocks, record, driven)
     np.testing.assert_allclose(R.T @ R, expected.T @ expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("second", [False, True])
+@pytest.mark.parametrize("n_trend", [0, 2])
+@pytest.mark.parametrize("poles", [[0.5], POLES, [0.9, 0.2, 1.02]])
+def test_factors_of_many_records_are_those_of_each(rng, poles, n_trend, second):
+    A = modes(*poles)
+    blocks, n = block_sections(A).blocks, len(A)
+    lengths = [7, 300, 40, 8, 40, 1, 100]
+    records = [
+        Record(*rng.standard_normal((2, 2, k)), rng.standard_normal((n_trend, k)))
+        for k in lengths
+    ]
+    driven = rng.standard_normal((len(records), n, 3)) if second else None
+    seen = []
+    for where, several in signal_factors(blocks, records, driven):
+        for i, R in zip(where, several, strict=True):
+            x = None if driven is None else driven[i]
+            own = signal_factor(blocks, records[i], x)
+            np.testing.assert_allclose(R.T @ R, own.T @ own, rtol=1e-9, atol=1e-9)
+        seen += where.tolist()
+    assert sorted(seen) == list(range(len(records)))
+
+
+def test_many_records_of_which_one_overflows_have_no_factors(rng):
+    records = [Record(*rng.standard_normal((2, 1, k))) for k in (20, 250, 250)]
+    found = dict(
+        (len(where), R) for where, R in signal_factors((np.array([[30.0]]),), records)
+    )
+    assert found == {3: None}
 
 
 def test_shared_signals_that_overflow_have_no_factor(rng):
