@@ -59,6 +59,6 @@ def align_outputs(X: Any, y: Any) -> Any:
         return y
     twice = own[own.duplicated()].tolist()[0]
     raise ValueError(
-        "`y` must have the row labels of X in the same order, as some stand several "
-        f"times ({twice!r}). Sort both alike, or give {_POSITIONS}."
+        "`y` must have the row labels of X in the same order, where some are repeated. "
+        f"Got {twice!r} several times. Sort both alike, or give {_POSITIONS}."
     )
