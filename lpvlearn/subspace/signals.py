@@ -255,12 +255,11 @@ def signal_factors(
         groups[-1].append(i)
     for group in groups:
         some = [records[i] for i in group]
+        own = None if driven is None else driven[group]
         if len(group) > 1:
-            own = None if driven is None else driven[group]
             yield np.array(group), _short_factors(blocks, some, own)
         else:
-            own = None if driven is None else driven[group[0]]
-            R = signal_factor(blocks, some[0], own)
+            R = signal_factor(blocks, some[0], None if own is None else own[0])
             yield np.array(group), None if R is None else R[None]
 
 

@@ -46,7 +46,6 @@ Array = NDArray[np.float64]
 
 _TOGETHER = 4096  # rows of regressions that are kept before they are factored
 
-
 # Places of experiments, and their regressions (n_experiments, n_rows, n_columns).
 Regressions = tuple[Places, Array]
 
