@@ -409,14 +409,14 @@ def _hankel_gram(
     gram = memory[: height * height].reshape(height, height)
     for k in range(0, len(records), _TOGETHER):
         some = records[k : k + _TOGETHER]
-        heads = np.stack([z[:n_ends] for z in some], axis=1)
+        step = len(some)
         tails = np.stack([z[len(z) - n_ends :] for z in some], axis=1)
-        lasts, step = tails.reshape(-1, c), len(some)
+        lasts = tails.reshape(-1, c)
         for d in range(n_ends):
             first[d] -= lasts[: (n_ends - d) * step].T @ lasts[d * step :]
-        ends = np.concatenate([tails, heads], axis=1).swapaxes(0, 1)
-        ends = ends.reshape(2 * step, n_ends * c)
-        _add_products(gram[c:, c:], ends, np.repeat([1.0, -1.0], step))
+        _add_products(gram[c:, c:], tails.swapaxes(0, 1).reshape(step, -1), 1.0)
+        heads = np.stack([z[:n_ends].ravel() for z in some])
+        _add_products(gram[c:, c:], heads, -1.0)
     gram[:c] = first.transpose(1, 0, 2).reshape(c, height)
     steps = memory.reshape(n_rows, stride)
     for i in range(1, n_rows):
@@ -426,7 +426,7 @@ def _hankel_gram(
             _trend_sums(z, n_rows, _trend_basis(len(z) - n_ends, n_trend)).T
             for z in records[k : k + _TOGETHER]
         ]
-        _add_products(gram, np.vstack(sums), np.array([-1.0]))
+        _add_products(gram, np.vstack(sums), -1.0)
     # The lower triangle by transposed blocks: cheaper than two masks.
     for start in range(0, height, _BLOCK):
         stop = min(start + _BLOCK, height)
@@ -436,11 +436,10 @@ def _hankel_gram(
     return gram
 
 
-def _add_products(gram: Array, rows: Array, signs: Array) -> None:
-    """Add ``rows.T @ diag(signs) @ rows`` to the upper triangle of a matrix."""
-    signed = rows * signs[:, None]
+def _add_products(gram: Array, rows: Array, sign: float) -> None:
+    """Add ``sign * rows.T @ rows`` to the upper triangle of a matrix."""
     for start in range(0, len(gram), _BLOCK):
-        part = signed[:, start : start + _BLOCK]
+        part = sign * rows[:, start : start + _BLOCK]
         gram[start : start + _BLOCK, start:] += part.T @ rows[:, start:]
 
 
