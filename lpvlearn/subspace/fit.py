@@ -464,7 +464,7 @@ def _believable(
     better than the plant itself by what the inputs tell of the noise: that does not
     refute the plant unless inputs were to be noise more than anything else
     (`_OF_NOISE`), or the plant is unstable, by no more than chance, and the other is
-    not.
+    not; or D was left free for a stable plant, but fits these parts no better.
     """
     n_trend = first.evidence.free.n_trend
     without_d = not first.evidence.free.direct.any()
@@ -476,7 +476,7 @@ def _believable(
         return other, _held_out(other, chosen_so)
 
     best, error = first, _held_out(first, choices)
-    before = error
+    before, makeshift = error, False
     try:
         if not error.parts:
             return first, None
@@ -495,9 +495,11 @@ def _believable(
             better = found.total < _OF_NOISE * error.total
             # data do not tell it apart from the first
             if better or _grows(best, _CERTAIN) and not _grows(other, _CERTAIN):
+                makeshift = found.total > error.total
                 best, error = other, found
         better = of_that.total < _OF_NOISE * error.total
-        if _grows(best) and not _grows(best, _CERTAIN) and not _grows(open_loop):
+        unsure = makeshift or (_grows(best) and not _grows(best, _CERTAIN))
+        if unsure and not _grows(open_loop):
             better |= of_that.clearly_better_than(error, _DOUBT)
         if better:
             best, error = open_loop, of_that

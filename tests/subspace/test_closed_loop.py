@@ -342,6 +342,34 @@ def test_auto_gives_up_what_parts_held_out_refute():
         assert first < min(1.2 * ordinary, 0.7 * without)
 
 
+def modes_sampled_early(seed, n_samples=500):
+    """Two lightly damped modes, outputs as in `sampled_early`."""
+    rng = np.random.default_rng(seed)
+    u = lfilter([1.0], [1.0, -0.97], rng.standard_normal((n_samples + 1, 1)), axis=0)
+    slow, fast = (
+        lfilter(b, [1.0, -2.0 * r * np.cos(w), r * r], u, axis=0)
+        for b, r, w in (([1.0, -0.9], 0.98, 0.2), ([0.0, 0.5], 0.97, 0.7))
+    )
+    y = 0.5 * (slow + fast)[:-1] + 0.5 * (slow + fast)[1:]
+    return u[:-1], y + 0.005 * y.std() * rng.standard_normal(y.shape)
+
+
+def test_a_free_d_that_only_makes_the_plant_stable_competes_with_the_open_loop():
+    for seed in (0, 1):
+        u, y = modes_sampled_early(seed)
+        u_other, y_other = modes_sampled_early(seed + 100)
+        with pytest.warns(UserWarning, match="D = 0 is unstable .* method='po-moesp'"):
+            model = SubspaceLTI().fit(u, y)
+        assert model.method_ == "po-moesp"
+        with pytest.warns(UserWarning, match="closed loop"):
+            free = pbsid().fit(u, y)
+        error, of_that = (
+            np.std(y_other - m.predict_with_initial_state(u_other, y_other))
+            for m in (model, free)
+        )
+        assert error < of_that
+
+
 def slow_plant_in_a_loop(seed, n_samples=1000):
     """What outputs tell of themselves one step ahead, and its response."""
     rng = np.random.default_rng(seed)
