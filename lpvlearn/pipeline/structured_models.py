@@ -329,13 +329,13 @@ def covariance_of_parameters(
 
     The deviations of the response (`deviated_models`) are carried to the parameters to
     first order, as the minimisation of that norm does, for "hinf" as the least-squares
-    fit of the response. `weight` is the `frequency_weight` of `GrayBoxRestructurer`.
+    fit of the response; what these do not determine is infinite. `weight` is the `frequency_weight` of `GrayBoxRestructurer`.
     """
     problem = problem_from_models(structure, [model], weight)
     response = problem.response_of
     changes = [response(above) - response(below) for above, below in deviated]
     T = problem.parameter_changes(theta, np.array(changes), norm) / (2.0 * DEVIATION)
-    return T.T @ T
+    return T.T @ T + problem.open_variances(theta)
 
 
 def _balanced(local: LocalModel) -> StateSpace:

@@ -178,6 +178,23 @@ class RestructuringProblem:
 
     def identifiability(self, theta: Array) -> Identifiability:
         """Which parameters the response determines, and how well."""
+        J, level = self._relative_changes(theta)
+        return Identifiability.from_jacobian(J, self.structure.parameter_names, level)
+
+    def open_variances(self, theta: Array) -> Array:
+        """Infinite on the diagonal for parameters that the response leaves open.
+
+        That is where a combination of those that no bound holds does not change it.
+        """
+        J, level = self._relative_changes(theta)
+        free = self._free_jacobian(theta).any(axis=(0, 1, 2))
+        names = np.array(self.structure.parameter_names)
+        found = Identifiability.from_jacobian(J[..., free], names[free].tolist(), level)
+        left_open = {name for direction in found.directions for name in direction}
+        return np.diag(np.where(np.isin(names, list(left_open)), np.inf, 0.0))
+
+    def _relative_changes(self, theta: Array) -> tuple[Complex, Array]:
+        """Of the response by relative steps of the parameters, and its sizes."""
         G, J = self.system.response_jacobian(theta, self.omega)
         scaling = channel_scaling(self.response)
         if scaling is not None:  # a faint channel tells parameters, too
@@ -199,8 +216,7 @@ class RestructuringProblem:
                 change = np.sqrt(np.sum(np.abs(moved - G) ** 2) / len(G))
             if change > _LINEAR * usual:
                 sizes[j] = abs(step[j])
-        names = self.structure.parameter_names
-        return Identifiability.from_jacobian(J * sizes, names, level)
+        return J * sizes, level
 
     def parameter_changes(self, theta: Array, dG: Complex, norm: str) -> Array:
         """First-order changes, (r, n_params), with the black box's response.
@@ -319,7 +335,7 @@ class RestructuringProblem:
         """Covariance of the parameters that minimise `norm`, from draws of the noise.
 
         In the linearised structure: the least maximum for "hinf", which is not linear
-        in the noise, else as `parameter_changes`.
+        in the noise, else as `parameter_changes`; with `open_variances`.
         """
         if norm != "hinf":
             changes = self.parameter_changes(theta, noise, norm)
@@ -334,7 +350,8 @@ class RestructuringProblem:
             explained = variance / max(float(np.sum(np.abs(E) ** 2)), 1e-300)
             E = E * np.sqrt(max(1.0 - explained, 0.0))
             changes = np.array([least_maximum(E - part, WJ) for part in dE])
-        return np.cov(changes.T, ddof=1).reshape(len(theta), -1)
+        covariance = np.cov(changes.T, ddof=1).reshape(len(theta), -1)
+        return covariance + self.open_variances(theta)
 
 
 def agreeing(fits: Sequence[LeastSquaresResult]) -> int:

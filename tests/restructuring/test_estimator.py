@@ -336,6 +336,28 @@ def test_a_parameter_at_its_bound_has_no_variance(norm, rough):
     assert variance[0] == 0 < variance[1]
 
 
+@pytest.mark.parametrize("norm", ["hinf", "h2", "similarity"])
+def test_parameters_of_which_only_the_product_is_seen_have_infinite_variances(norm):
+    product = GrayBoxStructure.from_template([["-a"]], [["b"]], [["c"]])
+    runs = [StateSpace(-2 + e, 3 - e, 1) for e in (-0.1, 0.0, 0.2)]
+    fitted = GrayBoxRestructurer(product, norm=norm)
+    with pytest.warns(RankWarning, match="determines 2 of the 3 parameters"):
+        fitted.fit_model(runs[1], realizations=runs)
+    variance = np.diag(fitted.params_covariance_)
+    assert 0 < variance[0] < np.inf and np.isinf(variance[1:]).all()
+    table = fitted.confidence_intervals()
+    assert_allclose(table.loc["b", ["lower", "upper"]], [-np.inf, np.inf])
+
+
+def test_a_bound_that_holds_one_parameter_tells_the_other():
+    product = GrayBoxStructure.from_template([["-a"]], [["b"]], [["c"]])
+    bounded = product.with_bounds({"b": (3.0, None)})
+    problem = problem_from_models(bounded, [StateSpace(-2, 3, 1)], None)
+    held, free = np.array([2.0, 3.0, 1.0]), np.array([2.0, 6.0, 0.5])
+    assert not problem.open_variances(held).any()
+    assert_allclose(np.diag(problem.open_variances(free)), [0.0, np.inf, np.inf])
+
+
 def test_restarts_from_perturbations_agree():
     structure, params = CASES["two_masses"]
     black_box = structure.model(params)
