@@ -329,7 +329,8 @@ def covariance_of_parameters(
 
     The deviations of the response (`deviated_models`) are carried to the parameters to
     first order, as the minimisation of that norm does, for "hinf" as the least-squares
-    fit of the response; what these do not determine is infinite. `weight` is the `frequency_weight` of `GrayBoxRestructurer`.
+    fit of the response; what these do not determine is infinite. `weight` is the
+    `frequency_weight` of `GrayBoxRestructurer`.
     """
     problem = problem_from_models(structure, [model], weight)
     response = problem.response_of
