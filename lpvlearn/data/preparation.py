@@ -32,6 +32,10 @@ _COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 # changes are multiples of them; longer ones than the last are not looked for.
 _HELD, _ENOUGH_CHANGES, _LONGEST_HELD = 0.95, 20, 1000
 
+# A signal is at a limit that stays for so many samples at an extreme value, this many
+# times longer than at any other, while inputs move by this share of their usual motion.
+_STAYS, _LONGER, _MOVES = 10, 3, 0.5
+
 
 def read_runs(
     estimator: Any,
@@ -235,3 +239,37 @@ def held_for(signals: Sequence[Array]) -> int:
         return 1
     longest = min(int(np.median(gaps)), _LONGEST_HELD)
     return next(k for k in range(longest, 0, -1) if np.mean(gaps % k == 0) >= _HELD)
+
+
+def limit_of(
+    signals: Sequence[Array], inputs: Sequence[Array]
+) -> tuple[float, int] | None:
+    """The value of a limit that a signal stays at, and for how many samples.
+
+    `signals` are (n_samples,), `inputs` (n_samples, n_inputs) per experiment. A signal
+    that has not begun to move is not at a limit.
+
+    >>> t = np.linspace(0.0, 20.0, 200)
+    >>> limit_of([np.minimum(np.sin(t), 0.8)], [np.cos(t)[:, None]])
+    (0.8, 42)
+    """
+    starts = [
+        np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [len(y)]]) for y in signals
+    ]
+    value = np.concatenate([y[k[:-1]] for y, k in zip(signals, starts, strict=True)])
+    length = np.concatenate([np.diff(k) for k in starts])
+    if length.max() < _STAYS:
+        return None
+    moves = [np.sum(np.diff(u, axis=0) ** 2, axis=1) for u in inputs]
+    usual = np.concatenate(moves).mean()
+    for limit in (value.max(), value.min()):
+        there = value == limit
+        longest = length[~there].max(initial=1)
+        least = max(_STAYS, _LONGER * longest + 1)
+        for y, k, motion in zip(signals, starts, moves, strict=True):
+            for start, stop in pairwise(k):
+                if start == 0 or stop - start < least or y[start] != limit:
+                    continue
+                if motion[start : stop - 1].mean() >= _MOVES * usual > 0.0:
+                    return float(limit), int(length[there & (length > longest)].sum())
+    return None

@@ -19,6 +19,7 @@ from ..data.preparation import (
     check_excitation,
     held_for,
     independent_inputs,
+    limit_of,
     remove_trends,
 )
 from ..exceptions import RankWarning, warn
@@ -256,6 +257,8 @@ def fit_pairs(
     _tell_of_feedback(fitted, choices, doubt, told)
     if fitted.selection.order and "held" not in told:
         _tell_of_held_outputs(pairs, told)
+    if "limit" not in told:
+        _tell_of_limits(pairs, told)
     if detrend is None:
         return fitted
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
@@ -274,6 +277,23 @@ def _tell_of_held_outputs(pairs: Pairs, told: set[str]) -> None:
             f"response of no linear system is. Take one row of every {slowest} (the "
             "first of each value), or `resample`.",
         )
+
+
+def _tell_of_limits(pairs: Pairs, told: set[str]) -> None:
+    """Tell of an output that stays at a limit of its sensor or of the plant."""
+    for i in range(pairs[0][1].shape[1]):
+        found = limit_of([y[:, i] for _, y in pairs], [u for u, _ in pairs])
+        if found is not None:
+            value, n_samples = found
+            tell(
+                told,
+                "limit",
+                f"Output {i + 1} stays at {value:.6g} for {n_samples} samples in which "
+                "the inputs move: it is at a limit, of its sensor or of the plant, as "
+                "no linear system has one. Set these samples to NaN and use "
+                "missing='split', or record within the limits.",
+            )
+            return
 
 
 def _with_constants(
@@ -301,7 +321,11 @@ def _with_constants(
 def _without_shifts(
     pairs: Pairs, choices: Choices, told: set[str], whole: LocalFit
 ) -> tuple[Pairs, LocalFit]:
-    """Cut the experiments where levels shift, if that explains them clearly better."""
+    """Cut the experiments where levels shift, if that explains them clearly better.
+
+    One step ahead, where an order of 0 explains all that moves slowly: of what the
+    inputs do the parts must explain as much of what is held out as the whole.
+    """
     feedback = whole.feedback
     if feedback is None:
         return pairs, whole
@@ -314,6 +338,9 @@ def _without_shifts(
     except TooFewSamples:
         return pairs, whole
     if not shifts_matter(whole.evidence.one_step, fitted.evidence.one_step):
+        return pairs, whole
+    left, before = (100.0 - _held_out(f, choices).bft for f in (fitted, whole))
+    if left > _LEFT_MORE * before:
         return pairs, whole
     samples = "; ".join(
         f"{', '.join(map(str, cuts))}{f' of experiment {k}' if len(pairs) > 1 else ''}"
@@ -670,6 +697,8 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
 # A model of like samples has led into another minimum where the error ends this many
 # times as large as theirs; between realizations of noise it varies by a few per cent.
 _WORSE = 1.2
+
+_LEFT_MORE = 1.2  # of parts held out, by experiments that are cut: more than by chance
 
 # Shares of the outputs' size left unexplained: that is reported; and that constants may
 # be the reason of

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.data.preparation import remove_trends
+from lpvlearn.data.preparation import limit_of, remove_trends
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace.fit import check_options, fit_pairs, warn_about
 from lpvlearn.systems.simulation import lti_response
@@ -361,6 +361,22 @@ def test_outputs_sampled_more_slowly_than_the_table_are_told():
     SubspaceLTI().fit(u, 2.0 * u)  # of no memory: held as its input is
     with pytest.warns(UserWarning, match="Output 1 keeps its values for 3 samples"):
         SubspaceLTI().fit(u, np.repeat(y[::3], 3, axis=0))
+
+
+def test_an_output_at_its_limit_is_told():
+    rng = np.random.default_rng(0)
+    u = lfilter([0.3], [1.0, -0.9], rng.standard_normal((600, 1)), axis=0)
+    y = lfilter([0.0, 0.1], [1.0, -0.9], u, axis=0)
+    y += 0.01 * rng.standard_normal(y.shape)
+    SubspaceLTI().fit(u, y)
+    step = np.repeat([0.0, 1.0, 0.0], [100, 200, 200])[:, None]
+    rest = lfilter([0.0, 0.1], [1.0, -0.9], step[:, 0]).round(3)
+    assert limit_of([rest], [step]) is None  # at rest, as the input
+    limit = np.quantile(y, 0.9)
+    with pytest.warns(UserWarning, match="Output 1 stays at .* missing='split'"):
+        SubspaceLTI().fit(u, np.minimum(y, limit))
+    y[y > limit] = np.nan
+    SubspaceLTI(missing="split").fit(u, y)
 
 
 def test_a_decay_that_is_not_known_is_told():

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI
+from lpvlearn.subspace import fit
 from lpvlearn.subspace.shifts import _statistics, cut_at, find_shifts
 from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.varx import find_feedback, longest_past, regression_of
@@ -107,3 +108,23 @@ def test_a_record_is_cut_as_by_hand():
         warnings.simplefilter("error")
         whole = SubspaceLTI(2, offset="constant").fit(u, y)
     assert len(whole.initial_states_) == 1
+
+
+def test_a_record_is_not_cut_where_parts_held_out_are_simulated_worse(monkeypatch):
+    """As where noise alone explains what moves between the cuts."""
+    rng = np.random.default_rng(3)
+    u, y = slow_record(rng, 900)
+    y = y + np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
+    errors = fit._held_out
+    monkeypatch.setattr(
+        fit,
+        "_held_out",
+        lambda fitted, choices: errors(fitted, choices)._replace(
+            bft=80.0 if len(fitted.scaled.records) > 1 else 90.0
+        ),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "A mode of the model|The model simulates")
+        found = SubspaceLTI().fit(u, y)
+    assert len(found.initial_states_) == 1
