@@ -41,7 +41,7 @@ _MIN_PIVOT = 1e-10
 # besides the matrix is small, and a square of that size stays in the cache.
 _BLOCK = 64
 
-_TOGETHER = 64  # experiments whose ends are multiplied at a time
+_TOGETHER = 32  # experiments whose ends are multiplied at a time
 
 # Samples transformed at a time: transforms this many times as long as the lags (and no
 # shorter than the second) spend little on the overlap of neighbouring blocks.
