@@ -184,10 +184,11 @@ def weights(value: Any, n: int, of: str = "row") -> Array:
     """`sample_weight` as a vector of `n` weights, or a ValueError."""
     found = real_array("sample_weight", value)
     good = found.shape == (n,) and (found >= 0.0).all() and (found < SQUARED).all()
-    if not good or not found.any():
+    if not good or not (found > 1.0 / SQUARED).any():
         raise ValueError(
-            f"`sample_weight` must hold {n} weights, one for each {of}: finite, not "
-            f"negative and not all zero. Got {shown(value)}."
+            f"`sample_weight` must hold {n} weights, one for each {of}: below "
+            f"{SQUARED:g}, not negative and not all zero, as what lies below "
+            f"{1.0 / SQUARED:g} is when squared. Got {shown(value)}."
         )
     return found
 

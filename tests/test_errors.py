@@ -553,6 +553,10 @@ STEPS |= {
         lambda: spring_restructurer().fit([1, 2], [[1, 2]] * 2, [0, 0]),
         ["`sample_weight`", "not all zero"],
     ),
+    "weights without squares": (
+        lambda: spring_restructurer().fit([1, 2], [[1, 2]] * 2, [1e-200, 1e-200]),
+        ["`sample_weight`", "not all zero, as what lies below 1e-150"],
+    ),
     "a word for a function": (
         lambda: GrayBoxStructure.from_function("pendulum", [1.0]),
         ["`function` must return (A, B, C)", "Got str"],

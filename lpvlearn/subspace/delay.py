@@ -210,7 +210,8 @@ def first_answers(pairs: Pairs, longest: int) -> Delay:
         R = np.asarray(np.linalg.qr(np.column_stack([X, y]), mode="r"))
         explained = R[k - longest - 1 : k, k:][::-1] ** 2
         left = (R[k:, k:] ** 2).sum(axis=0)
-        left = np.maximum(left, _ROUNDING * (y**2).sum(axis=0)) / error
+        least = _ROUNDING * (y**2).sum(axis=0) + np.finfo(float).tiny
+        left = np.maximum(left, least) / error
         count = np.arange(1, longest + 2)[:, None]
         F = np.cumsum(explained, axis=0) / count / left
         certain = (stats.f.sf(F, count, error) < _CHANCE / (longest + 1)).any(axis=1)

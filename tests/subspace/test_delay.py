@@ -351,6 +351,12 @@ def test_few_samples_of_a_system_leak_no_numerical_warnings():
         SubspaceLTI(input_delay="auto").fit(u, truth.simulate(u) + 0.1 * noise)
 
 
+def test_first_answers_of_an_output_that_stays_at_zero_are_none():
+    u, y = np.random.default_rng(0).normal(size=(60, 1)), np.zeros((60, 1))
+    y[:5] = u[:5]
+    np.testing.assert_array_equal(first_answers([(u, y)], 10), [-1])
+
+
 def test_first_answers_need_evidence_for_each_input():
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=(600, 3)), rng.normal(size=(600, 2))
