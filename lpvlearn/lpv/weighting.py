@@ -134,10 +134,12 @@ def _whitening(P: Array, size: Array) -> Array | None:
     variance = np.diagonal(P, axis1=1, axis2=2)
     if np.isnan(P).any() or (variance < 0).any():
         return None
-    # an infinite variance, of a parameter that its point does not determine: no weight
+    # an infinite variance, of a parameter that its point does not determine: no weight;
+    # one that none determines is a choice, kept as it is
     open_ = np.isinf(variance)
     P = np.where(open_[:, :, None] | open_[:, None, :], 0.0, P)
-    P = P + np.where(open_, (_OPEN * size) ** 2, 0.0)[:, :, None] * np.eye(len(size))
+    here = open_ & ~open_.all(axis=0)
+    P = P + np.where(here, (_OPEN * size) ** 2, 0.0)[:, :, None] * np.eye(len(size))
     if not np.isfinite(P).all():  # of finite variances: no covariance
         return None
     variance = np.diagonal(P, axis1=1, axis2=2)

@@ -237,7 +237,10 @@ class RestructuringProblem:
         J = self._free_jacobian(theta)
         WJ = np.einsum("kpq,kqmj->kpmj", W, J)
         flat = WJ.reshape(-1, J.shape[-1])
-        inverse = np.linalg.pinv(np.vstack([flat.real, flat.imag]))
+        columns = np.vstack([flat.real, flat.imag])
+        unit = np.linalg.norm(columns, axis=0)
+        unit = np.where(unit > 0, unit, 1.0)
+        inverse = np.linalg.pinv(columns / unit) / unit[:, None]
         real, imaginary = np.split(inverse, 2, axis=1)
         K = (real + 1j * imaginary).reshape(-1, *WJ.shape[:-1])
         K = np.einsum("jkpm,kpq->jkqm", K, W.conj())

@@ -48,6 +48,19 @@ def test_weights_of_points_divide_their_covariances():
     np.testing.assert_allclose(both, divided.coefficients(TERMS)[0], atol=1e-9)
 
 
+def test_what_no_point_determines_is_kept_as_it_is():
+    """Of values that only together mean anything, none is taken for noise."""
+    rng = np.random.default_rng(4)
+    theta, known = rng.normal(size=(6, 3)), covariances(rng)
+    moved = theta.copy()
+    moved[0, 1] += 1e-3
+    for n_open, matters in ((6, True), (1, False)):
+        P = known.copy()
+        P[:n_open, 1, 1] = np.inf
+        misfit = weighted_points(theta, np.ones(6), P).misfit(moved)
+        assert misfit > 1e6 if matters else misfit < 1e-6
+
+
 def test_the_misfit_of_the_true_form_is_a_chi_square():
     rng = np.random.default_rng(3)
     P = covariances(rng)
