@@ -223,8 +223,7 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 # * A load that comes or goes, or a sensor that moves, shifts the level within an
 #   experiment. A slow mode would explain it, and simulate other records by what it made
 #   up. ``"auto"`` looks for such shifts, which no regression on the past foresees, ends
-#   the experiment there and begins another, with a warning that says where, unless
-#   parts held out are simulated worse by what lies between.
+#   the experiment there and begins another, with a warning that says where.
 # * An output that stays at its largest or smallest value while the inputs move is at a
 #   limit, of its sensor or of the plant. A fit tells of it; NaN for these samples and
 #   ``missing="split"`` leave them out.

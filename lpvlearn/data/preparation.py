@@ -32,9 +32,9 @@ _COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 # changes are multiples of them; longer ones than the last are not looked for.
 _HELD, _ENOUGH_CHANGES, _LONGEST_HELD = 0.95, 20, 1000
 
-# A signal is at a limit that stays for so many samples at an extreme value, this many
-# times longer than at any other, while inputs move by this share of their usual motion.
-_STAYS, _LONGER, _MOVES = 10, 3, 0.5
+# A signal may be at a limit that stays for so many samples at an extreme value, this
+# many times longer than at any other; this share of it is at others.
+_STAYS, _LONGER, _OTHERS = 10, 3, 0.1
 
 
 def read_runs(
@@ -241,35 +241,31 @@ def held_for(signals: Sequence[Array]) -> int:
     return next(k for k in range(longest, 0, -1) if np.mean(gaps % k == 0) >= _HELD)
 
 
-def limit_of(
-    signals: Sequence[Array], inputs: Sequence[Array]
-) -> tuple[float, int] | None:
-    """The value of a limit that a signal stays at, and for how many samples.
+def stays_at_limits(signals: Sequence[Array]) -> list[list[tuple[int, int]]]:
+    """Where a signal stays at its largest or smallest value, as at a limit.
 
-    `signals` are (n_samples,), `inputs` (n_samples, n_inputs) per experiment. A signal
-    that has not begun to move is not at a limit.
+    Start and stop by experiment, of signals (n_samples,). Elsewhere it must be, too,
+    and not stay for as long: signals of two values, and coarse ones, are at no limit.
 
     >>> t = np.linspace(0.0, 20.0, 200)
-    >>> limit_of([np.minimum(np.sin(t), 0.8)], [np.cos(t)[:, None]])
-    (0.8, 42)
+    >>> stays_at_limits([np.clip(np.sin(t), -1.0, 0.8)])
+    [[(10, 23), (72, 85), (135, 148)]]
     """
-    starts = [
+    edges = [
         np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [len(y)]]) for y in signals
     ]
-    value = np.concatenate([y[k[:-1]] for y, k in zip(signals, starts, strict=True)])
-    length = np.concatenate([np.diff(k) for k in starts])
-    if length.max() < _STAYS:
-        return None
-    moves = [np.sum(np.diff(u, axis=0) ** 2, axis=1) for u in inputs]
-    usual = np.concatenate(moves).mean()
-    for limit in (value.max(), value.min()):
-        there = value == limit
-        longest = length[~there].max(initial=1)
-        least = max(_STAYS, _LONGER * longest + 1)
-        for y, k, motion in zip(signals, starts, moves, strict=True):
-            for start, stop in pairwise(k):
-                if start == 0 or stop - start < least or y[start] != limit:
-                    continue
-                if motion[start : stop - 1].mean() >= _MOVES * usual > 0.0:
-                    return float(limit), int(length[there & (length > longest)].sum())
-    return None
+    value = np.concatenate([y[k[:-1]] for y, k in zip(signals, edges, strict=True)])
+    length = np.concatenate([np.diff(k) for k in edges])
+    limits = value.min(), value.max()
+    others = length[~np.isin(value, limits)]
+    if others.sum() < _OTHERS * length.sum():
+        return [[] for _ in signals]
+    least = max(_STAYS, _LONGER * others.max(initial=1) + 1)
+    return [
+        [
+            (int(start), int(stop))
+            for start, stop in pairwise(k)
+            if stop - start >= least and y[start] in limits
+        ]
+        for y, k in zip(signals, edges, strict=True)
+    ]

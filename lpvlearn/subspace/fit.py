@@ -19,8 +19,8 @@ from ..data.preparation import (
     check_excitation,
     held_for,
     independent_inputs,
-    limit_of,
     remove_trends,
+    stays_at_limits,
 )
 from ..exceptions import RankWarning, warn
 from ..validation import is_whole, one_of, positive_time, real_array, shown
@@ -246,8 +246,14 @@ def fit_pairs(
         check_excitation(pairs, names)
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
+    outputs = [y for _, y in pairs]
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = _with_constants(pairs, choices, told, known)
+    if fitted.selection.order:
+        if "held" not in told:
+            _tell_of_held_outputs(outputs, told)
+        if "limit" not in told:
+            _tell_of_limits(outputs, fitted, told)
     # The errors of a rough model are not the noise that shifts must stand out of.
     if choices.offset == "auto" and choices.initial_states and choices.refine:
         pairs, fitted = _without_shifts(pairs, choices, told, fitted)
@@ -255,18 +261,14 @@ def fit_pairs(
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
         fitted, doubt = _believable(pairs, choices, told, fitted)
     _tell_of_feedback(fitted, choices, doubt, told)
-    if fitted.selection.order and "held" not in told:
-        _tell_of_held_outputs(pairs, told)
-    if "limit" not in told:
-        _tell_of_limits(pairs, told)
     if detrend is None:
         return fitted
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
 
 
-def _tell_of_held_outputs(pairs: Pairs, told: set[str]) -> None:
+def _tell_of_held_outputs(outputs: Sequence[Array], told: set[str]) -> None:
     """Tell of outputs that are sampled more slowly than the table."""
-    held = [held_for([y[:, i] for _, y in pairs]) for i in range(pairs[0][1].shape[1])]
+    held = [held_for([y[:, i] for y in outputs]) for i in range(outputs[0].shape[1])]
     slowest = max(held)
     if slowest > 1:
         tell(
@@ -279,19 +281,37 @@ def _tell_of_held_outputs(pairs: Pairs, told: set[str]) -> None:
         )
 
 
-def _tell_of_limits(pairs: Pairs, told: set[str]) -> None:
-    """Tell of an output that stays at a limit of its sensor or of the plant."""
-    for i in range(pairs[0][1].shape[1]):
-        found = limit_of([y[:, i] for _, y in pairs], [u for u, _ in pairs])
-        if found is not None:
-            value, n_samples = found
+def _tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) -> None:
+    """Tell of an output that stays at a limit where its model moves on."""
+    model = fitted.evidence.model
+    for i in range(outputs[0].shape[1]):
+        stays = stays_at_limits([y[:, i] for y in outputs])
+        if not any(stays):
+            continue
+        if len(model.initial_states) != len(outputs):
+            return
+        records = fitted.scaled.records
+        with np.errstate(over="ignore", invalid="ignore"):
+            moves = [model.outputs(r, k)[:, i] for k, r in enumerate(records)]
+            least = _MOVES_ON * np.std(np.concatenate(moves))
+        passed = [
+            (y[start, i], stop - start)
+            for y, expected, parts in zip(outputs, moves, stays, strict=True)
+            for start, stop in parts
+            if np.std(expected[start:stop]) > least > 0.0
+        ]
+        n_passed = sum(n for _, n in passed)
+        if n_passed > _AT_LIMITS * sum(map(len, outputs)):
+            values = ", ".join(
+                f"{value:.6g}" for value in sorted({v for v, _ in passed})
+            )
             tell(
                 told,
                 "limit",
-                f"Output {i + 1} stays at {value:.6g} for {n_samples} samples in which "
-                "the inputs move: it is at a limit, of its sensor or of the plant, as "
-                "no linear system has one. Set these samples to NaN and use "
-                "missing='split', or record within the limits.",
+                f"Output {i + 1} stays at {values} for {n_passed} "
+                "samples in which its model moves on: it is at a limit, of its sensor "
+                "or of the plant, as no linear system has one. Set these samples to "
+                "NaN and use missing='split', or record within the limits.",
             )
             return
 
@@ -323,8 +343,8 @@ def _without_shifts(
 ) -> tuple[Pairs, LocalFit]:
     """Cut the experiments where levels shift, if that explains them clearly better.
 
-    One step ahead, where an order of 0 explains all that moves slowly: of what the
-    inputs do the parts must explain as much of what is held out as the whole.
+    One step ahead, where noise alone explains all that moves slowly: parts that leave
+    inputs nothing to explain must simulate as much of what is held out as the whole.
     """
     feedback = whole.feedback
     if feedback is None:
@@ -339,9 +359,10 @@ def _without_shifts(
         return pairs, whole
     if not shifts_matter(whole.evidence.one_step, fitted.evidence.one_step):
         return pairs, whole
-    left, before = (100.0 - _held_out(f, choices).bft for f in (fitted, whole))
-    if left > _LEFT_MORE * before:
-        return pairs, whole
+    if whole.selection.order and not fitted.selection.order:
+        left, before = (100.0 - _held_out(f, choices).bft for f in (fitted, whole))
+        if left > before:
+            return pairs, whole
     samples = "; ".join(
         f"{', '.join(map(str, cuts))}{f' of experiment {k}' if len(pairs) > 1 else ''}"
         for k, cuts in enumerate(shifts)
@@ -698,7 +719,8 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
 # times as large as theirs; between realizations of noise it varies by a few per cent.
 _WORSE = 1.2
 
-_LEFT_MORE = 1.2  # of parts held out, by experiments that are cut: more than by chance
+# Share of its motion by which a model moves where an output stays, and of the samples
+_MOVES_ON, _AT_LIMITS = 0.05, 0.01
 
 # Shares of the outputs' size left unexplained: that is reported; and that constants may
 # be the reason of

@@ -64,13 +64,6 @@ class HeldOut(NamedTuple):
     total: float = np.inf  # sum of squares; infinite where nothing is held out
     residual: float = np.nan  # root mean square, in units of the scaled records
 
-    def far_better_than(self, other: HeldOut) -> bool:
-        """Whether errors are so much less that an order must not be refused for them.
-
-        By the unknowns of each model alone.
-        """
-        return bool(_FAR_MORE * self.total < other.total)
-
     def clearly_better_than(
         self, other: HeldOut, standard_errors: float, share: float = MATTERS
     ) -> bool:
@@ -84,7 +77,7 @@ class HeldOut(NamedTuple):
         """
         if not (np.isfinite(other.total) and np.isfinite(self.total)):
             return bool(np.isfinite(self.total))
-        if other.far_better_than(self):
+        if self.total > _FAR_MORE * other.total:
             return False
         total, gaps = 0.0, []
         for mine, others in zip(self.parts, other.parts, strict=True):

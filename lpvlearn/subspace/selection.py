@@ -252,10 +252,9 @@ def _search(
     close = [k for k, one in orders.items() if one.criterion < least.criterion + _PRICE]
     for order in [k for k in close if k > best] + [best - step for step in _LOWER]:
         if order in orders:
-            mine = errors[order] = validate(orders[order].candidate, records, settings)
+            errors[order] = validate(orders[order].candidate, records, settings)
             share = 0.0 if order > best else MATTERS
-            far = mine.far_better_than(errors[chosen])
-            if far or mine.clearly_better_than(errors[chosen], _DOUBT, share):
+            if errors[order].clearly_better_than(errors[chosen], _DOUBT, share):
                 chosen = order
     candidate = orders[chosen].candidate
     rows = _rows(orders, records, errors)

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.data.preparation import limit_of, remove_trends
+from lpvlearn.data.preparation import remove_trends, stays_at_limits
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace.fit import check_options, fit_pairs, warn_about
 from lpvlearn.systems.simulation import lti_response
@@ -369,14 +369,23 @@ def test_an_output_at_its_limit_is_told():
     y = lfilter([0.0, 0.1], [1.0, -0.9], u, axis=0)
     y += 0.01 * rng.standard_normal(y.shape)
     SubspaceLTI().fit(u, y)
-    step = np.repeat([0.0, 1.0, 0.0], [100, 200, 200])[:, None]
-    rest = lfilter([0.0, 0.1], [1.0, -0.9], step[:, 0]).round(3)
-    assert limit_of([rest], [step]) is None  # at rest, as the input
-    limit = np.quantile(y, 0.9)
-    with pytest.warns(UserWarning, match="Output 1 stays at .* missing='split'"):
-        SubspaceLTI().fit(u, np.minimum(y, limit))
-    y[y > limit] = np.nan
+    low, high = np.quantile(y, [0.2, 0.9])
+    for detrend in (None, "linear"):
+        for least in (low, -np.inf):
+            with pytest.warns(UserWarning, match=f"Output 1 stays at .*{high:.6g} for"):
+                SubspaceLTI(detrend=detrend).fit(u, np.clip(y, least, high))
+    y[y > high] = np.nan
     SubspaceLTI(missing="split").fit(u, y)
+
+
+def test_an_output_at_rest_is_at_no_limit():
+    """Though its sensor is coarse, and inputs move that do not drive it."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.integers(0, 2, (200, 2)), 5, axis=0).astype(float)
+    u[500:, 0], u[:500, 1] = 0.0, 0.0
+    y = lfilter([0.0, 0.1], [1.0, -0.9], u, axis=0).round(2)
+    assert len(stays_at_limits([y[:, 0]])[0]) == 1
+    SubspaceLTI().fit(u, y)
 
 
 def test_a_decay_that_is_not_known_is_told():

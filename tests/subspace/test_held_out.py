@@ -156,7 +156,6 @@ def test_what_common_unknowns_hide_is_not_forgotten():
             for part in (without, light)
         )
         assert mine.clearly_better_than(others, 0.0) == better
-        assert others.far_better_than(mine) != better
 
 
 def test_what_moves_in_one_piece_alone_is_not_held_out(rng):

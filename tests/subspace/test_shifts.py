@@ -110,21 +110,19 @@ def test_a_record_is_cut_as_by_hand():
     assert len(whole.initial_states_) == 1
 
 
-def test_a_record_is_not_cut_where_parts_held_out_are_simulated_worse(monkeypatch):
-    """As where noise alone explains what moves between the cuts."""
+def test_cuts_that_leave_inputs_nothing_to_explain_are_not_made(monkeypatch):
+    """Noise may explain, one step ahead, all that moves between them."""
     rng = np.random.default_rng(3)
     u, y = slow_record(rng, 900)
-    y = y + np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
-    errors = fit._held_out
-    monkeypatch.setattr(
-        fit,
-        "_held_out",
-        lambda fitted, choices: errors(fitted, choices)._replace(
-            bft=80.0 if len(fitted.scaled.records) > 1 else 90.0
-        ),
-    )
+    y = y + 0.1 * np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
+
+    def fitted(pairs, choices, *args, like=fit._fit):
+        order = 0 if len(pairs) > 1 else choices.order
+        return like(pairs, choices._replace(order=order), *args)
+
+    monkeypatch.setattr(fit, "_fit", fitted)
+    monkeypatch.setattr(fit, "shifts_matter", lambda whole, parts: True)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", "A mode of the model|The model simulates")
+        warnings.simplefilter("ignore", UserWarning)  # of what the shifts do
         found = SubspaceLTI().fit(u, y)
-    assert len(found.initial_states_) == 1
+    assert found.order_ > 0 and len(found.initial_states_) == 1
