@@ -294,11 +294,13 @@ def _tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) 
         with np.errstate(over="ignore", invalid="ignore"):
             moves = [model.outputs(r, k)[:, i] for k, r in enumerate(records)]
             least = _MOVES_ON * np.std(np.concatenate(moves))
+        if not 0.0 < least < np.inf:  # what it does is no number
+            continue
         passed = [
             (y[start, i], stop - start)
             for y, expected, parts in zip(outputs, moves, stays, strict=True)
             for start, stop in parts
-            if np.std(expected[start:stop]) > least > 0.0
+            if np.std(expected[start:stop]) > least
         ]
         n_passed = sum(n for _, n in passed)
         if n_passed > _AT_LIMITS * sum(map(len, outputs)):
@@ -308,10 +310,10 @@ def _tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) 
             tell(
                 told,
                 "limit",
-                f"Output {i + 1} stays at {values} for {n_passed} "
-                "samples in which its model moves on: it is at a limit, of its sensor "
-                "or of the plant, as no linear system has one. Set these samples to "
-                "NaN and use missing='split', or record within the limits.",
+                f"Output {i + 1} stays at {values} for {n_passed} samples in which "
+                "its model moves on: it is at a limit, of its sensor or of the plant, "
+                "as no linear system has one. Set these samples to NaN and use "
+                "missing='split', or record within the limits.",
             )
             return
 
