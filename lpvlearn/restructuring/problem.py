@@ -20,6 +20,7 @@ from scipy.linalg import block_diag, qr
 from ..models.statespace import DEVIATION, StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
+from ..systems.least_squares import column_scale
 from ..validation import weights
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, series
@@ -238,8 +239,7 @@ class RestructuringProblem:
         WJ = np.einsum("kpq,kqmj->kpmj", W, J)
         flat = WJ.reshape(-1, J.shape[-1])
         columns = np.vstack([flat.real, flat.imag])
-        unit = np.linalg.norm(columns, axis=0)
-        unit = np.where(unit > 0, unit, 1.0)
+        unit = column_scale(columns)
         inverse = np.linalg.pinv(columns / unit) / unit[:, None]
         real, imaginary = np.split(inverse, 2, axis=1)
         K = (real + 1j * imaginary).reshape(-1, *WJ.shape[:-1])
@@ -736,8 +736,7 @@ def _scaled_svd(J: Complex) -> tuple[Array, Array, Array]:
     flat = J.reshape(int(np.prod(J.shape[:-1])), n)
     # rows of zeros: few frequencies must not hide undetermined combinations
     columns = np.vstack([flat.real, flat.imag, np.zeros((n, n))])
-    unit = np.linalg.norm(columns, axis=0)
-    unit = np.where(unit > 0, unit, 1.0)
+    unit = column_scale(columns)
     _, s, Vt = np.linalg.svd(columns / unit, full_matrices=False)
     return unit, s, Vt
 

@@ -283,30 +283,25 @@ def _tell_of_held_outputs(outputs: Sequence[Array], told: set[str]) -> None:
 
 def _tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) -> None:
     """Tell of an output that stays at a limit where its model moves on."""
-    model = fitted.evidence.model
-    for i in range(outputs[0].shape[1]):
-        stays = stays_at_limits([y[:, i] for y in outputs])
-        if not any(stays):
-            continue
-        if len(model.initial_states) != len(outputs):
-            return
-        records = fitted.scaled.records
-        with np.errstate(over="ignore", invalid="ignore"):
-            moves = [model.outputs(r, k)[:, i] for k, r in enumerate(records)]
-            least = _MOVES_ON * np.std(np.concatenate(moves))
-        if not 0.0 < least < np.inf:  # what it does is no number
-            continue
+    model, records = fitted.evidence.model, fitted.scaled.records
+    stays = [
+        stays_at_limits([y[:, i] for y in outputs]) for i in range(outputs[0].shape[1])
+    ]
+    if not any(map(any, stays)) or len(model.initial_states) != len(records):
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        moves = [model.outputs(record, k) for k, record in enumerate(records)]
+        least = _MOVES_ON * np.std(np.vstack(moves), axis=0)
+    for i in np.flatnonzero(np.isfinite(least)):
         passed = [
             (y[start, i], stop - start)
-            for y, expected, parts in zip(outputs, moves, stays, strict=True)
+            for y, moved, parts in zip(outputs, moves, stays[i], strict=True)
             for start, stop in parts
-            if np.std(expected[start:stop]) > least
+            if np.std(moved[start:stop, i]) > least[i]
         ]
         n_passed = sum(n for _, n in passed)
         if n_passed > _AT_LIMITS * sum(map(len, outputs)):
-            values = ", ".join(
-                f"{value:.6g}" for value in sorted({v for v, _ in passed})
-            )
+            values = ", ".join(f"{v:.6g}" for v in sorted({v for v, _ in passed}))
             tell(
                 told,
                 "limit",
@@ -315,7 +310,6 @@ def _tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) 
                 "as no linear system has one. Set these samples to NaN and use "
                 "missing='split', or record within the limits.",
             )
-            return
 
 
 def _with_constants(
@@ -362,8 +356,7 @@ def _without_shifts(
     if not shifts_matter(whole.evidence.one_step, fitted.evidence.one_step):
         return pairs, whole
     if whole.selection.order and not fitted.selection.order:
-        left, before = (100.0 - _held_out(f, choices).bft for f in (fitted, whole))
-        if left > before:
+        if _held_out(fitted, choices).bft < _held_out(whole, choices).bft:
             return pairs, whole
     samples = "; ".join(
         f"{', '.join(map(str, cuts))}{f' of experiment {k}' if len(pairs) > 1 else ''}"
