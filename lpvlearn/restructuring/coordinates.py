@@ -51,17 +51,17 @@ def metric_coordinates(J: Complex, size: float) -> Array:
     """
     flat = J.reshape(-1, J.shape[3]) / np.sqrt(len(J))
     R = np.asarray(np.linalg.qr(np.vstack([flat.real, flat.imag]), mode="r"))
-    unit = _units(R)
+    unit = _units(np.linalg.norm(R, axis=0))
     _, s, Vt = np.linalg.svd(R / unit)
     s = np.maximum(s, _FIT_CAP * s.max(initial=0.0))
     s = np.where(s > 0, s, 1.0)
     return Vt.T * (size / s) / unit[:, None]
 
 
-def _units(R: Array) -> Array:
-    """Lengths of the columns, not zero."""
-    unit = np.linalg.norm(R, axis=0)
-    return np.where(unit > 0, unit, max(float(unit.max(initial=0.0)), 1e-300))
+def _units(lengths: Array) -> Array:
+    """Lengths of columns, those that are zero as the longest."""
+    longest = max(float(lengths.max(initial=0.0)), 1e-300)
+    return np.where(lengths > 0, lengths, longest)
 
 
 class ResponseGeometry:
@@ -92,19 +92,19 @@ class ResponseGeometry:
         self._shape = (k, p, m)
         self.changes = derivatives(self.L, self.S, self.at.R)
         flat = self.changes.reshape(-1, q)
-        J = np.concatenate([flat.real, flat.imag]) / np.sqrt(k)
-        metric = J / size
+        self._scale = size * np.sqrt(k)
+        J = np.concatenate([flat.real, flat.imag]) / self._scale
+        metric = gram = J.T @ J
         if pull is not None:
-            metric = np.concatenate([metric, pull / _REACH])
-        unit = _units(metric)
-        metric = metric / unit
-        squares, V = np.linalg.eigh(metric.T @ metric)
+            metric = metric + pull.T @ pull / _REACH**2
+        unit = _units(np.sqrt(np.diag(metric)))
+        squares, V = np.linalg.eigh(metric / np.outer(unit, unit))
         s = np.sqrt(np.maximum(squares, _METRIC_CAP**2 * squares.max(initial=0.0)))
         s = np.where(s > 0, s, 1.0)
         self.T = V / s / unit[:, None]
         self.inverse = (V * s).T * unit
-        self._J = J @ self.T
-        self._gram = self._J.T @ self._J + _DAMPING * size**2 * np.eye(q)
+        self._J = J
+        self._gram = self.T.T @ gram @ self.T + _DAMPING * np.eye(q)
 
     def _solve(self, g: Array) -> Array:
         return np.asarray(np.linalg.solve(self._gram, g))
@@ -117,15 +117,16 @@ class ResponseGeometry:
         if self._bend is not None:
             bend = np.tensordot(v, np.tensordot(v, self._bend, axes=1), axes=1)
             second = second + self.L @ bend @ at.R
-        flat = second.ravel() / np.sqrt(len(second))
-        return -self._solve(self._J.T @ np.concatenate([flat.real, flat.imag]))
+        flat = second.ravel() / self._scale
+        pulled = self._J.T @ np.concatenate([flat.real, flat.imag])
+        return -self._solve(self.T.T @ pulled)
 
     def tangential(self, gradient: Array) -> Complex:
         """The covector of the response with that gradient in y and no normal part.
 
         As ``P = R V^H L``, shape (k, n + n_inputs, n + n_outputs), for the covector V.
         """
-        flat = self._J @ self._solve(gradient) / np.sqrt(self._shape[0])
+        flat = self._J @ (self.T @ self._solve(gradient)) / self._scale
         half = len(flat) // 2
         V = (flat[:half] + 1j * flat[half:]).reshape(self._shape)
         return self.at.R @ V.conj().swapaxes(1, 2) @ self.L

@@ -36,6 +36,8 @@ _RESPONSE_ROUNDING = 1e-12  # of a response, whose digits the error has lost
 # input, are taken entry by entry: ten times faster for canonical forms of 24 states.
 _FEW = 25
 
+_CACHED = 100_000  # numbers that stay in a cache between two products of matrices
+
 # singular values are told apart down to that fraction of the largest: their gap divides
 _GAP = 1e-10
 
@@ -152,15 +154,19 @@ def derivatives(L: Complex, S: Array, R: Complex) -> Complex:
         entries = (S[j, a, b] * R.swapaxes(1, 2)[:, :, b])[:, None] * L[:, :, None, a]
         one_each = len(j) == len(S)
         return entries if one_each else np.add.reduceat(entries, starts[:-1], axis=3)
-    # contract the short axes first, (k, p, a) (j, a, b) -> (k, p, j, b), real and
+    # contract the short axes first, (k, p, a) (a, j, b) -> (k, p, j, b), real and
     # imaginary parts apart: S is real, which halves the work
-    m = R.shape[2]
-    left = np.tensordot(np.stack([L.real, L.imag]), S, axes=(3, 1))
-    parts = left.reshape(2, k, p * len(S), -1) @ np.concatenate([R.real, R.imag], 2)
-    changes = np.empty((k, p * len(S), m), complex)
-    changes.real = parts[0, :, :, :m] - parts[1, :, :, m:]
-    changes.imag = parts[0, :, :, m:] + parts[1, :, :, :m]
-    return changes.reshape(k, p, len(S), m).swapaxes(2, 3)
+    m, (q, rows, columns) = R.shape[2], S.shape
+    S = S.transpose(1, 0, 2).reshape(rows, q * columns)
+    L, R = np.concatenate([L.real, L.imag], 1), np.concatenate([R.real, R.imag], 2)
+    changes = np.empty((k, p, m, q), complex)
+    some = max(1, _CACHED // (2 * p * S.shape[1]))
+    for at in (slice(i, i + some) for i in range(0, k, some)):
+        left = (L[at].reshape(-1, rows) @ S).reshape(-1, 2 * p * q, columns)
+        parts = (left @ R[at]).reshape(-1, 2, p, q, 2, m).swapaxes(3, 5)
+        changes.real[at] = parts[:, 0, :, :, 0] - parts[:, 1, :, :, 1]
+        changes.imag[at] = parts[:, 0, :, :, 1] + parts[:, 1, :, :, 0]
+    return changes
 
 
 def remembering(f: Callable[[NDArray], Any], points: int = 4) -> Callable[..., Any]:
