@@ -294,6 +294,9 @@ display = BodeDisplay.from_models(
 #   means over the sample to come know the next inputs, too. "auto" then leaves D free,
 #   or takes ``"po-moesp"``, where parts held out speak clearly for it, and says both
 #   figures. Give the outputs a sample later if that is what happened.
+# * Outputs that lead the inputs by several samples, as clocks that differ or filters of
+#   the inputs alone make them, know what is to come as well. If later inputs explain
+#   parts held out ten times better (squared errors), a warning says how much later.
 
 in_loop.predictor_.K.round(2)
 

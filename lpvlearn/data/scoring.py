@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import fdtrc
 from sklearn.metrics import r2_score
 
-from ..exceptions import collected, warn
-from ..validation import squarable, weights
+from ..exceptions import DivergenceError, collected, warn
+from ..validation import SQUARED, squarable, weights
 from .alignment import align_outputs
 from .experiments import read_outputs
 
@@ -55,7 +55,16 @@ def score_from_rest(
         weight = weights(sample_weight, len(measured))[known]
         weights(weight, len(weight), "measured row")
     squarable("y", measured[known])
-    score = r2_score(measured[known], simulated[known], sample_weight=weight)
+    with np.errstate(over="ignore"):
+        score = r2_score(measured[known], simulated[known], sample_weight=weight)
+    if score == -np.inf:
+        row, i = np.unravel_index(np.argmax(np.abs(simulated)), simulated.shape)
+        raise DivergenceError(
+            f"the simulation diverges: output {i} is {simulated[row, i]:.4g} in row "
+            f"{row}, beyond what R2 can tell. BFT and VAF are 0 then "
+            "(`make_bft_scorer`). An unstable model predicts (`predict_ahead`), but "
+            "does not simulate for long."
+        )
     warn_of_motion(estimator, X, y, simulated)
     return float(score)
 
@@ -104,6 +113,8 @@ def _starts_in_motion(
     before, after = ((measured - x) / size for x in (from_rest, estimated))
     before, after = (np.where(known, x, 0.0) for x in (before, after))
     transient = before - after
+    if not np.abs(transient).max() < np.sqrt(SQUARED):  # it diverges
+        return False
     errors = [np.minimum(np.linalg.norm(x, axis=0), 1.0) for x in (before, after)]
     if 100.0 * np.mean(errors[0] - errors[1]) <= _GAIN:
         return False

@@ -220,6 +220,27 @@ def first_answers(pairs: Pairs, longest: int) -> Delay:
     return found
 
 
+def find_lead(pairs: Pairs) -> int:
+    """By how many samples the outputs may lead the inputs: 0 where they do not.
+
+    The latest input that certainly shows in an output, where some are still to come.
+    """
+    pairs = _head(pairs)
+    most = min(LONGEST, max(len(u) for u, _ in pairs) // _SHARE)
+    answers = first_answers(with_later_inputs(pairs, most), most)
+    return max(0, most - int(np.min(answers[answers >= 0], initial=most)))
+
+
+def with_later_inputs(pairs: Pairs, lead: int) -> Pairs:
+    """Outputs beside the inputs that come `lead` samples after them.
+
+    >>> u = np.arange(5.0)[:, None]
+    >>> with_later_inputs([(u, u)], 2)[0][0].ravel()
+    array([2., 3., 4.])
+    """
+    return [(u[lead:], y[: len(y) - lead]) for u, y in pairs if len(u) > lead + 1]
+
+
 class _Size(NamedTuple):
     """How many parameters a model has: sizes are in their order."""
 

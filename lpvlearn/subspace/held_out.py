@@ -37,6 +37,8 @@ _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 # By which an error must be less to matter, and by which it is so beyond doubt.
 MATTERS, _MUCH = 0.03, 0.5
 
+_GROWS = 1.001  # modulus of a pole by which its mode is one that grows
+
 _FAR_MORE = 4.0  # times the errors: more than an initial state takes of slow noise
 
 
@@ -153,18 +155,28 @@ def _answers(
     """Outputs to inputs (n_samples, n_inputs), and to what is unknown.
 
     Modes that grow are simulated backward, from rest at the end: the free responses
-    make up for it, and neither overflows.
+    make up for it, and neither overflows. NaN of a model whose poles are rounding.
     """
     A, B, C, D = model[:4]
-    if at_rest or not np.abs(np.linalg.eigvals(A)).max(initial=0.0) > 1.0:
+    sizes = np.abs(np.linalg.eigvals(A))
+    # They are told from others in the widest gap: rounding moves poles on the circle.
+    edges = np.sort(sizes[(sizes > 1.0) & (sizes < _GROWS)])
+    edges = np.concatenate([[1.0], edges, [_GROWS]])
+    widest = int(np.argmax(np.diff(edges)))
+    limit = edges[widest : widest + 2].mean()
+    if at_rest or not sizes.max(initial=0.0) > limit:
         free = free_responses(A, C, len(u), trend)
         return lti_response(A, B, C, D, u), free[:, :, len(A) * at_rest :]
-    R, Z, k = linalg.schur(A, sort="iuc")
-    X = np.zeros((k, len(A) - k))
-    if X.size:  # older versions of scipy refuse an equation without unknowns
-        X = linalg.solve_sylvester(R[:k, :k], -R[k:, k:], -R[:k, k:])
+    try:
+        R, Z, k = linalg.schur(A, sort=lambda re, im=0.0: np.hypot(re, im) < limit)
+        X = np.zeros((k, len(A) - k))
+        if X.size:  # older versions of scipy refuse an equation without unknowns
+            X = linalg.solve_sylvester(R[:k, :k], -R[k:, k:], -R[:k, k:])
+        back = np.linalg.inv(R[k:, k:])
+    except np.linalg.LinAlgError:  # others after they have changed places
+        return np.full((len(u), len(C)), np.nan), np.zeros((len(u), len(C), 0))
     left, right = Z.T[:k] - X @ Z.T[k:], Z[:, :k] @ X + Z[:, k:]
-    back, C_stable, C_growing = linalg.inv(R[k:, k:]), C @ Z[:, :k], C @ right
+    C_stable, C_growing = C @ Z[:, :k], C @ right
     into, seen = back @ Z.T[k:] @ B, C_growing @ back
     answer = lti_response(R[:k, :k], left @ B, C_stable, D, u)
     answer += lti_response(back, -into, seen, -C_growing @ into, u[::-1])[::-1]

@@ -324,6 +324,7 @@ def sampled_early(seed, n_samples=400):
     return u[:-1], 0.5 * (y[:-1] + y[1:]) + noise
 
 
+@pytest.mark.filterwarnings("ignore:Inputs that come 1 sample")
 def test_auto_gives_up_what_parts_held_out_refute():
     for seed in range(3):
         (u, y), (u_other, y_other) = sampled_early(seed), sampled_early(seed + 9)
@@ -354,6 +355,7 @@ def modes_sampled_early(seed, n_samples=500):
     return u[:-1], y + 0.005 * y.std() * rng.standard_normal(y.shape)
 
 
+@pytest.mark.filterwarnings("ignore:Inputs that come 1 sample")
 def test_a_free_d_that_only_makes_the_plant_stable_competes_with_the_open_loop():
     for seed in (0, 1):
         u, y = modes_sampled_early(seed)
@@ -368,6 +370,29 @@ def test_a_free_d_that_only_makes_the_plant_stable_competes_with_the_open_loop()
             for m in (model, free)
         )
         assert error < of_that
+
+
+@pytest.mark.parametrize("lead", [3, 6])
+def test_outputs_that_lead_the_inputs_are_told(lead):
+    rng = np.random.default_rng(lead)
+    for pole in (0.0, 0.9):
+        u = lfilter([1.0], [1.0, -pole], rng.standard_normal((800, 2)), axis=0)
+        y = lfilter([0.0, 1.0], [1.0, -1.5, 0.7], u @ [[1.0], [0.5]], axis=0)
+        y += 0.05 * y.std() * rng.standard_normal(y.shape)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            SubspaceLTI().fit(u[:-lead], y[lead:])
+        # what leads by a sample less than the plant needs is its feedthrough
+        (message,) = [str(w.message) for w in told if "lead the inputs" in str(w)]
+        assert f"come {lead - 1} sample(s) after the outputs" in message
+
+
+def test_the_inputs_of_a_loop_with_a_reference_do_not_come_too_late():
+    for seed in range(3):
+        u, y = closed_loop(np.random.default_rng(seed), 2000)
+        with pytest.warns(UserWarning) as told:
+            SubspaceLTI().fit(u, y)
+        assert not any("lead the inputs" in str(w.message) for w in told)
 
 
 def slow_plant_in_a_loop(seed, n_samples=1000):

@@ -103,6 +103,31 @@ def test_of_short_experiments_whole_ones_are_held_out(rng):
     assert out == [{40, 25}, {35}, {30}]
 
 
+@pytest.mark.parametrize("pole", [1.0, 1.0 + 1e-16, 1.0 + 1e-12, 1.0 + 1e-9, 1.0005])
+def test_integrators_are_no_modes_that_grow(rng, pole):
+    """Rounding moves several poles at one to either side of the circle."""
+    T = rng.standard_normal((5, 5))
+    A = T @ linalg.block_diag(np.diag(np.full(3, pole)) + np.eye(3, k=1), 0.5, 1.2)
+    A = np.linalg.solve(T.T, A.T).T
+    system = (A, rng.standard_normal((5, 1)), rng.standard_normal((1, 5)), np.eye(1))
+    u, y = experiment(rng, system, 40)
+    model = Realization(*system, np.zeros((1, 5)), 0.0)
+    error = held_out(lambda train: model, [Record.of(u, y)])
+    assert error.bft > 99.99
+
+
+def test_a_model_whose_poles_are_rounding_is_no_better_than_any(rng):
+    poles = rng.uniform(0.5, 1.5, 12)
+    A = np.diag(poles) + 1e15 * np.triu(rng.standard_normal((12, 12)), 1)
+    T = linalg.qr(rng.standard_normal((12, 12)))[0]
+    model = Realization(
+        T @ A @ T.T, np.ones((12, 1)), np.ones((1, 12)), np.eye(1), np.zeros((1, 12)), 0
+    )
+    u, y = rng.standard_normal((2, 1, 60))
+    error = held_out(lambda train: model, [Record.of(u.T, y.T)])
+    assert error.bft == 0.0
+
+
 def errors_of(*blocks):
     """Parts held out of errors given, a block of ten samples for each."""
     error = np.concatenate([np.full((10, 1), block) for block in blocks])
