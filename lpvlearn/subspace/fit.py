@@ -42,6 +42,7 @@ from .offsets import (
     Offsets,
     attributed,
     constants_matter,
+    follows_means_alone,
     may_have_constants,
     shifts_matter,
     with_levels,
@@ -310,8 +311,9 @@ def _tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) 
                 "limit",
                 f"Output {i + 1} stays at {values} for {n_passed} samples in which "
                 "its model moves on: it is at a limit, of its sensor or of the plant, "
-                "as no linear system has one. Set these samples to NaN and use "
-                "missing='split', or record within the limits.",
+                "as no linear system has one. Record within the limits. Or compare "
+                "with a fit that leaves them out (NaN, missing='split'), if what is "
+                "between them is long: each part has an initial state of its own.",
             )
 
 
@@ -344,6 +346,7 @@ def _without_shifts(
 
     One step ahead, where noise alone explains all that moves slowly: parts that leave
     inputs nothing to explain must simulate as much of what is held out as the whole.
+    Short ones hide in their initial states that a mode would grow.
     """
     feedback = whole.feedback
     if feedback is None:
@@ -357,6 +360,8 @@ def _without_shifts(
     except TooFewSamples:
         return pairs, whole
     if not shifts_matter(whole.evidence.one_step, fitted.evidence.one_step):
+        return pairs, whole
+    if _grows(fitted) and not _grows(whole):
         return pairs, whole
     if whole.selection.order and not fitted.selection.order:
         if _held_out(fitted, choices).bft < _held_out(whole, choices).bft:
@@ -658,7 +663,7 @@ def _tell_of_feedback(
         if loop and choices.feedthrough is True:
             what += (
                 f" {within}: D = 0 was taken. If the controller needs a sample to "
-                "answer, use method='pbsid', which leaves D free."
+                "answer, say method='pbsid' yourself, which leaves D free."
             )
         what += (
             " A model that is only to simulate records of the same loop may do so "
@@ -843,6 +848,14 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             f"error is {100.0 * residual:.0f} % of their size. Try a longer "
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
+        )
+    elif follows_means_alone(fitted.evidence):
+        tell(
+            told,
+            "useless",
+            "The model explains where the outputs stay, and next to nothing of how "
+            "they move. Try offset='constant', order='auto' or a longer `horizon`, and "
+            "check that inputs and outputs belong together and in the order of time.",
         )
     _warn_of_spikes(fitted, told)
     choice_is_told = TESTS <= told or residual > _USELESS

@@ -39,6 +39,7 @@ from .simulation_fit import (
     in_sections,
     jacobian_regression,
     project_out,
+    simulation_errors,
 )
 from .statistics import Evidence
 
@@ -54,6 +55,8 @@ _SUSPICIOUS, _SIGNIFICANT = 1e-2, 1e-3
 # By which the criterion is better with a chance of 1e-7; and the chance by the test of
 # the constants, above which that says more of poor models than of constants.
 CERTAIN, _LIKELY = 30.0, 0.5
+
+_USELESS = 0.9  # errors, relative, that explain next to nothing
 
 _MOSTLY = 0.5  # part of the squared errors; noise of long memory has a quarter at most
 
@@ -160,6 +163,23 @@ def _stays_far(records: Sequence[Record]) -> bool:
     return _is_far(records) and bool((begins > 0.5 * np.abs(level))[far].all())
 
 
+def follows_means_alone(evidence: Evidence) -> bool:
+    """Whether a model without constants explains no more than where outputs stay."""
+    stays = not evidence.free.n_trend and _stays_far(evidence.records)
+    return stays and _motion_left(evidence) > _USELESS**2
+
+
+def _motion_left(evidence: Evidence) -> float:
+    """Part of the outputs' motion about their means, squared, that a model leaves."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.vstack(simulation_errors(evidence.model, evidence.records))
+        left = np.sum(errors**2, axis=0)
+    motion = np.sum([r.u.shape[1] * r.y.var(axis=1) for r in evidence.records], axis=0)
+    moves = motion > 0.0
+    part = float(np.mean(left[moves] / motion[moves])) if moves.any() else 0.0
+    return part if np.isfinite(part) else np.inf
+
+
 def _levels(parts: Sequence[Array]) -> tuple[Array, Array]:
     """Size of the means of every channel, and of its motion about them."""
     n = sum(part.shape[1] for part in parts)
@@ -181,12 +201,16 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     static gain or a slow mode follows their means, which the criterion hardly minds and
     little excitation does not refute. They are left out where their test takes them for
     zero, or the criterion says that the model with them is a poor one: the other is one
-    with zeros.
+    with zeros. They are kept where they halve the squared errors of as many states: too
+    few of them follow the means, and leave to the noise how outputs move.
     """
     better = _criterion(without) - _criterion(other)
     if better > 0.0 and len(other.model.A) < len(without.model.A):
         return True
     far = _stays_far(without.records)
+    if far and _motion_left(other) < _MOSTLY * _motion_left(without):
+        if len(other.model.A) <= len(without.model.A) and not _grows(other):
+            return True
     if not better > (-CERTAIN if far else 0.0):
         return False
     chance = chance_of_constants(other)
@@ -220,6 +244,10 @@ def _has_slow_mode(evidence: Evidence) -> bool:
     longest = max(record.u.shape[1] for record in evidence.records)
     rates = 1.0 - np.linalg.eigvals(evidence.model.A).real
     return bool((rates * longest <= _SLOW).any())
+
+
+def _grows(evidence: Evidence) -> bool:
+    return bool(np.abs(np.linalg.eigvals(evidence.model.A)).max(initial=0.0) > 1.0)
 
 
 def chance_of_constants(evidence: Evidence, *, equal: bool = False) -> float:

@@ -254,7 +254,10 @@ def _search(
         if order in orders:
             errors[order] = validate(orders[order].candidate, records, settings)
             share = 0.0 if order > best else MATTERS
-            if errors[order].clearly_better_than(errors[chosen], _DOUBT, share):
+            tells = errors[order].bft > 0.0  # or inputs rest where it is held out
+            if tells and errors[order].clearly_better_than(
+                errors[chosen], _DOUBT, share
+            ):
                 chosen = order
     candidate = orders[chosen].candidate
     rows = _rows(orders, records, errors)

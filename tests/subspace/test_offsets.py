@@ -482,3 +482,22 @@ def test_rough_models_do_not_hide_constants(choice):
         model = SubspaceLTI(3, horizon=10, feedthrough=False, **choice).fit(u, y)
         assert model.offset_ == "constant"
         assert error_of(model) < 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3, 4])
+def test_too_few_states_do_not_follow_the_level(seed):
+    """Of a record far from zero, a state that stands for it is not there to move."""
+    rng = np.random.default_rng(seed)
+    u = lfilter([1.0], [1.0, -0.97], rng.standard_normal((300, 1)), axis=0)
+    y = 53.0 - lfilter([0.0, 0.0, 0.0, 0.5, 0.4], [1.0, -0.6], u, axis=0)
+    y += lfilter([0.3], [1.0, -1.5, 0.6], rng.standard_normal((300, 1)), axis=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of lacking states
+        model = SubspaceLTI(1).fit(u, y)
+    assert model.offset_ == "constant"
+    assert np.std(y - model.predict_with_initial_state(u, y)) < 0.3 * np.std(y)
+    if seed in (0, 3):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            SubspaceLTI(1, offset=None).fit(u, y)
+        assert any("nothing of how they move" in str(w.message) for w in told)

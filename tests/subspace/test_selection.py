@@ -5,6 +5,8 @@ import pytest
 from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI
+from lpvlearn.subspace import selection
+from lpvlearn.subspace.held_out import HeldOut, Part
 from lpvlearn.subspace.identification import Settings
 from lpvlearn.subspace.selection import (
     _horizon_grid,
@@ -141,6 +143,21 @@ def test_parts_held_out_decide_where_the_criterion_hardly_does():
         if chosen.order > least:
             assert close[chosen.order] > close[least]
     assert n_close > 0
+
+
+@pytest.mark.parametrize("bft, order", [(0.0, 3), (20.0, 1)])
+def test_parts_that_no_order_explains_do_not_refute_one(monkeypatch, bft, order):
+    """Inputs that rest where parts are held out tell nothing of what they drive."""
+
+    def validate(candidate, records, settings):
+        n = len(candidate.model.A)
+        error = (1.0 + n) * np.ones((50, 2))
+        part = Part(error, np.zeros((50, 2, 0)), np.eye(2))
+        return HeldOut([part], bft, float((error**2).sum()))
+
+    monkeypatch.setattr(selection, "validate", validate)
+    chosen = select([coloured(0, 600)], None, None, Settings(freedom(2, 1)))
+    assert chosen.order == order
 
 
 def test_losses_do_not_rise_with_the_order():

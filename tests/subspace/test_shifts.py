@@ -1,6 +1,7 @@
 """Shifts of level: found where they are, and nowhere else; cut as by hand."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -126,3 +127,27 @@ def test_cuts_that_leave_inputs_nothing_to_explain_are_not_made(monkeypatch):
         warnings.simplefilter("ignore", UserWarning)  # of what the shifts do
         found = SubspaceLTI().fit(u, y)
     assert found.order_ > 0 and len(found.initial_states_) == 1
+
+
+def test_cuts_that_make_a_stable_model_grow_are_not_made(monkeypatch):
+    """Initial states of the parts hide that their modes do not grow."""
+    rng = np.random.default_rng(3)
+    u, y = slow_record(rng, 900)
+    y = y + 0.1 * np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
+
+    def fitted(pairs, *args, like=fit._fit):
+        found = like(pairs, *args)
+        if len(pairs) == 1:
+            return found
+        evidence = found.evidence
+        grown = evidence.model._replace(A=1.5 * evidence.model.A)
+        evidence = replace(evidence, model=grown)
+        return found._replace(evidence=evidence, model=grown)
+
+    monkeypatch.setattr(fit, "_fit", fitted)
+    monkeypatch.setattr(fit, "shifts_matter", lambda whole, parts: True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of what the shifts do
+        found = SubspaceLTI(2).fit(u, y)
+    assert len(found.initial_states_) == 1
+    assert np.abs(found.lti_.poles()).max() < 1.0
