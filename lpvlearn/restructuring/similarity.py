@@ -32,6 +32,8 @@ _NULL_TOLERANCE = 1e-6
 # A start ends when its squared distance falls by less than _SLOW that often in a row:
 # far from the structure progress is slow and then fast again.
 _SLOW, _PATIENCE = 1e-4, 4
+_FINEST = 3e-16  # tolerances of what units may make small
+
 _ROUNDING = 1e-24  # squared distance, relative to the structure: it is reached exactly
 
 
@@ -283,6 +285,9 @@ def minimise_bilinear(
         equations.jacobian,
         bounds=limits,
         x_scale="jac",
+        ftol=_FINEST,
+        xtol=_FINEST,
+        gtol=_FINEST,
         max_nfev=max(max_iter, 1),
     )
     theta, active = found.x[equations.n**2 :], found.active_mask[equations.n**2 :]
