@@ -55,15 +55,18 @@ def score_from_rest(
         weight = weights(sample_weight, len(measured))[known]
         weights(weight, len(weight), "measured row")
     squarable("y", measured[known])
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         score = r2_score(measured[known], simulated[known], sample_weight=weight)
-    if score == -np.inf:
-        row, i = np.unravel_index(np.argmax(np.abs(simulated)), simulated.shape)
+    if not np.isfinite(score) and known.sum() > 1:
+        rows = np.flatnonzero(known)
+        at = np.argmax(np.abs(simulated[rows]))
+        row, i = rows[at // simulated.shape[1]], at % simulated.shape[1]
         raise DivergenceError(
-            f"the simulation diverges: output {i} is {simulated[row, i]:.4g} in row "
-            f"{row}, beyond what R2 can tell. BFT and VAF are 0 then "
-            "(`make_bft_scorer`). An unstable model predicts (`predict_ahead`), but "
-            "does not simulate for long."
+            f"R2 is beyond all numbers: output {i} is simulated as "
+            f"{simulated[row, i]:.4g} in row {row}, and measured as "
+            f"{measured[row, i]:.4g}. A simulation by an unstable model diverges: BFT "
+            "and VAF are 0 then (`make_bft_scorer`), and the model predicts "
+            "(`predict_ahead`)."
         )
     warn_of_motion(estimator, X, y, simulated)
     return float(score)

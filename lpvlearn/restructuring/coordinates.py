@@ -98,7 +98,7 @@ class ResponseGeometry:
         if pull is not None:
             metric = metric + pull.T @ pull / _REACH**2
         unit = _units(np.sqrt(np.diag(metric)))
-        squares, V = np.linalg.eigh(metric / np.outer(unit, unit))
+        squares, V = np.linalg.eigh(metric / unit / unit[:, None])
         s = np.sqrt(np.maximum(squares, _METRIC_CAP**2 * squares.max(initial=0.0)))
         s = np.where(s > 0, s, 1.0)
         self.T = V / s / unit[:, None]

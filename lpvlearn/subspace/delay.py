@@ -220,15 +220,16 @@ def first_answers(pairs: Pairs, longest: int) -> Delay:
     return found
 
 
-def find_lead(pairs: Pairs) -> int:
-    """By how many samples the outputs may lead the inputs: 0 where they do not.
+def find_lead(pairs: Pairs) -> tuple[int, int]:
+    """By how many samples the outputs may lead an input, and which one; 0 for none.
 
     The latest input that certainly shows in an output, where some are still to come.
     """
     pairs = _head(pairs)
     most = min(LONGEST, max(len(u) for u, _ in pairs) // _SHARE)
     answers = first_answers(with_later_inputs(pairs, most), most)
-    return max(0, most - int(np.min(answers[answers >= 0], initial=most)))
+    leads = np.where(answers < 0, 0, most - answers)
+    return int(leads.max()), int(leads.argmax())
 
 
 def with_later_inputs(pairs: Pairs, lead: int) -> Pairs:

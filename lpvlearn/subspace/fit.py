@@ -683,7 +683,7 @@ def _tell_of_lead(
     feedback, n_trend = fitted.feedback, fitted.evidence.free.n_trend
     if feedback is None or not feedback.found:
         return
-    lead = find_lead(pairs)
+    lead, latest = find_lead(pairs)
     if not lead:
         return
     plain = choices._replace(method="auto", offset=DETRENDS[n_trend])
@@ -693,18 +693,24 @@ def _tell_of_lead(
         return
     if other.feedback is None or other.feedback.found:
         return
+    # A reference of a few lines is the free motion of modes that do not decay.
+    longest = max(len(u) for u, _ in pairs)
+    if (
+        np.abs(np.linalg.eigvals(other.model.A)).max(initial=0.0)
+        > 1.0 - _LINE / longest
+    ):
+        return
     found, error = _held_out(other, plain), _held_out(fitted, choices)
-    share = _OF_NOISE if _grows(fitted) and not _grows(other) else _LED
-    if found.total < share * error.total:
+    if found.total < (_OF_NOISE if _grows(fitted) else _LED) * error.total:
         tell(
             told,
             "lead",
-            f"Inputs that come {lead} sample(s) after the outputs explain these far "
-            f"better than those before: with them a model without feedback simulates "
-            f"{found.bft:.3g} % of parts held out, this one {error.bft:.3g} %. Either "
-            "the outputs lead the inputs, by clocks or filters: move the inputs by as "
-            "much. Or a controller makes the inputs of the outputs and leaves little "
-            "to its reference: that must move more for a plant to be found.",
+            f"The outputs seem to know input {latest + 1} at least {lead} sample(s) "
+            "ahead: beside inputs that come so much later, a model without feedback "
+            f"simulates {found.bft:.3g} % of parts held out, this one {error.bft:.3g} "
+            "%. Either the outputs lead it, by clocks or filters: move it by as much. "
+            "Or a controller makes it of the outputs and leaves little to its "
+            "reference: that must move more for a plant to be found.",
         )
 
 
@@ -761,8 +767,9 @@ _WORSE = 1.2
 # Share of its motion by which a model moves where an output stays, and of the samples
 _MOVES_ON, _AT_LIMITS = 0.05, 0.01
 
-# Share of the squared errors that later inputs leave where the outputs lead them
-_LED = 0.1
+# Share of the squared errors that later inputs leave where the outputs lead them; time
+# constants per experiment of a mode that may be a line of a reference
+_LED, _LINE = 0.1, 3.0
 
 # Shares of the outputs' size left unexplained: that is reported; and that constants may
 # be the reason of
@@ -850,11 +857,13 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "together and in the order of time.",
         )
     elif follows_means_alone(fitted.evidence):
+        orders = {row.order for row in fitted.selection.rows}
+        higher = "" if len(orders) > 1 else ", order='auto'"
         tell(
             told,
             "useless",
             "The model explains where the outputs stay, and next to nothing of how "
-            "they move. Try offset='constant', order='auto' or a longer `horizon`, and "
+            f"they move. Try offset='constant'{higher} or a longer `horizon`, and "
             "check that inputs and outputs belong together and in the order of time.",
         )
     _warn_of_spikes(fitted, told)

@@ -58,6 +58,8 @@ CERTAIN, _LIKELY = 30.0, 0.5
 
 _USELESS = 0.9  # errors, relative, that explain next to nothing
 
+_FEW_STATES = 2  # none of which a model can spare for a level
+
 _MOSTLY = 0.5  # part of the squared errors; noise of long memory has a quarter at most
 
 _N_TESTED = 20  # experiments that the tests look at; more of them tell the same
@@ -201,15 +203,16 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     static gain or a slow mode follows their means, which the criterion hardly minds and
     little excitation does not refute. They are left out where their test takes them for
     zero, or the criterion says that the model with them is a poor one: the other is one
-    with zeros. They are kept where they halve the squared errors of as many states: too
-    few of them follow the means, and leave to the noise how outputs move.
+    with zeros. They are kept where they halve the squared errors of as few states:
+    these follow the means else, and leave to the noise how outputs move.
     """
     better = _criterion(without) - _criterion(other)
     if better > 0.0 and len(other.model.A) < len(without.model.A):
         return True
     far = _stays_far(without.records)
-    if far and _motion_left(other) < _MOSTLY * _motion_left(without):
-        if len(other.model.A) <= len(without.model.A) and not _grows(other):
+    few = len(other.model.A) <= min(len(without.model.A), _FEW_STATES)
+    if far and few and _motion_left(other) < _MOSTLY * _motion_left(without):
+        if not _grows(other):
             return True
     if not better > (-CERTAIN if far else 0.0):
         return False
