@@ -64,9 +64,8 @@ def score_from_rest(
         raise DivergenceError(
             f"R2 is beyond all numbers: output {i} is simulated as "
             f"{simulated[row, i]:.4g} in row {row}, and measured as "
-            f"{measured[row, i]:.4g}. A simulation by an unstable model diverges: BFT "
-            "and VAF are 0 then (`make_bft_scorer`), and the model predicts "
-            "(`predict_ahead`)."
+            f"{measured[row, i]:.4g}. A simulation by an unstable model diverges: use "
+            "BFT or VAF (`make_bft_scorer`), which are 0 then, or `predict_ahead`."
         )
     warn_of_motion(estimator, X, y, simulated)
     return float(score)

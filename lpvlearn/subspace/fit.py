@@ -311,9 +311,9 @@ def _tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) 
                 "limit",
                 f"Output {i + 1} stays at {values} for {n_passed} samples in which "
                 "its model moves on: it is at a limit, of its sensor or of the plant, "
-                "as no linear system has one. Record within the limits. Or compare "
-                "with a fit that leaves them out (NaN, missing='split'), if what is "
-                "between them is long: each part has an initial state of its own.",
+                "as no linear system has one. Record within the limits; or, if what "
+                "is between them is long, as each part has a state of its own, use "
+                "NaN for them and missing='split', and compare.",
             )
 
 
@@ -694,11 +694,8 @@ def _tell_of_lead(
     if other.feedback is None or other.feedback.found:
         return
     # A reference of a few lines is the free motion of modes that do not decay.
-    longest = max(len(u) for u, _ in pairs)
-    if (
-        np.abs(np.linalg.eigvals(other.model.A)).max(initial=0.0)
-        > 1.0 - _LINE / longest
-    ):
+    slowest = np.abs(np.linalg.eigvals(other.model.A)).max(initial=0.0)
+    if 1.0 - slowest < _LINE / max(len(u) for u, _ in pairs):
         return
     found, error = _held_out(other, plain), _held_out(fitted, choices)
     if found.total < (_OF_NOISE if _grows(fitted) else _LED) * error.total:
