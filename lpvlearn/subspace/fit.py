@@ -34,11 +34,13 @@ from .identification import (
     centred,
     identify,
     scale_records,
+    spectral_radius,
     validate,
 )
 from .offsets import (
     CERTAIN,
     N_TRENDS,
+    USELESS,
     Offsets,
     attributed,
     constants_matter,
@@ -262,9 +264,11 @@ def fit_pairs(
     doubt = None
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
         fitted, doubt = _believable(pairs, choices, told, fitted)
-    if "feedback" not in told:
-        _tell_of_feedback(fitted, choices, doubt, told)
-        _tell_of_lead(pairs, choices, told, fitted)
+    feedback = fitted.feedback
+    if feedback is not None and feedback.found and "feedback" not in told:
+        _tell_of_feedback(feedback, fitted, choices, doubt, told)
+        if known is None:
+            _tell_of_lead(pairs, choices, told, fitted)
     if detrend is None:
         return fitted
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
@@ -612,12 +616,14 @@ def _grows(fitted: LocalFit, deviations: float = 0.0) -> bool:
 
 
 def _tell_of_feedback(
-    fitted: LocalFit, choices: Choices, doubt: _Doubt | None, told: set[str]
+    feedback: Feedback,
+    fitted: LocalFit,
+    choices: Choices,
+    doubt: _Doubt | None,
+    told: set[str],
 ) -> None:
     """Tell the user of feedback, and what was done about it."""
-    feedback, method = fitted.feedback, choices.method
-    if feedback is None or not feedback.found:
-        return
+    method = choices.method
     what = (
         "The inputs know the noise of the outputs (future inputs explain "
         f"{100.0 * feedback.share:.2g} % of the innovations, p = "
@@ -675,17 +681,15 @@ def _tell_of_feedback(
 def _tell_of_lead(
     pairs: Pairs, choices: Choices, told: set[str], fitted: LocalFit
 ) -> None:
-    """Tell of outputs that lead the inputs, as if they knew what is to come.
+    """Tell of outputs that lead the inputs, where these seem to know the noise.
 
     Beside later inputs a model simulates parts held out far better, and there is no
     feedback. So does the inverse of a controller that leaves little to its reference.
     """
-    feedback, n_trend = fitted.feedback, fitted.evidence.free.n_trend
-    if feedback is None or not feedback.found:
-        return
     lead, latest = find_lead(pairs)
     if not lead:
         return
+    n_trend = fitted.evidence.free.n_trend
     plain = choices._replace(method="auto", offset=DETRENDS[n_trend])
     try:
         other = _fit(with_later_inputs(pairs, lead), plain, set(told), n_trend)
@@ -694,8 +698,7 @@ def _tell_of_lead(
     if other.feedback is None or other.feedback.found:
         return
     # A reference of a few lines is the free motion of modes that do not decay.
-    slowest = np.abs(np.linalg.eigvals(other.model.A)).max(initial=0.0)
-    if 1.0 - slowest < _LINE / max(len(u) for u, _ in pairs):
+    if 1.0 - spectral_radius(other.model.A) < _LINE / max(len(u) for u, _ in pairs):
         return
     found, error = _held_out(other, plain), _held_out(fitted, choices)
     if found.total < (_OF_NOISE if _grows(fitted) else _LED) * error.total:
@@ -768,9 +771,8 @@ _MOVES_ON, _AT_LIMITS = 0.05, 0.01
 # constants per experiment of a mode that may be a line of a reference
 _LED, _LINE = 0.1, 3.0
 
-# Shares of the outputs' size left unexplained: that is reported; and that constants may
-# be the reason of
-_USELESS, _HARDLY = 0.9, 0.4
+# Share of the outputs' size left unexplained that constants may be the reason of
+_HARDLY = 0.4
 
 # What is told from tests that take as long as a fit
 TESTS = {"held out", "orders", "static gain", "decay", "lack"}
@@ -823,6 +825,7 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
     `told` are the kinds of warnings that are not repeated; it grows by these.
     """
     model, residual = fitted.model, fitted.residual
+    chose_order = len({row.order for row in fitted.selection.rows}) > 1
     if model.rank_deficit:
         tell(
             told,
@@ -844,7 +847,7 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "identify it with stability='warn', or from a record of bounded outputs, "
             "with the controller's reference as input.",
         )
-    elif residual > _USELESS:
+    elif residual > USELESS:
         tell(
             told,
             "useless",
@@ -854,8 +857,7 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "together and in the order of time.",
         )
     elif follows_means_alone(fitted.evidence):
-        orders = {row.order for row in fitted.selection.rows}
-        higher = "" if len(orders) > 1 else ", order='auto'"
+        higher = "" if chose_order else ", order='auto'"
         tell(
             told,
             "useless",
@@ -864,15 +866,14 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "check that inputs and outputs belong together and in the order of time.",
         )
     _warn_of_spikes(fitted, told)
-    choice_is_told = TESTS <= told or residual > _USELESS
+    choice_is_told = TESTS <= told or residual > USELESS
     if fitted.selection.held_out is not None and not choice_is_told:
         _warn_about_choice(fitted, fitted.selection.held_out, told)
     feedback = None if fitted.method == "pbsid" else fitted.feedback
     if feedback is None or fitted.stability_loss or "lack" in told:
         return
     if lacks(fitted.evidence, feedback.innovations):
-        tried = {row.order for row in fitted.selection.rows}
-        remedy = "a higher `order`" if len(tried) > 1 else "order='auto'"
+        remedy = "a higher `order`" if chose_order else "order='auto'"
         # Without figures, so that a search over orders says it once of each.
         tell(
             told,
@@ -1029,7 +1030,7 @@ def warn_about_drift(
     `error` and `first` are relative simulation errors, of the stream and of its first
     `n_samples`.
     """
-    poor = error > min(_USELESS, max(_POOR, _MUCH_WORSE * first))
+    poor = error > min(USELESS, max(_POOR, _MUCH_WORSE * first))
     if poor and error > _GROWN * first:
         tell(
             told,

@@ -388,7 +388,10 @@ def identify(
             chosen = fit_once(records, order, horizon, unrefined, none).candidate
     energy = output_energy(records) or 1.0
     model, stability_loss = chosen.model, 0.0
-    if settings.enforce_stability and not _radius(model.A) < 1.0 - STABLE_MARGIN:
+    if (
+        settings.enforce_stability
+        and not spectral_radius(model.A) < 1.0 - STABLE_MARGIN
+    ):
         model = fit_once(records, order, horizon, settings, chosen.whitening)[0].model
         if 0.0 < chosen.model.loss < model.loss:
             stability_loss = np.sqrt(model.loss / energy)
@@ -433,5 +436,6 @@ def validate(
     )
 
 
-def _radius(A: Array) -> float:
+def spectral_radius(A: Array) -> float:
+    """Modulus of the farthest eigenvalue."""
     return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))

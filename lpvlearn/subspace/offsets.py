@@ -31,7 +31,7 @@ from scipy import linalg, stats
 from ..data.preparation import Pairs
 from ..systems.least_squares import column_scale
 from ..systems.simulation import lti_response, trend_signals
-from .identification import Centres
+from .identification import Centres, spectral_radius
 from .noise import autoregression, spectral_density
 from .selection import criterion_of
 from .signals import Record, signal_factor
@@ -56,7 +56,7 @@ _SUSPICIOUS, _SIGNIFICANT = 1e-2, 1e-3
 # the constants, above which that says more of poor models than of constants.
 CERTAIN, _LIKELY = 30.0, 0.5
 
-_USELESS = 0.9  # errors, relative, that explain next to nothing
+USELESS = 0.9  # errors, relative, that explain next to nothing
 
 _FEW_STATES = 2  # none of which a model can spare for a level
 
@@ -168,7 +168,7 @@ def _stays_far(records: Sequence[Record]) -> bool:
 def follows_means_alone(evidence: Evidence) -> bool:
     """Whether a model without constants explains no more than where outputs stay."""
     stays = not evidence.free.n_trend and _stays_far(evidence.records)
-    return stays and _motion_left(evidence) > _USELESS**2
+    return stays and _motion_left(evidence) > USELESS**2
 
 
 def _motion_left(evidence: Evidence) -> float:
@@ -211,8 +211,9 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         return True
     far = _stays_far(without.records)
     few = len(other.model.A) <= min(len(without.model.A), _FEW_STATES)
-    if far and few and _motion_left(other) < _MOSTLY * _motion_left(without):
-        if not _grows(other):
+    decays = spectral_radius(other.model.A) <= 1.0
+    if far and few and decays:
+        if _motion_left(other) < _MOSTLY * _motion_left(without):
             return True
     if not better > (-CERTAIN if far else 0.0):
         return False
@@ -247,10 +248,6 @@ def _has_slow_mode(evidence: Evidence) -> bool:
     longest = max(record.u.shape[1] for record in evidence.records)
     rates = 1.0 - np.linalg.eigvals(evidence.model.A).real
     return bool((rates * longest <= _SLOW).any())
-
-
-def _grows(evidence: Evidence) -> bool:
-    return bool(np.abs(np.linalg.eigvals(evidence.model.A)).max(initial=0.0) > 1.0)
 
 
 def chance_of_constants(evidence: Evidence, *, equal: bool = False) -> float:
