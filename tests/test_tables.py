@@ -212,7 +212,7 @@ def test_missing_outputs_count_nowhere_and_are_told(kind, at_home):
         assert np.isfinite(np.asarray(found, dtype=float)).all()
     with pytest.raises(ValueError, match="y contains NaN.*missing='split'"):
         make(kind).fit(X, y)
-    again = make(kind, missing="split").fit(X, y)
+    again = make(kind, missing="estimate").fit(X, y)
     assert_allclose(model_of(again), model_of(model), rtol=0.1)
 
 

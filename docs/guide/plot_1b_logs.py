@@ -109,11 +109,27 @@ split = SubspaceLTI(2, horizon=10, feedthrough=False, time="time", missing="spli
 pole(split)
 
 # %%
-# In a pipeline it is an option of the local models:
-# ``LocalLPVPipeline(SubspaceLTI(missing="split"), ...)``. It is the remedy for *spikes*
-# as well, which a fit tells of where they make much of its errors: write NaN in place
-# of what the sensor got wrong. Resampling bridges gaps of up
-# to ``max_gap`` steps, and writes NaN into longer ones, for ``missing="split"``.
+# Every piece has an initial state to be found, and where outputs are missing often, the
+# pieces are too short to tell anything. ``missing="estimate"`` does not cut there. It
+# estimates the outputs by the model and its noise, and the model by what is known of
+# them, in turn, until neither moves: the algorithm of *expectation and maximisation*.
+# Inputs and rows that are missing end an experiment as before, for nobody knows where
+# the system is after them. Here a third of the outputs is not there:
+
+often = y.mask(rng.random(len(y)) < 0.3)
+estimated_outputs = SubspaceLTI(
+    2, horizon=10, feedthrough=False, time="time", missing="estimate"
+).fit(X, often)
+pole(estimated_outputs)
+
+# %%
+# In a pipeline both are options of the local models:
+# ``LocalLPVPipeline(SubspaceLTI(missing="estimate"), ...)``. They are the remedy for
+# *spikes* as well, which a fit tells of where they make much of its errors: write NaN
+# in place of what the sensor got wrong. Resampling bridges gaps of up
+# to ``max_gap`` steps, and writes NaN into longer ones. After a gap in which the plant
+# was stopped, or something else moved it, "split" is right: what the model expects
+# takes no part in it.
 #
 # Scores, reports and pictures leave out what was not measured, and say how much that
 # is:

@@ -226,7 +226,7 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 #   the experiment there and begins another, with a warning that says where.
 # * An output that stays at its largest or smallest value while the inputs move is at a
 #   limit, of its sensor or of the plant. A fit tells of it; NaN for these samples and
-#   ``missing="split"`` leave them out.
+#   ``missing="estimate"`` leave them out.
 # * ``offset=None`` says that outputs are zero at rest at input zero, and that every
 #   constant tells something of the static gain.
 # * ``detrend="constant"`` or ``"linear"`` subtracts means or straight lines from inputs
@@ -319,7 +319,8 @@ local.residual_tests(X, y)
 #   where each starts: worth it for many short ones.
 # * ``missing="split"`` ends an experiment before a sample with NaN, or a row that the
 #   ``time`` column misses, and starts another one after it, with an initial state and a
-#   constant of its own: :ref:`guide_logs`.
+#   constant of its own; ``"estimate"`` estimates outputs that are missing, and ends an
+#   experiment where inputs are: :ref:`guide_logs`.
 # * ``integrating="angle"`` identifies the rate of an output that integrates, and
 #   integrates the model: see the example of a position servo. A pipeline without a
 #   structure interpolates the model of the rates, and integrates that.

@@ -144,10 +144,10 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--missing",
-        choices=("raise", "split"),
+        choices=("raise", "split", "estimate"),
         default="raise",
-        help="samples: refuse them, or end a record there and begin another "
-        "(default raise)",
+        help="samples: refuse them, end a record there and begin another, or estimate "
+        "outputs and end it where inputs are missing (default raise)",
     )
     model = parser.add_argument_group("the model")
     add = model.add_argument

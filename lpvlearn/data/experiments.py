@@ -74,8 +74,8 @@ _N_SHOWN = 10  # names in an error message, lest a wide table fills the screen
 
 # What else to do about a missing value, in a fit and in a simulation.
 _IDENTIFIED = (
-    ", or identify with missing='split' (of SubspaceLTI), which cuts the record there; "
-    "dropping single rows breaks it."
+    ", or identify with missing='split' (of SubspaceLTI), which cuts the record there, "
+    "or 'estimate', which estimates outputs; dropping single rows breaks it."
 )
 _SIMULATED = (
     ". A simulation needs every sample; predict_with_initial_state(X, y) begins anew "
@@ -286,6 +286,8 @@ class Experiment:
     input_names: tuple[Hashable, ...] = ()  # of the columns, or their positions
     breaks: tuple[int, ...] = ()  # samples before which time says that some are missing
     jitter: float = 0.0  # largest deviation from even time, relative to the step
+    # (n_samples, n_outputs): outputs that were missing, and are estimates; None: none
+    estimated: NDArray[np.bool_] | None = None
 
 
 @contextmanager

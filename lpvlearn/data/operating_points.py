@@ -257,11 +257,12 @@ def _cluster(means: Array, tol: Array) -> NDArray[np.intp]:
 def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:
     """Refuse outputs (of these names) that are constant, or stand among the inputs."""
     outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
-    constant = np.ptp(outputs, axis=0) == 0
+    lowest, highest = np.fmin.reduce(outputs), np.fmax.reduce(outputs)  # without NaN
+    constant = lowest == highest
     if len(outputs) > len(experiments) and constant.any():
         j = int(np.argmax(constant))
         raise ValueError(
-            f"Every output must vary. Got {names[j]!r} constant at {outputs[0, j]:g}: "
+            f"Every output must vary. Got {names[j]!r} constant at {lowest[j]:g}: "
             "no dynamics can be identified from it. Leave it out of `y`, or check the "
             "sensor and its column."
         )

@@ -125,7 +125,7 @@ def unbroken_runs(experiment: Experiment) -> list[Experiment]:
 
 
 def part_of(experiment: Experiment, part: slice) -> Experiment:
-    def cut(values: Array | None) -> Array | None:
+    def cut(values: NDArray[Any] | None) -> NDArray[Any] | None:
         return None if values is None else values[part]
 
     return replace(
@@ -133,6 +133,7 @@ def part_of(experiment: Experiment, part: slice) -> Experiment:
         rows=experiment.rows[part],
         inputs=experiment.inputs[part],
         outputs=cut(experiment.outputs),
+        estimated=cut(experiment.estimated),
         scheduling=cut(experiment.scheduling),
         breaks=(),
     )

@@ -80,15 +80,17 @@ def levels_of(errors: Sequence[Array], left_out: Sequence[Array] = ()) -> Levels
     The level of the quietest of eight bands of frequencies, and of those that are as
     quiet by chance, is that of white noise; the rest of the mean square is the model's
     own error: of the errors `left_out`, where there are any. Errors of records too
-    short to tell are taken for that.
+    short to tell are taken for that. Missing ones (NaN) are left out.
     """
-    total = np.mean(np.vstack(errors) ** 2, axis=0)
+    total = _mean_square(errors)
     powers: list[list[Array]] = [[] for _ in range(_BANDS)]
     for e in errors:
-        window = np.hanning(len(e) + 1)[:-1, None]
-        ordinates = np.abs(np.fft.rfft(window * e, axis=0)[1:-1]) ** 2
-        if len(ordinates) >= _BANDS:
-            ordinates /= np.sum(window**2)
+        known = ~np.isnan(e)
+        window = np.hanning(len(e) + 1)[:-1, None] * known
+        ordinates = np.abs(np.fft.rfft(window * np.where(known, e, 0.0), axis=0)) ** 2
+        ordinates = ordinates[1:-1]
+        if len(ordinates) >= _BANDS and window.any(axis=0).all():
+            ordinates /= np.sum(window**2, axis=0)
             parts = np.array_split(ordinates, _BANDS)
             for band, part in zip(powers, parts, strict=True):
                 band.append(part)
@@ -99,8 +101,16 @@ def levels_of(errors: Sequence[Array], left_out: Sequence[Array] = ()) -> Levels
         quiet = level <= level.min(axis=0) * (1.0 + spread)
         noise = np.minimum(np.mean(level, axis=0, where=quiet), total)
     if left_out:
-        total = np.maximum(total, np.mean(np.vstack(left_out) ** 2, axis=0))
+        total = np.maximum(total, _mean_square(left_out))
     return Levels(np.sqrt(total - noise), np.sqrt(noise))
+
+
+def _mean_square(errors: Sequence[Array]) -> Array:
+    """Of every output, where it is known; NaN where it never is."""
+    e = np.vstack(errors)
+    n_known = np.count_nonzero(~np.isnan(e), axis=0)
+    mean: Array = np.nansum(e**2, axis=0) / np.where(n_known, n_known, np.nan)
+    return mean
 
 
 def left_out_errors(

@@ -39,6 +39,7 @@ from ..data.operating_points import (
     local_experiments,
     moving_experiments,
 )
+from ..data.preparation import has_gaps, split_at_gaps
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, retold, warn
 from ..lpv.auto import AutoLPV
@@ -61,7 +62,7 @@ from ..validation import (
     verbosity,
 )
 from .html_report import html_report
-from .local_models import common_delay, identify_points
+from .local_models import common_delay, estimates_outputs, identify_points
 from .output_error import (
     known_coefficients,
     local_covariance,
@@ -473,7 +474,8 @@ list, default=None
 
     def _table(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
         """The experiments of a table to be fitted."""
-        experiments = self._read(X, y, reset=True, **options)
+        cut_at_outputs = not estimates_outputs(self.local)
+        experiments = self._read(X, y, reset=True, outputs=cut_at_outputs, **options)
         self.output_names_ = read_outputs(y)[1]
         self._single_output = np.asarray(y).ndim == 1
         return experiments
@@ -508,6 +510,8 @@ list, default=None
             moving: list[Experiment] = []
             if self.refiner is not None:
                 experiments, moving = _told_apart(experiments)
+                if any(map(has_gaps, moving)):
+                    moving = split_at_gaps(moving)
             points = local_experiments(experiments, self.scheduling_tol)
             self.sampling_time_ = self._sampling_time(experiments, structure)
 
@@ -682,7 +686,7 @@ list, default=None
 
     @property
     def _splits(self) -> bool:
-        return getattr(self.local, "missing", None) == "split"
+        return getattr(self.local, "missing", "raise") != "raise"
 
     def _sampling_time(self, experiments: list[Experiment], structure: Any) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]

@@ -291,14 +291,30 @@ def motions(
 
     A channel that stands still counts as moving by one.
     """
-    found, n = [], sum(len(e.inputs) for e in experiments)
+    found = []
     for values in zip(*((e.inputs, e.outputs) for e in experiments), strict=True):
-        sums = [
-            (v.sum(axis=0), ((v - v.mean(axis=0)) ** 2).sum(axis=0)) for v in values
-        ]
-        mean, variance = np.sum(sums, axis=0) / n
+        mean, variance = _moments(values, about_own=True)
         found.append((mean, np.where(variance > 0, np.sqrt(variance), 1.0)))
     return found[0], found[1]
+
+
+def _moments(values: Sequence[Any], *, about_own: bool) -> tuple[Array, Array]:
+    """Mean and variance of channels, NaN left out, about the mean of each part or all.
+
+    Zero where nothing is known.
+    """
+    counts = [np.count_nonzero(~np.isnan(v), axis=0) for v in values]
+    sums = [np.nansum(v, axis=0) for v in values]
+    n = np.maximum(np.sum(counts, axis=0), 1)
+    mean = np.sum(sums, axis=0) / n
+    centres = [mean for _ in values]
+    if about_own:
+        centres = [s / np.maximum(k, 1) for s, k in zip(sums, counts, strict=True)]
+    squares = [
+        np.nansum((v - centre) ** 2, axis=0)
+        for v, centre in zip(values, centres, strict=True)
+    ]
+    return mean, np.sum(squares, axis=0) / n
 
 
 def _in_own_time(
@@ -323,7 +339,8 @@ def _fit_alike(
     The first realisation chooses order, horizon and method, the others follow it. One
     with gaps is several experiments.
     """
-    if hasattr(local, "fit_each") and all(len(runs) == 1 for runs in realisations):
+    alike = hasattr(local, "fit_each") and not estimates_outputs(local)
+    if alike and all(len(runs) == 1 for runs in realisations):
         whole = [run for runs in realisations for run in runs]
         return _fit_table(local, whole, sampling_time, "fit_each")
     first = _fit_local(local, realisations[0], sampling_time)
@@ -333,6 +350,11 @@ def _fit_alike(
             chosen.set_params(**{name: getattr(first, name + "_")})
     others = [_fit_local(chosen, runs, sampling_time) for runs in realisations[1:]]
     return [first, *others]
+
+
+def estimates_outputs(local: Any) -> bool:
+    """Whether a local estimator takes outputs of which some are missing."""
+    return getattr(local, "missing", None) == "estimate"
 
 
 def _fit_local(
@@ -402,9 +424,7 @@ def _bare(experiment: Experiment) -> Experiment:
 
 def _far_from_zero(records: Sequence[Array]) -> bool:
     """Whether a channel stands far from zero, as to how it moves over all records."""
-    n = sum(map(len, records))
-    mean = sum(v.sum(axis=0) for v in records) / n
-    variance = sum(((v - mean) ** 2).sum(axis=0) for v in records) / n
+    mean, variance = _moments(records, about_own=False)
     return bool((np.abs(mean) > _OFFSET * np.sqrt(variance)).any())
 
 

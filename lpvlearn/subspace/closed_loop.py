@@ -288,7 +288,9 @@ class ClosedLoopEvidence(Evidence):
         if not (len(self.joint.A) or direct.any()):
             return np.zeros((0, 0))  # no parameters
         known = _knowledge(self.fitted, self.joint, self.transform, self.kept, direct)
-        return known.plant
+        # What is expected of missing outputs adds to what is known, and has no noise.
+        share = np.mean(np.vstack([record.known for record in self.records]))
+        return known.plant / share**2
 
     def of_others(self, records: Sequence[Record]) -> Realization:
         """The model, noise included, that other records would have given.

@@ -24,10 +24,22 @@ from ..data.experiments import (
     read_experiments,
     read_outputs,
 )
-from ..data.preparation import DETRENDS, read_runs, remove_trends, split_at_gaps
+from ..data.preparation import (
+    DETRENDS,
+    has_gaps,
+    read_runs,
+    remove_trends,
+    split_at_gaps,
+)
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL
-from ..exceptions import VersionedPickle, all_or_nothing, collected, warn
+from ..exceptions import (
+    DivergenceError,
+    VersionedPickle,
+    all_or_nothing,
+    collected,
+    warn,
+)
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
 from ..systems.simulation import (
@@ -56,6 +68,14 @@ from .integrating import (
     rates_of,
     simulates_worse,
     sums_of,
+)
+from .missing_outputs import (
+    by_prediction,
+    by_simulation,
+    first_guess,
+    movement,
+    runs_to_complete,
+    warn_of_many_pieces,
 )
 from .offsets import N_TRENDS
 from .residuals import (
@@ -92,6 +112,16 @@ _TAKEN = (
     "output_drift_",
     "offsets_differ_",
 )
+
+
+# Missing outputs are estimated in so many rounds at most, until they move by less than
+# this many standard deviations of an innovation.
+_MOST_ROUNDS, _SETTLED = 20, 0.01
+_FREE_ROUNDS = 3  # after so many no other order is looked for
+
+_FAINT = 1e-3  # weight of an estimate beside an output that is known
+
+_AGAIN = 3  # rounds in which a model that is known estimates them
 
 
 class SubspaceLTI(
@@ -174,9 +204,13 @@ class SubspaceLTI(
         with `detrend`, which has dealt with them) none. Where levels shift within an
         experiment, by a load or a sensor that moved, "auto" ends it there and begins
         another, with a warning, if the criterion is clearly better for that.
-    missing : {"raise", "split"}, default="raise"
+    missing : {"raise", "split", "estimate"}, default="raise"
         "split" ends an experiment before a sample with NaN, or a row that the `time`
         column misses, and starts another after it, with an initial state of its own.
+        "estimate" does so where inputs are missing; outputs are estimated by the model
+        and its noise, and the model by what is known of them, in turn (algorithm of
+        expectation and maximisation): take it where many are, each for a short time,
+        or one of several. Levels that shift are not looked for beside them.
     integrating : True, str, int or list of them, default=None
         Outputs with an integrator, as the position of a motor: by the columns of y or
         their positions, True for all. Their rates ``(y[k+1] - y[k]) / dt`` are
@@ -417,10 +451,79 @@ class SubspaceLTI(
         choices = check_options(self.get_params(deep=False))
         experiments = self._read(X, y, reset=True, cut=False)
         self._single_output = np.asarray(y).ndim == 1
+        if self.missing == "estimate" and any(map(has_gaps, experiments)):
+            if self.detrend is not None:
+                raise ValueError(
+                    "`detrend` must be None with missing='estimate': means of outputs "
+                    f"that are not there are not known. Got {self.detrend!r}. Use "
+                    f"offset={self.detrend!r}."
+                )
+            experiments = self._completed(experiments, choices)
+        elif self.missing == "split":
+            warn_of_many_pieces(experiments)
         delay, told = self._delay_of(experiments, choices), set[str]()
         self._identify(experiments, choices, delay, told)
         self._name(*_names_of(experiments, y))
         return self
+
+    def _completed(
+        self, experiments: list[Experiment], choices: Choices
+    ) -> list[Experiment]:
+        """Experiments with missing outputs as the model of the completed ones expects.
+
+        Cut where inputs are missing, or time has a hole.
+        """
+        runs = runs_to_complete(experiments, at_rest=not choices.initial_states)
+        completed = first_guess(runs)
+        delay = self._delay_of(completed, choices)
+        chosen: tuple[int, str] | None = None
+        known: LocalFit | None = None
+        moved = np.inf
+        for k in range(_MOST_ROUNDS):
+            with collected():  # said of the completed samples
+                fitted = self._identify(completed, choices, delay, set(), known)
+            before, completed = completed, self._expected(runs, completed)
+            noise = self.predictor_.covariance
+            last, moved = moved, movement(runs, before, completed, noise)
+            if not moved > _SETTLED or (known is not None and moved > last):
+                break
+            if chosen == (fitted.selection.order, fitted.method) or k >= _FREE_ROUNDS:
+                known = fitted
+            chosen = fitted.selection.order, fitted.method
+        return completed
+
+    def _expected(
+        self, runs: Sequence[Experiment], completed: Sequence[Experiment]
+    ) -> list[Experiment]:
+        """Runs of known inputs with the outputs that are expected of missing ones.
+
+        Their initial states, and trends, are those of runs that were `completed`
+        before: of the known outputs alone they might be anything.
+        """
+        predictor = self._evidence.predictor(self.lti_, None)
+        u0, y0 = self.resting_point()
+        rest = self.initial_state == "rest"
+        own = [(None, y0) if rest else self._own_part(e, predictor) for e in completed]
+        found = list(zip(runs, own, strict=True))
+        try:
+            if predictor.gain is not None:
+                return [
+                    by_prediction(e, predictor, e.inputs - u0, x0, level)
+                    for e, (x0, level) in found
+                ]
+            return by_simulation(
+                runs,
+                [
+                    level + self.lti_.simulate(e.inputs - u0, initial_state=x0)
+                    for e, (x0, level) in found
+                ],
+            )
+        except DivergenceError:
+            raise ValueError(
+                "missing='estimate' needs a model that can be simulated. That of "
+                f"order {self.order_} grows beyond numbers: use missing='split', "
+                "another `order`, or stability='enforce'."
+            ) from None
 
     def fit_each(self, X: Any, y: Any) -> list[Self]:
         """Fit one model to every experiment, as the first one chooses.
@@ -466,6 +569,11 @@ class SubspaceLTI(
         >>> print(f"{np.mean(poles):.3f}, {np.std(poles):.4f}")
         0.899, 0.0009
         """
+        if self.missing == "estimate":
+            raise ValueError(
+                "`missing` must be 'raise' or 'split' in fit_each. Got 'estimate'. Use "
+                "`fit` for every experiment."
+            )
         if self.integrating is not None:
             raise ValueError(
                 f"`integrating` must be None in fit_each. Got {self.integrating!r}. "
@@ -496,18 +604,30 @@ class SubspaceLTI(
     ) -> LocalFit:
         """Identify the model of experiments, by what is `known` of others like them."""
         self.time_jitter_ = max(e.jitter for e in experiments)
-        gaps = self.missing == "split"
+        gaps = self.missing != "raise"
         experiments = self._with_late_inputs(experiments, delay, gaps)
         self._stream: SampleStream | None = None
         pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
+        estimated = [e.estimated for e in experiments if e.estimated is not None]
+        if estimated and np.vstack(estimated).all(axis=0).any():
+            raise ValueError(
+                "missing='estimate' needs some samples of every output after inputs "
+                f"have come with their delay ({delay.max()} samples). Got none: take "
+                "a longer record."
+            )
+        choices = choices._replace(estimated=estimated)
         gaps |= bool(delay.any()) and choices.initial_states
         if known is not None:
             choices = choices.following(known)
         fitted = fit_as_stream(pairs, choices, told, detrend=self.detrend, gaps=gaps)
         if fitted is None:
-            names = experiments[0].input_names
             fitted = fit_pairs(
-                pairs, choices, told, detrend=self.detrend, names=names, known=known
+                pairs,
+                choices,
+                told,
+                detrend=self.detrend,
+                names=experiments[0].input_names,
+                known=known,
             )
         self._take(fitted, self._step_of(experiments), delay)
         warn_about(fitted, told)
@@ -517,6 +637,11 @@ class SubspaceLTI(
 
     def _fit_rates(self, X: Any, y: Any) -> Self:
         """Identify the rates of integrating outputs, and integrate their model."""
+        if self.missing == "estimate":
+            raise ValueError(
+                "`missing` must be 'raise' or 'split' with `integrating`: the rates of "
+                "missing outputs are not estimated. Got 'estimate'."
+            )
         if self.detrend is not None or self.offset not in (None, "auto"):
             raise ValueError(
                 "`integrating` needs detrend=None, and offset=None or 'auto': a "
@@ -689,6 +814,11 @@ class SubspaceLTI(
     def _choices_of_stream(self) -> Choices:
         """The options, checked, of which a stream takes not all."""
         choices = check_options(self.get_params(deep=False))
+        if self.missing == "estimate":
+            raise ValueError(
+                "`missing` must be 'raise' or 'split' in partial_fit, which never sees "
+                "what comes after a gap. Got 'estimate'. Use `fit` for it."
+            )
         if self.integrating is not None:
             raise ValueError(
                 "`integrating` must be None in partial_fit. Got "
@@ -910,8 +1040,8 @@ class SubspaceLTI(
         Returns
         -------
         ndarray of shape (n_samples,) or (n_samples, n_outputs)
-            With ``missing="split"`` NaN where an input is missing; the simulation
-            begins anew after that.
+            With ``missing="split"`` or "estimate" NaN where an input is missing; the
+            simulation begins anew after that.
         """
         check_is_fitted(self, "lti_")
 
@@ -1088,6 +1218,12 @@ class SubspaceLTI(
                 f"`y` must hold the {self.n_outputs_} output(s) of the model. Got "
                 f"{len(names)}."
             )
+        if self.missing == "estimate" and any(map(has_gaps, experiments)):
+            at_rest = self.initial_state == "rest"
+            runs = runs_to_complete(experiments, at_rest=at_rest)
+            experiments = first_guess(runs)
+            for _ in range(_AGAIN):
+                experiments = self._expected(runs, experiments)
         experiments = self._with_late_inputs(experiments, self.input_delay_, True)
         undelayed = self.lti_.with_input_delay(0)
         return model_residuals(
@@ -1231,7 +1367,7 @@ class SubspaceLTI(
         list of ndarray of int
         """
         check_is_fitted(self, "lti_")
-        gaps = "Xy" if self.missing == "split" else ""
+        gaps = "Xy" if self.missing != "raise" else ""
         optional = (*OPTIONAL_ROLES, "scheduling")
         options: dict[str, Any] = {"reset": False, "optional": optional}
         found = read_experiments(self, X, allow_missing=gaps, **options)
@@ -1241,12 +1377,12 @@ class SubspaceLTI(
         tags = super().__sklearn_tags__()
         # Tables of independent samples, as in the common tests, have no dynamics.
         tags.regressor_tags.poor_score = True
-        tags.input_tags.allow_nan = self.missing == "split"
+        tags.input_tags.allow_nan = self.missing != "raise"
         return tags
 
     def _read(self, X: Any, y: Any, **options: Any) -> list[Experiment]:
         """Experiments of a table; options as in `read_runs`."""
-        options = {"split": self.missing == "split", "reset": False} | options
+        options = {"split": self.missing != "raise", "reset": False} | options
         known = options["reset"] or self.time is None
         return read_runs(
             self,
@@ -1276,7 +1412,11 @@ class SubspaceLTI(
         if predictor is None or predictor.gain is None:
             responses = free_responses(lti.A, lti.C, len(y), trend)
             responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
-            own = estimate_initial_state(responses, y - self._simulated(experiment))
+            error = y - self._simulated(experiment)
+            if experiment.estimated is not None:  # lest known ones leave states open
+                faint = np.where(experiment.estimated, _FAINT, 1.0)
+                responses, error = responses * faint[:, :, None], error * faint
+            own = estimate_initial_state(responses, error)
         else:
             u = experiment.inputs - u0
             own = predictor.estimate_initial_state(u, y - y0, trend)

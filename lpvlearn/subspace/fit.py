@@ -63,6 +63,8 @@ Array = NDArray[np.float64]
 
 REFINEMENTS = ("auto", "simulation", "prediction")
 
+MISSING = ("raise", "split", "estimate")
+
 
 class Choices(NamedTuple):
     """Checked options that decide about a fit.
@@ -79,6 +81,8 @@ class Choices(NamedTuple):
     enforce_stability: bool = False
     initial_states: bool = True  # False starts every experiment from rest
     offset: str | None = None  # "auto" is to be chosen
+    # of every experiment, (n_samples, n_outputs): outputs that are estimates; none: ()
+    estimated: Sequence[NDArray[np.bool_]] = ()
 
     def following(self, known: LocalFit) -> Choices:
         """What was chosen for samples that tell the same."""
@@ -120,7 +124,7 @@ def check_options(options: Mapping[str, Any]) -> Choices:
     one_of("method", options["method"], ("auto", *METHODS, "pbsid"))
     one_of("stability", options["stability"], ("warn", "enforce"))
     one_of("initial_state", options["initial_state"], ("estimate", "rest"))
-    one_of("missing", options["missing"], ("raise", "split"))
+    one_of("missing", options["missing"], MISSING)
     one_of("detrend", options["detrend"], DETRENDS)
     one_of("offset", options["offset"], tuple(N_TRENDS))
     one_of("refine", options["refine"], (*REFINEMENTS, True, False))
@@ -259,7 +263,8 @@ def fit_pairs(
         if "limit" not in told:
             _tell_of_limits(outputs, fitted, told)
     # The errors of a rough model are not the noise that shifts must stand out of.
-    if choices.offset == "auto" and choices.initial_states and choices.refine:
+    cuts = choices.offset == "auto" and choices.initial_states and choices.refine
+    if cuts and not choices.estimated:
         pairs, fitted = _without_shifts(pairs, choices, told, fitted)
     doubt = None
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
@@ -315,9 +320,8 @@ def _tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) 
                 "limit",
                 f"Output {i + 1} stays at {values} for {n_passed} samples in which "
                 "its model moves on: it is at a limit, of its sensor or of the plant, "
-                "as no linear system has one. Record within the limits; or, if what "
-                "is between them is long, as each part has a state of its own, use "
-                "NaN for them and missing='split', and compare.",
+                "as no linear system has one. Record within the limits, or use NaN "
+                "for them and missing='estimate', and compare.",
             )
 
 
@@ -409,7 +413,7 @@ def _fit(
             settings.check_size([len(u) for u, _ in pairs], order, horizon)
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
-    scaled = scale_records(pairs, n_trend)
+    scaled = scale_records(pairs, n_trend, choices.estimated)
     feedback = find_feedback(scaled.records) if known is None else known.feedback
     settings = _heed(feedback, settings, choices.feedthrough is True)
     if settings.method == "pbsid":
@@ -421,10 +425,13 @@ def _fit(
         plant = _identify_open_loop(scaled, basis, order, horizon, settings, known)
     offsets = attributed(plant.evidence, centres, whole)
     evidence, offsets = with_levels(plant.evidence, offsets)
+    residual = plant.residual
+    if choices.estimated:
+        residual = _residual_of_known(evidence, settings.method, residual)
     return LocalFit(
         evidence.model,
         plant.singular_values,
-        plant.residual,
+        residual,
         plant.stability_loss,
         plant.selection,
         evidence,
@@ -435,6 +442,25 @@ def _fit(
         scaled,
         SharedSignals(),
     )
+
+
+def _residual_of_known(evidence: Evidence, method: str, found: float) -> float:
+    """What was `found` for errors relative to outputs, of those that are no estimates.
+
+    Of one-step errors those of estimates are next to nothing.
+    """
+    model, records = evidence.model, evidence.records
+    if method == "pbsid" or len(model.initial_states) != len(records):
+        share = sum(r.n_values for r in records) / sum(r.y.size for r in records)
+        return found / float(np.sqrt(share))
+    squares, power = 0.0, 0.0
+    for k, record in enumerate(records):
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = (record.y.T - model.outputs(record, k))[record.known]
+            squares += float(error @ error)
+        power += float(np.sum(record.y.T[record.known] ** 2))
+    known = float(np.sqrt(squares / power)) if power else found
+    return known if np.isfinite(known) else found
 
 
 def _identify_open_loop(
@@ -690,7 +716,8 @@ def _tell_of_lead(
     if not lead:
         return
     n_trend = fitted.evidence.free.n_trend
-    plain = choices._replace(method="auto", offset=DETRENDS[n_trend])
+    offset = DETRENDS[n_trend]
+    plain = choices._replace(method="auto", offset=offset, estimated=())
     try:
         other = _fit(with_later_inputs(pairs, lead), plain, set(told), n_trend)
     except TooFewSamples:
@@ -899,7 +926,7 @@ def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
         f"the farthest is sample {spikes.sample}"
         f"{f' of experiment {spikes.experiment}' if several else ''}, counted from 0. "
         "If a sensor got them wrong, they spoil the model: replace them by NaN and use "
-        "missing='split'.",
+        "missing='estimate'.",
     )
 
 

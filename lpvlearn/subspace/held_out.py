@@ -109,12 +109,12 @@ def held_out(
     """
     W = np.eye(len(records[0].y)) if weight is None else weight
     parts: list[Part] = []
-    errors, outputs = [], []
+    errors, outputs, n_known = [], [], 0
     records = thinned(records)
     for k in range(1, _N_PIECES + 1):
         cuts = _cuts(records, k)
         train = [
-            Record(*(signals[:, part].copy() for signals in record))
+            record.part(part)
             for record, (start, stop) in zip(records, cuts, strict=True)
             for part in (slice(0, start), slice(stop, None))
             if 0 < start == part.stop or record.u.shape[1] - stop >= _TOO_SHORT
@@ -125,14 +125,18 @@ def held_out(
                 continue
             begin = 0 if at_rest else start
             u, y = record.u.T[begin:stop], record.y.T[start:stop]
-            trend = record.trend[:, begin:stop]
+            trend, known = record.trend[:, begin:stop], record.known[start:stop]
             with np.errstate(over="ignore", invalid="ignore"):
                 answer, free = _answers(model, u, trend, at_rest)
-                part = Part(y - answer[start - begin :], free[start - begin :], W)
+                error = np.where(known, y - answer[start - begin :], 0.0)
+                free = np.where(known[:, :, None], free[start - begin :], 0.0)
+                part = Part(error, free, W)
                 error = part.without(part.free)
                 # What these unknowns take of the noise is made up for.
-                spare = error.size - free.shape[2]
-                error *= np.sqrt(error.size / spare) if spare > 0 else np.nan
+                n_values = int(np.count_nonzero(known))
+                spare = n_values - free.shape[2]
+                error *= np.sqrt(n_values / spare) if spare > 0 else np.nan
+            n_known += n_values
             parts.append(part)
             errors.append(error)
             outputs.append(y)
@@ -146,7 +150,7 @@ def held_out(
         bft = 100.0 * float(np.maximum(1.0 - np.sqrt(squares) / spread, 0.0).mean())
         total = float(squares.sum())
     bft = bft if np.isfinite(bft) else 0.0
-    return HeldOut(parts, bft, total, float(np.sqrt(total / error.size)))
+    return HeldOut(parts, bft, total, float(np.sqrt(total / n_known)))
 
 
 def _answers(

@@ -150,12 +150,20 @@ def _root_mean_square(parts: Sequence[Array]) -> Array:
 
 
 def scale_records(
-    experiments: Sequence[tuple[Array, Array]], n_trend: int = 0
+    experiments: Sequence[tuple[Array, Array]],
+    n_trend: int = 0,
+    estimated: Sequence[NDArray[np.bool_]] = (),
 ) -> ScaledRecords:
-    """Scale all experiments (u, y), a row per sample, together."""
+    """Scale all experiments (u, y), a row per sample, together.
+
+    Which outputs are `estimated` is known of experiments that go on after these ends.
+    """
     su = _root_mean_square([u for u, _ in experiments])
     sy = _root_mean_square([y for _, y in experiments])
     records = [Record.of(u / su, y / sy, n_trend) for u, y in experiments]
+    for k, missing in enumerate(estimated[: len(records)]):
+        record, n_samples = records[k], records[k].u.shape[1]
+        records[k] = record._replace(missing=missing[:n_samples].T)
     return ScaledRecords(records, su, sy)
 
 

@@ -131,7 +131,7 @@ class Whitening(NamedTuple):
         lost = len(self.filter) - 1
         first = lost if free.initial_states else 0
         out = []
-        for u, y, trend in records:
+        for u, y, trend, missing in records:
             if u.shape[1] > 2 * lost:
                 if lost:
                     u = scipy.signal.lfilter(self.filter, [1.0], u, axis=1)[:, first:]
@@ -141,8 +141,8 @@ class Whitening(NamedTuple):
                         trend = trend[:, first:]
                 if not _is_identity(self.weight):
                     y = self.weight @ y
-                signals = (np.ascontiguousarray(z) for z in (u, y, trend))
-                out.append(Record(*signals))
+                u, y, trend = (np.ascontiguousarray(z) for z in (u, y, trend))
+                out.append(Record(u, y, trend, missing[:, first:]))
         return out
 
     def model(self, model: Realization) -> Realization:

@@ -211,9 +211,18 @@ def model_residuals(
         errors = [np.where(rounding, 0.0, part) for part in errors]
     records, scale = evidence.records, evidence.output_scale
     head = min([_HEAD, *(record.y.shape[1] for record in records)])
-    known = {record.y[:, :head].tobytes() for record in records}
+    known = {r.y[:, :head].tobytes() for r in records if not r.missing.any()}
+    partly = [(r.y.T[:head], r.known[:head]) for r in records if r.missing.any()]
+    begun = [y[:head] / scale for _, y in pairs]
     fitted = None
-    if any((y[:head] / scale).T.tobytes() in known for _, y in pairs):
+    if any(
+        y.T.tobytes() in known
+        or any(
+            there.any() and np.array_equal(y[there], own[there])
+            for own, there in partly
+        )
+        for y in begun
+    ):
         response, n_noise = [np.eye(lti.n_outputs)], 0
         if predictor is not None:
             K, C = predictor.K, predictor.C
@@ -478,11 +487,17 @@ def find_spikes(evidence: Evidence) -> Spikes | None:
     if not all(np.isfinite(e).all() for e in errors):
         return None
     bends = [np.zeros_like(e) for e in errors]  # none at the ends of experiments
-    for bend, e in zip(bends, errors, strict=True):
+    looked_at = [record.known.copy() for record in whole.records]
+    for bend, e, known in zip(bends, errors, looked_at, strict=True):
         bend[1:-1] = np.abs(e[1:-1] - 0.5 * (e[:-2] + e[2:]))
+        known[1:-1] &= known[:-2] & known[2:]
     size, ends = np.vstack(bends), np.cumsum([len(e) for e in errors])
+    known = np.vstack(looked_at)
+    if not known.any(axis=0).all():
+        return None
+    middle = [np.median(column[at]) for column, at in zip(size.T, known.T, strict=True)]
     peaks = (size >= np.roll(size, 1, axis=0)) & (size >= np.roll(size, -1, axis=0))
-    size *= peaks & (size > _SPIKE * np.median(size, axis=0))
+    size *= known & peaks & (size > _SPIKE * np.array(middle))
     count, taken = np.sum(size > 0.0, axis=0), np.sum(size**2, axis=0)
     total = sum((e**2).sum(axis=0) for e in errors)
     power = sum((record.y**2).sum(axis=1) for record in whole.records)

@@ -497,7 +497,7 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     states that follow slow noise would prove themselves right.
     """
     n, (ny, m) = len(model.A), free.direct.shape
-    n_values = sum(record.y.size for record in records)
+    n_values = sum(record.n_values for record in records)
     n_samples = n_values // ny
     own = len(model.initial_states) * free.n_own(n)
     n_parameters = n * (m + ny) + int(free.direct.sum()) + own
@@ -537,7 +537,8 @@ def _innovations(
         noise = autoregression(parts, highest=highest)
         filters.append(np.append(1.0, -noise.C[0]))
         sizes.append(np.sqrt(noise.covariance[0, 0]) or 1.0)
-    lost, squares, n_samples = max(map(len, filters)) - 1, np.zeros(len(sizes)), 0.0
+    lost, squares = max(map(len, filters)) - 1, np.zeros(len(sizes))
+    n_samples = np.zeros(len(sizes))
     for record, error in zip(records, errors, strict=True):
         if len(error) <= 2 * lost:
             continue
@@ -553,7 +554,8 @@ def _innovations(
         white, unknown = signals[:, :, 0], signals[:, :, 1:]
         white = white - unknown @ estimate_initial_state(unknown, white)
         squares += (white**2).sum(axis=0)
-        n_samples += float((weights**2).sum())
+        # What is expected of missing ones leaves the squares of the others, on average.
+        n_samples += (weights**2 * record.known[lost:]).sum(axis=0)
     variances = np.array(sizes) ** 2 * squares / n_samples
     return [(float(v), len(f) - 1) for v, f in zip(variances, filters, strict=True)]
 

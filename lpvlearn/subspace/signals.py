@@ -52,6 +52,8 @@ class Record(NamedTuple):
     u: Array  # (n_inputs, n_samples)
     y: Array  # (n_outputs, n_samples)
     trend: Array = np.zeros((0, 0))  # (n_trend, n_samples), free in every output
+    # (n_outputs, n_samples): outputs that were missing, and are estimates; empty: none
+    missing: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
 
     @classmethod
     def of(cls, u: Array, y: Array, n_trend: int = 0) -> Record:
@@ -59,9 +61,26 @@ class Record(NamedTuple):
         trend = trend_signals(len(u), n_trend)
         return cls(np.ascontiguousarray(u.T), np.ascontiguousarray(y.T), trend)
 
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Outputs that were there, (n_samples, n_outputs)."""
+        if self.missing.size:
+            return ~self.missing.T
+        return np.broadcast_to(np.True_, self.y.shape[::-1])
+
+    @property
+    def n_values(self) -> int:
+        """Number of outputs that were there."""
+        return self.y.size - int(np.count_nonzero(self.missing))
+
+    def part(self, samples: slice) -> Record:
+        """Some of the samples, in memory of their own."""
+        u, y, trend = (signals[:, samples].copy() for signals in self[:3])
+        return Record(u, y, trend, self.missing[:, samples])
+
     def head(self, n_samples: int) -> Record:
         """The first samples."""
-        return Record(*(signals[:, :n_samples].copy() for signals in self))
+        return self.part(slice(n_samples))
 
 
 def output_energy(records: Sequence[Record]) -> float:

@@ -30,6 +30,7 @@ from scipy import fft
 from ..models.innovation import InnovationModel, NoiseModel
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..systems.response import resolvent
+from .missing_outputs import noise_of
 from .noise import Whitening, autoregression, reduced_noise_model, spectral_density
 from .signals import Record, block_slices, signal_pieces
 from .simulation_fit import (
@@ -169,7 +170,7 @@ class Evidence:
             return self.told.noise
         weight = self.whitening.weight
         model = with_initial_states(self.model, self.records, self.free, weight)
-        return autoregression(simulation_errors(model, self.records))
+        return _noise_of(model, self.records)
 
     @cached_property
     def covariance(self) -> Array:
@@ -187,7 +188,7 @@ class Evidence:
             return self.told.covariance
         records = self.whitening.records(self.records, self.free)
         model = with_initial_states(self.sections, records, self.free)
-        noise = autoregression(simulation_errors(model, records))
+        noise = _noise_of(model, records)
         covariance = parameter_covariance(model, records, self.free, noise)
         return covariance * self.share
 
@@ -303,6 +304,16 @@ class Evidence:
         return np.einsum("yo,foup->fyup", to_outputs, J)
 
 
+def _noise_of(model: Realization, records: Sequence[Record]) -> NoiseModel:
+    """Autoregression of the simulation errors that are known."""
+    errors = simulation_errors(model, records)
+    if not any(record.missing.any() for record in records):
+        return autoregression(errors)
+    return noise_of(
+        [np.where(r.known, e, np.nan) for r, e in zip(records, errors, strict=True)]
+    )
+
+
 def _deviations(J: NDArray[np.complex128], covariance: Array) -> NDArray[np.complex128]:
     """Standard deviations of the real and the imaginary part of what has Jacobian J."""
     variances = [
@@ -352,7 +363,7 @@ def parameter_covariance(
     kept &= values > _RCOND * values.max(initial=0.0)  # order 0, D = 0: none
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     inverse = inverse / scale[:, None] / scale
-    n_values = sum(record.y.size for record in records)
+    n_values = sum(record.n_values for record in records)
     n_free = int(kept.sum()) + len(records) * own
     return inverse @ S @ inverse * (n_values / max(n_values - n_free, 1))
 
@@ -369,16 +380,19 @@ def _experiment_terms(
     # Of the unit matrix: the Jacobian's coefficients in the signals, output by output.
     maps = jacobian_regression(np.eye(k), model, driven, free)
     maps = maps[:, :-1].reshape(ny, k, -1)
-    gram = X @ X.T
-    H = sum(L.T @ gram @ L for L in maps)
+    # Of every output where it is known; of complete records once for all.
+    seen = [X * ~row for row in record.missing] if record.missing.any() else [X]
+    of = np.arange(ny) % len(seen)
+    grams = [[left @ right.T for right in seen] for left in seen]
+    H = sum(L.T @ grams[i][i] @ L for i, L in zip(of, maps, strict=True))
     if len(noise.A) == 0:
         return np.asarray(H), sum(
-            noise.covariance[i, j] * (maps[i].T @ gram @ maps[j])
+            noise.covariance[i, j] * (maps[i].T @ grams[of[i]][of[j]] @ maps[j])
             for i in range(ny)
             for j in range(ny)
         )
     size = fft.next_fast_len(2 * X.shape[1], real=True)
-    transformed = fft.rfft(X, size, axis=1)
+    transformed = [fft.rfft(part, size, axis=1) for part in seen]
     density = spectral_density(noise, 2.0 * np.pi * np.arange(size // 2 + 1) / size)
     weight = np.full(size // 2 + 1, 2.0 / size)  # for the negative frequencies too
     weight[0 if size % 2 else [0, -1]] = 1.0 / size
@@ -386,8 +400,9 @@ def _experiment_terms(
     for i in range(ny):
         for j in range(ny):
             # Sum over t, s of X[:, t] r_ij(t - s) X[:, s].T
-            by_frequency = transformed.conj() * (weight * density[:, i, j])
-            S += maps[i].T @ (by_frequency @ transformed.T).real @ maps[j]
+            left, right = transformed[of[i]], transformed[of[j]]
+            by_frequency = left.conj() * (weight * density[:, i, j])
+            S += maps[i].T @ (by_frequency @ right.T).real @ maps[j]
     return np.asarray(H), S
 
 

@@ -153,12 +153,18 @@ def estimate_initial_state(responses: Array, error: Array) -> Array:
 
     ``min || error - sum_i responses[:, :, i] x0[i] ||``, of minimum norm where the
     responses (of every unit initial state) do not determine it. The error has shape
-    (n_samples, n_outputs), and one more axis for several runs. Of one run, entries may
-    be missing (NaN).
+    (n_samples, n_outputs), and one more axis for several runs. Entries may be missing
+    (NaN).
     """
     n_rows = error.shape[0] * error.shape[1]
     columns = responses.reshape(n_rows, -1)
-    if error.ndim == 2 and np.isnan(error).any():
+    if np.isnan(error).any():
+        if error.ndim > 2:
+            runs = [
+                estimate_initial_state(responses, run)
+                for run in np.moveaxis(error, 2, 0)
+            ]
+            return np.stack(runs, axis=1)
         known = ~np.isnan(error.reshape(n_rows))
         return scaled_lstsq(columns[known], error.reshape(n_rows)[known])[0]
     return scaled_lstsq(columns, error.reshape(n_rows, *error.shape[2:]))[0]

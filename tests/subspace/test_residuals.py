@@ -480,11 +480,14 @@ def test_spikes_are_told_and_where_the_farthest_is():
     y += 0.1 * rng.standard_normal(y.shape)
     y[[50, 350, 431], 1] += [3.0, -2.0, 4.0]
     runs = np.repeat([0.0, 1.0], 300)[:, None]
-    expected = r"3 sample.* of output 2 .*sample 131 of experiment 1,.*missing='split'"
+    expected = (
+        r"3 sample.* of output 2 .*sample 131 of experiment 1,.*missing='estimate'"
+    )
     with pytest.warns(UserWarning, match=expected):
         SubspaceLTI(2, horizon=8, experiment=2).fit(np.hstack([u, runs]), y)
     y[[50, 350, 431], 1] = np.nan
-    SubspaceLTI(2, horizon=8, missing="split").fit(u, y)  # silently
+    for missing in ("split", "estimate"):
+        SubspaceLTI(2, horizon=8, missing=missing).fit(u, y)  # silently
 
 
 def test_a_small_lack_is_not_told():

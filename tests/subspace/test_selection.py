@@ -202,7 +202,8 @@ def test_many_short_experiments_tell_the_order():
     y = lti_response(*system, u)
     y += 0.1 * y.std() * rng.standard_normal(y.shape)
     y[rng.choice(1000, 50, replace=False)] = np.nan
-    model = SubspaceLTI(missing="split").fit(u, y)
+    with pytest.warns(UserWarning, match="Use missing='estimate'"):
+        model = SubspaceLTI(missing="split").fit(u, y)
     assert model.order_ == 3
     exact = lti_response(*system, u)
     error = exact - model.lti_.simulate(u)

@@ -1,0 +1,301 @@
+r"""Outputs that are missing, by what the model expects of them.
+
+With the errors v of a simulation described in innovation form, ``x[t+1] = A x[t] + K
+e[t]``, ``v[t] = C x[t] + e[t]`` with covariance S of e, the missing ones are expected
+where ``sum(e.T inv(S) e)`` is least. A model of the completed samples expects others,
+and so forth: the algorithm of expectation and maximisation (A. P. Dempster, N. M. Laird
+and D. B. Rubin, "Maximum likelihood from incomplete data via the EM algorithm", Journal
+of the Royal Statistical Society B 39, 1977; for dynamic models A. J. Isaksson,
+"Identification of ARX-models subject to missing data", IEEE Transactions on Automatic
+Control 38, 1993). Where v is white the errors of missing outputs are zero, and the
+model that it ends at has the least squares of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, linalg
+from scipy.sparse.linalg import LinearOperator, cg
+
+from ..data.experiments import Experiment
+from ..data.preparation import complete_runs, part_of
+from ..exceptions import warn
+from ..models.innovation import InnovationModel, NoiseModel
+from ..systems.simulation import lti_response, state_trajectory
+from .noise import autoregression
+
+Array = NDArray[np.float64]
+
+# The first guess: longest answer to an input in samples, known samples of an output for
+# every unknown of it, samples that are looked at.
+_LONGEST, _PER_UNKNOWN, _MOST = 100, 20, 20_000
+
+_RCOND = 1e-6  # of its regression: inputs may hardly move
+
+# Pieces by what gaps of the inputs alone leave, and samples of a piece, to be told
+_MANY, _SHORT = 5, 50
+
+_DRAWN = 15  # times that missing errors are drawn, for the model of the noise
+
+# Of conjugate gradients: standard deviations of an innovation, and steps
+_TOL, _STEPS = 1e-3, 200
+
+_ROUNDING = 1e-9  # size of an error, relative to those that there are, that is not one
+
+
+def runs_to_complete(
+    experiments: Sequence[Experiment], *, at_rest: bool
+) -> list[Experiment]:
+    """Runs of samples whose inputs are known, and outputs of some of them.
+
+    What comes before the first output tells nothing of a run, but of one `at_rest`. A
+    ValueError where no run is left, an output is never known, or rest is in a gap.
+    """
+    whole = [run for e in experiments for run in complete_runs(e, 2, outputs=False)]
+    if at_rest and len(whole) > len(experiments):
+        raise ValueError(
+            "`initial_state` must be 'estimate' where inputs are missing, or rows of "
+            "the `time` column: what follows a gap does not start from rest. Got "
+            "'rest'."
+        )
+    runs, known = [], []
+    for run in whole:
+        there = np.isfinite(_outputs(run))
+        at = np.flatnonzero(there.any(axis=1))
+        if len(at) > 1:
+            runs.append(part_of(run, slice(0 if at_rest else at[0], at[-1] + 1)))
+            known.append(there.any(axis=0))
+    if not runs or not np.any(known, axis=0).all():
+        raise ValueError(
+            "missing='estimate' needs some samples of every output beside inputs that "
+            "are known. Got none: check X and y for columns that are NaN throughout, "
+            "and leave these out."
+        )
+    return runs
+
+
+def warn_of_many_pieces(experiments: Sequence[Experiment]) -> None:
+    """Tell of a record that missing outputs cut to pieces."""
+    pieces = [part for e in experiments for part in complete_runs(e)]
+    whole = [run for e in experiments for run in complete_runs(e, outputs=False)]
+    n_samples = sum(len(part.rows) for part in pieces)
+    many = len(pieces) >= _MANY * max(len(whole), 1)
+    if many and n_samples < _SHORT * len(pieces):
+        warn(
+            f"missing='split' cuts at outputs that are missing: {len(pieces)} pieces "
+            f"of {n_samples / len(pieces):.0f} samples in the mean, each with an "
+            "initial state of its own, tell little. Use missing='estimate', which cuts "
+            "where inputs are missing alone."
+        )
+
+
+def with_estimates(run: Experiment, outputs: Array) -> Experiment:
+    """A run with values of outputs that are missing in it."""
+    return replace(run, outputs=outputs, estimated=np.isnan(_outputs(run)))
+
+
+def movement(
+    runs: Sequence[Experiment],
+    before: Sequence[Experiment],
+    after: Sequence[Experiment],
+    noise: Array,
+) -> float:
+    """How far estimates moved, in standard deviations of innovations (their `noise`).
+
+    Root mean square over what is missing in the runs.
+    """
+    power = np.nanmean(np.vstack([_outputs(run) for run in runs]) ** 2, axis=0)
+    variance = np.maximum(np.diagonal(noise), _ROUNDING**2 * power)
+    variance[variance == 0.0] = 1.0
+    moved = [
+        ((_outputs(new) - _outputs(old)) ** 2 / variance)[np.isnan(_outputs(run))]
+        for run, old, new in zip(runs, before, after, strict=True)
+    ]
+    squares = np.concatenate(moved)
+    return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
+
+
+def _outputs(run: Experiment) -> Array:
+    assert run.outputs is not None
+    return run.outputs
+
+
+def first_guess(runs: Sequence[Experiment]) -> list[Experiment]:
+    """Runs with missing outputs by a moving average of the inputs and its noise.
+
+    >>> u = np.random.default_rng(0).standard_normal((200, 1))
+    >>> y = u.copy()
+    >>> y[50:60] = np.nan
+    >>> (guess,) = first_guess([Experiment("a", np.arange(200), u, y)])
+    >>> np.allclose(guess.outputs, u), guess.estimated.sum()
+    (True, np.int64(10))
+    """
+    pairs = [(run.inputs, _outputs(run)) for run in runs]
+    centre = np.mean(np.vstack([u for u, _ in pairs]), axis=0)
+    pairs = [(u - centre, y) for u, y in pairs]
+    n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
+    n_known = min(
+        sum(np.count_nonzero(~np.isnan(y[:, i])) for _, y in pairs)
+        for i in range(n_outputs)
+    )
+    n_lags = int(np.clip(n_known // (_PER_UNKNOWN * n_inputs), 1, _LONGEST))
+    share = min(1.0, _MOST / sum(len(u) for u, _ in pairs))
+    heads = [slice(max(1, int(share * len(u)))) for u, _ in pairs]
+    parts = list(zip(pairs, heads, strict=True))
+    X = np.vstack([_lagged(u[head], n_lags) for (u, _), head in parts])
+    Y = np.vstack([y[head] for (_, y), head in parts])
+    answers = np.zeros((X.shape[1], n_outputs))
+    for i in range(n_outputs):
+        known = ~np.isnan(Y[:, i])
+        k = _n_regressors(X[known], Y[known, i], n_inputs)
+        answers[:k, i] = np.linalg.lstsq(X[known, :k], Y[known, i], _RCOND)[0]
+    return by_simulation(runs, [_lagged(u, n_lags) @ answers for u, _ in pairs])
+
+
+def _n_regressors(X: Array, y: Array, n_inputs: int) -> int:
+    """How many of the first columns have the least value of Schwarz's criterion.
+
+    A constant, and half as many lags again and again.
+    """
+    factor: Array = linalg.qr(np.column_stack([X, y]), mode="r")[0]
+    left = factor[: X.shape[1] + 1, -1] ** 2
+    squares = np.cumsum(left[::-1])[::-1]  # that so many columns leave
+    n, highest = len(y), X.shape[1]
+    floor = _ROUNDING**2 * squares[0] or 1.0
+    lags = (highest - 1) // n_inputs
+    numbers = {1 + n_inputs * (lags >> k) for k in range(lags.bit_length() + 1)}
+    price = np.log(n) / n
+    return min(
+        sorted(numbers),
+        key=lambda k: np.log(max(squares[k:].max(initial=0.0), floor)) + price * k,
+    )
+
+
+def by_simulation(
+    runs: Sequence[Experiment], simulated: Sequence[Array]
+) -> list[Experiment]:
+    """Runs with missing outputs as simulated, and what is expected of the errors."""
+    errors = [_outputs(run) - y for run, y in zip(runs, simulated, strict=True)]
+    noise = noise_of(errors)
+    return [
+        with_estimates(
+            run, np.where(np.isnan(v), y + _expected(noise, v), _outputs(run))
+        )
+        for run, y, v in zip(runs, simulated, errors, strict=True)
+    ]
+
+
+def noise_of(errors: Sequence[Array]) -> NoiseModel:
+    """Autoregression of errors of which some are missing (NaN).
+
+    Of what is drawn by the model before from all that the missing ones may be: a signal
+    by the model, and what is expected of the difference. Expected errors alone have not
+    the power that the noise has, and would be more and more of a wave through those
+    that are known (stochastic EM: G. Celeux and J. Diebolt, 1985).
+
+    >>> e = np.random.default_rng(0).standard_normal((5000, 1))
+    >>> v = scipy.signal.lfilter([1.0], [1.0, -0.9], e, axis=0)
+    >>> v[np.random.default_rng(1).random(5000) < 0.4] = np.nan
+    >>> noise_of([v]).C.round(2)
+    array([[0.9]])
+    """
+    rng = np.random.default_rng(0)  # the same draws from round to round
+    white = [rng.standard_normal(v.shape) for v in errors]
+    power = np.nanmean(np.vstack(errors) ** 2, axis=0)
+    ny = len(power)
+    none = np.zeros((0, 0)), np.zeros((ny, 0)), np.zeros((0, ny))
+    noise = NoiseModel(*none, np.diag(power))
+    for _ in range(_DRAWN):
+        size = np.sqrt(np.maximum(np.diagonal(noise.covariance), 0.0))
+        unit = np.where(size > 0.0, size, 1.0)
+        values, vectors = np.linalg.eigh(noise.covariance / np.outer(unit, unit))
+        root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        signals = [
+            lti_response(noise.A, noise.K @ root, noise.C, root, z) for z in white
+        ]
+        drawn = [
+            np.where(np.isnan(v), signal + _expected(noise, v - signal), v)
+            for v, signal in zip(errors, signals, strict=True)
+        ]
+        noise = autoregression(drawn)
+    return noise
+
+
+def _expected(noise: NoiseModel, v: Array) -> Array:
+    """What noise is expected to be where it is not known (NaN)."""
+    whitener = noise.A - noise.K @ noise.C, noise.K, -noise.C, np.eye(len(noise.C))
+    missing = np.isnan(v)
+    v = np.where(missing, 0.0, v)
+    return v + expected_change(noise, lti_response(*whitener, v), missing)
+
+
+def by_prediction(
+    run: Experiment, model: InnovationModel, u: Array, x0: Array | None, level: Array
+) -> Experiment:
+    """A run with missing outputs as a predictor expects them that has a gain.
+
+    Its inputs are `u` about the resting point, its initial state `x0`, and the outputs
+    that its answers add to `level`.
+    """
+    y = _outputs(run) - level
+    missing = np.isnan(y)
+    y = np.where(missing, model.predict(u, y, initial_state=x0), y)
+    innovations = y - model.predict(u, y, initial_state=x0)
+    return with_estimates(run, level + y + expected_change(model, innovations, missing))
+
+
+def expected_change(
+    noise: NoiseModel | InnovationModel, innovations: Array, missing: NDArray[np.bool_]
+) -> Array:
+    """Change of missing outputs after which the innovations are the smallest.
+
+    Both arrays have shape (n_samples, n_outputs); `innovations` are those of some
+    values of the missing outputs. What comes after an experiment is not asked about.
+    """
+    A, C, K, S = noise.A, noise.C, noise.K, noise.covariance
+    change = np.zeros(missing.shape)
+    if not missing.any():
+        return change
+    scale = np.sqrt(np.maximum(np.diagonal(S), 0.0))
+    scale = np.maximum(scale, _ROUNDING * np.sqrt(np.mean(innovations**2, axis=0)))
+    scale[scale == 0.0] = 1.0
+    weight = np.linalg.pinv(S / scale[:, None] / scale, rcond=_RCOND, hermitian=True)
+    # Answers of the innovations, each in its own size, to impulses of the outputs
+    forcing = np.zeros((len(missing), *K.shape))
+    forcing[0] = K * scale
+    answers = -(C / scale[:, None]) @ state_trajectory(A - K @ C, forcing)
+    answers[0] += np.eye(len(S))
+    n_padded = fft.next_fast_len(2 * len(missing), real=True)
+    spectrum = fft.rfft(answers, n_padded, axis=0)
+
+    def convolved(spectrum: NDArray[np.complex128], v: Array) -> Array:
+        transformed = spectrum @ fft.rfft(v, n_padded, axis=0)[:, :, None]
+        return fft.irfft(transformed[:, :, 0], n_padded, axis=0)[: len(v)]
+
+    transposed = spectrum.conj().transpose(0, 2, 1)
+
+    def normal(x: Array) -> Array:
+        values = np.zeros(missing.shape)
+        values[missing] = x
+        return convolved(transposed, convolved(spectrum, values) @ weight)[missing]
+
+    size = np.count_nonzero(missing)
+    equations = LinearOperator((size, size), matvec=normal)
+    right = -convolved(transposed, (innovations / scale) @ weight)[missing]
+    tolerance = _TOL * np.sqrt(size)  # standard deviations
+    change[missing], _ = cg(equations, right, rtol=0.0, atol=tolerance, maxiter=_STEPS)
+    return change * scale
+
+
+def _lagged(u: Array, n_lags: int) -> Array:
+    """A constant, and the last inputs, zero before the first; a row per sample."""
+    n_inputs = u.shape[1]
+    out = np.ones((len(u), 1 + n_lags * n_inputs))
+    for k in range(n_lags):
+        part = out[:, 1 + k * n_inputs : 1 + (k + 1) * n_inputs]
+        part[:k], part[k:] = 0.0, u[: max(len(u) - k, 0)]
+    return out
