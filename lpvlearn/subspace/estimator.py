@@ -75,6 +75,7 @@ from .missing_outputs import (
     first_guess,
     movement,
     runs_to_complete,
+    warn_of_few,
     warn_of_many_pieces,
 )
 from .offsets import N_TRENDS
@@ -474,6 +475,7 @@ class SubspaceLTI(
         Cut where inputs are missing, or time has a hole.
         """
         runs = runs_to_complete(experiments, at_rest=not choices.initial_states)
+        warn_of_few(runs)
         completed = first_guess(runs)
         delay = self._delay_of(completed, choices)
         chosen: tuple[int, str] | None = None

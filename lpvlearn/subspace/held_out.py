@@ -126,6 +126,8 @@ def held_out(
             begin = 0 if at_rest else start
             u, y = record.u.T[begin:stop], record.y.T[start:stop]
             trend, known = record.trend[:, begin:stop], record.known[start:stop]
+            if not known.any():
+                continue
             with np.errstate(over="ignore", invalid="ignore"):
                 answer, free = _answers(model, u, trend, at_rest)
                 error = np.where(known, y - answer[start - begin :], 0.0)
@@ -135,7 +137,10 @@ def held_out(
                 # What these unknowns take of the noise is made up for.
                 n_values = int(np.count_nonzero(known))
                 spare = n_values - free.shape[2]
-                error *= np.sqrt(n_values / spare) if spare > 0 else np.nan
+                if spare > 0:
+                    error *= np.sqrt(n_values / spare)
+                elif known.all():
+                    error *= np.nan
             n_known += n_values
             parts.append(part)
             errors.append(error)

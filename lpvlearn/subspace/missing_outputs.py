@@ -41,6 +41,8 @@ _MANY, _SHORT = 5, 50
 
 _DRAWN = 15  # times that missing errors are drawn, for the model of the noise
 
+_FEW = 1.0 / 3.0  # share of an output that is there, below which that is told
+
 # Of conjugate gradients: standard deviations of an innovation, and steps
 _TOL, _STEPS = 1e-3, 200
 
@@ -90,6 +92,19 @@ def warn_of_many_pieces(experiments: Sequence[Experiment]) -> None:
             f"of {n_samples / len(pieces):.0f} samples in the mean, each with an "
             "initial state of its own, tell little. Use missing='estimate', which cuts "
             "where inputs are missing alone."
+        )
+
+
+def warn_of_few(runs: Sequence[Experiment]) -> None:
+    """Tell of an output that is hardly there."""
+    known = np.mean(np.vstack([np.isfinite(_outputs(run)) for run in runs]), axis=0)
+    rarest = int(np.argmin(known))
+    if known[rarest] < _FEW:
+        warn(
+            f"Output {rarest + 1} is missing in {100.0 * (1.0 - known[rarest]):.0f} % "
+            "of the samples: so few tell little of the order, and the model may be far "
+            "from the system without its bands (`frequency_response_std`) showing it. "
+            "Give `order`, record that output more often, or leave it out."
         )
 
 

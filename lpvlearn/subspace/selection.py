@@ -556,6 +556,7 @@ def _innovations(
         squares += (white**2).sum(axis=0)
         # What is expected of missing ones leaves the squares of the others, on average.
         n_samples += (weights**2 * record.known[lost:]).sum(axis=0)
+    n_samples[n_samples == 0.0] = 1.0  # of an output that is not known
     variances = np.array(sizes) ** 2 * squares / n_samples
     return [(float(v), len(f) - 1) for v, f in zip(variances, filters, strict=True)]
 

@@ -524,6 +524,11 @@ def estimator_calls(w):
         lp.SubspaceLTI, order=2, method="pbsid", **TABLE_ROLES
     ), {**table, "stability": "enforce", "offset": None,
         "missing": "split"}  # fmt: skip
+    gappy = np.where(np.arange(w.Y.size).reshape(w.Y.shape) % 7, w.Y, np.nan)
+    yield "SubspaceLTI.fit(missing outputs)", fitting(
+        lp.SubspaceLTI, **{**QUICK, "missing": "estimate"}
+    ), {"X": w.U, "y": gappy, "order": 2, "method": "auto", "offset": "auto",
+        "initial_state": "estimate", "refine": "auto"}  # fmt: skip
     yield "SubspaceLTI.fit(integrating)", fitting(
         lp.SubspaceLTI, **QUICK, **TABLE_ROLES
     ), {**table, "integrating": True}  # fmt: skip
