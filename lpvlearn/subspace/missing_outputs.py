@@ -213,7 +213,7 @@ def noise_of(errors: Sequence[Array]) -> NoiseModel:
     that are known (stochastic EM: G. Celeux and J. Diebolt, 1985).
 
     >>> e = np.random.default_rng(0).standard_normal((5000, 1))
-    >>> v = scipy.signal.lfilter([1.0], [1.0, -0.9], e, axis=0)
+    >>> v = lti_response(*np.array([[[0.9]], [[1.0]], [[0.9]], [[1.0]]]), e)
     >>> v[np.random.default_rng(1).random(5000) < 0.4] = np.nan
     >>> noise_of([v]).C.round(2)
     array([[0.9]])
