@@ -686,7 +686,7 @@ list, default=None
 
     @property
     def _splits(self) -> bool:
-        return getattr(self.local, "missing", "raise") != "raise"
+        return getattr(self.local, "missing", None) in ("split", "estimate")
 
     def _sampling_time(self, experiments: list[Experiment], structure: Any) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]
