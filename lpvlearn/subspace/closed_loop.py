@@ -71,7 +71,7 @@ from .noise import Whitening
 from .realization import reflect_unstable
 from .refinement import refine_simulation
 from .selection import PlantFit, Row, Selection
-from .signals import Record, output_energy, shorten
+from .signals import Record, output_energy, share_known, shorten
 from .simulation_fit import (
     Freedom,
     Realization,
@@ -289,8 +289,7 @@ class ClosedLoopEvidence(Evidence):
             return np.zeros((0, 0))  # no parameters
         known = _knowledge(self.fitted, self.joint, self.transform, self.kept, direct)
         # What is expected of missing outputs adds to what is known, and has no noise.
-        share = np.mean(np.vstack([record.known for record in self.records]))
-        return known.plant / share**2
+        return known.plant / share_known(self.records) ** 2
 
     def of_others(self, records: Sequence[Record]) -> Realization:
         """The model, noise included, that other records would have given.

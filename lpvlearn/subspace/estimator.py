@@ -475,6 +475,8 @@ class SubspaceLTI(
         Cut where inputs are missing, or time has a hole.
         """
         runs = runs_to_complete(experiments, at_rest=not choices.initial_states)
+        if not any(map(has_gaps, runs)):
+            return runs
         warn_of_few(runs)
         completed = first_guess(runs)
         delay = self._delay_of(completed, choices)

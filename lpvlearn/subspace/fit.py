@@ -53,8 +53,8 @@ from .realization import METHODS
 from .residuals import find_spikes, lacks
 from .selection import PlantFit, Row, Selection, better_horizon, select
 from .shifts import cut_at, find_shifts
-from .signals import Record, SharedSignals, shorten, thinned
-from .simulation_fit import Freedom, Realization
+from .signals import Record, SharedSignals, share_known, shorten, thinned
+from .simulation_fit import Freedom, Realization, simulation_errors
 from .statistics import Evidence
 from .varx import Feedback, find_feedback
 
@@ -451,14 +451,14 @@ def _residual_of_known(evidence: Evidence, method: str, found: float) -> float:
     """
     model, records = evidence.model, evidence.records
     if method == "pbsid" or len(model.initial_states) != len(records):
-        share = sum(r.n_values for r in records) / sum(r.y.size for r in records)
-        return found / float(np.sqrt(share))
-    squares, power = 0.0, 0.0
-    for k, record in enumerate(records):
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = (record.y.T - model.outputs(record, k))[record.known]
-            squares += float(error @ error)
-        power += float(np.sum(record.y.T[record.known] ** 2))
+        return found / float(np.sqrt(share_known(records)))
+    errors = simulation_errors(model, records)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = sum(
+            float(np.sum(e[record.known] ** 2))
+            for e, record in zip(errors, records, strict=True)
+        )
+    power = sum(float(np.sum(r.y.T[r.known] ** 2)) for r in records)
     known = float(np.sqrt(squares / power)) if power else found
     return known if np.isfinite(known) else found
 

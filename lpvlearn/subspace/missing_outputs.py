@@ -218,9 +218,13 @@ def noise_of(errors: Sequence[Array]) -> NoiseModel:
     >>> noise_of([v]).C.round(2)
     array([[0.9]])
     """
+    missing = np.isnan(np.vstack(errors))
+    if not missing.any():
+        return autoregression(errors)
     rng = np.random.default_rng(0)  # the same draws from round to round
     white = [rng.standard_normal(v.shape) for v in errors]
-    power = np.nanmean(np.vstack(errors) ** 2, axis=0)
+    n_known = np.maximum(np.count_nonzero(~missing, axis=0), 1)
+    power = np.nansum(np.vstack(errors) ** 2, axis=0) / n_known
     ny = len(power)
     none = np.zeros((0, 0)), np.zeros((ny, 0)), np.zeros((0, ny))
     noise = NoiseModel(*none, np.diag(power))

@@ -88,6 +88,11 @@ def output_energy(records: Sequence[Record]) -> float:
     return sum(float((record.y**2).sum()) for record in records)
 
 
+def share_known(records: Sequence[Record]) -> float:
+    """Share of the outputs that were there."""
+    return sum(r.n_values for r in records) / sum(r.y.size for r in records)
+
+
 def shorten(records: Sequence[Record]) -> tuple[list[Record], float]:
     """Heads of the records, some 30,000 samples in total, and their share."""
     total = sum(record.u.shape[1] for record in records)

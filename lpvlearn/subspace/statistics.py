@@ -31,7 +31,7 @@ from ..models.innovation import InnovationModel, NoiseModel
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..systems.response import resolvent
 from .missing_outputs import noise_of
-from .noise import Whitening, autoregression, reduced_noise_model, spectral_density
+from .noise import Whitening, reduced_noise_model, spectral_density
 from .signals import Record, block_slices, signal_pieces
 from .simulation_fit import (
     Freedom,
@@ -307,8 +307,6 @@ class Evidence:
 def _noise_of(model: Realization, records: Sequence[Record]) -> NoiseModel:
     """Autoregression of the simulation errors that are known."""
     errors = simulation_errors(model, records)
-    if not any(record.missing.any() for record in records):
-        return autoregression(errors)
     return noise_of(
         [np.where(r.known, e, np.nan) for r, e in zip(records, errors, strict=True)]
     )
