@@ -6,12 +6,15 @@ With a level t above the largest singular value of the error E at every frequenc
 
 is smooth: least squares for a large mu, the highest singular value for a small one.
 Its minimisers for a falling mu are the central path, which Newton's method follows in
-a trust region, along geodesics of the response.
+a trust region, along geodesics of the response, with multipliers of its own as the
+primal-dual methods of semidefinite programming have them (Conn, Gould, Orban and Toint,
+2000, for nonconvex problems).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +47,9 @@ _NOTHING = 1e-300  # square of the level of no error
 _WORSE = 1.05  # end above the least norm met by more: that point is kept instead
 _DEPTH = 0.5  # local maxima down to there join the frequencies
 _BENT = 1.5  # a step whose geodesic bends more than that is too long
-_HALVINGS = 6  # of a step along the path; beyond, Newton's method does better
+_APART = 1e3  # factor by which multipliers may differ from those of psi
+_REACH = 0.99  # part of a distance to the level that a step may take
+_CORRECTIONS = 3  # of a step, for the bend of the errors' squares
 
 
 def level_of(squares: Array, mu: float) -> float:
@@ -72,37 +77,108 @@ def level_of(squares: Array, mu: float) -> float:
 
 @dataclass(frozen=True)
 class Quadratic:
-    """psi near one theta, along geodesics of the response."""
+    """psi near one theta, along geodesics of the response, and the multipliers there.
 
+    Newton's method for ``Z_k (tau I - X_k) = mu I`` moves the multipliers Z of the
+    squares ``X = E^H E`` together with theta. On the path they are ``mu M``, ``M = (tau
+    I - X)^-1``. Off it M changes as soon as a step is as long as the distances to the
+    level tau, which shrink with mu; Z hardly does.
+    """
+
+    mu: float
     value: float
     gradient: Array
-    hessian: Array
-    drift: Array  # derivative of the gradient by mu
+    hessian: Array  # that of psi where Z is mu M
     geometry: ResponseGeometry  # of which y are the coordinates
+    E: Complex
+    M: Complex
+    Z: Complex
+    tau: float  # square of the level
+    by_level: Array  # derivative of the gradient by tau
+    level_curvature: float  # second derivative of psi by tau
+    level_slope: float = 0.0  # the first one
+
+    def at(self, mu: float, value: float) -> Quadratic:
+        """For another mu, of which this tau is not the best one, and psi `value`."""
+        slope = 0.5 * (1.0 - mu / self.mu) / self.tau
+        gradient = mu / self.mu * self.gradient - self._by_level(slope)
+        return replace(self, mu=mu, value=value, gradient=gradient, level_slope=slope)
+
+    def corrected(self, bend: Complex) -> Array:
+        """The gradient where the squares are off the linear ones by `bend`."""
+        W = _hermitian(self.Z @ bend @ self.M)
+        gradient = self.gradient + 2.0 * self.geometry.pulled(self.E @ W)
+        return gradient + self._by_level(_trace(W))
+
+    def bend(self, d: Array, E: Complex) -> Complex:
+        """Change of the squares that is not linear in a step `d` to the errors `E`."""
+        return _square(E) - _square(self.E) - self._linear(d)
+
+    def reach(self, d: Array, bend: Complex) -> float:
+        """Part of the step `d` that leaves some of every distance to the level."""
+        rise = self.M @ self._rise(d, bend)
+        if not np.isfinite(rise).all():
+            return 1.0
+        lowest = float(np.real(np.linalg.eigvals(rise)).min())
+        return _REACH / max(-lowest, _REACH)
+
+    def multipliers(self, d: Array, bend: Complex) -> Complex:
+        """Those after the step `d`."""
+        return self.mu * self.M - _hermitian(self.Z @ self._rise(d, bend) @ self.M)
+
+    def _by_level(self, slope: float) -> Array:
+        """Change of the gradient with a level for which psi has that slope."""
+        return slope / self.level_curvature * self.by_level
+
+    def _linear(self, d: Array) -> Complex:
+        dX = self.E.conj().swapaxes(1, 2) @ self.geometry.change(d)
+        return dX + dX.conj().swapaxes(1, 2)
+
+    def _rise(self, d: Array, bend: Complex) -> Complex:
+        """Change of ``tau I - X`` along the step `d`."""
+        slope = self.level_slope - _trace(_hermitian(self.Z @ bend @ self.M))
+        level = -(self.by_level @ d + slope) / self.level_curvature
+        return np.asarray(level * np.eye(self.M.shape[1]) - self._linear(d) - bend)
+
+
+def _square(E: Complex) -> Complex:
+    return np.asarray(E.conj().swapaxes(1, 2) @ E)
+
+
+def _hermitian(A: Complex) -> Complex:
+    return np.asarray(0.5 * (A + A.conj().swapaxes(1, 2)))
+
+
+def _trace(A: Complex) -> float:
+    return float(np.real(np.einsum("kii->", A)))
 
 
 class Barrier:
     """psi for one set of frequencies.
 
     The limits are kept by logarithms of their own; a unit step changes the response by
-    `size`. `missed` are frequencies of resonances between the others that rose above
-    the level at the point of the last `value`.
+    `size`. Of the point of the last `value`: `error` at the frequencies, and `missed`,
+    resonances between these that rose above the level. `carried` are frequencies and
+    their multipliers (those of psi if None).
     """
 
     def __init__(
-        self, system: ErrorSystem, limits: Limits, omega: Array, size: float
+        self,
+        system: ErrorSystem,
+        limits: Limits,
+        omega: Array,
+        size: float,
+        carried: tuple[Array, Complex] | None = None,
     ) -> None:
         self.system, self.limits, self.size = system, limits, size
         self.omega, self.missed = omega, np.zeros(0)
+        self.error: Complex = np.zeros((0, 0, 0), complex)
+        self.carried = carried
 
     def mu_of_level(self, theta: Array, ratio: float) -> float:
         """mu for which the level is `ratio` times the largest singular value."""
-        s = self._squares(theta)
+        s = _squares(self.system.weighted_error(theta, self.omega))
         return float(0.5 / (s / (ratio**2 * s.max() - s)).sum())
-
-    def _squares(self, theta: Array) -> Array:
-        E = self.system.weighted_error(theta, self.omega)
-        return np.asarray(np.linalg.svd(E, compute_uv=False) ** 2).ravel()
 
     def value(self, theta: Array, mu: float) -> float:
         """psi, infinite where the limits are not kept.
@@ -120,9 +196,10 @@ class Barrier:
         c = self.limits.values(theta, poles)
         if not c.max(initial=-1.0) < 0:
             return np.inf
-        s = self._squares(theta)
-        if not np.isfinite(s).all():
+        self.error = system.weighted_error(theta, self.omega)
+        if not np.isfinite(self.error).all():
             return np.inf
+        s = _squares(self.error)
         level = level_of(s, mu)
         turns = system.resonances(poles)
         if turns.size:
@@ -132,50 +209,77 @@ class Barrier:
         return _psi(s, level, mu) - _BARRIER * mu * float(np.log(-c).sum())
 
     def quadratic(self, theta: Array, mu: float) -> Quadratic:
-        """psi, its gradient and its Hessian.
+        """psi, its gradient, and its Hessian by the multipliers.
 
         With ``M = (t^2 I - E^H E)^-1`` and ``dX = E^H dE + dE^H E`` the terms of a
-        frequency have the derivatives ``2 mu Re tr(M E^H dE)`` and ``mu (2 tr(M dE^H
-        dE) + tr(M dX M dX) + 2 Re tr(M E^H d2E))``. The level is eliminated. Along
-        geodesics only the normal part of the covector ``2 mu E M`` meets ``d2E``.
+        frequency have the derivatives ``2 mu Re tr(M E^H dE)`` and ``2 tr(Z dE^H dE) +
+        tr(Z dX M dX) + 2 Re tr(Z E^H d2E)``, Z being ``mu M`` for the derivatives of
+        psi. The level is eliminated. Along geodesics only the normal part of the
+        covector ``2 E Z`` meets ``d2E``.
         """
         c, dc, _ = self.limits.rows(theta)
         pull, weight = dc / -c[:, None], _BARRIER * mu
         system, omega = self.system, self.omega
         geometry = ResponseGeometry(system, theta, omega, self.size, pull)
-        at, L, S = geometry.at, geometry.L, geometry.S
+        at, T = geometry.at, geometry.T
         E = system.weight_response(omega)[0] @ (at.G - system.target_response(omega))
         k, p, m = E.shape
-        q = len(S)
         _, sigma, Vh = np.linalg.svd(E)
         s = sigma**2
         tau = level_of(s.ravel(), mu)
-        padded = np.zeros((k, m))
-        padded[:, : s.shape[1]] = s
-        C = Vh.conj().swapaxes(1, 2) / np.sqrt(tau - padded)[:, None]  # M = C C^H
-        Eh, Ch = E.conj().swapaxes(1, 2), C.conj().swapaxes(1, 2)
-        inner = C @ (Ch @ Eh)  # M E^H
-        P = at.R @ inner @ L  # tr(M E^H dE_j) = tr(P S_j)
-        P2 = (at.R @ (C @ (Ch @ inner)) @ L).sum(0)
-        flat, T = S.reshape(q, -1), geometry.T
-        gradient = 2.0 * mu * (flat @ np.real(P.sum(0)).T.ravel())
-        by_level = -2.0 * mu * (flat @ np.real(P2).T.ravel())
-        level_curvature = mu / tau * float((s / (tau - s) ** 2).sum())
-        # dE C and C^H dX C, whose Gram matrices are the terms of first derivatives
-        dEC = (C.swapaxes(1, 2)[:, None] @ geometry.changes).reshape(-1, q)
-        Z = ((Ch @ Eh) @ dEC.reshape(k, p, m * q)).reshape(k, m, m, q)
-        dX = (Z + Z.conj().swapaxes(1, 2)).reshape(-1, q)
-        first = np.sqrt(2.0) * dEC
+        gaps = np.full((k, m), tau)
+        gaps[:, : s.shape[1]] -= s
+        C = np.asarray(Vh.conj().swapaxes(1, 2) / np.sqrt(gaps)[:, None], complex)
+        F = self._factor(C, gaps, mu)
+        Eh, Ch, Fh = (X.conj().swapaxes(1, 2) for X in (E, C, F))
+        M: Complex = C @ Ch
+        Z: Complex = F @ Fh
+        both = _hermitian(Z @ M)
+        bounds = weight * T.T @ pull.sum(0)
+        gradient = 2.0 * mu * geometry.pulled(E @ M) + bounds
+        by_level = -2.0 * geometry.pulled(E @ both)
+        level_curvature = _trace(both) - mu * _trace(M) / tau
+        # dE F and C^H dX F, whose Gram matrices are the terms of first derivatives
+        q = len(theta)
+        dEC = (C.swapaxes(1, 2)[:, None] @ geometry.changes).reshape(k, p, m * q)
+        dEF = (F.swapaxes(1, 2)[:, None] @ geometry.changes).reshape(k, p, m * q)
+        left = ((Ch @ Eh) @ dEF).reshape(k, m, m, q)
+        right = ((Fh @ Eh) @ dEC).reshape(k, m, m, q)
+        dX = (left + right.conj().swapaxes(1, 2)).reshape(-1, q)
+        first = np.sqrt(2.0) * dEF.reshape(-1, q)
         rows = np.concatenate([first.real, first.imag, dX.real, dX.imag])
-        value = _psi(s.ravel(), tau, mu) - weight * float(np.log(-c).sum())
-        hessian = mu * (rows.T @ rows) + weight * (pull.T @ pull)
+        hessian = T.T @ (rows.T @ rows + weight * (pull.T @ pull)) @ T
         hessian = hessian - np.outer(by_level, by_level) / level_curvature
-        gradient, by_level = T.T @ (gradient + weight * pull.sum(0)), T.T @ by_level
-        normal = 2.0 * mu * P - geometry.tangential(gradient)
-        hessian = T.T @ hessian @ T + geometry.second_derivatives(normal)
-        # at fixed theta the level falls with mu by 1 / (2 mu tau curvature)
-        drift = gradient / mu + by_level / (2.0 * mu * tau * level_curvature)
-        return Quadratic(value, gradient, hessian, drift, geometry)
+        seen = 2.0 * geometry.pulled(E @ Z) + bounds
+        normal = 2.0 * at.R @ (Z @ Eh) @ geometry.L - geometry.tangential(seen)
+        hessian = hessian + geometry.second_derivatives(normal)
+        value = _psi(s.ravel(), tau, mu) - weight * float(np.log(-c).sum())
+        local = value, gradient, hessian, geometry
+        return Quadratic(mu, *local, E, M, Z, tau, by_level, level_curvature)
+
+    def _factor(self, C: Complex, gaps: Array, mu: float) -> Complex:
+        """F with ``Z = F F^H``: the multipliers carried, within reach of ``mu M``.
+
+        ``M = C C^H``, with `gaps` between the squares and the level. New frequencies
+        share those of the nearest one: mostly it is the same maximum, which has moved.
+        The sum of traces is that of ``mu M``, which the level asks for.
+        """
+        if self.carried is None or not np.isfinite(self.carried[1]).all():
+            return np.asarray(np.sqrt(mu) * C)
+        omega, Z = self.carried
+        with np.errstate(invalid="ignore"):  # inf - inf is the nearest of all
+            nearest = np.abs(self.omega[:, None] - omega).argmin(1)
+        sharing = np.bincount(nearest)[nearest]
+        inverse = gaps[:, :, None] * C.conj().swapaxes(1, 2)
+        Z = Z[nearest] / (mu * sharing[:, None, None])
+        w, U = np.linalg.eigh(inverse @ Z @ inverse.conj().swapaxes(1, 2))
+        F = (C @ U) * np.sqrt(np.clip(w, 1.0 / _APART, _APART))[:, None]
+        wanted = mu * np.sum(np.abs(C) ** 2)
+        return np.asarray(F * np.sqrt(wanted / np.sum(np.abs(F) ** 2)))
+
+
+def _squares(E: Complex) -> Array:
+    return np.asarray(np.linalg.svd(E, compute_uv=False) ** 2).ravel()
 
 
 def _psi(squares: Array, tau: float, mu: float) -> float:
@@ -221,18 +325,19 @@ def central_path(
     best, best_norm = theta, found.norm
     seen = np.zeros(0) if frequencies is None else frequencies
     history: list[dict[str, float]] = []
-    n_iter = 0
+    n_iter, carried = 0, None
     while n_iter < max_iter and not time_is_up():
         if system.peaks_move:
             seen = np.union1d(seen, found.frequencies)
-        barrier = Barrier(system, limits, np.union1d(system.grid, seen), found.norm)
+        omega = np.union1d(system.grid, seen)
+        barrier = Barrier(system, limits, omega, found.norm, carried)
         if mu is None:
             mu = barrier.mu_of_level(theta, _FIRST_LEVEL)
         ahead = max(_SHRINK * mu, min(mu_end, mu))
         theta, steps = _stage(
             barrier, theta, mu, ahead, decrement * mu, max_iter - n_iter
         )
-        n_iter += steps
+        n_iter, carried = n_iter + steps, barrier.carried
         found = system.peaks(theta, _DEPTH)
         history.append({"objective": found.norm, "mu": mu, "steps": float(steps)})
         if found.norm < best_norm:
@@ -263,15 +368,14 @@ def _stage(
         n_iter += 1
         if not (np.isfinite(model.gradient).all() and np.isfinite(model.hessian).all()):
             break
-        spectrum, Q = np.linalg.eigh(0.5 * (model.hessian + model.hessian.T))
-        slopes = Q.T @ model.gradient
+        eigen = np.linalg.eigh(0.5 * (model.hessian + model.hessian.T))
+        spectrum, slopes = eigen[0], eigen[1].T @ model.gradient
         x = trust_region_step(spectrum, slopes, radius)
-        if ahead < mu and _promised(spectrum, slopes, x) < enough:
-            return _predicted(barrier, theta, model, (spectrum, Q), ahead, mu), n_iter
-        theta, radius, promised = _newton(
-            barrier, theta, mu, model, (spectrum, Q), radius
-        )
-        if promised < enough:
+        near = _promised(spectrum, slopes, x) < enough
+        if near and ahead < mu:
+            model = model.at(ahead, barrier.value(theta, ahead))
+        theta, radius, promised = _newton(barrier, theta, model, eigen, radius)
+        if near or promised < enough:
             break
     return theta, n_iter
 
@@ -283,7 +387,6 @@ def _promised(spectrum: Array, slopes: Array, x: Array) -> float:
 def _newton(
     barrier: Barrier,
     theta: Array,
-    mu: float,
     model: Quadratic,
     eigen: tuple[Array, Array],
     radius: float,
@@ -300,44 +403,63 @@ def _newton(
         promised, length = _promised(spectrum, slopes, x), float(np.linalg.norm(x))
         if promised < _NEGLIGIBLE:
             break
-        trial = _along(theta, model, Q @ x)
+        trial = _tried(barrier, theta, model, eigen, x, radius)
         if trial is None:
             radius = _SHORTER * min(length, radius)
             continue
-        ratio = (model.value - barrier.value(trial, mu)) / promised
+        ratio = (model.value - trial.value) / promised
         missed = np.union1d(missed, barrier.missed)
         if ratio > _TAKEN:
+            barrier.carried = barrier.omega, model.multipliers(trial.d, trial.bend)
             if missed.size:
                 barrier.omega = np.union1d(barrier.omega, missed)
             if ratio > _GOOD:
                 radius = max(radius, _LONGER * length)
             elif ratio < _POOR:
                 radius *= _SHORTER
-            return trial, radius, promised
+            return trial.theta, radius, promised
         radius = _FAILED * min(length, radius)
     return theta, radius, 0.0
 
 
-def _predicted(
+class _Trial(NamedTuple):
+    theta: Array
+    value: float  # of psi
+    d: Array  # the step
+    bend: Complex  # of the squares, as far as it was allowed for
+
+
+def _tried(
     barrier: Barrier,
     theta: Array,
     model: Quadratic,
     eigen: tuple[Array, Array],
-    ahead: float,
-    mu: float,
-) -> Array:
-    """A step along the path: to where it will be at the next mu, or part of the way."""
+    x: Array,
+    radius: float,
+) -> _Trial | None:
+    """The end of a step, corrected for the bend of the squares; None if bent too much.
+
+    Distances to the level are far shorter than the step, and what bends the squares
+    along it would be most of them.
+    """
     spectrum, Q = eigen
-    slopes = Q.T @ (model.gradient + (ahead - mu) * model.drift)
-    size = np.abs(spectrum)
-    d = -Q @ (slopes / np.maximum(size, _SINGULAR * size.max(initial=1e-300)))
-    here = barrier.value(theta, ahead)
-    for _ in range(_HALVINGS):
-        trial = _along(theta, model, d)
-        if trial is not None and barrier.value(trial, ahead) < here:
-            return trial
-        d = 0.5 * d
-    return theta
+    promised = _promised(spectrum, Q.T @ model.gradient, x)
+    best, bend = None, np.zeros_like(model.M)
+    for _ in range(_CORRECTIONS + 1):
+        d = Q @ x
+        d = model.reach(d, bend) * d
+        end = _along(theta, model, d)
+        if end is None:
+            break
+        value = barrier.value(end, model.mu)
+        if best is not None and not value < best.value:
+            break
+        best = _Trial(end, value, d, bend)
+        if not np.isfinite(value) or model.value - value > _GOOD * promised:
+            break
+        bend = model.bend(d, barrier.error)
+        x = trust_region_step(spectrum, Q.T @ model.corrected(bend), radius)
+    return best
 
 
 def _along(theta: Array, model: Quadratic, d: Array) -> Array | None:

@@ -109,6 +109,15 @@ class ResponseGeometry:
     def _solve(self, g: Array) -> Array:
         return np.asarray(np.linalg.solve(self._gram, g))
 
+    def change(self, d: Array) -> Complex:
+        """Change of the error along a step `d`, (k, n_outputs, n_inputs)."""
+        return np.asarray(self.changes @ (self.T @ d))
+
+    def pulled(self, V: Complex) -> Array:
+        """``Re sum_k tr(V_k^H dE_j)`` in y, for a covector V of the response."""
+        flat = self.changes.reshape(-1, self.changes.shape[3])
+        return np.asarray(self.T.T @ np.real(V.conj().ravel() @ flat))
+
     def acceleration(self, d: Array) -> Array:
         """Second derivative, in y, of the geodesic that leaves in the direction `d`."""
         v, n, at = self.T @ d, self.n, self.at

@@ -47,13 +47,73 @@ def test_the_quadratic_is_that_of_the_value_along_geodesics(case, mu, monkeypatc
 
 
 @pytest.mark.parametrize("case", SYSTEMS, ids=str)
-def test_drift_is_the_derivative_of_the_gradient_by_mu(case):
+def test_the_gradient_follows_mu(case):
     system, theta = system_of(**case)
     barrier = Barrier(system, Limits(system, 0.01), system.grid, 0.1)
     mu, h = 1e-2, 1e-7
     up, down = (barrier.quadratic(theta, mu + s * h).gradient for s in (1, -1))
-    drift = barrier.quadratic(theta, mu).drift
-    assert np.allclose(drift, (up - down) / (2 * h), rtol=1e-4, atol=1e-5)
+    here = barrier.quadratic(theta, mu)
+    ahead = (here.at(mu + h, here.value).gradient - here.gradient) / h
+    assert np.allclose(ahead, (up - down) / (2 * h), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("case", SYSTEMS, ids=str)
+def test_a_short_step_takes_the_multipliers_to_those_of_psi(case, monkeypatch):
+    system, theta = system_of(**case)
+    limits, mu = Limits(system, 0.01), 1e-2
+    here = Barrier(system, limits, system.grid, 0.1).quadratic(theta, mu)
+    assert np.allclose(here.Z, mu * here.M, rtol=1e-12)
+    d = 1e-6 * np.random.default_rng(2).normal(size=len(theta))
+    end = theta + here.geometry.T @ d
+    bend = here.bend(d, system.weighted_error(end, system.grid))
+    moved = here.multipliers(d, bend)
+    there = Barrier(system, limits, system.grid, 0.1).quadratic(end, mu)
+    change = np.abs(there.Z - here.Z).max()
+    assert np.abs(moved - there.Z).max() < 1e-3 * change
+
+
+def trace(A):
+    return np.trace(A, axis1=1, axis2=2).real
+
+
+@pytest.mark.parametrize("case", SYSTEMS, ids=str)
+def test_multipliers_of_their_own_solve_newtons_equations(case):
+    system, theta = system_of(**case)
+    limits, mu, omega = Limits(system, 0.01), 1e-2, system.grid
+    psi = Barrier(system, limits, omega, 0.1).quadratic(theta, mu)
+    rng = np.random.default_rng(3)
+    Z = psi.Z * rng.uniform(0.2, 5.0, size=(len(omega), 1, 1))
+    off = Barrier(system, limits, omega, 0.1, (omega, Z)).quadratic(theta, mu)
+    assert np.allclose(off.gradient, psi.gradient, rtol=1e-10)
+    assert np.allclose(off.Z, Z * trace(psi.Z).sum() / trace(Z).sum(), rtol=1e-8)
+    d = 1e-3 * rng.normal(size=len(theta))
+    dX = off.E.conj().swapaxes(1, 2) @ off.geometry.change(d)
+    dX = dX + dX.conj().swapaxes(1, 2)
+    moved = off.multipliers(d, np.zeros_like(dX))
+    # Z (tau I - X) = mu I to first order gives the change of the level, ...
+    left = off.mu * off.M - moved  # = sym(Z (level I - dX) M)
+    both = 0.5 * (off.Z @ off.M + off.M @ off.Z)
+    driven = 0.5 * (off.Z @ dX @ off.M + off.M @ dX @ off.Z)
+    level = np.sum(both.conj() * (left + driven)).real / np.sum(np.abs(both) ** 2)
+    assert np.allclose(left, level * both - driven, rtol=1e-6, atol=1e-12)
+    # ... which keeps the sum of traces at (1/2 + mu k m) / tau = mu tr M
+    total = mu * trace(off.M).sum()
+    assert np.isclose(trace(moved).sum(), total * (1.0 - level / off.tau), rtol=1e-8)
+    # and squares that bend by what is linear in d add what the Hessian has of first
+    # derivatives: its product with d, but for the term of dE^H dE and the second ones
+    added = off.corrected(dX) - off.gradient
+    expected = 2.0 * off.geometry.pulled(off.E @ (moved - off.mu * off.M))
+    assert np.allclose(added, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_new_frequencies_share_the_multipliers_of_the_nearest():
+    system, theta = system_of((1, 1))
+    limits, omega, mu = Limits(system, 0.01), system.grid, 1e-2
+    Z = Barrier(system, limits, omega, 0.1).quadratic(theta, mu).Z
+    more = np.append(omega, omega[3] * (1 + 1e-9))
+    split = Barrier(system, limits, more, 0.1, (omega, Z)).quadratic(theta, mu).Z
+    assert np.isclose(split[3, 0, 0], split[-1, 0, 0])
+    assert np.isclose(split[3] / split[5], 0.5 * Z[3] / Z[5], rtol=1e-6).all()
 
 
 @pytest.mark.parametrize("mu", [1e4, 1.0, 1e-3, 1e-9])
