@@ -33,6 +33,7 @@ _SCALING_PASSES = 16  # over rows and columns: each divides a size, in decades, 
 # adds: half of the digits are lost. (Far from zero, in units of its range, a variable
 # cancels what it adds.)
 _ILL_POSED = 1e-8
+_SINGULAR = 1e10  # condition that leaves six digits
 
 _MANY_VARIABLES = 4  # 24 orders in which to take the variables are tried
 
@@ -98,10 +99,22 @@ class LinearFractionalModel:
         return np.diag(np.repeat(unit / self.half_width, self.repetitions))
 
     def at(self, kappa: ArrayLike) -> StateSpace:
-        """The frozen model at one scheduling value, shape (n_scheduling,)."""
+        """The frozen model at one scheduling value, shape (n_scheduling,).
+
+        A ValueError where ``I - M11 Delta`` is singular, or nearly so: there is no
+        model, or rounding is much of it.
+        """
         M11, M12, M21, M22 = blocks(self.M, self.size)
         delta = self.delta(kappa)
-        z = np.linalg.solve(np.eye(self.size) - M11 @ delta, M12)
+        loop = np.eye(self.size) - M11 @ delta
+        finite = np.isfinite(loop).all()
+        if self.size and not (finite and np.linalg.cond(loop) < _SINGULAR):
+            raise ValueError(
+                "`kappa` must be where the model is well posed, `I - M11 Delta` not "
+                f"nearly singular. Got {kappa!r}; take a value near the range of the "
+                "data, or the LPVStateSpace itself, which loses no digits beyond it."
+            )
+        z = np.linalg.solve(loop, M12)
         A, B, C, D = blocks(M22 + M21 @ delta @ z, self.order)
         return StateSpace(A, B, C, D, input_delay=self.input_delay)
 

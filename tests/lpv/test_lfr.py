@@ -1,8 +1,10 @@
 """Linear-fractional models: the frozen models, and how often a variable repeats."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV, RationalLPV
 
@@ -73,3 +75,12 @@ def test_a_pole_at_zero_is_told_of():
     lpv = one_entry(lambda k: 1 / k, 1, 1, lambda d: RationalLPV(d, 1))
     with pytest.raises(ValueError, match=r"lfr\(normalized=True\)"):
         lpv.lfr()
+
+
+def test_there_is_no_model_where_the_form_is_singular():
+    M = np.array([[1.0, 1.0, 0.0], [1.0, -2.0, 1.0], [0.0, 1.0, 0.0]])  # 1 / (1 - k)
+    form = replace(spring_lpv().lfr(), M=M, repetitions=(1,), order=1)
+    kappa = form.centre + form.half_width
+    with pytest.raises(ValueError, match="must be where the model is well posed"):
+        form.at(kappa)
+    assert_allclose(form.at(kappa - 0.5 * form.half_width).A, [[-2.0 + 0.5 / 0.5]])
