@@ -208,7 +208,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         Covariance of `params_`, the parameters that minimise `norm`, from the spread of
         the `realizations`, or that of the `estimates`, given to `fit_model`, or the
         `noise` given to `fit`; absent without them. Infinite variances where these do
-        not determine a parameter, none at its bound.
+        not determine a parameter, none at its bound. Linear: a warning names the
+        parameters in whose intervals the response bends as much as it moves.
     covariance_degrees_of_freedom_ : float
         What the covariance is known from: one less than the realizations (for the
         H-infinity norm some of them, where there are many for many parameters), or
@@ -366,6 +367,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             spread = problem.spread_covariance(self.params_, seen, norm)
             self.params_covariance_ = spread * (len(seen) / len(realizations))
             self.covariance_degrees_of_freedom_ = len(seen) - 1.0
+        self._tell_of_bent(problem)
         return self
 
     @one_blas_thread
@@ -456,6 +458,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 self.params_, _DRAWS, seed
             )
             self.covariance_degrees_of_freedom_ = _DRAWS - 1.0
+        self._tell_of_bent(problem)
         self.n_features_in_ = 1
         return self
 
@@ -652,6 +655,20 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self.__dict__.pop(name, None)
         with bounded(self._seconds()):
             self._searched(problem, given, estimates, uncertainty, only_given)
+
+    def _tell_of_bent(self, problem: RestructuringProblem) -> None:
+        """Where `params_covariance_` is that of a linear model, and it is none."""
+        if not hasattr(self, "params_covariance_"):
+            return
+        bent = problem.bent(self.params_, self.params_covariance_)
+        if bent:
+            warn(
+                f"the intervals of {', '.join(map(repr, bent))} are not to be trusted: "
+                "within two standard deviations the response does not change in "
+                "proportion to them, as where two parts of the structure are so alike "
+                "that the noise hides which is which. Use more data or less noise, or "
+                "give what is known of them (a value, or bounds)."
+            )
 
     def _seconds(self) -> float:
         """`max_time`, which is checked, as a float; infinity for None."""

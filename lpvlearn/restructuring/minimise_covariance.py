@@ -42,6 +42,7 @@ from ..systems.least_squares import levenberg_marquardt
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Structure, Target, remembering
 from .limits import keeps_margin, natural_margin
+from .singular_points import bend_of, squared_combinations
 
 Array = NDArray[np.float64]
 
@@ -291,7 +292,16 @@ def minimise_covariance(
     z, J = coordinates(theta)
     gradient = J.T @ z
     held = ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
-    covariance, explained = _linear_analysis(np.where(held, 0.0, J))
+    J = np.where(held, 0.0, J)
+    covariance, explained, combinations = _linear_analysis(J)
+    if len(combinations):
+        bend = bend_of(lambda x: coordinates(x)[0], theta, lower, upper)
+        sizes = np.where(theta == 0.0, 1.0, np.abs(theta))
+        steps = combinations / np.abs(combinations / sizes).max(1, keepdims=True)
+        size = float(np.linalg.norm(J * sizes))
+        more = squared_combinations(J, steps, bend, size)
+        covariance = _linear_analysis(np.column_stack([J, more]))[0]
+        covariance = covariance[: len(theta), : len(theta)]
     freedom = len(z) - explained.shape[1]
     misfit = cost / max(freedom, 1)
     remaining = float(np.sum((explained.T @ z) ** 2))  # gain of a Gauss-Newton step
@@ -332,8 +342,8 @@ def common_coefficients(
     return reached[0], float(costs[0]), coordinates(reached[0])[1]
 
 
-def _linear_analysis(J: Array) -> tuple[Array, Array]:
-    """``(J^T J)^-1``, and orthonormal columns that span the range of J.
+def _linear_analysis(J: Array) -> tuple[Array, Array, Array]:
+    """``(J^T J)^-1``, orthonormal columns that span the range of J, rows the kernel.
 
     A column of zeros has no variance; parameters of a combination that J does not
     determine have an infinite one.
@@ -349,7 +359,9 @@ def _linear_analysis(J: Array) -> tuple[Array, Array]:
     part[np.diag_indices(len(part))] += np.where(open_, np.inf, 0.0)
     covariance = np.zeros((len(unit), len(unit)))
     covariance[np.ix_(free, free)] = part
-    return covariance / unit[:, None] / unit, U[:, : int(known.sum())]
+    kernel = np.zeros((int((~known).sum()), len(unit)))
+    kernel[:, free] = Vt[~known]
+    return covariance / unit[:, None] / unit, U[:, : int(known.sum())], kernel / unit
 
 
 class SampledStructure:

@@ -39,6 +39,7 @@ from .measured import (
     stable_realization,
 )
 from .similarity import bilinear_changes
+from .singular_points import Bend, bend_of, squared_combinations
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -64,6 +65,8 @@ _ROUNDING = 1e-10  # relative change of a response that is none: a step's end
 # Parameters whose own size changes the response by a smaller part are next to zero; and
 # the part of a promised change that tells a linear response.
 _ZERO, _LINEAR = 1e-3, 0.5
+
+_EXACT_STD = 1e-6  # relative standard deviation below which no interval matters
 
 _SAME = 1e-6  # relative difference of delays that is rounding
 
@@ -179,7 +182,7 @@ class RestructuringProblem:
 
     def identifiability(self, theta: Array) -> Identifiability:
         """Which parameters the response determines, and how well."""
-        J, level = self._relative_changes(theta)
+        J, level, _ = self._relative_changes(theta)
         return Identifiability.from_jacobian(J, self.structure.parameter_names, level)
 
     def open_variances(self, theta: Array) -> Array:
@@ -187,15 +190,49 @@ class RestructuringProblem:
 
         That is where a combination of those that no bound holds does not change it.
         """
-        J, level = self._relative_changes(theta)
+        J, level, _ = self._relative_changes(theta)
         free = self._free_jacobian(theta).any(axis=(0, 1, 2))
         names = np.array(self.structure.parameter_names)
         found = Identifiability.from_jacobian(J[..., free], names[free].tolist(), level)
         left_open = {name for direction in found.directions for name in direction}
         return np.diag(np.where(np.isin(names, list(left_open)), np.inf, 0.0))
 
-    def _relative_changes(self, theta: Array) -> tuple[Complex, Array]:
-        """Of the response by relative steps of the parameters, and its sizes."""
+    def bent(self, theta: Array, covariance: Array) -> list[str]:
+        """Parameters whose intervals are not those of a linear model.
+
+        A parameter is moved by two standard deviations to either side, and the others
+        as they go with it: the response there, taken for a linear one, moves it by as
+        much to both, and not by half of it more or less. That of two parts that are
+        nearly alike does not: it is even in their difference.
+        """
+        lower, upper = self.structure.lower, self.structure.upper
+        with np.errstate(all="ignore"):
+            std = np.sqrt(np.diag(covariance))
+            steps = 2.0 * covariance / std
+            room = np.where(steps.T, np.minimum(theta - lower, upper - theta), np.inf)
+            parts = np.minimum(1.0, np.min(room / np.abs(steps.T), axis=1))
+        known = np.isfinite(std) & (std > _EXACT_STD * self._relative_changes(theta)[2])
+        some, bend = np.flatnonzero(known & (parts > 0.0)), self._bend_of(theta)
+        bends = {j: bend(parts[j] * steps[:, j]) for j in some}
+        even = {j: 0.5 * found for j, found in bends.items() if found is not None}
+        if not even:
+            return []
+        moved = self.parameter_changes(theta, np.array(list(even.values())), "hinf")
+        names = self.structure.parameter_names
+        return [
+            names[j]
+            for j, row in zip(even, moved, strict=True)
+            if abs(row[j]) > _LINEAR * parts[j] ** 2 * 2.0 * std[j]
+        ]
+
+    def _bend_of(self, theta: Array) -> Bend:
+        lower, upper = self.structure.lower, self.structure.upper
+        return bend_of(
+            lambda there: self.system.response(there, self.omega), theta, lower, upper
+        )
+
+    def _relative_changes(self, theta: Array) -> tuple[Complex, Array, Array]:
+        """Of the response by relative steps, its sizes, and those of the parameters."""
         G, J = self.system.response_jacobian(theta, self.omega)
         scaling = channel_scaling(self.response)
         if scaling is not None:  # a faint channel tells parameters, too
@@ -217,7 +254,7 @@ class RestructuringProblem:
                 change = np.sqrt(np.sum(np.abs(moved - G) ** 2) / len(G))
             if change > _LINEAR * usual:
                 sizes[j] = abs(step[j])
-        return J * sizes, level
+        return J * sizes, level, sizes
 
     def parameter_changes(self, theta: Array, dG: Complex, norm: str) -> Array:
         """First-order changes, (r, n_params), with the black box's response.
@@ -235,9 +272,8 @@ class RestructuringProblem:
         W = self._weighted[0]
         if counts is not None:
             W = np.sqrt(counts)[:, None, None] * W
-        J = self._free_jacobian(theta)
-        WJ = np.einsum("kpq,kqmj->kpmj", W, J)
-        flat = WJ.reshape(-1, J.shape[-1])
+        WJ = np.einsum("kpq,kqmj->kpmj", W, self._changes(theta))
+        flat = WJ.reshape(-1, WJ.shape[-1])
         columns = np.vstack([flat.real, flat.imag])
         unit = column_scale(columns)
         inverse = np.linalg.pinv(columns / unit) / unit[:, None]
@@ -246,7 +282,23 @@ class RestructuringProblem:
         K = np.einsum("jkpm,kpq->jkqm", K, W.conj())
         if K.shape[2] != dG.shape[2]:  # several black boxes were stacked
             K = K.reshape(*K.shape[:2], -1, *dG.shape[2:]).sum(2)
+        K = K[: len(theta)]
         return np.asarray(np.einsum("jkpm,rkpm->rj", K.conj(), dG).real)
+
+    def _changes(self, theta: Array) -> Complex:
+        """Derivatives of the response, and columns of `squared_combinations`."""
+        J = self._free_jacobian(theta)
+        relative, level, sizes = self._relative_changes(theta)
+        free = J.any(axis=(0, 1, 2))
+        rows = _undetermined(relative[..., free], level)
+        if not len(rows):
+            return J
+        steps = np.zeros((len(rows), len(theta)))
+        steps[:, free] = rows / np.abs(rows).max(1, keepdims=True)
+
+        size, flat = float(np.linalg.norm(self.response)), J.reshape(-1, len(theta))
+        found = squared_combinations(flat, steps * sizes, self._bend_of(theta), size)
+        return np.concatenate([J, found.reshape(*J.shape[:3], -1)], axis=3)
 
     def _free_jacobian(self, theta: Array) -> Complex:
         """Derivative of the response; zero by parameters that their bounds hold.
@@ -344,7 +396,7 @@ class RestructuringProblem:
             changes = self.parameter_changes(theta, noise, norm)
         else:
             W = self._weighted[0]
-            WJ = np.einsum("kpq,kqmj->kpmj", W, self._free_jacobian(theta))
+            WJ = np.einsum("kpq,kqmj->kpmj", W, self._changes(theta))
             copies = W.shape[2] // noise.shape[2]  # of several black boxes
             dE = W @ np.tile(noise, (1, 1, copies, 1))
             # what the noise does not explain of the error is there with any noise
@@ -353,6 +405,7 @@ class RestructuringProblem:
             explained = variance / max(float(np.sum(np.abs(E) ** 2)), 1e-300)
             E = E * np.sqrt(max(1.0 - explained, 0.0))
             changes = np.array([least_maximum(E - part, WJ) for part in dE])
+            changes = changes[:, : len(theta)]
         covariance = np.cov(changes.T, ddof=1).reshape(len(theta), -1)
         return covariance + self.open_variances(theta)
 
@@ -704,19 +757,16 @@ class Identifiability:
         >>> found.rank, found.directions
         (1, ({'b': 1.0, 'c': -1.0},))
         """
-        k, n = len(J), J.shape[-1]
-        level = np.broadcast_to(level, (k,))
-        size = np.maximum(level, _DIGITS * np.linalg.norm(J.reshape(k, -1), axis=1))
-        even = J / np.where(size > 0, size, 1.0)[:, None, None, None]
-        unit, s, Vt = _scaled_svd(even)
-        rank = int((s > _RANK_TOLERANCE * s.max(initial=0.0)).sum())
+        n = J.shape[-1]
+        undetermined = _undetermined(J, level)
+        rank = n - len(undetermined)
         directions = tuple(
             {
                 name: float(value)
                 for name, value in zip(names, row, strict=True)
                 if abs(value) > _NAMED
             }
-            for row in _sparse_rows(Vt[rank:] / unit)
+            for row in _sparse_rows(undetermined)
         )
         # errors of the response are alike at all frequencies
         usual = float(max(np.linalg.norm(level), _DIGITS * np.linalg.norm(J))) or 1.0
@@ -728,6 +778,16 @@ class Identifiability:
         condition = float(np.linalg.norm(inverse, 2)) if rank == n else np.inf
         sensitivities = dict(zip(names, gains.tolist(), strict=True))
         return cls(rank, n, condition, directions, sensitivities)
+
+
+def _undetermined(J: Complex, level: Array | float) -> Array:
+    """Relative steps along which a response of that size does not change, by rows."""
+    k = len(J)
+    level = np.broadcast_to(level, (k,))
+    size = np.maximum(level, _DIGITS * np.linalg.norm(J.reshape(k, -1), axis=1))
+    unit, s, Vt = _scaled_svd(J / np.where(size > 0, size, 1.0)[:, None, None, None])
+    rank = int((s > _RANK_TOLERANCE * s.max(initial=0.0)).sum())
+    return np.asarray(Vt[rank:] / unit)
 
 
 def _scaled_svd(J: Complex) -> tuple[Array, Array, Array]:
