@@ -289,6 +289,13 @@ class Experiment:
     # (n_samples, n_outputs): outputs that were missing, and are estimates; None: none
     estimated: NDArray[np.bool_] | None = None
 
+    @property
+    def measured(self) -> Array:
+        """The outputs, of a table that was read with them."""
+        if self.outputs is None:
+            raise ValueError("`y` must hold the measured outputs. Got None.")
+        return self.outputs
+
 
 @contextmanager
 def naming(experiment: Experiment) -> Iterator[None]:

@@ -256,7 +256,7 @@ def _cluster(means: Array, tol: Array) -> NDArray[np.intp]:
 
 def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:
     """Refuse outputs (of these names) that are constant, or stand among the inputs."""
-    outputs = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    outputs = np.vstack([e.measured for e in experiments])
     lowest, highest = np.fmin.reduce(outputs), np.fmax.reduce(outputs)  # without NaN
     constant = lowest == highest
     if len(outputs) > len(experiments) and constant.any():

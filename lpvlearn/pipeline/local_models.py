@@ -375,7 +375,7 @@ def _fit_table(
 ) -> Any:
     """What a clone's method of fitting returns for the experiments as one table."""
     u = np.vstack([e.inputs for e in experiments])
-    y = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    y = np.vstack([e.measured for e in experiments])
     label = np.repeat(np.arange(len(experiments)), [len(e.rows) for e in experiments])
     names = _column_names(experiments[0].input_names, u.shape[1])
     table = pd.DataFrame(np.column_stack([u, label]), columns=names)
@@ -431,7 +431,7 @@ def _far_from_zero(records: Sequence[Array]) -> bool:
 def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
     """What to try first if the model turns out unstable: offsets make it so."""
     inputs = [e.inputs for e in experiments]
-    outputs = [e.outputs for e in experiments if e.outputs is not None]
+    outputs = [e.measured for e in experiments]
     still = all((y == outputs[0][0]).all() for y in outputs)
     if sum(map(len, outputs)) > len(experiments) and still:
         raise ValueError(
@@ -533,7 +533,7 @@ def _costs(fitted: Any, experiments: Sequence[Experiment]) -> dict[int, float]:
     table = getattr(fitted, "selection_", None)
     if table is None or "criterion" not in table:
         return {}
-    n_values = sum(e.outputs.size for e in experiments if e.outputs is not None)
+    n_values = sum(e.measured.size for e in experiments)
     known = table.dropna(subset="criterion")
     costs = n_values * known["criterion"].to_numpy()
     return dict(zip(known["order"].tolist(), costs.tolist(), strict=True))

@@ -586,9 +586,8 @@ def _own_of_local(found: StructuredModels) -> Own:
 
 
 def _record(e: Experiment, sampling_time: float) -> Record:
-    assert e.outputs is not None
     kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
-    return Record(e.inputs, e.outputs, kappa, e.sampling_time or sampling_time)
+    return Record(e.inputs, e.measured, kappa, e.sampling_time or sampling_time)
 
 
 def _errors(model: LPVStateSpace, e: Experiment, record: Record, own: Own) -> Array:

@@ -611,7 +611,7 @@ class SubspaceLTI(
         gaps = self.missing != "raise"
         experiments = self._with_late_inputs(experiments, delay, gaps)
         self._stream: SampleStream | None = None
-        pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
+        pairs = [(e.inputs, e.measured) for e in experiments]
         estimated = [e.estimated for e in experiments if e.estimated is not None]
         if estimated and np.vstack(estimated).all(axis=0).any():
             raise ValueError(
@@ -943,7 +943,7 @@ class SubspaceLTI(
             )
         if self.missing == "split":
             experiments = split_at_gaps(experiments)
-        pairs = [(e.inputs, _outputs_of(e)) for e in experiments]
+        pairs = [(e.inputs, e.measured) for e in experiments]
         pairs = remove_trends(pairs, self.detrend)[0]
         n_outputs = pairs[0][1].shape[1]
         if choices.method in ("auto", "pbsid"):  # a loop leaves delays where they are
@@ -1110,7 +1110,7 @@ class SubspaceLTI(
             x0 = None
             if initial_state == "estimate":
                 x0, level = self._own_part(e, predictor)
-            u, y = e.inputs - u0, _outputs_of(e) - level
+            u, y = e.inputs - u0, e.measured - level
             return level + predictor.predict(u, y, steps=steps, initial_state=x0)
 
         return self._in_table(experiments, X, predicted)
@@ -1233,7 +1233,7 @@ class SubspaceLTI(
         return model_residuals(
             undelayed,
             self._predictor(undelayed) if errors == "prediction" else None,
-            [(e.inputs, _outputs_of(e)) for e in experiments],
+            [(e.inputs, e.measured) for e in experiments],
             self._evidence,
             names,
             input_labels(experiments[0].input_names),
@@ -1411,7 +1411,7 @@ class SubspaceLTI(
         Behind the errors of simulation, or of a predictor that has a gain, for which
         inputs in transit are those at rest: what they miss dies out.
         """
-        (u0, y0), y = self.resting_point(), _outputs_of(experiment)
+        (u0, y0), y = self.resting_point(), experiment.measured
         lti, trend = self.lti_, trend_signals(len(y), self._evidence.free.n_trend)
         if predictor is None or predictor.gain is None:
             responses = free_responses(lti.A, lti.C, len(y), trend)
@@ -1440,13 +1440,6 @@ class SubspaceLTI(
                 out[e.rows] = outputs(e)
         out = out[:, 0] if self._single_output else out
         return self._contained(out, X, self.lti_.output_names)
-
-
-def _outputs_of(experiment: Experiment) -> Array:
-    """Outputs of an experiment, which must be there."""
-    if experiment.outputs is None:
-        raise ValueError("`y` must hold the measured outputs. Got None.")
-    return experiment.outputs
 
 
 def _names_of(experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:

@@ -90,7 +90,7 @@ def sums_of(experiments: Sequence[Experiment], step: float) -> list[Experiment]:
 def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:
     """Inputs with a last column that tells the experiments apart, and outputs."""
     u = np.vstack([e.inputs for e in experiments])
-    y = np.vstack([e.outputs for e in experiments if e.outputs is not None])
+    y = np.vstack([e.measured for e in experiments])
     names = [str(name) for name in experiments[0].input_names or range(u.shape[1])]
     label = "experiment"
     while label in names:

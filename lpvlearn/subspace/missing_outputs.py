@@ -66,7 +66,7 @@ def runs_to_complete(
         )
     runs, known = [], []
     for run in whole:
-        there = np.isfinite(_outputs(run))
+        there = np.isfinite(run.measured)
         at = np.flatnonzero(there.any(axis=1))
         if len(at) > 1:
             runs.append(part_of(run, slice(0 if at_rest else at[0], at[-1] + 1)))
@@ -97,7 +97,7 @@ def warn_of_many_pieces(experiments: Sequence[Experiment]) -> None:
 
 def warn_of_few(runs: Sequence[Experiment]) -> None:
     """Tell of an output that is hardly there."""
-    known = np.mean(np.vstack([np.isfinite(_outputs(run)) for run in runs]), axis=0)
+    known = np.mean(np.vstack([np.isfinite(run.measured) for run in runs]), axis=0)
     rarest = int(np.argmin(known))
     if known[rarest] < _FEW:
         warn(
@@ -110,7 +110,7 @@ def warn_of_few(runs: Sequence[Experiment]) -> None:
 
 def with_estimates(run: Experiment, outputs: Array) -> Experiment:
     """A run with values of outputs that are missing in it."""
-    return replace(run, outputs=outputs, estimated=np.isnan(_outputs(run)))
+    return replace(run, outputs=outputs, estimated=np.isnan(run.measured))
 
 
 def movement(
@@ -123,20 +123,15 @@ def movement(
 
     Root mean square over what is missing in the runs.
     """
-    power = np.nanmean(np.vstack([_outputs(run) for run in runs]) ** 2, axis=0)
+    power = np.nanmean(np.vstack([run.measured for run in runs]) ** 2, axis=0)
     variance = np.maximum(np.diagonal(noise), _ROUNDING**2 * power)
     variance[variance == 0.0] = 1.0
     moved = [
-        ((_outputs(new) - _outputs(old)) ** 2 / variance)[np.isnan(_outputs(run))]
+        ((new.measured - old.measured) ** 2 / variance)[np.isnan(run.measured)]
         for run, old, new in zip(runs, before, after, strict=True)
     ]
     squares = np.concatenate(moved)
     return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
-
-
-def _outputs(run: Experiment) -> Array:
-    assert run.outputs is not None
-    return run.outputs
 
 
 def first_guess(runs: Sequence[Experiment]) -> list[Experiment]:
@@ -149,7 +144,7 @@ def first_guess(runs: Sequence[Experiment]) -> list[Experiment]:
     >>> np.allclose(guess.outputs, u), guess.estimated.sum()
     (True, np.int64(10))
     """
-    pairs = [(run.inputs, _outputs(run)) for run in runs]
+    pairs = [(run.inputs, run.measured) for run in runs]
     centre = np.mean(np.vstack([u for u, _ in pairs]), axis=0)
     pairs = [(u - centre, y) for u, y in pairs]
     n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
@@ -194,11 +189,11 @@ def by_simulation(
     runs: Sequence[Experiment], simulated: Sequence[Array]
 ) -> list[Experiment]:
     """Runs with missing outputs as simulated, and what is expected of the errors."""
-    errors = [_outputs(run) - y for run, y in zip(runs, simulated, strict=True)]
+    errors = [run.measured - y for run, y in zip(runs, simulated, strict=True)]
     noise = noise_of(errors)
     return [
         with_estimates(
-            run, np.where(np.isnan(v), y + _expected(noise, v), _outputs(run))
+            run, np.where(np.isnan(v), y + _expected(noise, v), run.measured)
         )
         for run, y, v in zip(runs, simulated, errors, strict=True)
     ]
@@ -260,7 +255,7 @@ def by_prediction(
     Its inputs are `u` about the resting point, its initial state `x0`, and the outputs
     that its answers add to `level`.
     """
-    y = _outputs(run) - level
+    y = run.measured - level
     missing = np.isnan(y)
     y = np.where(missing, model.predict(u, y, initial_state=x0), y)
     innovations = y - model.predict(u, y, initial_state=x0)

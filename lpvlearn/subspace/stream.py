@@ -270,7 +270,7 @@ class SampleStream:
         self._choices, self._options = choices, deepcopy(options)
         self._given_step, self._names = step, first[0].input_names
         self.names: tuple[Any, Any] = (None, None)  # of the model's inputs and outputs
-        n_inputs, self._n_outputs = first[0].inputs.shape[1], _n_outputs(first)
+        n_inputs, self._n_outputs = first[0].inputs.shape[1], first[0].measured.shape[1]
         settings = choices.settings(self._n_outputs, n_inputs, np.eye(n_inputs))
         settings.check_size([BUFFER], choices.order, choices.horizon)
         self._told: set[str] = set()
@@ -380,7 +380,7 @@ class SampleStream:
         first batch, an experiment that does not go on evenly in time) this stream must
         be left: go on from the one that it branched off.
         """
-        n_outputs = _n_outputs(experiments)
+        n_outputs = experiments[0].measured.shape[1]
         if n_outputs != self._n_outputs:
             raise ValueError(
                 "`y` must have the same columns in all batches of a stream. Got "
@@ -449,11 +449,10 @@ class SampleStream:
                 parts += complete_runs(late, shortest=1) if has_gaps(late) else [late]
                 transit, sent = sent, None
             for part in parts:
-                assert part.outputs is not None
                 joins = continues and unbroken and part.rows[0] == e.rows[0]
                 last = part.rows[-1] == e.rows[-1]
                 if len(part.rows) > 1 or joins or last:
-                    out.append(Piece(part.inputs, part.outputs, not joins))
+                    out.append(Piece(part.inputs, part.measured, not joins))
             unbroken = bool(parts) and parts[-1].rows[-1] == e.rows[-1]
         self._label, self._open, self._in_transit = ordered[-1].label, unbroken, transit
         return out
@@ -497,12 +496,6 @@ class SampleStream:
         error = np.fmax(fitted.residual, summary.latest_error(fitted.model))
         warn_about_drift(float(error), self._first_residual, BUFFER, self._told)
         return fitted
-
-
-def _n_outputs(experiments: Sequence[Experiment]) -> int:
-    outputs = experiments[0].outputs
-    assert outputs is not None
-    return outputs.shape[1]
 
 
 def _without_labels(X: Any, y: Any, names: Sequence[Hashable]) -> tuple[Any, Any]:
