@@ -66,7 +66,7 @@ _ROUNDING = 1e-10  # relative change of a response that is none: a step's end
 # the part of a promised change that tells a linear response.
 _ZERO, _LINEAR = 1e-3, 0.5
 
-_EXACT_STD = 1e-6  # relative standard deviation below which no interval matters
+_KNOWN = 1e-2  # relative standard deviation of a parameter that is known well enough
 
 _SAME = 1e-6  # relative difference of delays that is rounding
 
@@ -203,7 +203,8 @@ class RestructuringProblem:
         A parameter is moved by two standard deviations to either side, and the others
         as they go with it: the response there, taken for a linear one, moves it by as
         much to both, and not by half of it more or less. That of two parts that are
-        nearly alike does not: it is even in their difference.
+        nearly alike does not: it is even in their difference. Parameters known to a
+        hundredth are known, whatever the others do to them.
         """
         lower, upper = self.structure.lower, self.structure.upper
         with np.errstate(all="ignore"):
@@ -211,7 +212,7 @@ class RestructuringProblem:
             steps = 2.0 * covariance / std
             room = np.where(steps.T, np.minimum(theta - lower, upper - theta), np.inf)
             parts = np.minimum(1.0, np.min(room / np.abs(steps.T), axis=1))
-        known = np.isfinite(std) & (std > _EXACT_STD * self._relative_changes(theta)[2])
+        known = np.isfinite(std) & (std > _KNOWN * self._relative_changes(theta)[2])
         some, bend = np.flatnonzero(known & (parts > 0.0)), self._bend_of(theta)
         bends = {j: bend(parts[j] * steps[:, j]) for j in some}
         even = {j: 0.5 * found for j, found in bends.items() if found is not None}
