@@ -66,6 +66,7 @@ _ROUNDING = 1e-10  # relative change of a response that is none: a step's end
 # the part of a promised change that tells a linear response.
 _ZERO, _LINEAR = 1e-3, 0.5
 
+_LOCAL = 0.1  # relative step that tells how the response bends
 _KNOWN = 1e-2  # relative standard deviation of a parameter that is known well enough
 
 _SAME = 1e-6  # relative difference of delays that is rounding
@@ -207,12 +208,15 @@ class RestructuringProblem:
         hundredth are known, whatever the others do to them.
         """
         lower, upper = self.structure.lower, self.structure.upper
+        sizes = self._relative_changes(theta)[2]
+        # Part of a step that tells how it bends: a long one may saturate.
+        room = np.minimum(np.minimum(theta - lower, upper - theta), _LOCAL * sizes)
         with np.errstate(all="ignore"):
             std = np.sqrt(np.diag(covariance))
             steps = 2.0 * covariance / std
-            room = np.where(steps.T, np.minimum(theta - lower, upper - theta), np.inf)
-            parts = np.minimum(1.0, np.min(room / np.abs(steps.T), axis=1))
-        known = np.isfinite(std) & (std > _KNOWN * self._relative_changes(theta)[2])
+            ratios = np.where(steps.T, room, np.inf) / np.abs(steps.T)
+            parts = np.minimum(1.0, np.min(ratios, axis=1))
+        known = np.isfinite(std) & (std > _KNOWN * sizes)
         some, bend = np.flatnonzero(known & (parts > 0.0)), self._bend_of(theta)
         bends = {j: bend(parts[j] * steps[:, j]) for j in some}
         even = {j: 0.5 * found for j, found in bends.items() if found is not None}

@@ -10,6 +10,7 @@ theirs: to their uncertainty it is one parameter more.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -41,9 +42,10 @@ def bend_of(
         room = np.minimum(theta - lower, upper - theta) + _ROUNDING * np.abs(theta)
         if (np.abs(step) > room).any():
             return None
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
             found = values(theta + step) + values(theta - step) - 2.0 * values(theta)
-        return found if np.isfinite(found).all() else None
+            return found if np.isfinite(found).all() else None
+        return None
 
     return bend
 

@@ -380,6 +380,7 @@ def test_intervals_of_parts_that_are_nearly_alike_are_told():
     alike = 1e-3 * np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     assert near.structure.parameter_names == ("a", "b", "g")
     assert near.bent(theta, alike) == ["a", "b"]
+    assert near.bent(theta, 1e9 * alike) == ["a", "b"]
     assert near.bent(theta, 1e-3 * alike) == []
     assert far.bent(apart, alike) == []
     assert near.bent(theta, np.zeros((3, 3))) == []
