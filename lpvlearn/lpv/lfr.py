@@ -33,7 +33,7 @@ _SCALING_PASSES = 16  # over rows and columns: each divides a size, in decades, 
 # adds: half of the digits are lost. (Far from zero, in units of its range, a variable
 # cancels what it adds.)
 _ILL_POSED = 1e-8
-_SINGULAR = 1e10  # condition that leaves six digits
+_SINGULAR = 1e12  # condition that leaves five digits: it is that of LU, not of rounding
 
 _MANY_VARIABLES = 4  # 24 orders in which to take the variables are tried
 

@@ -90,6 +90,7 @@ _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "p_value_",
 )
 
+_NAMED = 6  # parameters in a message; of more the number is enough
 _DRAWS = 32  # of the noise: standard deviations to an eighth
 _EFFORT = 512  # realizations times parameters, of which more are left out beyond these
 
@@ -209,7 +210,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         the `realizations`, or that of the `estimates`, given to `fit_model`, or the
         `noise` given to `fit`; absent without them. Infinite variances where these do
         not determine a parameter, none at its bound. Linear: a warning names the
-        parameters in whose intervals the response bends as much as it moves.
+        parameters in whose intervals the response bends by half of what it moves.
     covariance_degrees_of_freedom_ : float
         What the covariance is known from: one less than the realizations (for the
         H-infinity norm some of them, where there are many for many parameters), or
@@ -662,8 +663,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             return
         bent = problem.bent(self.params_, self.params_covariance_)
         if bent:
+            names = ", ".join(map(repr, bent[:_NAMED]))
+            names += f" and {len(bent) - _NAMED} more" if len(bent) > _NAMED else ""
             warn(
-                f"the intervals of {', '.join(map(repr, bent))} are not to be trusted: "
+                f"the intervals of {names} are not to be trusted: "
                 "within two standard deviations the response does not change in "
                 "proportion to them, as where two parts of the structure are so alike "
                 "that the noise hides which is which. Use more data or less noise, or "

@@ -66,7 +66,8 @@ _ROUNDING = 1e-10  # relative change of a response that is none: a step's end
 # the part of a promised change that tells a linear response.
 _ZERO, _LINEAR = 1e-3, 0.5
 
-_LOCAL = 0.1  # relative step that tells how the response bends
+# Relative step that tells how the response bends, and one so short that rounding would
+_LOCAL, _TOO_SHORT = 0.1, 1e-3
 _KNOWN = 1e-2  # relative standard deviation of a parameter that is known well enough
 
 _SAME = 1e-6  # relative difference of delays that is rounding
@@ -216,8 +217,10 @@ class RestructuringProblem:
             steps = 2.0 * covariance / std
             ratios = np.where(steps.T, room, np.inf) / np.abs(steps.T)
             parts = np.minimum(1.0, np.min(ratios, axis=1))
+            lengths = parts * np.max(np.abs(steps.T) / sizes, axis=1)
         known = np.isfinite(std) & (std > _KNOWN * sizes)
-        some, bend = np.flatnonzero(known & (parts > 0.0)), self._bend_of(theta)
+        some = np.flatnonzero(known & (lengths > _TOO_SHORT))
+        bend = self._bend_of(theta)
         bends = {j: bend(parts[j] * steps[:, j]) for j in some}
         even = {j: 0.5 * found for j, found in bends.items() if found is not None}
         if not even:
@@ -295,12 +298,11 @@ class RestructuringProblem:
         J = self._free_jacobian(theta)
         relative, level, sizes = self._relative_changes(theta)
         free = J.any(axis=(0, 1, 2))
-        rows = _undetermined(relative[..., free], level)
+        rows = _sparse_rows(_undetermined(relative[..., free], level))
         if not len(rows):
             return J
         steps = np.zeros((len(rows), len(theta)))
         steps[:, free] = rows / np.abs(rows).max(1, keepdims=True)
-
         size, flat = float(np.linalg.norm(self.response)), J.reshape(-1, len(theta))
         found = squared_combinations(flat, steps * sizes, self._bend_of(theta), size)
         return np.concatenate([J, found.reshape(*J.shape[:3], -1)], axis=3)

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 # Relative steps that show second derivatives, how many combinations are looked at, and
 # the part of their second derivative that is no change of the parameters to first order
-_SHORT, _MOST, _STANDS_OUT = 1e-3, 3, 1e-3
+_SHORT, _MOST, _STANDS_OUT = 1e-3, 6, 1e-3
 
 _ROUNDING = 1e-12  # of a parameter: a step that ends at its bound does not leave it
 
@@ -38,12 +38,14 @@ def bend_of(
     A function of the step; None where it leaves the bounds, or there are no values.
     """
 
+    here = values(theta)
+
     def bend(step: Array) -> NDArray[Any] | None:
         room = np.minimum(theta - lower, upper - theta) + _ROUNDING * np.abs(theta)
         if (np.abs(step) > room).any():
             return None
         with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
-            found = values(theta + step) + values(theta - step) - 2.0 * values(theta)
+            found = values(theta + step) + values(theta - step) - 2.0 * here
             return found if np.isfinite(found).all() else None
         return None
 

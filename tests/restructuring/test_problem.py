@@ -384,6 +384,10 @@ def test_intervals_of_parts_that_are_nearly_alike_are_told():
     assert near.bent(theta, 1e-3 * alike) == []
     assert far.bent(apart, alike) == []
     assert near.bent(theta, np.zeros((3, 3))) == []
+    # a bound that is a hair away leaves no step to tell by
+    bounded = near.structure.with_bounds({"a": (1.0 - 1e-10, None)})
+    box = near.structure.model(theta).balance()
+    assert problem_from_models(bounded, [box], None).bent(theta, alike) == []
 
 
 def test_fits_tell_of_intervals_that_are_not_linear():
