@@ -188,7 +188,7 @@ TWO_LAGS = GrayBoxStructure.from_template(
 )
 
 
-@pytest.mark.filterwarnings("ignore:the (structure|search for|parameters)")
+@pytest.mark.filterwarnings("ignore:the (structure|search for|parameters|intervals)")
 @pytest.mark.parametrize(
     "restructurer",
     [None, GrayBoxRestructurer(), "passthrough", GrayBoxRestructurer(TWO_LAGS)],
