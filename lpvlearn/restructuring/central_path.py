@@ -131,8 +131,7 @@ class Quadratic:
         return slope / self.level_curvature * self.by_level
 
     def _linear(self, d: Array) -> Complex:
-        dX = self.E.conj().swapaxes(1, 2) @ self.geometry.change(d)
-        return dX + dX.conj().swapaxes(1, 2)
+        return 2.0 * _hermitian(self.E.conj().swapaxes(1, 2) @ self.geometry.change(d))
 
     def _rise(self, d: Array, bend: Complex) -> Complex:
         """Change of ``tau I - X`` along the step `d`."""

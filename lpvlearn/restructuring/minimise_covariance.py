@@ -297,9 +297,8 @@ def minimise_covariance(
     if len(combinations):
         bend = bend_of(lambda x: coordinates(x)[0], theta, lower, upper)
         sizes = np.where(theta == 0.0, 1.0, np.abs(theta))
-        steps = combinations / np.abs(combinations / sizes).max(1, keepdims=True)
         size = float(np.linalg.norm(J * sizes))
-        more = squared_combinations(J, steps, bend, size)
+        more = squared_combinations(J, combinations, sizes, bend, size)
         covariance = _linear_analysis(np.column_stack([J, more]))[0]
         covariance = covariance[: len(theta), : len(theta)]
     freedom = len(z) - explained.shape[1]

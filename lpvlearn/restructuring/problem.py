@@ -8,7 +8,7 @@ from its derivative J: which ones, by its rank; and to first order how exactly.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -23,7 +23,7 @@ from ..systems.hinf_norm import hinf_norm
 from ..systems.least_squares import column_scale
 from ..validation import weights
 from .deadline import time_is_up
-from .error_system import ErrorSystem, Target, series
+from .error_system import ErrorSystem, Target, remembering, series
 from .known_poles import Division, divide
 from .least_squares import (
     LeastSquaresResult,
@@ -66,7 +66,7 @@ _ROUNDING = 1e-10  # relative change of a response that is none: a step's end
 # the part of a promised change that tells a linear response.
 _ZERO, _LINEAR = 1e-3, 0.5
 
-# Relative step that tells how the response bends, and one so short that rounding would
+# Relative step that tells how the response bends, and one of which rounding would tell
 _LOCAL, _TOO_SHORT = 0.1, 1e-3
 _KNOWN = 1e-2  # relative standard deviation of a parameter that is known well enough
 
@@ -97,6 +97,13 @@ class RestructuringProblem:
     def response(self) -> Complex:
         """The black box at the frequencies."""
         return self.system.target_response(self.omega)
+
+    @cached_property
+    def _derivatives(self) -> Callable[[Array], tuple[Complex, Complex]]:
+        """Response at parameters and its derivatives, the last ones remembered."""
+        return remembering(
+            lambda theta: self.system.response_jacobian(theta, self.omega), points=1
+        )
 
     @cached_property
     def _weighted(self) -> tuple[Complex, Complex, float]:
@@ -241,7 +248,7 @@ class RestructuringProblem:
 
     def _relative_changes(self, theta: Array) -> tuple[Complex, Array, Array]:
         """Of the response by relative steps, its sizes, and those of the parameters."""
-        G, J = self.system.response_jacobian(theta, self.omega)
+        G, J = self._derivatives(theta)
         scaling = channel_scaling(self.response)
         if scaling is not None:  # a faint channel tells parameters, too
             G, J = G * scaling, J * scaling[..., None]
@@ -302,9 +309,10 @@ class RestructuringProblem:
         if not len(rows):
             return J
         steps = np.zeros((len(rows), len(theta)))
-        steps[:, free] = rows / np.abs(rows).max(1, keepdims=True)
-        size, flat = float(np.linalg.norm(self.response)), J.reshape(-1, len(theta))
-        found = squared_combinations(flat, steps * sizes, self._bend_of(theta), size)
+        steps[:, free] = rows * sizes[free]
+        flat, bend = J.reshape(-1, len(theta)), self._bend_of(theta)
+        size = float(np.linalg.norm(self.response))
+        found = squared_combinations(flat, steps, sizes, bend, size)
         return np.concatenate([J, found.reshape(*J.shape[:3], -1)], axis=3)
 
     def _free_jacobian(self, theta: Array) -> Complex:
@@ -312,7 +320,7 @@ class RestructuringProblem:
 
         That is where the way to the bound changes the response by rounding.
         """
-        G, J = self.system.response_jacobian(theta, self.omega)
+        G, J = self._derivatives(theta)
         lower, upper = self.structure.lower, self.structure.upper
         way = np.minimum(theta - lower, upper - theta)
         effect = np.linalg.norm(J.reshape(-1, len(theta)), axis=0)

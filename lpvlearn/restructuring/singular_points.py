@@ -26,7 +26,6 @@ _SHORT, _MOST, _STANDS_OUT = 1e-3, 6, 1e-3
 
 _ROUNDING = 1e-12  # of a parameter: a step that ends at its bound does not leave it
 
-
 Bend = Callable[[Array], NDArray[Any] | None]
 
 
@@ -37,7 +36,6 @@ def bend_of(
 
     A function of the step; None where it leaves the bounds, or there are no values.
     """
-
     here = values(theta)
 
     def bend(step: Array) -> NDArray[Any] | None:
@@ -53,12 +51,13 @@ def bend_of(
 
 
 def squared_combinations(
-    J: NDArray[Any], combinations: Array, bend: Bend, size: float
+    J: NDArray[Any], combinations: Array, sizes: Array, bend: Bend, size: float
 ) -> NDArray[Any]:
     """Columns (n_values, r) beside the derivatives `J` (n_values, n_params).
 
-    The rows of `combinations` are steps of the parameters' own sizes along which the
-    values, of that `size`, do not change to first order; `bend` is that of `bend_of`.
+    The rows of `combinations` are steps of any length along which the values, of that
+    `size`, do not change to first order, `sizes` those of the parameters; `bend` is
+    that of `bend_of`.
     Left out is what bends within the span of J: there other parameters undo it.
 
     Examples
@@ -69,20 +68,21 @@ def squared_combinations(
     ...     return np.array([x[0] + x[1], (x[0] - x[1]) ** 2])
     >>> bend = bend_of(values, np.ones(2), np.zeros(2), np.full(2, np.inf))
     >>> J, difference = np.array([[1.0, 1.0], [0.0, 0.0]]), np.array([[1.0, -1.0]])
-    >>> squared_combinations(J, difference, bend, 2.0).round(6)
+    >>> squared_combinations(J, difference, np.ones(2), bend, 2.0).round(6)
     array([[0.],
            [8.]])
     """
-    steps = list(combinations[:_MOST])
+    lengths = np.abs(combinations / sizes).max(1, keepdims=True, initial=0.0)
+    steps = list((combinations / lengths)[:_MOST])
     sums = [steps[i] + steps[j] for j in range(len(steps)) for i in range(j)]
-    found = np.zeros((len(J), 0), J.dtype)
+    found, known = np.zeros((len(J), 0), J.dtype), _parts(J)
     for step in steps + sums:
         bent = bend(_SHORT * step)
         if bent is None:
             continue
         column = bent.ravel() / _SHORT**2
         own = _parts(column)
-        left = own - _parts(J) @ scaled_lstsq(_parts(J), own)[0]
+        left = own - known @ scaled_lstsq(known, own)[0]
         if np.linalg.norm(left) > _STANDS_OUT * max(float(np.linalg.norm(own)), size):
             found = np.column_stack([found, column])
     return found
