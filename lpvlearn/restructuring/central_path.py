@@ -93,6 +93,7 @@ class Quadratic:
     E: Complex
     M: Complex
     Z: Complex
+    both: Complex  # (Z M + M Z) / 2
     tau: float  # square of the level
     by_level: Array  # derivative of the gradient by tau
     level_curvature: float  # second derivative of psi by tau
@@ -108,7 +109,7 @@ class Quadratic:
         """The gradient where the squares are off the linear ones by `bend`."""
         W = _hermitian(self.Z @ bend @ self.M)
         gradient = self.gradient + 2.0 * self.geometry.pulled(self.E @ W)
-        return gradient + self._by_level(_trace(W))
+        return gradient + self._by_level(self._level_bend(bend))
 
     def bend(self, d: Array, E: Complex) -> Complex:
         """Change of the squares that is not linear in a step `d` to the errors `E`."""
@@ -130,22 +131,46 @@ class Quadratic:
         """Change of the gradient with a level for which psi has that slope."""
         return slope / self.level_curvature * self.by_level
 
+    def _level_bend(self, bend: Complex) -> float:
+        return float(np.vdot(self.both, bend).real)
+
     def _linear(self, d: Array) -> Complex:
-        return 2.0 * _hermitian(self.E.conj().swapaxes(1, 2) @ self.geometry.change(d))
+        return 2.0 * _hermitian(_adjoint(self.E) @ self.geometry.change(d))
 
     def _rise(self, d: Array, bend: Complex) -> Complex:
         """Change of ``tau I - X`` along the step `d`."""
-        slope = self.level_slope - _trace(_hermitian(self.Z @ bend @ self.M))
+        slope = self.level_slope - self._level_bend(bend)
         level = -(self.by_level @ d + slope) / self.level_curvature
         return np.asarray(level * np.eye(self.M.shape[1]) - self._linear(d) - bend)
 
 
+def _first_terms(E: Complex, C: Complex, F: Complex) -> Array:
+    """``2 tr(Z dE^H dE) + tr(Z dX M dX)`` as quadratic forms of dE in its `real_form`.
+
+    With ``dX = E^H dE + dE^H E``, ``M = C C^H`` and ``Z = F F^H``: the squares of the
+    norms of ``dE F`` and ``C^H dX F``. Shape (k, 2 n_outputs n_inputs, the same).
+    """
+    k, p, m = E.shape
+    entries = np.eye(p * m).reshape(-1, p, m)
+    dE = np.concatenate([entries, 1j * entries])
+    dEF = dE @ F[:, None]
+    Eh = _adjoint(E)
+    dX = (_adjoint(C) @ Eh)[:, None] @ dEF
+    dX = dX + _adjoint((_adjoint(F) @ Eh)[:, None] @ dE @ C[:, None])
+    parts = (np.sqrt(2.0) * dEF).reshape(k, len(dE), -1), dX.reshape(k, len(dE), -1)
+    return np.asarray(sum(np.real(X @ _adjoint(X)) for X in parts))
+
+
+def _adjoint(A: Complex) -> Complex:
+    return np.asarray(A.conj().swapaxes(-1, -2))
+
+
 def _square(E: Complex) -> Complex:
-    return np.asarray(E.conj().swapaxes(1, 2) @ E)
+    return np.asarray(_adjoint(E) @ E)
 
 
 def _hermitian(A: Complex) -> Complex:
-    return np.asarray(0.5 * (A + A.conj().swapaxes(1, 2)))
+    return np.asarray(0.5 * (A + _adjoint(A)))
 
 
 def _trace(A: Complex) -> float:
@@ -228,33 +253,26 @@ class Barrier:
         tau = level_of(s.ravel(), mu)
         gaps = np.full((k, m), tau)
         gaps[:, : s.shape[1]] -= s
-        C = np.asarray(Vh.conj().swapaxes(1, 2) / np.sqrt(gaps)[:, None], complex)
+        C = np.asarray(_adjoint(Vh) / np.sqrt(gaps)[:, None], complex)
         F = self._factor(C, gaps, mu)
-        Eh, Ch, Fh = (X.conj().swapaxes(1, 2) for X in (E, C, F))
-        M: Complex = C @ Ch
-        Z: Complex = F @ Fh
+        M: Complex = C @ _adjoint(C)
+        Z: Complex = F @ _adjoint(F)
         both = _hermitian(Z @ M)
         bounds = weight * T.T @ pull.sum(0)
         gradient = 2.0 * mu * geometry.pulled(E @ M) + bounds
         by_level = -2.0 * geometry.pulled(E @ both)
         level_curvature = _trace(both) - mu * _trace(M) / tau
-        # dE F and C^H dX F, whose Gram matrices are the terms of first derivatives
-        q = len(theta)
-        dEC = (C.swapaxes(1, 2)[:, None] @ geometry.changes).reshape(k, p, m * q)
-        dEF = (F.swapaxes(1, 2)[:, None] @ geometry.changes).reshape(k, p, m * q)
-        left = ((Ch @ Eh) @ dEF).reshape(k, m, m, q)
-        right = ((Fh @ Eh) @ dEC).reshape(k, m, m, q)
-        dX = (left + right.conj().swapaxes(1, 2)).reshape(-1, q)
-        first = np.sqrt(2.0) * dEF.reshape(-1, q)
-        rows = np.concatenate([first.real, first.imag, dX.real, dX.imag])
-        hessian = T.T @ (rows.T @ rows + weight * (pull.T @ pull)) @ T
+        J = geometry.changes
+        flat = J.reshape(-1, len(theta))
+        hessian = flat.T @ (_first_terms(E, C, F) @ J).reshape(flat.shape)
+        hessian = T.T @ (hessian + weight * (pull.T @ pull)) @ T
         hessian = hessian - np.outer(by_level, by_level) / level_curvature
         seen = 2.0 * geometry.pulled(E @ Z) + bounds
-        normal = 2.0 * at.R @ (Z @ Eh) @ geometry.L - geometry.tangential(seen)
+        normal = 2.0 * at.R @ (Z @ _adjoint(E)) @ geometry.L - geometry.tangential(seen)
         hessian = hessian + geometry.second_derivatives(normal)
         value = _psi(s.ravel(), tau, mu) - weight * float(np.log(-c).sum())
         local = value, gradient, hessian, geometry
-        return Quadratic(mu, *local, E, M, Z, tau, by_level, level_curvature)
+        return Quadratic(mu, *local, E, M, Z, both, tau, by_level, level_curvature)
 
     def _factor(self, C: Complex, gaps: Array, mu: float) -> Complex:
         """F with ``Z = F F^H``: the multipliers carried, within reach of ``mu M``.
@@ -269,9 +287,9 @@ class Barrier:
         with np.errstate(invalid="ignore"):  # inf - inf is the nearest of all
             nearest = np.abs(self.omega[:, None] - omega).argmin(1)
         sharing = np.bincount(nearest)[nearest]
-        inverse = gaps[:, :, None] * C.conj().swapaxes(1, 2)
+        inverse = gaps[:, :, None] * _adjoint(C)
         Z = Z[nearest] / (mu * sharing[:, None, None])
-        w, U = np.linalg.eigh(inverse @ Z @ inverse.conj().swapaxes(1, 2))
+        w, U = np.linalg.eigh(inverse @ Z @ _adjoint(inverse))
         F = (C @ U) * np.sqrt(np.clip(w, 1.0 / _APART, _APART))[:, None]
         wanted = mu * np.sum(np.abs(C) ** 2)
         return np.asarray(F * np.sqrt(wanted / np.sum(np.abs(F) ** 2)))

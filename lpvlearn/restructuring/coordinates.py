@@ -64,6 +64,16 @@ def _units(lengths: Array) -> Array:
     return np.where(lengths > 0, lengths, longest)
 
 
+def real_form(E: Complex) -> Array:
+    """Real parts of the entries of matrices, and their imaginary parts after these.
+
+    Shape (k, 2 n_outputs n_inputs, ...) of errors (k, n_outputs, n_inputs, ...).
+    """
+    k, p, m = E.shape[:3]
+    flat = E.reshape(k, p * m, *E.shape[3:])
+    return np.concatenate([flat.real, flat.imag], axis=1)
+
+
 class ResponseGeometry:
     """Response at one theta, its derivatives, and coordinates of its metric.
 
@@ -71,7 +81,8 @@ class ResponseGeometry:
     by `size` (root mean square), and the logarithms whose gradients are the rows of
     `pull` (those of distances to bounds) by less than about `_REACH`. `S` holds the
     derivatives of the system matrix, `L` that of the point `at` behind the weight, and
-    `changes` those of the error (k, n_outputs, n_inputs, n_params), ``L S_j R``.
+    `changes` those of the error, ``L S_j R``, as `real_form` has them: (k, 2 n_outputs
+    n_inputs, n_params).
     """
 
     def __init__(
@@ -90,11 +101,10 @@ class ResponseGeometry:
         k, p, _ = self.L.shape
         q, m = len(self.S), self.at.R.shape[2]
         self._shape = (k, p, m)
-        self.changes = derivatives(self.L, self.S, self.at.R)
-        flat = self.changes.reshape(-1, q)
         self._scale = size * np.sqrt(k)
-        J = np.concatenate([flat.real, flat.imag]) / self._scale
-        metric = gram = J.T @ J
+        self.changes = real_form(derivatives(self.L, self.S, self.at.R))
+        J = self.changes.reshape(-1, q)
+        metric = gram = J.T @ J / self._scale**2
         if pull is not None:
             metric = metric + pull.T @ pull / _REACH**2
         unit = _units(np.sqrt(np.diag(metric)))
@@ -103,7 +113,6 @@ class ResponseGeometry:
         s = np.where(s > 0, s, 1.0)
         self.T = V / s / unit[:, None]
         self.inverse = (V * s).T * unit
-        self._J = J
         self._gram = self.T.T @ gram @ self.T + _DAMPING * np.eye(q)
 
     def _solve(self, g: Array) -> Array:
@@ -111,12 +120,12 @@ class ResponseGeometry:
 
     def change(self, d: Array) -> Complex:
         """Change of the error along a step `d`, (k, n_outputs, n_inputs)."""
-        return np.asarray(self.changes @ (self.T @ d))
+        return self._complex(self.changes @ (self.T @ d))
 
     def pulled(self, V: Complex) -> Array:
         """``Re sum_k tr(V_k^H dE_j)`` in y, for a covector V of the response."""
-        flat = self.changes.reshape(-1, self.changes.shape[3])
-        return np.asarray(self.T.T @ np.real(V.conj().ravel() @ flat))
+        J = self.changes.reshape(-1, self.changes.shape[2])
+        return np.asarray(self.T.T @ (real_form(V).ravel() @ J))
 
     def acceleration(self, d: Array) -> Array:
         """Second derivative, in y, of the geodesic that leaves in the direction `d`."""
@@ -126,19 +135,20 @@ class ResponseGeometry:
         if self._bend is not None:
             bend = np.tensordot(v, np.tensordot(v, self._bend, axes=1), axes=1)
             second = second + self.L @ bend @ at.R
-        flat = second.ravel() / self._scale
-        pulled = self._J.T @ np.concatenate([flat.real, flat.imag])
-        return -self._solve(self.T.T @ pulled)
+        return -self._solve(self.pulled(second) / self._scale**2)
 
     def tangential(self, gradient: Array) -> Complex:
         """The covector of the response with that gradient in y and no normal part.
 
         As ``P = R V^H L``, shape (k, n + n_inputs, n + n_outputs), for the covector V.
         """
-        flat = self._J @ (self.T @ self._solve(gradient)) / self._scale
-        half = len(flat) // 2
-        V = (flat[:half] + 1j * flat[half:]).reshape(self._shape)
+        step = self.T @ self._solve(gradient) / self._scale**2
+        V = self._complex(self.changes @ step)
         return self.at.R @ V.conj().swapaxes(1, 2) @ self.L
+
+    def _complex(self, V: Array) -> Complex:
+        real, imag = np.split(V, 2, axis=1)
+        return np.asarray(real + 1j * imag).reshape(self._shape)
 
     def second_derivatives(self, P: Complex) -> Array:
         """``Re sum_k tr(V_k^H d2E_ij)`` in y, for a covector as ``P = R V^H L``.

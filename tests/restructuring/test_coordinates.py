@@ -8,6 +8,7 @@ from lpvlearn.restructuring.coordinates import (
     CanonicalForm,
     LocalChart,
     ResponseGeometry,
+    real_form,
     view_at,
 )
 from lpvlearn.restructuring.error_system import ErrorSystem
@@ -19,7 +20,7 @@ from .conftest import SYSTEMS, stable_model, system_of, target_of
 def weighted_response(system, theta, omega):
     """The response as one real vector, its norm the root mean square."""
     G = system.weight_response(omega)[0] @ system.response(theta, omega)
-    return np.concatenate([G.real.ravel(), G.imag.ravel()]) / np.sqrt(len(omega))
+    return real_form(G).ravel() / np.sqrt(len(omega))
 
 
 @pytest.mark.parametrize("case", SYSTEMS, ids=str)
@@ -56,7 +57,8 @@ def test_the_response_turns_away_from_its_tangent_along_a_geodesic(case):
         tangential = []
         for bend in (0 * a, a):
             second = along(d, bend, h) - 2 * along(d, bend, 0) + along(d, bend, -h)
-            tangential.append(np.linalg.norm(geometry._J.T @ second) / h**2)
+            J = geometry.changes.reshape(len(second), -1)
+            tangential.append(np.linalg.norm(J.T @ second) / h**2)
         assert tangential[1] < 1e-3 * tangential[0]
 
 
