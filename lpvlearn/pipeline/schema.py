@@ -32,7 +32,7 @@ from ..lpv.spline import SplineLPV
 from ..models.innovation import InnovationModel, NoiseModel
 from ..models.statespace import StateSpace
 from ..restructuring.estimator import GrayBoxRestructurer
-from ..restructuring.problem import Identifiability
+from ..restructuring.identifiability import Identifiability
 from ..structures.map import AffineMap, FixedMap, FunctionMap, RowsMap, StructureMap
 from ..structures.mechanical import FluxMap, ImplicitMap
 from ..structures.structure import GrayBoxStructure

@@ -24,6 +24,7 @@ from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
 from ..restructuring.deadline import bounded, time_is_up
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
+from ..restructuring.uncertainty import ParameterUncertainty
 from ..structures.structure import GrayBoxStructure
 from .branches import tied_branches
 from .local_models import LocalModel, motions
@@ -335,8 +336,9 @@ def covariance_of_parameters(
     problem = problem_from_models(structure, [model], weight)
     response = problem.response_of
     changes = [response(above) - response(below) for above, below in deviated]
-    T = problem.parameter_changes(theta, np.array(changes), norm) / (2.0 * DEVIATION)
-    return T.T @ T + problem.open_variances(theta)
+    found = ParameterUncertainty(problem, theta)
+    T = found.changes(np.array(changes), norm) / (2.0 * DEVIATION)
+    return T.T @ T + found.open_variances()
 
 
 def _balanced(local: LocalModel) -> StateSpace:

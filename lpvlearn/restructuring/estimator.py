@@ -61,6 +61,7 @@ from .problem import (
 from .similarity import minimise_bilinear
 from .starts import DISCRETE_BOX
 from .starts import search as starts_of
+from .uncertainty import ParameterUncertainty
 
 Array = NDArray[np.float64]
 
@@ -357,7 +358,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         if len(realizations):
             problem.check_realizations(realizations)
         known = problem.uncertainty(realizations, estimates)
-        self._restructure(problem, given, estimates, known, only_given=not search)
+        at = self._restructure(problem, given, estimates, known, only_given=not search)
         if hasattr(self, "params_covariance_"):
             self.covariance_degrees_of_freedom_ = np.inf
         elif len(realizations):
@@ -365,10 +366,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             # of the maximum each is a minimisation: some tell the spread of all
             few = max(_DRAWS, _EFFORT // len(self.params_))
             seen = realizations[:few] if norm == "hinf" else realizations
-            spread = problem.spread_covariance(self.params_, seen, norm)
+            spread = at.covariance_of_runs(seen, norm)
             self.params_covariance_ = spread * (len(seen) / len(realizations))
             self.covariance_degrees_of_freedom_ = len(seen) - 1.0
-        self._tell_of_bent(problem)
+        self._tell_of_bent(at)
         return self
 
     @one_blas_thread
@@ -450,16 +451,14 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "`sample_weight` must be None with norm='covariance', which weighs the "
                 "error by its `noise`: put a larger one where the response is doubted."
             )
-        self._restructure(problem, [], uncertainty=problem.uncertainty([], []))
+        at = self._restructure(problem, [], uncertainty=problem.uncertainty([], []))
         if hasattr(self, "params_covariance_"):
             self.covariance_degrees_of_freedom_ = np.inf
         elif problem.noise is not None:
             seed = check_random_state(self.random_state).randint(2**31)
-            self.params_covariance_ = problem.noise_covariance(
-                self.params_, _DRAWS, seed
-            )
+            self.params_covariance_ = at.covariance_of_noise(_DRAWS, seed)
             self.covariance_degrees_of_freedom_ = _DRAWS - 1.0
-        self._tell_of_bent(problem)
+        self._tell_of_bent(at)
         self.n_features_in_ = 1
         return self
 
@@ -647,7 +646,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         estimates: Sequence[Estimate] = (),
         uncertainty: float = 0.0,
         only_given: bool = False,
-    ) -> None:
+    ) -> ParameterUncertainty:
         """Starts and their least-squares fits, minimisation, certificates, warnings.
 
         All attributes are those of this fit, or, where it fails, of the one before.
@@ -655,13 +654,13 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         for name in _ABSENT_ELSEWHERE:  # of an earlier fit
             self.__dict__.pop(name, None)
         with bounded(self._seconds()):
-            self._searched(problem, given, estimates, uncertainty, only_given)
+            return self._searched(problem, given, estimates, uncertainty, only_given)
 
-    def _tell_of_bent(self, problem: RestructuringProblem) -> None:
+    def _tell_of_bent(self, at: ParameterUncertainty) -> None:
         """Where `params_covariance_` is that of a linear model, and it is none."""
         if not hasattr(self, "params_covariance_"):
             return
-        bent = problem.bent(self.params_, self.params_covariance_)
+        bent = at.not_linear(self.params_covariance_)
         if bent:
             names = ", ".join(map(repr, bent[:_NAMED]))
             names += f" and {len(bent) - _NAMED} more" if len(bent) > _NAMED else ""
@@ -684,7 +683,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         estimates: Sequence[Estimate],
         uncertainty: float,
         only_given: bool,
-    ) -> None:
+    ) -> ParameterUncertainty:
         rule = "be a whole number from 0 to 2**32 - 1, or None"
         with naming_argument("random_state", rule, self.random_state):
             seed = check_random_state(self.random_state).randint(2**31)
@@ -702,8 +701,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self._describe(problem, result, floor)
         if self.norm == "covariance":
             self._weigh(problem, estimates)
+        at = ParameterUncertainty(problem, self.params_)
+        self.identifiability_ = at.identifiability()
         doubted = isinstance(self.init, str) and not only_given and not found.certain
         self._warn(problem, result, enough, doubted, hurried)
+        return at
 
     def _minimise(
         self, problem: RestructuringProblem, fits: list[LeastSquaresResult]
@@ -771,7 +773,6 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         else:
             self.active_frequencies_ = np.sort(peaks.frequencies)
             self.remaining_error_ = self.error_
-        self.identifiability_ = problem.identifiability(self.params_)
 
     def _weigh(
         self, problem: RestructuringProblem, estimates: Sequence[Estimate]

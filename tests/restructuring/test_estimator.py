@@ -349,30 +349,6 @@ def test_parameters_of_which_only_the_product_is_seen_have_infinite_variances(no
     assert_allclose(table.loc["b", ["lower", "upper"]], [-np.inf, np.inf])
 
 
-def test_a_bound_that_holds_one_parameter_tells_the_other():
-    product = GrayBoxStructure.from_template([["-a"]], [["b"]], [["c"]])
-    bounded = product.with_bounds({"b": (3.0, None)})
-    problem = problem_from_models(bounded, [StateSpace(-2, 3, 1)], None)
-    held, free = np.array([2.0, 3.0, 1.0]), np.array([2.0, 6.0, 0.5])
-    assert not problem.open_variances(held).any()
-    assert_allclose(np.diag(problem.open_variances(free)), [0.0, np.inf, np.inf])
-
-
-@pytest.mark.parametrize("norm", ["hinf", "h2"])
-def test_changes_of_parameters_do_not_depend_on_units(norm):
-    structure = GrayBoxStructure.from_template(
-        [[0, 1], ["-k", "-d"]], [[0], ["g"]], [[1, 0]]
-    )
-    factor = 1.0 + 1e-6 * np.array([1.0, -2.0, 3.0])
-    for gain in (1.0, 1e17):
-        theta = structure.check_params({"k": 1.0, "d": 0.1, "g": gain})
-        problem = problem_from_models(structure, [structure.model(theta)], None)
-        moved = problem.response_of(structure.model(theta * factor))
-        dG = (moved - problem.response)[None]
-        (change,) = problem.parameter_changes(theta, dG, norm)
-        assert_allclose(change / theta, factor - 1.0, rtol=1e-2)
-
-
 def test_restarts_from_perturbations_agree():
     structure, params = CASES["two_masses"]
     black_box = structure.model(params)

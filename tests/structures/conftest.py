@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lpvlearn.restructuring.problem import Identifiability
+from lpvlearn.restructuring.identifiability import Identifiability
 
 OMEGA = np.geomspace(0.05, 50.0, 40)
 
