@@ -51,15 +51,8 @@ from ..systems.simulation import (
 from ..systems.threads import one_blas_thread
 from ..validation import frequencies, input_delays, naming_argument, one_of
 from .delay import Delay, find_delays, with_late_inputs
-from .fit import (
-    TESTS,
-    Choices,
-    LocalFit,
-    check_options,
-    fit_pairs,
-    warn_about,
-    warn_about_horizon,
-)
+from .fit import fit_pairs
+from .fit_warnings import TESTS, warn_about, warn_about_horizon
 from .integrating import (
     RateEvidence,
     as_table,
@@ -69,6 +62,7 @@ from .integrating import (
     simulates_worse,
     sums_of,
 )
+from .local_fit import LocalFit
 from .missing_outputs import (
     by_prediction,
     by_simulation,
@@ -79,6 +73,7 @@ from .missing_outputs import (
     warn_of_many_pieces,
 )
 from .offsets import N_TRENDS
+from .options import Choices, check_options
 from .residuals import (
     Residuals,
     check_kind,
@@ -622,7 +617,7 @@ class SubspaceLTI(
         choices = choices._replace(estimated=estimated)
         gaps |= bool(delay.any()) and choices.initial_states
         if known is not None:
-            choices = choices.following(known)
+            choices = known.chosen(choices)
         fitted = fit_as_stream(pairs, choices, told, detrend=self.detrend, gaps=gaps)
         if fitted is None:
             fitted = fit_pairs(

@@ -19,10 +19,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .fit import Choices, LocalFit
 from .hankel import HankelSum, extend_hankel_sum, start_hankel_sum
 from .identification import STABLE_LOSS, STABLE_MARGIN, Centres, centred
+from .local_fit import LocalFit
 from .offsets import Offsets, attributed, joined
+from .options import Choices
 from .realization import (
     ObservabilitySubspace,
     factor_input_matrices,

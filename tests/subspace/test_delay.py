@@ -8,7 +8,7 @@ from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.models.innovation import InnovationModel, NoiseModel
 from lpvlearn.subspace.delay import find_delays, first_answers, late_inputs
-from lpvlearn.subspace.fit import Choices
+from lpvlearn.subspace.options import Choices
 
 from ..conftest import stable_model
 

@@ -11,7 +11,9 @@ from scipy.signal import lfilter
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.data.preparation import remove_trends, stays_at_limits
 from lpvlearn.exceptions import RankWarning
-from lpvlearn.subspace.fit import check_options, fit_pairs, warn_about
+from lpvlearn.subspace.fit import fit_pairs
+from lpvlearn.subspace.fit_warnings import warn_about
+from lpvlearn.subspace.options import check_options
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes

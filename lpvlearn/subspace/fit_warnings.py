@@ -1,0 +1,439 @@
+"""What is said of a fit: what the samples lack, and what is wrong with the model.
+
+Of kinds of things that were told already nothing is said again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.preparation import held_for, stays_at_limits
+from ..exceptions import RankWarning, warn
+from .held_out import HeldOut
+from .identification import Settings
+from .local_fit import LocalFit
+from .offsets import CERTAIN, USELESS, follows_means_alone
+from .options import Choices
+from .residuals import find_spikes, lacks
+from .selection import better_horizon
+from .signals import thinned
+from .varx import Feedback
+
+Array = NDArray[np.float64]
+
+# What is told from tests that take as long as a fit
+TESTS = {"held out", "orders", "static gain", "decay", "lack"}
+
+# Share of its motion by which a model moves where an output stays, and of the samples
+_MOVES_ON, _AT_LIMITS = 0.05, 0.01
+
+_HALF = 0.5  # share of their energy that enforced stability must cost to be reported
+# Share of its fit (one less the relative error) that parts held out must confirm; with
+# 200 samples at equal noise and signal a right model comes to two thirds.
+_CONFIRMED = 0.5
+
+_ENOUGH = 100  # samples, for parts of them to tell anything
+
+# A standard deviation of the static gain by the root mean square of the response of its
+# output to all inputs as they move: above it, a gain that is not known matters.
+_OPEN = 0.3
+
+# Standard deviations of a pole, for its decay to be known; and one over the longest
+# experiment that matters: an integrator is known better.
+_DECAYS, _MATTERS = 2.0, 0.1
+
+# A pole on the unit circle is found this far outside at most; inside, an enforced one
+# keeps farther away than the second.
+_OUTSIDE, _INSIDE = 1e-8, 1e-9
+
+# A stream fits much worse than its first samples where its error exceeds theirs by
+# this factor, and this share of the outputs' size.
+_MUCH_WORSE, _POOR = 5.0, 0.2
+
+# What was poor from the start was told then; it is told again where it grows by this.
+_GROWN = 1.1
+
+
+def tell(
+    told: set[str], kind: str, message: str, category: type[Warning] = UserWarning
+) -> None:
+    """Warn of a kind of thing that was not told before; from now on it was."""
+    if kind not in told:
+        told.add(kind)
+        warn(message, category)
+
+
+def tell_of_held_outputs(outputs: Sequence[Array], told: set[str]) -> None:
+    """Tell of outputs that are sampled more slowly than the table."""
+    held = [held_for([y[:, i] for y in outputs]) for i in range(outputs[0].shape[1])]
+    slowest = max(held)
+    if slowest > 1:
+        tell(
+            told,
+            "held",
+            f"Output {held.index(slowest) + 1} keeps its values for {slowest} samples: "
+            "it was sampled more slowly than the table, and held in between as the "
+            f"response of no linear system is. Take one row of every {slowest} (the "
+            "first of each value), or `resample`.",
+        )
+
+
+def tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) -> None:
+    """Tell of an output that stays at a limit where its model moves on."""
+    model, records = fitted.evidence.model, fitted.scaled.records
+    stays = [
+        stays_at_limits([y[:, i] for y in outputs]) for i in range(outputs[0].shape[1])
+    ]
+    if not any(map(any, stays)) or len(model.initial_states) != len(records):
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        moves = [model.outputs(record, k) for k, record in enumerate(records)]
+        least = _MOVES_ON * np.std(np.vstack(moves), axis=0)
+    for i in np.flatnonzero(np.isfinite(least)):
+        passed = [
+            (y[start, i], stop - start)
+            for y, moved, parts in zip(outputs, moves, stays[i], strict=True)
+            for start, stop in parts
+            if np.std(moved[start:stop, i]) > least[i]
+        ]
+        n_passed = sum(n for _, n in passed)
+        if n_passed > _AT_LIMITS * sum(map(len, outputs)):
+            values = ", ".join(f"{v:.6g}" for v in sorted({v for v, _ in passed}))
+            tell(
+                told,
+                "limit",
+                f"Output {i + 1} stays at {values} for {n_passed} samples in which "
+                "its model moves on: it is at a limit, of its sensor or of the plant, "
+                "as no linear system has one. Record within the limits, or use NaN "
+                "for them and missing='estimate', and compare.",
+            )
+
+
+class Doubt(NamedTuple):
+    """Why the first model of a closed loop was given up."""
+
+    bft: float  # on parts held out, percent
+    bft_taken: float  # of the model that was taken instead
+    grew: bool  # whether it was unstable
+
+
+def tell_of_feedback(
+    feedback: Feedback,
+    fitted: LocalFit,
+    choices: Choices,
+    doubt: Doubt | None,
+    told: set[str],
+) -> None:
+    """Tell the user of feedback, and what was done about it."""
+    method = choices.method
+    what = (
+        "The inputs know the noise of the outputs (future inputs explain "
+        f"{100.0 * feedback.share:.2g} % of the innovations, p = "
+        f"{feedback.p_value:.1g}): the data come from a closed loop. "
+    )
+    loop = bool(np.any(choices.feedthrough)) and feedback.instantaneous
+    within = (
+        "Inputs and outputs also depend on each other within the sample, and the data "
+        "do not tell a feedthrough from a controller that answers at once"
+    )
+    if method not in ("auto", "pbsid"):
+        what += (
+            f"That biases method={method!r} however many samples there are. "
+            "Use method='pbsid', or identify with the controller's reference as input."
+        )
+    elif method == "pbsid" and loop:
+        what += (
+            f"{within}. "
+            "Use feedthrough=False unless the controller needs a sample to answer."
+        )
+    elif method == "pbsid":
+        return
+    elif feedback.cut_off:
+        what += (
+            "They are too few for the past that method='pbsid' needs: that of "
+            "method='po-moesp' was taken, which feedback biases. Record for longer, or "
+            "identify with the controller's reference as input."
+        )
+    elif doubt is not None:
+        open_loop = fitted.method == "po-moesp"
+        what += (
+            f"The model of method='pbsid'{' with D = 0' if loop else ''} is "
+            f"{'unstable' if doubt.grew else 'poor'} (its best fit to parts held out "
+            f"is {doubt.bft:.3g} %). Taken was that of "
+            f"{'method=' + repr(fitted.method) if open_loop else 'it with D free'} "
+            f"({doubt.bft_taken:.3g} %), as where inputs and outputs are not sampled "
+            "at once. If a controller makes the inputs"
+            f"{'' if open_loop else ' without a delay of a sample'}, use "
+            f"method='pbsid'{', feedthrough=False' if loop else ''}."
+        )
+    else:
+        what += "method='pbsid' was taken, which that does not bias."
+        if loop and choices.feedthrough is True:
+            what += (
+                f" {within}: D = 0 was taken. If the controller needs a sample to "
+                "answer, say method='pbsid' yourself, which leaves D free."
+            )
+        what += (
+            " A model that is only to simulate records of the same loop may do so "
+            "better by method='po-moesp'."
+        )
+    tell(told, "feedback", what)
+
+
+def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
+    """Tell the user when another horizon fits clearly better than the one given."""
+    if fitted.method == "pbsid":
+        return
+    settings = Settings(
+        fitted.evidence.free,
+        fitted.method,
+        choices.refine is not False,
+        choices.enforce_stability,
+    )
+    better = better_horizon(
+        fitted.first_model,
+        fitted.residual,
+        fitted.scaled.records,
+        fitted.selection.horizon,
+        settings,
+    )
+    if better is not None:
+        warn(
+            f"horizon={choices.horizon} ends in a poor model: its simulation error is "
+            f"{100.0 * fitted.residual:.3g} % of the outputs, that of horizon "
+            f"{better[0]} is {100.0 * better[1]:.3g} %. Use horizon='auto'."
+        )
+
+
+def warn_about(fitted: LocalFit, told: set[str]) -> None:
+    """Tell the user what is wrong with a model that is returned all the same.
+
+    `told` are the kinds of warnings that are not repeated; it grows by these.
+    """
+    model = fitted.model
+    chose_order = len({row.order for row in fitted.selection.rows}) > 1
+    if model.rank_deficit:
+        tell(
+            told,
+            "rank",
+            f"The data leave {model.rank_deficit} directions of B and D "
+            "undetermined; the smallest solution was taken. Excite the inputs "
+            "more richly, or lower `order`.",
+            RankWarning,
+        )
+    warn_about_pole(model.A, told, fitted.method)
+    _warn_of_error(fitted, chose_order, told)
+    _warn_of_spikes(fitted, told)
+    choice_is_told = TESTS <= told or fitted.residual > USELESS
+    if fitted.selection.held_out is not None and not choice_is_told:
+        _warn_about_choice(fitted, fitted.selection.held_out, told)
+    feedback = None if fitted.method == "pbsid" else fitted.feedback
+    if feedback is None or fitted.stability_loss or "lack" in told:
+        return
+    if lacks(fitted.evidence, feedback.innovations):
+        remedy = "a higher `order`" if chose_order else "order='auto'"
+        # Without figures, so that a search over orders says it once of each.
+        tell(
+            told,
+            "lack",
+            "The simulation error depends on past inputs, which explain more than a "
+            f"tenth of it: the model of order {len(model.A)} lacks states, a delay or "
+            f"a nonlinearity. Try {remedy}, `input_delay`, or, if the system is "
+            "nonlinear, smaller inputs; `residual_tests` tells which input it is.",
+        )
+
+
+def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
+    """Tell of a model that explains next to nothing, or only without its stability."""
+    residual = fitted.residual
+    as_found = residual - fitted.stability_loss
+    if residual**2 - as_found**2 > _HALF:
+        tell(
+            told,
+            "enforced",
+            "No stable model explains these outputs: the simulation error is "
+            f"{100.0 * residual:.0f} % of their size with stability='enforce', "
+            f"{100.0 * as_found:.3g} % without. The system seems to be unstable: "
+            "identify it with stability='warn', or from a record of bounded outputs, "
+            "with the controller's reference as input.",
+        )
+    elif residual > USELESS:
+        tell(
+            told,
+            "useless",
+            "The model explains next to nothing of the outputs: its simulation "
+            f"error is {100.0 * residual:.0f} % of their size. Try a longer "
+            "`horizon` or order='auto', and check that inputs and outputs belong "
+            "together and in the order of time.",
+        )
+    elif follows_means_alone(fitted.evidence):
+        higher = "" if chose_order else ", order='auto'"
+        tell(
+            told,
+            "useless",
+            "The model explains where the outputs stay, and next to nothing of how "
+            f"they move. Try offset='constant'{higher} or a longer `horizon`, and "
+            "check that inputs and outputs belong together and in the order of time.",
+        )
+
+
+def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
+    """Tell of samples that a sensor may have got wrong: the model follows them."""
+    spikes = None if "spikes" in told else find_spikes(fitted.evidence)
+    if spikes is None:
+        return
+    several, n = len(fitted.evidence.records) > 1, spikes.n_found
+    tell(
+        told,
+        "spikes",
+        f"{n} sample(s) of output {spikes.output + 1} stand far out of the "
+        f"errors of the model and make {100.0 * spikes.share:.0f} % of their squares; "
+        f"the farthest is sample {spikes.sample}"
+        f"{f' of experiment {spikes.experiment}' if several else ''}, counted from 0. "
+        "If a sensor got them wrong, they spoil the model: replace them by NaN and use "
+        "missing='estimate'.",
+    )
+
+
+def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> None:
+    """Tell what the samples do not confirm of a model of automatic order.
+
+    Without figures, so that a search says it once.
+    """
+    if sum(record.u.shape[1] for record in fitted.evidence.records) < _ENOUGH:
+        return
+    if 1.0 - held_out.residual < _CONFIRMED * (1.0 - fitted.residual):
+        tell(
+            told,
+            "held out",
+            "The model simulates parts of the record that it was not fitted to far "
+            "worse than the others (`selection_`): the system is nonlinear, changes "
+            "over the record or drifts, or the record is too short for it. Give a "
+            "lower `order`, leave disturbed parts out, or use offset='linear'.",
+        )
+    if _disputed(fitted):
+        tell(
+            told,
+            "orders",
+            "Parts held out took fewer states than the likelihood asks for, by more "
+            "than chance explains (`selection_`): the system is not quite linear, or "
+            "changes over the record, or its inputs move too seldom for parts to tell. "
+            "Compare both orders on another record, or give one with inputs that move "
+            "more often, and less far if the system is not linear.",
+        )
+    if _may_last(fitted):
+        tell(
+            told,
+            "decay",
+            "A mode of the model does not decay over the longest experiment, nor by "
+            "more than the standard deviation of its poles (`poles_std_`). It may be "
+            "an integrator (name its outputs in `integrating`), stand for a drift that "
+            "the inputs do not explain, or for a system that is not linear: it may "
+            "simulate other records poorly. Give a lower `order`, or record for "
+            "longer, with inputs that move more often.",
+        )
+
+    gain = fitted.evidence.static_gain()
+    if gain is None:
+        return
+    unknown = (gain.std > np.abs(gain.value)) & (gain.std > _OPEN * gain.size)
+    if unknown.any():
+        output, which = np.argwhere(unknown)[0] + 1
+        tell(
+            told,
+            "static gain",
+            f"The static gain (from input {which} to output {output}) is known no "
+            "better than to its own size: the record excites slow motions too little "
+            "to tell it. Record for longer, with inputs that are held for longer, or "
+            "lower `order`; at higher frequencies the model may be right "
+            "(`frequency_response_std`).",
+        )
+
+
+def _disputed(fitted: LocalFit) -> bool:
+    """Whether the criterion speaks clearly against the order that was taken."""
+    records, selection = fitted.scaled.records, fitted.selection
+    n_values = sum(record.y.size for record in thinned(records)) if records else 0
+    chosen = selection.order, selection.horizon
+    return any(
+        row[:2] == chosen and row.criterion * n_values > CERTAIN
+        for row in selection.rows
+    )
+
+
+def _may_last(fitted: LocalFit) -> bool:
+    """Whether the decay of a mode of a stable model is not known.
+
+    Of summaries of records nobody knows how long these were.
+    """
+    poles = fitted.evidence.state_space(fitted.model, 1.0).poles()
+    lengths = [record.u.shape[1] for record in fitted.scaled.records]
+    if not lengths:
+        return False
+    decay = 1.0 - np.abs(poles)
+    lasting = (decay >= 0.0) & (decay * max(lengths) < 1.0)
+    try:
+        spread = np.abs(fitted.evidence.poles_std()) if lasting.any() else decay
+    except ValueError:  # it is not known
+        return False
+    unknown = (decay < _DECAYS * spread) & (spread * max(lengths) > _MATTERS)
+    return bool((lasting & unknown).any())
+
+
+def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
+    """Tell the user that a model is unstable, or on the border of that."""
+    moduli = np.abs(np.linalg.eigvals(A))
+    radius = float(moduli.max(initial=0.0))
+    if radius > 1.0 + _OUTSIDE:
+        remedy = (
+            "Use stability='enforce' for a stable one, another `order`, or a longer "
+            "`horizon`."
+        )
+        if method == "pbsid":
+            remedy = (
+                "Such a plant can be predicted (`predict_ahead`), but not simulated "
+                "for long nor brought into a structure: for that, identify the closed "
+                "loop, with the controller's reference as input."
+            )
+        tell(
+            told,
+            "pole",
+            f"The identified model is unstable: a pole has modulus {radius:.6g}. "
+            + remedy,
+        )
+    elif radius >= 1.0 - _INSIDE:
+        count = int((moduli >= 1.0 - _INSIDE).sum())
+        tell(
+            told,
+            "border",
+            "The identified model is on the border of stability, by integrators or "
+            f"undamped oscillations: {count} of its poles at modulus 1, to rounding. "
+            "Its outputs may grow without end, and no chain of local "
+            "models takes it. Name outputs that integrate in `integrating`; otherwise "
+            "use stability='enforce', or another `order`.",
+        )
+
+
+def warn_about_drift(
+    error: float, first: float, n_samples: int, told: set[str]
+) -> None:
+    """Tell the user where a stream does not go on as its first samples began.
+
+    `error` and `first` are relative simulation errors, of the stream and of its first
+    `n_samples`.
+    """
+    poor = error > min(USELESS, max(_POOR, _MUCH_WORSE * first))
+    if poor and error > _GROWN * first:
+        tell(
+            told,
+            "drift",
+            f"The simulation error of the stream is {100.0 * error:.3g} % of the "
+            f"outputs, after {100.0 * first:.3g} % over its first {n_samples:,} "
+            "samples: these excite the system too little to go on from their model, "
+            "or the system or its noise has changed. Begin a stream with samples that "
+            "excite what comes later, or `fit` the whole table.",
+        )

@@ -1,0 +1,138 @@
+"""Options of `SubspaceLTI`, checked, and what of them decides about a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.preparation import DETRENDS
+from ..validation import is_whole, one_of, positive_time, real_array, shown
+from .identification import Settings
+from .offsets import N_TRENDS
+from .realization import METHODS
+from .simulation_fit import Freedom
+
+Array = NDArray[np.float64]
+
+REFINEMENTS = ("auto", "simulation", "prediction")
+
+MISSING = ("raise", "split", "estimate")
+
+
+class Choices(NamedTuple):
+    """Checked options that decide about a fit.
+
+    The method "auto" is "pbsid" where there is feedback, else "po-moesp".
+    """
+
+    order: int | None = None  # None is to be chosen
+    horizon: int | None = None
+    n_noise_states: int = 0
+    method: str = "auto"
+    feedthrough: Any = True
+    refine: str | bool = "auto"
+    enforce_stability: bool = False
+    initial_states: bool = True  # False starts every experiment from rest
+    offset: str | None = None  # "auto" is to be chosen
+    # of every experiment, (n_samples, n_outputs): outputs that are estimates; none: ()
+    estimated: Sequence[NDArray[np.bool_]] = ()
+
+    def settings(
+        self, n_outputs: int, n_inputs: int, basis: Array, n_trend: int = 0
+    ) -> Settings:
+        """How models of these channels are made.
+
+        `basis` (n_inputs, rank) are the original inputs in terms of the independent
+        ones, which the models have; `n_trend` as in `Freedom`.
+        """
+        mask = _feedthrough_mask(self.feedthrough, n_outputs, n_inputs, basis.shape[1])
+        return Settings(
+            Freedom(mask, self.initial_states, n_trend),
+            self.method,
+            self.refine is not False,
+            self.enforce_stability,
+            self.n_noise_states,
+            weigh=self.refine in ("auto", "prediction"),
+            compare=self.refine == "auto",
+        )
+
+
+def check_options(options: Mapping[str, Any]) -> Choices:
+    """Refuse what is not an option of `SubspaceLTI`, naming those that are."""
+    one_of("method", options["method"], ("auto", *METHODS, "pbsid"))
+    one_of("stability", options["stability"], ("warn", "enforce"))
+    one_of("initial_state", options["initial_state"], ("estimate", "rest"))
+    one_of("missing", options["missing"], MISSING)
+    one_of("detrend", options["detrend"], DETRENDS)
+    one_of("offset", options["offset"], tuple(N_TRENDS))
+    one_of("refine", options["refine"], (*REFINEMENTS, True, False))
+    _feedthrough(options["feedthrough"])
+    if options["sampling_time"] is not None:
+        positive_time("sampling_time", options["sampling_time"])
+    if options["initial_state"] == "rest" and options["missing"] == "split":
+        raise ValueError(
+            "`initial_state` must be 'estimate' with missing='split': what follows a "
+            "gap does not start from rest. Got 'rest'."
+        )
+    offset = options["offset"]
+    if options["detrend"] is not None and offset == "auto":
+        offset = None  # what is to become of offsets was said
+    return Choices(
+        _integer_or_auto("order", options["order"], 0),
+        _integer_or_auto("horizon", options["horizon"], 1),
+        _integer_or_auto("n_noise_states", options["n_noise_states"], 0) or 0,
+        options["method"],
+        options["feedthrough"],
+        REFINEMENTS[0] if options["refine"] is True else options["refine"],
+        options["stability"] == "enforce",
+        options["initial_state"] == "estimate",
+        offset,
+    )
+
+
+def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:
+    if isinstance(value, str) and value == "auto":
+        return None
+    if not is_whole(value) or value < lowest:
+        raise ValueError(
+            f"`{name}` must be 'auto' or an integer of at least {lowest}. Got "
+            f"{shown(value)}."
+        )
+    return int(value)
+
+
+def _feedthrough(value: Any) -> NDArray[np.bool_]:
+    """The option as one or a table of booleans."""
+    try:
+        mask = real_array("feedthrough", value)
+    except ValueError:
+        mask = np.full(1, np.nan)
+    if not np.isin(mask, (0.0, 1.0)).all():
+        raise ValueError(
+            "`feedthrough` must be True, False or a table of them, shape (n_outputs, "
+            f"n_inputs). Got {shown(value)}."
+        )
+    return mask.astype(bool)
+
+
+def _feedthrough_mask(
+    feedthrough: Any, n_outputs: int, n_inputs: int, rank: int
+) -> NDArray[np.bool_]:
+    """Free entries of D for the independent inputs, (n_outputs, rank)."""
+    mask = _feedthrough(feedthrough)
+    if mask.ndim == 0:
+        return np.full((n_outputs, rank), mask)
+    if mask.shape != (n_outputs, n_inputs):
+        raise ValueError(
+            "`feedthrough` must be True, False or a table of shape (n_outputs, "
+            f"n_inputs) = ({n_outputs}, {n_inputs}). Got shape {mask.shape}."
+        )
+    if rank == n_inputs or mask.all() or not mask.any():
+        return mask[:, :rank]
+    raise ValueError(
+        "`feedthrough` cannot fix single entries of D while inputs are collinear. "
+        "Leave all but one of the collinear inputs out."
+    )
