@@ -369,7 +369,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             spread = at.covariance_of_runs(seen, norm)
             self.params_covariance_ = spread * (len(seen) / len(realizations))
             self.covariance_degrees_of_freedom_ = len(seen) - 1.0
-        self._tell_of_bent(at)
+        self._tell_of_nonlinear(at)
         return self
 
     @one_blas_thread
@@ -458,7 +458,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             seed = check_random_state(self.random_state).randint(2**31)
             self.params_covariance_ = at.covariance_of_noise(_DRAWS, seed)
             self.covariance_degrees_of_freedom_ = _DRAWS - 1.0
-        self._tell_of_bent(at)
+        self._tell_of_nonlinear(at)
         self.n_features_in_ = 1
         return self
 
@@ -656,7 +656,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         with bounded(self._seconds()):
             return self._searched(problem, given, estimates, uncertainty, only_given)
 
-    def _tell_of_bent(self, at: ParameterUncertainty) -> None:
+    def _tell_of_nonlinear(self, at: ParameterUncertainty) -> None:
         """Where `params_covariance_` is that of a linear model, and it is none."""
         if not hasattr(self, "params_covariance_"):
             return

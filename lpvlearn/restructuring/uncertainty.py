@@ -19,7 +19,7 @@ from .identifiability import Identifiability, sparse_rows, undetermined_steps
 from .least_squares import channel_scaling, least_maximum
 from .problem import RestructuringProblem
 from .similarity import bilinear_changes
-from .singular_points import bend_of, squared_combinations
+from .singular_points import Bend, bend_of, squared_combinations
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -46,7 +46,6 @@ class ParameterUncertainty:
         self._response, self._jacobian = problem.system.response_jacobian(
             theta, problem.omega
         )
-        self._bend = bend_of(self._response_at, theta, *self._bounds)
 
     def identifiability(self) -> Identifiability:
         """Which parameters the response determines, and how well."""
@@ -166,6 +165,10 @@ class ParameterUncertainty:
             for j, row in zip(even, moved, strict=True)
             if abs(row[j]) > _LINEAR * parts[j] ** 2 * 2.0 * std[j]
         ]
+
+    @cached_property
+    def _bend(self) -> Bend:
+        return bend_of(self._response_at, self.theta, *self._bounds)
 
     def _response_at(self, theta: Array) -> Complex:
         return self.problem.system.response(theta, self.problem.omega)
