@@ -5,7 +5,8 @@ one, (u0 + v, y0 + G v) with the static gain G. They do not tell the state x0 th
 which matters while kappa moves. What moves outputs at rest is taken to come through
 inputs, ``w = u0 - P y0`` with ``P = G^-1``; then ``x0 = S y0`` with ``S = -A^-1 B P``.
 (P is a pseudoinverse without the directions in which G is next to nothing; what it does
-not reach stays an offset of the sensors.) Which family do the points make?
+not reach stays an offset of the sensors. Inputs of which the outputs tell nothing, ``(I
+- P G) u0``, are what they are, and add to x0.) Which family do the points make?
 
 - They follow one another by the models' own gain, ``du0 = P dy0``: they are equilibria
   of one system that schedules itself, and ``A dx0 + B du0 = 0`` along them. So
@@ -16,6 +17,8 @@ not reach stays an offset of the sensors.) Which family do the points make?
 
 Where inputs stand about one level, all points are moved to one u0: what differs at
 random would bend the interpolation.
+
+Models that integrate are at rest at any output, and their inputs are constants then.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 
 from ..models.statespace import StateSpace
 from .alignment import spanning_tree
@@ -51,7 +55,7 @@ def points_of_work(
     outputs: Array,
     scales: tuple[Array, Array],
 ) -> Array:
-    """``[u0, y0, x0]`` of stable models, (n_points, n_inputs + n_outputs + order).
+    """``[u0, y0, x0]`` of models, (n_points, n_inputs + n_outputs + order).
 
     From equilibria, `inputs` (n_points, n_inputs) and `outputs` (n_points, n_outputs);
     `scales` are the sizes of the motions of inputs and outputs.
@@ -69,34 +73,54 @@ def points_of_work(
            [2., 4., 4.]])
     """
     u_scale, y_scale = scales
+    if any(np.linalg.matrix_rank(model.A) < model.order for model in models):
+        found = zip(models, inputs, outputs, strict=True)
+        x0 = np.array([_state_at_rest(*point, scales) for point in found])
+        return np.hstack([inputs, outputs, x0])
     gains = np.array([model.dc_gain() for model in models])
     inverse = _inverse(gains * u_scale / y_scale[:, None])
     inverse *= u_scale[:, None] / y_scale
-    states = np.array(
-        [
-            -np.linalg.solve(model.A, model.B) @ P
-            for model, P in zip(models, inverse, strict=True)
-        ]
-    )
+    moved_states = -np.array([np.linalg.solve(m.A, m.B) for m in models])
+    states, seen = moved_states @ inverse, inverse @ gains
+    unseen = moved_states @ (np.eye(len(u_scale)) - seen)
     if np.sum(np.var(inputs / u_scale, axis=0)) <= _STANDING:
         common = np.broadcast_to(inputs.mean(axis=0), inputs.shape)
-        outputs = outputs + np.einsum("kij,kj->ki", gains, common - inputs)
+        outputs = outputs + _times(gains, common - inputs)
         inputs = common
     order, parents = spanning_tree(kappa)
     child, parent = order[1:], parents[order[1:]]
-    du = (inputs[child] - inputs[parent]) / u_scale
-    dy = outputs[child] - outputs[parent]
-    half = 0.5 * (inverse[child] + inverse[parent])
-    answer = np.einsum("kij,kj->ki", half, dy) / u_scale
-    moved = np.sum(du**2) + np.sum(answer**2)
-    if du.any() and np.sum((du - answer) ** 2) <= _UNEXPLAINED * moved:
-        x0 = np.einsum("kij,kj->ki", states, outputs)
-        for k, j, step in zip(child, parent, dy, strict=True):
+    du, dy = inputs[child] - inputs[parent], outputs[child] - outputs[parent]
+    asked = _times(0.5 * (seen[child] + seen[parent]), du) / u_scale
+    answer = _times(0.5 * (inverse[child] + inverse[parent]), dy) / u_scale
+    moved = np.sum(asked**2) + np.sum(answer**2)
+    if asked.any() and np.sum((asked - answer) ** 2) <= _UNEXPLAINED * moved:
+        x0 = _times(states, outputs) + _times(unseen, inputs)
+        for k, j, step, of_input in zip(child, parent, dy, du, strict=True):
             x0[k] = x0[j] + 0.5 * (states[k] + states[j]) @ step
+            x0[k] += 0.5 * (unseen[k] + unseen[j]) @ of_input
         return np.hstack([inputs, outputs, x0])
     bias = _constants_of_sensors(inputs, outputs, gains, inverse, u_scale)
-    x0 = np.einsum("kij,kj->ki", states, outputs - bias)
+    x0 = _times(states, outputs - bias) + _times(unseen, inputs)
     return np.hstack([inputs, outputs, x0])
+
+
+def _state_at_rest(
+    model: StateSpace, u0: Array, y0: Array, scales: tuple[Array, Array]
+) -> Array:
+    """The state at rest with an output, of all inputs the nearest to `u0`."""
+    u_scale, y_scale = scales
+    n = model.order
+    rest = null_space(np.hstack([model.A, model.B]))  # states and inputs
+    to_output = np.hstack([model.C, model.D]) @ rest / y_scale[:, None]
+    to_input = _STATIC * rest[n:] / u_scale[:, None]
+    wanted = np.concatenate([y0 / y_scale, _STATIC * u0 / u_scale])
+    z = np.linalg.lstsq(np.vstack([to_output, to_input]), wanted, rcond=None)[0]
+    return np.asarray(rest[:n] @ z)
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    """Products of matrices and vectors, point by point."""
+    return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
 
 
 def _constants_of_sensors(
@@ -106,10 +130,10 @@ def _constants_of_sensors(
 
     def size(values: Array, about: float = 0.0) -> float:
         """Of outputs, by the inputs that they are worth."""
-        worth = np.einsum("kij,kj->ki", inverse, values) / u_scale
+        worth = _times(inverse, values) / u_scale
         return float(np.sum((worth - np.mean(worth, axis=0) * about) ** 2))
 
-    constants = outputs - np.einsum("kij,kj->ki", gains, inputs)
+    constants = outputs - _times(gains, inputs)
     bias = constants.mean(axis=0)
     of_sensors, of_inputs = size(constants - bias), size(constants, about=1.0)
     if min(of_sensors, of_inputs) > _UNEXPLAINED * size(constants):
