@@ -164,7 +164,15 @@ def as_list(keys: Any) -> list[Any]:
 
 
 def is_table(X: Any) -> bool:
-    """Whether `X` has named columns, as a pandas or polars DataFrame has."""
+    """Whether `X` has named columns, as a pandas or polars DataFrame has.
+
+    A ValueError for a table or record batch of pyarrow.
+    """
+    if hasattr(X, "column_names") and hasattr(X, "to_pandas"):
+        raise ValueError(
+            "tables must be DataFrames of pandas or polars, or arrays. Got a "
+            f"{type(X).__name__} of pyarrow: use its to_pandas()."
+        )
     return hasattr(X, "columns") and hasattr(X, "__getitem__") and hasattr(X, "shape")
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..exceptions import warn
 from .experiments import Experiment, read_experiments
 
 Array = NDArray[np.float64]
@@ -35,6 +36,8 @@ _HELD, _ENOUGH_CHANGES, _LONGEST_HELD = 0.95, 20, 1000
 # A signal may be at a limit that stays for so many samples at an extreme value, this
 # many times longer than at any other; this share of it is at others.
 _STAYS, _LONGER, _OTHERS = 10, 3, 0.1
+
+_FEW = 5  # labels that a message lists
 
 
 def read_runs(
@@ -59,8 +62,22 @@ def read_runs(
     if not (split and cut):
         return found
     if outputs:
+        _warn_of_empty(found)
         return split_at_gaps(found)
     return [run for e in found for run in complete_runs(e, 1, outputs=False)]
+
+
+def _warn_of_empty(experiments: Sequence[Experiment]) -> None:
+    """Tell of experiments of which nothing is left where others have samples."""
+    empty = [e.label for e in experiments if not complete_runs(e)]
+    if empty and len(empty) < len(experiments):
+        more = f" and {len(empty) - _FEW} more" if len(empty) > _FEW else ""
+        warn(
+            f"experiment(s) {', '.join(map(repr, empty[:_FEW]))}{more} have no two "
+            "consecutive samples of which nothing is missing (NaN), and are left out, "
+            "with their operating points. Check their columns, or leave their rows "
+            "out yourself."
+        )
 
 
 def has_gaps(experiment: Experiment) -> bool:

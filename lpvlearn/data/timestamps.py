@@ -55,6 +55,11 @@ _RESTARTS = (
 
 # Stamps beyond are no seconds since 1970, but parts of them: the year 5138.
 _SINCE_1970 = 1e11
+_UNITS_SINCE_1970 = (
+    ("ms", "milliseconds", 1e14),
+    ("us", "microseconds", 1e17),
+    ("ns", "nanoseconds", np.inf),
+)
 
 # Share of the steps up to which a table does not look shuffled: those that go back in
 # time, where experiments follow each other, or leave rows out, as a logger does.
@@ -95,10 +100,15 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
     if not finite.all():
         _raise_bad_time(column, int(np.argmin(finite)), series)
     if len(seconds) and seconds.min() > _SINCE_1970:
+        unit, name = next(
+            (unit, name)
+            for unit, name, most in _UNITS_SINCE_1970
+            if seconds.min() < most
+        )
         warn(
             f"Time column {column!r} begins at {seconds.min():.4g}. Numbers are read "
-            "as seconds; if these are milliseconds since 1970, give dates instead: "
-            f"pandas.to_datetime(X[{column!r}], unit='ms')."
+            f"as seconds; if these are {name} since 1970, give dates instead: "
+            f"pandas.to_datetime(X[{column!r}], unit={unit!r})."
         )
     return seconds
 

@@ -35,6 +35,10 @@ _TENSOR = 2  # the highest degree in every variable: more takes minutes
 # would have coefficients too many.
 _SUPPORT = 10.0
 
+# A rational form, or a polynomial of a high degree, that has coefficients for more than
+# this share of the values meets most points: it must foresee those left out as well.
+_FREE = 0.5
+
 _INTERPOLATION = "pchip"  # where no form is true
 
 
@@ -73,6 +77,10 @@ class AutoLPV(Interpolator):
 
     Notes
     -----
+    A rational form, or a polynomial of a degree above 2, with more than half as many
+    coefficients as there are values must foresee points that are left out, within the
+    range of the others, as well as interpolation does.
+
     If a form is true, its chi-square is about its degrees of freedom. A form whose
     chi-square is more than four times that (and no chance, for few degrees of freedom)
     is not taken, unless what it leaves of the variation over the points is next to
@@ -129,7 +137,7 @@ class AutoLPV(Interpolator):
         excess = 1.0
         if not any(map(is_chance, chi2, dof)) and good.any():
             excess = np.min(chi2[good] / dof[good])
-        n = points.theta.size
+        n, chosen, believed = points.theta.size, 0, False
         price = 2.0 if self.criterion == "aic" else math.log(n)
         cost = chi2 / excess + price * (n - dof)
         if good.any():
@@ -140,7 +148,9 @@ class AutoLPV(Interpolator):
                 for _, form in found
             ]
             chosen = int(min(supported, key=lambda k: (bent[k], -dof[k], cost[k])))
-        else:
+            free = bent[chosen] and n - dof[chosen] > _FREE * n
+            believed = not free or _foresees(found[chosen][1], kappa, points)
+        if not good.any() or not believed:
             spline = SplineLPV(_INTERPOLATION).fit(kappa, points.theta)
             chosen = len(found)
             found.append((_INTERPOLATION, spline))
@@ -183,6 +193,32 @@ class AutoLPV(Interpolator):
     def _check_options(self) -> None:
         super()._check_options()
         one_of("criterion", self.criterion, _CRITERIA)
+
+
+def _foresees(form: Any, kappa: Array, points: WeightedPoints) -> bool:
+    """Whether points left out are met as well as by interpolation of the others.
+
+    Those within the range of the others, in the spread of every parameter.
+    """
+    theta, covariance = points.theta, points.covariance
+    assert covariance is not None  # the forms were judged by it
+    spread = np.ptp(theta, axis=0)
+    spread = np.where(spread > 0, spread, 1.0)
+    squares = np.zeros(2)
+    for place in np.unique(kappa, axis=0):
+        out = (kappa == place).all(axis=1)
+        rest = kappa[~out]
+        if ((place < rest.min(axis=0)) | (place > rest.max(axis=0))).any():
+            continue
+        try:
+            other = copy(form).fit(rest, theta[~out], covariance=covariance[~out])
+            spline = SplineLPV(_INTERPOLATION).fit(rest, theta[~out])
+        except ValueError:  # the others are too few
+            continue
+        for k, one in enumerate((other, spline)):
+            errors = (one.predict(kappa[out]) - theta[out]) / spread
+            squares[k] += float(np.sum(errors**2))
+    return bool(squares[0] <= squares[1])
 
 
 def _forms(kappa: Array) -> Iterator[tuple[str, PolynomialLPV | RationalLPV]]:

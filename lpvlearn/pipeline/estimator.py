@@ -862,7 +862,10 @@ def _check_step(name: str, step: Any) -> None:
     if isinstance(step, type):
         got = f"the class {step.__name__}, not an instance"
     elif all(hasattr(step, method) for method in (*methods, "get_params")):
-        return
+        other_step = name == "local" and hasattr(step, "fit_model")
+        if not other_step:
+            return
+        got += ", which is a `restructurer`"
     choice = ", ".join(["an estimator", *map(repr, other)]) + " or None"
     raise ValueError(
         f"`{name}` must be {choice}. Got {got}. Give an instance with the "

@@ -65,10 +65,11 @@ from .uncertainty import ParameterUncertainty
 
 Array = NDArray[np.float64]
 
-# A fit of an error up to that multiple of the black box's standard deviation is as good
-# as the true parameters' own.
+_AT_BOUND = 1e-6  # relative distance to a bound that holds a parameter
 _MOST_STARTS = 100_000  # all are drawn at once
 
+# A fit of an error up to that multiple of the black box's standard deviation is as good
+# as the true parameters' own.
 _NOISY = 1.5
 
 _OPTIMAL = 1e-5  # stationarity from which an optimum is known nearly only
@@ -672,6 +673,18 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "give what is known of them (a value, or bounds)."
             )
 
+    def _at_bounds(self) -> str:
+        """Which parameters stand at their bounds, as a sentence; nothing for none."""
+        structure, theta = self.structure_, self.params_
+        bounds = np.array([structure.lower, structure.upper])
+        held = np.isclose(theta, bounds, rtol=_AT_BOUND, atol=0.0).any(axis=0)
+        names = [
+            name for name, k in zip(structure.parameter_names, held, strict=True) if k
+        ]
+        if not names:
+            return ""
+        return f" At their bounds stand {', '.join(names)}: leave them more room."
+
     def _seconds(self) -> float:
         """`max_time`, which is checked, as a float; infinity for None."""
         return np.inf if self.max_time is None else float(self.max_time)
@@ -891,6 +904,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                     else "Either it cannot represent the model, or the search ended in "
                     "a wrong basin."
                 )
+                + self._at_bounds()
                 + " Give `init`, or raise `n_starts`, to search elsewhere."
                 + DISCRETE_BOX
                 * (self.structure is not None and not self.lti_.is_continuous),

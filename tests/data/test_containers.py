@@ -63,3 +63,11 @@ def test_polars(tables, model):
     X = polars.DataFrame({name: tables[0][name].tolist() for name in tables[0]})
     found = clone(model).set_output(transform="polars").fit(X, tables[1]).predict(X)
     assert isinstance(found, polars.DataFrame) and found.columns == ["position"]
+
+
+def test_tables_of_pyarrow_are_refused_by_name(tables, model):
+    pa = pytest.importorskip("pyarrow")
+    with pytest.raises(ValueError, match=r"a Table of pyarrow: use its to_pandas\(\)"):
+        clone(model).fit(pa.Table.from_pandas(tables[0]), tables[1])
+    with pytest.raises(ValueError, match="of pyarrow"):
+        clone(model).fit(tables[0], pa.Table.from_pandas(tables[1]))

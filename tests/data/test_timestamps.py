@@ -144,8 +144,9 @@ def test_a_tolerance_is_a_share_of_the_step(tol):
         check_time_tol(tol)
 
 
-def test_milliseconds_since_1970_are_told():
-    stamps = 1.7726e12 + 50.0 * np.arange(5)
-    with pytest.warns(UserWarning, match=r"X\['t'\], unit='ms'"):
-        time_in_seconds(stamps, "t")
-    assert time_in_seconds(stamps / 1e3, "t")[0] > 1e9  # seconds since 1970 are fine
+@pytest.mark.parametrize("unit, parts", [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_parts_of_seconds_since_1970_are_told(unit, parts):
+    seconds = 1.7726e9 + 0.05 * np.arange(5)
+    with pytest.warns(UserWarning, match=rf"X\['t'\], unit='{unit}'"):
+        time_in_seconds(parts * seconds, "t")
+    assert time_in_seconds(seconds, "t")[0] > 1e9  # seconds since 1970 are fine

@@ -124,3 +124,20 @@ def test_points_on_a_curve_choose_among_what_they_determine():
 def test_criteria_that_are_not_known_are_refused():
     with pytest.raises(ValueError, match="`criterion` must be 'aic' or 'bic'"):
         AutoLPV(criterion="press").fit(KAPPA, KAPPA)
+
+
+def test_forms_with_nearly_a_coefficient_for_every_value_must_foresee_points():
+    """A narrow bump, which a rational form meets at all points and nowhere else."""
+
+    def bump(x):
+        return np.column_stack([np.exp(-((x - 0.5) ** 2) / 0.01), 2 + 3 * x, 1 + x])
+
+    def fitted(values):
+        noise = 1e-3 * np.random.default_rng(0).normal(size=values.shape)
+        covariance = np.tile(1e-6 * np.eye(3), (len(values), 1, 1))
+        return AutoLPV().fit(kappa[:, None], values + noise, covariance=covariance)
+
+    kappa = np.linspace(0, 1, 5)
+    assert fitted(bump(kappa)).form_ == "pchip"
+    true = np.column_stack([1 / (1.2 + kappa), 2 + kappa, 3 / (1.2 + kappa)])
+    assert "rational" in fitted(true).form_

@@ -106,3 +106,49 @@ def test_models_that_are_not_square_rest_where_they_say(n_inputs, n_outputs):
         assert_allclose(model.A @ x + B @ v, 0.0, atol=1e-10)  # it is their answer
         assert_allclose(C @ x + D @ v, y, atol=1e-10)
     assert_allclose(y - gains[1] @ u, y0[1] - gains[1] @ u0[1], atol=1e-10)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.5])
+def test_inputs_that_one_output_does_not_tell_apart_are_what_they_are(bias):
+    """Two inputs, one output: the state at rest is that for both of them."""
+    h = np.linspace(0.5, 2.0, 5)
+    models = [
+        StateSpace(
+            [[-(k + 0.5), k], [0.2 * k, -0.2 * k - 0.1]],
+            [[1.0, 0.5], [0.0, 0.1]],
+            [[1.0, 0.0]],
+        )
+        for k in h
+    ]
+    u0 = np.tile([5.0, 8.0], (5, 1))
+    states = [-np.linalg.solve(m.A, m.B @ u) for m, u in zip(models, u0, strict=True)]
+    y0 = np.array([x[:1] for x in states]) + bias
+    values = points_of_work(models, h[:, None], u0, y0, (np.ones(2), np.ones(1)))
+    assert_allclose(values[:, 3:], states, rtol=1e-9)
+
+
+def test_an_input_that_stands_still_moves_no_state():
+    """Two tanks in a row, of which only the second one's pump and level change."""
+    level = np.linspace(0.5, 3.0, 40)
+    first = 0.25  # of the upper tank, whose pump stands still
+    models = [
+        StateSpace(
+            [[-0.5 / first**0.5, 0], [0.5 / first**0.5, -0.5 / h**0.5]],
+            np.eye(2),
+            [[0, 1]],
+        )
+        for h in level
+    ]
+    u0 = np.column_stack([np.full(40, first**0.5), level**0.5 - first**0.5])
+    columns = level[:, None], u0, level[:, None]
+    values = points_of_work(models, *columns, (np.full(2, 0.1), np.ones(1)))
+    steps = np.diff(values[:, 3:], axis=0)
+    assert_allclose(steps[:, 0], 0.0, atol=1e-3)
+    assert_allclose(steps[:, 1], np.diff(level), atol=1e-3)
+
+
+def test_what_integrates_rests_at_any_output():
+    models = [StateSpace([[0, 1], [0, -d]], [[0], [2.0]], [[1, 0]]) for d in (1.0, 3.0)]
+    places = np.array([[0.0], [1.0]])
+    values = points_of_work(models, places, np.ones((2, 1)), 7.0 + places, ONE)
+    assert_allclose(values, [[1, 7, 7, 0], [1, 8, 8, 0]], atol=1e-9)

@@ -765,3 +765,20 @@ def test_steps_that_last_are_told_where_wanted(capsys, monkeypatch, verbose, bar
         time.sleep(0.1)
     assert capsys.readouterr() == ("", told)
     assert watch.seconds["figures"] >= 0.1
+
+
+def test_points_of_which_no_sample_is_left_are_told():
+    X, y = spring_tables(kappas=[0.0, 0.5, 1.0, 1.5], n_samples=200)
+    y = y.copy()
+    y[(X["run"] == X["run"].unique()[1]).to_numpy()] = np.nan
+    pipeline = spring_pipeline(local=SubspaceLTI(2, missing="split"))
+    with pytest.warns(UserWarning, match="no two consecutive samples"):
+        pipeline.fit(X, y)
+    assert pipeline.operating_points_.ravel().tolist() == [0.0, 1.0, 1.5]
+
+
+def test_a_restructurer_in_the_first_place_is_named():
+    X, y = spring_tables(n_samples=60)
+    wrong = LocalLPVPipeline(GrayBoxRestructurer(spring_structure()), **ROLES)
+    with pytest.raises(ValueError, match="which is a `restructurer`"):
+        wrong.fit(X, y)
