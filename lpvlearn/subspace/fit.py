@@ -23,6 +23,7 @@ from ..exceptions import RankWarning
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .delay import find_lead, with_later_inputs
 from .fit_warnings import (
+    TESTS,
     Doubt,
     tell,
     tell_of_feedback,
@@ -53,7 +54,7 @@ from .options import Choices
 from .selection import PlantFit, Row, Selection, select
 from .shifts import cut_at, find_shifts
 from .signals import Record, SharedSignals, share_known, shorten
-from .simulation_fit import Realization, simulation_errors
+from .simulation_fit import Realization, simulation_errors, with_initial_states
 from .statistics import Evidence
 from .varx import Feedback, find_feedback
 
@@ -70,6 +71,11 @@ _LED, _LINE = 0.1, 3.0
 
 # Share of the outputs' size left unexplained that constants may be the reason of
 _HARDLY = 0.4
+
+# Experiments contradict one another where models of each leave less than this share of
+# the squared errors of the one for all. That is looked into where it leaves more than
+# this share of the outputs' size, for the longest ones, of so many samples a parameter.
+_CONTRADICTED, _ROUGH, _MOST_ALONE, _VALUES_EACH = 0.25, 0.1, 6, 10
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
 # model not to refute it; standard errors by which a lesser one must be better where the
@@ -111,6 +117,8 @@ def fit_pairs(
             tell_of_held_outputs(outputs, told)
         if "limit" not in told:
             tell_of_limits(outputs, fitted, told)
+    if len(pairs) > 1 and fitted.residual > _ROUGH and "contradiction" not in told:
+        _tell_of_contradiction(pairs, choices, told, fitted)
     # The errors of a rough model are not the noise that shifts must stand out of.
     cuts = choices.offset == "auto" and choices.initial_states and choices.refine
     if cuts and not choices.estimated:
@@ -148,6 +156,46 @@ def _with_constants(
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
+
+
+def _tell_of_contradiction(
+    pairs: Pairs, choices: Choices, told: set[str], whole: LocalFit
+) -> None:
+    """Tell of experiments that one model cannot explain, and models of each do."""
+    n_trend, free = whole.evidence.free.n_trend, whole.evidence.free
+    records, model = whole.scaled.records, whole.evidence.model
+    if whole.method == "pbsid" or choices.estimated or len(records) != len(pairs):
+        return
+    n_values = model.C.size + model.B.size + np.count_nonzero(free.direct)
+    least = _VALUES_EACH * (n_values + len(model.A))
+    lengths = np.array([record.y.size for record in records])
+    some = [k for k in np.argsort(-lengths)[:_MOST_ALONE] if lengths[k] >= least]
+    found = simulation_errors(with_initial_states(model, records, free), records)
+    same, energies = whole.chosen(choices), []
+    for k in some:
+        try:
+            other = _fit([pairs[k]], same, set(TESTS), n_trend, whole)
+        except TooFewSamples:
+            continue
+        own = other.scaled.records
+        scale = other.evidence.output_scale / whole.evidence.output_scale
+        errors = simulation_errors(other.evidence.model, own)[0] * scale
+        size = np.sum(records[k].y ** 2)
+        energies.append([np.sum(found[k] ** 2), np.sum(errors**2), size])
+    if len(energies) < 2:
+        return
+    together, apart, size = np.sum(energies, axis=0)
+    if apart < _CONTRADICTED * together:
+        left, alone = 100.0 * np.sqrt([together / size, apart / size])
+        tell(
+            told,
+            "contradiction",
+            "The experiments contradict one another: of their outputs one model leaves "
+            f"{left:.2g} %, models of each alone leave {max(alone, 0.01):.2g} %. The "
+            "system was not the same in them (a load, a setting, the sign of a "
+            "sensor), or it is not linear. Check them, give what differs as a "
+            "scheduling variable, or leave out those that do not belong here.",
+        )
 
 
 def _without_shifts(

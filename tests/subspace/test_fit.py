@@ -13,7 +13,7 @@ from lpvlearn.data.preparation import remove_trends, stays_at_limits
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace.fit import fit_pairs
 from lpvlearn.subspace.fit_warnings import warn_about
-from lpvlearn.subspace.options import check_options
+from lpvlearn.subspace.options import Choices, check_options
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
@@ -456,3 +456,22 @@ def test_an_order_that_the_likelihood_disputes_is_told(rng):
             warnings.simplefilter("always")
             warn_about(disputed, set())
         assert [str(w.message)[:14] for w in told] == ["Parts held out"] * (excess > 30)
+
+
+@pytest.mark.parametrize("gains", [(1.0, -1.0), (1.0, 1.0)])
+def test_experiments_that_contradict_one_another_are_told(gains, rng):
+    """A sensor that changes its sign; equal ones, as noisy, are silent."""
+    system = StateSpace([[0.6, 0.5], [-0.5, 0.6]], [[1], [0]], [[1, 0]], None, 1.0)
+    pairs = []
+    for gain in gains:
+        u = rng.standard_normal((400, 1))
+        y = gain * system.simulate(u)
+        pairs.append((u, y + 0.3 * y.std() * rng.standard_normal(y.shape)))
+    told = set()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        fit_pairs(pairs, Choices(order=2), told)
+    assert ("contradiction" in told) == (gains[0] != gains[1])
+    assert any("contradict" in str(w.message) for w in said) == (
+        "contradiction" in told
+    )
