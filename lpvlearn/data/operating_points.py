@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -28,6 +28,10 @@ _PARTS, _SWEEP = 10, 0.8
 # Largest spread of a scheduling variable within a local experiment, relative to its
 # range over the points: what moves further has seen several of the models.
 _MAX_SPREAD = 0.25
+
+# Points whose least extent is this part of their largest, in units of their ranges,
+# are taken for points of a line or plane.
+_JOINT = 0.1
 
 # A variable that is constant but for so many steps, of more than this share of its
 # range over the points and with so many samples for each, is at several points.
@@ -303,3 +307,26 @@ def neighbours(kappa: Array) -> NDArray[np.intp]:
     first = np.unique(scaled, axis=0, return_index=True)[1]
     tree = minimum_spanning_tree(cdist(scaled[first], scaled[first])).tocoo()
     return np.sort(np.column_stack([first[tree.row], first[tree.col]]), axis=1)
+
+
+def tell_of_joint_scheduling(kappa: Array, names: Sequence[Hashable]) -> None:
+    """Tell where scheduling variables move together from point to point.
+
+    What each does alone such points do not tell: the range that they span is empty
+    but for a line, a plane, or what is near it.
+    """
+    extent = np.ptp(kappa, axis=0)
+    moves = extent > 0
+    if moves.sum() < 2:
+        return
+    centred = (kappa - kappa.mean(axis=0))[:, moves] / extent[moves]
+    spread = np.linalg.svd(centred, compute_uv=False)
+    if spread[-1] > _JOINT * spread[0] and len(spread) == moves.sum():
+        return
+    which = ", ".join(repr(n) for n, m in zip(names, moves, strict=True) if m)
+    warn(
+        f"the scheduling variables {which} move together over the {len(kappa)} "
+        "operating points, which tell nothing of what each does alone: apart from "
+        "these points the LPV model extrapolates, though within the range of each "
+        "variable. Measure at other combinations, or use one of them alone."
+    )

@@ -38,8 +38,9 @@ _SUPPORT = 10.0
 # A rational form, or a polynomial of a high degree, that has coefficients for more than
 # this share of the values meets most points: it must foresee those left out as well.
 _FREE = 0.5
+_NOISE = 10.0  # standard deviations over which a parameter moves by more than noise
 
-_INTERPOLATION = "pchip"  # where no form is true
+INTERPOLATION = "pchip"  # where no form is true
 
 
 class AutoLPV(Interpolator):
@@ -151,9 +152,9 @@ class AutoLPV(Interpolator):
             free = bent[chosen] and n - dof[chosen] > _FREE * n
             believed = not free or _foresees(found[chosen][1], kappa, points)
         if not good.any() or not believed:
-            spline = SplineLPV(_INTERPOLATION).fit(kappa, points.theta)
+            spline = SplineLPV(INTERPOLATION).fit(kappa, points.theta)
             chosen = len(found)
-            found.append((_INTERPOLATION, spline))
+            found.append((INTERPOLATION, spline))
             chi2, dof, cost = np.r_[chi2, np.nan], np.r_[dof, 0], np.r_[cost, np.nan]
         self.form_, self.best_estimator_ = found[chosen]
         self.selection_ = pd.DataFrame(
@@ -198,12 +199,14 @@ class AutoLPV(Interpolator):
 def _foresees(form: Any, kappa: Array, points: WeightedPoints) -> bool:
     """Whether points left out are met as well as by interpolation of the others.
 
-    Those within the range of the others, in the spread of every parameter.
+    Those within the range of the others, in the spread of every parameter that moves
+    by more than its noise.
     """
     theta, covariance = points.theta, points.covariance
     assert covariance is not None  # the forms were judged by it
+    variance = np.mean(np.diagonal(covariance, axis1=1, axis2=2), axis=0)
     spread = np.ptp(theta, axis=0)
-    spread = np.where(spread > 0, spread, 1.0)
+    moves = spread > _NOISE * np.sqrt(variance)
     squares = np.zeros(2)
     for place in np.unique(kappa, axis=0):
         out = (kappa == place).all(axis=1)
@@ -212,11 +215,11 @@ def _foresees(form: Any, kappa: Array, points: WeightedPoints) -> bool:
             continue
         try:
             other = copy(form).fit(rest, theta[~out], covariance=covariance[~out])
-            spline = SplineLPV(_INTERPOLATION).fit(rest, theta[~out])
+            spline = SplineLPV(INTERPOLATION).fit(rest, theta[~out])
         except ValueError:  # the others are too few
             continue
         for k, one in enumerate((other, spline)):
-            errors = (one.predict(kappa[out]) - theta[out]) / spread
+            errors = (one.predict(kappa[out]) - theta[out])[:, moves] / spread[moves]
             squares[k] += float(np.sum(errors**2))
     return bool(squares[0] <= squares[1])
 

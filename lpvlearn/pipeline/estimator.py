@@ -38,11 +38,12 @@ from ..data.operating_points import (
     check_outputs,
     local_experiments,
     moving_experiments,
+    tell_of_joint_scheduling,
 )
 from ..data.preparation import has_gaps, split_at_gaps
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, retold, warn
-from ..lpv.auto import AutoLPV
+from ..lpv.auto import INTERPOLATION, AutoLPV
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.spline import SplineLPV
@@ -62,6 +63,7 @@ from ..validation import (
     verbosity,
 )
 from .html_report import html_report
+from .left_out import tell_unforeseen
 from .local_models import common_delay, estimates_outputs, identify_points
 from .output_error import (
     known_coefficients,
@@ -546,6 +548,7 @@ list, default=None
             span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
             self.scheduling_range_ = found.points.identified_range
             self.scheduling_names_ = as_list(self.scheduling)
+            tell_of_joint_scheduling(kappa, self.scheduling_names_)
             self.lpv_ = LPVStateSpace(
                 found.structure,
                 self.interpolator_,
@@ -579,6 +582,10 @@ list, default=None
                 else self.refiner_.output_errors_
             )
             growth = growth_rates(self.lpv_, kappa)
+            if getattr(self.interpolator_, "form_", "") == INTERPOLATION:
+                lti, cov = self.structured_models_, found.covariance
+                form = self.interpolator_
+                tell_unforeseen(self.lpv_, lti, form, kappa, found.theta, cov)
             report = tables(found, self.lpv_, self.sampling_time_, growth)
             self.parameters_, self.parameters_std_ = (
                 report.parameters,

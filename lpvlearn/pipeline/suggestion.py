@@ -8,18 +8,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from sklearn.base import clone
-from sklearn.utils.validation import check_is_fitted, has_fit_parameter
+from sklearn.utils.validation import check_is_fitted
 
 from ..data.operating_points import neighbours
-from ..exceptions import collected
 from ..lpv.lfr import scales
-from ..lpv.polynomial import PolynomialLPV
 from ..lpv.weighting import covariance_factor
 from ..models.gap import gap
 from ..models.statespace import DEVIATION, StateSpace
 from ..validation import one_of
 from .estimator import LocalLPVPipeline
+from .left_out import interpolated_without
 
 Array = NDArray[np.float64]
 
@@ -119,7 +117,14 @@ def suggest_operating_point(
 
     left_out = np.full((len(kappa), len(places)), np.nan)
     for i in range(len(kappa)):
-        without = _interpolated_without(pipeline, i, places)
+        without = interpolated_without(
+            pipeline.interpolator_,
+            kappa,
+            pipeline.parameters_.to_numpy(),
+            pipeline.parameters_covariance_,
+            i,
+            places,
+        )
         for k, values in enumerate([] if without is None else without):
             left_out[i, k] = distance(structure.model(values), frozen[k])
     noise = np.full(len(places), np.nan)
@@ -164,25 +169,3 @@ def _units(models: Sequence[StateSpace]) -> tuple[Array, Array]:
 def _in_units(model: StateSpace, units: tuple[Array, Array]) -> StateSpace:
     y, u = units[0][:, None], units[1]
     return StateSpace(model.A, model.B / u, model.C / y, model.D / y / u)
-
-
-def _interpolated_without(
-    pipeline: LocalLPVPipeline, point: int, places: Array
-) -> Array | None:
-    """Parameters at places without one operating point; None where all are needed."""
-    keep = np.arange(len(pipeline.operating_points_)) != point
-    form = clone(pipeline.interpolator_)
-    if keep.sum() == 1:
-        form = PolynomialLPV(degree=0)
-    elif getattr(form, "extrapolation", "ignore") in ("warn", "error"):
-        form.set_params(extrapolation="ignore")
-    known = {}
-    if has_fit_parameter(form, "covariance"):
-        known["covariance"] = pipeline.parameters_covariance_[keep]
-    kappa, theta = pipeline.operating_points_[keep], pipeline.parameters_[keep]
-    try:
-        with collected():  # what it warns of, the pipeline has said of all points
-            values = form.fit(kappa, theta.to_numpy(), **known).predict(places)
-            return np.reshape(values, (len(places), theta.shape[1]))
-    except ValueError:
-        return None

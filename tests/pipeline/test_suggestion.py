@@ -134,6 +134,7 @@ def test_two_scheduling_variables():
 
 @pytest.mark.filterwarnings("ignore:4 operating points determine")
 @pytest.mark.filterwarnings("ignore:3 operating points determine")
+@pytest.mark.filterwarnings("ignore:the scheduling variables .* move together")
 def test_points_on_a_line_have_one_neighbour_on_each_side():
     table = suggest_operating_point(plane([(0, 0), (2, 2), (3, 3), (1, 1)]))
     assert_allclose(sorted(table["mass"]), [0.5, 1.5, 2.5], atol=1e-9)

@@ -1,0 +1,99 @@
+"""Operating points that are left out, and what the others make of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import clone
+from sklearn.utils.validation import has_fit_parameter
+
+from ..exceptions import collected, warn
+from ..lpv.model import LPVStateSpace
+from ..lpv.polynomial import PolynomialLPV
+from ..models.statespace import StateSpace
+
+Array = NDArray[np.float64]
+
+_GRID = 200  # frequencies over those of the poles, and a decade beyond
+_UNFORESEEN = (
+    1.0  # error of a model that the others make of a point, in its largest gain
+)
+_NAMED = 3  # operating points that a message lists
+
+
+def interpolated_without(
+    form: Any, kappa: Array, theta: Array, covariance: Array, point: int, places: Array
+) -> Array | None:
+    """Parameters at places without one operating point; None where all are needed."""
+    keep = np.arange(len(kappa)) != point
+    form = clone(form)
+    if keep.sum() == 1:
+        form = PolynomialLPV(degree=0)
+    elif getattr(form, "extrapolation", "ignore") in ("warn", "error"):
+        form.set_params(extrapolation="ignore")
+    known = {}
+    if has_fit_parameter(form, "covariance"):
+        known["covariance"] = covariance[keep]
+    try:
+        with collected():  # what it warns of was said of all points
+            values = form.fit(kappa[keep], theta[keep], **known).predict(places)
+            return np.reshape(values, (len(places), theta.shape[1]))
+    except ValueError:
+        return None
+
+
+def tell_unforeseen(
+    lpv: LPVStateSpace,
+    models: Sequence[StateSpace],
+    form: Any,
+    kappa: Array,
+    theta: Array,
+    covariance: Array,
+) -> None:
+    """Tell of points within the range of the others of which these know nothing.
+
+    Where no form is true the interpolation follows the points: one that the others do
+    not foresee is another system, or there are too few of them.
+    """
+    found = []
+    for k, (place, model) in enumerate(zip(kappa, models, strict=True)):
+        rest = np.delete(kappa, k, axis=0)
+        if ((place < rest.min(axis=0)) | (place > rest.max(axis=0))).any():
+            continue
+        values = interpolated_without(form, kappa, theta, covariance, k, kappa[[k]])
+        if values is not None:
+            error = _difference(lpv.structure.model(values[0]), model)
+            found += [(error, k)] if error > _UNFORESEEN else []
+    if found:
+        worst = sorted(found, reverse=True)
+        named = ", ".join(
+            f"{k} (scheduling {', '.join(f'{v:.4g}' for v in kappa[k])}: "
+            f"{100.0 * error:.2g} %)"
+            for error, k in worst[:_NAMED]
+        )
+        more = f" and {len(worst) - _NAMED} more" if len(worst) > _NAMED else ""
+        warn(
+            "no form fits the parameters over the operating points, and the others do "
+            f"not foresee point(s) {named}{more}, by the error in the largest gain: "
+            "between points the LPV model may be as wrong. Look at `parameters_` for a "
+            "point that is unlike the others, give a structure where there is none, or "
+            "measure in between (`suggest_operating_point`)."
+        )
+
+
+def _difference(one: StateSpace, other: StateSpace) -> float:
+    """Largest difference of responses, relative to the second one's largest gain."""
+    poles = np.abs(np.concatenate([one.poles(), other.poles()]))
+    poles = poles[poles > 0] if (poles > 0).any() else np.ones(1)
+    omega = np.geomspace(0.1 * poles.min(), 10.0 * poles.max(), _GRID)
+    omega = np.union1d(omega, poles)
+    if other.sampling_time is not None:
+        return 0.0
+    with np.errstate(all="ignore"):
+        G, G0 = (m.with_input_delay(0).frequency_response(omega) for m in (one, other))
+        size = np.linalg.norm(G0, 2, axis=(1, 2)).max(initial=0.0)
+        error = np.linalg.norm(G - G0, 2, axis=(1, 2)).max(initial=0.0) / (size or 1.0)
+    return float(error) if np.isfinite(error) else 0.0

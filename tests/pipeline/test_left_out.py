@@ -1,0 +1,49 @@
+"""Operating points that the others do not foresee, and variables that move together."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from lpvlearn import AutoLPV, PolynomialLPV
+
+from ..conftest import spring_pipeline, spring_tables
+
+KAPPAS = [0.0, 0.5, 1.0, 1.5]
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return spring_tables(noise=1e-2, n_samples=300, kappas=KAPPAS)
+
+
+def said(pipeline, X, y):
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        pipeline.fit(X, y)
+    return " ".join(str(w.message) for w in found)
+
+
+def test_a_point_that_is_unlike_the_others_is_told(tables):
+    """One sensor with the other sign, which no form of the parameters explains."""
+    X, y = tables
+    assert "foresee" not in said(spring_pipeline(), X, y)
+    turned = y.copy()
+    turned[(X["kappa"] == 1.0).to_numpy()] *= -1.0
+    pipeline = spring_pipeline(interpolator=AutoLPV())
+    words = said(pipeline, X, turned)
+    assert pipeline.interpolator_.form_ == "pchip"
+    assert "do not foresee point(s)" in words and "2 (scheduling 1:" in words
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_scheduling_variables_that_move_together_are_told(tables, together):
+    X, y = tables
+    load = {0.0: 3.0, 0.5: 2.0, 1.0: 1.0, 1.5: 0.0}
+    if not together:
+        load |= {0.0: 0.0, 0.5: 2.0}
+    X = X.assign(load=X["kappa"].map(load))
+    pipeline = spring_pipeline(interpolator=PolynomialLPV(1))
+    words = said(pipeline.set_params(scheduling=["kappa", "load"]), X, y)
+    assert ("'kappa', 'load' move together over the 4" in words) == together
+    assert np.isfinite(pipeline.parameters_.to_numpy()).all()
