@@ -19,6 +19,9 @@ from lpvlearn.inspection import ResidualDisplay, SimulationDisplay
 
 from .conftest import ROLES, spring_pipeline, spring_structure, spring_tables
 
+# One time-invariant model of several operating points is meant here.
+pytestmark = pytest.mark.filterwarnings("ignore:The experiments contradict one another")
+
 X, Y = spring_tables(noise=0.02, n_samples=150, kappas=(0.0, 0.5, 1.0))
 # Three experiments at one point, which a time-invariant model explains.
 ALIKE = spring_tables(noise=0.02, n_samples=150, kappas=(0.0,), n_repeats=3)

@@ -795,7 +795,8 @@ def _told_apart(
     if not moving:
         warn(
             "`refiner` has nothing to do: no experiment moves between operating "
-            "points. The model is that of the local experiments."
+            "points. The model is that of the local experiments. Where these are "
+            "sweeps to and fro, leave local models out: OutputErrorLPV().fit(X, y)."
         )
     return local, moving
 

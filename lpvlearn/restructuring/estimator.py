@@ -65,6 +65,10 @@ from .uncertainty import ParameterUncertainty
 
 Array = NDArray[np.float64]
 
+_INTEGRATOR = (
+    " The structure integrates by its fixed entries, and the black box does not: name "
+    "the outputs that integrate, SubspaceLTI(integrating=...)."
+)
 _AT_BOUND = 1e-6  # relative distance to a bound that holds a parameter
 _MOST_STARTS = 100_000  # all are drawn at once
 
@@ -904,6 +908,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                     else "Either it cannot represent the model, or the search ended in "
                     "a wrong basin."
                 )
+                + _INTEGRATOR * problem.lacks_poles
                 + self._at_bounds()
                 + " Give `init`, or raise `n_starts`, to search elsewhere."
                 + DISCRETE_BOX

@@ -42,6 +42,7 @@ _FIXED = 1e-10  # relative singular value or difference that is rounding of a st
 _CLEAN = 1e-12  # entry of a unit eigenvector that is rounding
 _SHARED = 1e-6  # the same of a black box, whose pole is one of several rounded numbers
 _NEAR = 0.05  # distance of a pole, relative to c, that is an estimate of a known one
+_CHAINED = 1e-3  # cosine of left and right eigenvectors: of a chain it is zero
 _STEPS = 8  # poles of one value in a chain: more integrators no one has in series
 
 
@@ -73,11 +74,21 @@ class Division:
             total = np.where(step.shown, total * own, total)
         return total[:, :, None]
 
+    def lacks(self, model: Target) -> bool:
+        """Whether a model has not all of the poles, nor estimates of them."""
+        own = np.linalg.eigvals(model.A)
+        for step in self.steps:
+            c = abs(step.instead - step.pole)
+            near = np.sum((own.imag == 0) & (np.abs(own - step.pole) <= _NEAR * c))
+            if near < sum(other.pole == step.pole for other in self.steps):
+                return True
+        return False
+
     def of(self, model: Target) -> Target:
         """The weights behind a model, without those of its poles that they cancel."""
         for step in self.steps:
-            A = _snapped(model.A, step)
-            model = Target(A, model.B, model.C, model.D, model.dt)
+            model = _snapped(model, step)
+            A = model.A
             V = _directions(A, step.pole, _SHARED)
             hidden = np.abs(model.C[~step.shown] @ V).max(0, initial=0.0)
             size = np.abs(model.C).max(initial=0.0)
@@ -149,11 +160,14 @@ def divide(
 
 
 def integrators(structure: GrayBoxStructure) -> int:
-    """How many poles at zero the structure has for all parameters."""
+    """How many chains of poles at zero the structure has for all parameters.
+
+    The rates of outputs that integrate have one pole less of each.
+    """
     thetas = _drawn(structure)
     if not thetas or 0.0 not in _fixed_poles(structure, thetas, None):
         return 0
-    return _multiplicity(_blocks(structure, thetas[0])[0], 0.0)
+    return _directions(_blocks(structure, thetas[0])[0], 0.0, _FIXED).shape[1]
 
 
 def _multiplicity(A: Array, pole: float) -> int:
@@ -209,17 +223,31 @@ def _directions(A: Array, pole: float, tolerance: float) -> Array:
     return V[:, (rest <= _FIXED * terms).all(0)]
 
 
-def _snapped(A: Array, step: _Step) -> Array:
-    """A with its pole near a known one moved there, where none is there yet."""
-    if len(A) == 0 or _directions(A, step.pole, _SHARED).shape[1]:
-        return A
+def _snapped(model: Target, step: _Step) -> Target:
+    """A model with its pole near a known one moved there, where none is there yet.
+
+    Of outputs that do not show the pole its part is left out, where that is little: it
+    is of the estimate. Poles of a chain are left as they are.
+    """
+    A, B, C = model.A, model.B, model.C
+    if len(A) == 0:
+        return model
     poles, W, V = eig(A, left=True)
     away = np.where(poles.imag == 0, np.abs(poles - step.pole), np.inf)
     i = int(np.argmin(away))
-    if not away[i] <= _NEAR * abs(step.instead - step.pole):
-        return A
     v, w = V[:, i].real, W[:, i].real
-    return np.asarray(A + (step.pole - poles[i].real) * np.outer(v, w) / (w @ v))
+    c = abs(step.instead - step.pole)
+    if not away[i] <= _NEAR * c or abs(w @ v) <= _CHAINED:
+        return model
+    mode = np.outer(v, w) / (w @ v)
+    if _directions(A, step.pole, _SHARED).shape[1] == 0:
+        A = A + (step.pole - poles[i].real) * mode
+    hidden = ~step.shown
+    G = np.linalg.solve((step.pole + 1j * c) * np.eye(len(A)) - A, B)
+    part = np.linalg.norm(C[hidden] @ mode @ B) / c
+    if part <= _NEAR * np.linalg.norm(C[hidden] @ G + model.D[hidden]):
+        C = np.where(hidden[:, None], C - C @ mode, C)
+    return Target(A, B, C, model.D, model.dt)
 
 
 def _blocks(structure: GrayBoxStructure, theta: Array) -> tuple[Array, Array]:

@@ -71,6 +71,7 @@ class RestructuringProblem:
     whole: GrayBoxStructure
     division: Division | None = None
     noise: Array | None = None  # standard deviations of the entries of a response
+    lacks_poles: bool = False  # whether a black box has not the poles of the structure
 
     @cached_property
     def response(self) -> Complex:
@@ -274,7 +275,9 @@ def problem_from_models(
     ]
     whole = structure
     structure, division = divide(structure, boxes, known_poles)
+    lacks_poles = False
     if division is not None:
+        lacks_poles = any(map(division.lacks, boxes))
         boxes = [division.of(box) for box in boxes]
     for box in boxes:
         _check_stable(box)
@@ -307,6 +310,7 @@ def problem_from_models(
         first.input_delay,
         whole,
         division,
+        lacks_poles=lacks_poles,
     )
 
 

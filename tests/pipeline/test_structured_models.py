@@ -259,6 +259,23 @@ def test_one_order_with_integrators_is_that_of_all_points():
     assert pipeline.report_["local_BFT"].min() > 99.0
 
 
+def test_the_rates_of_a_double_integrator_have_one_integrator():
+    structure = GrayBoxStructure.from_template([[0, 1], [0, 0]], [[0], ["b"]], [[1, 0]])
+    rng, runs = np.random.default_rng(0), []
+    for kappa in (0.0, 1.0):
+        u = np.repeat(rng.choice([-1.0, 1.0], 150), 6)
+        y = structure.model({"b": 5.0 - 3.0 * kappa}).simulate(u, sampling_time=0.05)
+        runs.append((u, kappa, y + 5e-3 * rng.standard_normal(y.shape)))
+    X, y = from_trajectories(runs, sampling_time=0.05)
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    local = SubspaceLTI(integrating=True)
+    pipeline = LocalLPVPipeline(local, GrayBoxRestructurer(structure), **roles)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the noise of rates
+        pipeline.fit(X, y)
+    assert_allclose(pipeline.parameters_["b"], [5.0, 2.0], rtol=1e-2)
+
+
 def test_nothing_is_said_of_distances_between_integrators():
     rng, runs = np.random.default_rng(5), []
     structure = GrayBoxStructure.from_template(

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from sklearn.exceptions import ConvergenceWarning
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.restructuring.known_poles import divide
@@ -186,3 +187,25 @@ def test_errors_teach(structure, known_poles, words):
     model = SERVO.model([3.0, 2.0])
     with pytest.raises(ValueError, match=words):
         GrayBoxRestructurer(structure, known_poles=known_poles).fit_model(model)
+
+
+def test_an_estimated_integrator_leaves_the_outputs_that_do_not_show_it():
+    """Position and velocity, of which the latter has a little of the estimated pole."""
+    structure = GrayBoxStructure.from_template(
+        [[0, 1], [0, "-d"]], [[0], ["b"]], [[1, 0], [0, 1]]
+    )
+    truth = structure.model({"d": 1.0, "b": 5.0})
+    for pole in (-1e-3, -1e-7, 1e-7):
+        A = truth.A + pole * np.array([[1.0, 0.0], [0.0, 0.0]])
+        C = truth.C + np.array([[0.0, 0.0], [1e-4, 0.0]])
+        fitted = GrayBoxRestructurer(structure).fit_model(StateSpace(A, truth.B, C))
+        np.testing.assert_allclose(fitted.params_, [5.0, 1.0], rtol=5e-3)
+
+
+def test_a_black_box_that_lacks_the_integrator_is_told_of():
+    structure = GrayBoxStructure.from_template(
+        [[0, 1], [0, "-d"]], [[0], ["b"]], [[1, 0]]
+    )
+    box = StateSpace([[-0.4, 1.0], [0.0, -1.0]], [[0.0], [5.0]], [[1.0, 0.0]])
+    with pytest.warns(ConvergenceWarning, match=r"SubspaceLTI\(integrating=\.\.\.\)"):
+        GrayBoxRestructurer(structure).fit_model(box)
