@@ -583,9 +583,13 @@ list, default=None
             )
             growth = growth_rates(self.lpv_, kappa)
             if getattr(self.interpolator_, "form_", "") == INTERPOLATION:
-                lti, cov = self.structured_models_, found.covariance
-                form = self.interpolator_
-                tell_unforeseen(self.lpv_, lti, form, kappa, found.theta, cov)
+                tell_unforeseen(
+                    self.lpv_,
+                    self.structured_models_,
+                    self.interpolator_.best_estimator_,
+                    kappa,
+                    found.theta,
+                )
             report = tables(found, self.lpv_, self.sampling_time_, growth)
             self.parameters_, self.parameters_std_ = (
                 report.parameters,

@@ -18,6 +18,7 @@ from ..models.statespace import StateSpace
 Array = NDArray[np.float64]
 
 _GRID = 200  # frequencies over those of the poles, and a decade beyond
+_BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 _UNFORESEEN = (
     1.0  # error of a model that the others make of a point, in its largest gain
 )
@@ -25,7 +26,12 @@ _NAMED = 3  # operating points that a message lists
 
 
 def interpolated_without(
-    form: Any, kappa: Array, theta: Array, covariance: Array, point: int, places: Array
+    point: int,
+    form: Any,
+    kappa: Array,
+    theta: Array,
+    places: Array,
+    covariance: Array | None = None,
 ) -> Array | None:
     """Parameters at places without one operating point; None where all are needed."""
     keep = np.arange(len(kappa)) != point
@@ -35,7 +41,7 @@ def interpolated_without(
     elif getattr(form, "extrapolation", "ignore") in ("warn", "error"):
         form.set_params(extrapolation="ignore")
     known = {}
-    if has_fit_parameter(form, "covariance"):
+    if covariance is not None and has_fit_parameter(form, "covariance"):
         known["covariance"] = covariance[keep]
     try:
         with collected():  # what it warns of was said of all points
@@ -51,19 +57,20 @@ def tell_unforeseen(
     form: Any,
     kappa: Array,
     theta: Array,
-    covariance: Array,
 ) -> None:
     """Tell of points within the range of the others of which these know nothing.
 
     Where no form is true the interpolation follows the points: one that the others do
     not foresee is another system, or there are too few of them.
     """
+    if len(kappa) < 3 or not models[0].is_continuous:
+        return
     found = []
     for k, (place, model) in enumerate(zip(kappa, models, strict=True)):
         rest = np.delete(kappa, k, axis=0)
         if ((place < rest.min(axis=0)) | (place > rest.max(axis=0))).any():
             continue
-        values = interpolated_without(form, kappa, theta, covariance, k, kappa[[k]])
+        values = interpolated_without(k, form, kappa, theta, kappa[[k]])
         if values is not None:
             error = _difference(lpv.structure.model(values[0]), model)
             found += [(error, k)] if error > _UNFORESEEN else []
@@ -71,7 +78,7 @@ def tell_unforeseen(
         worst = sorted(found, reverse=True)
         named = ", ".join(
             f"{k} (scheduling {', '.join(f'{v:.4g}' for v in kappa[k])}: "
-            f"{100.0 * error:.2g} %)"
+            f"{100.0 * error:.0f} %)"
             for error, k in worst[:_NAMED]
         )
         more = f" and {len(worst) - _NAMED} more" if len(worst) > _NAMED else ""
@@ -85,15 +92,16 @@ def tell_unforeseen(
 
 
 def _difference(one: StateSpace, other: StateSpace) -> float:
-    """Largest difference of responses, relative to the second one's largest gain."""
+    """Largest difference of responses, relative to the second one's largest gain.
+
+    Of continuous-time models.
+    """
     poles = np.abs(np.concatenate([one.poles(), other.poles()]))
     poles = poles[poles > 0] if (poles > 0).any() else np.ones(1)
     omega = np.geomspace(0.1 * poles.min(), 10.0 * poles.max(), _GRID)
-    omega = np.union1d(omega, poles)
-    if other.sampling_time is not None:
-        return 0.0
+    omega = np.union1d(omega, _BESIDE * poles)
     with np.errstate(all="ignore"):
         G, G0 = (m.with_input_delay(0).frequency_response(omega) for m in (one, other))
-        size = np.linalg.norm(G0, 2, axis=(1, 2)).max(initial=0.0)
-        error = np.linalg.norm(G - G0, 2, axis=(1, 2)).max(initial=0.0) / (size or 1.0)
-    return float(error) if np.isfinite(error) else 0.0
+        size, error = np.abs([G0, G - G0]).max(axis=(1, 2, 3))
+        relative = error / (size or 1.0)
+    return float(relative) if np.isfinite(relative) else 0.0

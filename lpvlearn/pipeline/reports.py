@@ -122,7 +122,13 @@ def tables(
                 row |= dict(zip("std_" + names, spread[k], strict=True))
         rows.append(row)
 
-    if missed:
+    if missed and any(model.integrating for model in found.local):
+        warn(
+            "inputs or outputs stand away from zero, and models of `integrating` have "
+            "no offsets: what a constant input or rate adds up to is missed. Subtract "
+            "from the inputs where the system rests, or use the rates as outputs."
+        )
+    elif missed:
         warn(
             "inputs or outputs stand away from zero, and the LPV model has no offsets: "
             "it misses what a constant of every experiment would explain. Have it "

@@ -118,12 +118,12 @@ def suggest_operating_point(
     left_out = np.full((len(kappa), len(places)), np.nan)
     for i in range(len(kappa)):
         without = interpolated_without(
+            i,
             pipeline.interpolator_,
             kappa,
             pipeline.parameters_.to_numpy(),
-            pipeline.parameters_covariance_,
-            i,
             places,
+            pipeline.parameters_covariance_,
         )
         for k, values in enumerate([] if without is None else without):
             left_out[i, k] = distance(structure.model(values), frozen[k])
