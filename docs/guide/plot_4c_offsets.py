@@ -128,8 +128,8 @@ round(bft_score(data.y_large, y), 1)
 #   of an output that does not answer at rest, :math:`G(0) = 0`: a rate, a
 #   high-pass. Where both would do, the state that is nearer to zero is taken.
 # * **More outputs than inputs:** the best :math:`u_0 - w` in the least-squares sense,
-#   the rest are offsets of sensors. **More inputs than outputs:** the smallest :math:`w`:
-#   inputs are what they are, as far as the outputs do not tell otherwise.
+#   the rest are offsets of sensors. **More inputs than outputs:** the smallest
+#   :math:`w`, for inputs of which the outputs tell nothing are what they are.
 #
 # A rate alone does not tell where a system stands: if the scheduling variable is a
 # position, measure that as an output, too.
