@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ..exceptions import collected
 from ..validation import one_of
 from .interpolator import Interpolator
 from .polynomial import PolynomialLPV, chebyshev_terms, resolvable_powers
@@ -214,8 +215,9 @@ def _foresees(form: Any, kappa: Array, points: WeightedPoints) -> bool:
         if ((place < rest.min(axis=0)) | (place > rest.max(axis=0))).any():
             continue
         try:
-            other = copy(form).fit(rest, theta[~out], covariance=covariance[~out])
-            spline = SplineLPV(INTERPOLATION).fit(rest, theta[~out])
+            with collected():  # what few points do not determine
+                other = copy(form).fit(rest, theta[~out], covariance=covariance[~out])
+                spline = SplineLPV(INTERPOLATION).fit(rest, theta[~out])
         except ValueError:  # the others are too few
             continue
         for k, one in enumerate((other, spline)):

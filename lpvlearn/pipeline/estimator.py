@@ -874,8 +874,7 @@ def _check_step(name: str, step: Any) -> None:
     if isinstance(step, type):
         got = f"the class {step.__name__}, not an instance"
     elif all(hasattr(step, method) for method in (*methods, "get_params")):
-        other_step = name == "local" and hasattr(step, "fit_model")
-        if not other_step:
+        if name != "local" or not hasattr(step, "fit_model"):
             return
         got += ", which is a `restructurer`"
     choice = ", ".join(["an estimator", *map(repr, other)]) + " or None"
