@@ -28,6 +28,9 @@ from .conftest import (
 
 skops = pytest.importorskip("skops.io")
 
+# One time-invariant model of several operating points is meant here.
+pytestmark = pytest.mark.filterwarnings("ignore:The experiments contradict one another")
+
 KAPPA = np.linspace(0.0, 1.0, 9)[:, None]
 THETA = np.column_stack([1.0 + KAPPA, 1.0 / (2.0 + KAPPA)])
 RECORD = {"inputs": "force", "experiment": "run", "time": "time"}

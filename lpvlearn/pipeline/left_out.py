@@ -19,9 +19,11 @@ Array = NDArray[np.float64]
 
 _GRID = 200  # frequencies over those of the poles, and a decade beyond
 _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
-_UNFORESEEN = (
-    1.0  # error of a model that the others make of a point, in its largest gain
-)
+
+# Error of what the others make of a model, in its largest gain: that of a resonance
+# that is elsewhere, as may be at a point of many; and what is worse than that.
+_ELSEWHERE, _WORSE = 1.0, 1.5
+
 _NAMED = 3  # operating points that a message lists
 
 
@@ -65,17 +67,17 @@ def tell_unforeseen(
     """
     if len(kappa) < 3 or not models[0].is_continuous:
         return
-    found = []
+    errors = {}
     for k, (place, model) in enumerate(zip(kappa, models, strict=True)):
         rest = np.delete(kappa, k, axis=0)
         if ((place < rest.min(axis=0)) | (place > rest.max(axis=0))).any():
             continue
         values = interpolated_without(k, form, kappa, theta, kappa[[k]])
         if values is not None:
-            error = _difference(lpv.structure.model(values[0]), model)
-            found += [(error, k)] if error > _UNFORESEEN else []
-    if found:
-        worst = sorted(found, reverse=True)
+            errors[k] = _difference(lpv.structure.model(values[0]), model)
+    high = [(error, k) for k, error in errors.items() if error > _ELSEWHERE]
+    worst = sorted(high, reverse=True)
+    if worst and (worst[0][0] > _WORSE or 2 * len(worst) >= len(errors)):
         named = ", ".join(
             f"{k} (scheduling {', '.join(f'{v:.4g}' for v in kappa[k])}: "
             f"{100.0 * error:.0f} %)"
