@@ -73,7 +73,7 @@ def points_of_work(
            [2., 4., 4.]])
     """
     u_scale, y_scale = scales
-    if any(np.linalg.matrix_rank(model.A) < model.order for model in models):
+    if any(m.order and np.linalg.matrix_rank(m.A) < m.order for m in models):
         found = zip(models, inputs, outputs, strict=True)
         x0 = np.array([_state_at_rest(*point, scales) for point in found])
         return np.hstack([inputs, outputs, x0])
