@@ -323,6 +323,7 @@ def _tail(score: Array, effect: Array, density: Array, n_error: float) -> float:
     """Chance of such a score, by the F distribution."""
     covariance = np.einsum("eikp,ij,ejkq->pq", effect, density, effect, optimize=True)
     scale = np.sqrt(np.diagonal(covariance))
+    scale = np.where(scale > 0, scale, 1.0)  # zero of outputs that are one signal
     inverse = np.linalg.pinv(covariance / scale[:, None] / scale, hermitian=True)
     statistic = float((score / scale) @ inverse @ (score / scale))
     q = len(score)

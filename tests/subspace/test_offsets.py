@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
 from lpvlearn.subspace import hankel
 from lpvlearn.subspace.identification import centred
+from lpvlearn.subspace.offsets import _tail
 from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import Freedom, _general_regression, block_fit
 from lpvlearn.systems.simulation import lti_response, trend_signals
@@ -501,3 +502,9 @@ def test_too_few_states_do_not_follow_the_level(seed):
             warnings.simplefilter("always")
             SubspaceLTI(1, offset=None).fit(u, y)
         assert any("nothing of how they move" in str(w.message) for w in told)
+
+
+def test_signals_without_any_noise_tell_of_no_constants():
+    """Two outputs that are one signal leave a direction without errors."""
+    nothing = np.zeros((1, 2, 3, 1))
+    assert _tail(np.zeros(1), nothing, np.eye(2), 10.0) == 1.0
