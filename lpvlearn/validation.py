@@ -130,6 +130,16 @@ def naming_argument(name: str, rule: str, value: Any) -> Iterator[None]:
         raise kind(f"`{name}` must {rule}. Got {shown(value)}: {error}") from error
 
 
+def listed(texts: Sequence[str], most: int) -> str:
+    """The first of some texts, and how many there are beside them.
+
+    >>> listed(["a", "b", "c"], 2)
+    'a, b and 1 more'
+    """
+    rest = len(texts) - most
+    return ", ".join(texts[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
 def shown(value: Any) -> str:
     """A value in a message, of which a table shows its beginning only."""
     try:

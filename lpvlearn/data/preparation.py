@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..exceptions import warn
+from ..validation import listed
 from .experiments import Experiment, read_experiments
 
 Array = NDArray[np.float64]
@@ -62,21 +63,23 @@ def read_runs(
     if not (split and cut):
         return found
     if outputs:
-        _warn_of_empty(found)
-        return split_at_gaps(found)
+        parts = split_at_gaps(found)
+        _warn_of_empty(found, parts)
+        return parts
     return [run for e in found for run in complete_runs(e, 1, outputs=False)]
 
 
-def _warn_of_empty(experiments: Sequence[Experiment]) -> None:
-    """Tell of experiments of which nothing is left where others have samples."""
-    empty = [e.label for e in experiments if not complete_runs(e)]
-    if empty and len(empty) < len(experiments):
-        more = f" and {len(empty) - _FEW} more" if len(empty) > _FEW else ""
+def _warn_of_empty(
+    experiments: Sequence[Experiment], parts: Sequence[Experiment]
+) -> None:
+    """Tell of experiments of which no part is left."""
+    left = {part.label for part in parts}
+    empty = [repr(e.label) for e in experiments if e.label not in left]
+    if empty:
         warn(
-            f"experiment(s) {', '.join(map(repr, empty[:_FEW]))}{more} have no two "
-            "consecutive samples of which nothing is missing (NaN), and are left out, "
-            "with their operating points. Check their columns, or leave their rows "
-            "out yourself."
+            f"experiment(s) {listed(empty, _FEW)} have no two consecutive samples "
+            "of which nothing is missing (NaN), and are left out, with their operating "
+            "points. Check their columns, or leave their rows out yourself."
         )
 
 

@@ -17,7 +17,7 @@ from .interpolator import Interpolator
 from .polynomial import PolynomialLPV, chebyshev_terms, resolvable_powers
 from .rational import RationalLPV
 from .spline import SplineLPV
-from .weighting import WeightedPoints, is_chance
+from .weighting import WeightedPoints, inner_places, is_chance
 
 Array = NDArray[np.float64]
 
@@ -152,7 +152,7 @@ class AutoLPV(Interpolator):
             chosen = int(min(supported, key=lambda k: (bent[k], -dof[k], cost[k])))
             free = bent[chosen] and n - dof[chosen] > _FREE * n
             believed = not free or _foresees(found[chosen][1], kappa, points)
-        if not good.any() or not believed:
+        if not believed:
             spline = SplineLPV(INTERPOLATION).fit(kappa, points.theta)
             chosen = len(found)
             found.append((INTERPOLATION, spline))
@@ -209,11 +209,8 @@ def _foresees(form: Any, kappa: Array, points: WeightedPoints) -> bool:
     spread = np.ptp(theta, axis=0)
     moves = spread > _NOISE * np.sqrt(variance)
     squares = np.zeros(2)
-    for place in np.unique(kappa, axis=0):
-        out = (kappa == place).all(axis=1)
+    for out in inner_places(kappa):
         rest = kappa[~out]
-        if ((place < rest.min(axis=0)) | (place > rest.max(axis=0))).any():
-            continue
         try:
             with collected():  # what few points do not determine
                 other = copy(form).fit(rest, theta[~out], covariance=covariance[~out])

@@ -7,6 +7,7 @@ terms can describe the values, the minimum is a chi-square.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -154,6 +155,20 @@ def _whitening(P: Array, size: Array) -> Array | None:
     if np.linalg.eigvalsh(correlation).min() < _SINGULAR:
         return None
     return np.linalg.inv(np.linalg.cholesky(correlation)) / deviation[:, None, :]
+
+
+def inner_places(kappa: Array) -> Iterator[NDArray[np.bool_]]:
+    """The points (n_points,) of every place that lies within the range of the others.
+
+    >>> [out.tolist() for out in inner_places(np.array([[0.0], [2.0], [1.0]]))]
+    [[False, False, True]]
+    """
+    for place in np.unique(kappa, axis=0):
+        out = (kappa == place).all(axis=1)
+        rest = kappa[~out]
+        if len(rest) and (place >= rest.min(axis=0)).all():
+            if (place <= rest.max(axis=0)).all():
+                yield out
 
 
 def is_chance(chi2: float, degrees_of_freedom: int) -> bool:

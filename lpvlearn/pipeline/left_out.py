@@ -13,11 +13,13 @@ from sklearn.utils.validation import has_fit_parameter
 from ..exceptions import collected, warn
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
+from ..lpv.weighting import inner_places
 from ..models.statespace import StateSpace
+from ..restructuring.error_system import frequency_grid
+from ..validation import listed
 
 Array = NDArray[np.float64]
 
-_GRID = 200  # frequencies over those of the poles, and a decade beyond
 _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 
 # Error of what the others make of a model, in its largest gain: that of a resonance
@@ -65,31 +67,28 @@ def tell_unforeseen(
     Where no form is true the interpolation follows the points: one that the others do
     not foresee is another system, or there are too few of them.
     """
-    if len(kappa) < 3 or not models[0].is_continuous:
+    if not models[0].is_continuous:
         return
     errors = {}
-    for k, (place, model) in enumerate(zip(kappa, models, strict=True)):
-        rest = np.delete(kappa, k, axis=0)
-        if ((place < rest.min(axis=0)) | (place > rest.max(axis=0))).any():
-            continue
+    for out in inner_places(kappa):
+        k = int(out.argmax())
         values = interpolated_without(k, form, kappa, theta, kappa[[k]])
         if values is not None:
-            errors[k] = _difference(lpv.structure.model(values[0]), model)
+            errors[k] = _difference(lpv.structure.model(values[0]), models[k])
     high = [(error, k) for k, error in errors.items() if error > _ELSEWHERE]
     worst = sorted(high, reverse=True)
     if worst and (worst[0][0] > _WORSE or 2 * len(worst) >= len(errors)):
-        named = ", ".join(
+        named = [
             f"{k} (scheduling {', '.join(f'{v:.4g}' for v in kappa[k])}: "
             f"{100.0 * error:.0f} %)"
-            for error, k in worst[:_NAMED]
-        )
-        more = f" and {len(worst) - _NAMED} more" if len(worst) > _NAMED else ""
+            for error, k in worst
+        ]
         warn(
             "no form fits the parameters over the operating points, and the others do "
-            f"not foresee point(s) {named}{more}, by the error in the largest gain: "
-            "between points the LPV model may be as wrong. Look at `parameters_` for a "
-            "point that is unlike the others, give a structure where there is none, or "
-            "measure in between (`suggest_operating_point`)."
+            f"not foresee point(s) {listed(named, _NAMED)}, by the error in the "
+            "largest gain: between points the LPV model may be as wrong. Look at "
+            "`parameters_` for a point that is unlike the others, give a structure "
+            "where there is none, or measure in between (`suggest_operating_point`)."
         )
 
 
@@ -98,10 +97,8 @@ def _difference(one: StateSpace, other: StateSpace) -> float:
 
     Of continuous-time models.
     """
-    poles = np.abs(np.concatenate([one.poles(), other.poles()]))
-    poles = poles[poles > 0] if (poles > 0).any() else np.ones(1)
-    omega = np.geomspace(0.1 * poles.min(), 10.0 * poles.max(), _GRID)
-    omega = np.union1d(omega, _BESIDE * poles)
+    poles = np.concatenate([one.poles(), other.poles()])
+    omega = _BESIDE * frequency_grid(poles, None)
     with np.errstate(all="ignore"):
         G, G0 = (m.with_input_delay(0).frequency_response(omega) for m in (one, other))
         size, error = np.abs([G0, G - G0]).max(axis=(1, 2, 3))

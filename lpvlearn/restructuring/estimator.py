@@ -29,6 +29,7 @@ from ..structures.structure import GrayBoxStructure
 from ..systems.threads import one_blas_thread
 from ..validation import (
     flag,
+    listed,
     naming_argument,
     number,
     one_of,
@@ -667,8 +668,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             return
         bent = at.not_linear(self.params_covariance_)
         if bent:
-            names = ", ".join(map(repr, bent[:_NAMED]))
-            names += f" and {len(bent) - _NAMED} more" if len(bent) > _NAMED else ""
+            names = listed([repr(name) for name in bent], _NAMED)
             warn(
                 f"the intervals of {names} are not to be trusted: "
                 "within two standard deviations the response does not change in "

@@ -23,7 +23,6 @@ from ..exceptions import RankWarning
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .delay import find_lead, with_later_inputs
 from .fit_warnings import (
-    TESTS,
     Doubt,
     tell,
     tell_of_feedback,
@@ -162,7 +161,7 @@ def _tell_of_contradiction(
     pairs: Pairs, choices: Choices, told: set[str], whole: LocalFit
 ) -> None:
     """Tell of experiments that one model cannot explain, and models of each do."""
-    n_trend, free = whole.evidence.free.n_trend, whole.evidence.free
+    free, same = whole.evidence.free, whole.chosen(choices)
     records, model = whole.scaled.records, whole.evidence.model
     if whole.method == "pbsid" or choices.estimated or len(records) != len(pairs):
         return
@@ -171,10 +170,10 @@ def _tell_of_contradiction(
     lengths = np.array([record.y.size for record in records])
     some = [k for k in np.argsort(-lengths)[:_MOST_ALONE] if lengths[k] >= least]
     found = simulation_errors(with_initial_states(model, records, free), records)
-    same, energies = whole.chosen(choices), []
+    energies = []
     for k in some:
         try:
-            other = _fit([pairs[k]], same, set(TESTS), n_trend, whole)
+            other = _fit([pairs[k]], same, told | {"collinear"}, free.n_trend, whole)
         except TooFewSamples:
             continue
         own = other.scaled.records
