@@ -24,6 +24,7 @@ from ..validation import (
     squarable,
     weights,
 )
+from .extrapolation import describe_extrapolation
 from .weighting import WeightedPoints, is_chance, weighted_points
 
 Array = NDArray[np.float64]
@@ -31,10 +32,6 @@ Array = NDArray[np.float64]
 _EXTRAPOLATIONS = ("ignore", "warn", "clip", "error")
 
 _POINTS = "be a table of finite numbers, shape (n_points, n_scheduling)"
-
-# Values this close to the identified range, relative to its width, are in it: a
-# measured mean and a range read from a report differ by rounding.
-_RANGE_RTOL = 1e-6
 
 _CLOSE = 1e-8  # of a number: half the least interval about it that digits resolve well
 
@@ -283,7 +280,7 @@ class Interpolator(
         if self.extrapolation == "clip":
             kappa = np.clip(kappa, *self.scheduling_range_)
         elif self.extrapolation != "ignore":
-            message = _describe_extrapolation(kappa, self.scheduling_range_)
+            message = describe_extrapolation(kappa, self.scheduling_range_)
             if message and self.extrapolation == "error":
                 raise ValueError(message)
             if message:
@@ -381,19 +378,3 @@ def to_unit(kappa: Array, scheduling_range: Array) -> Array:
     """Scheduling values mapped linearly from their range to [-1, 1]."""
     low, high = domains(scheduling_range)
     return (2 * kappa - (low + high)) / (high - low)
-
-
-def _describe_extrapolation(X: Array, scheduling_range: Array) -> str:
-    """Say how far values are out of range; nothing when they are in it."""
-    low, high = scheduling_range
-    excess = np.maximum(low - X, X - high) - _RANGE_RTOL * (high - low)
-    if not (excess > 0).any():
-        return ""
-    row, j = np.unravel_index(np.argmax(excess), excess.shape)
-    outside = int((excess > 0).any(axis=1).sum())
-    return (
-        f"Scheduling values must be within the identified range, [{low[j]:.6g}, "
-        f"{high[j]:.6g}] for variable {j + 1}. Got {outside} of {len(X)} outside, the "
-        f"farthest {X[row, j]:.6g}. No interpolation is to be trusted there: identify "
-        "a model there too, or hold the border's value with `extrapolation='clip'`."
-    )

@@ -12,12 +12,7 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import (
-    DivergenceError,
-    ExtrapolationWarning,
-    finite_simulation,
-    warn,
-)
+from ..exceptions import DivergenceError, finite_simulation
 from ..models.statespace import StateSpace, sorted_poles, split_delay
 from ..models.system_matrix import blocks
 from ..structures.map import numerical_jacobian
@@ -42,14 +37,13 @@ from ..validation import (
 )
 from .coefficients import MatrixCoefficients, matrix_coefficients
 from .export import Grid, as_dataset, control_models, write_mat
+from .extrapolation import warn_extrapolation
 from .lfr import LinearFractionalModel, linear_fractional
 from .weighting import covariance_factor
 
 Array = NDArray[np.float64]
 
 _Basis = Callable[[Array], ArrayLike] | ArrayLike
-
-_DIGITS = 3  # of a range that a message shows
 
 # Samples whose matrices are held at once: for 6 states, 2 inputs and outputs 17 MB.
 _BLOCK = 32_768
@@ -1161,32 +1155,3 @@ def _quiet(regressor: Any) -> Any:
     for name in loud:
         quiet.set_params(**{name: "ignore"})
     return quiet
-
-
-def warn_extrapolation(
-    kappa: Array, identified_range: Array, names: Sequence[Hashable]
-) -> None:
-    """Warn, once, of scheduling values outside the (2, n_scheduling) range identified.
-
-    The message names every such variable, its range and the farthest value.
-    """
-    low, high = identified_range
-    width = np.where(high > low, high - low, 1.0)
-    excess = np.maximum(low - kappa, kappa - high) / width
-    said = []
-    for j in np.flatnonzero((excess > 0).any(axis=0)):
-        digits = _DIGITS - int(np.floor(np.log10(width[j])))
-        shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
-        farthest = kappa[np.argmax(excess[:, j]), j]
-        said.append(
-            f"Scheduling variable {names[int(j)]!r} must be within the identified "
-            f"range, {shown[0]} to {shown[1]}. Got {int((excess[:, j] > 0).sum())} of "
-            f"{len(kappa)} samples outside, the farthest at {farthest:.4g}"
-        )
-    if said:
-        warn(
-            f"{'. '.join(said)}: the model is extrapolated. Identify a model there "
-            "too, or hold the border's with "
-            "interpolator=AutoLPV(extrapolation='clip').",
-            ExtrapolationWarning,
-        )

@@ -44,6 +44,7 @@ from ..data.preparation import has_gaps, split_at_gaps
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, retold, warn
 from ..lpv.auto import INTERPOLATION, AutoLPV
+from ..lpv.extrapolation import warn_outside_hull
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.spline import SplineLPV
@@ -698,6 +699,16 @@ list, default=None
     @property
     def _splits(self) -> bool:
         return getattr(self.local, "missing", None) in ("split", "estimate")
+
+    def _tell_extrapolation(self, kappa: Array) -> None:
+        super()._tell_extrapolation(kappa)
+        if self.refiner_ is None:  # which has seen where they move between the points
+            warn_outside_hull(
+                kappa,
+                self.operating_points_,
+                self.scheduling_range_,
+                self.scheduling_names_,
+            )
 
     def _sampling_time(self, experiments: list[Experiment], structure: Any) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]

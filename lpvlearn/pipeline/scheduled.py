@@ -17,7 +17,8 @@ from ..data.preparation import read_runs
 from ..data.scoring import score_from_rest
 from ..data.timestamps import check_unit
 from ..exceptions import VersionedPickle
-from ..lpv.model import LPVStateSpace, warn_extrapolation
+from ..lpv.extrapolation import warn_extrapolation
+from ..lpv.model import LPVStateSpace
 from ..metrics.table_simulation import simulate_experiments
 from ..validation import flag
 from .bands import prediction_std
@@ -76,7 +77,8 @@ class ScheduledEstimator(
         Warns
         -----
         ExtrapolationWarning
-            Where a scheduling variable leaves `scheduling_range_`.
+            Where a scheduling variable leaves `scheduling_range_`; of several, where
+            they leave the convex hull of the operating points of local experiments.
         """
         check_is_fitted(self, "lpv_")
         return_std = flag("return_std", return_std)
@@ -186,15 +188,17 @@ class ScheduledEstimator(
         signals = [e.scheduling for e in experiments if e.scheduling is not None]
         clips = getattr(self.lpv_.interpolator, "extrapolation", None) == "clip"
         if signals and not clips:
-            warn_extrapolation(
-                np.vstack(signals), self.scheduling_range_, self.scheduling_names_
-            )
+            self._tell_extrapolation(np.vstack(signals))
         model = self.lpv_.silenced()  # said above, of all experiments at once
         out = simulate_experiments(
             model, experiments, self.sampling_time_, n_rows_of(X), estimate=estimate
         )
         out = out[:, 0] if self._single_output else out
         return self._contained(out, X, model.output_names)
+
+    def _tell_extrapolation(self, kappa: Array) -> None:
+        """Warn of values (n_samples, n_scheduling) beyond those identified."""
+        warn_extrapolation(kappa, self.scheduling_range_, self.scheduling_names_)
 
     def _read(
         self, X: Any, y: Any, *, reset: bool = False, **options: Any

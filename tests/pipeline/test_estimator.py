@@ -502,11 +502,11 @@ def test_deviations_of_averaged_parameters_cover_their_errors():
     assert " std" in pipeline.summary()
 
 
-def test_two_scheduling_variables():
-    """k = 40 + 10 load + 5 heat, on a grid of four points and at one within."""
+def load_and_heat(places):
+    """k = 40 + 10 load + 5 heat: a table with an experiment at each place."""
     tables, outputs = [], []
     rng = np.random.default_rng(0)
-    for run, (load, heat) in enumerate([(0, 0), (0, 1), (1, 0), (1, 1), (0.5, 0.5)]):
+    for run, (load, heat) in enumerate(places):
         u = rng.choice([-1.0, 1.0], size=60).repeat(5)
         theta = {"b": 30.0, "c": 1.2, "k": 40.0 + 10 * load + 5 * heat}
         y = spring_structure().model(theta).simulate(u, sampling_time=0.02)
@@ -520,13 +520,28 @@ def test_two_scheduling_variables():
         GrayBoxRestructurer(spring_structure()),
         PolynomialLPV(1),
         **{**ROLES, "scheduling": ["load", "heat"]},
-    ).fit(X, y)
+    )
+    return pipeline.fit(X, y), X, y
+
+
+def test_two_scheduling_variables():
+    """On a grid of four points and at one within."""
+    grid = [(0, 0), (0, 1), (1, 0), (1, 1), (0.5, 0.5)]
+    pipeline, X, y = load_and_heat(grid)
     assert pipeline.parameters_.index[1] == (0.0, 1.0)
     assert pipeline.report_.index.equals(pipeline.parameters_.index)
     np.testing.assert_allclose(pipeline.predict(X), y, atol=1e-6)
     assert "load from 0 to 1, heat from 0 to 1" in pipeline.summary()
     with pytest.warns(ExtrapolationWarning, match="'heat' .* the farthest at 3"):
         pipeline.predict(X.assign(heat=3.0))
+
+
+@pytest.mark.filterwarnings("ignore:3 operating points determine")
+def test_a_corner_that_no_points_surround_is_extrapolation():
+    pipeline, X, y = load_and_heat([(0, 0), (0, 1), (1, 0)])
+    np.testing.assert_allclose(pipeline.predict(X), y, atol=1e-6)
+    with pytest.warns(ExtrapolationWarning, match="'load' = 1, 'heat' = 1, by 71 %"):
+        pipeline.predict(X.assign(load=1.0, heat=1.0))
 
 
 @pytest.mark.filterwarnings("ignore:All experiments are at one operating point")
