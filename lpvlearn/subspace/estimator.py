@@ -139,7 +139,8 @@ class SubspaceLTI(
         that simulates parts held out clearly better. 0 is a pure gain.
     method : {"auto", "po-moesp", "pi-moesp", "n4sid", "cva", "pbsid"}, default="auto"
         "auto" is "po-moesp", or "pbsid" where the data come from a closed loop, with a
-        warning. "pi-moesp" uses past inputs only as instruments: consistent under
+        warning, and where noise that moves the states of the plant is likelier than
+        any that is added to its outputs. "pi-moesp" uses past inputs only as instruments: consistent under
         coloured measurement noise, but it needs long horizons. "n4sid" and "cva" use
         past inputs and outputs, as "po-moesp", and differ in the weighting. "pbsid"
         minimises the error of prediction instead of simulation: feedback does not

@@ -50,7 +50,7 @@ from .offsets import (
     with_levels,
 )
 from .options import Choices
-from .selection import PlantFit, Row, Selection, select
+from .selection import PRICE, PlantFit, Row, Selection, select
 from .shifts import cut_at, find_shifts
 from .signals import Record, SharedSignals, share_known, shorten
 from .simulation_fit import Realization, simulation_errors, with_initial_states
@@ -75,6 +75,9 @@ _HARDLY = 0.4
 # the squared errors of the one for all. That is looked into where it leaves more than
 # this share of the outputs' size, for the longest ones, of so many samples a parameter.
 _CONTRADICTED, _ROUGH, _MOST_ALONE, _VALUES_EACH = 0.25, 0.1, 6, 10
+
+# Lags of a noise that may be more than that of a sensor.
+_LAGS = 2
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
 # model not to refute it; standard errors by which a lesser one must be better where the
@@ -125,6 +128,8 @@ def fit_pairs(
     doubt = None
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
         fitted, doubt = _believable(pairs, choices, told, fitted)
+    elif _may_share_noise(fitted, choices):
+        fitted = _with_shared_noise(pairs, choices, told, fitted)
     feedback = fitted.feedback
     if feedback is not None and feedback.found and "feedback" not in told:
         tell_of_feedback(feedback, fitted, choices, doubt, told)
@@ -435,6 +440,70 @@ def _believable(
         chosen = choices._replace(method=best.method)
         best = _with_constants(pairs, chosen, told, best)
     return best, doubt
+
+
+def _may_share_noise(fitted: LocalFit, choices: Choices) -> bool:
+    """Whether noise of more than a lag may be what else moves the plant."""
+    feedback = fitted.feedback
+    return bool(
+        choices.method == "auto"
+        and choices.refine in ("auto", "prediction")
+        and fitted.selection.order
+        and not choices.estimated
+        and feedback is not None
+        and not feedback.found
+        and fitted.residual > _ROUGH
+        and len(fitted.evidence.noise.A) >= _LAGS * len(fitted.model.C)
+    )
+
+
+def _with_shared_noise(
+    pairs: Pairs, choices: Choices, told: set[str], first: LocalFit
+) -> LocalFit:
+    """The model of which noise moves the states of the plant, if that is likelier.
+
+    Such noise tells of the poles what inputs do not. A model of the simulation error
+    has no use for that, and takes what noise does in a mode that inputs hardly excite
+    for their doing. Parts held out hardly tell: there, that noise is all that is left
+    of either. The states of the plant must explain all of the noise, and where outputs
+    are several be no more than without: further ones may be those of a noise that the
+    outputs share.
+    """
+    n_trend = first.evidence.free.n_trend
+    like = choices._replace(method="pbsid", offset=DETRENDS[n_trend])
+    several, own = pairs[0][1].shape[1] > 1, first.selection.order
+    best, error = first, None
+    for order in dict.fromkeys((choices.order, own)):
+        try:
+            other = _fit(pairs, like._replace(order=order), told, n_trend, first)
+        except TooFewSamples:
+            continue
+        evidence = other.evidence
+        shares = isinstance(evidence, ClosedLoopEvidence) and evidence.kept.all()
+        more = other.selection.order > own and several
+        if not shares or more or other.grows():
+            continue
+        if len(evidence.one_step.noise.A) or _deviance(other) > _deviance(best):
+            continue
+        error = error or _held_out(first, choices)
+        found = _held_out(other, like._replace(order=other.selection.order))
+        if not error.clearly_better_than(found, _DOUBT):
+            best = other
+    return best
+
+
+def _deviance(fitted: LocalFit) -> float:
+    """Minus twice the logarithm of the likelihood, and the price of the parameters.
+
+    That of the innovations of all outputs together: what one of them tells of another's
+    noise is no evidence of states.
+    """
+    evidence = fitted.evidence.one_step
+    noise, (ny, n) = evidence.noise, evidence.model.C.shape
+    n_samples = sum(record.u.shape[1] for record in evidence.records)
+    n_parameters = n * (evidence.model.B.shape[1] + ny) + ny * len(noise.A)
+    volume = float(np.linalg.slogdet(noise.covariance)[1])
+    return n_samples * volume + PRICE * n_parameters
 
 
 def _held_out(fitted: LocalFit, choices: Choices) -> HeldOut:

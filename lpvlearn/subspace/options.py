@@ -25,7 +25,8 @@ MISSING = ("raise", "split", "estimate")
 class Choices(NamedTuple):
     """Checked options that decide about a fit.
 
-    The method "auto" is "pbsid" where there is feedback, else "po-moesp".
+    The method "auto" is "pbsid" where there is feedback, or noise moves the plant, else
+    "po-moesp".
     """
 
     order: int | None = None  # None is to be chosen

@@ -81,7 +81,7 @@ _MORE_ROUNDS = 2  # of an order about the best: with the noise that it leaves it
 # Of a parameter, in squared standard deviations of its estimate: two of them. Akaike's
 # price of 2 takes a superfluous state in one fit of ten, Schwarz's of log(n) leaves
 # out states of a few thousand noisy samples that would improve the simulation.
-_PRICE = 4.0
+PRICE = 4.0
 
 # Samples of the longest experiment for each lag of the noise: in short ones initial
 # states are why errors correlate.
@@ -249,7 +249,7 @@ def _search(
         least = min(orders.values(), key=_criterion)
     chosen = best = least.order
     errors = {best: validate(least.candidate, records, settings)}
-    close = [k for k, one in orders.items() if one.criterion < least.criterion + _PRICE]
+    close = [k for k, one in orders.items() if one.criterion < least.criterion + PRICE]
     for order in [k for k in close if k > best] + [best - step for step in _LOWER]:
         if order in orders:
             errors[order] = validate(orders[order].candidate, records, settings)
@@ -510,12 +510,12 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     poles = np.linalg.eigvals(model.A)
     decay = np.maximum(1.0 - np.abs(poles[poles.imag > 0.0]), 2.0 / longest)
     misfit = -2.0 * float(np.log(decay).sum())
-    misfit += few * _PRICE * n_parameters
+    misfit += few * PRICE * n_parameters
     noise = _innovations(model, records, free, longest // _SAMPLES_PER_LAG)
     for i, (variance, n_lags) in enumerate(noise):
         power = sum(float(record.y[i] @ record.y[i]) for record in records) / n_samples
         variance = max(variance, _EXACT * power) or 1.0
-        misfit += n_samples * np.log(variance) + _PRICE * n_lags
+        misfit += n_samples * np.log(variance) + PRICE * n_lags
     return float(misfit)
 
 

@@ -465,6 +465,49 @@ def test_auto_is_po_moesp_in_open_loop(system):
     np.testing.assert_array_equal(model.lti_.A, same.lti_.A)
 
 
+def shaken(seed, shared, n_samples=3000):
+    """A light mode that wind moves more than the input does, or a sensor's noise.
+
+    That is as large, and oscillates as lightly at twice the frequency. Returns the
+    samples and the plant.
+    """
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.choice([-1.0, 1.0], n_samples // 40), 40)[:, None]
+    light = np.exp(-0.005 + 0.14j)
+    A, C = modes(light, 0.98), np.array([[1.0, 0.3, 1.0]])
+    plant = A, np.array([[0.02], [0.01], [0.02]]), C, np.zeros((1, 1))
+    y = lti_response(*plant, u)
+    oscillation = modes(light) if shared else modes(np.exp(-0.005 + 0.28j))
+    gust = np.array([[0.3], [1.0]])
+    wind = rng.standard_normal((n_samples + 2000, 1))
+    noise = lti_response(oscillation, gust, C[:, :2], np.zeros((1, 1)), wind)[2000:]
+    y = y + y.std() * noise / noise.std()
+    return (u, y + 0.01 * y.std() * rng.standard_normal(y.shape)), plant
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_noise_that_moves_the_plant_tells_of_its_poles(seed):
+    samples, plant = shaken(seed, shared=True)
+    model, without = SubspaceLTI().fit(*samples), SubspaceLTI(method="po-moesp")
+    assert model.method_ == "pbsid" and model.order_ == 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a mode that does not decay, and others
+        without.fit(*samples)
+    assert miss(model, plant) < min(0.3, 0.6 * miss(without, plant))
+    found, true = (np.sort_complex(np.linalg.eigvals(A)) for A in (model.lti_.A, plant[0]))
+    std = np.sort_complex(model.lti_.poles())
+    assert_allclose(found, std)
+    assert (np.abs(found - true) < 5.0 * np.abs(model.poles_std_).max()).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_noise_of_a_sensor_leaves_the_plant_alone(seed):
+    samples, _ = shaken(seed, shared=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert SubspaceLTI().fit(*samples).method_ == "po-moesp"
+
+
 def early_outputs(seed, n_samples=300):
     """Three modes under coloured inputs, the outputs read a sample before them."""
     rng = np.random.default_rng(seed)
