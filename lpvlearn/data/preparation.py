@@ -38,6 +38,10 @@ _HELD, _ENOUGH_CHANGES, _LONGEST_HELD = 0.95, 20, 1000
 # many times longer than at any other; this share of it is at others.
 _STAYS, _LONGER, _OTHERS = 10, 3, 0.1
 
+# A sample stands out that is this many times as far from the median as this share of
+# others are, of so many at least.
+_FAR, _USUAL, _FAR_OF = 5.0, 0.95, 50
+
 _FEW = 5  # labels that a message lists
 
 
@@ -217,6 +221,7 @@ def independent_inputs(inputs: Sequence[Array]) -> Array | None:
     stacked = np.vstack(inputs)
     n_samples, n_inputs = stacked.shape
     scale = np.abs(stacked).max(axis=0)
+    scale[scale == 0.0] = 1.0  # of one that rests in these
     gram = stacked / scale
     # Only a suspicion is checked on the samples themselves.
     values = np.linalg.eigvalsh(gram.T @ gram)
@@ -245,6 +250,24 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
             "out of `inputs`; a column that is no input needs its role (`scheduling=`, "
             "`operating_point=`, `experiment=`)."
         )
+
+
+def far_out(signals: Array) -> NDArray[np.bool_]:
+    """Single samples (n_samples, n_signals) far from all others and from neighbours.
+
+    >>> u = np.tile([1.0, -1.0, 0.5, 0.0], 25)[:, None]
+    >>> u[40] = 30.0
+    >>> np.flatnonzero(far_out(u))
+    array([40])
+    """
+    far = np.zeros(signals.shape, dtype=bool)
+    if len(signals) < _FAR_OF:
+        return far
+    middle = np.median(signals, axis=0)
+    usual = np.quantile(np.abs(signals - middle), _USUAL, axis=0)
+    at = (np.abs(signals - middle) > _FAR * usual) & (usual > 0.0)
+    far[1:-1] = at[1:-1] & ~at[:-2] & ~at[2:]
+    return far
 
 
 def held_for(signals: Sequence[Array]) -> int:

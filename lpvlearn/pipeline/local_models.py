@@ -44,6 +44,9 @@ _APART = 0.1
 # more than that part of the output that does most.
 _STANDING = 0.05
 
+# One that much slower may be an integrator, known by samples that are not many.
+_ABOUT_ZERO = 0.25
+
 _HELD = (
     "If only its controller holds the plant, identify the closed loop, with the "
     "controller's reference as input and the controller in the structure. "
@@ -485,7 +488,7 @@ def _integrating_outputs(lti: StateSpace) -> str:
     poles, V = np.linalg.eig(lti.A)
     i = int(np.argmax(poles.real))
     others = np.delete(np.abs(poles), i)
-    if poles[i].imag or abs(poles[i]) > _STANDING * others.min(initial=np.inf):
+    if poles[i].imag or abs(poles[i]) > _ABOUT_ZERO * others.min(initial=np.inf):
         return ""
     seen = np.abs(lti.C @ V[:, i].real)
     places = np.flatnonzero(seen > _STANDING * seen.max()).tolist()

@@ -280,9 +280,10 @@ class ClosedLoopEvidence(Evidence):
         """Of B, D, A and C of the plant, where it is known."""
         if self.fitted is None:
             raise ValueError(
-                "The covariance is that of a refined model: it needs refine='auto', an "
-                "`order` that the modes of the plant add up to ('auto'), and poles of "
-                "multiplicity two at most."
+                "The covariance is that of a model at a minimum of the prediction "
+                "error, which this one is not: its order is not that of the modes "
+                "that inputs reach, it was not refined, or poles coincide. Use "
+                "refine='auto' and another `order`."
             )
         direct = self.free.direct
         if not (len(self.joint.A) or direct.any()):
@@ -570,7 +571,8 @@ def _criteria(errors: Sequence[Array], subspace: _Subspace) -> Array:
     n, (ny, m) = subspace.n_columns, subspace.direct.shape
     floor, each = _EXACT * np.eye(ny), 2.0 * (m + 2 * ny) * np.log(np.log(max(n, 3)))
     volumes = [np.linalg.slogdet(E @ E.T + floor)[1] for E in errors]
-    return np.array(volumes) + each / n * np.arange(len(errors))
+    least = ny * np.log(_EXACT)  # but for rounding
+    return np.maximum(volumes, least) + each / n * np.arange(len(errors))
 
 
 def _refined(

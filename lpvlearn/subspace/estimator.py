@@ -656,11 +656,13 @@ class SubspaceLTI(
         table, rates = as_table(rates_of(experiments, flags, float(step)))
         m = table.shape[1] - 1
         direct = np.broadcast_to(self.feedthrough, (len(flags), m)) | flags[:, None]
-        rate_model = clone(self).set_params(
+        rate_model = clone(
+            self
+        ).set_params(
             integrating=None,
             offset=None,
             missing="raise",
-            feedthrough=direct if not direct.all() else True,
+            feedthrough=direct,  # within the sample by how rates are made, not by default
             sampling_time=None if step is True else step,
             inputs=list(table.columns[:-1]),
             experiment=table.columns[-1],

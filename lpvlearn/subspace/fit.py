@@ -16,6 +16,7 @@ from ..data.preparation import (
     DETRENDS,
     Pairs,
     check_excitation,
+    far_out,
     independent_inputs,
     remove_trends,
 )
@@ -28,6 +29,7 @@ from .fit_warnings import (
     tell_of_feedback,
     tell_of_held_outputs,
     tell_of_limits,
+    tell_of_still_outputs,
 )
 from .held_out import HeldOut, held_out
 from .identification import (
@@ -76,6 +78,9 @@ _HARDLY = 0.4
 # this share of the outputs' size, for the longest ones, of so many samples a parameter.
 _CONTRADICTED, _ROUGH, _MOST_ALONE, _VALUES_EACH = 0.25, 0.1, 6, 10
 
+# Share of the error that is left without samples of inputs that are not answered.
+_ANSWERED = 0.6
+
 # Lags of a noise that may be more than that of a sensor.
 _LAGS = 2
 
@@ -112,6 +117,8 @@ def fit_pairs(
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
     outputs = [y for _, y in pairs]
+    if "still" not in told:
+        tell_of_still_outputs(outputs, told)
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = _with_constants(pairs, choices, told, known)
     if fitted.selection.order:
@@ -121,6 +128,8 @@ def fit_pairs(
             tell_of_limits(outputs, fitted, told)
     if len(pairs) > 1 and fitted.residual > _ROUGH and "contradiction" not in told:
         _tell_of_contradiction(pairs, choices, told, fitted)
+    if fitted.residual > _ROUGH and "input spikes" not in told:
+        _tell_of_input_spikes(pairs, choices, told, fitted)
     # The errors of a rough model are not the noise that shifts must stand out of.
     cuts = choices.offset == "auto" and choices.initial_states and choices.refine
     if cuts and not choices.estimated:
@@ -199,6 +208,40 @@ def _tell_of_contradiction(
             "system was not the same in them (a load, a setting, the sign of a "
             "sensor), or it is not linear. Check them, give what differs as a "
             "scheduling variable, or leave out those that do not belong here.",
+        )
+
+
+def _tell_of_input_spikes(
+    pairs: Pairs, choices: Choices, told: set[str], whole: LocalFit
+) -> None:
+    """Tell of single samples of an input that the outputs do not answer."""
+    without, found = [], []
+    for k, (u, y) in enumerate(pairs):
+        spikes = far_out(u)
+        u = u.copy()
+        for i, j in np.argwhere(spikes):
+            u[i, j] = 0.5 * (u[i - 1, j] + u[i + 1, j])
+            found.append((j, k, i))
+        without.append((u, y))
+    if not found:
+        return
+    n_trend = whole.evidence.free.n_trend
+    try:
+        other = _fit(without, whole.chosen(choices), set(told), n_trend)
+    except TooFewSamples:
+        return
+    if other.residual < _ANSWERED * whole.residual:
+        j, k, i = found[0]
+        where = f"sample {i}{f' of experiment {k}' if len(pairs) > 1 else ''}"
+        tell(
+            told,
+            "input spikes",
+            f"{len(found)} sample(s) of the inputs stand far out, and the outputs do "
+            f"not answer them; the first is {where} of input {j + 1}, counted from 0. "
+            f"With what their neighbours have in their place a model leaves "
+            f"{100.0 * other.residual:.2g} % of the outputs, not "
+            f"{100.0 * whole.residual:.2g} %. If they were logged wrongly, replace "
+            "them by NaN and use missing='split', or by what was sent.",
         )
 
 
@@ -391,8 +434,9 @@ def _believable(
     the model of "po-moesp". The latter minimises the simulation error, and so does
     better than the plant itself by what the inputs tell of the noise: that does not
     refute the plant unless inputs were to be noise more than anything else
-    (`_OF_NOISE`), or the plant is unstable, by no more than chance, and the other is
-    not; or D was left free for a stable plant, but fits these parts no better.
+    (`_OF_NOISE`), and how they act at once was not said; or the plant is unstable, by
+    no more than chance, and the other is not; or D was left free for a stable plant,
+    but fits these parts no better.
     """
     n_trend = first.evidence.free.n_trend
     without_d = not first.evidence.free.direct.any()
@@ -425,7 +469,9 @@ def _believable(
             if better or best.grows(_CERTAIN) and not other.grows(_CERTAIN):
                 makeshift = found.total > error.total
                 best, error = other, found
-        better = of_that.total < _OF_NOISE * error.total
+        # whoever says which entries of D act knows how the channels were sampled
+        said = not isinstance(choices.feedthrough, bool)
+        better = not said and of_that.total < _OF_NOISE * error.total
         unsure = makeshift or (best.grows() and not best.grows(_CERTAIN))
         if unsure and not open_loop.grows():
             better |= of_that.clearly_better_than(error, _DOUBT)

@@ -26,7 +26,7 @@ from .varx import Feedback
 Array = NDArray[np.float64]
 
 # What is told from tests that take as long as a fit
-TESTS = {"held out", "orders", "static gain", "decay", "lack"}
+TESTS = {"held out", "orders", "static gain", "response", "decay", "lack"}
 
 # Share of its motion by which a model moves where an output stays, and of the samples
 _MOVES_ON, _AT_LIMITS = 0.05, 0.01
@@ -50,6 +50,9 @@ _DECAYS, _MATTERS = 2.0, 0.1
 # keeps farther away than the second.
 _OUTSIDE, _INSIDE = 1e-8, 1e-9
 
+# Poles this close to one may be those of integrators.
+_ABOUT_ONE = 0.02
+
 # A stream fits much worse than its first samples where its error exceeds theirs by
 # this factor, and this share of the outputs' size.
 _MUCH_WORSE, _POOR = 5.0, 0.2
@@ -65,6 +68,20 @@ def tell(
     if kind not in told:
         told.add(kind)
         warn(message, category)
+
+
+def tell_of_still_outputs(outputs: Sequence[Array], told: set[str]) -> None:
+    """Tell of outputs that never change beside others that do."""
+    still = np.all([np.ptp(y, axis=0) == 0.0 for y in outputs], axis=0)
+    still &= np.ptp([y[0] for y in outputs], axis=0) == 0.0
+    if still.any() and not still.all():
+        k = int(np.argmax(still))
+        tell(
+            told,
+            "still",
+            f"Output {k + 1} is {outputs[0][0, k]:.6g} in all samples: no input "
+            "acts on it. Check its sensor and its column, or leave it out of `y`.",
+        )
 
 
 def tell_of_held_outputs(outputs: Sequence[Array], told: set[str]) -> None:
@@ -135,7 +152,7 @@ def tell_of_feedback(
         f"{100.0 * feedback.share:.2g} % of the innovations, p = "
         f"{feedback.p_value:.1g}): the data come from a closed loop. "
     )
-    loop = bool(np.any(choices.feedthrough)) and feedback.instantaneous
+    loop = choices.feedthrough is True and feedback.instantaneous
     within = (
         "Inputs and outputs also depend on each other within the sample, and the data "
         "do not tell a feedthrough from a controller that answers at once"
@@ -172,7 +189,7 @@ def tell_of_feedback(
         )
     else:
         what += "method='pbsid' was taken, which that does not bias."
-        if loop and choices.feedthrough is True:
+        if loop:
             what += (
                 f" {within}: D = 0 was taken. If the controller needs a sample to "
                 "answer, say method='pbsid' yourself, which leaves D free."
@@ -337,20 +354,36 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "longer, with inputs that move more often.",
         )
 
+    _warn_of_unknown_response(fitted, told)
+
+
+def _warn_of_unknown_response(fitted: LocalFit, told: set[str]) -> None:
+    """Tell where the inputs excite the system too little to tell its response."""
     gain = fitted.evidence.static_gain()
-    if gain is None:
-        return
-    unknown = (gain.std > np.abs(gain.value)) & (gain.std > _OPEN * gain.size)
-    if unknown.any():
-        output, which = np.argwhere(unknown)[0] + 1
+    if gain is not None:
+        unknown = (gain.std > np.abs(gain.value)) & (gain.std > _OPEN * gain.size)
+        if unknown.any():
+            output, which = np.argwhere(unknown)[0] + 1
+            tell(
+                told,
+                "static gain",
+                f"The static gain (from input {which} to output {output}) is known no "
+                "better than to its own size: the record excites slow motions too "
+                "little to tell it. Record for longer, with inputs that are held for "
+                "longer, or lower `order`; at higher frequencies the model may be "
+                "right (`frequency_response_std`).",
+            )
+            return
+    share, omega = fitted.evidence.unknown_share()
+    if share > _OPEN:
+        period = f"{2.0 * np.pi / omega:.3g}" if omega else "many"
         tell(
             told,
-            "static gain",
-            f"The static gain (from input {which} to output {output}) is known no "
-            "better than to its own size: the record excites slow motions too little "
-            "to tell it. Record for longer, with inputs that are held for longer, or "
-            "lower `order`; at higher frequencies the model may be right "
-            "(`frequency_response_std`).",
+            "response",
+            "The response is hardly known (`frequency_response_std`) at frequencies that "
+            "the record hardly excites, least for oscillations with a period of "
+            f"{period} samples: inputs that hold these may be simulated wildly. Use "
+            "inputs that move as fast or as slowly as that, or lower `order`.",
         )
 
 
@@ -386,13 +419,19 @@ def _may_last(fitted: LocalFit) -> bool:
 
 def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
     """Tell the user that a model is unstable, or on the border of that."""
-    moduli = np.abs(np.linalg.eigvals(A))
+    poles = np.linalg.eigvals(A)
+    moduli = np.abs(poles)
     radius = float(moduli.max(initial=0.0))
     if radius > 1.0 + _OUTSIDE:
         remedy = (
             "Use stability='enforce' for a stable one, another `order`, or a longer "
             "`horizon`."
         )
+        if (np.abs(poles[moduli > 1.0] - 1.0) < _ABOUT_ONE).all():
+            remedy = (
+                "Name outputs that integrate, as a position does, in `integrating`. "
+                f"Else: {remedy}"
+            )
         if method == "pbsid":
             remedy = (
                 "Such a plant can be predicted (`predict_ahead`), but not simulated "

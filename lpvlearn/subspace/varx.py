@@ -316,7 +316,7 @@ class _Correlated(NamedTuple):
 
 def _wilks(y: Array, known: Array, dof: int) -> _Correlated:
     """Test whether rows of `dof` degrees of freedom lie in orthonormal columns."""
-    y = y[y.any(axis=1)]
+    y = y[np.sum(y**2, axis=1) > 0.0]
     # Outputs that repeat others tell nothing more. They count as degrees of freedom all
     # the same: where there is no noise, what a short past leaves of them is one signal.
     own = _basis(y, y, _DEPENDENT).T

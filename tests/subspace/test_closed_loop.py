@@ -494,7 +494,9 @@ def test_noise_that_moves_the_plant_tells_of_its_poles(seed):
         warnings.simplefilter("ignore")  # of a mode that does not decay, and others
         without.fit(*samples)
     assert miss(model, plant) < min(0.3, 0.6 * miss(without, plant))
-    found, true = (np.sort_complex(np.linalg.eigvals(A)) for A in (model.lti_.A, plant[0]))
+    found, true = (
+        np.sort_complex(np.linalg.eigvals(A)) for A in (model.lti_.A, plant[0])
+    )
     std = np.sort_complex(model.lti_.poles())
     assert_allclose(found, std)
     assert (np.abs(found - true) < 5.0 * np.abs(model.poles_std_).max()).all()
