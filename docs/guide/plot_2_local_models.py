@@ -43,10 +43,10 @@ any number of inputs and outputs.
 # ``method`` says what serves as past data: inputs and outputs (``"po-moesp"``, what the
 # default is in open loop; ``"n4sid"`` and ``"cva"`` weight them differently), or inputs
 # alone (``"pi-moesp"``, the paper's choice, which coloured measurement noise does not
-# disturb). For ``"pbsid"`` see :ref:`guide_closed_loop`. In open loop the default takes it
-# where noise moves the plant itself, as wind moves a tower, and not its sensors: such
-# noise tells of the poles what inputs do not, which is worth most in modes that these
-# hardly excite. Taken is what is likelier.
+# disturb). For ``"pbsid"`` see :ref:`guide_closed_loop`. In open loop the default takes
+# that one where noise moves the plant itself, as wind moves a tower, and not its
+# sensors: such noise tells of the poles what inputs do not, which is worth most of
+# modes that these hardly excite. Taken is what is likelier.
 
 import numpy as np
 

@@ -360,28 +360,29 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
 def _warn_of_unknown_response(fitted: LocalFit, told: set[str]) -> None:
     """Tell where the inputs excite the system too little to tell its response."""
     gain = fitted.evidence.static_gain()
-    if gain is not None:
-        unknown = (gain.std > np.abs(gain.value)) & (gain.std > _OPEN * gain.size)
-        if unknown.any():
-            output, which = np.argwhere(unknown)[0] + 1
-            tell(
-                told,
-                "static gain",
-                f"The static gain (from input {which} to output {output}) is known no "
-                "better than to its own size: the record excites slow motions too "
-                "little to tell it. Record for longer, with inputs that are held for "
-                "longer, or lower `order`; at higher frequencies the model may be "
-                "right (`frequency_response_std`).",
-            )
-            return
-    share, omega = fitted.evidence.unknown_share()
+    if gain is None:
+        return
+    unknown = (gain.std > np.abs(gain.value)) & (gain.std > _OPEN * gain.size)
+    if unknown.any():
+        output, which = np.argwhere(unknown)[0] + 1
+        tell(
+            told,
+            "static gain",
+            f"The static gain (from input {which} to output {output}) is known no "
+            "better than to its own size: the record excites slow motions too little "
+            "to tell it. Record for longer, with inputs that are held for longer, or "
+            "lower `order`; at higher frequencies the model may be right "
+            "(`frequency_response_std`).",
+        )
+        return
+    share, omega = fitted.evidence.unknown_share(gain.size)
     if share > _OPEN:
         period = f"{2.0 * np.pi / omega:.3g}" if omega else "many"
         tell(
             told,
             "response",
-            "The response is hardly known (`frequency_response_std`) at frequencies that "
-            "the record hardly excites, least for oscillations with a period of "
+            "The response is hardly known (`frequency_response_std`) at frequencies "
+            "that the record hardly excites, least for oscillations with a period of "
             f"{period} samples: inputs that hold these may be simulated wildly. Use "
             "inputs that move as fast or as slowly as that, or lower `order`.",
         )

@@ -286,37 +286,27 @@ class Evidence:
         """
         radius = float(np.abs(np.linalg.eigvals(self.model.A)).max(initial=0.0))
         longest = max(record.u.shape[1] for record in self.records)
-        if radius >= 1.0 - 1.0 / longest or not self._is_known():
+        known = self.refined and self.sections.blocks is not None
+        if not known or radius >= 1.0 - 1.0 / longest or not len(self.model.A):
             return None
-        response, size = self._response_over(_N_FREQUENCIES)
+        lti = self.state_space(self.model, 1.0)
+        response = lti.frequency_response(np.linspace(0.0, np.pi, _N_FREQUENCIES))
         std = self.frequency_response_std(np.zeros(1))[0].real
-        return StaticGain(response[0].real, std, size / self.input_scale)
+        power = np.mean(np.abs(response * self.input_scale) ** 2, axis=0)
+        size = np.sqrt(power.sum(axis=1, keepdims=True)) / self.input_scale
+        return StaticGain(response[0].real, std, size)
 
-    def unknown_share(self) -> tuple[float, float]:
-        """Standard deviation of the response over all frequencies, relative to it.
+    def unknown_share(self, size: Array) -> tuple[float, float]:
+        """Standard deviation of the response over all frequencies by its `size`.
 
         The largest of an input and an output, root mean square, and the frequency
-        (radians per sample) where it is largest; 0 where nothing is known of it.
+        (radians per sample) where it is largest. `size` as in `StaticGain`.
         """
-        if not self._is_known():
-            return 0.0, 0.0
         omega = np.linspace(0.0, np.pi, _N_DEVIATIONS)
-        _, size = self._response_over(_N_FREQUENCIES)
-        std = np.abs(self.frequency_response_std(omega)) * self.input_scale
+        std = np.abs(self.frequency_response_std(omega))
         share = np.sqrt(np.mean(std**2, axis=0)) / np.where(size > 0.0, size, np.inf)
         output, which = np.unravel_index(np.argmax(share), share.shape)
         return float(share.max()), float(omega[np.argmax(std[:, output, which])])
-
-    def _is_known(self) -> bool:
-        known = self.refined and self.sections.blocks is not None
-        return bool(known and len(self.model.A))
-
-    def _response_over(self, n_frequencies: int) -> tuple[NDArray, Array]:
-        """The response, and the root mean square of that of every output, (ny, 1)."""
-        omega = np.linspace(0.0, np.pi, n_frequencies)
-        response = self.state_space(self.model, 1.0).frequency_response(omega)
-        power = np.mean(np.abs(response * self.input_scale) ** 2, axis=0)
-        return response, np.sqrt(power.sum(axis=1, keepdims=True))
 
     def _frequency_jacobian(self, omega: Array) -> NDArray[np.complex128]:
         J = _frequency_response_jacobian(self.sections, self.free, omega)

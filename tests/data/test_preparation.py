@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.data.preparation import complete_runs, has_gaps, split_at_gaps
+from lpvlearn.data.preparation import (
+    complete_runs,
+    far_out,
+    has_gaps,
+    independent_inputs,
+    split_at_gaps,
+)
 
 WHOLE = Experiment(
     "a", 10 + np.arange(9), np.ones((9, 1)), np.ones((9, 2)), np.ones((9, 1))
@@ -41,3 +47,26 @@ def test_runs_end_at_holes_of_time():
     assert all(run.breaks == () and len(run.outputs) == len(run.rows) for run in runs)
     with pytest.raises(ValueError, match="at least 2 consecutive complete samples"):
         split_at_gaps([replace(WHOLE, breaks=tuple(range(1, 9)))])
+
+
+def test_inputs_that_rest_are_no_scale():
+    u = np.random.default_rng(0).standard_normal((50, 3))
+    u[:, 1] = 0.0
+    P = independent_inputs([u])
+    assert P.shape == (3, 2) and not P[1].any()
+
+
+@pytest.mark.parametrize(
+    ("signal", "found"),
+    [
+        (np.sign(np.random.default_rng(0).standard_normal(200)), []),
+        (np.eye(200)[70], []),  # an impulse, beside which nothing moves
+        (np.random.default_rng(0).standard_normal(5000), []),
+        (np.full(20, 1.0), []),
+        (np.linspace(-1, 1, 200) + 40.0 * np.eye(200)[33], [33]),
+        (np.linspace(-1, 1, 200) + 40.0 * np.eye(200)[[33, 34]].sum(axis=0), []),
+    ],
+    ids=["two values", "impulse", "noise", "short", "one", "two that are neighbours"],
+)
+def test_single_samples_stand_far_out(signal, found):
+    assert np.flatnonzero(far_out(signal[:, None])).tolist() == found

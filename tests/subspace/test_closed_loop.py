@@ -268,7 +268,7 @@ def test_orders_that_no_modes_add_up_to_are_those_of_the_subspace(system):
     u, y = record(system, 600)
     model = pbsid(1).fit(u, y)
     assert model.order_ == 1 and model.lti_.is_stable
-    with pytest.raises(AttributeError, match="modes of the plant add up to"):
+    with pytest.raises(AttributeError, match="not that of the modes that inputs reach"):
         _ = model.poles_std_
     with pytest.warns(UserWarning, match="next to nothing"):
         assert pbsid(0).fit(u, y).order_ == 0
@@ -494,12 +494,9 @@ def test_noise_that_moves_the_plant_tells_of_its_poles(seed):
         warnings.simplefilter("ignore")  # of a mode that does not decay, and others
         without.fit(*samples)
     assert miss(model, plant) < min(0.3, 0.6 * miss(without, plant))
-    found, true = (
-        np.sort_complex(np.linalg.eigvals(A)) for A in (model.lti_.A, plant[0])
-    )
-    std = np.sort_complex(model.lti_.poles())
-    assert_allclose(found, std)
-    assert (np.abs(found - true) < 5.0 * np.abs(model.poles_std_).max()).all()
+    both = model.lti_.poles(), linalg.eigvals(plant[0])
+    found, true = map(np.sort_complex, both)
+    assert (np.abs(found - true) < 4.0 * np.abs(model.poles_std_).max()).all()
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

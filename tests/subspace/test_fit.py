@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import lfilter, tf2ss
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.data.preparation import remove_trends, stays_at_limits
@@ -475,3 +475,56 @@ def test_experiments_that_contradict_one_another_are_told(gains, rng):
     assert any("contradict" in str(w.message) for w in said) == (
         "contradiction" in told
     )
+
+
+# -- what is wrong with channels, or not excited ---------------------------------------
+
+
+def test_inputs_that_were_logged_wrongly_are_told(rng):
+    u, y = record(rng, 800)
+    noisy = y + 0.01 * rng.standard_normal(y.shape)
+    wrong = u.copy()
+    wrong[[100, 350, 600], 1] = 60.0
+    told = r"3 sample\(s\) of the inputs .* first is sample 100 of input 2, .*='split'"
+    with pytest.warns(UserWarning, match=told):
+        SubspaceLTI().fit(wrong, noisy)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # pulses that were sent
+        sent = lti_response(*SYSTEM, wrong) + 0.01 * rng.standard_normal(y.shape)
+        model = SubspaceLTI().fit(wrong, sent)
+    np.testing.assert_allclose(poles_of(model), POLES, atol=1e-2)
+
+
+@pytest.mark.parametrize("level", [0.0, 5.0])
+def test_an_output_that_never_changes_is_told(rng, level):
+    u, y = record(rng, 800)
+    y = np.column_stack([y + 0.01 * rng.standard_normal(y.shape), np.full(800, level)])
+    with pytest.warns(UserWarning) as caught:
+        model = SubspaceLTI().fit(u, y)
+    assert any(f"Output 3 is {level:g} in all" in str(w.message) for w in caught)
+    assert not [w for w in caught if issubclass(w.category, RuntimeWarning)]
+    np.testing.assert_allclose(model.lti_.frequency_response([0.3])[0, 2], 0, atol=1e-9)
+
+
+def test_a_response_that_inputs_hardly_excite_is_told():
+    """By a chirp up to a tenth of the sampling frequency; white noise tells it."""
+    plant = lti_of([1, 0.1, 1], [1, 0.3, 9], [1, 0.3])
+    t, rng = np.arange(150), np.random.default_rng(0)
+    chirp = np.cos(2.0 * np.pi * (5e-4 + 0.05 * t / 150) * t)
+    for u, told in ((chirp, True), (rng.standard_normal(150), False)):
+        y = plant.simulate(u).ravel()
+        y = y + 0.03 * y.std() * rng.standard_normal(150)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            SubspaceLTI().fit(u[:, None], y)
+        said = " ".join(str(w.message) for w in caught)
+        assert told == ("the record hardly excites" in said)
+
+
+def lti_of(*factors):
+    """``(2 s^2 + 5 s + 10) / (product of the factors)``, sampled at 5 Hz."""
+    denominator = np.array([1.0])
+    for factor in factors:
+        denominator = np.polymul(denominator, factor)
+    A, B, C, D = tf2ss([2.0, 5.0, 10.0], denominator)
+    return StateSpace(A, B, C, D).to_discrete(0.2)

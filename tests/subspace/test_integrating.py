@@ -170,3 +170,29 @@ def test_integrators_are_offered_by_name():
     assert "SubspaceLTI(integrating=[1])" in _integrating_outputs(drifting)
     growing = StateSpace([[2.0, 1.0], [0.0, -3.0]], [[0.0], [1.0]], [[1.0, 0.0]])
     assert _integrating_outputs(growing) == ""
+
+
+def test_the_rates_of_a_loop_keep_what_acts_at_once():
+    """Rates hold the input of their first sample, whatever a controller does."""
+    friction, gain, n = 2.8, 7.0, 3000
+    rng = np.random.default_rng(5)
+    decay, ratio = np.exp(-friction * STEP), gain / friction
+    wanted = np.repeat(rng.choice([-0.5, 0.5], n // 60), 60)
+    wanted = wanted + 0.1 * np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
+    u, y = np.zeros((2, n))
+    angle = speed = load = before = 0.0
+    for k in range(n):
+        y[k] = angle
+        u[k] = 8.0 * (wanted[k] - angle) - (angle - before) / STEP
+        before, load = angle, 0.95 * load + 0.2 * rng.standard_normal()
+        final = ratio * (u[k] + load)
+        angle += final * STEP + (speed - final) * (1 - decay) / friction
+        speed = final + (speed - final) * decay
+    with pytest.warns(UserWarning, match="closed loop"):
+        model = SubspaceLTI(1, integrating=True, sampling_time=STEP).fit(u[:, None], y)
+    rates = model.rates_
+    assert rates.method_ == "pbsid"
+    at_once = ratio * (1 - (1 - decay) / friction / STEP)
+    np.testing.assert_allclose(rates.lti_.D.item(), at_once, rtol=0.2)
+    static = rates.lti_.frequency_response([0.0]).real.item()
+    np.testing.assert_allclose(static, ratio, rtol=0.3)
