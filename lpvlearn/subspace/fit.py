@@ -518,22 +518,23 @@ def _with_shared_noise(
     n_trend = first.evidence.free.n_trend
     like = choices._replace(method="pbsid", offset=DETRENDS[n_trend])
     several, own = pairs[0][1].shape[1] > 1, first.selection.order
+    tried = [like]
+    if choices.order is None:  # as many states at least, of which the inputs reach all
+        tried += [like._replace(n_noise_states=n) for n in (own, own + 1)]
     best, error = first, None
-    for order in dict.fromkeys((choices.order, own)):
+    for like in tried:
         try:
-            other = _fit(pairs, like._replace(order=order), told, n_trend, first)
+            other = _fit(pairs, like, told, n_trend, first)
         except TooFewSamples:
             continue
         evidence = other.evidence
         shares = isinstance(evidence, ClosedLoopEvidence) and evidence.kept.all()
-        more = other.selection.order > own and several
-        if not shares or more or other.grows():
+        if not shares or (other.selection.order > own and several) or other.grows():
             continue
-        if len(evidence.one_step.noise.A) or _deviance(other) > _deviance(best):
+        if len(evidence.one_step.noise.A) or not _deviance(other) < _deviance(best):
             continue
         error = error or _held_out(first, choices)
-        found = _held_out(other, like._replace(order=other.selection.order))
-        if not error.clearly_better_than(found, _DOUBT):
+        if not error.clearly_better_than(_held_out(other, like), _DOUBT):
             best = other
     return best
 
