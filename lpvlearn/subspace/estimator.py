@@ -655,14 +655,13 @@ class SubspaceLTI(
         step = self._step_of(experiments)
         table, rates = as_table(rates_of(experiments, flags, float(step)))
         m = table.shape[1] - 1
+        # What acts at once follows from how rates are made: a table, which says so.
         direct = np.broadcast_to(self.feedthrough, (len(flags), m)) | flags[:, None]
-        rate_model = clone(
-            self
-        ).set_params(
+        rate_model = clone(self).set_params(
             integrating=None,
             offset=None,
             missing="raise",
-            feedthrough=direct,  # by how rates are made, and not by default
+            feedthrough=direct,
             sampling_time=None if step is True else step,
             inputs=list(table.columns[:-1]),
             experiment=table.columns[-1],

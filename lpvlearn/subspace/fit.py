@@ -516,15 +516,14 @@ def _with_shared_noise(
     outputs share.
     """
     n_trend = first.evidence.free.n_trend
-    like = choices._replace(method="pbsid", offset=DETRENDS[n_trend])
     several, own = pairs[0][1].shape[1] > 1, first.selection.order
-    tried = [like]
+    tried = [choices._replace(method="pbsid", offset=DETRENDS[n_trend])]
     if choices.order is None:  # as many states at least, of which the inputs reach all
-        tried += [like._replace(n_noise_states=n) for n in (own, own + 1)]
+        tried += [tried[0]._replace(n_noise_states=n) for n in (own, own + 1)]
     best, error = first, None
-    for like in tried:
+    for chosen in tried:
         try:
-            other = _fit(pairs, like, told, n_trend, first)
+            other = _fit(pairs, chosen, told, n_trend, first)
         except TooFewSamples:
             continue
         evidence = other.evidence
@@ -534,7 +533,7 @@ def _with_shared_noise(
         if len(evidence.one_step.noise.A) or not _deviance(other) < _deviance(best):
             continue
         error = error or _held_out(first, choices)
-        if not error.clearly_better_than(_held_out(other, like), _DOUBT):
+        if not error.clearly_better_than(_held_out(other, chosen), _DOUBT):
             best = other
     return best
 

@@ -70,7 +70,7 @@ def check_options(options: Mapping[str, Any]) -> Choices:
     one_of("detrend", options["detrend"], DETRENDS)
     one_of("offset", options["offset"], tuple(N_TRENDS))
     one_of("refine", options["refine"], (*REFINEMENTS, True, False))
-    _feedthrough(options["feedthrough"])
+    mask = _feedthrough(options["feedthrough"])
     if options["sampling_time"] is not None:
         positive_time("sampling_time", options["sampling_time"])
     if options["initial_state"] == "rest" and options["missing"] == "split":
@@ -86,7 +86,7 @@ def check_options(options: Mapping[str, Any]) -> Choices:
         _integer_or_auto("horizon", options["horizon"], 1),
         _integer_or_auto("n_noise_states", options["n_noise_states"], 0) or 0,
         options["method"],
-        options["feedthrough"],
+        mask if mask.ndim else bool(mask),
         REFINEMENTS[0] if options["refine"] is True else options["refine"],
         options["stability"] == "enforce",
         options["initial_state"] == "estimate",
