@@ -140,11 +140,12 @@ class SubspaceLTI(
     method : {"auto", "po-moesp", "pi-moesp", "n4sid", "cva", "pbsid"}, default="auto"
         "auto" is "po-moesp", or "pbsid" where the data come from a closed loop, with a
         warning, and where noise that moves the states of the plant is likelier than
-        one that is added to its outputs. "pi-moesp" uses past inputs only as
-        instruments: consistent under coloured measurement noise, but it needs long
-        horizons. "n4sid" and "cva" use past inputs and outputs, as "po-moesp", and
-        differ in the weighting. "pbsid" minimises the error of prediction instead of
-        simulation: feedback does not bias it, and the plant may be unstable.
+        one that is added to its outputs (of up to 20,000 samples). "pi-moesp" uses
+        past inputs only as instruments: consistent under coloured measurement noise,
+        but it needs long horizons. "n4sid" and "cva" use past inputs and outputs, as
+        "po-moesp", and differ in the weighting. "pbsid" minimises the error of
+        prediction instead of simulation: feedback does not bias it, and the plant may
+        be unstable.
     horizon : int or "auto", default="auto"
         Past and future horizon in samples; for "pbsid" the past that its first
         regression needs, by Akaike's criterion. "auto" tries a geometric grid and takes

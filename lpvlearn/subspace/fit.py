@@ -81,8 +81,9 @@ _CONTRADICTED, _ROUGH, _MOST_ALONE, _VALUES_EACH = 0.25, 0.1, 6, 10
 # Share of the error that is left without samples of inputs that are not answered.
 _ANSWERED = 0.6
 
-# Lags of a noise that may be more than that of a sensor.
-_LAGS = 2
+# Lags of a noise that may be more than that of a sensor; samples of which more tell the
+# plant without it.
+_LAGS, _PLENTY = 2, 20_000
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
 # model not to refute it; standard errors by which a lesser one must be better where the
@@ -490,9 +491,10 @@ def _believable(
 
 def _may_share_noise(fitted: LocalFit, choices: Choices) -> bool:
     """Whether noise of more than a lag may be what else moves the plant."""
-    feedback = fitted.feedback
+    feedback, records = fitted.feedback, fitted.scaled.records
     return bool(
         choices.method == "auto"
+        and sum(record.u.shape[1] for record in records) <= _PLENTY
         and choices.refine in ("auto", "prediction")
         and fitted.selection.order
         and not choices.estimated
