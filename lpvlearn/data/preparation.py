@@ -195,10 +195,10 @@ def _trend(values: Array, degree: int) -> Array:
     return mean + t[:, None] * slope
 
 
-def constant_inputs(inputs: Sequence[Array]) -> NDArray[np.intp]:
+def constant_columns(signals: Sequence[Array]) -> NDArray[np.intp]:
     """Columns that have one and the same value in all samples of all experiments."""
-    low = np.min([u.min(axis=0) for u in inputs], axis=0)
-    high = np.max([u.max(axis=0) for u in inputs], axis=0)
+    low = np.min([part.min(axis=0) for part in signals], axis=0)
+    high = np.max([part.max(axis=0) for part in signals], axis=0)
     return np.flatnonzero(low == high)
 
 
@@ -240,7 +240,7 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
             "A dynamic model needs an experiment of at least 2 samples. Got n_samples "
             f"= {len(inputs)} in {len(inputs)} experiment(s) of 1 sample."
         )
-    constant = constant_inputs(inputs)
+    constant = constant_columns(inputs)
     if len(constant):
         k = constant[0]
         raise ValueError(

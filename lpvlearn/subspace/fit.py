@@ -522,15 +522,19 @@ def _with_shared_noise(
     tried = [choices._replace(method="pbsid", offset=DETRENDS[n_trend])]
     if choices.order is None:  # as many states at least, of which the inputs reach all
         tried += [tried[0]._replace(n_noise_states=n) for n in (own, own + 1)]
-    best, error = first, None
+    best, error, n_joint = first, None, -1
     for chosen in tried:
+        if chosen.n_noise_states <= n_joint:
+            continue  # as many states were chosen before
         try:
             other = _fit(pairs, chosen, told, n_trend, first)
         except TooFewSamples:
             continue
         evidence = other.evidence
-        shares = isinstance(evidence, ClosedLoopEvidence) and evidence.kept.all()
-        if not shares or (other.selection.order > own and several) or other.grows():
+        if not isinstance(evidence, ClosedLoopEvidence):
+            continue
+        n_joint, more = len(evidence.kept), other.selection.order > own
+        if not evidence.kept.all() or (more and several) or other.grows():
             continue
         if len(evidence.one_step.noise.A) or not _deviance(other) < _deviance(best):
             continue

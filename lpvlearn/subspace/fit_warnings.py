@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import held_for, stays_at_limits
+from ..data.preparation import constant_columns, held_for, stays_at_limits
 from ..exceptions import RankWarning, warn
 from .held_out import HeldOut
 from .identification import Settings
@@ -72,10 +72,9 @@ def tell(
 
 def tell_of_still_outputs(outputs: Sequence[Array], told: set[str]) -> None:
     """Tell of outputs that never change beside others that do."""
-    still = np.all([np.ptp(y, axis=0) == 0.0 for y in outputs], axis=0)
-    still &= np.ptp([y[0] for y in outputs], axis=0) == 0.0
-    if still.any() and not still.all():
-        k = int(np.argmax(still))
+    still = constant_columns(outputs)
+    if 0 < len(still) < outputs[0].shape[1]:
+        k = int(still[0])
         tell(
             told,
             "still",

@@ -26,7 +26,7 @@ from ..data.experiments import ROLES, Column, Experiment
 from ..data.preparation import (
     Pairs,
     complete_runs,
-    constant_inputs,
+    constant_columns,
     has_gaps,
     independent_inputs,
     remove_trends,
@@ -549,7 +549,7 @@ def fit_as_stream(
 def _as_independent(first: Pairs, pairs: Pairs) -> bool:
     """Whether the inputs of the first samples vary as independently as those of all."""
     inputs = [u for u, _ in first]
-    if len(constant_inputs(inputs)):
+    if len(constant_columns(inputs)):
         return False
     basis = independent_inputs(inputs)
     if basis is None:
