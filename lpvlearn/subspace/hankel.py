@@ -47,6 +47,9 @@ _TOGETHER = 32  # experiments whose ends are multiplied at a time
 # shorter than the second) spend little on the overlap of neighbouring blocks.
 _LAG_BLOCKS, _LEAST_BLOCK = 8, 4096
 
+# Rows from which on a QR decomposition is not cheap; it takes ten times as long.
+_MANY_ROWS = 200
+
 _QR_BLOCK = 64  # columns that LAPACK's QR works on at a time, at most
 
 # Hankel columns factored at a time: this many for each row (at least the second), so
@@ -61,21 +64,25 @@ def data_factors(
     *,
     past_outputs: bool = True,
     n_trend: int = 0,
-) -> Iterator[Array]:
-    """`data_factor` of every horizon; one correlation sequence serves them all."""
+    cheap: bool = False,
+) -> Iterator[Array | None]:
+    """`data_factor` of every horizon; one correlation sequence serves them all.
+
+    With `cheap` None stands for factors of many rows, but for the first, whose Gram
+    matrix is singular to working precision.
+    """
     records = [without_trend(z, n_trend) for z in records]
     known: dict[int, Array] = {}
     if len(horizons) > 1:
         known = pooled_correlations(records, [2 * horizon for horizon in horizons])
-    for horizon in horizons:
-        yield data_factor(
-            records,
-            n_inputs,
-            horizon,
-            past_outputs=past_outputs,
-            correlations=known.get(2 * horizon),
-            n_trend=n_trend,
-        )
+    n_outputs = records[0].shape[1] - n_inputs
+    for k, horizon in enumerate(horizons):
+        rows = _past_future_rows(n_inputs, n_outputs, horizon, past_outputs)
+        problem = records, 2 * horizon, rows
+        factor = _squared_factor(*problem, known.get(2 * horizon), n_trend)
+        if factor is None and not (cheap and k > 0 and len(rows) > _MANY_ROWS):
+            factor = _qr_factor(*problem, n_trend)
+        yield factor
 
 
 def pooled_correlations(
@@ -105,7 +112,6 @@ def data_factor(
     *,
     past_outputs: bool = True,
     engine: str = "cholesky",
-    correlations: Array | None = None,
     n_trend: int = 0,
 ) -> Array:
     """Lower triangular factor of ``[U_f; U_p; Y_p; Y_f]`` of pooled experiments.
@@ -114,9 +120,8 @@ def data_factor(
     among the rows of the factor (Verhaegen and Verdult, *Filtering and System
     Identification*, 2007, Chapter 9). The engine "cholesky" builds the Gram matrix from
     correlations and falls back to "qr" where that would lose accuracy; both give the
-    same factor. `correlations` are known `pooled_correlations` of the records, of
-    ``2 * horizon`` lags. `n_trend` takes a constant (1) or a straight line (2) out of
-    every experiment, whose samples should have none to speak of (`without_trend`).
+    same factor. `n_trend` takes a constant (1) or a straight line (2) out of every
+    experiment, whose samples should have none to speak of (`without_trend`).
 
     >>> z = np.random.default_rng(0).standard_normal((300, 3))
     >>> L = data_factor([z], n_inputs=2, horizon=4)
@@ -124,26 +129,35 @@ def data_factor(
     True
     """
     n_outputs = records[0].shape[1] - n_inputs
-    rows = _past_future_rows(n_inputs, n_outputs, horizon, past_outputs=past_outputs)
-    if engine == "cholesky":
-        return hankel_factor(records, 2 * horizon, rows, correlations, n_trend)
-    return _qr_factor(records, 2 * horizon, rows, n_trend)
+    rows = _past_future_rows(n_inputs, n_outputs, horizon, past_outputs)
+    factor = hankel_factor if engine == "cholesky" else _qr_factor
+    return factor(records, 2 * horizon, rows, n_trend)
 
 
 def hankel_factor(
-    records: Sequence[Array],
-    n_rows: int,
-    rows: NDArray[np.intp],
-    correlations: Array | None = None,
-    n_trend: int = 0,
+    records: Sequence[Array], n_rows: int, rows: NDArray[np.intp], n_trend: int = 0
 ) -> Array:
     """Lower triangular factor of some `rows` of `n_rows` block rows, in that order.
 
-    `correlations` and `n_trend` as in `data_factor`.
+    `n_trend` as in `data_factor`.
+    """
+    factor = _squared_factor(records, n_rows, rows, None, n_trend)
+    return _qr_factor(records, n_rows, rows, n_trend) if factor is None else factor
+
+
+def _squared_factor(
+    records: Sequence[Array],
+    n_rows: int,
+    rows: NDArray[np.intp],
+    correlations: Array | None,
+    n_trend: int,
+) -> Array | None:
+    """That of the Gram matrix; None where squaring would lose accuracy.
+
+    `correlations` are known `pooled_correlations` of the records, of `n_rows` lags.
     """
     gram = _pooled_gram(records, n_rows, rows, correlations, n_trend)
-    lower = cholesky_factor(gram, overwrite=True)
-    return _qr_factor(records, n_rows, rows, n_trend) if lower is None else lower
+    return cholesky_factor(gram, overwrite=True)
 
 
 def _qr_factor(
@@ -224,7 +238,7 @@ def _trend_sums(z: Array, n_rows: int, Q: Array) -> Array:
 
 
 def _past_future_rows(
-    n_inputs: int, n_outputs: int, horizon: int, *, past_outputs: bool = True
+    n_inputs: int, n_outputs: int, horizon: int, past_outputs: bool = True
 ) -> NDArray[np.intp]:
     """Rows of a Hankel matrix of ``[u, y]`` in the order ``U_f, U_p, (Y_p), Y_f``."""
     c = n_inputs + n_outputs
@@ -252,7 +266,7 @@ class HankelSum(NamedTuple):
     def rows(self) -> NDArray[np.intp]:
         """Rows of the Hankel matrix that are kept, in their order."""
         sizes = self.n_inputs, self.n_outputs, self.horizon
-        return _past_future_rows(*sizes, past_outputs=self.past_outputs)
+        return _past_future_rows(*sizes, self.past_outputs)
 
     def triangular(self) -> Array:
         """Triangular factor of everything seen."""

@@ -194,19 +194,31 @@ def centred(pairs: Pairs, n_trend: int, initial_states: bool) -> tuple[Pairs, Ce
 
 
 def subspaces_of(
-    records: Sequence[Record], widths: Mapping[int, int], method: str
+    records: Sequence[Record],
+    widths: Mapping[int, int],
+    method: str,
+    *,
+    cheap: bool = False,
 ) -> dict[int, ObservabilitySubspace]:
-    """Observability subspace of every horizon, of as many directions as given."""
+    """Observability subspace of every horizon, of as many directions as given.
+
+    With `cheap` the longer horizons are left out where the samples are so smooth, or so
+    free of noise, that many of them are linearly dependent to working precision.
+    """
     m, ny = len(records[0].u), len(records[0].y)
     samples = [np.ascontiguousarray(np.vstack((r.u, r.y)).T) for r in records]
     past_outputs, n_trend = method != "pi-moesp", len(records[0].trend)
     factors = data_factors(
-        samples, m, widths, past_outputs=past_outputs, n_trend=n_trend
+        samples, m, widths, past_outputs=past_outputs, n_trend=n_trend, cheap=cheap
     )
-    return {  # of factors none is kept while the next one is made
-        horizon: observability_subspace(next(factors), m, ny, horizon, width, method)
-        for horizon, width in widths.items()
-    }
+    found = {}
+    for horizon, width in widths.items():
+        factor = next(factors)
+        if factor is not None:
+            space = observability_subspace(factor, m, ny, horizon, width, method)
+            found[horizon] = space
+        del factor  # none is kept while the next one is made
+    return found
 
 
 def realize(

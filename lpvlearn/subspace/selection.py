@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.simulation import estimate_initial_state, free_responses
+from .decimation import SlowStarts
 from .hankel import correlation_sequence
 from .held_out import MATTERS, HeldOut
 from .identification import (
@@ -182,6 +183,7 @@ class _Tried(NamedTuple):
     candidate: Candidate  # its model that of whitened records, until it is judged
     criterion: float
     errors: dict[int, float]  # by horizon, relative, of the model before refinement
+    slow: bool  # whether it began with decimated records
 
 
 def select(
@@ -219,9 +221,11 @@ class _Range(NamedTuple):
 
     orders: range
     horizon: int | None
-    # of the records as they are, for orders up to the highest: by horizon, as found
-    spaces: dict[int, ObservabilitySubspace]
+    # of the records as they are, for orders up to the highest: by horizon, as found;
+    # None for horizons that are left out
+    spaces: dict[int, ObservabilitySubspace | None]
     starts: dict[tuple[int, int], Realization]  # by order and horizon, as found
+    slow: bool = False  # whether decimated records are asked as well
 
 
 def _search(
@@ -233,7 +237,8 @@ def _search(
         horizons = [horizon] if horizon else _horizons(records, 0, settings)
         highest = _highest_order(records, horizons, settings)
     wanted = _Range(range(order or 0, highest + 1), horizon, {}, {})
-    pilot = _pilot(records, wanted, settings)
+    pilot, slow = _pilot(records, wanted, settings)
+    wanted = wanted._replace(slow=slow)
     noise = _noise_of(pilot, records, wanted, settings)
     found = _judged(_try_orders(wanted, records, noise, settings), records, settings)
     orders = _by_own_noise(found, records, wanted, settings)
@@ -323,12 +328,18 @@ def _judge(
     return one._replace(candidate=candidate, criterion=criterion)
 
 
-def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realization:
-    """A model whose errors are the noise, or little else: outputs are weighted."""
+def _pilot(
+    records: list[Record], wanted: _Range, settings: Settings
+) -> tuple[Realization, bool]:
+    """A model whose errors are the noise, or little else: outputs are weighted.
+
+    And whether longer horizons than those that are affordable are why it is as good.
+    """
     free, whitening = settings.free, Whitening.none(len(records[0].y))
     order = max(wanted.orders[0], min(wanted.orders[-1], _PILOT_ORDER))
-    only = wanted._replace(orders=range(order, order + 1))
     _look_up(wanted, order, records, settings)  # for the orders to come as well
+    is_cut = wanted.horizon is None and _is_cut_short(wanted, records, settings)
+    only = wanted._replace(orders=range(order, order + 1), slow=is_cut)
     tried = _try_orders(only, records, whitening, settings, _PILOT_STEPS)
     model = tried[0].candidate.model
     for _ in range(_WEIGHINGS if len(records[0].y) > 1 else 0):
@@ -340,7 +351,7 @@ def _pilot(records: list[Record], wanted: _Range, settings: Settings) -> Realiza
         start = restarted(model, whitening, white, free)
         model = refine_simulation(start, white, free, _PILOT_STEPS)
         model = _unwhitened(model, whitening, records, settings)
-    return model
+    return model, tried[0].slow
 
 
 def _unwhitened(
@@ -403,8 +414,11 @@ def _look_up(
     new = [h for h in horizons if h not in wanted.spaces]
     if new:
         widths = {h: min(width, settings.max_order(h)) for h in new}
-        wanted.spaces.update(subspaces_of(records, widths, settings.method))
-    return {h: wanted.spaces[h] for h in horizons}
+        cheap = wanted.horizon is None
+        found = subspaces_of(records, widths, settings.method, cheap=cheap)
+        wanted.spaces.update({h: found.get(h) for h in new})
+    spaces = {h: wanted.spaces[h] for h in horizons}
+    return {h: space for h, space in spaces.items() if space is not None}
 
 
 def _horizons(records: Sequence[Record], order: int, settings: Settings) -> list[int]:
@@ -465,12 +479,16 @@ def _try_orders(
     tried: list[_Tried] = []
     best, stale = np.inf, 0
     energy = output_energy(records)
+    slow_starts = SlowStarts(records, orders[-1], settings)
     for order in orders:
         starts = _starts(wanted, order, records, settings)
         if not starts:
             break
         horizon = _best_horizon(starts, refine=True)
         start = starts[horizon]
+        slow = slow_starts.best(order) if wanted.slow else None
+        if slow is not None and slow.loss * _LOSS_SLACK[True] < start.loss:
+            start = slow
         model = refine_simulation(start, records, settings.free, max_iter)
         below = tried[-1].candidate.model if tried else None
         if below is not None and model.loss > _AS_GOOD * below.loss:
@@ -480,7 +498,7 @@ def _try_orders(
         criterion = criterion_of(model, records, settings.free)
         candidate = Candidate(model, horizon, whitening, True)
         errors = _relative_errors(starts, records)
-        tried.append(_Tried(order, candidate, criterion, errors))
+        tried.append(_Tried(order, candidate, criterion, errors, start is slow))
         stale = 0 if criterion < best else stale + 1
         best = min(best, criterion)
         if stale > _PATIENCE or model.loss <= _EXACT * energy:
@@ -594,6 +612,14 @@ def _starts(
                 wanted.starts[order, horizon] = found
             starts[horizon] = wanted.starts[order, horizon]
     return starts
+
+
+def _is_cut_short(
+    wanted: _Range, records: Sequence[Record], settings: Settings
+) -> bool:
+    """Whether horizons that the data could fill are left out for what they cost."""
+    room = settings.max_horizon([record.u.shape[1] for record in records])
+    return _highest_horizon(records, settings) < room or None in wanted.spaces.values()
 
 
 def _best_horizon(starts: Mapping[int, Realization], refine: bool) -> int:
