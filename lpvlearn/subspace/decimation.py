@@ -66,20 +66,25 @@ class SlowStarts:
         self._settings = settings
         self._known: dict[int, _Decimated | None] = {}
 
-    def best(self, order: int) -> Realization | None:
-        """Not yet refined; by the factor that suits the order, if the records do."""
-        best, factor = None, 2
-        while order and (found := self._decimated(factor)) and order <= found.highest:
-            slow = realize(found.subspace, found.records, order, self._settings)
-            A = full_rate(slow.A, factor)
-            if A is not None:
-                free = self._settings.free
-                model = simulation_fit(A, slow.C, self._records, free)
-                if best is not None and not model.loss < _BETTER * best.loss:
-                    return min(best, model, key=lambda model: model.loss)
-                best = model
-            factor *= 2
+    def best(self, order: int, factor: int = 2) -> Realization | None:
+        """Not yet refined; by the factor, the least or more, that suits the order."""
+        best = None
+        while (model := self._start(order, factor)) is not None:
+            if best is not None and not model.loss < _BETTER * best.loss:
+                break
+            best, factor = model, 2 * factor
         return best
+
+    def _start(self, order: int, factor: int) -> Realization | None:
+        """From records decimated by a factor; None if these do not show the order."""
+        found = self._decimated(factor) if order else None
+        if found is None or order > found.highest:
+            return None
+        slow = realize(found.subspace, found.records, order, self._settings)
+        A = full_rate(slow.A, factor)
+        if A is None:
+            return None
+        return simulation_fit(A, slow.C, self._records, self._settings.free)
 
     def _decimated(self, factor: int) -> _Decimated | None:
         """Records of every so many samples; none where too few of these are left."""
@@ -136,6 +141,8 @@ def full_rate(A: Array, factor: int) -> Array | None:
     array([[ 0.9,  0.2],
            [-0.2,  0.9]])
     """
+    if A.size == 0:
+        return A
     values, vectors = np.linalg.eig(A)
     if not np.linalg.cond(vectors) < _MAX_CONDITION:
         return None

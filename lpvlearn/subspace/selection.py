@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.simulation import estimate_initial_state, free_responses
-from .decimation import SlowStarts
+from .decimation import SlowStarts, decimated, full_rate
 from .hankel import correlation_sequence
 from .held_out import MATTERS, HeldOut
 from .identification import (
@@ -193,12 +193,14 @@ def select(
     settings: Settings,
 ) -> Selection:
     """Choose the order, the horizon or both (None) for scaled records."""
-    records = thinned(records)
+    whole, records = records, thinned(records)
     # The order is that of the system, whatever a stable or rough model can show of it,
     # or one that minimises other errors.
     by_evidence = settings._replace(enforce_stability=False, refine=True)
     if settings.refine and not settings.enforce_stability:
         chosen = _search(records, order, horizon, by_evidence)
+        if horizon is None:
+            chosen = _of_longer_time(chosen, whole, order, by_evidence)
         return chosen if settings.weigh else replace(chosen, candidate=None)
     rows: list[Row] = []
     if order is None:
@@ -214,6 +216,34 @@ def select(
         for h, error in errors.items()
     ]
     return Selection(order, best, sorted(rows))
+
+
+def _of_longer_time(
+    chosen: Selection, whole: Sequence[Record], order: int | None, settings: Settings
+) -> Selection:
+    """The choice, or that of decimated records of all the time where that is better.
+
+    As many samples of slow motion as a choice needs may take longer than the records
+    that it was made of.
+    """
+    n_samples = sum(record.u.shape[1] for record in whole)
+    factor = -(-n_samples // sum(record.u.shape[1] for record in thinned(whole)))
+    if factor == 1 or chosen.candidate is None:
+        return chosen
+    n, free = order or max(chosen.order, _PILOT_ORDER), settings.free
+    slow = SlowStarts(whole, n, settings).best(n, factor)
+    model = chosen.candidate.model
+    least = simulation_fit(model.A, model.C, whole, free).loss / _LOSS_SLACK[True]
+    if slow is None or not slow.loss < least:
+        return chosen
+    other = _search(thinned(decimated(whole, factor)), order, None, settings)
+    assert other.candidate is not None
+    A = full_rate(other.candidate.model.A, factor)
+    if A is None:
+        return chosen
+    model = simulation_fit(A, other.candidate.model.C, whole, free)
+    candidate = Candidate(model, other.horizon, Whitening.none(len(model.C)), True)
+    return replace(other, candidate=candidate) if model.loss < least else chosen
 
 
 class _Range(NamedTuple):
@@ -333,7 +363,7 @@ def _pilot(
 ) -> tuple[Realization, bool]:
     """A model whose errors are the noise, or little else: outputs are weighted.
 
-    And whether longer horizons than those that are affordable are why it is as good.
+    And whether decimated records are why it is as good.
     """
     free, whitening = settings.free, Whitening.none(len(records[0].y))
     order = max(wanted.orders[0], min(wanted.orders[-1], _PILOT_ORDER))

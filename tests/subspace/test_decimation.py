@@ -90,6 +90,9 @@ class TestFullRate:
         A = full_rate(np.diag([0.5, -0.3, 0.0]), 2)
         assert_allclose(np.sort(np.linalg.eigvals(A)), [1e-3, 1e-3, np.sqrt(0.5)])
 
+    def test_nothing_stays_nothing(self):
+        assert full_rate(np.zeros((0, 0)), 3).shape == (0, 0)
+
     def test_none_for_eigenvectors_without_digits(self):
         assert full_rate(np.array([[0.9, 1.0], [0.0, 0.9]]), 2) is None
 
@@ -102,9 +105,9 @@ class TestSlowStarts:
 
     def test_is_near_where_long_horizons_see_noise(self):
         u, y = _record()
-        slow = SlowStarts([Record.of(u, y)], 8, _settings())
-        assert _distance(slow.best(4).A, _plant().poles()) < 0.3
-        assert slow.best(4).loss < 1.1 * 0.03**2 * (y**2).sum()
+        model = SlowStarts([Record.of(u, y)], 8, _settings()).best(4)
+        assert _distance(model.A, _plant().poles()) < 0.3
+        assert model.loss < 1.1 * 0.03**2 * (y**2).sum()
 
     @pytest.mark.parametrize("n_samples", [12, 40])
     def test_short_records_have_none(self, n_samples):
@@ -131,3 +134,17 @@ def test_experiments_with_constants_are_fitted_alike():
     model = SubspaceLTI(experiment=1, offset="constant", sampling_time=STEP).fit(X, y)
     plant, u = _plant(), _smooth_input(12_000, 5)
     assert bft_score(plant.simulate(u), model.lti_.simulate(u)) > 99.0
+
+
+@pytest.mark.parametrize("seed", [8, 9])
+def test_orders_of_long_records_are_chosen_over_all_of_their_time(seed):
+    # The twelve thousand samples of a choice, at most, are too few of so slow a motion.
+    rng = np.random.default_rng(seed)
+    modes = [[[0.0, 1.0], [-(w**2), -0.2 * w]] for w in (0.8, 2.0)]
+    B, C = [[0.0], [1.0], [0.0], [-2.0]], [[1.0, 0.0, 1.0, 0.0]]
+    plant = StateSpace(linalg.block_diag(*modes), B, C).to_discrete(0.001)
+    u, fresh = rng.standard_normal((2, 60_000, 1))
+    y = plant.simulate(u)
+    model = SubspaceLTI().fit(u, y + y.std() * rng.standard_normal(y.shape))
+    assert model.order_ == 4
+    assert bft_score(plant.simulate(fresh), model.lti_.simulate(fresh)) > 98.0
