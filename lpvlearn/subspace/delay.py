@@ -44,7 +44,9 @@ Array = NDArray[np.float64]
 
 Delay = NDArray[np.intp]
 
-LONGEST = 30  # samples that a delay is looked for, of each input
+# Samples that a delay is looked for, of each input, and of all of them together where
+# it is not found among these.
+LONGEST, _MOST_LAGS = 30, 300
 
 _SHARE = 10  # and no longer than this part of the longest experiment, a tenth
 
@@ -138,8 +140,7 @@ def find_delays(
     whose removal here leaves little for the models to tell.
     """
     pairs = remove_trends(_head(pairs), DETRENDS[settings.free.n_trend])[0]
-    longest = min(LONGEST, max(len(u) for u, _ in pairs) // _SHARE)
-    answers = first_answers(pairs, longest)
+    answers = _answers(pairs)
     direct = settings.free.direct.any(axis=0)
     delay = np.where(answers < 0, 0, np.maximum(answers - ~direct, 0))
     if not delay.any():
@@ -164,6 +165,18 @@ def find_delays(
     for j in np.flatnonzero(delay):
         delay[j] = trial.delay_of(int(j), delay, orders, given=order is not None)
     return delay
+
+
+def _answers(pairs: Pairs) -> Delay:
+    """`first_answers`, looked for over more lags where there are none."""
+    most = max(len(u) for u, _ in pairs) // _SHARE
+    longest = min(LONGEST, most)
+    answers = first_answers(pairs, longest)
+    most = min(most, max(longest, _MOST_LAGS // len(answers)))
+    while (answers < 0).any() and longest < most:
+        longest = min(2 * longest, most)
+        answers = np.where(answers < 0, first_answers(pairs, longest), answers)
+    return answers
 
 
 def _head(pairs: Pairs) -> Pairs:

@@ -286,6 +286,18 @@ def test_delays_are_found_and_none_is_imagined(kind, direct):
         np.testing.assert_array_equal(found, [delay])
 
 
+@pytest.mark.parametrize("delay", [30, 31, 60])
+def test_long_delays_are_looked_for_where_no_input_answers_before(delay):
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (12, 1)), 100, axis=0)
+    plant = StateSpace([[0.97]], [[1.0]], [[0.1]], sampling_time=1.0)
+    y = plant.with_input_delay(delay).simulate(u)
+    y += 0.03 * y.std() * rng.normal(size=y.shape)
+    model = SubspaceLTI(input_delay="auto").fit(u + 3.0, y + 5.0)
+    np.testing.assert_array_equal(model.input_delay_, [delay])
+    assert model.order_ == 1
+
+
 @pytest.mark.parametrize("delay", [0, 1, 2])
 def test_a_given_order_is_not_raised_to_do_without_a_delay(delay):
     """A state more would make up for the sample of delay, and for a weak mode."""
