@@ -53,8 +53,9 @@ N_TRENDS = {"auto": 0, None: 0, "constant": 1, "linear": 2}
 _SUSPICIOUS, _SIGNIFICANT = 1e-2, 1e-3
 
 # By which the criterion is better with a chance of 1e-7; and the chance by the test of
-# the constants, above which that says more of poor models than of constants.
-CERTAIN, _LIKELY = 30.0, 0.5
+# the constants, above which that says more of poor models than of constants; unless the
+# criterion is better by the third, of signals far from zero among noise of long memory.
+CERTAIN, _LIKELY, _BEYOND_DOUBT = 30.0, 0.5, 150.0
 
 USELESS = 0.9  # errors, relative, that explain next to nothing
 
@@ -217,6 +218,8 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
             return True
     if not better > (-CERTAIN if far else 0.0):
         return False
+    if far and better > _BEYOND_DOUBT:
+        return True
     chance = chance_of_constants(other)
     return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > CERTAIN))
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
+from lpvlearn.metrics import bft_score
 from lpvlearn.subspace import hankel
 from lpvlearn.subspace.identification import centred
 from lpvlearn.subspace.offsets import _tail
@@ -352,6 +353,21 @@ def test_constants_of_what_stays_far_from_zero_are_taken_in_slow_noise(level):
         gains.append(model.lti_.dc_gain().item())
     assert taken == (0 if level is None else 6)
     np.testing.assert_allclose(np.mean(gains), 2.0, atol=0.2)
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_drift_does_not_hide_constants_far_from_zero(seed):
+    rng = np.random.default_rng(seed)
+    A, B, C = [[0.97, 0.0], [0.18, 0.82]], [[0.07], [0.0]], [[0.0, 1.0]]
+    plant = StateSpace(A, B, C, None, 1.0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (9, 1)), 100, axis=0)
+    y = plant.simulate(u)
+    drift = 0.01 * np.cumsum(rng.standard_normal(y.shape), axis=0)
+    noise = 0.02 * rng.standard_normal(y.shape)
+    model = SubspaceLTI(2).fit(u + 6.0, y + y.std() * (drift + noise) + 10.0)
+    fresh = np.repeat(rng.choice([-1.0, 1.0], (160, 1)), 5, axis=0)
+    assert model.offset_ == "constant"
+    assert bft_score(plant.simulate(fresh), model.lti_.simulate(fresh)) > 93.0
 
 
 def test_prediction_warns_where_constants_differ(rng):
