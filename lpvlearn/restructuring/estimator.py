@@ -832,8 +832,9 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "black box as its noise explains (`p_value_` "
                 f"{found.p_value:.1g}): the standard deviations are too small then, "
                 "and the parameters meet the frequencies best that the data tell most "
-                "of. Give the structure what it lacks, or keep the H-infinity optimum "
-                "by norm='hinf' (in a pipeline, efficient=False)."
+                "of. Give the structure what it lacks, the local models the delay of "
+                "an input that answers late (`input_delay`), or keep the H-infinity "
+                "optimum by norm='hinf' (in a pipeline, efficient=False)."
             )
 
     def _warn(
