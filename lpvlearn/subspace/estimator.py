@@ -136,7 +136,7 @@ class SubspaceLTI(
     order : int or "auto", default="auto"
         Number of states. "auto" takes the order with the best criterion (minus
         twice the logarithm of the likelihood, and 4 for each parameter), or a lower one
-        that simulates parts held out clearly better. 0 is a pure gain.
+        that simulates parts held out clearly better, of at most 30. 0 is a pure gain.
     method : {"auto", "po-moesp", "pi-moesp", "n4sid", "cva", "pbsid"}, default="auto"
         "auto" is "po-moesp", or "pbsid" where the data come from a closed loop, with a
         warning, and where noise that moves the states of the plant is likelier than
@@ -165,8 +165,9 @@ class SubspaceLTI(
         Samples by which the inputs, or each of them, act late: ``y[t]`` depends on
         ``u[t - input_delay]`` through D, on earlier inputs through the state. A sampled
         system without feedthrough has a delay of 0: its first answer, a sample after
-        the input, is in the state. "auto" looks for delays of up to 30 samples, a tenth
-        of the longest experiment, and takes those that are certain.
+        the input, is in the state. "auto" looks for delays of up to 300 samples (all
+        inputs together), a tenth of the longest experiment, and takes those that are
+        certain.
     refine : {"auto", "simulation", "prediction", False}, default="auto"
         What is minimised after the subspace step: "simulation" the simulation error,
         "prediction" that error whitened by an autoregression of itself and weighted by

@@ -52,6 +52,7 @@ from .offsets import (
     with_levels,
 )
 from .options import Choices
+from .rounding import rounded_outputs
 from .selection import PRICE, PlantFit, Row, Selection, select
 from .shifts import cut_at, find_shifts
 from .signals import Record, SharedSignals, share_known, shorten
@@ -502,6 +503,7 @@ def _may_share_noise(fitted: LocalFit, choices: Choices) -> bool:
         and not feedback.found
         and fitted.residual > _ROUGH
         and len(fitted.evidence.noise.A) >= _LAGS * len(fitted.model.C)
+        and not rounded_outputs(fitted.model, records).repeated.any()
     )
 
 

@@ -19,8 +19,10 @@ from .local_fit import LocalFit
 from .offsets import CERTAIN, USELESS, follows_means_alone
 from .options import Choices
 from .residuals import find_spikes, lacks
-from .selection import better_horizon
+from .rounding import rounded_outputs
+from .selection import MAX_ORDER, better_horizon
 from .signals import thinned
+from .statistics import Evidence
 from .varx import Feedback
 
 Array = NDArray[np.float64]
@@ -250,7 +252,21 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
     feedback = None if fitted.method == "pbsid" else fitted.feedback
     if feedback is None or fitted.stability_loss or "lack" in told:
         return
-    if lacks(fitted.evidence, feedback.innovations):
+    if not lacks(fitted.evidence, feedback.innovations):
+        return
+    rounded = _rounded_output(fitted.evidence)
+    if rounded is not None:
+        output, share = rounded
+        tell(
+            told,
+            "lack",
+            f"Output {output + 1} is rounded to steps of {100.0 * share:.2g} % of its "
+            "size, and the errors of the model are hardly larger: more states would "
+            "follow what rounding does wherever the inputs repeat themselves. Give a "
+            "low `order`, use larger inputs or a finer sensor, or leave the noise in "
+            "that a filter takes away before it is rounded.",
+        )
+    else:
         remedy = "a higher `order`" if chose_order else "order='auto'"
         # Without figures, so that a search over orders says it once of each.
         tell(
@@ -261,6 +277,16 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             f"a nonlinearity. Try {remedy}, `input_delay`, or, if the system is "
             "nonlinear, smaller inputs; `residual_tests` tells which input it is.",
         )
+
+
+def _rounded_output(evidence: Evidence) -> tuple[int, float] | None:
+    """An output whose errors are mostly rounding, and the step relative to its size."""
+    variances = rounded_outputs(evidence.model, evidence.records).variances
+    if not variances.any():
+        return None
+    output = int(variances.argmax())
+    size = np.std(np.hstack([record.y[output] for record in evidence.records]))
+    return output, float(np.sqrt(12.0 * variances[output]) / size)
 
 
 def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
@@ -302,6 +328,9 @@ def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
     spikes = None if "spikes" in told else find_spikes(fitted.evidence)
     if spikes is None:
         return
+    rounded = rounded_outputs(fitted.evidence.model, fitted.evidence.records)
+    if rounded.variances[spikes.output]:
+        return  # some errors of that are larger than others
     several, n = len(fitted.evidence.records) > 1, spikes.n_found
     tell(
         told,
@@ -330,6 +359,14 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "worse than the others (`selection_`): the system is nonlinear, changes "
             "over the record or drifts, or the record is too short for it. Give a "
             "lower `order`, leave disturbed parts out, or use offset='linear'.",
+        )
+    if len(fitted.model.A) == MAX_ORDER:
+        tell(
+            told,
+            "highest",
+            f"The automatic order is the highest that is tried, {MAX_ORDER}: the "
+            "system may have more states. Give a higher `order`, or use fewer outputs "
+            "or a narrower band of frequencies.",
         )
     if _disputed(fitted):
         tell(

@@ -67,6 +67,8 @@ class Settings(NamedTuple):
     n_noise_states: int = 0  # additional states of the subspace step
     weigh: bool = True  # whether errors are weighed by their noise when refined
     compare: bool = True  # whether parts held out may say that other models are better
+    # By output the share of errors that repeat those before, as those of rounding do.
+    repeated: tuple[float, ...] = ()
 
     def max_horizon(self, lengths: Sequence[int]) -> int:
         """Largest horizon whose Hankel columns outnumber its rows (at least 1).

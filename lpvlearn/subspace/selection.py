@@ -45,6 +45,7 @@ from .identification import (
 from .noise import Whitening, autoregression, taper
 from .realization import ObservabilitySubspace
 from .refinement import refine_simulation
+from .rounding import rounded_outputs
 from .signals import Record, output_energy, thinned
 from .simulation_fit import (
     Freedom,
@@ -65,7 +66,7 @@ _MAX_ROWS = 1000
 
 # Highest order tried, and the values that the data must have for each parameter: fewer
 # and the criterion, which is one of many samples, would be trusted too far.
-_MAX_ORDER, _VALUES_PER_PARAMETER = 20, 3
+MAX_ORDER, _VALUES_PER_PARAMETER = 30, 3
 
 # So many values for each initial state of other experiments than the first, by those
 # for a parameter: what many unknowns gain by chance is known well.
@@ -269,19 +270,30 @@ def _search(
     wanted = _Range(range(order or 0, highest + 1), horizon, {}, {})
     pilot, slow = _pilot(records, wanted, settings)
     wanted = wanted._replace(slow=slow)
+    repeated = tuple(rounded_outputs(pilot, records).repeated)
+    settings = settings._replace(repeated=repeated)
     noise = _noise_of(pilot, records, wanted, settings)
-    found = _judged(_try_orders(wanted, records, noise, settings), records, settings)
+    tried = _try_orders(wanted, records, noise, settings, pilot=pilot)
+    found = _judged(tried, records, settings)
     orders = _by_own_noise(found, records, wanted, settings)
     least = min(orders.values(), key=_criterion)
-    again = least.candidate.whitening
-    if not again.is_close_to(noise):
-        first = max(wanted.orders[0], least.order - _PATIENCE)
-        last = min(wanted.orders[-1], least.order + _PATIENCE)
-        about = wanted._replace(orders=range(first, last + 1))
-        found = _judged(_try_orders(about, records, again, settings), records, settings)
-        for k, one in found.items():
+    highest, last = max(orders), wanted.orders[-1]
+    again = not least.candidate.whitening.is_close_to(noise)
+    while again or least.order == highest < last:
+        lowest, end = highest, last  # or until further states gain nothing
+        if again:
+            lowest = max(wanted.orders[0], least.order - _PATIENCE)
+            end = min(last, least.order + _PATIENCE)
+        noise = least.candidate.whitening
+        about = wanted._replace(orders=range(lowest, end + 1))
+        tried = _try_orders(about, records, noise, settings)
+        for k, one in _judged(tried, records, settings).items():
             orders[k] = min(orders.get(k, one), one, key=_criterion)
         least = min(orders.values(), key=_criterion)
+        reached = max((one.order for one in tried), default=lowest)
+        if not again and reached == highest:
+            break  # the data show no more
+        highest, again = reached, False
     chosen = best = least.order
     errors = {best: validate(least.candidate, records, settings)}
     close = [k for k, one in orders.items() if one.criterion < least.criterion + PRICE]
@@ -354,7 +366,7 @@ def _judge(
     model, free = weighted.model(candidate.model), settings.free
     records = weighted.records(records, free)
     model = with_initial_states(model, records, free)
-    criterion = criterion_of(model, records, free)
+    criterion = criterion_of(model, records, free, settings.repeated)
     return one._replace(candidate=candidate, criterion=criterion)
 
 
@@ -491,7 +503,7 @@ def _highest_order(
     affordable = n_values / _VALUES_PER_PARAMETER - m * ny
     affordable /= m + ny + 1 + _OF_OTHERS * (len(records) - 1)
     by_horizon = max(settings.max_order(h) for h in horizons)
-    return int(np.clip(affordable, 0, min(_MAX_ORDER, by_horizon)))
+    return int(np.clip(affordable, 0, min(MAX_ORDER, by_horizon)))
 
 
 def _try_orders(
@@ -500,12 +512,20 @@ def _try_orders(
     whitening: Whitening,
     settings: Settings,
     max_iter: int | None = None,
+    pilot: Realization | None = None,
 ) -> list[_Tried]:
-    """Every order in turn on whitened records, until further states gain nothing."""
-    orders = wanted.orders
+    """Every order in turn on whitened records, until further states gain nothing.
+
+    A `pilot` that is better yet, a model of the records themselves, tells that they do.
+    """
+    orders, limit, n_pilot = wanted.orders, np.inf, 0
     if not whitening.is_none:
         records = whitening.records(records, settings.free)
         wanted = wanted._replace(spaces={}, starts={})
+    if pilot is not None:
+        model = with_initial_states(whitening.model(pilot), records, settings.free)
+        limit = criterion_of(model, records, settings.free, settings.repeated)
+        n_pilot = len(model.A)
     tried: list[_Tried] = []
     best, stale = np.inf, 0
     energy = output_energy(records)
@@ -525,24 +545,34 @@ def _try_orders(
             other = _with_more_states(below, records, settings)
             if other is not None and other.loss < model.loss:
                 model = other
-        criterion = criterion_of(model, records, settings.free)
+        criterion = criterion_of(model, records, settings.free, settings.repeated)
         candidate = Candidate(model, horizon, whitening, True)
         errors = _relative_errors(starts, records)
         tried.append(_Tried(order, candidate, criterion, errors, start is slow))
         stale = 0 if criterion < best else stale + 1
         best = min(best, criterion)
-        if stale > _PATIENCE or model.loss <= _EXACT * energy:
+        known = best <= limit or order >= n_pilot
+        if (known and stale > _PATIENCE) or model.loss <= _EXACT * energy:
             break
     return tried
 
 
-def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -> float:
+def criterion_of(
+    model: Realization,
+    records: Sequence[Record],
+    free: Freedom,
+    repeated: Sequence[float] = (),
+) -> float:
     """Likelihood and number of parameters of a model of records, whitened or not.
 
     Minus twice the logarithm of the likelihood, and the price of the parameters with
     the correction that a ratio of sums of squares in few samples needs. The errors that
     a model leaves tell the noise of every output anew: by that of the model before,
     states that follow slow noise would prove themselves right.
+
+    Of errors that are mostly rounding a share, of every output, repeats those before:
+    they are no noise of a memory, and tell as much as the others do alone. States may
+    follow them in every part of a record whose inputs repeat themselves.
     """
     n, (ny, m) = len(model.A), free.direct.shape
     n_values = sum(record.n_values for record in records)
@@ -559,18 +589,23 @@ def criterion_of(model: Realization, records: Sequence[Record], free: Freedom) -
     decay = np.maximum(1.0 - np.abs(poles[poles.imag > 0.0]), 2.0 / longest)
     misfit = -2.0 * float(np.log(decay).sum())
     misfit += few * PRICE * n_parameters
-    noise = _innovations(model, records, free, longest // _SAMPLES_PER_LAG)
+    told = 1.0 - np.array(repeated or np.zeros(ny))
+    lags = np.where(told < 1.0, 0, longest // _SAMPLES_PER_LAG)
+    noise = _innovations(model, records, free, lags)
     for i, (variance, n_lags) in enumerate(noise):
         power = sum(float(record.y[i] @ record.y[i]) for record in records) / n_samples
         variance = max(variance, _EXACT * power) or 1.0
-        misfit += n_samples * np.log(variance) + PRICE * n_lags
+        misfit += told[i] * n_samples * np.log(variance) + PRICE * n_lags
     return float(misfit)
 
 
 def _innovations(
-    model: Realization, records: Sequence[Record], free: Freedom, highest: int
+    model: Realization,
+    records: Sequence[Record],
+    free: Freedom,
+    highest: NDArray[np.intp],
 ) -> list[tuple[float, int]]:
-    """Variance and number of lags of the noise of every output.
+    """Variance and number of lags of the noise of every output, up to the highest.
 
     The own unknowns are those that make the least of the innovations: of slow noise,
     what makes the least of the errors leaves large ones in the first samples. These,
@@ -582,7 +617,7 @@ def _innovations(
     filters, sizes = [], []
     for i in range(len(model.C)):
         parts = [error[:, [i]] for error in errors]
-        noise = autoregression(parts, highest=highest)
+        noise = autoregression(parts, highest=int(highest[i]))
         filters.append(np.append(1.0, -noise.C[0]))
         sizes.append(np.sqrt(noise.covariance[0, 0]) or 1.0)
     lost, squares = max(map(len, filters)) - 1, np.zeros(len(sizes))

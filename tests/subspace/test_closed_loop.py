@@ -333,7 +333,7 @@ def test_auto_gives_up_what_parts_held_out_refute():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of the closed loop
             rivals = [
-                SubspaceLTI(method="po-moesp").fit(u, y),
+                SubspaceLTI(model.order_, method="po-moesp").fit(u, y),
                 pbsid(feedthrough=False).fit(u, y),
             ]
         first, ordinary, without = (

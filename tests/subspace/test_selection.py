@@ -1,11 +1,14 @@
 """The choice of order and horizon, in its parts."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lpvlearn import SubspaceLTI
-from lpvlearn.subspace import selection
+from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn.metrics import bft_score
+from lpvlearn.subspace import fit_warnings, selection
 from lpvlearn.subspace.held_out import HeldOut, Part
 from lpvlearn.subspace.identification import Settings
 from lpvlearn.subspace.selection import (
@@ -158,6 +161,47 @@ def test_parts_that_no_order_explains_do_not_refute_one(monkeypatch, bft, order)
     monkeypatch.setattr(selection, "validate", validate)
     chosen = select([coloured(0, 600)], None, None, Settings(freedom(2, 1)))
     assert chosen.order == order
+
+
+def _ladder(n_stages):
+    """Chains of coils and capacitors, with a resistor at the end."""
+    A = np.zeros((2 * n_stages, 2 * n_stages))
+    for i in range(n_stages):
+        current, voltage = 2 * i, 2 * i + 1
+        A[current, current], A[current, voltage] = -2.0, -1.0
+        A[voltage, current] = 100.0
+        if i > 0:
+            A[current, voltage - 2] = 1.0
+            A[voltage - 2, current] = -100.0
+    A[-1, -1] = -1.0
+    B, C = np.eye(2 * n_stages)[:, :1], np.eye(2 * n_stages)[-1:]
+    return StateSpace(A, B, C).to_discrete(0.02)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_resonances_that_noise_could_be_do_not_end_the_search(seed):
+    # A long autoregression imitates those that an order lacks, so that the criterion
+    # rises over several orders before it falls to its minimum.
+    rng, plant = np.random.default_rng(seed), _ladder(4)
+    u = np.repeat(rng.choice([-1.0, 1.0], (1000, 1)), 4, axis=0)
+    y = plant.simulate(u)
+    y += 0.01 * y.std() * rng.standard_normal(y.shape)
+    model, fresh = SubspaceLTI().fit(u, y), rng.standard_normal((2000, 1))
+    assert model.order_ == 8
+    assert bft_score(plant.simulate(fresh), model.lti_.simulate(fresh)) > 99.0
+
+
+def test_the_highest_order_that_is_tried_is_told(monkeypatch):
+    monkeypatch.setattr(selection, "MAX_ORDER", 4)
+    monkeypatch.setattr(fit_warnings, "MAX_ORDER", 4)
+    rng = np.random.default_rng(1)
+    u = rng.standard_normal((2000, 1))
+    y = _ladder(4).simulate(u)
+    y += 0.01 * y.std() * rng.standard_normal(y.shape)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        assert SubspaceLTI(method="po-moesp").fit(u, y).order_ == 4
+    assert any("is the highest that is tried, 4" in str(w.message) for w in told)
 
 
 def test_losses_do_not_rise_with_the_order():
