@@ -10,8 +10,10 @@ spectra known), the plain simulation error and, where it is installed, MOESP of 
 (`ctrlsys`). `orders`: loss in best fit on fresh data against the best of the orders 0
 to 12 given by hand, over 80 random systems of 0 to 40 dB, 200 to 5,000 samples, half of
 them in AR(1) noise. `coverage`: share of true values within 95 % bands of poles and
-responses. `disturbances`: best fit on fresh data where noise moves the plant itself, or
-passes through another system, by what the default does and by either method.
+responses. `awkward`: best fit on fresh data of records that are sampled far too fast,
+rounded, or of many resonances. `disturbances`: best fit on fresh data where noise moves
+the plant itself, or passes through another system, by what the default does and by
+either method.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import warnings
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, signal
 from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI
@@ -326,8 +328,108 @@ def _disturbed(name: str, rng) -> tuple[Array, Array, Array, Array]:
     return u, y, fresh, plant.simulate(fresh)
 
 
+def awkward(first: int, n_runs: int = 8) -> None:
+    """Best fit of records sampled far too fast, of many resonances, or rounded."""
+    print("record                             mean  worst  orders         CPU s")
+    for name in _AWKWARD:
+        fits, found, seconds = [], [], []
+        for seed in range(first, first + n_runs):
+            u, y, fresh, target = _AWKWARD[name](np.random.default_rng(seed))
+            start = time.process_time()
+            model = SubspaceLTI().fit(u, y)
+            seconds.append(time.process_time() - start)
+            miss = linalg.norm(target - model.lti_.simulate(fresh))
+            fits.append(100.0 * (1.0 - miss / linalg.norm(target - target.mean())))
+            found.append(model.order_)
+        mean, worst = np.mean(np.maximum(fits, 0.0)), np.min(fits)
+        shown = f"{min(found)} to {max(found)}"
+        took = f"{np.median(seconds):5.1f}"
+        print(f"{name:34s} {mean:5.1f}  {worst:5.1f}  {shown:12s} {took}", flush=True)
+
+
+def _too_fast(kind: str, per_period: int, decibel: float):
+    """Modes and lags within a decade, so many samples in a period of the fastest."""
+
+    def record(rng):
+        n, blocks = int(rng.integers(2, 6)), []
+        while sum(map(len, blocks)) < n:
+            w, zeta = 10 ** rng.uniform(0, 1), 10 ** rng.uniform(-1.5, -0.3)
+            mode = [[0.0, 1.0], [-w * w, -2.0 * zeta * w]]
+            oscillates = n - sum(map(len, blocks)) > 1 and rng.random() < 0.7
+            blocks.append(np.array(mode if oscillates else [[-w]]))
+        A = linalg.block_diag(*blocks)
+        B, C = rng.standard_normal((2, n, 1))
+        poles = np.linalg.eigvals(A)
+        step = 2.0 * np.pi / np.abs(poles).max() / per_period
+        plant = StateSpace(A, B, C.T).to_discrete(step)
+        lasting = 20.0 / np.abs(poles.real).min() / step
+        u, fresh = (
+            _inputs(kind, per_period, size, rng)
+            for size in (int(np.clip(lasting, 20_000, 60_000)), 20_000)
+        )
+        y = plant.simulate(u)
+        y += y.std() * 10 ** (-decibel / 20) * rng.standard_normal(y.shape)
+        return u, y, fresh, plant.simulate(fresh)
+
+    return record
+
+
+def _inputs(kind: str, per_period: int, size: int, rng) -> Array:
+    if kind == "held":
+        clock = per_period // 4
+        values = rng.choice([-1.0, 1.0], size=(size // clock + 1, 1))
+        return values.repeat(clock, axis=0)[:size]
+    white = rng.standard_normal((size, 1))
+    low_pass = signal.butter(4, min(0.9, 4.0 / per_period), output="sos")
+    return signal.sosfilt(low_pass, white, axis=0) if kind == "smooth" else white
+
+
+def _ladder(rng):
+    """Four coils and capacitors, of one resistor at the end; 4,000 samples, 40 dB."""
+    n = 8
+    A = np.diag(np.tile([-2.0, 0.0], 4))
+    for coil in range(0, n, 2):
+        A[coil, coil + 1], A[coil + 1, coil] = -1.0, 100.0
+        if coil > 0:
+            A[coil, coil - 1], A[coil - 1, coil] = 1.0, -100.0
+    A[-1, -1] = -1.0
+    plant = StateSpace(A, np.eye(n)[:, :1], np.eye(n)[-1:]).to_discrete(0.02)
+    u = rng.choice([-1.0, 1.0], (1000, 1)).repeat(4, axis=0)
+    fresh, y = rng.standard_normal((2000, 1)), plant.simulate(u)
+    y += 0.01 * y.std() * rng.standard_normal(y.shape)
+    return u, y, fresh, plant.simulate(fresh)
+
+
+def _rounded(n_levels: int):
+    """A mode that answers to steps, in so many steps of the sensor; 1,000 samples."""
+
+    def record(rng):
+        A, B = [[0.0, 1.0], [-0.01, -0.12]], [[0.0], [0.01]]
+        plant = StateSpace(A, B, [[1.0, 0.0]]).to_discrete(1.0)
+        clocks = rng.integers(36, 84, size=30)
+        u = rng.choice([0.0, 1.0], (30, 1)).repeat(clocks, axis=0)[:1000]
+        y = plant.simulate(u)
+        step = np.ptp(y) / n_levels
+        fresh = rng.choice([-1.0, 1.0], (300, 1)).repeat(3, axis=0)
+        return u, step * np.round((y + 40.0) / step), fresh, plant.simulate(fresh)
+
+    return record
+
+
+_AWKWARD = {
+    "smooth, 30 in a period, 30 dB": _too_fast("smooth", 30, 30.0),
+    "smooth, 500 in a period, 30 dB": _too_fast("smooth", 500, 30.0),
+    "held, 500 in a period, 0 dB": _too_fast("held", 500, 0.0),
+    "held, 2000 in a period, 10 dB": _too_fast("held", 2000, 10.0),
+    "white, 500 in a period, 0 dB": _too_fast("white", 500, 0.0),
+    "ladder of order 8": _ladder,
+    "order 2, rounded to 10 steps": _rounded(10),
+    "order 2, rounded to 40 steps": _rounded(40),
+}
+
 STUDIES = {
     "accuracy": accuracy,
+    "awkward": awkward,
     "orders": orders,
     "coverage": coverage,
     "disturbances": disturbances,
