@@ -262,9 +262,8 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "lack",
             f"Output {output + 1} is rounded to steps of {100.0 * share:.2g} % of its "
             "size, and the errors of the model are hardly larger: more states would "
-            "follow what rounding does wherever the inputs repeat themselves. Give a "
-            "low `order`, use larger inputs or a finer sensor, or leave the noise in "
-            "that a filter takes away before it is rounded.",
+            "follow what rounding does wherever the inputs repeat themselves. Keep "
+            "the `order` low, or use larger inputs or a finer sensor.",
         )
     else:
         remedy = "a higher `order`" if chose_order else "order='auto'"
