@@ -227,6 +227,11 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 #   experiment. A slow mode would explain it, and simulate other records by what it made
 #   up. ``"auto"`` looks for such shifts, which no regression on the past foresees, ends
 #   the experiment there and begins another, with a warning that says where.
+# * Where outputs wander (a temperature, a bias, loads that add up), a slow mode follows
+#   what no input did, whatever constants there are. The differences of the samples have
+#   the same plant, and a noise that does not wander: the model is theirs where that is
+#   likelier, or where the samples need a mode slower than the record to do better. Its
+#   static gain is less certain, as its deviations say.
 # * An output that stays at its largest or smallest value while the inputs move is at a
 #   limit, of its sensor or of the plant. A fit tells of it; NaN for these samples and
 #   ``missing="estimate"`` leave them out.

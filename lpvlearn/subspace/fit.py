@@ -7,6 +7,7 @@ The records are made regular, order and horizon chosen, the model identified
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from ..data.preparation import (
 from ..exceptions import RankWarning
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .delay import find_lead, with_later_inputs
+from .drift import differences, drifts, may_drift, of_levels
 from .fit_warnings import (
     Doubt,
     tell,
@@ -52,10 +54,11 @@ from .offsets import (
     with_levels,
 )
 from .options import Choices
+from .residuals import lacks
 from .rounding import rounded_outputs
 from .selection import PRICE, PlantFit, Row, Selection, select
 from .shifts import cut_at, find_shifts
-from .signals import Record, SharedSignals, share_known, shorten
+from .signals import Record, SharedSignals, output_energy, share_known, shorten
 from .simulation_fit import Realization, simulation_errors, with_initial_states
 from .statistics import Evidence
 from .varx import Feedback, find_feedback
@@ -123,6 +126,8 @@ def fit_pairs(
         tell_of_still_outputs(outputs, told)
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = _with_constants(pairs, choices, told, known)
+    drifting = _of_drifting_noise(pairs, choices, told, fitted)
+    fitted = drifting or fitted
     if fitted.selection.order:
         if "held" not in told:
             tell_of_held_outputs(outputs, told)
@@ -139,7 +144,7 @@ def fit_pairs(
     doubt = None
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
         fitted, doubt = _believable(pairs, choices, told, fitted)
-    elif _may_share_noise(fitted, choices):
+    elif drifting is None and _may_share_noise(fitted, choices):
         fitted = _with_shared_noise(pairs, choices, told, fitted)
     feedback = fitted.feedback
     if feedback is not None and feedback.found and "feedback" not in told:
@@ -171,6 +176,60 @@ def _with_constants(
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
+
+
+def _of_drifting_noise(
+    pairs: Pairs, choices: Choices, told: set[str], whole: LocalFit
+) -> LocalFit | None:
+    """The model by differences of all samples; None where their noise does not drift.
+
+    Where a controller answers the outputs, its inputs follow the drift as well.
+    """
+    weighed = choices.refine in ("auto", "prediction") and not choices.estimated
+    if whole.method == "pbsid" or not weighed or not choices.initial_states:
+        return None
+    if whole.feedback is None or whole.feedback.found or whole.stability_loss:
+        return None
+    if not may_drift(whole):
+        return None
+    innovations = whole.feedback.innovations
+    same = choices._replace(method=whole.method, differences=True)
+    n_trend = whole.evidence.free.n_trend
+    try:
+        found = _fit(differences(pairs), same, set(told), max(n_trend - 1, 0))
+    except TooFewSamples:
+        return None
+    if choices.offset == "auto":  # where drift begins is anywhere
+        n_trend = max(n_trend, 1)
+    moved, centres = centred(pairs, n_trend, choices.initial_states)
+    moved = [(u @ found.evidence.basis, y) for u, y in moved]
+    scaled = scale_records(moved, n_trend)
+    evidence = of_levels(found.evidence, scaled, n_trend)
+    evidence, offsets = with_levels(evidence, attributed(evidence, centres, pairs))
+    feedback = find_feedback(scaled.records)
+    if feedback is None or feedback.found:
+        return None
+    energy = output_energy(evidence.records) or 1.0
+    other = found._replace(
+        model=evidence.model,
+        residual=float(np.sqrt(evidence.model.loss / energy)),
+        evidence=evidence,
+        feedback=feedback,
+        offsets=offsets,
+        first_model=evidence.model,
+        scaled=scaled,
+    )
+    if found.stability_loss or not drifts(whole, other):
+        return None
+    if lacks(whole.evidence, innovations) or lacks(evidence, feedback.innovations):
+        return None  # errors that inputs explain are no drift
+    held_out = found.selection.held_out
+    if held_out is not None:  # its errors, by those of all differences
+        share = held_out.residual / found.residual
+        held_out = held_out._replace(residual=share * other.residual)
+        selection = replace(found.selection, held_out=held_out)
+        other = other._replace(selection=selection)
+    return other
 
 
 def _tell_of_contradiction(
@@ -474,6 +533,8 @@ def _believable(
         # whoever says which entries of D act knows how the channels were sampled
         said = not isinstance(choices.feedthrough, bool)
         better = not said and of_that.total < _OF_NOISE * error.total
+        # growing modes simulate bounded signals by what is to come of the inputs
+        better &= not open_loop.grows(_CERTAIN)
         unsure = makeshift or (best.grows() and not best.grows(_CERTAIN))
         if unsure and not open_loop.grows():
             better |= of_that.clearly_better_than(error, _DOUBT)

@@ -290,7 +290,7 @@ def _rounded_output(evidence: Evidence) -> tuple[int, float] | None:
 
 def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
     """Tell of a model that explains next to nothing, or only without its stability."""
-    residual = fitted.residual
+    residual, whitening = fitted.residual, fitted.evidence.whitening
     as_found = residual - fitted.stability_loss
     if residual**2 - as_found**2 > _HALF:
         tell(
@@ -301,6 +301,16 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
             f"{100.0 * as_found:.3g} % without. The system seems to be unstable: "
             "identify it with stability='warn', or from a record of bounded outputs, "
             "with the controller's reference as input.",
+        )
+    elif residual > USELESS and len(fitted.model.A) and whitening.of_differences:
+        tell(
+            told,
+            "useless",
+            "The outputs drift, by what the inputs do not do and more than by what "
+            f"they do: the simulation error is {100.0 * residual:.0f} % of their size. "
+            "The model is that of the differences of the samples, and tells how the "
+            "outputs move, not where they stand. Record what makes them drift as an "
+            "input, or use `predict_ahead`.",
         )
     elif residual > USELESS:
         tell(

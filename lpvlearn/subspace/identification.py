@@ -69,6 +69,7 @@ class Settings(NamedTuple):
     compare: bool = True  # whether parts held out may say that other models are better
     # By output the share of errors that repeat those before, as those of rounding do.
     repeated: tuple[float, ...] = ()
+    differences: bool = False  # of samples: most of these may be noise
 
     def max_horizon(self, lengths: Sequence[int]) -> int:
         """Largest horizon whose Hankel columns outnumber its rows (at least 1).

@@ -56,6 +56,8 @@ _LARGEST_RATIO = 1e4
 # Filters and weights that differ by less cost the square of it in efficiency.
 _SAME_FILTER, _SAME_WEIGHT = 0.05, 1.05
 
+_NOTHING = 1e-9  # of a constant: rounding of a filter that takes differences
+
 _LEAST_VARIANCE = 1e-6  # of a combination of outputs of unit variance, for its weight
 
 
@@ -103,6 +105,11 @@ class Whitening(NamedTuple):
     def is_none(self) -> bool:
         """Whether it changes nothing."""
         return len(self.filter) == 1 and _is_identity(self.weight)
+
+    @property
+    def of_differences(self) -> bool:
+        """Whether it leaves nothing of a constant: the noise drifts (`drift`)."""
+        return bool(abs(self.filter.sum()) < _NOTHING)
 
     def is_close_to(self, other: Whitening) -> bool:
         """Whether it would give much the same model as another one."""

@@ -169,10 +169,10 @@ def _stays_far(records: Sequence[Record]) -> bool:
 def follows_means_alone(evidence: Evidence) -> bool:
     """Whether a model without constants explains no more than where outputs stay."""
     stays = not evidence.free.n_trend and _stays_far(evidence.records)
-    return stays and _motion_left(evidence) > USELESS**2
+    return stays and motion_left(evidence) > USELESS**2
 
 
-def _motion_left(evidence: Evidence) -> float:
+def motion_left(evidence: Evidence) -> float:
     """Part of the outputs' motion about their means, squared, that a model leaves."""
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.vstack(simulation_errors(evidence.model, evidence.records))
@@ -207,14 +207,14 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     with zeros. They are kept where they halve the squared errors of as few states:
     these follow the means else, and leave to the noise how outputs move.
     """
-    better = _criterion(without) - _criterion(other)
+    better = criterion_in_units(without) - criterion_in_units(other)
     if better > 0.0 and len(other.model.A) < len(without.model.A):
         return True
     far = _stays_far(without.records)
     few = len(other.model.A) <= min(len(without.model.A), _FEW_STATES)
     decays = spectral_radius(other.model.A) <= 1.0
     if far and few and decays:
-        if _motion_left(other) < _MOSTLY * _motion_left(without):
+        if motion_left(other) < _MOSTLY * motion_left(without):
             return True
     if not better > (-CERTAIN if far else 0.0):
         return False
@@ -231,12 +231,12 @@ def shifts_matter(whole: Evidence, parts: Evidence) -> bool:
     glitches with them, which are no shifts.
     """
     n, kept = (sum(r.u.shape[1] for r in e.records) for e in (whole, parts))
-    if not _criterion(whole) - n / kept * _criterion(parts) > CERTAIN:
+    if not criterion_in_units(whole) - n / kept * criterion_in_units(parts) > CERTAIN:
         return False
     return chance_of_constants(parts, equal=True) < _SIGNIFICANT
 
 
-def _criterion(evidence: Evidence) -> float:
+def criterion_in_units(evidence: Evidence) -> float:
     """That of the orders, of outputs in their units; minus infinity where one is 0."""
     records = evidence.records
     if not np.logical_or.reduce([record.y.any(axis=1) for record in records]).all():

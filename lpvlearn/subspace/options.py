@@ -40,6 +40,7 @@ class Choices(NamedTuple):
     offset: str | None = None  # "auto" is to be chosen
     # of every experiment, (n_samples, n_outputs): outputs that are estimates; none: ()
     estimated: Sequence[NDArray[np.bool_]] = ()
+    differences: bool = False  # whether the samples are those of others
 
     def settings(
         self, n_outputs: int, n_inputs: int, basis: Array, n_trend: int = 0
@@ -58,6 +59,7 @@ class Choices(NamedTuple):
             self.n_noise_states,
             weigh=self.refine in ("auto", "prediction"),
             compare=self.refine == "auto",
+            differences=self.differences,
         )
 
 

@@ -269,7 +269,7 @@ def _search(
         highest = _highest_order(records, horizons, settings)
     wanted = _Range(range(order or 0, highest + 1), horizon, {}, {})
     pilot, slow = _pilot(records, wanted, settings)
-    wanted = wanted._replace(slow=slow)
+    wanted = wanted._replace(slow=slow or settings.differences)
     repeated = tuple(rounded_outputs(pilot, records).repeated)
     settings = settings._replace(repeated=repeated)
     noise = _noise_of(pilot, records, wanted, settings)
@@ -313,6 +313,10 @@ def _search(
 
 def _criterion(one: _Tried) -> float:
     return one.criterion
+
+
+def _loss(model: Realization) -> float:
+    return model.loss
 
 
 def _judged(
@@ -537,9 +541,14 @@ def _try_orders(
         horizon = _best_horizon(starts, refine=True)
         start = starts[horizon]
         slow = slow_starts.best(order) if wanted.slow else None
-        if slow is not None and slow.loss * _LOSS_SLACK[True] < start.loss:
-            start = slow
-        model = refine_simulation(start, records, settings.free, max_iter)
+        # Nearly as good ones may end in different minima where noise is most of both.
+        rivals = [start] if slow is None else [start, slow]
+        worst = min(map(_loss, rivals)) * _LOSS_SLACK[True]
+        rivals = [one for one in rivals if one.loss <= worst] or [start]
+        refined = [
+            refine_simulation(one, records, settings.free, max_iter) for one in rivals
+        ]
+        model = min(refined, key=_loss)
         below = tried[-1].candidate.model if tried else None
         if below is not None and model.loss > _AS_GOOD * below.loss:
             other = _with_more_states(below, records, settings)
@@ -548,7 +557,7 @@ def _try_orders(
         criterion = criterion_of(model, records, settings.free, settings.repeated)
         candidate = Candidate(model, horizon, whitening, True)
         errors = _relative_errors(starts, records)
-        tried.append(_Tried(order, candidate, criterion, errors, start is slow))
+        tried.append(_Tried(order, candidate, criterion, errors, rivals[0] is slow))
         stale = 0 if criterion < best else stale + 1
         best = min(best, criterion)
         known = best <= limit or order >= n_pilot

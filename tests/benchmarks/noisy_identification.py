@@ -13,7 +13,8 @@ them in AR(1) noise. `coverage`: share of true values within 95 % bands of poles
 responses. `awkward`: best fit on fresh data of records that are sampled far too fast,
 rounded, or of many resonances. `disturbances`: best fit on fresh data where noise moves
 the plant itself, or passes through another system, by what the default does and by
-either method.
+either method. `drift`: best fit on fresh data where outputs wander, and where noise is
+slow but stays, and how many standard deviations the static gain is off.
 """
 
 from __future__ import annotations
@@ -347,6 +348,92 @@ def awkward(first: int, n_runs: int = 8) -> None:
         print(f"{name:34s} {mean:5.1f}  {worst:5.1f}  {shown:12s} {took}", flush=True)
 
 
+def drift(first: int, n_runs: int = 12) -> None:
+    """Best fit, and static gains by their deviations, of outputs that wander."""
+    print("time constants to  noise       mean  worst  gains off: median, > 3  CPU s")
+    for slowest in (40.0, 400.0):
+        for kind in _SLOW_NOISE:
+            fits, off, seconds = [], [], 0.0
+            for seed in range(first, first + n_runs):
+                rng = np.random.default_rng(seed)
+                plant = _slow_plant(rng, slowest)
+                n_samples = int(np.exp(rng.uniform(np.log(300), np.log(3000))))
+                u, fresh = (_held_or_not(rng, n) for n in (n_samples, 2000))
+                y, target = plant.simulate(u), plant.simulate(fresh)
+                v = _SLOW_NOISE[kind](rng, n_samples)[:, None]
+                y = y + y.std() * v + 5.0 * y.std() * (rng.random() < 0.5)
+                start = time.process_time()
+                model = SubspaceLTI(sampling_time=1.0).fit(u, y)
+                seconds += time.process_time() - start
+                miss = linalg.norm(target - model.lti_.simulate(fresh))
+                spread = linalg.norm(target - target.mean())
+                fits.append(max(100.0 * (1.0 - miss / spread), 0.0))
+                try:
+                    std = abs(model.frequency_response_std([1e-6]).item())
+                except ValueError:  # kept stable: no deviations
+                    continue
+                gap = model.lti_.frequency_response([1e-6]).item()
+                off.append(abs(gap - plant.frequency_response([1e-6]).item()) / std)
+            print(
+                f"{slowest:17.0f}  {kind:10s} {np.mean(fits):5.1f}  {min(fits):5.1f} "
+                f"{np.median(off):19.1f}, {np.sum(np.array(off) > 3.0):3d}"
+                f"  {seconds / n_runs:5.2f}",
+                flush=True,
+            )
+
+
+def _slow_plant(rng, slowest: float) -> StateSpace:
+    """One to four states: lags of 3 samples to the slowest, modes of 5 to 30."""
+    n, blocks = int(rng.integers(1, 5)), []
+    while sum(map(len, blocks)) < n:
+        if n - sum(map(len, blocks)) > 1 and rng.random() < 0.4:
+            pole = np.exp(complex(-1.0 / rng.uniform(5.0, 30.0), rng.uniform(0.1, 1.0)))
+            blocks.append([[pole.real, pole.imag], [-pole.imag, pole.real]])
+        else:
+            blocks.append([[np.exp(-1.0 / rng.uniform(3.0, slowest))]])
+    A, start = linalg.block_diag(*blocks), 0
+    B, C = rng.standard_normal((n, 1)), rng.standard_normal((1, n))
+    for block in blocks:
+        part = slice(start, start + len(block))
+        P = linalg.solve_discrete_lyapunov(A[part, part], B[part] @ B[part].T)
+        B[part] /= np.sqrt(np.trace(C[:, part] @ P @ C[:, part].T))
+        start += len(block)
+    return StateSpace(A, B, C, None, 1.0)
+
+
+def _held_or_not(rng, n_samples: int) -> Array:
+    """White, held at one of two levels, or slow."""
+    kind = rng.integers(3)
+    if kind == 0:
+        return rng.standard_normal((n_samples, 1))
+    if kind == 1:
+        clock = int(rng.integers(5, 40))
+        levels = rng.choice([-1.0, 1.0], (n_samples // clock + 1, 1))
+        return levels.repeat(clock, axis=0)[:n_samples]
+    return lfilter([0.3], [1, -0.9], rng.standard_normal((n_samples, 1)), axis=0)
+
+
+def _walk(rng, n: int) -> Array:
+    return np.cumsum(rng.standard_normal(n)) / np.sqrt(n)
+
+
+def _lag(pole: float, rng, n: int) -> Array:
+    e = rng.standard_normal(n)
+    return np.sqrt(1.0 - pole**2) * lfilter([1.0], [1.0, -pole], e)
+
+
+# relative to the outputs: walks by what they reach at the end
+_SLOW_NOISE = {
+    "walk": lambda rng, n: 0.5 * _walk(rng, n),
+    "large walk": lambda rng, n: 3.0 * _walk(rng, n),
+    "and white": lambda rng, n: 0.5 * _walk(rng, n) + 0.07 * rng.standard_normal(n),
+    "white": lambda rng, n: 0.1 * rng.standard_normal(n),
+    "AR(.9)": lambda rng, n: 0.2 * _lag(0.9, rng, n),
+    "AR(.99)": lambda rng, n: 0.3 * _lag(0.99, rng, n),
+    "ramp": lambda rng, n: np.linspace(-0.5, 0.5, n) + 0.05 * rng.standard_normal(n),
+}
+
+
 def _too_fast(kind: str, per_period: int, decibel: float):
     """Modes and lags within a decade, so many samples in a period of the fastest."""
 
@@ -433,6 +520,7 @@ STUDIES = {
     "orders": orders,
     "coverage": coverage,
     "disturbances": disturbances,
+    "drift": drift,
 }
 
 if __name__ == "__main__":

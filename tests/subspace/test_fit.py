@@ -318,6 +318,9 @@ def test_a_static_gain_that_is_not_known_is_told():
             warnings.simplefilter("always")
             model = SubspaceLTI(2, offset=None).fit(*slow_in_slow_noise(seed))
         gain = model._evidence.static_gain()
+        if gain is None:  # with a mode as slow as the record
+            assert any("does not decay" in str(w.message) for w in told)
+            continue
         response = model.lti_.frequency_response([0.0])[0].real
         np.testing.assert_allclose(gain.value, response, rtol=1e-9)
         unknown = gain.std.item() > abs(gain.value.item())

@@ -1,0 +1,110 @@
+"""Noise that drifts: plants told by the differences of their samples.
+
+Outputs may wander off by what inputs do not do: temperatures, biases of sensors, loads
+that add up. Of any one record of that a slow state explains a good part, driven by the
+inputs and an initial state of its own, as regressions of one random walk on another do
+(Granger and Newbold, *Journal of Econometrics* 2, 1974); what it gains of the
+likelihood is no chi-square, and the states that the plant has go astray with it. The
+differences of all channels have the same plant,
+
+    ``y[k+1] - y[k] = G(q) (u[k+1] - u[k]) + (v[k+1] - v[k])``,
+
+and a noise that does not wander. Where v does not either, its differences hide slow
+motions: the model of the samples is the better one, and likelier.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.preparation import Pairs
+from .identification import ScaledRecords
+from .local_fit import LocalFit
+from .noise import Whitening
+from .offsets import CERTAIN, criterion_in_units, motion_left
+from .selection import PRICE
+from .signals import shorten
+from .simulation_fit import with_initial_states
+from .statistics import Evidence
+
+Array = NDArray[np.float64]
+
+_FEWEST = 3  # samples of an experiment, for more than one difference
+
+# Time constants per longest experiment: of modes and of noise that may be drift; of
+# noise that may be it beside more noise, of which few lags tell less; of modes that may
+# have followed it, with rates by that of the slowest other mode. Faster ones followed
+# noise that comes back as often as drift.
+_SLOW, _SLOW_BESIDE, _FOLLOWS, _FAR = 30.0, 60.0, 1.0, 0.5
+
+_EXPLAINED = 0.02  # relative error below which drift does not matter
+
+_DIFFERENCE = np.array([1.0, -1.0])  # as a filter
+
+
+def differences(pairs: Pairs) -> Pairs:
+    """Those of consecutive samples, (n_samples - 1, n_channels)."""
+    return [(np.diff(u, axis=0), np.diff(y, axis=0)) for u, y in pairs]
+
+
+def may_drift(fitted: LocalFit) -> bool:
+    """Whether the errors of a model wander, or a mode of it may do so for them."""
+    evidence = fitted.evidence
+    lengths = [record.u.shape[1] for record in evidence.records]
+    if min(lengths) < _FEWEST or motion_left(evidence) < _EXPLAINED**2:
+        return False
+    rates = [_rates(A) for A in (evidence.model.A, evidence.noise.A)]
+    return bool((np.concatenate(rates) * max(lengths) < _SLOW).any())
+
+
+def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
+    """The model of differences as one of the samples themselves.
+
+    These are `scaled`, their inputs in the combinations that the model has.
+    """
+    records, share = shorten(scaled.records)
+    of_inputs = scaled.input_scale / other.input_scale
+    of_outputs = other.output_scale / scaled.output_scale
+    free = other.free._replace(n_trend=n_trend)
+    weight = other.whitening.weight / of_outputs
+    weight = weight / np.linalg.det(weight) ** (1.0 / len(weight))
+    model = other.model._replace(
+        B=other.model.B * of_inputs,
+        C=of_outputs[:, None] * other.model.C,
+        D=of_outputs[:, None] * other.model.D * of_inputs,
+    )
+    return replace(
+        other,
+        model=with_initial_states(model, records, free, weight),
+        records=records,
+        input_scale=scaled.input_scale,
+        output_scale=scaled.output_scale,
+        free=free,
+        whitening=Whitening(np.convolve(_DIFFERENCE, other.whitening.filter), weight),
+        share=share,
+    )
+
+
+def drifts(whole: LocalFit, other: LocalFit) -> bool:
+    """Whether the model of differences, `other`, is to be preferred.
+
+    Where errors wander, what further slow modes gain may be chance; and of equals that
+    model is taken which does not say that it knows where the outputs stand. Else it
+    must be better beyond chance.
+    """
+    better = criterion_in_units(whole.evidence) - criterion_in_units(other.evidence)
+    n_samples = max(record.u.shape[1] for record in whole.evidence.records)
+    if not (_rates(other.evidence.noise.A) * n_samples < _SLOW_BESIDE).any():
+        return better > CERTAIN
+    # modes of the samples that are far slower than those of their differences
+    rates, slowest = _rates(whole.model.A), _rates(other.model.A).min(initial=1.0)
+    n_followed = int((rates < min(_FOLLOWS / n_samples, _FAR * slowest)).sum())
+    return better > -PRICE - CERTAIN * n_followed
+
+
+def _rates(A: Array) -> Array:
+    """Of modes, one over the samples in which they decay, grow or turn."""
+    return np.abs(1.0 - np.linalg.eigvals(A))

@@ -1,0 +1,152 @@
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_allclose
+
+from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn.metrics import bft_score
+from lpvlearn.subspace.drift import differences, of_levels
+from lpvlearn.subspace.fit import _fit
+from lpvlearn.subspace.options import Choices
+
+
+def _plant(slow=30.0, fast=6.0):
+    poles = np.exp([-1.0 / slow, -1.0 / fast])
+    B = (1.0 - poles)[:, None] * [[1.0], [0.4]]
+    return StateSpace(np.diag(poles), B, np.ones((1, 2)), None, 1.0)
+
+
+def _record(seed, n_samples=1_000, drift=0.03, noise=0.05, start=0.0):
+    """Steps of an input, and outputs that wander as far as they answer these."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.choice([-1.0, 1.0], n_samples // 20), 20)[:, None]
+    y = _plant().simulate(u)[:, 0] + start
+    y += drift * np.cumsum(rng.standard_normal(n_samples))
+    return u, y + noise * rng.standard_normal(n_samples)
+
+
+def _fresh_bft(model):
+    u = np.repeat(np.random.default_rng(99).choice([-1.0, 1.0], 100), 20)[:, None]
+    return bft_score(_plant().simulate(u), model.lti_.simulate(u))
+
+
+def _quiet_fit(u, y, **options):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The (outputs drift|response|static gain)")
+        return SubspaceLTI(sampling_time=1.0, **options).fit(u, y)
+
+
+def _of_differences(model):
+    return model._evidence.whitening.of_differences
+
+
+class TestOfLevels:
+    @pytest.mark.parametrize("offset", [None, "constant"])
+    def test_differences_of_exact_samples_tell_the_same_system(self, offset):
+        rng = np.random.default_rng(0)
+        plant = _plant().transform(rng.standard_normal((2, 2)))
+        u = rng.standard_normal((300, 1))
+        y = plant.simulate(u, initial_state=[0.3, -1.0]) + 2.0 * (offset is not None)
+        choices = Choices(order=2, horizon=8, offset=offset)
+        n_trend = int(offset is not None)
+        whole = _fit([(u, y)], choices, set(), n_trend)
+        found = _fit(differences([(u, y)]), choices, set(), 0)
+        evidence = of_levels(found.evidence, whole.scaled, n_trend)
+        omega = np.linspace(1e-3, np.pi, 20)
+        response = evidence.state_space(evidence.model, 1.0)
+        assert_allclose(
+            response.frequency_response(omega),
+            plant.frequency_response(omega),
+            rtol=1e-9,
+        )
+        assert evidence.model.loss < 1e-15  # with initial states and constants
+
+    def test_scales_of_several_channels_are_those_of_the_samples(self):
+        rng = np.random.default_rng(1)
+        A = np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.0], [0.0, 0.0, 0.7]])
+        B, C = rng.standard_normal((3, 2)), rng.standard_normal((2, 3))
+        plant = StateSpace(A, B * [1e3, 1e-2], C * [[1e-5], [1e4]], None, 1.0)
+        u = np.cumsum(rng.standard_normal((400, 2)), axis=0) * [1e-3, 1e2]
+        y = plant.simulate(u)
+        choices = Choices(order=3, horizon=8)
+        whole = _fit([(u, y)], choices, set(), 0)
+        found = _fit(differences([(u, y)]), choices, set(), 0)
+        evidence = of_levels(found.evidence, whole.scaled, 0)
+        assert_allclose(
+            evidence.state_space(evidence.model, 1.0).dc_gain(),
+            plant.dc_gain(),
+            rtol=1e-8,
+        )
+
+
+class TestDriftingOutputs:
+    @pytest.mark.parametrize("order", ["auto", 2])
+    def test_no_slow_state_follows_the_drift(self, order):
+        fits, deviations = [], []
+        for seed in range(5):
+            model = _quiet_fit(*_record(seed), order=order)
+            std = np.abs(model.frequency_response_std([1e-6])).item()
+            error = (model.lti_.dc_gain() - _plant().dc_gain()).item()
+            deviations.append(abs(error) / std)
+            fits.append(_fresh_bft(model))
+            assert (np.abs(1.0 - model.lti_.poles()) * 1_000 > 5.0).all()
+        assert np.median(fits) > 85.0
+        assert min(fits) > 50.0
+        assert np.median(deviations) < 1.5
+        assert max(deviations) < 4.0
+
+    def test_where_the_outputs_stand_does_not_matter(self):
+        models = [_quiet_fit(*_record(3, start=k)) for k in (0.0, 500.0)]
+        gains = [model.lti_.dc_gain().item() for model in models]
+        assert gains[0] == pytest.approx(gains[1], rel=1e-6)
+
+    def test_outputs_drift_apart(self):
+        u, y = _record(0)
+        other = 20.0 * _record(10)[1] - 20.0 * _plant().simulate(_record(10)[0])[:, 0]
+        answer = 20.0 * _plant().simulate(u)[:, 0]
+        model = _quiet_fit(u, np.column_stack([y, answer + other]))
+        assert _of_differences(model)
+        gains = model.lti_.dc_gain().ravel() / [1.0, 20.0]
+        std = np.abs(model.frequency_response_std([1e-6])).ravel() / [1.0, 20.0]
+        assert (np.abs(gains - _plant().dc_gain().item()) < 3.5 * std).all()
+
+    def test_experiments_wander_on_their_own(self):
+        taken = 0
+        for first in (0, 4, 8):
+            parts = [_record(first + k, n_samples=400) for k in range(4)]
+            X = pd.DataFrame({"u": np.vstack([u for u, _ in parts])[:, 0]})
+            X["run"] = np.repeat(np.arange(4), 400)
+            y = np.concatenate([y for _, y in parts])
+            model = _quiet_fit(X, y, experiment="run")
+            taken += _of_differences(model)
+            assert _fresh_bft(model) > 90.0
+        assert taken > 1
+
+    def test_a_model_that_drift_outweighs_is_told_so(self):
+        with pytest.warns(UserWarning, match="The outputs drift.*predict_ahead"):
+            SubspaceLTI(2, sampling_time=1.0).fit(*_record(1, drift=0.3))
+
+
+class TestOutputsThatDoNotDrift:
+    @pytest.mark.parametrize("colour", [0.0, 0.9])
+    def test_slow_modes_are_told_by_the_samples(self, colour):
+        rng = np.random.default_rng(4)
+        u = np.repeat(rng.choice([-1.0, 1.0], 50), 40)[:, None]
+        plant, e = _plant(slow=150.0), rng.standard_normal(2_000)
+        v = np.zeros(2_000)
+        for t in range(1, 2_000):
+            v[t] = colour * v[t - 1] + e[t]
+        y = plant.simulate(u)[:, 0] + 0.2 * v * np.sqrt(1.0 - colour**2)
+        model = SubspaceLTI(sampling_time=1.0).fit(u, y)
+        assert not _of_differences(model)
+        std = np.abs(model.frequency_response_std([1e-6])).item()
+        assert abs((model.lti_.dc_gain() - plant.dc_gain()).item()) < 3.5 * std
+
+    def test_what_was_said_of_the_refinement_is_heeded(self):
+        u, y = _record(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = SubspaceLTI(2, sampling_time=1.0, refine="simulation").fit(u, y)
+        assert not _of_differences(model)
