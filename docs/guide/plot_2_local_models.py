@@ -311,8 +311,8 @@ in_loop.predictor_.K.round(2)
 # %%
 # Does it lack something?
 # -----------------------
-# A fit of whose errors past inputs explain more than a tenth warns: states, a delay or
-# a nonlinearity is missing. ``residual_tests`` says more:
+# A fit of whose errors past inputs explain more than 3 %, beyond chance, warns: states,
+# a delay or a nonlinearity is missing. ``residual_tests`` says more:
 
 local.residual_tests(X, y)
 

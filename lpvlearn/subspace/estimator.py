@@ -440,9 +440,9 @@ class SubspaceLTI(
             If inputs are collinear or do not excite the system sufficiently.
         UserWarning
             If the model is unstable or explains next to nothing of the outputs, if
-            the data come from a closed loop, and if more than a tenth of the errors
-            depends on past inputs (beyond chance, and 1 % of the outputs): the model
-            lacks states, a delay or a nonlinearity.
+            the data come from a closed loop, and if more than 3 % of the errors depend
+            on past inputs (beyond chance, and .3 % of the outputs): the model lacks
+            states, a delay or a nonlinearity.
         """
         self.__dict__.pop("rates_", None)  # of an earlier fit
         if self.integrating is not None:

@@ -80,8 +80,9 @@ _HEAD = 50  # outputs by which an experiment is recognised: measured, hardly the
 _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligible
 
 # A lack is told that explains this share of the errors, is larger than this share of
-# the output, and so improbable by chance; it is looked for in so many samples.
-_MUCH, _MUCH_OF_OUTPUT, _CERTAIN, _MAX_SAMPLES = 0.1, 0.01, 1e-8, 4_096
+# the output, and so improbable by chance; it is looked for in so many samples. Of them
+# it moves a response by more than its stated deviation, or by far more.
+_MUCH, _MUCH_OF_OUTPUT, _CERTAIN, _MAX_SAMPLES = 0.03, 0.003, 1e-6, 4_096
 
 # A spike is so many times what half of the errors stay within (8 standard deviations of
 # Gaussian noise); spikes are told that make this share of the squared errors, in no

@@ -499,8 +499,9 @@ def test_a_small_lack_is_not_told():
     noise = rng.standard_normal(y.shape)
     SubspaceLTI(1, horizon=8).fit(u, y + weak + 0.5 * noise)
     SubspaceLTI(1, horizon=8).fit(u, y + 0.05 * weak)
-    with pytest.warns(UserWarning, match="lacks states"):
-        SubspaceLTI(1, horizon=8).fit(u, y + weak + 0.01 * noise)
+    for size in (0.01, 0.35):  # the lack is all of the errors, or 5 % of their squares
+        with pytest.warns(UserWarning, match="lacks states"):
+            SubspaceLTI(1, horizon=8).fit(u, y + weak + size * noise)
 
 
 @pytest.mark.parametrize("pole", [0.0, 0.9])
