@@ -1,6 +1,7 @@
 """How near the parameters of a gray box are to the Cramer-Rao bound.
 
     python tests/benchmarks/efficiency.py [--runs 40] [--first 0] [--only NAME]
+    python tests/benchmarks/efficiency.py --chain [--runs 5] [--first 0]
 
 Two masses on springs, forces in, positions out, both masses driven by white noise. For
 every way of restructuring: the root mean square, over runs and parameters, of the error
@@ -16,6 +17,10 @@ outputs, whitened by the true noise, ``inv(J^T J)``.
 box that minimises the simulation error. "noise": the same from one whose errors were
 whitened, as `SubspaceLTI` does. "ml": least squares on the whitened outputs, from the
 true parameters.
+
+With `--chain` the same of a whole `LocalLPVPipeline` with its defaults, from tables of
+seven operating points, 400 samples each, between which both springs stiffen: orders and
+horizons are its own.
 """
 
 from __future__ import annotations
@@ -28,10 +33,16 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, SubspaceLTI
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    SubspaceLTI,
+)
 from lpvlearn.pipeline.local_models import _average
 from lpvlearn.pipeline.structured_models import covariance_of_parameters
 from lpvlearn.restructuring.minimise_covariance import efficient_parameters
@@ -90,10 +101,12 @@ def simulated(theta: np.ndarray, u: np.ndarray) -> np.ndarray:
     return STRUCTURE.model(theta).simulate(u, sampling_time=STEP)
 
 
-def experiment(rng: np.random.Generator, case: Case) -> Record:
+def experiment(
+    rng: np.random.Generator, case: Case, theta: np.ndarray = TRUTH
+) -> Record:
     """A fresh input and fresh noise."""
     u = rng.standard_normal((case.n_samples, 2))
-    clean = simulated(TRUTH, u)
+    clean = simulated(theta, u)
     white = rng.standard_normal(clean.shape)
     std = clean.std(axis=0) * case.noise * np.sqrt(1.0 - case.pole**2)
     return Record(u, clean + lfilter([1.0], [1.0, -case.pole], std * white, 0), std)
@@ -205,17 +218,61 @@ def study(name: str, runs: range) -> None:
         )
 
 
+def chain(name: str, runs: range) -> None:
+    """Print what a pipeline with its defaults makes of tables of seven points."""
+    case, begin = CASES[name], time.process_time()
+    stiffening = np.array(TRUTH)[None] * np.ones((7, 1))
+    for parameter, slope in (("k1", 3.0), ("k2", 1.5)):
+        stiffening[:, STRUCTURE.parameter_names.index(parameter)] += slope * np.arange(
+            7
+        )
+    errors, inside = [], []
+    for run in runs:
+        rng = np.random.default_rng([run, *name.encode()])
+        tables, outputs, bounds = [], [], []
+        for point, theta in enumerate(stiffening):
+            record = experiment(rng, case, theta)
+            J = jacobian(theta, [record], case)
+            bounds.append(np.sqrt(np.diag(np.linalg.inv(J.T @ J))))
+            table = pd.DataFrame(record.u, columns=["first", "second"])
+            at = {"time": STEP * np.arange(len(table)), "stiffness": float(point)}
+            tables.append(table.assign(**at, run=point))
+            outputs.append(record.y)
+        pipeline = LocalLPVPipeline(
+            restructurer=GrayBoxRestructurer(STRUCTURE),
+            inputs=["first", "second"],
+            scheduling="stiffness",
+            experiment="run",
+            time="time",
+        ).fit(pd.concat(tables, ignore_index=True), np.vstack(outputs))
+        error = pipeline.parameters_[[*STRUCTURE.parameter_names]] - stiffening
+        errors.append(error.to_numpy() / bounds)
+        inside.append(error.abs() <= 1.96 * pipeline.parameters_std_)
+    error = np.abs(errors)
+    print(
+        f"the chain, {name}: {len(runs)} runs, RMSE / bound "
+        f"{np.sqrt(np.mean(error**2)):.3f}, of a run median "
+        f"{np.median(np.sqrt(np.mean(error**2, axis=(1, 2)))):.3f}, worst "
+        f"{np.sqrt(np.mean(error**2, axis=(1, 2))).max():.3f}; within 95 % "
+        f"{100.0 * np.mean(inside):.1f}; "
+        f"{(time.process_time() - begin) / len(runs):.1f} CPU s each",
+        flush=True,
+    )
+
+
 def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--only", default="")
+    parser.add_argument("--chain", action="store_true")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    for name in CASES:
-        if options.only in name:
-            study(name, range(options.first, options.first + options.runs))
+    part = chain if options.chain else study
+    for name, case in CASES.items():
+        if options.only in name and not (options.chain and case.n_samples > 400):
+            part(name, range(options.first, options.first + options.runs))
 
 
 if __name__ == "__main__":
