@@ -169,6 +169,7 @@ def test_automatic_horizon_is_as_good_as_the_best_of_a_full_scan(method, refine)
         assert auto > max(scan) - 0.3
 
 
+@pytest.mark.slow
 def test_automatic_order_on_the_slow_and_fast_system():
     orders = []
     for seed in range(3):

@@ -1,5 +1,6 @@
 """Missing outputs, estimated by the model that they are missing for."""
 
+import copy
 from contextlib import nullcontext
 
 import numpy as np
@@ -141,8 +142,9 @@ def test_least_squares_of_the_known_errors():
     options = {"horizon": 8, "refine": "simulation", "missing": "estimate"}
     model = SubspaceLTI(4, **options).fit(u, gappy)
 
+    other = copy.deepcopy(model)
+
     def squares(lti):
-        other = SubspaceLTI(4, **options).fit(u, gappy)
         other.lti_ = lti
         left = gappy - other.predict_with_initial_state(u, gappy)
         return np.nansum(left**2)
@@ -187,7 +189,7 @@ def test_inputs_and_outputs_missing_with_delay_and_offset():
     gappy = without(true.simulate(late) + y - true.simulate(u) + 7.0, 0.1)
     some = u.copy()
     some[700:705] = np.nan
-    model = SubspaceLTI(missing="estimate", input_delay="auto").fit(some, gappy)
+    model = SubspaceLTI(4, missing="estimate", input_delay="auto").fit(some, gappy)
     assert model.input_delay_.tolist() == [3]
     assert model.offset_ == "constant"
     levels = model.output_offset_ - model.input_offset_ @ model.lti_.dc_gain().T
@@ -215,7 +217,7 @@ def test_a_plant_in_a_loop():
 def test_residuals_of_gappy_records_are_tested():
     _, u, y = record(7)
     gappy = without(y, 0.2)
-    model = SubspaceLTI(missing="estimate").fit(u, gappy)
+    model = SubspaceLTI(4, missing="estimate").fit(u, gappy)
     assert model.residual_tests(u, gappy)["passed"].all()
     low = SubspaceLTI(2, missing="estimate")
     with pytest.warns(UserWarning, match="depends on past inputs"):
