@@ -35,8 +35,9 @@ _COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 _HELD, _ENOUGH_CHANGES, _LONGEST_HELD = 0.95, 20, 1000
 
 # A signal may be at a limit that stays for so many samples at an extreme value, this
-# many times longer than at any other; this share of it is at others.
-_STAYS, _LONGER, _OTHERS = 10, 3, 0.1
+# many times longer than at any other; this share of it is at others. One that changes
+# in this share of its samples does not stay anywhere by itself.
+_STAYS, _LONGER, _OTHERS, _CHANGES = 10, 3, 0.1, 0.5
 
 # A sample stands out that is this many times as far from the median as this share of
 # others are, of so many at least.
@@ -285,14 +286,15 @@ def held_for(signals: Sequence[Array]) -> int:
     return next(k for k in range(longest, 0, -1) if np.mean(gaps % k == 0) >= _HELD)
 
 
-def stays_at_limits(signals: Sequence[Array]) -> list[list[tuple[int, int]]]:
+def stays_put(signals: Sequence[Array]) -> list[list[tuple[int, int]]]:
     """Where a signal stays at its largest or smallest value, as at a limit.
 
     Start and stop by experiment, of signals (n_samples,). Elsewhere it must be, too,
     and not stay for as long: signals of two values, and coarse ones, are at no limit.
+    Of one that changes all the time else, as sensors of many digits do, any value.
 
     >>> t = np.linspace(0.0, 20.0, 200)
-    >>> stays_at_limits([np.clip(np.sin(t), -1.0, 0.8)])
+    >>> stays_put([np.clip(np.sin(t), -1.0, 0.8)])
     [[(10, 23), (72, 85), (135, 148)]]
     """
     edges = [
@@ -304,12 +306,14 @@ def stays_at_limits(signals: Sequence[Array]) -> list[list[tuple[int, int]]]:
     others = length[~np.isin(value, limits)]
     if others.sum() < _OTHERS * length.sum():
         return [[] for _ in signals]
-    least = max(_STAYS, _LONGER * others.max(initial=1) + 1)
+    changes = np.count_nonzero(length == 1) > _CHANGES * length.sum()
+    longest = 1 if changes else others.max(initial=1)
+    least = max(_STAYS, _LONGER * longest + 1)
     return [
         [
             (int(start), int(stop))
             for start, stop in pairwise(k)
-            if stop - start >= least and y[start] in limits
+            if stop - start >= least and (changes or y[start] in limits)
         ]
         for y, k in zip(signals, edges, strict=True)
     ]

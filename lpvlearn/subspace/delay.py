@@ -139,10 +139,8 @@ def find_delays(
     `order` and `horizon` as of `select`. Experiments have the trends of `settings`,
     whose removal here leaves little for the models to tell.
     """
-    pairs = remove_trends(_head(pairs), DETRENDS[settings.free.n_trend])[0]
-    answers = _answers(pairs)
-    direct = settings.free.direct.any(axis=0)
-    delay = np.where(answers < 0, 0, np.maximum(answers - ~direct, 0))
+    pairs = remove_trends(first_samples(pairs), DETRENDS[settings.free.n_trend])[0]
+    delay = longest_delays(pairs, np.any(settings.free.direct, axis=0))
     if not delay.any():
         return delay
     if settings.method != "pbsid":
@@ -167,8 +165,13 @@ def find_delays(
     return delay
 
 
-def _answers(pairs: Pairs) -> Delay:
-    """`first_answers`, looked for over more lags where there are none."""
+def longest_delays(pairs: Pairs, direct: NDArray[np.bool_]) -> Delay:
+    """Samples after which every input certainly shows in an output; else 0.
+
+    Those that are `direct` (n_inputs,) act through D, others a sample later. They are
+    looked for over more lags where there are none, and no delay is longer.
+    """
+    pairs = first_samples(pairs)
     most = max(len(u) for u, _ in pairs) // _SHARE
     longest = min(LONGEST, most)
     answers = first_answers(pairs, longest)
@@ -176,10 +179,10 @@ def _answers(pairs: Pairs) -> Delay:
     while (answers < 0).any() and longest < most:
         longest = min(2 * longest, most)
         answers = np.where(answers < 0, first_answers(pairs, longest), answers)
-    return answers
+    return np.where(answers < 0, 0, np.maximum(answers - ~direct, 0))
 
 
-def _head(pairs: Pairs) -> Pairs:
+def first_samples(pairs: Pairs) -> Pairs:
     """The first experiments, some thousand samples of them."""
     out, left = [], _MAX_SAMPLES
     for u, y in pairs:
@@ -238,7 +241,7 @@ def find_lead(pairs: Pairs) -> tuple[int, int]:
 
     The latest input that certainly shows in an output, where some are still to come.
     """
-    pairs = _head(pairs)
+    pairs = first_samples(pairs)
     most = min(LONGEST, max(len(u) for u, _ in pairs) // _SHARE)
     answers = first_answers(with_later_inputs(pairs, most), most)
     leads = np.where(answers < 0, 0, most - answers)

@@ -51,7 +51,7 @@ from ..systems.simulation import (
 from ..systems.threads import one_blas_thread
 from ..validation import frequencies, input_delays, naming_argument, one_of
 from .delay import Delay, find_delays, with_late_inputs
-from .fit import fit_pairs
+from .fit import fit_pairs, tell_of_delay
 from .fit_warnings import TESTS, warn_about, warn_about_horizon
 from .integrating import (
     RateEvidence,
@@ -635,6 +635,8 @@ class SubspaceLTI(
         warn_about(fitted, told)
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
+        if known is None and not isinstance(self.input_delay, str) and not delay.any():
+            tell_of_delay(remove_trends(pairs, self.detrend)[0], choices, told, fitted)
         return fitted
 
     def _fit_rates(self, X: Any, y: Any) -> Self:

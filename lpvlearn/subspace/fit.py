@@ -22,8 +22,9 @@ from ..data.preparation import (
     remove_trends,
 )
 from ..exceptions import RankWarning
+from ..systems.simulation import delayed
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
-from .delay import find_lead, with_later_inputs
+from .delay import find_lead, first_samples, longest_delays, with_later_inputs
 from .drift import differences, drifts, may_drift, of_levels
 from .fit_warnings import (
     Doubt,
@@ -84,6 +85,12 @@ _CONTRADICTED, _ROUGH, _MOST_ALONE, _VALUES_EACH = 0.25, 0.1, 6, 10
 
 # Share of the error that is left without samples of inputs that are not answered.
 _ANSWERED = 0.6
+
+# Samples of a delay, or states in its place, that are told: fewer cost next to nothing.
+# The response of the model comes to half its height within so many times a delay, over
+# so many times of which that is looked for, and is not so high yet half the way there.
+_LATE, _FEWER = 3, 2
+_RISEN, _WHOLE, _EARLY = 4, 20, 0.25
 
 # Lags of a noise that may be more than that of a sensor; samples of which more tell the
 # plant without it.
@@ -304,6 +311,74 @@ def _tell_of_input_spikes(
             f"{100.0 * whole.residual:.2g} %. If they were logged wrongly, replace "
             "them by NaN and use missing='split', or by what was sent.",
         )
+
+
+def tell_of_delay(
+    pairs: Pairs, choices: Choices, told: set[str], whole: LocalFit
+) -> None:
+    """Tell of inputs that arrive late, where no delay was asked for.
+
+    Each sample of a delay takes a state, or blurs the response. The first answer that
+    is certain may come later than the input arrives: with that much delay a model must
+    simulate parts held out clearly better, or no worse with fewer states.
+    """
+    if whole.method == "pbsid" or choices.estimated or "delay" in told:
+        return
+    pairs = first_samples(pairs)
+    channels = pairs[0][1].shape[1], pairs[0][0].shape[1]
+    direct = np.broadcast_to(choices.feedthrough, channels)
+    delay = longest_delays(pairs, np.any(direct, axis=0))
+    cut = int(delay.max())
+    # A model that lacks something tells nothing of how the plant begins to answer.
+    if cut < _LATE or not ("lack" in told or _answers_late(whole, cut)):
+        return
+    n_trend = whole.evidence.free.n_trend
+    given = choices._replace(method=whole.method, offset=DETRENDS[n_trend])
+    late = [(delayed(u, delay)[cut:], y[cut:]) for u, y in pairs if len(u) > cut + 1]
+    early = [(u[cut:], y[cut:]) for u, y in pairs if len(u) > cut + 1]
+    try:
+        other = _fit(late, given, set(told), n_trend)
+        first = _fit(early, whole.chosen(choices), set(told), n_trend)
+    except TooFewSamples:
+        return
+    error, found = _held_out(first, given), _held_out(other, given)
+    n_saved = first.selection.order - other.selection.order
+    better = n_saved >= _FEWER and not error.clearly_better_than(found, 0.0)
+    if not better and not found.clearly_better_than(error, _DOUBT):
+        return
+    orders = other.selection.order, first.selection.order
+    if better:
+        what = f"does as well on parts held out as this one of order {orders[1]}"
+    else:
+        what = (
+            f"simulates {found.bft:.3g} % of parts held out, this one {error.bft:.3g} %"
+        )
+    tell(
+        told,
+        "delay",
+        f"Input {int(delay.argmax()) + 1} shows in the outputs only after {cut} "
+        f"samples. With a delay in its place a model of order {orders[0]} {what}. Use "
+        "input_delay='auto', or give the samples of the delay.",
+    )
+
+
+def _answers_late(fitted: LocalFit, delay: int) -> bool:
+    """Whether the impulse response of a model may be that of a delay.
+
+    Of a slow system the first samples are as small, beside what comes later.
+    """
+    A, B, C, D = fitted.model[:4]
+    states, steps = B, []
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_WHOLE * delay):
+            steps.append(np.abs(C @ states).max(axis=0))
+            states = A @ states
+    heights = np.vstack([np.abs(D).max(axis=0), *steps])
+    if not np.isfinite(heights).all():
+        return False
+    heights = heights / np.maximum(heights.max(axis=0), np.finfo(float).tiny)
+    late = (heights[: delay // 2 + 1] < _EARLY).all(axis=0)
+    return bool((late & (heights[: _RISEN * delay] > 0.5).any(axis=0)).any())
 
 
 def _without_shifts(

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import constant_columns, held_for, stays_at_limits
+from ..data.preparation import constant_columns, held_for, stays_put
 from ..exceptions import RankWarning, warn
 from .held_out import HeldOut
 from .identification import Settings
@@ -32,6 +32,8 @@ TESTS = {"held out", "orders", "static gain", "response", "decay", "lack"}
 
 # Share of its motion by which a model moves where an output stays, and of the samples
 _MOVES_ON, _AT_LIMITS = 0.05, 0.01
+
+_SOME = 3  # values that are listed
 
 _HALF = 0.5  # share of their energy that enforced stability must cost to be reported
 # Share of its fit (one less the relative error) that parts held out must confirm; with
@@ -101,11 +103,9 @@ def tell_of_held_outputs(outputs: Sequence[Array], told: set[str]) -> None:
 
 
 def tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) -> None:
-    """Tell of an output that stays at a limit where its model moves on."""
+    """Tell of an output that stays where it is though its model moves on."""
     model, records = fitted.evidence.model, fitted.scaled.records
-    stays = [
-        stays_at_limits([y[:, i] for y in outputs]) for i in range(outputs[0].shape[1])
-    ]
+    stays = [stays_put([y[:, i] for y in outputs]) for i in range(outputs[0].shape[1])]
     if not any(map(any, stays)) or len(model.initial_states) != len(records):
         return
     with np.errstate(over="ignore", invalid="ignore"):
@@ -120,14 +120,17 @@ def tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) -
         ]
         n_passed = sum(n for _, n in passed)
         if n_passed > _AT_LIMITS * sum(map(len, outputs)):
-            values = ", ".join(f"{v:.6g}" for v in sorted({v for v, _ in passed}))
+            values = sorted({v for v, _ in passed})
+            some = ", ".join(f"{v:.6g}" for v in values[:_SOME])
+            some += ", ..." if len(values) > _SOME else ""
             tell(
                 told,
                 "limit",
-                f"Output {i + 1} stays at {values} for {n_passed} samples in which "
+                f"Output {i + 1} stays at {some} for {n_passed} samples in which "
                 "its model moves on: it is at a limit, of its sensor or of the plant, "
-                "as no linear system has one. Record within the limits, or use NaN "
-                "for them and missing='estimate', and compare.",
+                "or its sensor hangs, as no linear system does. Record within the "
+                "limits, or use NaN for these samples and missing='estimate', and "
+                "compare.",
             )
 
 

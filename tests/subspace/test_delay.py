@@ -1,5 +1,8 @@
 """Input delays: given, found, and from batch to batch."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -120,7 +123,10 @@ def test_residuals_tell_of_a_delay_that_is_missing():
     tests = estimator().fit(u, y).residual_tests(u, y, n_lags=10)
     assert tests["passed"].all()
     wrong = estimator(input_delay=0, horizon=10)
-    with pytest.warns(UserWarning, match="lacks states, a delay"):
+    with (
+        pytest.warns(UserWarning, match="shows in the outputs only after 4"),
+        pytest.warns(UserWarning, match="lacks states, a delay"),
+    ):
         wrong.fit(u, y)
     tests = wrong.residual_tests(u, y, n_lags=10).set_index("test")
     assert not tests.loc["past inputs", "passed"].all()
@@ -378,6 +384,32 @@ def test_first_answers_need_evidence_for_each_input():
 
 
 # -- refused ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ["auto", 2])
+def test_a_delay_that_nobody_asked_for_is_told(order):
+    rng = np.random.default_rng(0)
+    u = rng.choice([-1.0, 1.0], (300, 2)).repeat(4, axis=0)
+    late = np.r_[np.zeros(12), u[:-12, 1]]
+    y = lfilter([0.0, 0.1], [1.0, -1.6, 0.7], u[:, 0] - late)
+    y += 0.1 * rng.standard_normal(len(y))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        SubspaceLTI(order).fit(u, y)
+    text = "".join(str(w.message) for w in told)
+    assert text.count("shows in the outputs") == 1
+    assert re.search(r"Input 2 .* 1[23] samples.* order 2 .*input_delay='auto'", text)
+    model = SubspaceLTI(order, input_delay="auto").fit(u, y)  # silently
+    assert model.order_ == 2
+    assert abs(model.input_delay_ - [0, 12]).max() <= 1
+
+
+def test_a_slow_answer_is_no_delay():
+    rng = np.random.default_rng(1)
+    u = rng.choice([-1.0, 1.0], (40, 1)).repeat(50, axis=0)
+    y = lfilter([1e-6], np.poly([0.99, 0.98, 0.97]), u[:, 0])
+    y += 0.05 * y.std() * rng.standard_normal(len(y))
+    SubspaceLTI().fit(u, y)  # silently
 
 
 @pytest.mark.parametrize("delay", [-1, 1.5, [1, 2, 3], "some"])

@@ -200,7 +200,8 @@ def test_pure_gain_and_pure_delay(rng):
     assert model.order_ == 0
     np.testing.assert_allclose(model.lti_.D, gain, atol=1e-10)
     delayed = np.vstack([np.zeros((3, 1)), u[:-3, :1]])
-    model = SubspaceLTI().fit(u[:, :1], delayed)
+    with pytest.warns(UserWarning, match="only after 3 samples"):
+        model = SubspaceLTI().fit(u[:, :1], delayed)
     assert model.order_ == 3
     np.testing.assert_allclose(model.predict(u[:, :1]), delayed, atol=1e-6)
 
