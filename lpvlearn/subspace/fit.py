@@ -334,8 +334,10 @@ def tell_of_delay(
         return
     n_trend = whole.evidence.free.n_trend
     given = choices._replace(method=whole.method, offset=DETRENDS[n_trend])
-    late = [(delayed(u, delay)[cut:], y[cut:]) for u, y in pairs if len(u) > cut + 1]
-    early = [(u[cut:], y[cut:]) for u, y in pairs if len(u) > cut + 1]
+    known = slice(cut if choices.initial_states else 0, None)  # from rest, all are
+    pairs = [(u, y) for u, y in pairs if len(u) > cut + 1]
+    late = [(delayed(u, delay)[known], y[known]) for u, y in pairs]
+    early = [(u[known], y[known]) for u, y in pairs]
     try:
         other = _fit(late, given, set(told), n_trend)
         first = _fit(early, whole.chosen(choices), set(told), n_trend)

@@ -386,8 +386,9 @@ def test_first_answers_need_evidence_for_each_input():
 # -- refused ---------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("start", ["estimate", "rest"])
 @pytest.mark.parametrize("order", ["auto", 2])
-def test_a_delay_that_nobody_asked_for_is_told(order):
+def test_a_delay_that_nobody_asked_for_is_told(order, start):
     rng = np.random.default_rng(0)
     u = rng.choice([-1.0, 1.0], (300, 2)).repeat(4, axis=0)
     late = np.r_[np.zeros(12), u[:-12, 1]]
@@ -395,7 +396,7 @@ def test_a_delay_that_nobody_asked_for_is_told(order):
     y += 0.1 * rng.standard_normal(len(y))
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        SubspaceLTI(order).fit(u, y)
+        SubspaceLTI(order, initial_state=start).fit(u, y)
     text = "".join(str(w.message) for w in told)
     assert text.count("shows in the outputs") == 1
     assert re.search(r"Input 2 .* 1[23] samples.* order 2 .*input_delay='auto'", text)
