@@ -18,10 +18,12 @@ from ..systems.least_squares import column_scale
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-# Singular values smaller than that part of the largest are rounding: responses and
-# their derivatives are exact to about 1e-13, behind resolvents less so.
-_RANK_TOLERANCE = 1e-9
-_DIGITS = 1e-12  # of a response, that are lost where its terms cancel
+# Singular values smaller than that part of the largest may be rounding, and are below
+# the second one, at a few units in the last place. Between them they are where a change
+# of the response by its rounding, 1e-13 or, where terms cancel, ten times as much,
+# moves a parameter by its own size: a high condition alone is told as such.
+_RANK_TOLERANCE, _ZERO = 1e-9, 1e-14
+_DIGITS = 1e-12
 _NAMED = 0.1  # smaller parts of an undetermined combination would only clutter its name
 
 
@@ -120,8 +122,12 @@ def undetermined_steps(J: Complex, level: Array | float) -> Array:
     level = np.broadcast_to(level, (k,))
     size = np.maximum(level, _DIGITS * np.linalg.norm(J.reshape(k, -1), axis=1))
     unit, s, Vt = _scaled_svd(J / np.where(size > 0, size, 1.0)[:, None, None, None])
-    rank = int((s > _RANK_TOLERANCE * s.max(initial=0.0)).sum())
-    return np.asarray(Vt[rank:] / unit)
+    steps = Vt / unit
+    with np.errstate(divide="ignore", over="ignore"):  # along zero without end
+        moved = _DIGITS * np.sqrt(k) * np.abs(steps).max(1, initial=0.0) / s
+    part = s / (s.max(initial=0.0) or 1.0)
+    open_ = (part <= _ZERO) | (part <= _RANK_TOLERANCE) & (moved >= 1.0)
+    return np.asarray(steps[open_])
 
 
 def _scaled_svd(J: Complex) -> tuple[Array, Array, Array]:

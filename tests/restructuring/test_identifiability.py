@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from lpvlearn import GrayBoxStructure
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn.exceptions import RankWarning
 from lpvlearn.restructuring.identifiability import Identifiability
 from lpvlearn.restructuring.problem import problem_from_models
 from lpvlearn.restructuring.uncertainty import ParameterUncertainty
@@ -163,6 +164,30 @@ def test_a_canonical_form_of_any_order_is_identifiable(order):
     structure = GrayBoxStructure.observable_canonical(order)
     found = identified(structure, np.r_[-a[::-1], b])
     assert found.rank == 2 * order and found.directions == ()
+
+
+@pytest.mark.parametrize("seed", [0, 3, 11])
+def test_a_high_condition_is_no_deficiency(seed):
+    """Coefficients that are recovered are determined; those of one state more are not.
+
+    Singular values go down to 3e-14 here, and to 1e-16 there.
+    """
+    rng = np.random.default_rng(seed)
+    n = 7 + seed % 2
+    A = rng.normal(size=(n, n))
+    A -= (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(n)
+    box = StateSpace(A, rng.normal(size=(n, 1)), rng.normal(size=(1, n)))
+    fitted = GrayBoxRestructurer().fit_model(box)
+    found = fitted.identifiability_
+    a = dict(zip(fitted.structure_.parameter_names, fitted.params_, strict=True))
+    exact = np.poly(A)[:0:-1]
+    recovered = [-a[f"a{n}_{j + 1}"] for j in range(n)]
+    np.testing.assert_allclose(recovered, exact, rtol=1e-6)
+    assert found.rank == found.n_params and 1e8 < found.condition < 1e13
+    more = GrayBoxStructure.observable_canonical(n + 1)
+    with pytest.warns(RankWarning, match="does not change along"):
+        found = GrayBoxRestructurer(more).fit_model(box).identifiability_
+    assert found.rank == 2 * n + 1
 
 
 def test_a_common_factor_shows_all_its_names():
