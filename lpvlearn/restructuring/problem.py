@@ -51,6 +51,7 @@ _SAME_COST = 1e-4  # relative difference of the costs of fits in one basin: it i
 # a rate that no response down to the lowest frequency could show.
 _LEAST_DECAY = 1e-4
 
+_LEAST_NORM = 1e-150  # of a black box: squares of smaller ones leave the numbers
 _SAME = 1e-6  # relative difference of delays that is rounding
 
 
@@ -294,6 +295,8 @@ def problem_from_models(
     parts = (target.A, target.B, target.C, target.D)
     if system.weight is not None:
         parts = series(*parts, system.weight)
+    reference = hinf_norm(*parts, dt=dt).norm
+    _check_size(reference)
     bound = 0.0
     plain = division is None and filter_ is None
     if len(models) == 1 and plain and len(first.A) > structure.order:
@@ -304,7 +307,7 @@ def problem_from_models(
         boxes[0],
         system.grid,
         natural_margin(target),
-        hinf_norm(*parts, dt=dt).norm,
+        reference,
         first.D - boxes[0].D,
         bound,
         first.input_delay,
@@ -312,6 +315,16 @@ def problem_from_models(
         division,
         lacks_poles=lacks_poles,
     )
+
+
+def _check_size(norm: float) -> None:
+    if not norm > _LEAST_NORM:
+        raise ValueError(
+            "`model` must have a response that is not zero where it is compared: "
+            f"nothing tells the parameters then. Got one of the norm {norm:.3g}. Name "
+            "inputs that move the outputs, give the structure a feedthrough if the "
+            "model is a gain, or choose other units if it is only small."
+        )
 
 
 def _check_stable(box: Target) -> None:

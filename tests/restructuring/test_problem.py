@@ -173,3 +173,10 @@ def test_realizations_are_models_of_the_same_channels_and_time(other):
         GrayBoxRestructurer(spring_structure()).fit_model(
             box, realizations=[box, other]
         )
+
+
+@pytest.mark.parametrize(("b", "c"), [(0.0, 1.0), (1e-200, 1e-150), (1e-160, 1.0)])
+def test_a_black_box_of_no_response_is_refused(b, c):
+    box = StateSpace([[0, 1], [-4, -0.5]], [[0], [b]], [[c, 0]])
+    with pytest.raises(ValueError, match="must have a response that is not zero"):
+        GrayBoxRestructurer(spring_structure()).fit_model(box)
