@@ -32,6 +32,9 @@ Complex = NDArray[np.complex128]
 # that length all the same: further along them its second derivative takes over.
 _METRIC_CAP = 1e-3
 _FIT_CAP = 1e-5  # the same for the H2 norm, whose steps are straight
+# A unit step is no longer than that, relative to a parameter (or one): at a flat point,
+# as q = 0 of q^2, its derivative would ask for one without end.
+_FARTHEST = 1e8
 _REACH = 2.0  # change of the logarithm of a distance to a bound in a unit step
 _DAMPING = 1e-5  # of the acceleration along directions that the response hardly sees
 _BENT = 1.0  # part of a step that its bend may be at most
@@ -108,9 +111,9 @@ class ResponseGeometry:
         if pull is not None:
             metric = metric + pull.T @ pull / _REACH**2
         unit = _units(np.sqrt(np.diag(metric)))
+        unit = np.maximum(unit, 1.0 / (_FARTHEST * np.maximum(np.abs(theta), 1.0)))
         squares, V = np.linalg.eigh(metric / unit / unit[:, None])
-        s = np.sqrt(np.maximum(squares, _METRIC_CAP**2 * squares.max(initial=0.0)))
-        s = np.where(s > 0, s, 1.0)
+        s = np.sqrt(np.maximum(squares, _METRIC_CAP**2 * squares.max(initial=1.0)))
         self.T = V / s / unit[:, None]
         self.inverse = (V * s).T * unit
         self._gram = self.T.T @ gram @ self.T + _DAMPING * np.eye(q)

@@ -249,9 +249,10 @@ class ErrorSystem:
 
     def poles(self, theta: Array) -> Complex:
         """Poles of the gray-box model; infinite where its matrices are not finite."""
-        A = self.split(self.structure.system_matrix(theta))[0]
-        if not np.isfinite(A).all():
-            return np.full(self.n, np.inf + 0j)
+        S = self.structure.system_matrix(theta)
+        if not np.isfinite(S).all():
+            return np.full(max(self.n, 1), np.inf + 0j)
+        A = self.split(S)[0]
         return np.linalg.eigvals(A).astype(complex)
 
     def resonances(self, poles: Complex) -> Array:

@@ -8,6 +8,7 @@ fits.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -61,6 +62,10 @@ _FAINT = 0.03  # size of modes that only fill the order: seen, but hardly distur
 _FAST = 3.0  # decay of these modes, relative to the fastest: they are out of the way
 _EXACT_PARTS = 1e-6  # distance of a start by parts that the black box itself is
 _SLOWEST = 1e-9  # poles smaller than that part of the largest are integrators
+
+# A parameter is at a flat point where a change of its size, one at least, changes the
+# response by less; decades about one of its starts elsewhere.
+_FLAT, _DECADES = 1e-4, 3.0
 
 # Starts at each time scale that are carried through a continuation: its steps cost as
 # much as a fit each, and a wrong size does it no harm.
@@ -246,6 +251,9 @@ def _candidates(
     if drawn is not None and guess is None:
         known = [] if structure.initial is None else [structure.initial[None]]
         rows += [*known, drawn]
+    begun = structure.initial if guess is None else guess
+    if begun is not None:
+        rows.append(_off_flat_points(problem, begun, n_starts, rng))
     found = np.vstack(rows)
     if smoother:
         continued = continuation_candidates(structure, box, found, rng)
@@ -254,6 +262,27 @@ def _candidates(
         more = continuation_candidates(structure, box, found, rng, thorough=True)
         found = np.vstack([found, more])
     return found
+
+
+def _off_flat_points(
+    problem: RestructuringProblem, theta: Array, count: int, rng: np.random.Generator
+) -> Array:
+    """Starts from `theta` whose parameters of no effect there are of any size.
+
+    As q = 0 in a gain of 1 + q^2: no derivative leads away, and no factor. None where
+    all have an effect.
+    """
+    with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
+        G, J = problem.system.response_jacobian(theta, problem.omega)
+        size = max(np.linalg.norm(G), np.linalg.norm(problem.response))
+        effect = np.linalg.norm(J.reshape(-1, len(theta)), axis=0)
+        flat = effect * np.maximum(np.abs(theta), 1.0) <= _FLAT * size
+        if flat.any():
+            shape = count, len(theta)
+            anywhere = 10.0 ** rng.uniform(-_DECADES, _DECADES, shape)
+            anywhere *= rng.choice([-1.0, 1.0], shape)
+            return np.where(flat, anywhere, drawn_around(theta, count, rng))
+    return np.zeros((0, len(theta)))
 
 
 def _reduced_otherwise(

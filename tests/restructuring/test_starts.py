@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from sklearn.exceptions import ConvergenceWarning
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn.exceptions import RankWarning
 from lpvlearn.restructuring import starts
 from lpvlearn.restructuring.problem import problem_from_models
 from lpvlearn.restructuring.starts import continuation_candidates, hopped_fits
@@ -146,3 +148,27 @@ def test_later_starts_of_a_canonical_form_are_other_reductions(dt):
     spring = problem_from_models(spring_structure(), [two_modes()], None)
     fits = [spring.fit(np.array([1.0, 0.1, 1.0]))]
     assert starts._reduced_otherwise(spring, fits, 1) is None
+
+
+def gain_of_a_square(q):
+    return [[-1.0]], [[1.0]], [[1.0 + q[0] ** 2]]
+
+
+@pytest.mark.parametrize("guess", [0.0, 1e-12, 1e-9, 0.1])
+@pytest.mark.parametrize("init", ["similarity", "guess"])
+def test_a_flat_point_is_left(guess, init):
+    """At q = 0 the derivative of 1 + q^2 is zero, and near it steps are too long."""
+    structure = GrayBoxStructure.from_function(gain_of_a_square, [guess])
+    box = structure.model([2.0])
+    given = "similarity" if init == "similarity" else [guess]
+    fitted = GrayBoxRestructurer(structure, init=given).fit_model(box)
+    assert fitted.relative_error_ < 1e-9
+    assert abs(fitted.params_[0]) == pytest.approx(2.0)
+
+
+def test_a_flat_point_that_is_the_optimum_is_kept():
+    structure = GrayBoxStructure.from_function(gain_of_a_square, [1e-9])
+    with pytest.warns((ConvergenceWarning, RankWarning)):
+        fitted = GrayBoxRestructurer(structure).fit_model(StateSpace(-1, 1, 0.5))
+    assert fitted.error_ == pytest.approx(0.5)
+    assert fitted.lower_bound_ == 0.0
