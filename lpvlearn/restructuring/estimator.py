@@ -53,6 +53,7 @@ from .minimise_covariance import (
 from .minimise_h2 import minimise_h2
 from .minimise_hinf import SOLVERS, is_saddle, minimise_hinf, promising
 from .problem import (
+    CLEAN_FIT,
     EXACT_FIT,
     FrequencyWeight,
     RestructuringProblem,
@@ -102,11 +103,6 @@ _DRAWS = 32  # of the noise: standard deviations to an eighth
 _EFFORT = 512  # realizations times parameters, of which more are left out beyond these
 
 _SEARCH_SHARE = 0.7  # of `max_time`, for the starts: the rest is the minimisation's
-
-# An error is exact that is rounding: of that size, relative to the black box (responses
-# are known to 1e-13: no certificate of a thousandth stands on less), or of so many
-# units in the last place of all entries (at most what counts as an exact fit).
-_ROUNDING, _UNITS = 1e-10, 3.0
 
 
 class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
@@ -734,11 +730,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 problem.structure, problem.box, fits[0].x, self.max_iter
             )
             return *found, 0.0
-        units = _UNITS * system.rounding(fits[0].x) / max(problem.reference, 1e-300)
+        rounding = max(CLEAN_FIT, problem.rounding(fits[0].x))
         options: dict[str, Any] = {
             "max_iter": self.max_iter,
             "tol": self.tol,
-            "negligible": problem.reference * max(_ROUNDING, min(units, EXACT_FIT)),
+            "negligible": problem.reference * rounding,
         }
         if self.norm == "h2":
             runs = [minimise_h2(system, f, margin, **options) for f in promising(fits)]

@@ -20,6 +20,7 @@ from ..models.statespace import DEVIATION, StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
 from ..validation import weights
+from .coordinates import CanonicalForm, view_at
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, series
 from .known_poles import Division, divide
@@ -28,7 +29,7 @@ from .least_squares import (
     channel_scaling,
     fit_frequency_response,
 )
-from .limits import growth, keeps_margin, natural_margin
+from .limits import Limits, growth, keeps_margin, natural_margin
 from .measured import (
     MeasuredErrorSystem,
     read_frequency_data,
@@ -43,6 +44,12 @@ FrequencyWeight = StateSpace | Sequence[float | None] | None
 
 GOOD_FIT = 3e-3  # relative least-squares error that a wrong basin seldom comes down to
 EXACT_FIT = 1e-8  # and one that is rounding: nothing is better
+CLEAN_FIT = 1e-10  # responses are known to 1e-13: no certificate stands on less
+
+# An error is rounding, too, of so many units in the last place of all entries, at most
+# of that size: forms of many states hold no more digits.
+_UNITS, _MOST_ROUNDING = 3.0, 1e-6
+_STALLED = 1e-4  # error at which a canonical form may stop for its coordinates alone
 AGREEING = 2  # starts that end at the best fit: it is taken for the best there is
 _LONGER = 3  # times as many fits where the best one is good, but no other ends there
 _SAME_COST = 1e-4  # relative difference of the costs of fits in one basin: it is 1e-6
@@ -105,10 +112,47 @@ class RestructuringProblem:
     ) -> LeastSquaresResult | None:
         """Least-squares fit of the response from given parameters; None if unstable."""
         fit = self._fit(theta, scaling, False)
-        if fit is None or not EXACT_FIT < fit.relative_error <= GOOD_FIT:
+        if fit is not None and EXACT_FIT < fit.relative_error <= GOOD_FIT:
+            # it may have stopped on the way along a curved valley
+            fit = self._fit(fit.x, scaling, True)
+        if fit is None or fit.relative_error > _STALLED or np.ndim(scaling):
             return fit
-        # it may have stopped on the way along a curved valley
-        return self._fit(fit.x, scaling, True)
+        return self._locally(fit)
+
+    def rounding(self, theta: Array) -> float:
+        """The relative error that rounding makes of both models."""
+        units = _UNITS * self.system.rounding(theta) / max(self.reference, 1e-300)
+        return min(units, _MOST_ROUNDING)
+
+    def is_exact(self, fit: LeastSquaresResult, enough: float = EXACT_FIT) -> bool:
+        """Whether nothing is better: an error of at most `enough`, or of rounding."""
+        error = fit.relative_error
+        if not enough < error <= _MOST_ROUNDING:
+            return error <= enough
+        return error <= self.rounding(fit.x)
+
+    def _locally(self, fit: LeastSquaresResult) -> LeastSquaresResult:
+        """A fit of a canonical form, ended in coordinates of the models near it.
+
+        The coefficients of many states are so badly conditioned that the fit stops
+        short of what they can hold.
+        """
+        rounding = max(CLEAN_FIT, self.rounding(fit.x)) * self.reference
+        if self.system.values(fit.x, self.omega).max() <= rounding:
+            return fit
+        form = CanonicalForm.of(self.system, fit.x)
+        view = view_at(self.system, fit.x, Limits(self.system, self.margin), form)
+        if form is None or view.system is self.system:
+            return fit
+        near = fit_frequency_response(
+            view.system, view.theta, self.omega, admissible=view.limits.admissible
+        )
+        if near is None:
+            return fit
+        S = view.system.structure.system_matrix(near.x)
+        theta = form.refined(S, self.omega)
+        found = None if theta is None else self._fit(theta, 1.0, False)
+        return found if found is not None and found.cost < fit.cost else fit
 
     def _fit(
         self, theta: Array, scaling: Array | float, geodesic: bool
@@ -153,7 +197,9 @@ class RestructuringProblem:
         for number, theta in enumerate(thetas[: _LONGER * n_fits]):
             best = min((f.relative_error for f in fits), default=np.inf)
             together = agreeing([*known, *fits])
-            if best <= enough or best <= GOOD_FIT and together >= AGREEING:
+            if best <= GOOD_FIT and together >= AGREEING:
+                break
+            if any(self.is_exact(fit, enough) for fit in fits):
                 break
             if best > GOOD_FIT and number >= n_fits:
                 break

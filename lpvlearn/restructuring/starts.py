@@ -180,7 +180,8 @@ def _rounds(
         ends += sorted(more, key=_COST)[:1]
         fits = sorted(fits + more, key=_COST)
         best = fits[0].relative_error if fits else np.inf
-        certain = linear or best <= enough or agreeing(ends) >= AGREEING
+        exact = bool(fits) and problem.is_exact(fits[0], enough)
+        certain = linear or exact or agreeing(ends) >= AGREEING
         if certain and best <= max(_FAR_FIT, enough) or (fits and time_is_up()):
             break
     if fits and best > _HOP_FIT:

@@ -180,3 +180,24 @@ def test_a_black_box_of_no_response_is_refused(b, c):
     box = StateSpace([[0, 1], [-4, -0.5]], [[0], [b]], [[c, 0]])
     with pytest.raises(ValueError, match="must have a response that is not zero"):
         GrayBoxRestructurer(spring_structure()).fit_model(box)
+
+
+@pytest.mark.filterwarnings("ignore::lpvlearn.exceptions.RankWarning")
+def test_a_form_of_many_states_ends_where_its_coefficients_do():
+    """What is left is rounding, though far above that of a response."""
+    rng = np.random.default_rng(2)
+    w, z = 10 ** rng.uniform(-0.75, 0.75, (2, 12))
+    poles = w * np.exp(1j * (np.pi - np.arccos(np.minimum(0.03 * z, 0.5))))
+    A = np.zeros((24, 24))
+    for i, pole in enumerate(poles):
+        A[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [
+            [pole.real, pole.imag],
+            [-pole.imag, pole.real],
+        ]
+    box = StateSpace(A, rng.normal(size=(24, 3)), rng.normal(size=(3, 24)))
+    box = box.transform(rng.normal(size=(24, 24)))
+    structure = GrayBoxStructure.observable_canonical(24, 3, 3)
+    fitted = GrayBoxRestructurer(structure).fit_model(box)
+    problem = problem_from_models(structure, [box], None)
+    assert 1e-10 < fitted.relative_error_ <= problem.rounding(fitted.params_)
+    assert fitted.n_iter_ == 0
