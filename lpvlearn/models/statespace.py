@@ -210,7 +210,10 @@ class StateSpace:
 
     @property
     def is_stable(self) -> bool:
-        """True if all poles are strictly inside the stability region."""
+        """True if all poles are strictly inside the stability region, however near.
+
+        Nearer than 1e-13 of its size a pole counts as on the border to `hinf_norm`.
+        """
         return bool((self._growth(self.poles()) < 0).all())
 
     def _growth(self, poles: NDArray[np.complex128]) -> Array:
