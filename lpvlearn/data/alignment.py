@@ -1,4 +1,4 @@
-"""Outputs beside the rows of X: as many, and under the same labels."""
+"""Outputs beside the rows of X and the columns of a fit, by their labels."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from sklearn.utils.validation import check_consistent_length
 from ..exceptions import warn
 from ..validation import naming_argument
 
-_POSITIONS = "y.to_numpy() if the rows belong together as they stand"
 
-
-def align_outputs(X: Any, y: Any) -> Any:
-    """`y` in the order of the rows of `X`.
+def align_outputs(
+    X: Any, y: Any, estimator: Any = None, *, names: tuple[str, str] = ("X", "y")
+) -> Any:
+    """`y` in the order of the rows of `X`, its columns in that of a fitted estimator.
 
     Rows belong together as they stand, unless both tables bear the same labels in
     another order: those of `y` are then put into that of `X`, with a warning. A
@@ -29,7 +29,10 @@ def align_outputs(X: Any, y: Any) -> Any:
     """
     if y is None or not hasattr(y, "__len__"):
         return y  # where outputs are read, it is said what they must be
-    with naming_argument("y", "have as many rows as X", y):
+    y = in_columns(y, _fitted_outputs(estimator))
+    first, second = names  # in messages
+    positions = f"{second}.to_numpy() if the rows belong together as they stand"
+    with naming_argument(second, f"have as many rows as {first}", y):
         check_consistent_length(X, y)
     own, given = getattr(X, "index", None), getattr(y, "index", None)
     if not isinstance(own, pd.Index) or not isinstance(given, pd.Index):
@@ -41,24 +44,60 @@ def align_outputs(X: Any, y: Any) -> Any:
     if own.is_unique and given.is_unique:
         if same:
             warn(
-                "`y` has the row labels of X in another order: its rows are put into "
-                f"the order of X, by label. Give {_POSITIONS}."
+                f"`{second}` has the row labels of {first} in another order: its rows "
+                f"are put into the order of {first}, by label. Give {positions}."
             )
             return y.loc[own]
         # Numbers of rows say nothing, nor do labels of another kind.
         numbered = given.equals(pd.RangeIndex(len(y))) or own.dtype != given.dtype
         if numbered or own.names != given.names or not shared.any():
             return y
-        first = given[~shared].tolist()[0]
+        other = given[~shared].tolist()[0]
         raise ValueError(
-            f"`y` must have the row labels of X. Got {(~shared).sum()} label(s) that X "
-            f"does not have, the first {first!r}, and {shared.sum()} that "
-            f"it has. Select the same rows of both, or give {_POSITIONS}."
+            f"`{second}` must have the row labels of {first}. Got {(~shared).sum()} "
+            f"label(s) that {first} does not have, the first {other!r}, and "
+            f"{shared.sum()} that it has. Select the same rows of both, or give "
+            f"{positions}."
         )
     if not same:
         return y
     twice = own[own.duplicated()].tolist()[0]
     raise ValueError(
-        "`y` must have the row labels of X in the same order, where some are repeated. "
-        f"Got {twice!r} several times. Sort both alike, or give {_POSITIONS}."
+        f"`{second}` must have the row labels of {first} in the same order, where some "
+        f"are repeated. Got {twice!r} several times. Sort both alike, or give "
+        f"{positions}."
     )
+
+
+def in_columns(y: Any, names: Any, argument: str = "y") -> Any:
+    """`y` with its columns in the order of `names`, where it has the same ones.
+
+    Those of other names belong together as they stand, as those of arrays do; a
+    ValueError where only some are the same.
+
+    Examples
+    --------
+    >>> in_columns(pd.DataFrame({"a": [1], "b": [2]}), ["b", "a"]).columns.tolist()
+    ['b', 'a']
+    """
+    own = list(getattr(y, "columns", ()))
+    names = [] if names is None else list(names)
+    if own == names or len(own) != len(names) or len(set(own)) < len(own):
+        return y
+    others = [name for name in own if name not in names]
+    if len(others) == len(own):
+        return y
+    if others:
+        raise ValueError(
+            f"`{argument}` must have the outputs {names}, in any order, or names of "
+            f"its own. Got {own}: {others[0]!r} is none of them. Name the columns "
+            f"alike, or give {argument}.to_numpy() if they belong together as they "
+            "stand."
+        )
+    return y[names]
+
+
+def _fitted_outputs(estimator: Any) -> Any:
+    """Names of the outputs that an estimator was fitted to; None where it has none."""
+    names = getattr(estimator, "output_names_", None)
+    return names or getattr(getattr(estimator, "lti_", None), "output_names", None)

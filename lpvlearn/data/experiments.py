@@ -352,7 +352,7 @@ def read_experiments(
         numeric = all(role is None for role in roles.values())
         X = _as_matrix(estimator, X, numeric=numeric)
     table = Table(X)
-    y = align_outputs(X, y)
+    y = align_outputs(X, y, None if reset else estimator)
     if not reset and table.named and hasattr(estimator, "feature_names_in_"):
         roles = fitted_roles(estimator, table, roles, optional)
     elif y is None and not reset:

@@ -36,8 +36,8 @@ _WINDOWS = 8  # of that length in a record; of a longer transient the start will
 def score_from_rest(
     estimator: Any, X: Any, y: Any, sample_weight: ArrayLike | None = None
 ) -> float:
-    """R2 of ``estimator.predict(X)``, missing outputs left out; warns of motion."""
-    y = align_outputs(X, y)
+    """R2 of ``estimator.predict(X)``; tells of motion, and of outputs left out."""
+    y = align_outputs(X, y, estimator)
     measured, simulated = read_outputs(y)[0], read_outputs(estimator.predict(X))[0]
     if measured.shape != simulated.shape:
         raise ValueError(
@@ -50,6 +50,7 @@ def score_from_rest(
             "`y` must hold at least 1 measured sample of all outputs. Got none in "
             f"{len(measured)} rows."
         )
+    tell_missing(measured)
     weight = None
     if sample_weight is not None:
         weight = weights(sample_weight, len(measured))[known]
@@ -69,6 +70,16 @@ def score_from_rest(
         )
     warn_of_motion(estimator, X, y, simulated)
     return float(score)
+
+
+def tell_missing(measured: Array) -> None:
+    """Tell how many values of outputs were not measured, and so are not scored."""
+    n_missing = int(np.count_nonzero(np.isnan(measured)))
+    if n_missing:
+        warn(
+            f"{n_missing} of {measured.size} values of the outputs are missing, and "
+            "were left out of the score; `fit_report` tells how many of each."
+        )
 
 
 def warn_of_motion(estimator: Any, X: Any, y: Any, simulated: Array) -> None:

@@ -206,7 +206,7 @@ class ResidualDisplay:
             residuals = estimator._residuals(X, y, errors)
         elif simulates and hasattr(estimator, "predict_with_initial_state"):
             X = Table(X).X
-            y = align_outputs(X, y)
+            y = align_outputs(X, y, estimator)
             outputs, names = read_outputs(y)
             simulated = estimator.predict_with_initial_state(X, y)
             wrong = outputs - np.reshape(simulated, outputs.shape)

@@ -18,7 +18,7 @@ from ..data.experiments import (
 )
 from ..data.timestamps import time_in_seconds
 from ..metrics.scorers import check_options, simulate
-from ..metrics.scores import bft_score
+from ..metrics.scores import best_fit
 from .drawing import (
     ACCENT,
     axes_grid,
@@ -129,7 +129,7 @@ class SimulationDisplay:
                     f"the simulation {name!r} must have the shape of `y_true`, "
                     f"{self.y_true.shape}. Got {y_pred.shape}."
                 )
-            self.bft_[name] = bft_score(self.y_true, y_pred, multioutput="raw_values")
+            self.bft_[name] = best_fit(self.y_true, y_pred)
         self.std = {
             name: as_numbers("std", read_outputs(own)[0])
             for name, own in by_name("std", std).items()
@@ -265,7 +265,7 @@ class SimulationDisplay:
                 "it and use from_predictions()."
             )
         X = Table(X).X
-        outputs, names = read_outputs(align_outputs(X, y))
+        outputs, names = read_outputs(align_outputs(X, y, estimator))
         rows = _rows_of(estimator, X, experiment)
         part = X.iloc[rows] if hasattr(X, "iloc") else X[rows]
         found = simulate(estimator, part, outputs[rows], initial_state)

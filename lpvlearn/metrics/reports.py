@@ -21,7 +21,7 @@ from .scorers import (
     split,
     unwrap,
 )
-from .scores import bft_score, r2_ratio, vaf_score
+from .scores import accounted_variance, best_fit, r2_ratio
 from .table_simulation import ScheduledModel, TableSimulator
 
 
@@ -113,8 +113,8 @@ def _measures(
     columns: dict[str, NDArray[Any]] = {}
     true, pred = true[:, known], pred[:, known]
     for name, values in {
-        "BFT": bft_score(true, pred, multioutput="raw_values"),
-        "VAF": vaf_score(true, pred, multioutput="raw_values"),
+        "BFT": best_fit(true, pred),
+        "VAF": accounted_variance(true, pred),
         "RMSE": np.sqrt(np.nanmean((true - pred) ** 2, axis=0)),
         "R2": r2_ratio(true, pred),
     }.items():

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ..data.alignment import align_outputs
 from ..data.experiments import ROLES, Table, fitted_roles, read_outputs
-from ..data.scoring import warn_of_motion
+from ..data.scoring import tell_missing, warn_of_motion
 from ..validation import one_of, real_array, whole_number
-from .scores import Multioutput, bft_score, vaf_score
+from .scores import Multioutput, accounted_variance, best_fit
 
 InitialState = Literal["rest", "estimate"]
 
@@ -47,10 +47,11 @@ class TrajectoryScorer:
 
     def __call__(self, estimator: Any, X: Any, y: Any) -> float | dict[str, float]:
         """Score an estimator's simulation of `X` against `y`."""
-        score = bft_score if self.metric == "BFT" else vaf_score
+        score = best_fit if self.metric == "BFT" else accounted_variance
         simulator, X = unwrap(estimator, X)
         found = simulate(simulator, X, y, self.initial_state)
         Y, names = found.measured, found.names
+        tell_missing(Y)
         pool = self.average == "pool"
         groups = [np.arange(len(Y))]
         if self.burn_in or not pool:
@@ -58,8 +59,7 @@ class TrajectoryScorer:
         if pool:
             groups = [np.concatenate(groups)]
         scores = [
-            score(Y[rows], found.simulated[rows], multioutput=self.multioutput)
-            for rows in groups
+            score(Y[rows], found.simulated[rows], self.multioutput) for rows in groups
         ]
         if not self.burn_in:
             found.warn_of_motion(simulator, X)
@@ -241,7 +241,7 @@ def simulate(estimator: Any, X: Any, y: Any, initial_state: str) -> Simulated:
 
     What lacks an input, and is not simulated therefore, counts as not measured.
     """
-    y = align_outputs(X, y)
+    y = align_outputs(X, y, estimator)
     measured, names = read_outputs(y)
     if initial_state == "rest":
         found = read_outputs(estimator.predict(X))[0]

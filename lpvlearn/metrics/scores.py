@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from ..data.alignment import align_outputs, in_columns
 from ..data.experiments import read_outputs
+from ..data.scoring import tell_missing
 from ..validation import SQUARED, real_array, shown, squarable
 
 _SMALL = 1e-100  # beside larger numbers, what squares lose is nothing
@@ -15,6 +18,8 @@ _SMALL = 1e-100  # beside larger numbers, what squares lose is nothing
 _LESS = -600  # power of two by which numbers without a square have one: all are ratios
 
 _WORST = -1e300  # of a fit, of which the percentage is a number still
+
+Array = NDArray[np.float64]
 
 Multioutput = Literal["raw_values", "uniform_average"] | ArrayLike
 
@@ -31,7 +36,8 @@ def bft_score(
     ----------
     y_true, y_pred : array-like of shape (n_samples,) or (n_samples, n_outputs)
         Measured and simulated outputs. Samples of an output that were not measured
-        (NaN in `y_true`) are left out of its score.
+        (NaN in `y_true`) are left out of its score, and it is told how many. Rows and
+        columns of two DataFrames belong together by their labels.
     multioutput : {"raw_values", "uniform_average"} or array-like of shape (n_outputs,)
         One score per output, their mean, or their weighted mean.
 
@@ -62,6 +68,14 @@ def bft_score(
     55.27...
     """
     true, pred = _read_pair(y_true, y_pred)
+    score = best_fit(true, pred, multioutput)
+    tell_missing(true)
+    return score
+
+
+def best_fit(true: Array, pred: Array, multioutput: Multioutput = "raw_values") -> Any:
+    """`bft_score` of matrices, NaN where not measured, without a word of these."""
+    true, pred = _read_pair(true, pred)
     _check_measured(true)
     return _percent(_norm(true - pred), _norm(_centred(true)), multioutput)
 
@@ -78,7 +92,8 @@ def vaf_score(
     ----------
     y_true, y_pred : array-like of shape (n_samples,) or (n_samples, n_outputs)
         Measured and simulated outputs. Samples of an output that were not measured
-        (NaN in `y_true`) are left out of its score.
+        (NaN in `y_true`) are left out of its score, and it is told how many. Rows and
+        columns of two DataFrames belong together by their labels.
     multioutput : {"raw_values", "uniform_average"} or array-like of shape (n_outputs,)
         One score per output, their mean, or their weighted mean.
 
@@ -108,6 +123,16 @@ def vaf_score(
     80.0
     """
     true, pred = _read_pair(y_true, y_pred)
+    score = accounted_variance(true, pred, multioutput)
+    tell_missing(true)
+    return score
+
+
+def accounted_variance(
+    true: Array, pred: Array, multioutput: Multioutput = "raw_values"
+) -> Any:
+    """`vaf_score` of matrices, NaN where not measured, without a word of these."""
+    true, pred = _read_pair(true, pred)
     _check_measured(true)
     error, spread = _norm(_centred(true - pred)), _norm(_centred(true))
     return _percent(error, spread, multioutput, power=2)
@@ -178,8 +203,14 @@ def _read_pair(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return two matrices of equal shape, (n_samples, n_outputs).
 
-    Unless refused, `missing` values of the first are NaN in both.
+    Of two tables, rows and columns belong together by their labels. Unless refused,
+    `missing` values of the first are NaN in both.
     """
+    tables = pd.DataFrame, pd.Series
+    if isinstance(y_true, tables) and isinstance(y_pred, tables):
+        y_pred = in_columns(y_pred, getattr(y_true, "columns", None), names[1])
+        if len(y_true) == len(y_pred):
+            y_pred = align_outputs(y_true, y_pred, names=names)
     pair = zip((y_true, y_pred), names, strict=True)
     # column after column in memory, where sums take a tenth of the time
     true, pred = (

@@ -27,7 +27,7 @@ from ..systems.simulation import (
     trend_signals,
     with_transit,
 )
-from .scores import bft_score
+from .scores import best_fit
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def fit_of(
         found = forced + own.T @ free.transpose(1, 2, 0)
         true.append(y.reshape(model.n_outputs, -1))
         simulated.append(found.reshape(model.n_outputs, -1))
-    return float(bft_score(np.hstack(true).T, np.hstack(simulated).T))
+    return float(best_fit(np.hstack(true).T, np.hstack(simulated).T, "uniform_average"))
 
 
 def simulate_experiments(

@@ -40,7 +40,7 @@ from ..lpv.refinement import (
     squares,
 )
 from ..lpv.weighting import covariance_of
-from ..metrics.scores import bft_score
+from ..metrics.scores import best_fit
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
@@ -610,8 +610,8 @@ def _report(
         old, new = (np.vstack([errors[k] for k in runs]) for errors in (before, after))
         rows[label] = {
             "n_samples": len(y),
-            "start_BFT": float(bft_score(y, y + old)),
-            "BFT": float(bft_score(y, y + new)),
+            "start_BFT": float(best_fit(y, y + old, "uniform_average")),
+            "BFT": float(best_fit(y, y + new, "uniform_average")),
         }
     report = pd.DataFrame.from_dict(rows, orient="index")
     return report.rename_axis("experiment")

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, clone
 from sklearn.utils.validation import check_is_fitted
 
+from ..data.alignment import align_outputs
 from ..data.containers import OutputContainer
 from ..data.experiments import (
     OPTIONAL_ROLES,
@@ -1216,6 +1217,7 @@ class SubspaceLTI(
         """What is tested; `ResidualDisplay` draws it."""
         check_is_fitted(self, "lti_")
         check_kind(errors)
+        y = align_outputs(X, y, self)
         experiments = self._read(X, y, split=True, cut=False)
         names = [] if y is None else read_outputs(y)[1]
         if y is not None and len(names) != self.n_outputs_:

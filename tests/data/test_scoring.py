@@ -27,7 +27,8 @@ def test_missing_outputs_are_left_out(spring):
     assert model.score(X, y) == r2_score(y, model.predict(X))
     lost = np.random.default_rng(0).random(len(y)) < 0.2
     weight = np.random.default_rng(1).random(len(y))
-    found = model.score(X, y.mask(lost[:, None]), sample_weight=weight)
+    with pytest.warns(UserWarning, match=f"^{lost.sum()} of {len(y)} values"):
+        found = model.score(X, y.mask(lost[:, None]), sample_weight=weight)
     known = y[~lost], model.predict(X)[~lost]
     assert found == r2_score(*known, sample_weight=weight[~lost])
 

@@ -3,7 +3,9 @@
 import pickle
 
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.signal import lfilter
 from sklearn.base import clone
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.linear_model import LinearRegression
@@ -17,8 +19,10 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from lpvlearn import (
+    SubspaceLTI,
     bft_score,
     bft_scorer,
+    fit_report,
     make_bft_scorer,
     make_vaf_scorer,
     vaf_score,
@@ -175,7 +179,8 @@ def test_missing_samples_are_left_out(data, average, initial_state):
     both = lost[:, None].repeat(2, axis=1)
     scorer = make_bft_scorer(average=average, initial_state=initial_state, burn_in=3)
     wrong = y.mask(both, 1e3)  # what is missing may have been anything
-    found = scorer(model, X, y.mask(both))
+    with pytest.warns(UserWarning, match=f"^{both.sum()} of 240 values .* missing"):
+        found = scorer(model, X, y.mask(both))
     assert found != scorer(model, X, wrong)
     known = ~lost & (np.arange(120) % 40 >= 3)
     simulated = (
@@ -186,6 +191,25 @@ def test_missing_samples_are_left_out(data, average, initial_state):
     groups = [known] if average == "pool" else [known & (X["run"] == r) for r in "abc"]
     expected = np.mean([bft_score(y[rows], simulated[rows]) for rows in groups])
     assert found == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("initial_state", ["rest", "estimate"])
+def test_outputs_in_another_order_are_those_of_the_fit(initial_state):
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((300, 1))
+    y = lfilter([0.0, 1.0], [1.0, -0.8], u, axis=0) * [1.0, -3.0]
+    y = pd.DataFrame(y + 0.1 * rng.standard_normal(y.shape), columns=["a", "b"])
+    model, other = SubspaceLTI(1, horizon=5).fit(u, y), y[["b", "a"]]
+    scorer = make_bft_scorer(initial_state=initial_state, multioutput="raw_values")
+    assert scorer(model, u, other) == scorer(model, u, y)
+    reports = [fit_report(model, u, y, initial_state=initial_state) for y in (other, y)]
+    pd.testing.assert_frame_equal(*reports)
+    pd.testing.assert_frame_equal(*(model.residual_tests(u, y) for y in (other, y)))
+    np.testing.assert_array_equal(*(model.predict_ahead(u, y) for y in (other, y)))
+    assert model.score(u, other) == model.score(u, y)
+    assert scorer(model, u, y.set_axis(["c", "d"], axis=1))["BFT_c"] > 90.0
+    with pytest.raises(ValueError, match="must have the outputs .*'c' is none of them"):
+        scorer(model, u, y.set_axis(["b", "c"], axis=1))
 
 
 @pytest.mark.parametrize("scorer", [bft_scorer, vaf_scorer])
