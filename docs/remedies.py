@@ -26,7 +26,7 @@ _CELL = "A cell of a template holds a sum of names with factors, as ``2*k - 1``.
 
 REMEDIES = {
     # -- warnings
-    "`y` has the row labels of X in another order": "Nothing is wrong if the labels "
+    "`…` has the row labels of … in another order": "Nothing is wrong if the labels "
     "are right; give arrays if they mean nothing.",
     "Input column": "A role that was forgotten makes a column an input, and the "
     "model explains the outputs by it.",

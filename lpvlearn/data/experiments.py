@@ -531,9 +531,10 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
             at = zip(
                 ("row", "column"), np.unravel_index(k, entries.shape), strict=False
             )
+            cause = "" if isinstance(flat[k], str) else f": {error}"
             raise kind(
                 f"`{argument}` must hold numbers. Got {shown(as_scalar(flat[k]))} at "
-                f"{', '.join(f'{axis} {i}' for axis, i in at)}: {error}."
+                f"{', '.join(f'{axis} {i}' for axis, i in at)}{cause}."
             ) from error
         if entries.ndim in _RESHAPED:
             raise ValueError(
@@ -588,10 +589,11 @@ def _check_finite(
     where = next(k for k, rows in enumerate(groups) if row in rows)
     missing = np.isnan(matrix[row, column])
     what = "NaN" if missing else "infinity or a value too large to be squared"
+    first = "" if missing else "put NaN where nothing was measured, then "
     raise ValueError(
         f"Input {argument} contains {what}. First in column {names[column]!r} of "
-        f"experiment {labels[where]!r}, at row {row}: fill the gap (interpolate)"
-        f"{remedy}"
+        f"experiment {labels[where]!r}, at row {row}: {first}fill the gap "
+        f"(interpolate){remedy}"
     )
 
 

@@ -20,8 +20,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 # Steps that differ by no more than that part of them are even: stamps are rounded, and
-# no other signal but a ramp comes near.
-_EVEN = 0.05
+# no other signal but a ramp comes near. Stamps that jitter stay this part of a step
+# about a straight line, which sums of uneven steps leave.
+_EVEN, _JITTER = 0.05, 0.5
 _FEWEST = 10  # steps below which a few even ones are chance
 _RESTARTS = 0.05  # share of the steps that may go back, from experiment to experiment
 
@@ -95,14 +96,35 @@ def _typical_step(column: Array) -> float:
 
 
 def _is_clock(column: Array, groups: Sequence[Indices]) -> bool:
-    """Whether a column rises evenly, from anew where another experiment begins."""
+    """Whether a column rises evenly, from anew where another experiment begins.
+
+    Evenly but for the jitter of stamps.
+    """
     steps = np.concatenate([np.diff(column[rows]) for rows in groups])
     if len(steps) < _FEWEST or not np.isfinite(steps).all():
         return False
     typical = float(np.median(steps))
     uneven = steps[np.abs(steps - typical) > _EVEN * typical]
-    back = (uneven < 0).all() and len(uneven) <= _RESTARTS * len(steps)
-    return typical > 0 and bool(back if len(groups) == 1 else not len(uneven))
+    n_back = int((steps < 0).sum())
+    if not typical > 0 or n_back > (_RESTARTS * len(steps) if len(groups) == 1 else 0):
+        return False
+    if (uneven < 0).all():
+        return True
+    columns = [column[rows] for rows in groups]
+    return all(
+        _is_straight(part, typical)
+        for whole in columns
+        for part in np.split(whole, np.flatnonzero(np.diff(whole) < 0) + 1)
+    )
+
+
+def _is_straight(column: Array, step: float) -> bool:
+    """Whether it stays about a straight line by less than the jitter of stamps."""
+    row = np.arange(len(column))
+    if len(row) < 2:
+        return True
+    line = np.polynomial.Polynomial.fit(row, column, 1)
+    return bool(np.abs(column - line(row)).max() < _JITTER * step)
 
 
 def _is_count(column: Array) -> bool:

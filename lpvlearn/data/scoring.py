@@ -78,7 +78,7 @@ def tell_missing(measured: Array) -> None:
     if n_missing:
         warn(
             f"{n_missing} of {measured.size} values of the outputs are missing, and "
-            "were left out of the score; `fit_report` tells how many of each."
+            "were left out of the score. Use `fit_report` to see how many of each."
         )
 
 

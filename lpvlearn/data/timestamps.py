@@ -299,7 +299,12 @@ def _decimal_unit(seconds: NDArray[np.float64]) -> float:
 
 
 def _raise_bad_time(column: Hashable, row: int, series: pd.Series) -> NoReturn:
+    value = series.iloc[row]
+    if pd.isna(value):
+        remedy = "drop such rows: with missing='split' they are a gap"
+    else:
+        remedy = "convert text with pandas.to_datetime"
     raise ValueError(
         f"Time column {column!r} must hold finite numbers (seconds) or datetimes. Got "
-        f"{shown(series.iloc[row])} at row {row}; convert text with pandas.to_datetime."
+        f"{'no time' if pd.isna(value) else shown(value)} at row {row}; {remedy}."
     )

@@ -164,7 +164,8 @@ def tell_of_feedback(
     if method not in ("auto", "pbsid"):
         what += (
             f"That biases method={method!r} however many samples there are. "
-            "Use method='pbsid', or identify with the controller's reference as input."
+            "Use method='pbsid' (of `fit`, with the whole table), or identify with the "
+            "controller's reference as input."
         )
     elif method == "pbsid" and loop:
         what += (

@@ -41,6 +41,9 @@ CLOCKS = {
     "time": np.tile(TIME, RUNS),
     "time that goes on": 0.01 * np.arange(N * RUNS),
     "rounded time": np.tile(TIME / 3, RUNS).round(4),
+    "jittering time": np.tile(
+        TIME + 0.003 * np.random.default_rng(5).uniform(-1.0, 1.0, N), RUNS
+    ),
     "late time": 1.7e9 + np.tile(TIME, RUNS),
     "row number": np.arange(N * RUNS),
     "single precision": np.tile(TIME, RUNS).astype(np.float32),
