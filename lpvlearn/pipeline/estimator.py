@@ -681,6 +681,7 @@ list, default=None
             ),
             self.lpv_,
             sampling_time=self.sampling_time_,
+            jitter=self.time_jitter_,
             scheduling=self.scheduling_names_,
             local=_name_of_step(self.local, "local"),
             restructurer=_name_of_step(self.restructurer, "restructurer"),

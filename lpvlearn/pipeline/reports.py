@@ -31,6 +31,7 @@ _LOOKED_AT = 10  # experiments of an operating point: more tell the same of cons
 _THROUGH = 1e-7
 
 _NO_FLOOR = 1e-8  # share of the black box's norm below which a floor is rounding
+_ROUNDED = 1e-6  # part of a step by which stamps are off that are rounded
 
 
 class Tables(NamedTuple):
@@ -193,14 +194,16 @@ def summarise(
     lpv: LPVStateSpace,
     *,
     sampling_time: float,
+    jitter: float,
     scheduling: Sequence[Hashable],
     local: str,
     restructurer: str,
 ) -> Summary:
     """What a fitted pipeline found, for people.
 
-    `scheduling` names the variables (none: a time-invariant model), `local` and
-    `restructurer` the classes of steps 3 and 4.
+    `jitter` is by how much of a step time stamps are off, at most; `scheduling` names
+    the variables (none: a time-invariant model), `local` and `restructurer` the classes
+    of steps 3 and 4.
     """
     report = found.points
     kappa = np.array([np.atleast_1d(label) for label in report.index], dtype=float)
@@ -221,6 +224,8 @@ def summarise(
         "",
         f"Local models: {local}, simulation fit (BFT) {_span(report['local_BFT'])} %",
     ]
+    if jitter > _ROUNDED:
+        lines.insert(2, f"Time stamps off by up to {100.0 * jitter:.2g} % of a step")
     if lpv.input_delay.any():
         samples = np.round(lpv.input_delay / sampling_time).astype(int)
         lines.insert(2, f"Input delay: {', '.join(map(str, samples))} sample(s)")

@@ -156,3 +156,13 @@ def test_the_summary_tells_what_was_found(fitted, balanced):
         assert words in text
     assert max(map(len, text.splitlines())) <= 120
     assert "no common state basis" in balanced.summary()
+
+
+def test_stamps_that_are_off_are_told():
+    X, y = spring_tables(n_samples=100)
+    assert "Time stamps" not in spring_pipeline().fit(X, y).summary()
+    step = X["time"].iloc[1] - X["time"].iloc[0]
+    off = np.random.default_rng(0).uniform(-0.004, 0.004, len(X)) * step
+    model = spring_pipeline().fit(X.assign(time=X["time"] + off), y)
+    line = f"Time stamps off by up to {100.0 * model.time_jitter_:.2g} % of a step"
+    assert line in model.summary()
