@@ -26,6 +26,8 @@ _EVEN, _JITTER = 0.05, 0.5
 _FEWEST = 10  # steps below which a few even ones are chance
 _RESTARTS = 0.05  # share of the steps that may go back, from experiment to experiment
 
+_TORN = 0.05  # share of the steps of an index that may be larger than the others
+
 _ORDERED = ("integer", "datetime64", "timedelta64")  # index types that tell an order
 
 _HOLDS = 10.0  # samples that a number of an experiment stands for, at least, on average
@@ -69,9 +71,10 @@ def warn_of_forgotten_roles(
 
 
 def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
-    """Warn of rows that are not in the order of their numbers or dates, the index.
+    """Warn of rows not in the order of their numbers or dates, the index, or torn.
 
-    Labels that stand twice (tables below each other) tell nothing.
+    Labels that stand twice (tables below each other) tell nothing. Numbers that go on
+    by the same step but in a few places tell that rows are missing there.
     """
     index = getattr(X, "index", None)
     if not isinstance(index, pd.Index) or index.inferred_type not in _ORDERED:
@@ -89,6 +92,23 @@ def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
                 "means nothing, drop it (reset_index)."
             )
             return
+        if index.inferred_type == "integer" and len(labels) > _FEWEST:
+            steps = np.diff(labels.to_numpy().astype(np.float64))
+            torn = np.flatnonzero(steps > np.median(steps))
+            if (
+                0 < len(torn) <= _TORN * len(steps)
+                and (steps >= np.median(steps)).all()
+            ):
+                where = int(torn[0])
+                warn(
+                    "Rows of X are missing within an experiment: its index goes from "
+                    f"{labels[where]} to {labels[where + 1]}. To a model the record "
+                    "goes on there. Split by experiment (ExperimentSplit) or in time "
+                    "(BlockedTimeSeriesSplit), not by KFold; of rows that were dropped "
+                    "name the `time` and use missing='split'; if the index means "
+                    "nothing, drop it (reset_index)."
+                )
+                return
 
 
 def _typical_step(column: Array) -> float:

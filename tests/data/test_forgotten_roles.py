@@ -142,3 +142,20 @@ def test_shuffled_rows_are_told_in_predictions_too():
     model = SubspaceLTI(2, horizon=5).fit(X, y)
     with pytest.warns(UserWarning, match="not in the order of its index"):
         model.predict(X.sample(frac=1, random_state=0))
+
+
+def test_rows_that_are_missing_are_told():
+    rng = np.random.default_rng(0)
+    u = pd.DataFrame({"u": rng.standard_normal(300)})
+    y = u["u"].shift(1, fill_value=0.0).rename("y")
+    torn = np.r_[0:100, 200:300]
+    model = SubspaceLTI(1, horizon=4)
+    with (
+        pytest.warns(UserWarning, match="from 99 to 200.*ExperimentSplit"),
+        pytest.warns(UserWarning, match="farthest is sample 100"),
+    ):
+        model.fit(u.iloc[torn], y.iloc[torn])
+    for rows in (slice(100, 300), slice(0, 300, 3)):  # silently: no row is missing
+        model.fit(u.iloc[rows], y.iloc[rows])
+    runs = u.assign(run=np.repeat([0, 1, 2], 100)).iloc[torn]
+    SubspaceLTI(1, horizon=4, experiment="run").fit(runs, y.iloc[torn])
