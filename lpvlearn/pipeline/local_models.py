@@ -464,8 +464,9 @@ def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpa
         advice = _integrating_outputs(lti) + advice
         raise ValueError(
             f"the local model must be stable. Got a pole at {worst:.4g} 1/s. {advice}"
-            "local=SubspaceLTI(stability='enforce'), another `order`, a longer "
-            "`horizon` or more data, or leave the point out by on_error='skip'."
+            "local=SubspaceLTI(offset='linear') if the outputs drift, "
+            "stability='enforce', another `order`, a longer `horizon` or more data, or "
+            "leave the point out by on_error='skip'."
         )
     if lti.order > model.order:
         poles = model.poles()

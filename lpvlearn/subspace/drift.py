@@ -40,6 +40,8 @@ _FEWEST = 3  # samples of an experiment, for more than one difference
 # noise that comes back as often as drift.
 _SLOW, _SLOW_BESIDE, _FOLLOWS, _FAR = 30.0, 60.0, 1.0, 0.5
 
+_LASTS = 3.0  # of a mode that has not decayed at the end of the longest experiment
+
 _EXPLAINED = 0.02  # relative error below which drift does not matter
 
 _DIFFERENCE = np.array([1.0, -1.0])  # as a filter
@@ -48,6 +50,13 @@ _DIFFERENCE = np.array([1.0, -1.0])  # as a filter
 def differences(pairs: Pairs) -> Pairs:
     """Those of consecutive samples, (n_samples - 1, n_channels)."""
     return [(np.diff(u, axis=0), np.diff(y, axis=0)) for u, y in pairs]
+
+
+def outlasts(fitted: LocalFit) -> bool:
+    """Whether a mode does not decay over the longest experiment, or grows."""
+    n_samples = max(record.u.shape[1] for record in fitted.evidence.records)
+    slow = (_rates(fitted.model.A) * n_samples < _LASTS).any()
+    return bool(slow) or fitted.grows()
 
 
 def may_drift(fitted: LocalFit) -> bool:

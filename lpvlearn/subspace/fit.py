@@ -25,7 +25,7 @@ from ..exceptions import RankWarning
 from ..systems.simulation import delayed
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .delay import find_lead, first_samples, longest_delays, with_later_inputs
-from .drift import differences, drifts, may_drift, of_levels
+from .drift import differences, drifts, may_drift, of_levels, outlasts
 from .fit_warnings import (
     Doubt,
     tell,
@@ -182,6 +182,14 @@ def _with_constants(
         other = _fit(pairs, judged, told, 1, fitted)
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
+    # The states of a given order that are to follow a drift are missing elsewhere.
+    given = choices.order is not None and choices.initial_states and n_trend < 2
+    lost = given and (outlasts(fitted) or fitted.residual > _HARDLY)
+    if choices.offset == "auto" and lost:
+        other = _fit(pairs, judged, told, 2, fitted)
+        without, tested = fitted.evidence.one_step, other.evidence.one_step
+        if not outlasts(other) and constants_matter(without, tested):
+            fitted, n_trend = other, 2
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
 
 
@@ -359,8 +367,9 @@ def tell_of_delay(
         told,
         "delay",
         f"Input {int(delay.argmax()) + 1} shows in the outputs only after {cut} "
-        f"samples. With a delay in its place a model of order {orders[0]} {what}. Use "
-        "input_delay='auto', or give the samples of the delay.",
+        f"samples, for certain. With a delay in their place a model of order "
+        f"{orders[0]} {what}. Use input_delay='auto', which finds how many of them are "
+        "a delay.",
     )
 
 

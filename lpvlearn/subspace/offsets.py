@@ -167,8 +167,13 @@ def _stays_far(records: Sequence[Record]) -> bool:
 
 
 def follows_means_alone(evidence: Evidence) -> bool:
-    """Whether a model without constants explains no more than where outputs stay."""
+    """Whether a model without constants explains no more than where outputs stay.
+
+    What one that grows over the record simulates tells nothing.
+    """
     stays = not evidence.free.n_trend and _stays_far(evidence.records)
+    longest = max(record.u.shape[1] for record in evidence.records)
+    stays &= longest * (spectral_radius(evidence.model.A) - 1.0) < 1.0
     return stays and motion_left(evidence) > USELESS**2
 
 

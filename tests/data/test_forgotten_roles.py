@@ -145,17 +145,15 @@ def test_shuffled_rows_are_told_in_predictions_too():
 
 
 def test_rows_that_are_missing_are_told():
-    rng = np.random.default_rng(0)
-    u = pd.DataFrame({"u": rng.standard_normal(300)})
-    y = u["u"].shift(1, fill_value=0.0).rename("y")
-    torn = np.r_[0:100, 200:300]
-    model = SubspaceLTI(1, horizon=4)
-    with (
-        pytest.warns(UserWarning, match="from 99 to 200.*ExperimentSplit"),
-        pytest.warns(UserWarning, match="farthest is sample 100"),
-    ):
-        model.fit(u.iloc[torn], y.iloc[torn])
-    for rows in (slice(100, 300), slice(0, 300, 3)):  # silently: no row is missing
-        model.fit(u.iloc[rows], y.iloc[rows])
-    runs = u.assign(run=np.repeat([0, 1, 2], 100)).iloc[torn]
-    SubspaceLTI(1, horizon=4, experiment="run").fit(runs, y.iloc[torn])
+    u = pd.DataFrame({"u": np.arange(300.0) ** 2 % 7})
+
+    def torn(rows, **roles):
+        told = warned(rows, inputs=["u"], reset=True, **roles)
+        return [message for message in told if "missing within" in message]
+
+    parts = u.iloc[np.r_[0:100, 200:300]]
+    (message,) = torn(parts)
+    assert "from 99 to 200" in message and "ExperimentSplit" in message
+    for rows in (slice(100, 300), slice(0, 300, 3)):
+        assert torn(u.iloc[rows]) == []
+    assert torn(parts.assign(run=parts.index // 150), experiment="run") == []

@@ -128,6 +128,20 @@ class TestDriftingOutputs:
         with pytest.warns(UserWarning, match="The outputs drift.*predict_ahead"):
             SubspaceLTI(2, sampling_time=1.0).fit(*_record(1, drift=0.3))
 
+    @pytest.mark.parametrize("seed", range(3))
+    def test_states_of_a_given_order_are_left_to_the_plant(self, seed):
+        """A straight line, which one of them would follow."""
+        rng = np.random.default_rng(seed)
+        plant = StateSpace([[0.0, 1.0], [-40.0, -1.2]], [[0.0], [30.0]], [[1.0, 0.0]])
+        plant = plant.to_discrete(0.02)
+        u = rng.choice([-1.0, 1.0], (150, 1)).repeat(6, axis=0)
+        y = plant.simulate(u)
+        y += np.linspace(0.0, 8.0 * y.std(), len(y))[:, None]
+        y += 0.01 * y.std() * rng.standard_normal(y.shape)
+        model = _quiet_fit(u, y, order=2)
+        assert model.offset_ == "linear"
+        assert_allclose(model.lti_.dc_gain(), plant.dc_gain(), rtol=0.05)
+
 
 class TestOutputsThatDoNotDrift:
     @pytest.mark.parametrize("colour", [0.0, 0.9])
