@@ -10,9 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ..pipeline.memory import unwritten
+
 _PROBE = 2**16  # bytes that must find room before the work begins
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_VANISHED = "The folder has vanished: do not move or clear it meanwhile."
 
 
 @contextmanager
@@ -80,16 +82,9 @@ def _told(target: Path, folder: Path | None = None) -> Iterator[None]:
         where = error.filename
         if folder and where is not None and not str(where).startswith(str(folder)):
             raise  # another file's
-        if error.errno == errno.ENOENT or (folder and not folder.exists()):
-            advice = "The folder has vanished: do not move or clear it meanwhile."
-        elif error.errno in _FULL:
-            advice = "Free space there, or take another place."
-        else:
-            advice = "Take a place where you may write."
-        raise OSError(
-            f"--output {target}: it cannot be written ({error.strerror or error}), and "
-            f"nothing of it is there. {advice}"
-        ) from error
+        gone = folder and (error.errno == errno.ENOENT or not folder.exists())
+        told = unwritten(f"--output {target}", error, _VANISHED if gone else None)
+        raise OSError(f"{told} Nothing of it is there.") from error
 
 
 def _umask() -> int:

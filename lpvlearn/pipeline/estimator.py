@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,14 +16,9 @@ from typing import Any, Self
 
 import numpy as np
 import pandas as pd
-from joblib import Memory, hash
 from numpy.typing import NDArray
 from sklearn.base import clone
-from sklearn.utils.validation import (
-    check_is_fitted,
-    check_memory,
-    has_fit_parameter,
-)
+from sklearn.utils.validation import check_is_fitted, has_fit_parameter
 
 from ..data.dataset import kept_on_disk, open_dataset, tables_by_experiment
 from ..data.experiments import (
@@ -66,6 +60,7 @@ from ..validation import (
 from .html_report import html_report
 from .left_out import tell_unforeseen
 from .local_models import common_delay, estimates_outputs, identify_points
+from .memory import checked_memory
 from .output_error import (
     known_coefficients,
     local_covariance,
@@ -496,7 +491,7 @@ list, default=None
     def _fit(self, read: Callable[[], list[Experiment]]) -> None:
         self._check_options()
         steps = {"local": self.local, "restructurer": self.restructurer}
-        memory = _checked_memory(self.memory, steps)
+        memory = checked_memory(self.memory, steps)
         runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
         restructurer, watch = self._restructurer(), Stopwatch(verbose=self.verbose)
         efficient = getattr(restructurer, "norm", None) == "covariance"
@@ -815,30 +810,6 @@ def _told_apart(
             "sweeps to and fro, leave local models out: OutputErrorLPV().fit(X, y)."
         )
     return local, moving
-
-
-def _checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
-    """A joblib.Memory from the argument `memory`, usable for steps (by their names)."""
-    path = str(memory) if hasattr(memory, "__fspath__") else memory
-    try:
-        memory = check_memory(path)  # which takes a path as text only
-    except ValueError as error:
-        raise ValueError(
-            "`memory` must be None, a folder, or a joblib.Memory. Got "
-            f"{type(memory).__name__}."
-        ) from error
-    if getattr(memory, "location", None) is None:
-        return memory
-    for name, step in steps.items():
-        try:
-            hash(step)
-        except (pickle.PicklingError, AttributeError, TypeError) as error:
-            raise ValueError(
-                f"`memory` needs steps that can be pickled. Got a `{name}` that cannot "
-                f"({error}): replace lambda and nested functions by functions at the "
-                "top of a module, or leave `memory` out."
-            ) from error
-    return memory
 
 
 def _check_channels(

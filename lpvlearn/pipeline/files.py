@@ -29,6 +29,7 @@ from sklearn.base import BaseEstimator
 
 from ..exceptions import version
 from ..validation import file_name, shown
+from .memory import unwritten
 from .schema import CLASSES, Form, after_loading, before_saving, forms_of
 
 SCHEMA = 1  # raised when a file of today could be misread by the code of tomorrow
@@ -78,7 +79,8 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     ------
     ValueError
         If the model holds what a file without code cannot: a regressor of another
-        library, a `RandomState`, a subclass of the user.
+        library, a `RandomState`, a subclass of the user. If `path` names a folder, a
+        device or a pipe.
     OSError
         If the file cannot be written.
 
@@ -107,6 +109,7 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     >>> load(path).poles()
     array([-2.+0.j])
     """
+    target = _file(path)
     writer = _Writer()
     if type(before_saving(model)) not in CLASSES.values():
         raise ValueError(f"`model` must be one of this library. Got {shown(model)}.")
@@ -129,7 +132,12 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
         raise ValueError(
             f"`model` must be one that `load` can build anew. Got {error}."
         ) from error
-    _replace(Path(os.path.realpath(file_name(path))), buffer.getbuffer())
+    try:
+        _replace(target, buffer.getbuffer())
+    except OSError as error:
+        told = type(error)(unwritten(f"`path` {str(path)!r}", error))
+        told.errno = error.errno
+        raise told from error
 
 
 def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
@@ -179,7 +187,7 @@ def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
     >>> load(path, function=decay).model([4.0]).A
     array([[-0.25]])
     """
-    data = file_name(path).read_bytes()
+    data = _file(path).read_bytes()
     try:
         members = _members(data)
         del data
@@ -192,6 +200,21 @@ def load(path: str | os.PathLike[str], *, function: Functions = None) -> Any:
 
 class _Told(Exception):
     """An error of which the message says all."""
+
+
+def _file(path: Any) -> Path:
+    """Where the file is, or will be, that `path` names; links are followed.
+
+    A device or a pipe is refused: it must not be replaced, and may have no end.
+    """
+    place = Path(os.path.realpath(file_name(path)))
+    if os.path.lexists(place) and not place.is_file():
+        kind = "a folder" if place.is_dir() else "no regular file"
+        raise ValueError(
+            f"`path` must name a file, or one to come. Got {str(path)!r}, which is "
+            f"{kind}: take another name."
+        )
+    return place
 
 
 def _replace(target: Path, content: memoryview) -> None:

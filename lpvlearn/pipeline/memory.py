@@ -9,6 +9,7 @@ packages the version counts.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import inspect
 import pickle
@@ -23,10 +24,53 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
+from joblib import Memory, hash
+from sklearn.utils.validation import check_memory
 
 from ..exceptions import warn
 
 _LIBRARY = Path(__file__).parents[1]
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_NO_FOLDER = (errno.ENOENT, errno.ENOTDIR)
+
+
+def checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
+    """A joblib.Memory from the argument `memory`, usable for steps (by their names)."""
+    path = str(memory) if hasattr(memory, "__fspath__") else memory
+    try:
+        memory = check_memory(path)  # which takes a path as text only
+    except ValueError as error:
+        raise ValueError(
+            "`memory` must be None, a folder, or a joblib.Memory. Got "
+            f"{type(memory).__name__}."
+        ) from error
+    except OSError as error:
+        told = unwritten(f"`memory` must be a folder. Got {str(memory)!r}", error)
+        raise type(error)(told) from error
+    if getattr(memory, "location", None) is None:
+        return memory
+    for name, step in steps.items():
+        try:
+            hash(step)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ValueError(
+                f"`memory` needs steps that can be pickled. Got a `{name}` that cannot "
+                f"({error}): replace lambda and nested functions by functions at the "
+                "top of a module, or leave `memory` out."
+            ) from error
+    return memory
+
+
+def unwritten(place: str, error: OSError, advice: str | None = None) -> str:
+    """That a place cannot be written, what the system says of it, and what to do."""
+    if error.errno in _FULL:
+        advice = "Free space there, or take another place."
+    elif error.errno in _NO_FOLDER:
+        advice = advice or "Make the folder that it is in, or take another place."
+    else:
+        advice = advice or "Take a place where you may write."
+    return f"{place}: it cannot be written ({error.strerror or error}). {advice}"
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import textwrap
 import tracemalloc
 import warnings
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -502,10 +503,22 @@ def test_a_link_still_points_to_the_file(tmp_path):
 
 
 def test_a_folder_that_is_not_there_says_so(tmp_path):
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FileNotFoundError, match="`path` .*none.*Make the folder"):
         save(StateSpace(-1, 1, 1), tmp_path / "none" / "model.zip")
     with pytest.raises(FileNotFoundError):
         load(tmp_path / "none.zip")
+
+
+def test_what_is_no_regular_file_stays_as_it_is(tmp_path):
+    pipe, link = tmp_path / "pipe", tmp_path / "link"
+    os.mkfifo(pipe)
+    link.symlink_to(pipe)
+    for place in (pipe, link, tmp_path):
+        for use in (partial(save, StateSpace(-1, 1, 1)), load):
+            with pytest.raises(ValueError, match="`path` must name a file"):
+                use(place)
+    assert pipe.is_fifo() and link.is_symlink()
+    assert {*os.listdir(tmp_path)} == {"pipe", "link"}
 
 
 # -- the format ------------------------------------------------------------------------

@@ -114,12 +114,18 @@ def test_memory_is_a_folder_a_path_or_a_joblib_memory(tmp_path):
             pd.testing.assert_frame_equal(pipeline.report_, expected.report_)
 
 
-def test_memory_teaches_what_it_cannot_keep(tmp_path):
+def test_memory_teaches_what_it_cannot_be(tmp_path):
     X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
     with pytest.raises(
         ValueError, match="`memory` must be None, a folder, or a joblib"
     ):
         spring_pipeline(memory=3).fit(X, y)
+    file = tmp_path / "file"
+    file.touch()
+    for place in (file, file / "below"):
+        with pytest.raises(NotADirectoryError, match="`memory` must be a folder. Got"):
+            spring_pipeline(memory=place).fit(X, y)
+
     truth = spring_structure()
     structure = GrayBoxStructure.from_function(
         lambda theta: truth.matrices(theta), [30.0, 1.2, 50.0]
