@@ -206,7 +206,9 @@ list, default=None
         search over the interpolator then identifies and restructures nothing twice,
         nor do splits that share operating points. Results are known by the values of
         the arguments, and by the code of the library and of the user's functions and
-        classes. Entries are pickles, which may run code: use a folder that you trust.
+        classes; a fit with steps that cannot be pickled, such as lambda, is not kept,
+        with a warning. Entries are pickles, which may run code: use a folder that you
+        trust.
     n_jobs : int, default=None
         Operating points worked on at the same time.
     verbose : int, default=0
@@ -491,6 +493,8 @@ list, default=None
     def _fit(self, read: Callable[[], list[Experiment]]) -> None:
         self._check_options()
         steps = {"local": self.local, "restructurer": self.restructurer}
+        if self.refiner is not None:  # whose result holds the interpolation
+            steps |= {"interpolator": self.interpolator, "refiner": self.refiner}
         memory = checked_memory(self.memory, steps)
         runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
         restructurer, watch = self._restructurer(), Stopwatch(verbose=self.verbose)

@@ -28,6 +28,7 @@ from joblib import Memory, hash
 from sklearn.utils.validation import check_memory
 
 from ..exceptions import warn
+from ..validation import shown
 
 _LIBRARY = Path(__file__).parents[1]
 
@@ -54,11 +55,12 @@ def checked_memory(memory: Any, steps: dict[str, Any]) -> Memory:
         try:
             hash(step)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
-            raise ValueError(
-                f"`memory` needs steps that can be pickled. Got a `{name}` that cannot "
-                f"({error}): replace lambda and nested functions by functions at the "
-                "top of a module, or leave `memory` out."
-            ) from error
+            warn(
+                f"`memory` keeps nothing of this fit: its `{name}` cannot be pickled "
+                f"({shown(str(error))}). Replace lambda and nested functions by "
+                "functions at the top of a module, or leave `memory` out."
+            )
+            return Memory(None)
     return memory
 
 

@@ -126,13 +126,19 @@ def test_memory_teaches_what_it_cannot_be(tmp_path):
         with pytest.raises(NotADirectoryError, match="`memory` must be a folder. Got"):
             spring_pipeline(memory=place).fit(X, y)
 
+
+def test_steps_that_cannot_be_pickled_are_not_kept_and_said(tmp_path):
+    X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
     truth = spring_structure()
     structure = GrayBoxStructure.from_function(
         lambda theta: truth.matrices(theta), [30.0, 1.2, 50.0]
     )
     pipeline = spring_pipeline(restructurer=GrayBoxRestructurer(structure))
-    with pytest.raises(ValueError, match="pickled. Got a `restructurer`.*lambda"):
+    expected = pipeline.fit(X, y).parameters_
+    with pytest.warns(UserWarning, match="keeps nothing .* `restructurer`") as told:
         pipeline.set_params(memory=tmp_path).fit(X, y)
+    assert len(told) == 1 and not list(tmp_path.rglob("output.pkl"))
+    pd.testing.assert_frame_equal(pipeline.parameters_, expected)
 
 
 # -- code ------------------------------------------------------------------------------
