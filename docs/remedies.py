@@ -28,6 +28,8 @@ REMEDIES = {
     # -- warnings
     "`…` has the row labels of … in another order": "Nothing is wrong if the labels "
     "are right; give arrays if they mean nothing.",
+    "…: it cannot be written": "What the system says stands in brackets: free space, "
+    "make the folder, or take a place where you may write.",
     "Input column": "A role that was forgotten makes a column an input, and the "
     "model explains the outputs by it.",
     "All experiments are at one operating point": "See `scheduling_tol`, if they are "
@@ -77,8 +79,6 @@ REMEDIES = {
     "… lacks the column(s)": "Name the columns as in the table of the fit.",
     "… lacks outputs to compare with": "Give a table with the outputs of the fit.",
     "--output …: there is": "Take another name.",
-    "--output …: it cannot be written": "Make room on the disk, or take a folder that "
-    "you may write to.",
     "there is no such file": "Check the path; it counts from the current folder.",
     "…: there is no such file": "Check the path; it counts from the current folder.",
     "a structure of the form": "Leave out what it does not take.",
