@@ -198,6 +198,7 @@ def test_a_time_invariant_model_needs_no_scheduling_variable(fitted):
 # ------------------------------------------------------------------- gaps and jitter
 
 
+@pytest.mark.filterwarnings(r"ignore:\d+ of \d+ values of the outputs are missing")
 @pytest.mark.parametrize("kind", MODELS)
 def test_missing_outputs_count_nowhere_and_are_told(kind, at_home):
     X, Y = TABLES[kind]
@@ -219,6 +220,7 @@ def test_missing_outputs_count_nowhere_and_are_told(kind, at_home):
     assert_allclose(model_of(again), model_of(model), rtol=0.1)
 
 
+@pytest.mark.filterwarnings(r"ignore:\d+ of \d+ values of the outputs are missing")
 @pytest.mark.parametrize("kind", MODELS)
 @pytest.mark.parametrize("hole", ["rows", "inputs", "both"])
 def test_holes_are_gaps_for_a_fit_that_splits(kind, hole, at_home):

@@ -98,6 +98,10 @@ def in_columns(y: Any, names: Any, argument: str = "y") -> Any:
 
 
 def _fitted_outputs(estimator: Any) -> Any:
-    """Names of the outputs that an estimator was fitted to; None where it has none."""
-    names = getattr(estimator, "output_names_", None)
-    return names or getattr(getattr(estimator, "lti_", None), "output_names", None)
+    """Names of the outputs that an estimator was fitted to; None where it has none.
+
+    A stream is not asked for the model that it has not made yet.
+    """
+    kept = getattr(estimator, "__dict__", {})
+    names = kept.get("output_names_")
+    return names or getattr(kept.get("lti_"), "output_names", None)

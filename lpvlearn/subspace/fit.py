@@ -7,6 +7,7 @@ The records are made regular, order and horizon chosen, the model identified
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -186,10 +187,11 @@ def _with_constants(
     given = choices.order is not None and choices.initial_states and n_trend < 2
     lost = given and (outlasts(fitted) or fitted.residual > _HARDLY)
     if choices.offset == "auto" and lost:
-        other = _fit(pairs, judged, told, 2, fitted)
-        without, tested = fitted.evidence.one_step, other.evidence.one_step
-        if not outlasts(other) and constants_matter(without, tested):
-            fitted, n_trend = other, 2
+        with suppress(TooFewSamples):
+            other = _fit(pairs, judged, told, 2, fitted)
+            without, tested = fitted.evidence.one_step, other.evidence.one_step
+            if not outlasts(other) and constants_matter(without, tested):
+                fitted, n_trend = other, 2
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
 
 
@@ -352,6 +354,8 @@ def tell_of_delay(
     except TooFewSamples:
         return
     error, found = _held_out(first, given), _held_out(other, given)
+    if [p.error.shape for p in error.parts] != [p.error.shape for p in found.parts]:
+        return  # late inputs move in other parts
     n_saved = first.selection.order - other.selection.order
     better = n_saved >= _FEWER and not error.clearly_better_than(found, 0.0)
     if not better and not found.clearly_better_than(error, _DOUBT):
