@@ -179,30 +179,33 @@ class _PlainTable(NamedTuple):
         return found.set_axis(self.columns.built(), axis=1)
 
 
+WRITTEN_BY = "_lpvlearn_version"  # the entry of a pickled state that tells it
+
+
 class VersionedPickle:
-    """What an estimator's pickle tells: the version of this library that wrote it.
+    """What the pickle of a public object tells: the version that wrote it.
 
     Scikit-learn's estimators tell theirs; what others inherit from it does not. Tables
-    are taken apart, so that skops holds the estimator as well.
+    are taken apart, so that skops holds an estimator as well.
     """
 
     def __getstate__(self) -> dict[str, Any]:
         state: dict[str, Any] = super().__getstate__()  # type: ignore[assignment]
         plain = {name: _PlainTable.of(value) for name, value in state.items()}
-        return plain | {"_lpvlearn_version": version()}
+        return plain | {WRITTEN_BY: version()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         own = {
             name: value.table() if isinstance(value, _PlainTable) else value
             for name, value in state.items()
-            if name != "_lpvlearn_version"
+            if name != WRITTEN_BY
         }
-        written = state.get("_lpvlearn_version", "0.1.0 or before")
+        written = state.get(WRITTEN_BY, "0.1.0 or before")
         if written != version():
             warn(
                 f"A pickled {type(self).__name__} was written by lpvlearn {written}, "
-                f"this is {version()}: what it tells may be wrong. Fit it anew, or "
+                f"this is {version()}: what it tells may be wrong. Make it anew, or "
                 "keep models by lpvlearn.save(), whose files later versions read.",
                 VersionWarning,
             )
-        super().__setstate__(own)  # type: ignore[misc]
+        getattr(super(), "__setstate__", self.__dict__.update)(own)

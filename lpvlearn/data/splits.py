@@ -60,6 +60,7 @@ from sklearn.model_selection import BaseCrossValidator
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_consistent_length, column_or_1d
 
+from ..exceptions import VersionedPickle
 from ..validation import flag, naming_argument, one_of, whole_number
 from .experiments import (
     Column,
@@ -79,7 +80,7 @@ Indices = NDArray[np.intp]
 Parts = tuple[list[Indices], list[Indices]]
 
 
-class _SplitOfExperiments(BaseCrossValidator):
+class _SplitOfExperiments(VersionedPickle, BaseCrossValidator):
     """Splits of which training and test set are put together from experiments.
 
     Subclasses say what their experiments are (`_read`), how many folds these make

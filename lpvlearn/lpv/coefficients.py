@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import warn
+from ..exceptions import VersionedPickle, warn
 from ..models.statespace import StateSpace
 from ..models.system_matrix import blocks
 from ..structures.structure import GrayBoxStructure
@@ -34,7 +34,7 @@ _GRID = "Take frozen models: grid(points), to_control(points), to_mat(path, poin
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MatrixCoefficients:
+class MatrixCoefficients(VersionedPickle):
     """Coefficients of the matrices of an LPV model.
 
     ``A(kappa) = sum_k A[k] t_k(kappa) / d(kappa)``, B, C and D alike, with the products

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..exceptions import VersionedPickle
 from ..models.statespace import StateSpace
 from ..models.system_matrix import blocks
 from ..validation import flag, place
@@ -39,7 +40,7 @@ _MANY_VARIABLES = 4  # 24 orders in which to take the variables are tried
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearFractionalModel:
+class LinearFractionalModel(VersionedPickle):
     """An LPV model as an upper linear-fractional transformation.
 
     ``z = M11 w + M12 v``, ``[x'; y] = M21 w + M22 v``, ``w = Delta(kappa) z`` with

@@ -12,7 +12,7 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import DivergenceError, finite_simulation
+from ..exceptions import DivergenceError, VersionedPickle, finite_simulation
 from ..models.statespace import StateSpace, sorted_poles, split_delay
 from ..models.system_matrix import blocks
 from ..structures.map import numerical_jacobian
@@ -52,7 +52,7 @@ _ENTRIES = 1_000_000  # of derivatives that are held at once: 8 MB
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LPVStateSpace:
+class LPVStateSpace(VersionedPickle):
     """A continuous-time state-space model scheduled by measured variables, Eq. (1).
 
     ``dx/dt = A(kappa) x + B(kappa) u``, ``y = C(kappa) x + D(kappa) u`` with static

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
+from ..exceptions import VersionedPickle
 from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import (
     delayed,
@@ -41,7 +42,7 @@ class NoiseModel(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class InnovationModel:
+class InnovationModel(VersionedPickle):
     """Innovation form of an identified model.
 
     ``x[t+1] = A x[t] + B u[t] + K e[t]``, ``y[t] = C x[t] + D u[t] + e[t]`` with white

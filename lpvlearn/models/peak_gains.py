@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..exceptions import VersionedPickle
 from ..systems.hinf_norm import hinf_norm, linf_norm
 from ..validation import one_of, share
 from .statespace import StateSpace
@@ -16,7 +17,7 @@ Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
-class PeakGains:
+class PeakGains(VersionedPickle):
     """A norm and the local maxima of the largest singular value near it.
 
     Attributes

@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import finite_simulation, warn
+from ..exceptions import (
+    WRITTEN_BY,
+    VersionedPickle,
+    finite_simulation,
+    version,
+    warn,
+)
 from ..systems.balancing import Balancing, align_signs, balancing_transformations
 from ..systems.hinf_norm import hinf_norm
 from ..systems.response import frequency_response
@@ -48,7 +54,7 @@ _METHODS = ("zoh", "tustin")
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
-class StateSpace:
+class StateSpace(VersionedPickle):
     """A linear time-invariant model in state-space form.
 
     Continuous time, ``dx/dt = A x + B u, y = C x + D u``, or discrete time,
@@ -189,7 +195,8 @@ class StateSpace:
         # Copies and pickles are built anew, so that their arrays are read-only too.
         matrices = self.A, self.B, self.C, self.D
         names = self.input_names, self.output_names, self.units
-        return type(self), (*matrices, self.sampling_time, self.input_delay, *names)
+        given = (*matrices, self.sampling_time, self.input_delay, *names)
+        return type(self), given, {WRITTEN_BY: version()}
 
     def __repr__(self) -> str:
         dt = self.sampling_time

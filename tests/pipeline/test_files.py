@@ -22,6 +22,7 @@ from sklearn.linear_model import LinearRegression
 import lpvlearn
 from lpvlearn import (
     AutoLPV,
+    ExperimentSplit,
     GrayBoxRestructurer,
     GrayBoxStructure,
     InnovationModel,
@@ -36,9 +37,10 @@ from lpvlearn import (
     load,
     save,
 )
-from lpvlearn.exceptions import VersionWarning, collected
+from lpvlearn.exceptions import VersionedPickle, VersionWarning, collected
 from lpvlearn.models.innovation import NoiseModel
 from lpvlearn.pipeline.files import _TEXT, SCHEMA
+from lpvlearn.pipeline.memory import fingerprint
 from lpvlearn.pipeline.schema import CLASSES, FORMS, before_saving
 
 from ..conftest import (
@@ -839,16 +841,32 @@ def test_many_damaged_files_load_or_tell(pipeline, fitted, tmp_path):
 
 
 def test_pickles_of_another_version_warn(fitted, monkeypatch):
+    lti, lpv = stable_model(1, sampling_time=0.1), spring_lpv()
+    one = np.ones((1, 1))
+    noise = NoiseModel(0.9 * one, 0.9 * one, one, one)
     for model in (
         fitted[0],
         PolynomialLPV(),
         GrayBoxRestructurer(),
         LocalLPVPipeline(),
+        ExperimentSplit(),
+        lti,
+        InnovationModel(StateSpace(0.5, 1, 1, sampling_time=1.0), noise),
+        lpv,
+        lpv.coefficients(),
+        lpv.lfr(),
     ):
         content = pickle.dumps(model)
         other = pickle.loads(content)
         assert vars(other).keys() == vars(model).keys()
+        assert fingerprint(other) == fingerprint(model)
         with monkeypatch.context() as patch:
             patch.setattr(lpvlearn, "__version__", "99.0")
-            with pytest.warns(VersionWarning, match=r"written by .* this is 99\.0"):
+            with collected() as told:
                 pickle.loads(content)
+        text = f"A pickled {type(model).__name__} was written by lpvlearn "
+        assert any(message.startswith(text) for message, _ in told)
+        assert {category for _, category in told} == {VersionWarning}
+    public = (getattr(lpvlearn, name) for name in lpvlearn.__all__)
+    classes = {c for c in public if isinstance(c, type)} - {GrayBoxStructure}
+    assert all(issubclass(c, VersionedPickle) for c in classes)
