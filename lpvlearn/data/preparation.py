@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..exceptions import warn
-from ..validation import listed
+from ..validation import SQUARED, listed
 from .experiments import Experiment, read_experiments
 
 Array = NDArray[np.float64]
@@ -234,7 +234,10 @@ def independent_inputs(inputs: Sequence[Array]) -> Array | None:
 
 
 def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> None:
-    """Refuse a single sample and inputs that never change; None numbers the inputs."""
+    """Refuse a single sample, and inputs that never change or are next to nothing.
+
+    Without `names` the inputs are numbered.
+    """
     inputs = [u for u, _ in pairs]
     if max(len(u) for u in inputs) < 2:
         raise ValueError(
@@ -250,6 +253,13 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
             "its effect cannot be told from the initial state. Excite it, or leave it "
             "out of `inputs`; a column that is no input needs its role (`scheduling=`, "
             "`operating_point=`, `experiment=`)."
+        )
+    size = np.max([np.maximum(u.max(axis=0), -u.min(axis=0)) for u in inputs], axis=0)
+    for k in np.flatnonzero(size < 1.0 / SQUARED):  # a model from it has huge entries
+        raise ValueError(
+            f"Every input must reach {1.0 / SQUARED:g}, as what is below is zero when "
+            f"squared. Got input {k if names is None else names[k]!r} of at most "
+            f"{size[k]:.3g}: give it in a smaller unit."
         )
 
 

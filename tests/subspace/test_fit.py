@@ -201,6 +201,16 @@ def test_constant_inputs_are_called_by_their_names(rng):
         SubspaceLTI(time=0).fit(X.to_numpy(), y)
 
 
+@pytest.mark.parametrize("unit", [1e-290, 1e-308, 1e-310])
+def test_inputs_that_are_next_to_nothing_are_named(unit):
+    rng = np.random.default_rng(0)
+    X = pd.DataFrame(rng.normal(size=(100, 2)), columns=["valve", "fan"])
+    y = X.to_numpy().sum(axis=1)
+    with pytest.raises(ValueError, match="Got input 'fan' of at most .* smaller unit"):
+        SubspaceLTI(1).fit(X * [1.0, unit], y)
+    SubspaceLTI(1).fit(X * [1.0, 1e-149], y)
+
+
 def test_a_given_horizon_that_ends_in_a_poor_minimum_warns():
     """A pole a hundred times slower than the horizon, past inputs as instruments."""
     poles = np.exp(1e-3 * np.array([-0.7, -45.0, -3.8 + 52.6j, -46.0 + 121.0j]))
