@@ -255,9 +255,9 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
             "`operating_point=`, `experiment=`)."
         )
     size = np.max([np.maximum(u.max(axis=0), -u.min(axis=0)) for u in inputs], axis=0)
-    for k in map(
-        int, np.flatnonzero(size < 1.0 / SQUARED)
-    ):  # a model from it has huge entries
+    small = np.flatnonzero(size < 1.0 / SQUARED).tolist()
+    if small:  # a model from it has huge entries
+        k = small[0]
         raise ValueError(
             f"Every input must reach {1.0 / SQUARED:g}, as what is below is zero when "
             f"squared. Got input {k if names is None else names[k]!r} of at most "
