@@ -48,9 +48,11 @@ from .identification import (
 )
 from .local_fit import LocalFit
 from .offsets import (
+    CERTAIN,
     N_TRENDS,
     attributed,
     constants_matter,
+    criterion_in_units,
     may_have_constants,
     shifts_matter,
     with_levels,
@@ -185,12 +187,14 @@ def _with_constants(
             fitted, n_trend = other, 1
     # The states of a given order that are to follow a drift are missing elsewhere.
     given = choices.order is not None and choices.initial_states and n_trend < 2
+    given &= fitted.method != "pbsid" and not choices.enforce_stability
     lost = given and (outlasts(fitted) or fitted.residual > _HARDLY)
     if choices.offset == "auto" and lost:
         with suppress(TooFewSamples):
             other = _fit(pairs, judged, told, 2, fitted)
             without, tested = fitted.evidence.one_step, other.evidence.one_step
-            if not outlasts(other) and constants_matter(without, tested):
+            better = criterion_in_units(without) - criterion_in_units(tested)
+            if better > CERTAIN and not outlasts(other):
                 fitted, n_trend = other, 2
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
 
