@@ -8,6 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lpvlearn import (
     GrayBoxRestructurer,
+    LocalLPVPipeline,
+    StateSpace,
     SubspaceLTI,
     bft_score,
     bft_scorer,
@@ -168,6 +170,26 @@ def uses(model, table, y):
     yield compare_models(frozen, table, y)["BFT"]
     yield SimulationDisplay.from_estimator(model, table, y).bft_["simulated"]
     yield ResidualDisplay.from_estimator(model, table, y).tests["p_value"]
+
+
+def test_outputs_are_found_by_their_names():
+    rng = np.random.default_rng(0)
+    plant = StateSpace(0.9, 1, [[1], [3]], [[0], [1]], sampling_time=0.1)
+    u = pd.DataFrame({"u": rng.standard_normal(300)})
+    y = plant.simulate(u) + rng.standard_normal((300, 2))
+    y = pd.DataFrame(y, columns=["a", "b"])
+    turned, plant = y[["b", "a"]], plant.with_names(output_names=["a", "b"])
+    stream, expected = SubspaceLTI(1), SubspaceLTI(1).partial_fit(u, y)
+    for first, part in ((0, y), (100, turned), (200, turned)):
+        stream.partial_fit(u[first : first + 100], part[first : first + 100])
+    assert_allclose(stream.predict(u), expected.predict(u))
+    local = SubspaceLTI(1, sampling_time=0.1).fit(u, y)
+    for model in (local, LocalLPVPipeline(local, "passthrough").fit(u, y)):
+        turned_and_not = (uses(model, u, given) for given in (turned, y))
+        for found, right in zip(*turned_and_not, strict=True):
+            assert_array_equal(found, right)
+    reports = [compare_models({"plant": plant}, u, given) for given in (turned, y)]
+    pd.testing.assert_frame_equal(*reports)
 
 
 @pytest.mark.parametrize("kind", MODELS)

@@ -29,7 +29,7 @@ def align_outputs(
     """
     if y is None or not hasattr(y, "__len__"):
         return y  # where outputs are read, it is said what they must be
-    y = in_columns(y, _fitted_outputs(estimator))
+    y = in_columns(y, getattr(estimator, "_output_names", None))
     first, second = names  # in messages
     positions = f"{second}.to_numpy() if the rows belong together as they stand"
     with naming_argument(second, f"have as many rows as {first}", y):
@@ -69,6 +69,19 @@ def align_outputs(
     )
 
 
+def beside(
+    y_true: Any, y_pred: Any, names: tuple[str, str] = ("y_true", "y_pred")
+) -> Any:
+    """`y_pred` in the rows and columns of `y_true`, by the labels of two tables."""
+    tables = pd.DataFrame, pd.Series
+    if not isinstance(y_true, tables) or not isinstance(y_pred, tables):
+        return y_pred
+    y_pred = in_columns(y_pred, getattr(y_true, "columns", None), names[1])
+    if len(y_true) != len(y_pred):
+        return y_pred
+    return align_outputs(y_true, y_pred, names=names)
+
+
 def in_columns(y: Any, names: Any, argument: str = "y") -> Any:
     """`y` with its columns in the order of `names`, where it has the same ones.
 
@@ -95,13 +108,3 @@ def in_columns(y: Any, names: Any, argument: str = "y") -> Any:
             "stand."
         )
     return y[names]
-
-
-def _fitted_outputs(estimator: Any) -> Any:
-    """Names of the outputs that an estimator was fitted to; None where it has none.
-
-    A stream is not asked for the model that it has not made yet.
-    """
-    kept = getattr(estimator, "__dict__", {})
-    names = kept.get("output_names_")
-    return names or getattr(kept.get("lti_"), "output_names", None)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..data.alignment import align_outputs
+from ..data.alignment import align_outputs, beside
 from ..data.experiments import (
     ROLES,
     Table,
@@ -113,7 +113,7 @@ class SimulationDisplay:
                 f"of `y_true`. Got {self.time.shape}."
             )
         self.predictions = {
-            name: as_numbers("predictions", read_outputs(y)[0])
+            name: as_numbers("predictions", read_outputs(beside(y_true, y))[0])
             for name, y in by_name("predictions", predictions).items()
         }
         self.true_name = true_name = str(true_name)
@@ -131,7 +131,7 @@ class SimulationDisplay:
                 )
             self.bft_[name] = best_fit(self.y_true, y_pred)
         self.std = {
-            name: as_numbers("std", read_outputs(own)[0])
+            name: as_numbers("std", read_outputs(beside(y_true, own))[0])
             for name, own in by_name("std", std).items()
         }
         for name, own in self.std.items():

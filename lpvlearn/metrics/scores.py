@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from ..data.alignment import align_outputs, in_columns
+from ..data.alignment import beside
 from ..data.experiments import read_outputs
 from ..data.scoring import tell_missing
 from ..validation import SQUARED, real_array, shown, squarable
@@ -206,11 +205,7 @@ def _read_pair(
     Of two tables, rows and columns belong together by their labels. Unless refused,
     `missing` values of the first are NaN in both.
     """
-    tables = pd.DataFrame, pd.Series
-    if isinstance(y_true, tables) and isinstance(y_pred, tables):
-        y_pred = in_columns(y_pred, getattr(y_true, "columns", None), names[1])
-        if len(y_true) == len(y_pred):
-            y_pred = align_outputs(y_true, y_pred, names=names)
+    y_pred = beside(y_true, y_pred, names)
     pair = zip((y_true, y_pred), names, strict=True)
     # column after column in memory, where sums take a tenth of the time
     true, pred = (

@@ -169,6 +169,10 @@ class TableSimulator(BaseEstimator):
         self.operating_point = operating_point
         self.time_tol = time_tol
 
+    @property
+    def _output_names(self) -> Any:
+        return self.model.output_names
+
     def predict(self, X: Any) -> Array:
         """Simulate from rest."""
         return self._simulate(self._read(X, None), n_rows_of(X), estimate=False)

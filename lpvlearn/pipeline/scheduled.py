@@ -50,6 +50,10 @@ class ScheduledEstimator(
     def _splits(self) -> bool:
         """Whether experiments are cut where samples are missing."""
 
+    @property
+    def _output_names(self) -> Any:
+        return getattr(self, "output_names_", None)
+
     def predict(self, X: Any, return_std: bool = False) -> Array | tuple[Array, Array]:
         """Simulate the LPV model along every experiment of a table, from rest.
 

@@ -990,6 +990,15 @@ class SubspaceLTI(
         """Let the model know the names of the columns, where they have some."""
         self.lti_ = self.lti_.with_names(inputs, outputs)
 
+    @property
+    def _output_names(self) -> Any:
+        """Names of the outputs of the fit or stream; None where they had none.
+
+        A stream is not asked for the model that it has not made yet.
+        """
+        stream = self.__dict__.get("_stream")
+        return self.lti_.output_names if stream is None else stream.names[1]
+
     def _step_of(self, experiments: Sequence[Experiment]) -> float:
         """Seconds between the samples of a table; True where nothing tells them."""
         for e in experiments:

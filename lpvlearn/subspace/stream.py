@@ -316,7 +316,10 @@ class SampleStream:
         simply inputs and outputs, arrays or tables as the first ones were, `options`
         are not those that the stream began with, or enough samples wait.
         """
-        if self._named:
+        outputs = self.names[1]
+        if self._named and (
+            outputs is None or list(getattr(y, "columns", outputs)) == [*outputs]
+        ):
             X, y = _without_labels(X, y, self._names)
         if not (type(X) is type(y) is np.ndarray and X.dtype == y.dtype == np.float64):
             return None

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -41,6 +42,14 @@ def test_simulation_draws_the_signals_and_tells_their_bft():
             f"good: BFT {fits[0]:.1f} %",
             f"poor: BFT {fits[1]:.1f} %",
         ]
+
+
+def test_columns_of_a_simulation_are_found_by_their_names():
+    rng = np.random.default_rng(1)
+    y = pd.DataFrame(rng.standard_normal((50, 2)), columns=["a", "b"])
+    turned = SimulationDisplay.from_predictions(range(50), y, 0.9 * y[["b", "a"]])
+    expected = bft_score(y, 0.9 * y, multioutput="raw_values")
+    assert_array_equal(turned.bft_["simulated"], expected)
 
 
 def test_zoom_shows_a_part_and_keeps_the_fit_of_the_whole():
