@@ -234,6 +234,9 @@ def test_missing_outputs_count_nowhere_and_are_told(kind, at_home):
     assert_allclose(report["BFT"], expected)
     display = SimulationDisplay.from_estimator(model, X, y)
     assert display.n_missing_.tolist() == [int(lost[:150].sum())]
+    residuals = ResidualDisplay.from_estimator(model, X, y)
+    assert (residuals.tests["n_missing"] == lost.sum()).all()
+    assert residuals.axes_[0, 0].get_ylabel().endswith(f", {lost.sum()} missing")
     for found in uses(model, X, y):
         assert np.isfinite(np.asarray(found, dtype=float)).all()
     with pytest.raises(ValueError, match="y contains NaN.*missing='split'"):

@@ -130,7 +130,7 @@ class ResidualDisplay:
             )
         self.confidence, self.what = float(level[0]), what
         residuals, n_lags = with_windows(residuals, n_lags)
-        errors, u, outputs, inputs, _ = residuals
+        errors, u, outputs, inputs = residuals[:4]
         self.output_names = [str(name) for name in outputs]
         self.input_names = [str(name) for name in inputs]
         quantile = float(norm.ppf(0.5 + 0.5 * self.confidence))
@@ -213,7 +213,11 @@ class ResidualDisplay:
             runs = read_runs(estimator, X, y, split=True, reset=False)
             labels = input_labels(runs[0].input_names)
             residuals = Residuals(
-                [wrong[e.rows] for e in runs], [e.inputs for e in runs], names, labels
+                [wrong[e.rows] for e in runs],
+                [e.inputs for e in runs],
+                names,
+                labels,
+                n_missing=np.isnan(wrong).sum(axis=0),
             )
         else:
             wanted = " or a LocalLPVPipeline" if simulates else ""
@@ -250,8 +254,9 @@ class ResidualDisplay:
         }
         lags = self.cross_correlations.lags
         for i, output in enumerate(self.output_names):
-            self.axes_[i, 0].set_ylabel(output)
             tests = self.tests.iloc[i * (1 + 3 * m) :]  # whiteness, then m at a time
+            lost = tests["n_missing"].iloc[0]
+            self.axes_[i, 0].set_ylabel(f"{output}, {lost} missing" if lost else output)
             own = self.autocorrelations[1:, i]
             self._panel((i, 0), lags[lags > 0], own, self.autocorrelation_band)
             self._say(self.axes_[i, 0], tests.iloc[0], "whiteness", "left")

@@ -1165,7 +1165,9 @@ class SubspaceLTI(
             - statistic, dof : chi-squared with that many degrees of freedom, about,
               where there is nothing to be found (for inputs ``dof * F``);
             - p_value : probability of such a statistic by chance;
-            - passed : whether the p-value is not below `level`.
+            - passed : whether the p-value is not below `level`;
+            - n_missing : samples of the output that are missing (NaN), or of which an
+              input is.
 
         Raises
         ------
@@ -1235,6 +1237,11 @@ class SubspaceLTI(
                 f"`y` must hold the {self.n_outputs_} output(s) of the model. Got "
                 f"{len(names)}."
             )
+        lost = (
+            np.isnan(e.measured) | ~np.isfinite(e.inputs).all(axis=1, keepdims=True)
+            for e in experiments
+        )
+        n_missing = sum(part.sum(axis=0) for part in lost)
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
             at_rest = self.initial_state == "rest"
             runs = runs_to_complete(experiments, at_rest=at_rest)
@@ -1243,7 +1250,7 @@ class SubspaceLTI(
                 experiments = self._expected(runs, experiments)
         experiments = self._with_late_inputs(experiments, self.input_delay_, True)
         undelayed = self.lti_.with_input_delay(0)
-        return model_residuals(
+        found = model_residuals(
             undelayed,
             self._predictor(undelayed) if errors == "prediction" else None,
             [(e.inputs, e.measured) for e in experiments],
@@ -1252,6 +1259,7 @@ class SubspaceLTI(
             input_labels(experiments[0].input_names),
             self.detrend,
         )
+        return found._replace(n_missing=n_missing)
 
     @property
     def predictor_(self) -> InnovationModel:

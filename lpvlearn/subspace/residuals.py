@@ -120,6 +120,7 @@ class Residuals(NamedTuple):
     output_names: Sequence[Hashable]
     input_names: Sequence[Hashable]
     fitted: Fitted | None = None  # None: the model was not fitted to these samples
+    n_missing: Sequence[int] | None = None  # of every output; None: none
 
 
 class CrossCorrelations(NamedTuple):
@@ -295,7 +296,7 @@ def residual_tests(
     """
     level = share("level", level)
     residuals, n_lags = with_windows(residuals, n_lags)
-    errors, inputs, output_names, input_names, fitted = residuals
+    errors, inputs, output_names, input_names, fitted, n_missing = residuals
     white = whiteness_tests(errors, n_lags, 0 if fitted is None else fitted.n_noise)
     by_input = input_tests(errors, inputs, n_lags, fitted)
     names = "past inputs", "present input", "future inputs"
@@ -309,6 +310,8 @@ def residual_tests(
         rows, columns=["output", "test", "input", "statistic", "dof", "p_value"]
     )
     table["passed"] = table["p_value"] >= level
+    lost = [0] * len(output_names) if n_missing is None else n_missing
+    table["n_missing"] = np.repeat(lost, len(table) // len(lost))
     return table
 
 

@@ -349,7 +349,7 @@ def test_the_table_names_what_was_tested():
     e, u = rng.standard_normal((400, 2)), rng.standard_normal((400, 3))
     residuals = Residuals([e], [u], ["angle", "rate"], list("abc"))
     table = residual_tests(residuals, level=0.5)
-    columns = "output test input statistic dof p_value passed"
+    columns = "output test input statistic dof p_value passed n_missing"
     assert list(table.columns) == columns.split()
     assert len(table) == 2 * (1 + 3 + 3 + 3)
     assert list(table["output"][[0, 10]]) == ["angle", "rate"]
