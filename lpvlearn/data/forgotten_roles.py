@@ -15,6 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..exceptions import warn
+from .timestamps import MISSING
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -52,6 +53,14 @@ def warn_of_forgotten_roles(
                 "from row to row, as times and row numbers do. If it is the time, name "
                 f"it: time={name!r}; if it numbers the rows, drop it; if it is a ramp "
                 "that the system got, list the inputs in `inputs`."
+            )
+        elif roles["time"] is None and _is_clock(-column, groups):
+            warn(
+                f"Input column {name!r} falls by the same {-_typical_step(column):.6g} "
+                "from row to row, as times do where the latest row comes first. If it "
+                "is the time, sort the rows by it, in X and y (sort_values of pandas), "
+                f"and name it: time={name!r}; if it is a ramp that the system got, "
+                "list the inputs in `inputs`."
             )
         elif roles["experiment"] is None and _is_count(column):
             warn(
@@ -118,24 +127,30 @@ def _typical_step(column: Array) -> float:
 def _is_clock(column: Array, groups: Sequence[Indices]) -> bool:
     """Whether a column rises evenly, from anew where another experiment begins.
 
-    Evenly but for the jitter of stamps.
+    Evenly but for the jitter of stamps, and for those of rows that are missing.
     """
-    steps = np.concatenate([np.diff(column[rows]) for rows in groups])
+    parts = [column[rows] for rows in groups]
+    steps = np.concatenate([np.diff(part) for part in parts])
     if len(steps) < _FEWEST or not np.isfinite(steps).all():
         return False
     typical = float(np.median(steps))
-    uneven = steps[np.abs(steps - typical) > _EVEN * typical]
-    n_back = int((steps < 0).sum())
-    if not typical > 0 or n_back > (_RESTARTS * len(steps) if len(groups) == 1 else 0):
+    n_back, n_over = int((steps < 0).sum()), int((steps > MISSING * typical).sum())
+    few = _RESTARTS * len(steps)
+    if not typical > 0 or n_over > few or n_back > (few if len(groups) == 1 else 0):
         return False
+    uneven = steps[np.abs(steps - typical) > _EVEN * typical]
     if (uneven < 0).all():
         return True
-    columns = [column[rows] for rows in groups]
     return all(
-        _is_straight(part, typical)
-        for whole in columns
-        for part in np.split(whole, np.flatnonzero(np.diff(whole) < 0) + 1)
+        _is_straight(run, typical) for part in parts for run in _runs(part, typical)
     )
+
+
+def _runs(column: Array, step: float) -> list[Array]:
+    """What is between steps that go back or leave something out."""
+    steps = np.diff(column)
+    breaks = np.flatnonzero((steps < 0) | (steps > MISSING * step))
+    return np.split(column, breaks + 1)
 
 
 def _is_straight(column: Array, step: float) -> bool:

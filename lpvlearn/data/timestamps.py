@@ -22,7 +22,7 @@ _STEP_RTOL, _SAMPLING_TIME_RTOL = 1e-6, 1e-4
 
 # Steps beyond so many typical ones leave out a sample. Stamps may be off the grid by
 # less than half of what is left to that: then no jitter looks like a gap.
-_GAP, _LARGEST_TOL = 1.6, 0.25
+MISSING, _LARGEST_TOL = 1.6, 0.25
 
 TIME_TOL = 0.01  # of the estimators: what a clock's jitter costs is far below noise
 
@@ -230,7 +230,7 @@ def read_clock(
 
 def missing_after(steps: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Steps so long that samples must be missing within."""
-    return steps > _GAP * np.median(steps)
+    return steps > MISSING * np.median(steps)
 
 
 def _off_grid(

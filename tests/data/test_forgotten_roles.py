@@ -46,6 +46,7 @@ CLOCKS = {
     ),
     "late time": 1.7e9 + np.tile(TIME, RUNS),
     "row number": np.arange(N * RUNS),
+    "time with rows left out": 0.01 * np.delete(np.arange(N * RUNS + 3), [9, 50, 99]),
     "single precision": np.tile(TIME, RUNS).astype(np.float32),
 }
 
@@ -53,7 +54,7 @@ INPUTS = {
     "noise": RNG.normal(size=N * RUNS),
     "random walk upwards": np.cumsum(RNG.uniform(0.5, 1.5, N * RUNS)),
     "binary noise": RNG.choice([-1.0, 1.0], N * RUNS),
-    "falling": -np.arange(N * RUNS),
+    "falling walk": -np.cumsum(RNG.uniform(0.5, 1.5, N * RUNS)),
     "a step": np.tile(np.arange(N) >= N // 2, RUNS).astype(float),
     "stair": np.tile(np.arange(N) // 4, RUNS),
     "sawtooth": np.arange(N * RUNS) % 8,
@@ -71,6 +72,14 @@ def test_an_evenly_rising_input_may_be_the_time(name):
     assert "time='clock'" in message and "`inputs`" in message
     # as one experiment, where the clock restarts now and then, too
     assert any("time='clock'" in m for m in warned(X.drop(columns="run")))
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.003])
+def test_an_evenly_falling_input_may_be_the_time_of_the_latest_row_first(jitter):
+    time = 0.01 * np.arange(N * RUNS) + jitter * RNG.uniform(-1.0, 1.0, N * RUNS)
+    (message,) = warned(table(clock=time[::-1]), experiment="run")
+    assert message.startswith("Input column 'clock' falls by the same 0.0")
+    assert "the latest row comes first" in message and "sort_values" in message
 
 
 @pytest.mark.parametrize("name", INPUTS)
