@@ -37,27 +37,14 @@ class DivergenceError(ValueError):
     """A simulation left the range of the floating-point numbers."""
 
 
-_ABSURD = 1e100  # no quantity is as large, in whatever unit
-
-
 def finite_simulation(
     outputs: NDArray[np.float64], cause: Callable[[], str]
 ) -> NDArray[np.float64]:
-    """Simulated outputs, or a DivergenceError that tells where they end, and why.
-
-    Of outputs that are numbers yet, but absurd ones, a warning tells the same.
-    """
-    if outputs.max(initial=0.0) < _ABSURD and outputs.min(initial=0.0) > -_ABSURD:
-        return outputs
+    """Simulated outputs, or a DivergenceError that tells where they end, and why."""
     finite = np.isfinite(outputs)
-    left = ~finite if not finite.all() else np.abs(outputs) >= _ABSURD
-    sample, *place = (int(i) for i in np.argwhere(left)[0])
     if finite.all():
-        warn(
-            f"the simulation diverges: output {place[0]} is "
-            f"{outputs[sample, *place]:.4g} at sample {sample}. {cause()}"
-        )
         return outputs
+    sample, *place = (int(i) for i in np.argwhere(~finite)[0])
     before = f"{outputs[sample - 1, *place]:.4g} at sample {sample - 1}, and "
     raise DivergenceError(
         f"the simulation diverges: output {place[0]} is {before if sample else ''}"

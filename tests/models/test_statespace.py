@@ -349,10 +349,7 @@ def test_control_models_of_unknown_time_or_kind_are_refused():
 
 def test_an_unstable_model_grows_until_its_numbers_end():
     model = StateSpace(10.0, 1, 1, sampling_time=1.0)
-    model.simulate(np.ones(101))
-    told = r"0 is 1\.111e\+100 at sample 101\. .*\(a pole at 10"
-    with pytest.warns(UserWarning, match=told):  # which no quantity is
-        y = model.simulate(np.ones(309))  # 1.1e307 at last
+    y = model.simulate(np.ones(309))  # 1.1e307 at last
     assert_allclose(y[:4, 0], [0, 1, 11, 111])
     assert np.isfinite(y).all()
     with pytest.raises(DivergenceError, match=r"0 is 1\.111e\+308 at sample 309"):
