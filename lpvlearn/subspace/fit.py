@@ -181,9 +181,11 @@ def _with_constants(
     hides = fitted.method == "pbsid" or not choices.initial_states
     hides |= choices.order is not None and fitted.residual > _HARDLY
     tested = fitted.evidence.one_step
+    tried = [tested]
     if choices.offset == "auto" and (hides or may_have_constants(tested)):
         other = _fit(pairs, judged, told, 1, fitted)
-        if constants_matter(tested, other.evidence.one_step):
+        tried.append(other.evidence.one_step)
+        if constants_matter(tested, tried[-1]):
             fitted, n_trend = other, 1
     # The states of a given order that are to follow a drift are missing elsewhere.
     given = choices.order is not None and choices.initial_states and n_trend < 2
@@ -192,8 +194,8 @@ def _with_constants(
     if choices.offset == "auto" and lost:
         with suppress(TooFewSamples):
             other = _fit(pairs, judged, told, 2, fitted)
-            without, tested = fitted.evidence.one_step, other.evidence.one_step
-            better = criterion_in_units(without) - criterion_in_units(tested)
+            least = min(map(criterion_in_units, tried))
+            better = least - criterion_in_units(other.evidence.one_step)
             if better > CERTAIN and not outlasts(other):
                 fitted, n_trend = other, 2
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
