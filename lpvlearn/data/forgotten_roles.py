@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..exceptions import warn
-from .timestamps import MISSING
+from .timestamps import missing_after
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -25,9 +25,10 @@ Indices = NDArray[np.intp]
 # about a straight line, which sums of uneven steps leave.
 _EVEN, _JITTER = 0.05, 0.5
 _FEWEST = 10  # steps below which a few even ones are chance
-_RESTARTS = 0.05  # share of the steps that may go back, from experiment to experiment
 
-_TORN = 0.05  # share of the steps of an index that may be larger than the others
+# Share of the steps that may go back, from experiment to experiment, or leave rows out;
+# and of those of an index that may do the latter.
+_RESTARTS, _TORN = 0.05, 0.05
 
 _ORDERED = ("integer", "datetime64", "timedelta64")  # index types that tell an order
 
@@ -103,11 +104,9 @@ def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
             return
         if index.inferred_type == "integer" and len(labels) > _FEWEST:
             steps = np.diff(labels.to_numpy().astype(np.float64))
-            torn = np.flatnonzero(steps > np.median(steps))
-            if (
-                0 < len(torn) <= _TORN * len(steps)
-                and (steps >= np.median(steps)).all()
-            ):
+            typical = np.median(steps)
+            torn = np.flatnonzero(steps > typical)
+            if 0 < len(torn) <= _TORN * len(steps) and (steps >= typical).all():
                 where = int(torn[0])
                 warn(
                     "Rows of X are missing within an experiment: its index goes from "
@@ -134,7 +133,7 @@ def _is_clock(column: Array, groups: Sequence[Indices]) -> bool:
     if len(steps) < _FEWEST or not np.isfinite(steps).all():
         return False
     typical = float(np.median(steps))
-    n_back, n_over = int((steps < 0).sum()), int((steps > MISSING * typical).sum())
+    n_back, n_over = int((steps < 0).sum()), int(missing_after(steps, typical).sum())
     few = _RESTARTS * len(steps)
     if not typical > 0 or n_over > few or n_back > (few if len(groups) == 1 else 0):
         return False
@@ -149,7 +148,7 @@ def _is_clock(column: Array, groups: Sequence[Indices]) -> bool:
 def _runs(column: Array, step: float) -> list[Array]:
     """What is between steps that go back or leave something out."""
     steps = np.diff(column)
-    breaks = np.flatnonzero((steps < 0) | (steps > MISSING * step))
+    breaks = np.flatnonzero((steps < 0) | missing_after(steps, step))
     return np.split(column, breaks + 1)
 
 

@@ -22,7 +22,7 @@ _STEP_RTOL, _SAMPLING_TIME_RTOL = 1e-6, 1e-4
 
 # Steps beyond so many typical ones leave out a sample. Stamps may be off the grid by
 # less than half of what is left to that: then no jitter looks like a gap.
-MISSING, _LARGEST_TOL = 1.6, 0.25
+_GAP, _LARGEST_TOL = 1.6, 0.25
 
 TIME_TOL = 0.01  # of the estimators: what a clock's jitter costs is far below noise
 
@@ -228,9 +228,11 @@ def read_clock(
     return Clock(step, jitter, np.flatnonzero(missing) + 1, slack)
 
 
-def missing_after(steps: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Steps so long that samples must be missing within."""
-    return steps > MISSING * np.median(steps)
+def missing_after(
+    steps: NDArray[np.float64], typical: float | None = None
+) -> NDArray[np.bool_]:
+    """Steps so long that samples must be missing within; `typical` is their median."""
+    return steps > _GAP * (np.median(steps) if typical is None else typical)
 
 
 def _off_grid(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -66,15 +67,15 @@ def bft_score(
     >>> bft_score([1.0, 2.0, 3.0, 4.0], [1.5, 2.5, 2.5, 3.5])
     55.27...
     """
-    true, pred = _read_pair(y_true, y_pred)
-    score = best_fit(true, pred, multioutput)
-    tell_missing(true)
-    return score
+    return _told(_best_fit, y_true, y_pred, multioutput)
 
 
 def best_fit(true: Array, pred: Array, multioutput: Multioutput = "raw_values") -> Any:
     """`bft_score` of matrices, NaN where not measured, without a word of these."""
-    true, pred = _read_pair(true, pred)
+    return _best_fit(*_read_pair(true, pred), multioutput)
+
+
+def _best_fit(true: Array, pred: Array, multioutput: Multioutput) -> Any:
     _check_measured(true)
     return _percent(_norm(true - pred), _norm(_centred(true)), multioutput)
 
@@ -121,17 +122,17 @@ def vaf_score(
     >>> vaf_score([1.0, 2.0, 3.0, 4.0], [1.5, 2.5, 2.5, 3.5])
     80.0
     """
-    true, pred = _read_pair(y_true, y_pred)
-    score = accounted_variance(true, pred, multioutput)
-    tell_missing(true)
-    return score
+    return _told(_accounted_variance, y_true, y_pred, multioutput)
 
 
 def accounted_variance(
     true: Array, pred: Array, multioutput: Multioutput = "raw_values"
 ) -> Any:
     """`vaf_score` of matrices, NaN where not measured, without a word of these."""
-    true, pred = _read_pair(true, pred)
+    return _accounted_variance(*_read_pair(true, pred), multioutput)
+
+
+def _accounted_variance(true: Array, pred: Array, multioutput: Multioutput) -> Any:
     _check_measured(true)
     error, spread = _norm(_centred(true - pred)), _norm(_centred(true))
     return _percent(error, spread, multioutput, power=2)
@@ -191,6 +192,19 @@ def r2_ratio(y_true: ArrayLike, y_pred: ArrayLike) -> NDArray[np.float64]:
     with np.errstate(over="ignore"):
         error = np.nansum((true - pred) ** 2, axis=0)
     return _fit_ratio(error, np.nansum(_centred(true) ** 2, axis=0))
+
+
+def _told(
+    measure: Callable[[Array, Array, Multioutput], Any],
+    y_true: ArrayLike,
+    y_pred: ArrayLike,
+    multioutput: Multioutput,
+) -> Any:
+    """A measure of outputs of any kind; tells how many are missing."""
+    true, pred = _read_pair(y_true, y_pred)
+    score = measure(true, pred, multioutput)
+    tell_missing(true)
+    return score
 
 
 def _read_pair(

@@ -171,7 +171,6 @@ def longest_delays(pairs: Pairs, direct: NDArray[np.bool_]) -> Delay:
     Those that are `direct` (n_inputs,) act through D, others a sample later. They are
     looked for over more lags where there are none, and no delay is longer.
     """
-    pairs = first_samples(pairs)
     most = max(len(u) for u, _ in pairs) // _SHARE
     longest = min(LONGEST, most)
     answers = first_answers(pairs, longest)

@@ -54,19 +54,18 @@ def differences(pairs: Pairs) -> Pairs:
 
 def outlasts(fitted: LocalFit) -> bool:
     """Whether a mode does not decay over the longest experiment, or grows."""
-    n_samples = max(record.u.shape[1] for record in fitted.evidence.records)
-    slow = (_rates(fitted.model.A) * n_samples < _LASTS).any()
+    slow = (_rates(fitted.model.A) * _longest(fitted.evidence) < _LASTS).any()
     return bool(slow) or fitted.grows()
 
 
 def may_drift(fitted: LocalFit) -> bool:
     """Whether the errors of a model wander, or a mode of it may do so for them."""
     evidence = fitted.evidence
-    lengths = [record.u.shape[1] for record in evidence.records]
-    if min(lengths) < _FEWEST or motion_left(evidence) < _EXPLAINED**2:
+    shortest = min(record.u.shape[1] for record in evidence.records)
+    if shortest < _FEWEST or motion_left(evidence) < _EXPLAINED**2:
         return False
     rates = [_rates(A) for A in (evidence.model.A, evidence.noise.A)]
-    return bool((np.concatenate(rates) * max(lengths) < _SLOW).any())
+    return bool((np.concatenate(rates) * _longest(evidence) < _SLOW).any())
 
 
 def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
@@ -105,13 +104,18 @@ def drifts(whole: LocalFit, other: LocalFit) -> bool:
     must be better beyond chance.
     """
     better = criterion_in_units(whole.evidence) - criterion_in_units(other.evidence)
-    n_samples = max(record.u.shape[1] for record in whole.evidence.records)
+    n_samples = _longest(whole.evidence)
     if not (_rates(other.evidence.noise.A) * n_samples < _SLOW_BESIDE).any():
         return better > CERTAIN
     # modes of the samples that are far slower than those of their differences
     rates, slowest = _rates(whole.model.A), _rates(other.model.A).min(initial=1.0)
     n_followed = int((rates < min(_FOLLOWS / n_samples, _FAR * slowest)).sum())
     return better > -PRICE - CERTAIN * n_followed
+
+
+def _longest(evidence: Evidence) -> int:
+    """Samples of the longest experiment."""
+    return max(record.u.shape[1] for record in evidence.records)
 
 
 def _rates(A: Array) -> Array:

@@ -23,7 +23,7 @@ from ..data.preparation import (
     remove_trends,
 )
 from ..exceptions import RankWarning
-from ..systems.simulation import delayed
+from ..systems.simulation import delayed, lti_response
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .delay import find_lead, first_samples, longest_delays, with_later_inputs
 from .drift import differences, drifts, may_drift, of_levels, outlasts
@@ -222,6 +222,8 @@ def _of_drifting_noise(
         found = _fit(differences(pairs), same, set(told), max(n_trend - 1, 0))
     except TooFewSamples:
         return None
+    if found.stability_loss:
+        return None
     if choices.offset == "auto":  # where drift begins is anywhere
         n_trend = max(n_trend, 1)
     moved, centres = centred(pairs, n_trend, choices.initial_states)
@@ -242,7 +244,7 @@ def _of_drifting_noise(
         first_model=evidence.model,
         scaled=scaled,
     )
-    if found.stability_loss or not drifts(whole, other):
+    if not drifts(whole, other):
         return None
     if lacks(whole.evidence, innovations) or lacks(evidence, feedback.innovations):
         return None  # errors that inputs explain are no drift
@@ -377,7 +379,7 @@ def tell_of_delay(
         told,
         "delay",
         f"Input {int(delay.argmax()) + 1} shows in the outputs only after {cut} "
-        f"samples, for certain. With a delay in their place a model of order "
+        "samples, for certain. With a delay in their place a model of order "
         f"{orders[0]} {what}. Use input_delay='auto', which finds how many of them are "
         "a delay.",
     )
@@ -389,12 +391,15 @@ def _answers_late(fitted: LocalFit, delay: int) -> bool:
     Of a slow system the first samples are as small, beside what comes later.
     """
     A, B, C, D = fitted.model[:4]
-    states, steps = B, []
+    impulse = np.zeros((_WHOLE * delay + 1, 1))
+    impulse[0] = 1.0
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(_WHOLE * delay):
-            steps.append(np.abs(C @ states).max(axis=0))
-            states = A @ states
-    heights = np.vstack([np.abs(D).max(axis=0), *steps])
+        heights = np.column_stack(
+            [
+                np.abs(lti_response(A, B[:, [j]], C, D[:, [j]], impulse)).max(axis=1)
+                for j in range(B.shape[1])
+            ]
+        )
     if not np.isfinite(heights).all():
         return False
     heights = heights / np.maximum(heights.max(axis=0), np.finfo(float).tiny)

@@ -278,8 +278,8 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
             "The simulation error depends on past inputs, beyond chance and by more "
             f"than a little: the model of order {len(model.A)} lacks states, a delay "
             f"or a nonlinearity, and is not as certain as it says. Try {remedy}, "
-            "`input_delay`, or, if the system is "
-            "nonlinear, smaller inputs; `residual_tests` tells which input it is.",
+            "`input_delay`, or, if the system is nonlinear, smaller inputs; "
+            "`residual_tests` tells which input it is.",
         )
 
 
