@@ -83,8 +83,8 @@ def _told(target: Path, folder: Path | None = None) -> Iterator[None]:
         if folder and where is not None and not str(where).startswith(str(folder)):
             raise  # another file's
         gone = folder and (error.errno == errno.ENOENT or not folder.exists())
-        place = f"--output {target}, of which nothing is there"
-        raise OSError(unwritten(place, error, _VANISHED if gone else None)) from error
+        advice = _VANISHED if gone else None
+        raise OSError(unwritten(f"--output {target}", error, advice)) from error
 
 
 def _umask() -> int:
