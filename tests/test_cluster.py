@@ -16,6 +16,7 @@ from lpvlearn.paper import run_paper_experiment
 
 from .conftest import spring_pipeline, spring_tables
 
+cloudpickle = pytest.importorskip("cloudpickle")
 distributed = pytest.importorskip("distributed")
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default")]
@@ -40,6 +41,25 @@ def chain(**options):
 @pytest.fixture(scope="module")
 def tables():
     return spring_tables(noise=0.01, kappas=np.linspace(0.0, 1.5, 8))
+
+
+@pytest.fixture
+def sent(monkeypatch):
+    """Bytes of tasks that go to the cluster, and what goes there beside them."""
+    tasks, beside = [], []
+    submit, scatter = distributed.Client.submit, distributed.Client.scatter
+
+    def submitting(self, *args, **options):
+        tasks.append(len(cloudpickle.dumps(options["tasks"])))
+        return submit(self, *args, **options)
+
+    def scattering(self, data, **options):
+        beside.append(data)
+        return scatter(self, data, **options)
+
+    monkeypatch.setattr(distributed.Client, "submit", submitting)
+    monkeypatch.setattr(distributed.Client, "scatter", scattering)
+    return tasks, beside
 
 
 def with_a_worker_killed(client, work):
@@ -74,6 +94,24 @@ def test_a_chain_comes_out_to_the_bit(cluster, tables):
     alone = chain().fit(*tables)
     np.testing.assert_array_equal(fitted.parameters_, alone.parameters_)
     np.testing.assert_array_equal(fitted.predict(tables[0]), alone.predict(tables[0]))
+
+
+def test_data_are_sent_once(cluster, sent):
+    """Those of an operating point with its task, a table of a search beside all."""
+    X, y = spring_tables(noise=0.01, n_samples=4000, kappas=np.linspace(0.0, 1.5, 8))
+    once = X[["force", "time"]].to_numpy().nbytes + y.to_numpy().nbytes
+    cv = ExperimentSplit(3, experiment="run", scheduling="kappa")
+    search = GridSearchCV(chain(), {"interpolator__degree": [1, 2]}, cv=cv)
+    tasks, beside = sent
+    for model, tables in ((chain(n_jobs=2), []), (search, [X, y])):
+        tasks.clear()
+        with parallel_config(backend="dask"):
+            model.fit(X, y)  # of the search: once more with all data
+        assert once < sum(tasks) < 1.2 * once
+        found = [data for data in beside if isinstance(data, pd.DataFrame)]
+        assert len(found) == len(tables)
+        for one, other in zip(found, tables, strict=True):
+            pd.testing.assert_frame_equal(one, other)
 
 
 def test_a_search_comes_out_to_the_bit(cluster, tables):

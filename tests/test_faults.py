@@ -7,10 +7,13 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import numpy as np
 import pytest
 from joblib import delayed
 
@@ -44,7 +47,8 @@ if __name__ == "__main__":
 ALONE = "model.fit(X, y)"
 SEARCH = """
     folds = [(X.index, X.index)]
-    GridSearchCV(model, {'local__order': [2] * 8}, cv=folds, n_jobs=2).fit(X, y)
+    search = GridSearchCV(model, {'local__order': [2] * 8}, cv=folds, n_jobs=2)
+    model = search.fit(X, y).best_estimator_
 """
 
 
@@ -76,6 +80,16 @@ def session(process):
             fields = stat.read_text().rpartition(")")[2].split()
             pid = int(stat.parent.name)
             if int(fields[3]) == process.pid != pid and fields[0] != "Z":
+                found.append(pid)
+    return found
+
+
+def workers(process):
+    """Those in the session that run the code of Loky."""
+    found = []
+    for pid in session(process):
+        with contextlib.suppress(OSError):
+            if b"LokyProcess" in Path(f"/proc/{pid}/cmdline").read_bytes():
                 found.append(pid)
     return found
 
@@ -119,7 +133,7 @@ def tables(folder):
     return {name: (folder / name).read_bytes() for name in names}
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_an_ended_command_leaves_points_to_go_on_with(name, tmp_path, whole):
     output, done = tmp_path / "results", tmp_path / ".results.done"
     process = begun([*PAPER, "--output", output])
@@ -142,8 +156,15 @@ def test_an_ended_command_leaves_points_to_go_on_with(name, tmp_path, whole):
     assert not done.exists()
 
 
-@pytest.mark.parametrize("fit", [ALONE, SEARCH])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "fit, number",
+    [
+        (ALONE, signal.SIGTERM),
+        (ALONE, signal.SIGKILL),
+        (SEARCH, signal.SIGHUP),
+        (SEARCH, signal.SIGKILL),
+    ],
+)
 def test_workers_end_with_the_process_that_started_them(fit, number, tmp_path):
     jobs = 2 if fit == ALONE else None
     process = begun(script(fit, n_jobs=jobs, memory=str(tmp_path)))
@@ -153,10 +174,19 @@ def test_workers_end_with_the_process_that_started_them(fit, number, tmp_path):
     nothing_left(process)
 
 
+def test_workers_that_only_begin_end_as_well():
+    """Half of their first task is sent then: it is too large to be sent at once."""
+    process = begun(script(size=20_000, n_jobs=2))
+    until(lambda: len(workers(process)) == 2, "no workers")
+    process.send_signal(signal.SIGHUP)
+    process.communicate(timeout=PATIENCE)
+    nothing_left(process)
+
+
 def test_a_killed_worker_is_told(tmp_path):
     process = begun(script(n_jobs=2, memory=str(tmp_path)))
     wait_for_points(tmp_path)
-    os.kill(max(session(process)), signal.SIGKILL)
+    os.kill(workers(process)[0], signal.SIGKILL)
     _, told = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
     assert "RuntimeError: A worker process was killed" in told
@@ -180,6 +210,21 @@ def test_a_worker_killed_in_the_middle_of_its_result_is_told():
         list(results_of(tasks, n_jobs=2))
 
 
+def starved():
+    """Ask for more memory than this process may have."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (2**32, before[1]))
+    try:
+        return np.ones(2**32)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def test_a_worker_out_of_memory_is_told():
+    with pytest.raises(MemoryError, match="Unable to allocate 32.*fewer `n_jobs`"):
+        list(results_of([delayed(starved)()] * 2, n_jobs=2))
+
+
 def test_two_processes_share_one_memory(tmp_path):
     both = [begun(script(size=1000, memory=str(tmp_path))) for _ in range(2)]
     (one, told), (two, _) = (p.communicate(timeout=2 * PATIENCE) for p in both)
@@ -196,15 +241,42 @@ def test_a_place_that_cannot_be_written_is_told_at_the_start(capsys):
     assert "local models" not in told
 
 
+def limited(size):
+    """Before a process begins: it cannot write more than so many bytes to a file."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+def test_a_folder_that_cannot_be_written_is_told():
+    as_nobody = "import os; os.geteuid() or os.seteuid(65534)"  # root may write there
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o555)
+        command = script(f"{as_nobody}; {ALONE}", size=100, memory=folder)
+        process = begun(command)
+        _, told = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    assert "PermissionError: `memory` must be a folder." in told
+    assert folder in told and "Take a place where you may write" in told
+
+
+@pytest.mark.parametrize("fit", [ALONE, SEARCH.replace(" * 8", "")])
+def test_a_memory_that_is_full_is_told_and_the_fit_goes_on(fit, tmp_path):
+    command = script(fit, size=200, memory=str(tmp_path))
+    full = begun(command, preexec_fn=partial(limited, 512))
+    found, told = full.communicate(timeout=2 * PATIENCE)
+    assert full.returncode == 0
+    assert "`memory` could not keep a result" in told and "Traceback" not in told
+    whole = written(tmp_path)  # what is small enough
+    again, told = begun(command).communicate(timeout=2 * PATIENCE)
+    assert again == found and "memory" not in told
+    assert whole.items() < written(tmp_path).items()
+
+
 @pytest.mark.parametrize("size", [2**14, 2**17])
 def test_a_full_disk_is_told_and_nothing_half_written_stays(size, tmp_path):
-    def limited():
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
     command = [*PAPER[:3], "--realizations", "1", "--jobs", "1", "--output", "results"]
     home = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    process = begun(command, preexec_fn=limited, cwd=tmp_path, env=home)
+    process = begun(command, preexec_fn=partial(limited, size), cwd=tmp_path, env=home)
     _, told = process.communicate(timeout=2 * PATIENCE)
     assert process.returncode == 1
     assert "--output results: it cannot be written (File too large)" in told

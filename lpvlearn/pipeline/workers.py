@@ -6,7 +6,6 @@ import gc
 import multiprocessing
 import os
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
@@ -16,14 +15,14 @@ from typing import Any
 from joblib import Parallel, delayed, effective_n_jobs
 from joblib.externals.loky import reusable_executor
 
+from ..systems.worker import WATCH, end_with_parent
+
 # A call as `joblib.delayed` writes it down: function, arguments, keywords.
 Task = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
 
 # Tasks that processes have at a time, done or waiting: their next ones as well, or all
 # but one process, whose core is left to the one that sends them.
 QUEUED, ALL_BUT_ONE = "2 * n_jobs", "n_jobs - 1"
-
-_WATCH = 0.5  # seconds between two looks at other processes
 
 _KILLED = (
     "A worker process was killed before its work was done, most often for want of "
@@ -40,9 +39,22 @@ def results_of(
     These are at work from now on, and have `sent` tasks at a time. Raises a
     RuntimeError where one of them is killed from outside.
     """
-    watched = (delayed(_in_worker)(os.getpid(), *task) for task in tasks)
     parallel = Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch=sent)
-    return _guarded(parallel(watched))
+    return _guarded(parallel(_watched(tasks)))
+
+
+def _watched(tasks: Iterable[Task]) -> Iterator[Task]:
+    """Tasks whose processes end with this one, for which they work.
+
+    Joblib asks for the first one when it has an executor, of which no process runs yet:
+    these shall look after this one before they wait for tasks, as the half of a task
+    that was sent by a process killed meanwhile is waited for without an end.
+    """
+    executor = reusable_executor._executor
+    if executor is not None and executor._initializer is None:
+        executor._initializer, executor._initargs = end_with_parent, (os.getpid(),)
+    for task in tasks:
+        yield delayed(_in_worker)(os.getpid(), *task)
 
 
 def started(n_jobs: int | None) -> Callable[[], None]:
@@ -71,6 +83,11 @@ def _guarded(results: Iterator[Any]) -> Iterator[Any]:
         yield from results
     except BrokenProcessPool as error:
         raise RuntimeError(_KILLED) from error
+    except MemoryError as error:
+        raise MemoryError(
+            f"The work takes more memory than there is ({error}). Take fewer `n_jobs`, "
+            "as each holds its own copy of what it works on."
+        ) from error
     finally:
         done.set()
 
@@ -84,7 +101,7 @@ def _watch_workers(done: threading.Event) -> None:
     executor = reusable_executor._executor
     results = executor and executor._result_queue
     seen_dead = False
-    while results is not None and not done.wait(_WATCH):
+    while results is not None and not done.wait(WATCH):
         workers = list(executor._processes.values())
         dead = any(not worker.is_alive() for worker in workers)
         if dead and seen_dead and executor._flags.broken is None:
@@ -103,23 +120,15 @@ def _in_worker(
 ) -> Any:
     if multiprocessing.current_process().name.startswith("LokyProcess"):
         within = asked_by == os.getpid()  # a fit of a search, say
-        _end_with_parent(os.getppid() if within else asked_by)
+        end_with_parent(os.getppid() if within else asked_by)
+        _freeze_modules()
     return function(*args, **kwargs)
 
 
 @cache
-def _end_with_parent(parent: int) -> None:
-    """Have this process end when the one that started it, and asks, has, and at once.
+def _freeze_modules() -> None:
+    """An end that looks for cycles in them takes a quarter of a second.
 
-    Loky's wait for more work for minutes when that one was killed, and what they share
-    with it stays in memory. Modules are frozen: an end that looks for cycles in them
-    takes a quarter of a second, for which the other process waits.
+    The other process waits for it.
     """
     gc.freeze()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_WATCH)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
