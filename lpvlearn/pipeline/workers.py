@@ -14,6 +14,7 @@ from typing import Any
 
 from joblib import Parallel, delayed, effective_n_jobs
 from joblib.externals.loky import reusable_executor
+from joblib.parallel import get_active_backend
 
 from ..systems.worker import WATCH, end_with_parent
 
@@ -36,11 +37,14 @@ def results_of(
 ) -> Iterator[Any]:
     """Results of tasks in their order, as they come, from `n_jobs` processes.
 
+    All at once where the backend of joblib cannot send them one by one, as Ray's.
     These are at work from now on, and have `sent` tasks at a time. Raises a
     RuntimeError where one of them is killed from outside.
     """
-    parallel = Parallel(n_jobs=n_jobs, return_as="generator", pre_dispatch=sent)
-    return _guarded(parallel(_watched(tasks)))
+    backend, _ = get_active_backend()
+    as_they_come = "generator" if backend.supports_return_generator else "list"
+    parallel = Parallel(n_jobs=n_jobs, return_as=as_they_come, pre_dispatch=sent)
+    return _guarded(iter(parallel(_watched(tasks))))
 
 
 def _watched(tasks: Iterable[Task]) -> Iterator[Task]:

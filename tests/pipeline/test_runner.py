@@ -100,6 +100,12 @@ def test_threads_do_not_mix_what_they_warn_of():
     assert [len(done.told) for done in found] == [2, 3, 2]
 
 
+def test_backends_that_send_all_results_at_once_serve_as_well():
+    with joblib.parallel_config("multiprocessing"):  # as that of Ray
+        found = run(3, n_jobs=2)
+    assert [done.result for done in found] == [0, 1, 2]
+
+
 def test_a_failure_still_tells_what_was_warned_of():
     with pytest.warns(UserWarning) as caught:
         with pytest.raises(ValueError, match=r"point 3 \(scheduling 3\): It fails\."):
