@@ -68,8 +68,9 @@ from .uncertainty import ParameterUncertainty
 Array = NDArray[np.float64]
 
 _INTEGRATOR = (
-    " The structure integrates by its fixed entries, and the black box does not: name "
-    "the outputs that integrate, SubspaceLTI(integrating=...)."
+    " The structure has poles on the axis or beyond by its fixed entries, and the "
+    "black box lacks them: name the outputs that integrate, "
+    "SubspaceLTI(integrating=...), or let a parameter damp what oscillates."
 )
 _AT_BOUND = 1e-6  # relative distance to a bound that holds a parameter
 _MOST_STARTS = 100_000  # all are drawn at once
@@ -137,13 +138,15 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     frequency_weight : StateSpace, (low, high) or None, default=None
         Weight W of the error, ``W (G - G0)``: a stable model with one output for all
         outputs alike, or a square one; or a band in rad/s, None leaving a side open.
-    known_poles : array-like of float, default=None
-        Poles on the axis or beyond that black box and structure share, as the zero of
-        an integrator: real, in 1/s (of a discrete-time model 1 for an integrator). None
-        are those that the structure has for all parameters, by fixed entries. They are
-        divided out of both: the error is weighted by ``(s - p) / (s - q)`` on every
-        output that shows the pole p, with ``q = -p``, or, for an integrator, ``-c``, c
-        being the slowest rate of the black box's other poles. See Notes.
+    known_poles : array-like of float or complex, default=None
+        Poles on the axis or beyond that black box and structure share, in 1/s: the zero
+        of an integrator, the pair ``[1j * w0, -1j * w0]`` of an oscillator without
+        damping (of a discrete-time model 1, and ``exp`` of ``1j * w0 * dt`` and its
+        conjugate). None are those that the structure has for all parameters, by fixed
+        entries. They are divided out of both: the error is weighted by ``(s - p) / (s -
+        q)`` on every output that shows the pole p, with q the mirror image of p, or,
+        on the axis, ``p - c``, c being the distance to the nearest of the black box's
+        other poles, and ``|p|`` at most where p is not zero. See Notes.
     max_iter : int, default=1000
         Newton steps on the central path and iterations of the solver, in all.
     max_time : float, default=None
@@ -241,9 +244,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
 
     A motor's position has an integrator, and the distance of two integrators of
     different gains is infinite. With s / (s + c) in front it is that of the gains at
-    low frequencies, and Eq. (6) above c. All errors, bounds and certificates are then
-    those of the weighted error; `lti_` has the pole. A black box whose pole lies near
-    but is stable is weighted alike, not divided.
+    low frequencies, and Eq. (6) above c; with (s^2 + w0^2) / ((s + c)^2 + w0^2) that of
+    the residues of two oscillators at w0, and Eq. (6) away from it. All errors, bounds
+    and certificates are then those of the weighted error; `lti_` has the pole. A pole
+    of the black box that is nearer to p than c / 20 is an estimate of it, and moved
+    there; one that is farther off is weighted alike, not divided.
 
     Examples
     --------

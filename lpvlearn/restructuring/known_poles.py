@@ -1,21 +1,30 @@
-r"""Integrators and other poles that black box and structure share: divided out.
+r"""Poles on the axis or beyond that black box and structure share: divided out.
 
 With :math:`G = C (sI - A)^{-1} B + D` and a pole p of it that no parameter moves, the
 error :math:`G(\theta) - G_0` is infinite there unless the residues agree. A weight
 
-.. math:: w(s) = \frac{s - p}{s - q} = 1 + \frac{q - p}{s - q}
+.. math:: w(s) = \frac{s - p}{s - q}, \qquad
+    w(s) = \frac{(s - p)(s - \bar p)}{(s - q)(s - \bar q)}
+    \text{ of a pair,}
 
-on every output that shows the pole makes it finite: s / (s + c) for an integrator, with
-c the slowest rate of the rest, and of size one at all frequencies for p > 0, where
-q = -p. The realisation of w behind G has states (x, z), ``z' = q z + (C x)_shown``.
-Where ``A V = p V``, the directions
+on every output that shows the pole makes it finite. On the axis q = p - c, with c the
+distance to the nearest other pole, and \|p\| at most: s / (s + c) for an integrator,
+:math:`(s^2 + \omega_0^2) / ((s + c)^2 + \omega_0^2)` for an undamped oscillator. Beyond
+it :math:`q = -\bar p`, of size one at all frequencies. In discrete time this holds for
+the logarithms. The realisation of w behind G has states (x, z),
 
-    N = [V; (C V)_shown / (p - q)],    [A, 0; C_shown, q] N = p N,
+    z' = Q z + b (C x)_shown,   y_shown = (C x)_shown + h z,   P = Q - b h,
 
-are seen by no output, for ``C V + (q - p) N_z = 0``: they are left out, and the pole
-with them, exactly. Where V and the outputs that it moves are fixed entries, N holds for
-all parameters, and the divided system matrix is ``left S(theta) right + constant``. A
-pole that is left, as the second one of a double integrator, is divided out likewise.
+P and Q companion matrices of numerator and denominator. Where ``A V = p V`` and
+``P e = p e``, ``h e = -1``, the directions
+
+    N = [V; e (C V)_shown],    [A, 0; b C_shown, Q] N = p N,
+
+are seen by no output, for ``(C V)_shown + h N_z = 0``: they are left out, and the pole
+with them, exactly; those of a pair by their real and imaginary parts. Where V and the
+outputs that it moves are fixed entries, N holds for all parameters, and the divided
+system matrix is ``left S(theta) right + constant``. A pole that is left, as the second
+one of a double integrator, is divided out likewise.
 """
 
 from __future__ import annotations
@@ -26,11 +35,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag, eig, qr
+from scipy.linalg import block_diag, companion, eig, null_space, qr
 
 from ..structures.map import framed
 from ..structures.structure import GrayBoxStructure
-from ..validation import real_array
+from ..systems.response import pole_rates
+from ..validation import complex_array
 from .error_system import Target, laplace_variable
 
 Array = NDArray[np.float64]
@@ -39,6 +49,7 @@ Flags = NDArray[np.bool_]
 
 _DRAWS = 3  # random parameters at which a pole must be, to be there for all
 _FIXED = 1e-10  # relative singular value or difference that is rounding of a structure
+_ROUNDED = 1e-6  # relative error of the eigenvalues of a chain, which rounding splits
 _CLEAN = 1e-12  # entry of a unit eigenvector that is rounding
 _SHARED = 1e-6  # the same of a black box, whose pole is one of several rounded numbers
 _NEAR = 0.05  # distance of a pole, relative to c, that is an estimate of a known one
@@ -47,19 +58,32 @@ _STEPS = 8  # poles of one value in a chain: more integrators no one has in seri
 
 
 class _Step(NamedTuple):
-    """A weight ``(s - pole) / (s - instead)`` on the outputs that are `shown`."""
+    """A weight ``(s - pole) / (s - instead)`` on the outputs that are `shown`.
 
-    pole: float
-    instead: float
+    A pole above the real axis stands for a pair.
+    """
+
+    pole: complex
+    instead: complex
     shown: Flags
+
+    @property
+    def near(self) -> float:
+        """Distance up to which a pole is an estimate of this one."""
+        return _NEAR * abs(self.instead - self.pole)
+
+    def distances(self, poles: Complex) -> Array:
+        """Of poles that may be estimates of this one: real ones, or upper ones."""
+        alike = np.sign(poles.imag) == np.sign(self.pole.imag)
+        return np.where(alike, np.abs(poles - self.pole), np.inf)
 
 
 @dataclass(frozen=True)
 class Division:
     """Weights that divide known poles out.
 
-    A real pole of a model that is nearer to a known one than a twentieth of c is an
-    estimate of it, and moved there: no record tells them apart.
+    A pole of a model that is nearer to a known one than a twentieth of c is an estimate
+    of it, and moved there: few records tell them apart.
     """
 
     steps: tuple[_Step, ...]
@@ -70,17 +94,16 @@ class Division:
         s = laplace_variable(omega, self.dt)[0][:, None]
         total = np.ones((len(omega), len(self.steps[0].shown)), complex)
         for step in self.steps:
-            own = (s - step.pole) / (s - step.instead)
-            total = np.where(step.shown, total * own, total)
+            for p, q in zip(_both(step.pole), _both(step.instead), strict=True):
+                total = np.where(step.shown, total * ((s - p) / (s - q)), total)
         return total[:, :, None]
 
     def lacks(self, model: Target) -> bool:
         """Whether a model has not all of the poles, nor estimates of them."""
-        own = np.linalg.eigvals(model.A)
+        own = np.linalg.eigvals(model.A).astype(complex)
         for step in self.steps:
-            c = abs(step.instead - step.pole)
-            near = np.sum((own.imag == 0) & (np.abs(own - step.pole) <= _NEAR * c))
-            if near < sum(other.pole == step.pole for other in self.steps):
+            found = np.sum(step.distances(own) <= step.near)
+            if found < sum(other.pole == step.pole for other in self.steps):
                 return True
         return False
 
@@ -109,25 +132,24 @@ def divide(
     """The structure without its known poles, and what divides them out of a model.
 
     `known_poles` None are those on the axis or beyond that the structure has for all
-    parameters. `slowest` is the rate c; None is that of the boxes. Division is None
-    where there are none. A ValueError where a pole that is given is not the
-    structure's, or its state and its outputs are no fixed entries.
+    parameters. `slowest` is the most that c may be; None takes the boxes' poles.
+    Division is None where there are none. A ValueError where a pole that is given is
+    not the structure's, or its state and its outputs are no fixed entries.
     """
     dt = boxes[0].dt
     thetas = _drawn(structure)
     poles = _fixed_poles(structure, thetas, dt)
     if known_poles is not None:
-        given = np.unique(real_array("known_poles", known_poles))
-        poles = [float(pole) for pole in given]
-        _check(poles, dt)
+        poles = _read(known_poles, dt)
     if not poles:
         return structure, None
-    c = _slowest(boxes, poles, _blocks(structure, thetas[0])[0], slowest)
+    A = _blocks(structure, thetas[0])[0]
     steps: list[_Step] = []
     for pole in poles:
-        rate = pole if dt is None else float(np.log(pole)) / dt
-        back = -rate if rate > _FIXED * c else -c
-        instead = back if dt is None else float(np.exp(back * dt))
+        instead = -pole.conjugate() if dt is None else 1.0 / pole.conjugate()
+        if _on_axis(np.array(pole), dt):
+            c = _nearest(boxes, pole, len(A) - len(_without(A, pole)), slowest)
+            instead = pole - c if dt is None else pole * float(np.exp(-c * dt))
         for number in range(_STEPS):
             matrices = [_blocks(structure, theta) for theta in thetas]
             V = _directions(matrices[0][0], pole, _FIXED)
@@ -135,9 +157,9 @@ def divide(
                 if number == 0:
                     raise ValueError(
                         f"`known_poles` must be poles of `structure` for all of its "
-                        f"parameters. Got {pole:g}, which is none: write the state of "
-                        "the pole with fixed entries, as an integrator x1' = x2 with "
-                        "row [0, 1, ...] of A."
+                        f"parameters. Got {pole:.10g}, which is none: write the state "
+                        "of the pole with fixed entries, as an integrator x1' = x2 "
+                        "with row [0, 1, ...] of A."
                     )
                 break
             CV = matrices[0][1] @ V
@@ -145,10 +167,10 @@ def divide(
                 moved = np.abs(A @ V - pole * V).max() > _FIXED * np.abs(A).max()
                 if moved or np.abs(C @ V - CV).max() > _FIXED * np.abs(C).max():
                     raise ValueError(
-                        f"the pole at {pole:g} that `structure` has for all parameters "
-                        "must have a state and outputs of fixed entries. Got ones that "
-                        "depend on parameters. Scale its state so that the entries of "
-                        "C are numbers, and put the gain into B."
+                        f"the pole at {pole:.10g} that `structure` has for all "
+                        "parameters must have a state and outputs of fixed entries. "
+                        "Got ones that depend on parameters. Scale its state so that "
+                        "the entries of C are numbers, and put the gain into B."
                     )
             shown = np.abs(CV).max(1) > _FIXED * np.abs(CV).max()
             step = _Step(pole, instead, np.asarray(shown))
@@ -170,34 +192,46 @@ def integrators(structure: GrayBoxStructure) -> int:
     return _directions(_blocks(structure, thetas[0])[0], 0.0, _FIXED).shape[1]
 
 
-def _multiplicity(A: Array, pole: float) -> int:
-    """How often a matrix has an eigenvalue, one of a chain as it splits."""
-    own = np.linalg.eigvals(A)
-    near = np.sqrt(_FIXED) * max(float(np.abs(own).max()), 1e-300)
-    return int((np.abs(own - pole) <= near).sum())
+def _without(A: Array, pole: complex) -> Array | Complex:
+    """A matrix without one of its eigenvalues, all of a chain: what acts beside it."""
+    while (V := _directions(A, pole, _FIXED)).shape[1]:
+        W = null_space(V.conj().T)
+        A = W.conj().T @ A @ W
+    return A
 
 
 def _frame(
-    step: _Step, CV: Array, V: Array, n_inputs: int
+    step: _Step, CV: Array | Complex, V: Array | Complex, n_inputs: int
 ) -> tuple[Array, Array, Array]:
     """``left, right, constant`` of the weights behind a model, without directions V."""
-    n, p, gain = len(V), len(CV), step.instead - step.pole
+    # of the scalar weight, in units of time in which its poles are about one
+    unit = abs(step.pole) or 1.0
+    zeros, poles = (
+        np.poly(np.divide(_both(own), unit)).real for own in (step.pole, step.instead)
+    )
+    Q, h = unit * companion(poles), unit * (zeros - poles)[None, 1:]
+    m = len(Q)
+    b, e = np.eye(m)[:, :1], (step.pole / unit) ** np.arange(m - 1, -1, -1)[:, None]
+    e = -e / (h @ e)
+    n, p = len(V), len(CV)
     E = np.eye(p)[step.shown]
-    r = len(E)
+    r = m * len(E)
     series = np.block(
         [
             [np.eye(n), np.zeros((n, p))],
-            [np.zeros((r, n)), E],
+            [np.zeros((r, n)), np.kron(E, b)],
             [np.zeros((p, n)), np.eye(p)],
         ]
     )
     inputs = block_diag(np.eye(n), np.zeros((0, r)), np.eye(n_inputs))
     constant = np.zeros((n + r + p, n + r + n_inputs))
-    constant[n : n + r, n : n + r] = step.instead * np.eye(r)
-    constant[n + r :, n : n + r] = gain * E.T
+    constant[n : n + r, n : n + r] = np.kron(np.eye(len(E)), Q)
+    constant[n + r :, n : n + r] = np.kron(E.T, h)
     # coordinates of the states in which N stands alone, one original state each
-    N = np.vstack([V, E @ CV / -gain])
-    own = qr(V.T, mode="r", pivoting=True)[1][: V.shape[1]]
+    N = np.vstack([V, np.kron(E @ CV, e)])
+    if m > 1:
+        N = np.hstack([N.real, N.imag])
+    own = qr(N[:n].T, mode="r", pivoting=True)[1][: N.shape[1]]
     rest = np.setdiff1d(np.arange(n + r), own)
     out = np.eye(n + r)[rest]
     if own.size:
@@ -207,13 +241,13 @@ def _frame(
     return left @ series, inputs @ right, left @ constant @ right
 
 
-def _directions(A: Array, pole: float, tolerance: float) -> Array:
-    """Eigenvectors of a real pole, (n, k); a pole of a chain has one of them."""
+def _directions(A: Array | Complex, pole: complex, tolerance: float) -> Array | Complex:
+    """Eigenvectors of a pole, (n, k); a pole of a chain has one of them."""
     if len(A) == 0:
         return np.zeros((0, 0))
     _, s, Vt = np.linalg.svd(A - pole * np.eye(len(A)))
     size = max(float(np.linalg.norm(A, 2)), abs(pole), 1e-300)
-    V = np.asarray(Vt[s <= tolerance * size].T)
+    V = np.asarray(Vt[s <= tolerance * size].conj().T)
     if tolerance > _FIXED:
         return V
     # in bad units a pole may be small beside others: row by row it is none
@@ -233,20 +267,20 @@ def _snapped(model: Target, step: _Step) -> Target:
     if len(A) == 0:
         return model
     poles, W, V = eig(A, left=True)
-    away = np.where(poles.imag == 0, np.abs(poles - step.pole), np.inf)
+    away = step.distances(poles)
     i = int(np.argmin(away))
-    v, w = V[:, i].real, W[:, i].real
-    c = abs(step.instead - step.pole)
-    if not away[i] <= _NEAR * c or abs(w @ v) <= _CHAINED:
+    v, w = V[:, i], W[:, i].conj()
+    if not away[i] <= step.near or abs(w @ v) <= _CHAINED:
         return model
     mode = np.outer(v, w) / (w @ v)
+    count = len(_both(step.pole))
     if _directions(A, step.pole, _SHARED).shape[1] == 0:
-        A = A + (step.pole - poles[i].real) * mode
-    hidden = ~step.shown
+        A = A + count * ((step.pole - poles[i]) * mode).real
+    hidden, c = ~step.shown, step.near / _NEAR
     G = np.linalg.solve((step.pole + 1j * c) * np.eye(len(A)) - A, B)
     part = np.linalg.norm(C[hidden] @ mode @ B) / c
     if part <= _NEAR * np.linalg.norm(C[hidden] @ G + model.D[hidden]):
-        C = np.where(hidden[:, None], C - C @ mode, C)
+        C = np.where(hidden[:, None], C - count * (C @ mode).real, C)
     return Target(A, B, C, model.D, model.dt)
 
 
@@ -280,47 +314,87 @@ def _drawn(structure: GrayBoxStructure) -> list[Array]:
 
 def _fixed_poles(
     structure: GrayBoxStructure, thetas: list[Array], dt: float | None
-) -> list[float]:
-    """Real poles on the axis or beyond that the structure has at all parameters."""
+) -> list[complex]:
+    """Poles on the axis or beyond that the structure has at all parameters.
+
+    Of pairs the upper ones.
+    """
     border = 0.0 if dt is None else 1.0
     if structure.order == 0 or not thetas:
         return []
     matrices = [_blocks(structure, theta)[0] for theta in thetas]
-    poles = np.linalg.eigvals(matrices[0])
-    beyond = poles.real[(poles.imag == 0) & (poles.real > border)]
+    own = np.linalg.eigvals(_without(matrices[0], border)).astype(complex)
+    # rounding splits the poles of a chain around their mean
+    means = [own[np.abs(own - pole) <= _ROUNDED * abs(pole)].mean() for pole in own]
+    beyond = _upper(np.array(means), dt)
     return [
         pole
-        for pole in dict.fromkeys([border, *map(float, beyond)])
+        for pole in dict.fromkeys([border, *beyond])
         if all(_directions(A, pole, _FIXED).shape[1] for A in matrices)
     ]
 
 
-def _check(poles: list[float], dt: float | None) -> None:
-    border, name = (0.0, "zero") if dt is None else (1.0, "one")
-    for pole in poles:
-        if not (np.isfinite(pole) and pole >= border):
+def _read(known_poles: ArrayLike, dt: float | None) -> list[complex]:
+    """The argument, of pairs the upper ones."""
+    given = np.unique(complex_array("known_poles", known_poles))
+    fine = np.isfinite(given)
+    fine[fine] = _outside(given[fine], dt)
+    if not fine.all():
+        rule = "real part zero or more" if dt is None else "absolute value one or more"
+        raise ValueError(
+            f"`known_poles` must be of {rule}: stable ones need no care. Got "
+            f"{_plain(given[~fine][0]):.10g}."
+        )
+    for pole in given:
+        if not np.isclose(given, pole.conj(), rtol=_ROUNDED, atol=0.0).any():
             raise ValueError(
-                f"`known_poles` must be real, and {name} or more: stable ones need no "
-                f"care. Got {pole:g}."
+                "`known_poles` must hold complex poles in pairs. Got "
+                f"{pole:.10g} without {pole.conj():.10g}: add it."
             )
+    return _upper(given, dt)
 
 
-def _slowest(
-    boxes: Sequence[Target], known: list[float], A: Array, given: float | None
+def _upper(poles: Complex, dt: float | None) -> list[complex]:
+    """Those on the axis or beyond and not below the real line, without rounding."""
+    poles = poles[(poles.imag >= 0) & _outside(poles, dt)]
+    at = poles / np.abs(poles) if dt is not None else 1j * poles.imag
+    poles = np.where(_on_axis(poles, dt), at, poles)
+    return [_plain(pole) for pole in poles.tolist()]
+
+
+def _plain(pole: complex) -> complex:
+    """A real pole as a float."""
+    return pole if pole.imag else float(pole.real)
+
+
+def _both(pole: complex) -> list[complex]:
+    """A real pole, or a pair."""
+    return [pole, pole.conjugate()] if pole.imag else [pole]
+
+
+def _on_axis(poles: Complex, dt: float | None) -> Flags:
+    rates = pole_rates(poles, dt)
+    return np.abs(rates.real) <= _ROUNDED * np.abs(rates)
+
+
+def _outside(poles: Complex, dt: float | None) -> Flags:
+    return (pole_rates(poles, dt).real > 0) | _on_axis(poles, dt)
+
+
+def _nearest(
+    boxes: Sequence[Target], pole: complex, count: int, most: float | None
 ) -> float:
-    """Least rate of the other poles of black boxes; one where there are none.
+    """Distance of a pole to the nearest other one of black boxes, in 1/s.
 
-    As many as the A of a structure has at a known pole are left out, the nearest ones.
+    At most the size of the rate itself; one where there are none. Poles as many as the
+    structure has at this one are left out, the nearest ones.
     """
-    if given is not None:
-        return given
-    dt, found = boxes[0].dt, []
+    dt = boxes[0].dt
+    rate, found = pole_rates(np.array(pole), dt), []
     for box in boxes:
         poles = np.linalg.eigvals(box.A).astype(complex)
-        for pole in known:
-            near = np.argsort(np.abs(poles - pole), kind="stable")
-            poles = poles[near[_multiplicity(A, pole) :]]
-        found.append(poles if dt is None else np.log(poles[poles != 0]) / dt)
-    size = np.abs(np.concatenate(found))
+        others = np.argsort(np.abs(poles - pole), kind="stable")[count:]
+        found.append(np.abs(pole_rates(poles[others], dt) - rate))
+    size = np.append(np.concatenate(found) if most is None else most, np.abs(rate))
     size = size[size > 0]
     return float(size.min()) if size.size else 1.0

@@ -382,7 +382,8 @@ def _check_stable(box: Target) -> None:
             "`model` must be stable: its distance to a gray-box model is infinite "
             f"otherwise. Got a pole at {worst:.4g}. Identify it with "
             "stability='enforce'; if it is an integrator, write it into the structure "
-            "with fixed entries, and both are divided by it; or, if only a "
+            "with fixed entries (so, too, an oscillator of known frequency without "
+            "damping), and both are divided by it; or, if only a "
             "controller holds the system, identify the closed loop, with the "
             "controller's reference as input and the controller in the structure."
         )
@@ -475,7 +476,7 @@ def problem_from_response(
         structure, [nothing], known_poles, slowest=float(np.sqrt(low * high))
     )
     if division is not None:
-        _check_positive(grid, division)
+        _check_finite(grid, division)
         divided = division.weight(grid)
         G, std = divided * G, None if std is None else np.abs(divided) * std
     if std is not None:
@@ -498,12 +499,14 @@ def problem_from_response(
     )
 
 
-def _check_positive(grid: Array, division: Division) -> None:
-    if grid.min() == 0 and any(step.pole == 0 for step in division.steps):
-        raise ValueError(
-            "`omega` must be positive where `structure` has an integrator, whose "
-            "response is infinite at zero. Got 0."
-        )
+def _check_finite(grid: Array, division: Division) -> None:
+    for step in division.steps:
+        if (grid == step.pole / 1j).any():
+            raise ValueError(
+                "`omega` must be positive where `structure` has an integrator, and "
+                "must differ from the frequencies of oscillators without damping: the "
+                f"response is infinite there. Got {step.pole.imag:g}."
+            )
 
 
 def _weight_model(

@@ -7,6 +7,7 @@ import pytest
 from sklearn.exceptions import ConvergenceWarning
 
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn.restructuring.error_system import series
 from lpvlearn.restructuring.known_poles import divide
 
 from .conftest import disguised, target_of
@@ -25,6 +26,51 @@ FREE_MASSES = GrayBoxStructure.mechanical(
 )  # fmt: skip
 BALL = template([[2, 1], [0, "-a"]], [[0], ["b"]], [[1, 0]])
 SAMPLED = template([[1, "e"], [0, "f"]], [["g"], ["h"]], [[1, 0]])
+OSCILLATOR = template(
+    [[0, 1, 0], [-25, 0, 1], [0, 0, "-a"]], [["f"], ["g"], ["b"]], [[1, 0, 0]]
+)
+# an angle, the sloshing of a liquid, and an actuator; the last output shows neither
+SLOSHING = template(
+    [
+        [0, 1, 0, 0, 0],
+        [0, 0, 0, 0, "k"],
+        [0, 0, 0, 2, 0],
+        [0, 0, -2, 0, 1],
+        [0, 0, 0, 0, "-a"],
+    ],
+    [[0, 0], [0, "e"], [0, "f"], [0, "g"], ["b", 0]],
+    [[1, 0, 1, 0, 0], [1, 0, 0, 0, 0], [0, 0, 0, 3, 0], [0, 0, 0, 0, 1]],
+)
+IN_SERIES = template(
+    [
+        [0, 1, 0, 0, 0],
+        [-9, 0, 1, 0, 0],
+        [0, 0, 0, 1, 0],
+        [0, 0, -9, 0, 1],
+        [0, 0, 0, 0, "-a"],
+    ],
+    [[0], ["e"], [0], ["f"], ["b"]],
+    [[1, 0, 0, 0, 0], [0, 0, 1, 0, 0]],
+)
+SIDE_BY_SIDE = template(
+    [
+        [0, 3e3, 0, 0, 0],
+        [-3e3, 0, 0, 0, 0],
+        [0, 0, 0, 3e3, 0],
+        [0, 0, -3e3, 0, 2e3],
+        [0, 0, 0, 0, "-a"],
+    ],
+    [["e", 0], ["f", 0], [0, 0], [0, "g"], [0, "b"]],
+    [[1, 0, 0, 0, 0], [0, 0, 1, 0, 0]],
+)
+SPIRAL = template([[0.5, -4, 1], [1, 0.5, 0], [0, 0, "-a"]], [["f"], [0], ["b"]],
+                  [[0, 1, 0]])  # fmt: skip
+COS, SIN = np.cos(0.6), np.sin(0.6)
+ALTERNATING = template(
+    [[COS, SIN, 0, 0], [-SIN, COS, 0, 1], [0, 0, -1, "e"], [0, 0, 0, "a"]],
+    [["f"], [0], ["g"], ["b"]],
+    [[1, 0, 0, 0], [0, 0, 1, 0]],
+)
 
 CASES = {
     "servo": (SERVO, {"a": 3.0, "b": 2.0}, None),
@@ -36,6 +82,18 @@ CASES = {
     ),
     "unstable": (BALL, {"a": 3.0, "b": 2.0}, None),
     "discrete": (SAMPLED, {"e": 0.1, "f": 0.7, "g": 0.02, "h": 0.3}, 0.1),
+    "oscillator": (OSCILLATOR, {"a": 3.0, "b": 2.0, "f": 1.0, "g": 4.0}, None),
+    "integrators and a pair": (
+        SLOSHING, {"k": 1.5, "a": 9.0, "b": 4.0, "e": 0.7, "f": 0.5, "g": 2.0}, None,
+    ),
+    "pairs in series": (IN_SERIES, {"a": 1.0, "b": 2.0, "e": 3.0, "f": 0.4}, None),
+    "pairs side by side": (
+        SIDE_BY_SIDE, {"a": 1e3, "b": 2e3, "e": 3e3, "f": 900.0, "g": 5e3}, None,
+    ),
+    "unstable pair": (SPIRAL, {"a": 3.0, "b": 2.0, "f": 0.4}, None),
+    "discrete pair": (
+        ALTERNATING, {"a": 0.8, "b": 0.3, "e": 0.2, "f": 1.0, "g": 0.5}, 0.1,
+    ),
 }  # fmt: skip
 
 
@@ -70,11 +128,16 @@ def test_the_divided_response_is_the_weighted_one(name):
     expected = division.weight(omega) * model.frequency_response(omega)
     own = divided.model(theta, dt)
     assert own.is_stable
-    np.testing.assert_allclose(own.frequency_response(omega), expected, rtol=1e-8)
+    zero = 1e-12 * np.abs(expected).max()  # of channels that are
+    np.testing.assert_allclose(
+        own.frequency_response(omega), expected, rtol=1e-8, atol=zero
+    )
     box = division.of(target_of(disguised(model, np.random.default_rng(1))))
     of_box = StateSpace(box.A, box.B, box.C, box.D, dt)
     assert of_box.is_stable
-    np.testing.assert_allclose(of_box.frequency_response(omega), expected, rtol=1e-6)
+    np.testing.assert_allclose(
+        of_box.frequency_response(omega), expected, rtol=1e-6, atol=zero
+    )
     step = 1e-6 * theta
     for j, slope in enumerate(divided.jacobian(theta)):
         ends = [
@@ -104,6 +167,36 @@ def test_the_error_is_the_norm_of_the_weighted_difference():
             box.frequency_response(omega)
         )
         assert np.abs(weight * other[:, 0, 0]).max() > peak
+
+
+def test_the_error_beside_an_oscillator_is_the_norm_of_the_weighted_difference():
+    """With c the frequency of the pair, which is nearer than the other poles."""
+    box = OSCILLATOR.model({"a": 3.0, "b": 2.0, "f": 1.0, "g": 4.0})
+    quick = target_of(StateSpace([[-400.0]], [[480.0]], [[1.0]]))
+    box = StateSpace(*series(box.A, box.B, box.C, box.D, quick))
+    fitted = GrayBoxRestructurer(OSCILLATOR).fit_model(box)
+    omega = np.geomspace(1e-3, 1e4, 4000)
+    error = fitted.lti_.frequency_response(omega) - box.frequency_response(omega)
+    weight = (25.0 - omega**2) / ((1j * omega + 5.0) ** 2 + 25.0)
+    peak = np.abs(weight * error[:, 0, 0]).max()
+    assert np.isclose(fitted.error_, peak, rtol=1e-4)
+
+
+def test_a_mode_beside_the_known_pair_is_not_taken_for_it():
+    """With c the distance of the two, and the box's own pair an estimate."""
+    structure = template(
+        [[0, 5, 0, 0], [-5, 0, 1, 0], [0, 0, 0, 1], [0, 0, "-k", "-d"]],
+        [[0], ["e"], [0], ["b"]],
+        [[1, 0, 0, 0]],
+    )
+    theta = structure.check_params({"k": 30.0, "d": 0.1, "b": 2.0, "e": 1.0})
+    box = structure.model(theta)
+    (step,) = divide(structure, [target_of(box)], None)[1].steps
+    c = np.sqrt(30.0 - 0.05**2) - 5.0
+    assert np.isclose(step.pole - step.instead, np.hypot(c, 0.05))
+    A = box.A - 1e-3 * np.diag([1.0, 1.0, 0.0, 0.0])
+    fitted = GrayBoxRestructurer(structure).fit_model(StateSpace(A, box.B, box.C))
+    np.testing.assert_allclose(fitted.params_, theta, rtol=1e-2)
 
 
 def test_outputs_that_do_not_show_the_pole_are_not_weighted():
@@ -159,6 +252,7 @@ SPRING = template([[0, 1], ["k", "c"]], [[0], ["b"]], [[1, 0]])
     [
         SPRING,
         SPRING.with_bounds({"k": (None, 0), "c": (None, 0)}),
+        template([[0, 1], ["k", 0]], [[0], ["b"]], [[1, 0]]),
         template([[0, 1e6], ["1e-3 * k", "1e15 * c"]], [[0], ["b"]], [[1e6, 0]]),
         SPRING.with_bounds({"k": (-9, 0), "c": (-2, 0), "b": (0, 0.5)}),
         GrayBoxStructure.from_function(
@@ -171,6 +265,7 @@ def test_a_pole_that_parameters_move_is_not_known(structure):
     assert divide(structure, [target_of(box)], None) == (structure, None)
 
 
+SCALED = template([[0, 1], [-25, 0]], [["b"], [1]], [["g", 0]])
 GAIN = template([[0, 1], [0, "-a"]], [[0], [1]], [["g", 0]])
 
 
@@ -179,7 +274,11 @@ GAIN = template([[0, 1], [0, "-a"]], [[0], [1]], [["g", 0]])
     [
         (SERVO, [], "if it is an integrator, write it into the structure"),
         (SERVO, [1.0], "must be poles of `structure` for all of its parameters"),
-        (SERVO, [-1.0], "must be real, and zero or more"),
+        (SERVO, [-1.0], "must be of real part zero or more"),
+        (SERVO, [5j, -5j], "must be poles of `structure` for all of its parameters"),
+        (SERVO, [0.0, 5j], r"in pairs. Got 0\+5j without 0-5j: add it"),
+        (SERVO, [np.nan], "must be of real part zero or more"),
+        (SCALED, None, "must have a state and outputs of fixed entries"),
         (GAIN, None, "must have a state and outputs of fixed entries"),
     ],
 )
@@ -209,3 +308,49 @@ def test_a_black_box_that_lacks_the_integrator_is_told_of():
     box = StateSpace([[-0.4, 1.0], [0.0, -1.0]], [[0.0], [5.0]], [[1.0, 0.0]])
     with pytest.warns(ConvergenceWarning, match=r"SubspaceLTI\(integrating=\.\.\.\)"):
         GrayBoxRestructurer(structure).fit_model(box)
+
+
+@pytest.mark.parametrize("shift", [-0.01, 0.01, 0.01j, -0.01j])
+def test_a_pair_that_is_nearly_the_known_one_is_an_estimate_of_it(shift):
+    truth = OSCILLATOR.model({"a": 3.0, "b": 2.0, "f": 1.0, "g": 4.0})
+    A, s = truth.A.copy(), np.real(shift)
+    A[:2, :2] = [[s, 1.0], [-((5.0 + np.imag(shift)) ** 2), s]]
+    box = disguised(StateSpace(A, truth.B, truth.C), np.random.default_rng(2))
+    fitted = GrayBoxRestructurer(OSCILLATOR).fit_model(box)
+    np.testing.assert_allclose(fitted.params_, [3.0, 2.0, 1.0, 4.0], rtol=2e-2)
+
+
+def test_measured_responses_of_oscillators():
+    omega = np.geomspace(0.1, 100.0, 60)
+    truth = OSCILLATOR.check_params({"a": 3.0, "b": 2.0, "f": 1.0, "g": 4.0})
+    frf = OSCILLATOR.model(truth).frequency_response(omega)
+    fitted = GrayBoxRestructurer(OSCILLATOR).fit(omega, frf)
+    np.testing.assert_allclose(fitted.params_, truth, rtol=1e-6)
+    omega[30] = 5.0
+    with pytest.raises(ValueError, match=r"`omega` .* must differ .* Got 5"):
+        GrayBoxRestructurer(OSCILLATOR).fit(omega, frf)
+
+
+def test_poles_may_be_named():
+    """As NumPy has them, with or without their rounding."""
+    model = OSCILLATOR.model({"a": 3.0, "b": 2.0, "f": 1.0, "g": 4.0})
+    own = divide(OSCILLATOR, [target_of(model)], None)[1]
+    for names in ([5j, -5j], np.roots([1, 0, 25]), [5j + 1e-12, -5j + 1e-12]):
+        named = divide(OSCILLATOR, [target_of(model)], names)[1]
+        assert named.steps[0].pole == own.steps[0].pole == 5j
+    z = np.exp([0.6j, -0.6j])
+    assert len(divide(*_sampled(), z)[1].steps) == 1
+
+
+def _sampled():
+    theta = ALTERNATING.check_params(CASES["discrete pair"][1])
+    return ALTERNATING, [target_of(ALTERNATING.model(theta, 0.1))]
+
+
+def test_the_integrator_of_fast_systems_is_told_from_their_slow_pole():
+    structure = template(
+        [[0, 1, 0], [0, "-a", 1], [0, 0, "-w"]], [[0], [0], ["b"]], [[1, 0, 0]]
+    ).with_bounds({"w": (1e6, None)})
+    box = structure.model({"a": 1.0, "w": 2e6, "b": 1e6})
+    (step,) = divide(structure, [target_of(box)], None)[1].steps
+    assert np.isclose(step.instead, -1.0)
