@@ -35,7 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag, companion, eig, null_space, qr
+from scipy.linalg import block_diag, companion, eig, matrix_balance, null_space, qr
 
 from ..structures.map import framed
 from ..structures.structure import GrayBoxStructure
@@ -112,7 +112,7 @@ class Division:
         for step in self.steps:
             model = _snapped(model, step)
             A = model.A
-            V = _directions(A, step.pole, _SHARED)
+            V = _directions(A, step.pole, _SHARED, step.near)
             hidden = np.abs(model.C[~step.shown] @ V).max(0, initial=0.0)
             size = np.abs(model.C).max(initial=0.0)
             V = V[:, hidden <= _SHARED * size]
@@ -241,20 +241,23 @@ def _frame(
     return left @ series, inputs @ right, left @ constant @ right
 
 
-def _directions(A: Array | Complex, pole: complex, tolerance: float) -> Array | Complex:
+def _directions(
+    A: Array | Complex, pole: complex, tolerance: float, most: float = np.inf
+) -> Array | Complex:
     """Eigenvectors of a pole, (n, k); a pole of a chain has one of them."""
     if len(A) == 0:
         return np.zeros((0, 0))
+    A, units = matrix_balance(A, permute=False)  # in bad units, slow poles are small
     _, s, Vt = np.linalg.svd(A - pole * np.eye(len(A)))
     size = max(float(np.linalg.norm(A, 2)), abs(pole), 1e-300)
-    V = np.asarray(Vt[s <= tolerance * size].conj().T)
-    if tolerance > _FIXED:
-        return V
-    # in bad units a pole may be small beside others: row by row it is none
-    V = np.where(np.abs(V) > _CLEAN, V, 0.0)
-    terms = np.abs(A) @ np.abs(V) + abs(pole) * np.abs(V)
-    rest = np.abs(A @ V - pole * V)
-    return V[:, (rest <= _FIXED * terms).all(0)]
+    V = np.asarray(Vt[s <= min(tolerance * size, most)].conj().T)
+    if tolerance <= _FIXED:
+        V = np.where(np.abs(V) > _CLEAN, V, 0.0)
+        terms = np.abs(A) @ np.abs(V) + abs(pole) * np.abs(V)
+        rest = np.abs(A @ V - pole * V)
+        V = V[:, (rest <= _FIXED * terms).all(0)]
+    V = units @ V
+    return V / np.linalg.norm(V, axis=0)
 
 
 def _snapped(model: Target, step: _Step) -> Target:
@@ -274,7 +277,7 @@ def _snapped(model: Target, step: _Step) -> Target:
         return model
     mode = np.outer(v, w) / (w @ v)
     count = len(_both(step.pole))
-    if _directions(A, step.pole, _SHARED).shape[1] == 0:
+    if _directions(A, step.pole, _SHARED, step.near).shape[1] == 0:
         A = A + count * ((step.pole - poles[i]) * mode).real
     hidden, c = ~step.shown, step.near / _NEAR
     G = np.linalg.solve((step.pole + 1j * c) * np.eye(len(A)) - A, B)

@@ -347,6 +347,25 @@ def _sampled():
     return ALTERNATING, [target_of(ALTERNATING.model(theta, 0.1))]
 
 
+@pytest.mark.parametrize("fast", [1e3, 1e8])
+def test_slow_poles_beside_fast_ones_are_not_known(fast):
+    structure = template(
+        [[0, 1, 0], [0, "-a", "a"], [0, 0, -fast]], [[0], [0], ["b"]], [[1, 0, 0]]
+    )
+    model = structure.model({"a": 1.0, "b": 2.0 * fast})
+    for box in (model, disguised(model, np.random.default_rng(0))):
+        fitted = GrayBoxRestructurer(structure).fit_model(box)
+        np.testing.assert_allclose(fitted.params_, [1.0, 2.0 * fast], rtol=1e-6)
+
+
+def test_the_oscillator_of_fast_systems_may_have_slow_units():
+    w = 2.0 * np.pi * 1e6
+    structure = template([[0, 1], [-(w**2), 0]], [["f"], ["g"]], [[1, 0]])
+    box = structure.model({"f": 2.0, "g": w})
+    fitted = GrayBoxRestructurer(structure).fit_model(box)
+    np.testing.assert_allclose(fitted.params_, [2.0, w], rtol=1e-6)
+
+
 def test_the_integrator_of_fast_systems_is_told_from_their_slow_pole():
     structure = template(
         [[0, 1, 0], [0, "-a", 1], [0, 0, "-w"]], [[0], [0], ["b"]], [[1, 0, 0]]
