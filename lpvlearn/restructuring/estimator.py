@@ -799,12 +799,14 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self.hinf_params_, self.hinf_error_ = self.params_, self.error_
         self.chi2_ = self.degrees_of_freedom_ = self.p_value_ = np.nan
         dt, size = problem.system.dt, problem.reference
-        known: dict[str, Any] = {}
-        if problem.division is not None:
-            known = {"admissible": problem.is_stable, "omega": problem.omega}
+        admissible = None if problem.division is None else problem.is_stable
         if problem.noise is None:
             found = efficient_parameters(
-                problem.whole, estimates, self.params_, sampling_time=dt, **known
+                problem.whole,
+                estimates,
+                self.params_,
+                sampling_time=dt,
+                admissible=admissible,
             )
         else:
             box = measured_response(problem.omega, problem.response, problem.noise)

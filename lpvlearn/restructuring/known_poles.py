@@ -41,7 +41,7 @@ from ..structures.map import framed
 from ..structures.structure import GrayBoxStructure
 from ..systems.response import pole_rates
 from ..validation import complex_array
-from .error_system import Target, laplace_variable
+from .error_system import Target, frequency_grid, laplace_variable
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -53,6 +53,7 @@ _ROUNDED = 1e-6  # relative error of the eigenvalues of a chain, which rounding 
 _CLEAN = 1e-12  # entry of a unit eigenvector that is rounding
 _SHARED = 1e-6  # the same of a black box, whose pole is one of several rounded numbers
 _NEAR = 0.05  # distance of a pole, relative to c, that is an estimate of a known one
+_BESIDE = 0.5  # part of that distance at which frequencies tell of an estimate only
 _CHAINED = 1e-3  # cosine of left and right eigenvectors: of a chain it is zero
 _STEPS = 8  # poles of one value in a chain: more integrators no one has in series
 
@@ -98,6 +99,25 @@ class Division:
                 total = np.where(step.shown, total * ((s - p) / (s - q)), total)
         return total[:, :, None]
 
+    def apart(self, omega: Array) -> Array:
+        """Frequencies that are far from the poles, beside errors of their estimates."""
+        s = laplace_variable(omega, self.dt)[0]
+        near = [np.abs(s - step.pole) <= _BESIDE * step.near for step in self.steps]
+        return omega[~np.any(near, axis=0)]
+
+    def grid(self, model: Target) -> Array:
+        """Frequencies that see the other poles of a model, as it is weighted.
+
+        The model may be in discrete time where the structure is not.
+        """
+        rates = pole_rates(np.linalg.eigvals(model.A), model.dt)
+        for step in self.steps:
+            p, q = pole_rates(np.array([step.pole, step.instead]), self.dt)
+            for known, instead in zip(_both(p), _both(q), strict=True):
+                near = np.abs(rates - known) <= _NEAR * abs(p - q)
+                rates = np.append(rates[~near], instead)
+        return self.apart(frequency_grid(rates, None))
+
     def lacks(self, model: Target) -> bool:
         """Whether a model has not all of the poles, nor estimates of them."""
         own = np.linalg.eigvals(model.A).astype(complex)
@@ -125,30 +145,33 @@ class Division:
 
 def divide(
     structure: GrayBoxStructure,
+    dt: float | None,
     boxes: Sequence[Target],
-    known_poles: ArrayLike | None,
-    slowest: float | None = None,
+    known_poles: ArrayLike | None = None,
+    slowest: float = np.inf,
 ) -> tuple[GrayBoxStructure, Division | None]:
     """The structure without its known poles, and what divides them out of a model.
 
+    `dt` is that of the structure; `boxes` may be in discrete time where it is not.
     `known_poles` None are those on the axis or beyond that the structure has for all
-    parameters. `slowest` is the most that c may be; None takes the boxes' poles.
-    Division is None where there are none. A ValueError where a pole that is given is
-    not the structure's, or its state and its outputs are no fixed entries.
+    parameters. `slowest` is the most that c may be. Division is None where there are
+    none. A ValueError where a pole that is given is not the structure's, or its state
+    and its outputs are no fixed entries.
     """
-    dt = boxes[0].dt
     thetas = _drawn(structure)
     poles = _fixed_poles(structure, thetas, dt)
     if known_poles is not None:
         poles = _read(known_poles, dt)
     if not poles:
         return structure, None
-    A = _blocks(structure, thetas[0])[0]
+    whole = _blocks(structure, thetas[0])[0]
     steps: list[_Step] = []
     for pole in poles:
         instead = -pole.conjugate() if dt is None else 1.0 / pole.conjugate()
         if _on_axis(np.array(pole), dt):
-            c = _nearest(boxes, pole, len(A) - len(_without(A, pole)), slowest)
+            rate = complex(pole_rates(np.array(pole), dt))
+            count = len(whole) - len(_without(whole, pole))
+            c = _nearest(boxes, rate, count, slowest)
             instead = pole - c if dt is None else pole * float(np.exp(-c * dt))
         for number in range(_STEPS):
             matrices = [_blocks(structure, theta) for theta in thetas]
@@ -384,20 +407,15 @@ def _outside(poles: Complex, dt: float | None) -> Flags:
     return (pole_rates(poles, dt).real > 0) | _on_axis(poles, dt)
 
 
-def _nearest(
-    boxes: Sequence[Target], pole: complex, count: int, most: float | None
-) -> float:
+def _nearest(boxes: Sequence[Target], rate: complex, count: int, most: float) -> float:
     """Distance of a pole to the nearest other one of black boxes, in 1/s.
 
-    At most the size of the rate itself; one where there are none. Poles as many as the
-    structure has at this one are left out, the nearest ones.
+    At most the size of its rate, or `most`; one where there are none. Poles as many as
+    the structure has at this one are left out, the nearest ones.
     """
-    dt = boxes[0].dt
-    rate, found = pole_rates(np.array(pole), dt), []
+    found = [most, abs(rate)]
     for box in boxes:
-        poles = np.linalg.eigvals(box.A).astype(complex)
-        others = np.argsort(np.abs(poles - pole), kind="stable")[count:]
-        found.append(np.abs(pole_rates(poles[others], dt) - rate))
-    size = np.append(np.concatenate(found) if most is None else most, np.abs(rate))
-    size = size[size > 0]
-    return float(size.min()) if size.size else 1.0
+        away = np.abs(pole_rates(np.linalg.eigvals(box.A), box.dt) - rate)
+        found += np.sort(away)[count:].tolist()
+    c = min(value for value in [*found, np.inf] if value > 0)
+    return c if np.isfinite(c) else 1.0

@@ -38,9 +38,11 @@ from scipy.sparse import diags_array
 from scipy.stats import chi2
 
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
+from ..structures.structure import GrayBoxStructure
 from ..systems.least_squares import levenberg_marquardt
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Structure, Target, remembering
+from .known_poles import divide
 from .limits import keeps_margin, natural_margin
 from .singular_points import bend_of, squared_combinations
 
@@ -150,22 +152,23 @@ class UncertainBoxes:
     @classmethod
     def of(
         cls,
-        structure: Structure,
+        structure: GrayBoxStructure,
         estimates: Sequence[Estimate],
         sampling_time: float | None = None,
-        omega: Array | None = None,
     ) -> UncertainBoxes | None:
         """Of estimates with their models on either side; None where one has none.
 
         Where these are in discrete time and the structure (`sampling_time`) is not, it
-        is sampled behind a hold. `omega` are frequencies to tell the models apart at.
+        is sampled behind a hold.
         """
         first = estimates[0][0]
         target = Target(first.A, first.B, first.C, first.D, first.sampling_time)
+        division = divide(structure, sampling_time, [target])[1]
+        own: Structure = structure
         if first.sampling_time is not None and sampling_time is None:
-            structure = SampledStructure(structure, first.sampling_time)
-        system = ErrorSystem(structure, target)
-        grid = system.grid if omega is None else omega
+            own = SampledStructure(structure, first.sampling_time)
+        system = ErrorSystem(own, target)
+        grid = system.grid if division is None else division.grid(target)
         if first.sampling_time is not None:
             grid = grid[grid < np.pi / first.sampling_time]
         found = [uncertain_response(box, pairs, grid) for box, pairs in estimates]
@@ -205,22 +208,21 @@ class CovarianceFit:
 
 
 def efficient_parameters(
-    structure: Structure,
+    structure: GrayBoxStructure,
     estimates: Sequence[Estimate],
     start: Array,
     *,
     sampling_time: float | None = None,
     admissible: Callable[[Array], bool] | None = None,
-    omega: Array | None = None,
 ) -> CovarianceFit | None:
     """Parameters of a structure from independent estimates of one system.
 
     The estimates are those of all experiments, or of each realization of the noise, as
     for `UncertainBoxes`. None where an uncertainty is not known, or the start does not
     keep the stability margin. Of models with known poles a margin says nothing: what is
-    `admissible`, and frequencies that see the other poles, are given.
+    `admissible` is given.
     """
-    found = UncertainBoxes.of(structure, estimates, sampling_time, omega)
+    found = UncertainBoxes.of(structure, estimates, sampling_time)
     if found is None:
         return None
     margin = natural_margin(found.system.target)

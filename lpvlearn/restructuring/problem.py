@@ -321,7 +321,7 @@ def problem_from_models(
         for m in models
     ]
     whole = structure
-    structure, division = divide(structure, boxes, known_poles)
+    structure, division = divide(structure, dt, boxes, known_poles)
     lacks_poles = False
     if division is not None:
         lacks_poles = any(map(division.lacks, boxes))
@@ -343,6 +343,7 @@ def problem_from_models(
         parts = series(*parts, system.weight)
     reference = hinf_norm(*parts, dt=dt).norm
     _check_size(reference)
+    omega = system.grid if division is None else division.apart(system.grid)
     bound = 0.0
     plain = division is None and filter_ is None
     if len(models) == 1 and plain and len(first.A) > structure.order:
@@ -351,7 +352,7 @@ def problem_from_models(
         structure,
         system,
         boxes[0],
-        system.grid,
+        omega,
         natural_margin(target),
         reference,
         first.D - boxes[0].D,
@@ -470,10 +471,9 @@ def problem_from_response(
     if sample_weight is not None:
         W = W * weights(sample_weight, len(grid), "frequency")[:, None, None]
     std = read_noise(noise, coherence, n_averages, G)
-    whole, nothing = structure, Target(*(np.zeros((0, 0)),) * 4)
-    low, high = grid[grid > 0].min(), grid.max()
+    whole, low, high = structure, grid[grid > 0].min(), grid.max()
     structure, division = divide(
-        structure, [nothing], known_poles, slowest=float(np.sqrt(low * high))
+        structure, None, [], known_poles, slowest=float(np.sqrt(low * high))
     )
     if division is not None:
         _check_finite(grid, division)

@@ -295,6 +295,32 @@ def test_nothing_is_said_of_distances_between_integrators():
     assert "through the local models" not in text and "nan" not in text
 
 
+def test_undamped_oscillators_are_weighed_by_their_uncertainty():
+    """Identified pairs lie beside the axis; the residues tell what explains them."""
+    structure = GrayBoxStructure.from_template(
+        [[0, 1], [-25, 0]], [["f"], ["g"]], [[1, 0]]
+    )
+    rng, runs = np.random.default_rng(0), []
+    truth = np.array([[1.0, 4.0], [0.7, 3.0]])
+    for kappa, row in enumerate(truth):
+        u = rng.standard_normal(500)
+        y = structure.model(row).simulate(u, sampling_time=0.05)
+        runs.append(
+            (u, float(kappa), y + 0.03 * y.std() * rng.standard_normal(y.shape))
+        )
+    X, y = from_trajectories(runs, sampling_time=0.05)
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    local = SubspaceLTI(stability="enforce")
+    pipeline = LocalLPVPipeline(local, GrayBoxRestructurer(structure), **roles)
+    pipeline.fit(X, y)
+    for fitted, row in zip(pipeline.restructurers_, truth, strict=True):
+        assert fitted.p_value_ > 1e-3
+        std = np.sqrt(np.diag(fitted.params_covariance_))
+        assert (np.abs(fitted.params_ - row) < 4.0 * std).all()
+        assert (std < 0.05).all()
+    assert pipeline.score(X, y) > 0.998
+
+
 def test_one_canonical_form_needs_one_order():
     models = [
         LocalModel(StateSpace(-np.eye(n), np.ones((n, 1)), np.ones((1, n))), n, None)

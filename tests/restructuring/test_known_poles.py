@@ -123,7 +123,7 @@ def test_the_divided_response_is_the_weighted_one(name):
     structure, truth, dt = CASES[name]
     theta = structure.check_params(truth)
     model = structure.model(theta, dt)
-    divided, division = divide(structure, [target_of(model)], None)
+    divided, division = divide(structure, dt, [target_of(model)])
     omega = np.geomspace(0.05, 20.0, 40)
     expected = division.weight(omega) * model.frequency_response(omega)
     own = divided.model(theta, dt)
@@ -191,7 +191,7 @@ def test_a_mode_beside_the_known_pair_is_not_taken_for_it():
     )
     theta = structure.check_params({"k": 30.0, "d": 0.1, "b": 2.0, "e": 1.0})
     box = structure.model(theta)
-    (step,) = divide(structure, [target_of(box)], None)[1].steps
+    (step,) = divide(structure, None, [target_of(box)])[1].steps
     c = np.sqrt(30.0 - 0.05**2) - 5.0
     assert np.isclose(step.pole - step.instead, np.hypot(c, 0.05))
     A = box.A - 1e-3 * np.diag([1.0, 1.0, 0.0, 0.0])
@@ -200,9 +200,9 @@ def test_a_mode_beside_the_known_pair_is_not_taken_for_it():
 
 
 def test_outputs_that_do_not_show_the_pole_are_not_weighted():
-    structure, truth, _ = CASES["flexible, three outputs"]
+    structure, truth, dt = CASES["flexible, three outputs"]
     model = structure.model(truth)
-    _, division = divide(structure, [target_of(model)], None)
+    _, division = divide(structure, dt, [target_of(model)])
     weight = division.weight(np.array([1.0]))[0, :, 0]
     assert weight[2] == 1.0 and abs(weight[0]) < 1.0
     assert weight[0] == weight[1]
@@ -262,7 +262,7 @@ SPRING = template([[0, 1], ["k", "c"]], [[0], ["b"]], [[1, 0]])
 )
 def test_a_pole_that_parameters_move_is_not_known(structure):
     box = SPRING.model({"k": -4.0, "c": -1.0, "b": 0.3})
-    assert divide(structure, [target_of(box)], None) == (structure, None)
+    assert divide(structure, None, [target_of(box)]) == (structure, None)
 
 
 SCALED = template([[0, 1], [-25, 0]], [["b"], [1]], [["g", 0]])
@@ -334,9 +334,9 @@ def test_measured_responses_of_oscillators():
 def test_poles_may_be_named():
     """As NumPy has them, with or without their rounding."""
     model = OSCILLATOR.model({"a": 3.0, "b": 2.0, "f": 1.0, "g": 4.0})
-    own = divide(OSCILLATOR, [target_of(model)], None)[1]
+    own = divide(OSCILLATOR, None, [target_of(model)])[1]
     for names in ([5j, -5j], np.roots([1, 0, 25]), [5j + 1e-12, -5j + 1e-12]):
-        named = divide(OSCILLATOR, [target_of(model)], names)[1]
+        named = divide(OSCILLATOR, None, [target_of(model)], names)[1]
         assert named.steps[0].pole == own.steps[0].pole == 5j
     z = np.exp([0.6j, -0.6j])
     assert len(divide(*_sampled(), z)[1].steps) == 1
@@ -344,7 +344,7 @@ def test_poles_may_be_named():
 
 def _sampled():
     theta = ALTERNATING.check_params(CASES["discrete pair"][1])
-    return ALTERNATING, [target_of(ALTERNATING.model(theta, 0.1))]
+    return ALTERNATING, 0.1, [target_of(ALTERNATING.model(theta, 0.1))]
 
 
 @pytest.mark.parametrize("fast", [1e3, 1e8])
@@ -371,5 +371,5 @@ def test_the_integrator_of_fast_systems_is_told_from_their_slow_pole():
         [[0, 1, 0], [0, "-a", 1], [0, 0, "-w"]], [[0], [0], ["b"]], [[1, 0, 0]]
     ).with_bounds({"w": (1e6, None)})
     box = structure.model({"a": 1.0, "w": 2e6, "b": 1e6})
-    (step,) = divide(structure, [target_of(box)], None)[1].steps
+    (step,) = divide(structure, None, [target_of(box)])[1].steps
     assert np.isclose(step.instead, -1.0)
