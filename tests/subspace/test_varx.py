@@ -147,6 +147,33 @@ def test_a_controller_that_answers_at_once_is_found_whatever_its_reference():
     assert found.found and found.instantaneous
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_kicks_of_a_derivative_do_not_hide_feedback(seed):
+    """A levitation, double pole at +-30, held by a PID that steps of a reference kick.
+
+    Inputs of the same kind tell nothing of the noise of a plant that they do not know.
+    """
+    rng = np.random.default_rng(seed)
+    r = (rng.choice([-1.0, 1.0], 8) * rng.uniform(0.3, 1.0, 8)).repeat(250)
+    a, b = np.cosh(0.06), np.sinh(0.06)
+    A, B = np.array([[a, b], [b, a]]), np.array([a - 1.0, b]) / 9.0
+    u, y, x = np.zeros((2000, 1)), np.zeros((2000, 1)), np.zeros(2)
+    total = derived = last = after = 0.0
+    for t, e in enumerate(0.002 * rng.standard_normal(2000)):
+        y[t] = x[0] + e
+        error = r[t] - y[t, 0]
+        total += 2.16 * error
+        derived = 0.1 * derived + 650.0 * (error - last)
+        u[t], last, after = after, error, 95.0 * error + total + derived
+        x = A @ x + B * u[t]
+    assert np.abs(y).max() < 10.0
+    short = u[:9], y[:9]  # has no sample with all that the test needs
+    assert find_feedback(records_of((u, y), short)).found
+    other = lfilter([0.0, 0.1], [1.0, -0.9], u, axis=0)
+    other += 0.002 * other.std() * rng.standard_normal(u.shape)
+    assert not find_feedback(records_of((u, other))).found
+
+
 def test_there_may_be_nothing_to_test():
     rng, t = np.random.default_rng(0), np.arange(500)[:, None]
     sine = np.sin(0.8 * t)  # known from two samples
