@@ -152,14 +152,17 @@ def fit_pairs(
     if cuts and not choices.estimated:
         pairs, fitted = _without_shifts(pairs, choices, told, fitted)
     doubt = None
+    foreseen = fitted.feedback is not None and fitted.feedback.foreseen
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
-        fitted, doubt = _believable(pairs, choices, told, fitted)
+        # Of inputs without anything new a rival makes of many states what it likes.
+        if not foreseen:
+            fitted, doubt = _believable(pairs, choices, told, fitted)
     elif drifting is None and _may_share_noise(fitted, choices):
         fitted = _with_shared_noise(pairs, choices, told, fitted)
     feedback = fitted.feedback
     if feedback is not None and feedback.found and "feedback" not in told:
         tell_of_feedback(feedback, fitted, choices, doubt, told)
-        if known is None:
+        if known is None and not foreseen:
             _tell_of_lead(pairs, choices, told, fitted)
     if detrend is None:
         return fitted

@@ -199,6 +199,13 @@ def tell_of_feedback(
                 f" {within}: D = 0 was taken. If the controller needs a sample to "
                 "answer, say method='pbsid' yourself, which leaves D free."
             )
+        if feedback.foreseen:
+            what += (
+                " But the inputs follow from the past: what moves them besides the "
+                "controller is a few sines or less, which hardly tells the plant from "
+                "the controller. Let the reference, or what is added to the inputs, "
+                "move by random steps or noise."
+            )
         what += (
             " A model that is only to simulate records of the same loop may do so "
             "better by method='po-moesp'."

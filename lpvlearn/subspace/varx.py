@@ -83,6 +83,7 @@ class Feedback(NamedTuple):
     innovations: Array  # (n_outputs,), their variances
     cut_off: bool = False  # whether the samples carry no longer past than they chose
     regression: Regression | None = None  # of outputs on inputs and the past
+    foreseen: bool = False  # whether every input follows from the past and the outputs
 
     @property
     def found(self) -> bool:
@@ -175,6 +176,8 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
     u, y, future = np.split(rows[:, past * c :], [m, c])
     dof = n - past * c
     within = _wilks(y, _basis(u, rows[:m], _FORESEEN), dof)
+    seen = _basis(y, rows[m:c], _DEPENDENT)
+    foreseen = not _basis(u - (u @ seen) @ seen.T, rows[:m], _FORESEEN).size
     present = _basis(u, rows[:m], _DEPENDENT)
     y, future = (x - (x @ present) @ present.T for x in (y, future))
     noisy = np.linalg.norm(y, axis=1) > _NOISE_FREE * np.linalg.norm(rows[m:c], axis=1)
@@ -194,7 +197,8 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
         found = max(found, of_most)
     innovations = np.sum(y**2, axis=1) / max(dof, 1)
     regression = _coefficients(factor, past, longest, m, ny)
-    return Feedback(*found, within.p_value, curved, innovations, cut_off, regression)
+    acting = within.p_value
+    return Feedback(*found, acting, curved, innovations, cut_off, regression, foreseen)
 
 
 def regression_of(records: Sequence[Record]) -> Regression | None:

@@ -615,3 +615,14 @@ def test_a_record_in_other_words():
     driven = np.hstack([u, e])
     B, D = np.hstack([P.B, P.K]), np.hstack([P.D, np.eye(1)])
     assert_allclose(lti_response(P.A, B, P.C, D, driven, x0), y, atol=1e-8)
+
+
+def test_a_reference_of_few_sines_is_told():
+    rng = np.random.default_rng(0)
+    u, y, x = np.zeros((1000, 1)), np.zeros(1000), 0.0
+    for t, e in enumerate(0.1 * rng.standard_normal(1000)):
+        y[t] = x + e
+        u[t] = np.sin(0.1 * t) - 0.5 * y[t - 1]
+        x = 0.95 * x + 0.3 * u[t, 0]
+    with pytest.warns(UserWarning, match="the inputs follow from the past"):
+        assert SubspaceLTI().fit(u, y).method_ == "pbsid"

@@ -174,6 +174,22 @@ def test_kicks_of_a_derivative_do_not_hide_feedback(seed):
     assert not find_feedback(records_of((u, other))).found
 
 
+@pytest.mark.parametrize("at_once", [False, True])
+def test_inputs_of_a_loop_may_follow_from_the_past(at_once):
+    """Of a reference of a sine, which two samples foresee: not of one with noise."""
+    rng = np.random.default_rng(0)
+    for size in (0.0, 0.02):
+        u, y, x = np.zeros((2000, 1)), np.zeros((2000, 1)), 0.0
+        r = np.sin(0.1 * np.arange(2000)) + size * rng.standard_normal(2000)
+        for t, e in enumerate(0.1 * rng.standard_normal(2000)):
+            y[t] = x + e
+            u[t] = r[t] - 0.5 * y[t if at_once else t - 1]
+            x = 1.02 * x + 0.3 * u[t, 0]
+        records = records_of((u, y))
+        assert find_feedback(records).foreseen == (size == 0.0)
+    assert not find_feedback(records_of(open_loop(rng, 400, "held"))).foreseen
+
+
 def test_there_may_be_nothing_to_test():
     rng, t = np.random.default_rng(0), np.arange(500)[:, None]
     sine = np.sin(0.8 * t)  # known from two samples
