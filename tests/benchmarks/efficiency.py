@@ -34,6 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
@@ -66,6 +67,7 @@ class Case(NamedTuple):
     noise: tuple[float, float]
     pole: float = 0.0
     n_realizations: int = 1
+    process: float = 0.0  # of forces that shake the masses, by what they do to outputs
 
 
 CASES = {
@@ -76,6 +78,7 @@ CASES = {
     "1000 samples, noise 1:100": Case(1000, (0.01, 1.0)),
     "1000 samples, AR(0.9)": Case(1000, (0.1, 0.1), 0.9),
     "6 x 400 averaged, 20 dB": Case(400, (0.1, 0.1), 0.0, 6),
+    "1000 samples, shaken": Case(1000, (0.03, 0.03), process=0.1),
 }
 
 
@@ -89,11 +92,12 @@ class Estimate(NamedTuple):
 
 
 class Record(NamedTuple):
-    """One experiment and the white noise's size."""
+    """One experiment, the white noise's size, and a root of its covariance."""
 
     u: np.ndarray
     y: np.ndarray
     std: np.ndarray
+    root: np.ndarray | None = None  # of samples and outputs, where forces shake
 
 
 def simulated(theta: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -109,11 +113,33 @@ def experiment(
     clean = simulated(theta, u)
     white = rng.standard_normal(clean.shape)
     std = clean.std(axis=0) * case.noise * np.sqrt(1.0 - case.pole**2)
-    return Record(u, clean + lfilter([1.0], [1.0, -case.pole], std * white, 0), std)
+    y = clean + lfilter([1.0], [1.0, -case.pole], std * white, 0)
+    if not case.process:
+        return Record(u, y, std)
+    v = simulated(theta, rng.standard_normal((2 * len(u), 2)))
+    size = case.process * clean.std(axis=0) / v.std(axis=0)
+    root = root_of_covariance(theta, size, std, len(u))
+    return Record(u, y + size * v[len(u) :], std, root)
+
+
+def root_of_covariance(
+    theta: np.ndarray, size: np.ndarray, std: np.ndarray, n: int
+) -> np.ndarray:
+    """Of n samples of outputs that white forces move, and of white noise in these."""
+    pulses = np.zeros((2, 2 * n, 2))
+    pulses[[0, 1], 0, [0, 1]] = 1.0
+    h = size * [simulated(theta, pulse) for pulse in pulses]  # (forces, time, outputs)
+    R = [np.einsum("fto,ftp->op", h[:, k:], h[:, : 2 * n - k]) for k in range(n)]
+    R[0] = R[0] + np.diag(std**2)
+    lags = np.array([r.T for r in R[:0:-1]] + R)
+    by_times = lags[np.subtract.outer(np.arange(n), np.arange(n)) + n - 1]
+    return np.linalg.cholesky(by_times.swapaxes(1, 2).reshape(2 * n, 2 * n))
 
 
 def whitened(y: np.ndarray, record: Record, case: Case) -> np.ndarray:
-    """Outputs, filtered and divided so that their noise is white and of size one."""
+    """Outputs, filtered or divided so that their noise is white and of size one."""
+    if record.root is not None:
+        return solve_triangular(record.root, y.ravel(), lower=True)
     return (lfilter([1.0, -case.pole], [1.0], y, axis=0) / record.std).ravel()
 
 

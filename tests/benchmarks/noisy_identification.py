@@ -383,7 +383,7 @@ def _average(case: Case, seed: int) -> tuple[Array, Array]:
     )
 
 
-def times(first: int, n_runs: int = 10) -> None:
+def times(first: int, n_runs: int = 5) -> None:
     """Processor time of a fit with all choices by that of one that is told them."""
     print(f"{'case':28s} {'all s':>7s}  by order and method given   by horizon, too")
     for case in CASES:
