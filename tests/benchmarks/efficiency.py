@@ -15,8 +15,8 @@ outputs, whitened by the true noise, ``inv(J^T J)``.
 
 "weighted": the parameters at the least distance in units of the covariance of a black
 box that minimises the simulation error. "noise": the same from one whose errors were
-whitened, as `SubspaceLTI` does. "ml": least squares on the whitened outputs, from the
-true parameters.
+whitened, as `SubspaceLTI` does. "pbsid": from one of that method. "ml": least squares
+on the whitened outputs, from the true parameters.
 
 With `--chain` the same of a whole `LocalLPVPipeline` with its defaults, from tables of
 seven operating points, 400 samples each, between which both springs stiffen: orders and
@@ -178,12 +178,12 @@ def weighted(fits: Sequence[SubspaceLTI], start: np.ndarray) -> Estimate:
 
 def estimates(records: Sequence[Record], case: Case) -> Iterator[tuple[str, Estimate]]:
     """What every method makes of the records."""
-    plain, fits = (
+    plain, fits, shared = (
         [
-            SubspaceLTI(4, horizon=15, sampling_time=STEP, refine=refine).fit(r.u, r.y)
+            SubspaceLTI(4, horizon=15, sampling_time=STEP, **options).fit(r.u, r.y)
             for r in records
         ]
-        for refine in ("simulation", "auto")
+        for options in ({"refine": "simulation"}, {}, {"method": "pbsid"})
     )
     models = [fit.lti_ for fit in fits]
     black_boxes = [model.to_continuous().balance() for model in models]
@@ -212,6 +212,7 @@ def estimates(records: Sequence[Record], case: Case) -> Iterator[tuple[str, Esti
             start = found.params_
     yield "weighted", weighted(plain, start)
     yield "noise", weighted(fits, start)
+    yield "pbsid", weighted(shared, start)
     yield "ml", maximum_likelihood(records, case)
 
 
