@@ -96,8 +96,8 @@ _LATE, _FEWER = 3, 2
 _RISEN, _WHOLE, _EARLY = 4, 20, 0.25
 
 # Lags of a noise that may be more than that of a sensor; samples of which more tell the
-# plant without it.
-_LAGS, _PLENTY = 2, 20_000
+# plant without it; share of the outputs' size below which either model is as good.
+_LAGS, _PLENTY, _AUDIBLE = 2, 20_000, 0.01
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
 # model not to refute it; standard errors by which a lesser one must be better where the
@@ -666,7 +666,7 @@ def _may_share_noise(fitted: LocalFit, choices: Choices) -> bool:
         and not choices.estimated
         and feedback is not None
         and not feedback.found
-        and fitted.residual > _ROUGH
+        and fitted.residual > _AUDIBLE
         and len(fitted.evidence.noise.A) >= _LAGS * len(fitted.model.C)
         and not rounded_outputs(fitted.model, records).repeated.any()
     )

@@ -465,11 +465,11 @@ def test_auto_is_po_moesp_in_open_loop(system):
     np.testing.assert_array_equal(model.lti_.A, same.lti_.A)
 
 
-def shaken(seed, shared, n_samples=3000):
+def shaken(seed, shared, n_samples=3000, size=1.0):
     """A light mode that wind moves more than the input does, or a sensor's noise.
 
-    That is as large, and oscillates as lightly at twice the frequency. Returns the
-    samples and the plant.
+    That is `size` times as large, and oscillates as lightly at twice the frequency.
+    Returns the samples and the plant.
     """
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.choice([-1.0, 1.0], n_samples // 40), 40)[:, None]
@@ -481,7 +481,7 @@ def shaken(seed, shared, n_samples=3000):
     gust = np.array([[0.3], [1.0]])
     wind = rng.standard_normal((n_samples + 2000, 1))
     noise = lti_response(oscillation, gust, C[:, :2], np.zeros((1, 1)), wind)[2000:]
-    y = y + y.std() * noise / noise.std()
+    y = y + size * y.std() * noise / noise.std()
     return (u, y + 0.01 * y.std() * rng.standard_normal(y.shape)), plant
 
 
@@ -496,6 +496,14 @@ def test_noise_that_moves_the_plant_tells_of_its_poles(seed):
     assert miss(model, plant) < min(0.3, 0.6 * miss(without, plant))
     both = model.lti_.poles(), linalg.eigvals(plant[0])
     found, true = map(np.sort_complex, both)
+    assert (np.abs(found - true) < 4.0 * np.abs(model.poles_std_).max()).all()
+
+
+def test_little_noise_that_moves_the_plant_is_known_for_it():
+    samples, plant = shaken(0, shared=True, size=0.05)
+    model = SubspaceLTI(3).fit(*samples)
+    assert model.method_ == "pbsid"
+    found, true = map(np.sort_complex, (model.lti_.poles(), linalg.eigvals(plant[0])))
     assert (np.abs(found - true) < 4.0 * np.abs(model.poles_std_).max()).all()
 
 
