@@ -721,6 +721,7 @@ def _deviance(fitted: LocalFit) -> float:
     noise, (ny, n) = evidence.noise, evidence.model.C.shape
     n_samples = sum(record.u.shape[1] for record in evidence.records)
     n_parameters = n * (evidence.model.B.shape[1] + ny) + ny * len(noise.A)
+    n_parameters += evidence.free.n_own(n) * len(evidence.records)
     volume = float(np.linalg.slogdet(noise.covariance)[1])
     return n_samples * volume + PRICE * n_parameters
 
