@@ -36,8 +36,8 @@ _FEWEST = 3  # samples of an experiment, for more than one difference
 
 # Time constants per longest experiment: of noise that may be drift; of noise that may
 # be it beside more noise, of which few lags tell less; of modes that may have followed
-# it, with rates by that of the slowest other mode. Faster ones are, or followed, what
-# comes back as often as drift: of measured records samples tell more than differences.
+# it, with rates by that of the slowest other mode. Faster noise comes back as often as
+# it drifts: of measured records the samples tell more then than their differences.
 _SLOW, _SLOW_BESIDE, _FOLLOWS, _FAR = 12.0, 60.0, 1.0, 0.5
 
 _LASTS = 3.0  # of a mode that has not decayed at the end of the longest experiment
@@ -64,8 +64,8 @@ def may_drift(fitted: LocalFit) -> bool:
     shortest = min(record.u.shape[1] for record in evidence.records)
     if shortest < _FEWEST or motion_left(evidence) < _EXPLAINED**2:
         return False
-    follows = _rates(evidence.model.A) * _longest(evidence) < _FOLLOWS
-    return bool(follows.any()) or _wanders(evidence)
+    slow = _rates(evidence.noise.A) * _longest(evidence) < _SLOW
+    return bool(slow.any()) or outlasts(fitted)
 
 
 def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
@@ -99,26 +99,18 @@ def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
 def drifts(whole: LocalFit, other: LocalFit) -> bool:
     """Whether the model of differences, `other`, is to be preferred.
 
-    Errors of the samples must wander, or modes follow what does. Where those of the
-    differences do so, what further slow modes gain may be chance; and of equals that
+    Where errors wander, what further slow modes gain may be chance; and of equals that
     model is taken which does not say that it knows where the outputs stand. Else it
     must be better beyond chance.
     """
     better = criterion_in_units(whole.evidence) - criterion_in_units(other.evidence)
     n_samples = _longest(whole.evidence)
+    if not (_rates(other.evidence.noise.A) * n_samples < _SLOW_BESIDE).any():
+        return better > CERTAIN
     # modes of the samples that are far slower than those of their differences
     rates, slowest = _rates(whole.model.A), _rates(other.model.A).min(initial=1.0)
     n_followed = int((rates < min(_FOLLOWS / n_samples, _FAR * slowest)).sum())
-    if not n_followed and not _wanders(whole.evidence):
-        return False
-    if not (_rates(other.evidence.noise.A) * n_samples < _SLOW_BESIDE).any():
-        return better > CERTAIN
     return better > -PRICE - CERTAIN * n_followed
-
-
-def _wanders(evidence: Evidence) -> bool:
-    """Whether errors do, as far as their noise model tells."""
-    return bool((_rates(evidence.noise.A) * _longest(evidence) < _SLOW).any())
 
 
 def _longest(evidence: Evidence) -> int:
