@@ -63,9 +63,10 @@ _OUTLYING, _MOST = 6.0, 0.95
 
 # Share of what the past does not explain of an input, beyond which what stands out of
 # it (the kicks of a derivative at steps of a reference) hides what noise does there;
-# share of the innovations that the rest must tell: without kicks inputs that are held
-# may follow what a past of some samples lacks (of 480 records in open loop up to .09)
-_HIDES, _MUCH = 0.5, 0.1
+# share of the samples at which an input moves beside such kicks; share of the
+# innovations that these must tell: an input may follow what a past of some samples
+# lacks (of 480 records in open loop up to .09)
+_HIDES, _ANSWERS, _MUCH = 0.5, 0.3, 0.1
 
 _DEPENDENT = 1e-9  # part of a regressor below which it is rounding
 
@@ -256,14 +257,18 @@ def _calm(
     """Samples after which no input stands out; None where none hides the others.
 
     Of inputs less what `steps` (n_regressors, n_inputs) foresee of them a sample ahead:
-    that tells nothing of the innovations unless there is feedback.
+    that tells nothing of the innovations unless there is feedback. Values that are held
+    until they change answer nothing in between.
     """
-    m = len(records[0].u)
-    left = [w.future[:m] - steps.T @ w.linear[:-1] for w in _windows_of(records, past)]
+    m, windows = len(records[0].u), _windows_of(records, past)
+    left = [w.future[:m] - steps.T @ w.linear[:-1] for w in windows]
+    moves = np.hstack([w.future[:m] != w.linear[:m] for w in windows])
     together = np.hstack(left)
     limit = _OUTLYING * np.median(np.abs(together), axis=1, keepdims=True)
-    squares = np.where(np.abs(together) > limit, together**2, 0.0).sum(axis=1)
-    if not (squares > _HIDES * (together**2).sum(axis=1)).any():
+    outside = np.abs(together) > limit
+    squares = np.where(outside, together**2, 0.0).sum(axis=1)
+    hides = squares > _HIDES * (together**2).sum(axis=1)
+    if not (hides & (np.mean(moves & ~outside, axis=1) > _ANSWERS)).any():
         return None
     calm = []
     for part in left:
