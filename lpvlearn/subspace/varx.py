@@ -184,17 +184,17 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
     noisy = np.linalg.norm(y, axis=1) > _NOISE_FREE * np.linalg.norm(rows[m:c], axis=1)
     dof -= m
     found, curved = _wilks(y[noisy], _basis(future, rows[c:], _FORESEEN), dof), 0.0
-    calm = None
+    windows, calm = _windows_of(records, past), None
     if found.p_value >= _LEVEL:
         known = np.vstack([rows[:m], factor[: past * c]])
         steps = scaled_lstsq(known.T, rows[c : c + m].T, _DEPENDENT)[0]
-        calm = _calm(records, past, steps)
+        calm = _calm(windows, steps)
         if calm is not None:
-            of_calm = _of_calm(records, past, noisy, calm)
+            of_calm = _of_calm(windows, noisy, calm)
             found = of_calm if of_calm.share > _MUCH else found
     if found.p_value < _LEVEL:  # an input that noise reaches at once may tell of it
         first = 1 if within.p_value < _INSTANTANEOUS else 0
-        of_most, curved = _of_most(records, past, noisy, first, calm)
+        of_most, curved = _of_most(windows, m, noisy, first, calm)
         found = max(found, of_most)
     innovations = np.sum(y**2, axis=1) / max(dof, 1)
     regression = _coefficients(factor, past, longest, m, ny)
@@ -251,16 +251,14 @@ def _windows_of(records: Sequence[Record], past: int) -> list[_Windows]:
     return [_Windows.of(z, m, past) for z in samples_of(records) if len(z) >= least]
 
 
-def _calm(
-    records: Sequence[Record], past: int, steps: Array
-) -> NDArray[np.bool_] | None:
+def _calm(windows: Sequence[_Windows], steps: Array) -> NDArray[np.bool_] | None:
     """Samples after which no input stands out; None where none hides the others.
 
     Of inputs less what `steps` (n_regressors, n_inputs) foresee of them a sample ahead:
     that tells nothing of the innovations unless there is feedback. Values that are held
     until they change answer nothing in between.
     """
-    m, windows = len(records[0].u), _windows_of(records, past)
+    m = steps.shape[1]
     left = [w.future[:m] - steps.T @ w.linear[:-1] for w in windows]
     moves = np.hstack([w.future[:m] != w.linear[:m] for w in windows])
     together = np.hstack(left)
@@ -281,14 +279,10 @@ def _calm(
 
 
 def _of_calm(
-    records: Sequence[Record],
-    past: int,
-    noisy: NDArray[np.bool_],
-    calm: NDArray[np.bool_],
+    windows: Sequence[_Windows], noisy: NDArray[np.bool_], calm: NDArray[np.bool_]
 ) -> _Correlated:
     """Test of the samples after which no input stands out."""
-    parts = zip(*_windows_of(records, past), strict=True)
-    L, Y, F = (np.hstack(part)[:, calm] for part in parts)
+    L, Y, F = (np.hstack(part)[:, calm] for part in zip(*windows, strict=True))
     sizes = np.cumsum([len(L), int(noisy.sum())])
     if L.shape[1] <= len(L) + len(F):
         return _Correlated(1.0, 0.0)
@@ -300,8 +294,8 @@ def _of_calm(
 
 
 def _of_most(
-    records: Sequence[Record],
-    past: int,
+    windows: Sequence[_Windows],
+    m: int,
     noisy: NDArray[np.bool_],
     first: int,
     calm: NDArray[np.bool_] | None,
@@ -312,11 +306,9 @@ def _of_most(
     of those samples (`calm` ones, where there is need of these) whose innovations do
     not stand out. The second is the share of the innovations that nonlinear terms of
     the last samples explain, of which the `first` is the sample itself (0), of which
-    inputs are known, or the one before.
+    the `m` inputs are known, or the one before.
     """
-    c = len(records[0].u) + len(records[0].y)
-    m, curved = len(records[0].u), []
-    windows = _windows_of(records, past)
+    c, curved = m + len(windows[0].outputs), []
     for linear, *_ in windows:
         last = linear[first * m : m + _N_CURVED * c]
         mixed = last[:1] * last[1:]
