@@ -174,11 +174,13 @@ def test_workers_end_with_the_process_that_started_them(fit, number, tmp_path):
     nothing_left(process)
 
 
-def test_workers_that_only_begin_end_as_well():
+@pytest.mark.parametrize("fit", [ALONE, SEARCH])
+def test_workers_that_only_begin_end_as_well(fit):
     """Half of their first task is sent then: it is too large to be sent at once."""
-    process = begun(script(size=20_000, n_jobs=2))
+    process = begun(script(fit, size=20_000, n_jobs=2 if fit == ALONE else None))
     until(lambda: len(workers(process)) == 2, "no workers")
-    process.send_signal(signal.SIGHUP)
+    time.sleep(0.5)  # while they import, or the first waits for the rest of its task
+    process.send_signal(signal.SIGKILL)
     process.communicate(timeout=PATIENCE)
     nothing_left(process)
 

@@ -22,6 +22,7 @@ from ..lpv.model import LPVStateSpace
 from ..metrics.table_simulation import simulate_experiments
 from ..validation import flag
 from .bands import prediction_std
+from .workers import end_what_begins_with_this_process
 
 Array = NDArray[np.float64]
 
@@ -53,6 +54,11 @@ class ScheduledEstimator(
     @property
     def _output_names(self) -> Any:
         return getattr(self, "output_names_", None)
+
+    def __sklearn_clone__(self) -> Any:
+        """Searches ask for a clone when they have workers to begin that fit it."""
+        end_what_begins_with_this_process()
+        return super().__sklearn_clone__()
 
     def predict(self, X: Any, return_std: bool = False) -> Array | tuple[Array, Array]:
         """Simulate the LPV model along every experiment of a table, from rest.

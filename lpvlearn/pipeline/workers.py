@@ -48,17 +48,21 @@ def results_of(
 
 
 def _watched(tasks: Iterable[Task]) -> Iterator[Task]:
-    """Tasks whose processes end with this one, for which they work.
+    """Tasks whose processes end with this one, for which they work."""
+    end_what_begins_with_this_process()
+    for task in tasks:
+        yield delayed(_in_worker)(os.getpid(), *task)
 
-    Joblib asks for the first one when it has an executor, of which no process runs yet:
-    these shall look after this one before they wait for tasks, as the half of a task
-    that was sent by a process killed meanwhile is waited for without an end.
+
+def end_what_begins_with_this_process() -> None:
+    """Have processes that do not run yet look after this one before they ask for tasks.
+
+    The half of a task that was sent by a process killed meanwhile is waited for without
+    an end. Joblib asks for its first task when it has an executor and no process.
     """
     executor = reusable_executor._executor
     if executor is not None and executor._initializer is None:
         executor._initializer, executor._initargs = end_with_parent, (os.getpid(),)
-    for task in tasks:
-        yield delayed(_in_worker)(os.getpid(), *task)
 
 
 def started(n_jobs: int | None) -> Callable[[], None]:
