@@ -18,7 +18,7 @@ from .identification import Settings
 from .local_fit import LocalFit
 from .offsets import CERTAIN, USELESS, follows_means_alone
 from .options import Choices
-from .residuals import find_spikes, lacks
+from .residuals import bent_outputs, find_spikes, lacks
 from .rounding import rounded_outputs
 from .selection import MAX_ORDER, better_horizon
 from .signals import thinned
@@ -28,7 +28,10 @@ from .varx import Feedback
 Array = NDArray[np.float64]
 
 # What is told from tests that take as long as a fit
-TESTS = {"held out", "orders", "static gain", "response", "decay", "lack"}
+TESTS = {"held out", "orders", "static gain", "response", "decay", "bent", "lack"}
+
+# What was told of that bends a response as well
+_BENDS = {"bent", "limit", "held", "input spikes"}
 
 # Share of its motion by which a model moves where an output stays, and of the samples
 _MOVES_ON, _AT_LIMITS = 0.05, 0.01
@@ -260,6 +263,8 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
     choice_is_told = TESTS <= told or fitted.residual > USELESS
     if fitted.selection.held_out is not None and not choice_is_told:
         _warn_about_choice(fitted, fitted.selection.held_out, told)
+    if not told & _BENDS:
+        _warn_of_bends(fitted, told)
     feedback = None if fitted.method == "pbsid" else fitted.feedback
     if feedback is None or fitted.stability_loss or "lack" in told:
         return
@@ -363,6 +368,28 @@ def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
         "If a sensor got them wrong, they spoil the model: replace them by NaN and use "
         "missing='estimate'.",
     )
+
+
+def _warn_of_bends(fitted: LocalFit, told: set[str]) -> None:
+    """Tell of a plant that is not linear over the range of the record.
+
+    In a loop, inputs and what they do know the noise.
+    """
+    if fitted.feedback is None or fitted.feedback.found or fitted.stability_loss:
+        return
+    bent = bent_outputs(fitted.evidence)
+    if bent:
+        tell(
+            told,
+            "bent",
+            f"The errors of output {bent[0] + 1} follow squares or cubes of the inputs "
+            "or of what these do, beyond chance and by more than a little: over the "
+            "range of this record the system is not linear, and the model, which "
+            "stands in for it there, simulates larger, smaller or other motions "
+            "worse. Use inputs that move less, about one operating point at a time "
+            "(`split_levels` cuts a record by a signal's level), or give what bends it "
+            "as a scheduling variable.",
+        )
 
 
 def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> None:

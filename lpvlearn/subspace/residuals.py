@@ -43,9 +43,12 @@ from ..data.preparation import DETRENDS, remove_trends
 from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import StateSpace
+from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import (
+    delayed,
     estimate_initial_state,
     free_responses,
+    lti_response,
     trend_signals,
 )
 from ..systems.threads import one_blas_thread
@@ -83,6 +86,10 @@ _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligi
 # the output, and so improbable by chance; it is looked for in so many samples. Of them
 # it moves a response by more than its stated deviation, or by far more.
 _MUCH, _MUCH_OF_OUTPUT, _CERTAIN, _MAX_SAMPLES = 0.03, 0.003, 1e-6, 4_096
+
+# Powers of signals that a linear system does not know; what they explain is told where
+# it is larger than this share of the output; rows for each of all terms that are tried.
+_POWERS, _BENT, _ROWS_PER_TERM = (2, 3), 0.03, 2
 
 # A spike is so many times what half of the errors stay within (8 standard deviations of
 # Gaussian noise); spikes are told that make this share of the squared errors, in no
@@ -406,18 +413,13 @@ def input_tests(
             white = scipy.signal.lfilter(a, [1.0], present, axis=0)
             parts.append((white[start + n_lags : len(e) - n_lags].T, u[start:]))
         n = sum(white.shape[1] for white, _ in parts)
-        columns = _factor(parts, n_rows)
-        size = np.linalg.norm(columns, axis=0)
-        columns /= np.where(size > 0.0, size, 1.0)
+        columns = _of_size_one(_factor(parts, n_rows))
         n_own = columns.shape[1] - 1 - n_rows * m
         starts = n_own + m * np.array([0, n_lags, n_lags + 1, n_rows])
         for found, first, stop in zip(tests, starts[:-1], starts[1:], strict=True):
-            Q = _basis(columns[:, :first])
-            left = columns - Q @ (Q.T @ columns)
-            left -= Q @ (Q.T @ left)  # once more: what is left may be small
+            left, n_known = _without(columns[:, :first], columns)
             added = [left[:, first + j : stop : m] for j in range(m)]
-            dof = n - Q.shape[1]
-            found.append([_f_test(part, left[:, -1], dof) for part in added])
+            found.append([_f_test(part, left[:, -1], n - n_known) for part in added])
     return tests
 
 
@@ -466,6 +468,100 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
         for i in suspects
         for test in tests[i]
     )
+
+
+@one_blas_thread
+def bent_outputs(evidence: Evidence) -> list[int]:
+    """Outputs whose errors clearly follow powers of signals, and not just by a little.
+
+    Squares and cubes of the inputs, and of what the model answers to these from rest,
+    that act through its modes as inputs do. Of the errors of a linear system in open
+    loop they explain nothing, whatever its noise is: both are given by the inputs
+    (after Ramsey, *Journal of the Royal Statistical Society B* 31, 1969). What lagged
+    inputs explain, and the signals themselves, is taken from all of them before: states
+    that a model lacks are another thing. So is what initial states do: where little is
+    left of slow noise, much of that is of the first samples.
+    """
+    poles = np.linalg.eigvals(evidence.model.A).astype(complex)
+    if not np.isfinite(evidence.model.loss) or np.abs(poles).max(initial=0.0) > 1.0:
+        return []  # errors of one that is unstable may be anything
+    records, free = thinned(evidence.records, _MAX_SAMPLES), evidence.free
+    records = [record for record in records if record.u.shape[1] > 2 * _N_LAGS]
+    if not records:
+        return []
+    model = with_initial_states(
+        evidence.model, records, free, evidence.whitening.weight
+    )
+    A, B, C, D = model.A, model.B, model.C, model.D
+    rest = np.zeros(len(A))
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = simulation_errors(model, records)
+        moved = [
+            np.hstack([r.u.T, lti_response(A, B, C, D, r.u.T, rest)]) for r in records
+        ]
+    whole = np.vstack(moved)
+    if not all(np.isfinite(x).all() for x in (whole, *errors)):
+        return []
+    moves = whole.std(axis=0) > 0.0
+    centre, spread = whole.mean(axis=0)[moves], whole.std(axis=0)[moves]
+    moved = [(z[:, moves] - centre) / spread for z in moved]
+    size = np.hstack([record.y for record in records]).std(axis=1)
+    share = np.vstack(errors).std(axis=0) / np.where(size > 0.0, size, np.inf)
+    m = len(records[0].u)
+    n_lags = min(_N_LAGS, len(whole) // (_WINDOWS_PER_LAG * m))
+    found = []
+    for i in np.flatnonzero(share > _BENT):
+        signals, n_own = [], 0
+        for record, z, e in zip(records, moved, errors, strict=True):
+            u = record.u.T
+            late = [delayed(u, np.full(m, k)) for k in range(n_lags + 1)]
+            linear = np.hstack([_through(poles, u, 2), *late, _through(poles, z), z])
+            powers = np.hstack([z**power for power in _POWERS])
+            bent = np.hstack([_through(poles, powers), powers])
+            own = free_responses(A, C, len(u), record.trend)[:, i]
+            n_own += own.shape[1]
+            part = np.column_stack([own, linear, bent, e[:, i]])
+            signals.append(part[n_lags:])  # the inputs before are not known
+        n_linear = linear.shape[1]
+        # What is left of the errors is filtered: what the model lacks is no noise.
+        whole = _rows(signals, np.ones(1), own.shape[1])
+        if len(whole) < _ROWS_PER_TERM * whole.shape[1]:
+            continue
+        noise = _without(_of_size_one(whole[:, :n_linear]), whole[:, -1:])[0]
+        stops = np.cumsum([len(part) for part in signals])[:-1]
+        (a,) = _whitening_filters(np.split(noise, stops))
+        columns = _of_size_one(_rows(signals, a, own.shape[1]))
+        left, n_known = _without(columns[:, :n_linear], columns)
+        n = len(columns) - n_own - n_known
+        test = _f_test(left[:, n_linear:-1], left[:, -1], n)
+        explained = (test.statistic - test.dof) / (test.statistic + n)
+        much = explained * share[i] ** 2 > _BENT**2
+        if much and max(test.p_value, _chance(left[:, n_linear:])) < _CERTAIN:
+            found.append(int(i))
+    return found
+
+
+def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:
+    """Filtered signals of all records, of each less what the first `n_own` explain."""
+    rows = []
+    for part in signals:
+        white = scipy.signal.lfilter(a, [1.0], part, axis=0)[len(a) - 1 :]
+        own = _of_size_one(white[:, :n_own])
+        rows.append(_without(own, white[:, n_own:])[0])
+    return np.vstack(rows)
+
+
+def _chance(columns: Array) -> float:
+    """That of what the others explain of the last one, whose variance may vary.
+
+    As that of noise does which grows with the signals. By the covariance HC3 (MacKinnon
+    and White, *Journal of Econometrics* 29, 1985).
+    """
+    Z, error = _basis(columns[:, :-1]), columns[:, -1]
+    explained = Z.T @ error
+    spread = Z * ((error - Z @ explained) / (1.0 - np.sum(Z**2, axis=1)))[:, None]
+    statistic = explained @ scaled_lstsq(spread.T @ spread, explained)[0]
+    return float(stats.chi2.sf(statistic, Z.shape[1]))
 
 
 class Spikes(NamedTuple):
@@ -537,23 +633,28 @@ def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:
     are orthogonal for a white input and close poles do no harm. Thrice would allow for
     curvature, but then a mode that is missing beside another one goes unseen.
     """
-    poles = np.asarray(fitted.poles, dtype=complex)
-    outside = np.abs(poles) > 1.0  # reflected: their own answers would overflow
-    poles = np.where(outside, 1.0 / np.where(outside, poles, 1.0).conj(), poles)
-    spanned, signals = [np.zeros((len(u), 0))], u
-    for pole in np.tile(poles[poles.imag >= 0.0], 2):
-        late = signals.astype(complex)
-        answer = scipy.signal.lfilter([0.0, 1.0], [1.0, -pole], late, axis=0)
-        spanned += [answer.real, answer.imag] if pole.imag else [answer.real]
-        denominator = np.poly([pole, pole.conj()] if pole.imag else [pole]).real
-        signals = scipy.signal.lfilter(denominator[::-1], denominator, signals, axis=0)
-    states = np.hstack(spanned)
+    states = _through(fitted.poles, u, 2)
     driven = [np.hstack([states, u[:, free]]) for free in fitted.direct]
     return [
         scipy.signal.lfilter(h, [1.0], signals, axis=0)
         for h, signals in zip(fitted.filter[:, output].T, driven, strict=True)
         if h.any() and signals.size
     ]
+
+
+def _through(poles: NDArray[np.complex128], u: Array, times: int = 1) -> Array:
+    """Answers of modes to signals, that go through every pole so many times."""
+    poles = np.asarray(poles, dtype=complex)
+    outside = np.abs(poles) > 1.0  # reflected: their own answers would overflow
+    poles = np.where(outside, 1.0 / np.where(outside, poles, 1.0).conj(), poles)
+    spanned, signals = [np.zeros((len(u), 0))], u
+    for pole in np.tile(poles[poles.imag >= 0.0], times):
+        late = signals.astype(complex)
+        answer = scipy.signal.lfilter([0.0, 1.0], [1.0, -pole], late, axis=0)
+        spanned += [answer.real, answer.imag] if pole.imag else [answer.real]
+        denominator = np.poly([pole, pole.conj()] if pole.imag else [pole]).real
+        signals = scipy.signal.lfilter(denominator[::-1], denominator, signals, axis=0)
+    return np.hstack(spanned)
 
 
 def _factor(parts: Sequence[tuple[Array, Array]], n_rows: int) -> Array:
@@ -599,6 +700,18 @@ def _f_test(added: Array, target: Array, dof: int) -> ResidualTest:
     loss = max(float(left @ left), np.finfo(float).tiny)
     statistic = float(explained @ explained) / loss * error
     return ResidualTest(statistic, q, float(stats.f.sf(statistic / q, q, error)))
+
+
+def _of_size_one(columns: Array) -> Array:
+    size = np.linalg.norm(columns, axis=0)
+    return columns / np.where(size > 0.0, size, 1.0)
+
+
+def _without(known: Array, columns: Array) -> tuple[Array, int]:
+    """What known ones, of size one, do not explain, and of how many directions."""
+    Q = _basis(known)
+    left = columns - Q @ (Q.T @ columns)
+    return left - Q @ (Q.T @ left), Q.shape[1]  # once more: it may be small
 
 
 def _basis(columns: Array) -> Array:
