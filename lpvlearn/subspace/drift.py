@@ -59,13 +59,17 @@ def outlasts(fitted: LocalFit) -> bool:
 
 
 def may_drift(fitted: LocalFit) -> bool:
-    """Whether the errors of a model wander, or a mode of it may do so for them."""
+    """Whether the errors of a model wander, or a mode of it may do so for them.
+
+    Of what such a mode leaves of drift, white errors are not.
+    """
     evidence = fitted.evidence
     shortest = min(record.u.shape[1] for record in evidence.records)
     if shortest < _FEWEST or motion_left(evidence) < _EXPLAINED**2:
         return False
-    slow = _rates(evidence.noise.A) * _longest(evidence) < _SLOW
-    return bool(slow.any()) or outlasts(fitted)
+    rates = _rates(evidence.noise.A)
+    slow = rates * _longest(evidence) < _SLOW
+    return bool(slow.any()) or (len(rates) > 0 and outlasts(fitted))
 
 
 def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
