@@ -53,6 +53,7 @@ from .offsets import (
     attributed,
     constants_matter,
     criterion_in_units,
+    follows_means_alone,
     may_have_constants,
     shifts_matter,
     with_levels,
@@ -103,6 +104,10 @@ _LAGS, _PLENTY, _AUDIBLE = 2, 20_000, 0.01
 # model not to refute it; standard errors by which a lesser one must be better where the
 # plant grows; standard deviations by which a pole does so for certain.
 _OF_NOISE, _DOUBT, _CERTAIN = 0.5, 2.0, 3.0
+
+# Share of the squared errors of parts held out that further states leave there where
+# they are the plant's.
+_FAR_BETTER = 0.5
 
 
 class TooFewSamples(ValueError):
@@ -157,7 +162,7 @@ def fit_pairs(
         # Of inputs without anything new a rival makes of many states what it likes.
         if not foreseen:
             fitted, doubt = _believable(pairs, choices, told, fitted)
-    elif drifting is None and _may_share_noise(fitted, choices):
+    elif _may_share_noise(fitted, choices):
         fitted = _with_shared_noise(pairs, choices, told, fitted)
     feedback = fitted.feedback
     if feedback is not None and feedback.found and "feedback" not in told:
@@ -681,14 +686,17 @@ def _with_shared_noise(
     has no use for that, and takes what noise does in a mode that inputs hardly excite
     for their doing. Parts held out hardly tell: there, that noise is all that is left
     of either. The states of the plant must explain all of the noise, and where outputs
-    are several be no more than without: further ones may be those of a noise that the
-    outputs share.
+    are several be no more than without, as further ones may be those of a noise that
+    the outputs share; unless parts held out are simulated far better with these. Noise
+    that drifts makes some models likelier by chance than a chi-square tells.
     """
     n_trend = first.evidence.free.n_trend
     several, own = pairs[0][1].shape[1] > 1, first.selection.order
     tried = [choices._replace(method="pbsid", offset=DETRENDS[n_trend])]
     if choices.order is None:  # as many states at least, of which the inputs reach all
         tried += [tried[0]._replace(n_noise_states=n) for n in (own, own + 1)]
+    least = _deviance(first)
+    least -= CERTAIN if first.evidence.whitening.of_differences else 0.0
     best, error, n_joint = first, None, -1
     for chosen in tried:
         if chosen.n_noise_states <= n_joint:
@@ -700,14 +708,19 @@ def _with_shared_noise(
         evidence = other.evidence
         if not isinstance(evidence, ClosedLoopEvidence):
             continue
-        n_joint, more = len(evidence.kept), other.selection.order > own
-        if not evidence.kept.all() or (more and several) or other.grows():
+        n_joint, deviance = len(evidence.kept), _deviance(other)
+        if not evidence.kept.all() or other.grows():
             continue
-        if len(evidence.one_step.noise.A) or not _deviance(other) < _deviance(best):
+        if len(evidence.one_step.noise.A) or not deviance < least:
             continue
-        error = error or _held_out(first, choices)
-        if not error.clearly_better_than(_held_out(other, chosen), _DOUBT):
-            best = other
+        if follows_means_alone(evidence):
+            continue  # what moves it is all called noise
+        error, its = error or _held_out(first, choices), _held_out(other, chosen)
+        more = several and other.selection.order > own
+        if more and not its.total < _FAR_BETTER * error.total:
+            continue
+        if not error.clearly_better_than(its, _DOUBT):
+            best, least = other, deviance
     return best
 
 

@@ -164,3 +164,19 @@ class TestOutputsThatDoNotDrift:
             warnings.simplefilter("ignore")
             model = SubspaceLTI(2, sampling_time=1.0, refine="simulation").fit(u, y)
         assert not _of_differences(model)
+
+
+@pytest.mark.parametrize("seed", [3, 11])
+def test_noise_that_shakes_slow_modes_may_be_more_than_drift(seed):
+    rng = np.random.default_rng(seed)
+    A = np.array([[0.985, 0.15, 0.0], [-0.15, 0.985, 0.0], [0.0, 0.0, 0.995]])
+    B, C = rng.standard_normal((3, 1)), np.array([[1.0, 0.5, 1.0], [0.0, 1.0, -1.0]])
+    plant = StateSpace(A, B, C, None, 1.0)
+    u = np.repeat(rng.choice([-1.0, 1.0], (30, 1)), 10, axis=0)
+    K, w = 0.25 * rng.standard_normal((3, 2)), rng.standard_normal((300, 2))
+    y, v = plant.simulate(u), StateSpace(A, K, C, np.eye(2), 1.0).simulate(w)
+    model = _quiet_fit(u, y + 0.5 * y.std() / v.std() * v)
+    fresh = rng.standard_normal((1_000, 1))
+    target = plant.simulate(fresh)
+    error = model.lti_.simulate(fresh) - target
+    assert np.linalg.norm(error) < 0.25 * np.linalg.norm(target)
