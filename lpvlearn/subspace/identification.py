@@ -282,7 +282,7 @@ def fit_once(
             if other.loss < model.loss and not settings.enforce_stability:
                 model = other
         model = refine_simulation(model, white, settings.free, patient=True)
-    model = _of_records(model, records, whitening, settings.free)
+    model = of_records(model, records, whitening, settings.free)
     candidate = Candidate(model, horizon, whitening, settings.refine)
     return Fitted(candidate, subspace.singular_values)
 
@@ -313,11 +313,11 @@ def refit(
     else:
         model = restarted(start, whitening, white, free)
         model = refine_simulation(model, white, free, patient=patient)
-    model = _of_records(model, records, whitening, settings.free)
+    model = of_records(model, records, whitening, settings.free)
     return Fitted(Candidate(model, horizon, whitening, True), np.zeros(0))
 
 
-def _of_records(
+def of_records(
     model: Realization,
     records: Sequence[Record],
     whitening: Whitening,

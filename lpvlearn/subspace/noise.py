@@ -152,6 +152,13 @@ class Whitening(NamedTuple):
                 out.append(Record(u, y, trend, missing[:, first:]))
         return out
 
+    def lengths(self, records: Sequence[Record], free: Freedom) -> list[int]:
+        """Samples of every one of the `records` that it leaves."""
+        lost = len(self.filter) - 1
+        first = lost if free.initial_states else 0
+        lengths = [record.u.shape[1] for record in records]
+        return [n - first for n in lengths if n > 2 * lost]
+
     def model(self, model: Realization) -> Realization:
         """The model of whitened samples; states and loss are still those before."""
         return model._replace(C=self.weight @ model.C, D=self.weight @ model.D)

@@ -36,6 +36,7 @@ from .identification import (
     Candidate,
     Settings,
     fit_once,
+    of_records,
     realize,
     refit,
     restarted,
@@ -322,13 +323,19 @@ def _loss(model: Realization) -> float:
 def _judged(
     tried: Sequence[_Tried], records: list[Record], settings: Settings
 ) -> dict[int, _Tried]:
-    """By order: models of the records, and their criteria in these."""
+    """By order: models of the records, and their criteria in these.
+
+    Of samples that were weighted but not filtered the criterion is what it was.
+    """
     found = {}
     for one in tried:
-        candidate = one.candidate
-        model = _unwhitened(candidate.model, candidate.whitening, records, settings)
-        candidate = candidate._replace(model=model)
-        found[one.order] = _judge(one, candidate, records, settings)
+        whitening = one.candidate.whitening
+        model = of_records(one.candidate.model, records, whitening, settings.free)
+        candidate = one.candidate._replace(model=model)
+        if len(whitening.filter) > 1:
+            found[one.order] = _judge(one, candidate, records, settings)
+        else:
+            found[one.order] = one._replace(candidate=candidate)
     return found
 
 
@@ -355,7 +362,8 @@ def _by_own_noise(
                     break
                 known = candidate.horizon, settings, noise, candidate.model
                 candidate = refit(records, order, *known, patient=False).candidate
-            found[order] = _judge(found[order], candidate, records, settings)
+            if candidate is not found[order].candidate:
+                found[order] = _judge(found[order], candidate, records, settings)
             stale = 0 if found[order].criterion < best else stale + 1
             best = min(best, found[order].criterion)
             order += step
@@ -368,8 +376,8 @@ def _judge(
     """A model of the records, its criterion in samples weighted but not filtered."""
     weighted = Whitening(np.ones(1), candidate.whitening.weight)
     model, free = weighted.model(candidate.model), settings.free
+    model = model._replace(trends=model.trends @ weighted.weight.T)
     records = weighted.records(records, free)
-    model = with_initial_states(model, records, free)
     criterion = criterion_of(model, records, free, settings.repeated)
     return one._replace(candidate=candidate, criterion=criterion)
 
@@ -396,19 +404,8 @@ def _pilot(
         whitening, white = again, again.records(records, free)
         start = restarted(model, whitening, white, free)
         model = refine_simulation(start, white, free, _PILOT_STEPS)
-        model = _unwhitened(model, whitening, records, settings)
+        model = of_records(model, records, whitening, free)
     return model, tried[0].slow
-
-
-def _unwhitened(
-    model: Realization,
-    whitening: Whitening,
-    records: Sequence[Record],
-    settings: Settings,
-) -> Realization:
-    """The model of the records themselves."""
-    weight, model = whitening.weight, whitening.undone(model)
-    return with_initial_states(model, records, settings.free, weight)
 
 
 def _noise_of(
@@ -417,7 +414,7 @@ def _noise_of(
     """Noise in the errors of a model; none where a filter takes too many samples."""
     errors = simulation_errors(model, records)
     found = Whitening.of(errors, settings.free)
-    lengths = [r.u.shape[1] for r in found.records(records, settings.free)]
+    lengths = found.lengths(records, settings.free)
     room, horizon = settings.max_horizon(lengths), wanted.horizon or 1
     if room < horizon or settings.max_order(room) < wanted.orders[0]:
         return Whitening.none(len(records[0].y))
