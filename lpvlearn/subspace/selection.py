@@ -108,6 +108,15 @@ _DOUBT = 1.0  # standard errors by which another order must be better
 # How far below the choice other orders are simulated on parts held out.
 _LOWER = (1, 2, 4, 8, 16)
 
+# Of a criterion, for each value, above the best one: so far the noise of its own brings
+# no order. That has taken up to seven tenths of such a distance, mostly a tenth.
+_FAR = 1.0
+
+# An order below that is as far and has so many times the squared errors, in samples
+# that it was fitted to, cannot be better on parts held out: states that are free anew
+# in each of these take a tenth or so of slow noise.
+_BEYOND = 100.0
+
 
 class Row(NamedTuple):
     """One row of the selection table.
@@ -276,7 +285,7 @@ def _search(
     noise = _noise_of(pilot, records, wanted, settings)
     tried = _try_orders(wanted, records, noise, settings, pilot=pilot)
     found = _judged(tried, records, settings)
-    orders = _by_own_noise(found, records, wanted, settings)
+    orders, far = _by_own_noise(found, records, wanted, settings)
     least = min(orders.values(), key=_criterion)
     highest, last = max(orders), wanted.orders[-1]
     again = not least.candidate.whitening.is_close_to(noise)
@@ -299,14 +308,18 @@ def _search(
     errors = {best: validate(least.candidate, records, settings)}
     close = [k for k, one in orders.items() if one.criterion < least.criterion + PRICE]
     for order in [k for k in close if k > best] + [best - step for step in _LOWER]:
-        if order in orders:
-            errors[order] = validate(orders[order].candidate, records, settings)
-            share = 0.0 if order > best else MATTERS
-            tells = errors[order].bft > 0.0  # or inputs rest where it is held out
-            if tells and errors[order].clearly_better_than(
-                errors[chosen], _DOUBT, share
-            ):
-                chosen = order
+        if order not in orders:
+            continue
+        if order in far:
+            if _is_beyond(far[order], orders[chosen], errors[chosen], records):
+                continue
+            own = _with_own_noise(far[order], records, wanted, settings)
+            orders[order] = min(own, orders[order], key=_criterion)
+        errors[order] = validate(orders[order].candidate, records, settings)
+        share = 0.0 if order > best else MATTERS
+        tells = errors[order].bft > 0.0  # or inputs rest where it is held out
+        if tells and errors[order].clearly_better_than(errors[chosen], _DOUBT, share):
+            chosen = order
     candidate = orders[chosen].candidate
     rows = _rows(orders, records, errors)
     return Selection(chosen, candidate.horizon, rows, candidate, errors[chosen])
@@ -318,6 +331,15 @@ def _criterion(one: _Tried) -> float:
 
 def _loss(model: Realization) -> float:
     return model.loss
+
+
+def _is_beyond(
+    one: _Tried, chosen: _Tried, error: HeldOut, records: Sequence[Record]
+) -> bool:
+    """Whether an order cannot be better on parts held out than the choice is."""
+    n_values = sum(record.n_values for record in records)
+    least = max(chosen.candidate.model.loss, error.residual**2 * n_values)
+    return one.candidate.model.loss > _BEYOND * least
 
 
 def _judged(
@@ -344,30 +366,45 @@ def _by_own_noise(
     records: list[Record],
     wanted: _Range,
     settings: Settings,
-) -> dict[int, _Tried]:
+) -> tuple[dict[int, _Tried], dict[int, _Tried]]:
     """All orders, those about the best one fitted again by the noise of each.
 
     The noise of one model for all favours orders like its own: what states too many
-    took of slow noise, those that leave it would have to follow.
+    took of slow noise, those that leave it would have to follow. Those that are too far
+    from the best one for it are left as they are, and returned on their own as well.
     """
-    found = dict(found)
-    first = min(found.values(), key=_criterion).order
+    found, far = dict(found), {}
+    least = min(found.values(), key=_criterion)
+    first = least.order
+    limit = least.criterion + _FAR * sum(record.n_values for record in records)
     for step in (-1, 1):
         order, best, stale = first if step < 0 else first + 1, np.inf, 0
         while order in found and stale <= _PATIENCE:
-            candidate = found[order].candidate
-            for _ in range(_MORE_ROUNDS):
-                noise = _noise_of(candidate.model, records, wanted, settings)
-                if noise.is_close_to(candidate.whitening):
-                    break
-                known = candidate.horizon, settings, noise, candidate.model
-                candidate = refit(records, order, *known, patient=False).candidate
-            if candidate is not found[order].candidate:
-                found[order] = _judge(found[order], candidate, records, settings)
+            one = found[order]
+            if one.criterion > limit:
+                far[order] = one
+            else:
+                found[order] = _with_own_noise(one, records, wanted, settings)
             stale = 0 if found[order].criterion < best else stale + 1
             best = min(best, found[order].criterion)
             order += step
-    return found
+    return found, far
+
+
+def _with_own_noise(
+    one: _Tried, records: list[Record], wanted: _Range, settings: Settings
+) -> _Tried:
+    """An order fitted again by the noise that it leaves itself."""
+    candidate = one.candidate
+    for _ in range(_MORE_ROUNDS):
+        noise = _noise_of(candidate.model, records, wanted, settings)
+        if noise.is_close_to(candidate.whitening):
+            break
+        known = candidate.horizon, settings, noise, candidate.model
+        candidate = refit(records, one.order, *known, patient=False).candidate
+    if candidate is one.candidate:
+        return one
+    return _judge(one, candidate, records, settings)
 
 
 def _judge(
