@@ -538,9 +538,10 @@ def _costs(fitted: Any, experiments: Sequence[Experiment]) -> dict[int, float]:
     if table is None or "criterion" not in table:
         return {}
     n_values = sum(e.measured.size for e in experiments)
-    known = table.dropna(subset="criterion")
-    costs = n_values * known["criterion"].to_numpy()
-    return dict(zip(known["order"].tolist(), costs.tolist(), strict=True))
+    orders, criteria = table["order"].to_numpy(), table["criterion"].to_numpy()
+    known = ~np.isnan(criteria)
+    costs = n_values * criteria[known]
+    return dict(zip(orders[known].tolist(), costs.tolist(), strict=True))
 
 
 def _horizon(fitted: Any) -> int | None:

@@ -194,7 +194,6 @@ class _Tried(NamedTuple):
     candidate: Candidate  # its model that of whitened records, until it is judged
     criterion: float
     errors: dict[int, float]  # by horizon, relative, of the model before refinement
-    slow: bool  # whether it began with decimated records
 
 
 def select(
@@ -430,9 +429,10 @@ def _pilot(
     order = max(wanted.orders[0], min(wanted.orders[-1], _PILOT_ORDER))
     _look_up(wanted, order, records, settings)  # for the orders to come as well
     is_cut = wanted.horizon is None and _is_cut_short(wanted, records, settings)
-    only = wanted._replace(orders=range(order, order + 1), slow=is_cut)
-    tried = _try_orders(only, records, whitening, settings, _PILOT_STEPS)
-    model = tried[0].candidate.model
+    only = wanted._replace(orders=range(order, order + 1))
+    starts = _starts(only, order, records, settings)
+    slow = SlowStarts(records, order, settings).best(order) if is_cut else None
+    model, is_slow = _refined(starts, slow, records, settings, _PILOT_STEPS)
     for _ in range(_WEIGHINGS if len(records[0].y) > 1 else 0):
         errors = simulation_errors(model, records)
         again = Whitening.of(errors, free, filtered=False)
@@ -442,7 +442,7 @@ def _pilot(
         start = restarted(model, whitening, white, free)
         model = refine_simulation(start, white, free, _PILOT_STEPS)
         model = of_records(model, records, whitening, free)
-    return model, tried[0].slow
+    return model, is_slow
 
 
 def _noise_of(
@@ -549,7 +549,6 @@ def _try_orders(
     records: Sequence[Record],
     whitening: Whitening,
     settings: Settings,
-    max_iter: int | None = None,
     pilot: Realization | None = None,
 ) -> list[_Tried]:
     """Every order in turn on whitened records, until further states gain nothing.
@@ -572,32 +571,46 @@ def _try_orders(
         starts = _starts(wanted, order, records, settings)
         if not starts:
             break
-        horizon = _best_horizon(starts, refine=True)
-        start = starts[horizon]
         slow = slow_starts.best(order) if wanted.slow else None
-        # Nearly as good ones may end in different minima where noise is most of both.
-        rivals = [start] if slow is None else [start, slow]
-        worst = min(map(_loss, rivals)) * _LOSS_SLACK[True]
-        rivals = [one for one in rivals if one.loss <= worst] or [start]
-        refined = [
-            refine_simulation(one, records, settings.free, max_iter) for one in rivals
-        ]
-        model = min(refined, key=_loss)
+        model = _refined(starts, slow, records, settings)[0]
         below = tried[-1].candidate.model if tried else None
         if below is not None and model.loss > _AS_GOOD * below.loss:
             other = _with_more_states(below, records, settings)
             if other is not None and other.loss < model.loss:
                 model = other
         criterion = criterion_of(model, records, settings.free, settings.repeated)
+        horizon = _best_horizon(starts, refine=True)
         candidate = Candidate(model, horizon, whitening, True)
         errors = _relative_errors(starts, records)
-        tried.append(_Tried(order, candidate, criterion, errors, rivals[0] is slow))
+        tried.append(_Tried(order, candidate, criterion, errors))
         stale = 0 if criterion < best else stale + 1
         best = min(best, criterion)
         known = best <= limit or order >= n_pilot
         if (known and stale > _PATIENCE) or model.loss <= _EXACT * energy:
             break
     return tried
+
+
+def _refined(
+    starts: Mapping[int, Realization],
+    slow: Realization | None,
+    records: Sequence[Record],
+    settings: Settings,
+    max_iter: int | None = None,
+) -> tuple[Realization, bool]:
+    """From the best of the starts of an order, or a slow one where that is no worse.
+
+    And whether the latter was asked.
+    """
+    start = starts[_best_horizon(starts, refine=True)]
+    # Nearly as good ones may end in different minima where noise is most of both.
+    rivals = [start] if slow is None else [start, slow]
+    worst = min(map(_loss, rivals)) * _LOSS_SLACK[True]
+    rivals = [one for one in rivals if one.loss <= worst] or [start]
+    refined = [
+        refine_simulation(one, records, settings.free, max_iter) for one in rivals
+    ]
+    return min(refined, key=_loss), rivals[0] is slow
 
 
 def criterion_of(
@@ -712,9 +725,12 @@ def _starts(
     wanted: _Range, order: int, records: Sequence[Record], settings: Settings
 ) -> dict[int, Realization]:
     """Model of an order, before refinement, from every horizon that can show it."""
-    starts = {}
+    starts: dict[int, Realization] = {}
     for horizon, space in _look_up(wanted, wanted.orders[0], records, settings).items():
         if order <= settings.max_order(horizon):
+            if order == 0 and starts:  # they are the same without states
+                starts[horizon] = next(iter(starts.values()))
+                continue
             if (order, horizon) not in wanted.starts:
                 found = realize(space, records, order, settings)
                 wanted.starts[order, horizon] = found
