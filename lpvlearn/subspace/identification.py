@@ -24,10 +24,18 @@ from .realization import (
     reflect_unstable,
 )
 from .refinement import refine_simulation
-from .signals import Record, SharedSignals, output_energy, shorten
+from .signals import (
+    Record,
+    SharedSignals,
+    block_radius,
+    block_sections,
+    output_energy,
+    shorten,
+)
 from .simulation_fit import (
     Freedom,
     Realization,
+    block_fit,
     simulation_errors,
     simulation_fit,
     with_initial_states,
@@ -245,7 +253,11 @@ def realize(
 
     ny, n_noise = len(records[0].y), settings.n_noise_states
     A, C = subspace.state_pair(ny, order, n_noise, with_inputs)
-    stable_A = reflect_unstable(A, 1.0 - STABLE_MARGIN if enforce else 1.0)
+    limit = 1.0 - STABLE_MARGIN if enforce else 1.0
+    sections = block_sections(A)  # which tell of the poles as well
+    if sections is not None and block_radius(sections.blocks) <= limit:
+        return block_fit(sections.blocks, C @ sections.transform, records, free)
+    stable_A = reflect_unstable(A, limit)
     stable = simulation_fit(stable_A, C, records, free)
     if stable_A is A or enforce:
         return stable

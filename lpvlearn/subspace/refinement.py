@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.least_squares import column_scale, scaled_lstsq
-from .signals import Record, SharedSignals, output_energy
+from .signals import Record, SharedSignals, block_radius, output_energy
 from .simulation_fit import Freedom, Realization, block_fit, linearised, moved_model
 
 Array = NDArray[np.float64]
@@ -120,11 +120,11 @@ def _accepted(
     steps: Iterable[Array],
 ) -> tuple[int, Realization] | None:
     """The first of ever shorter steps that reduces the error, and its number."""
-    radius = max(_STABLE_RADIUS, _spectral_radius(model.blocks or ()))
+    radius = max(_STABLE_RADIUS, block_radius(model.blocks or ()))
     for number, trial_step in enumerate(steps):
         moved = moved_model(model, trial_step, free)
         blocks = moved.blocks or ()
-        if _spectral_radius(blocks) > radius:
+        if block_radius(blocks) > radius:
             continue
         trial = block_fit(blocks, moved.C, records, free)
         if trial.loss < model.loss:
@@ -152,18 +152,3 @@ def _trial_steps(
         if damping > 0.0:
             gain = s / (s**2 + damping * s[0] ** 2)
             yield (right.T @ (gain * projected)) / scale
-
-
-def _spectral_radius(blocks: Sequence[Array]) -> float:
-    """Largest modulus of the poles of blocks of one or two states."""
-    radius = 0.0
-    for block in blocks:
-        if len(block) == 1:
-            radius = max(radius, abs(float(block[0, 0])))
-            continue
-        centre = 0.5 * float(block[0, 0] + block[1, 1])
-        det = float(block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0])
-        spread = centre * centre - det
-        modulus = det**0.5 if spread < 0.0 else abs(centre) + spread**0.5
-        radius = max(radius, modulus)
-    return radius

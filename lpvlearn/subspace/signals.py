@@ -479,6 +479,21 @@ def block_slices(blocks: Sequence[Array]) -> list[slice]:
     return [slice(stop - len(b), stop) for b, stop in zip(blocks, stops, strict=True)]
 
 
+def block_radius(blocks: Sequence[Array]) -> float:
+    """Largest modulus of the poles of blocks of one or two states."""
+    radius = 0.0
+    for block in blocks:
+        if len(block) == 1:
+            radius = max(radius, abs(float(block[0, 0])))
+            continue
+        centre = 0.5 * float(block[0, 0] + block[1, 1])
+        det = float(block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0])
+        spread = centre * centre - det
+        modulus = det**0.5 if spread < 0.0 else abs(centre) + spread**0.5
+        radius = max(radius, modulus)
+    return radius
+
+
 def _characteristic(block: Array) -> list[float]:
     """Coefficients of ``det(z I - A)`` of a block, of the highest power first."""
     if len(block) == 1:

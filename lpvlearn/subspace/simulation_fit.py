@@ -386,7 +386,7 @@ def linear_regression(
 def _by_experiment(out: Array, shape: tuple[int, ...]) -> Array:
     """From (n_outputs, n_rows, n_columns), rows those of `shape` (..., k)."""
     ny, _, columns = out.shape
-    split = np.moveaxis(out.reshape(ny, *shape, columns), 0, -3)
+    split = out.reshape(ny, -1, shape[-1], columns).swapaxes(0, 1)
     return split.reshape(*shape[:-1], ny * shape[-1], columns)
 
 
