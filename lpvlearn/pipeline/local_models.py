@@ -62,7 +62,9 @@ class LocalModel:
     horizon: int | None  # of the subspace step, where the estimator tells it
     costs: dict[int, float] = field(default_factory=dict)  # of orders, by the criterion
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
-    deviated: list[ModelPair] = field(default_factory=list)  # of the local estimator
+    # to either side of it, as identified
+    pairs: list[ModelPair] = field(default_factory=list)
+    discretization: str = "zoh"
     integrating: list[int] = field(default_factory=list)  # outputs, by place
     n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
     # inputs and outputs at rest, near the experiments; None: not looked for
@@ -70,6 +72,16 @@ class LocalModel:
     # the model as identified (of every realization) with models to either side of it,
     # where the covariance is known; with "zoh" in discrete time
     estimates: list[Estimate] = field(default_factory=list)
+
+    def deviated(self) -> list[ModelPair]:
+        """The pairs in continuous time; none where one of them has no equivalent.
+
+        Few ask for them: the covariance of most parameters comes from `estimates`.
+        """
+        try:
+            return _all_continuous(self.pairs, self.discretization)
+        except ValueError:
+            return []
 
 
 def identify_points(
@@ -167,7 +179,8 @@ def identify_point(
             fitted.lti_.order,
             _horizon(fitted),
             _costs(fitted, experiments),
-            deviated=_all_continuous(pairs, discretization),
+            pairs=pairs,
+            discretization=discretization,
             integrating=_integrating(fitted),
             n_trend=_n_trend(fitted),
             rest=_equilibrium(lti, [fitted], experiments),

@@ -160,14 +160,14 @@ def offsets_of_points(found: StructuredModels) -> Array | None:
 def _covariance(fitted: Any, model: LocalModel, runner: PointRunner) -> Array | None:
     """Covariance of the parameters at a point, None where it is not known."""
     known = getattr(fitted, "params_covariance_", None)  # where it tells its own
-    if known is None and model.deviated:
+    if known is None and (deviated := model.deviated()):
         known = runner.call(
             covariance_of_parameters,
             fitted.structure_,
             fitted.params_,
             getattr(fitted, "frequency_weight", None),
             model.lti,
-            model.deviated,
+            deviated,
             getattr(fitted, "norm", "hinf"),
         )
     return known

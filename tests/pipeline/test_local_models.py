@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 from sklearn.base import clone
 
-from lpvlearn import LocalLPVPipeline, SubspaceLTI
+from lpvlearn import LocalLPVPipeline, StateSpace, SubspaceLTI
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.pipeline.local_models import identify_point
+from lpvlearn.pipeline.local_models import LocalModel, identify_point
 
 from ..conftest import ROLES, spring_tables
 
@@ -51,6 +51,16 @@ def test_a_plant_that_only_its_loop_holds_is_refused_with_the_remedy():
         pytest.raises(ValueError, match="must be stable.*identify the closed loop"),
     ):
         identify_point(local, [loop_record(0, 1.1)], **options)
+
+
+def test_deviations_are_unknown_where_one_has_no_continuous_time():
+    lag, other, still = (StateSpace(a, 1.0, 1.0, 0.0, STEP) for a in (0.5, 0.6, 0.0))
+    found = LocalModel(lag.to_continuous(), 1, None, pairs=[(lag, other)])
+    assert [m.A.item() for m in found.deviated()[0]] == pytest.approx(
+        [np.log(0.5) / STEP, np.log(0.6) / STEP]
+    )
+    found = LocalModel(lag.to_continuous(), 1, None, pairs=[(lag, still)])
+    assert found.deviated() == []
 
 
 class Restless(SubspaceLTI):

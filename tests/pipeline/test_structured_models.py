@@ -122,7 +122,7 @@ def test_nothing_is_claimed_where_the_covariance_is_not_known(options):
         combine="pool",
         discretization="zoh",
     )
-    assert point.deviated == []
+    assert point.deviated() == []
 
 
 def test_a_frequency_weight_enters_the_covariance():
