@@ -317,6 +317,24 @@ in_loop.predictor_.K.round(2)
 local.residual_tests(X, y)
 
 # %%
+# Is the system linear there?
+# ---------------------------
+# A linear model of a plant that bends (friction, a valve, a sensor that saturates) is
+# an average over the motions of its record, and simulates others worse, however small
+# its standard deviations are. In open loop a fit warns where squares and cubes of the
+# inputs, or of what they do, explain errors of more than 3 % of an output: the errors
+# of a linear plant do not know these. Here the input acts by its hyperbolic tangent:
+
+bending = np.random.default_rng(0).uniform(-2.0, 2.0, (100, 1)).repeat(5, axis=0)
+answer = np.zeros(len(bending))
+for t in range(1, len(bending)):
+    answer[t] = 0.9 * answer[t - 1] + np.tanh(1.5 * bending[t - 1, 0])
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    SubspaceLTI(sampling_time=1.0).fit(bending, answer)
+print(told[0].message)
+
+# %%
 # Long records and gaps
 # ---------------------
 # * ``partial_fit`` takes a record batch by batch, in memory that does not grow with it.

@@ -444,7 +444,9 @@ class SubspaceLTI(
             If the model is unstable or explains next to nothing of the outputs, if
             the data come from a closed loop, and if more than 3 % of the errors depend
             on past inputs (beyond chance, and .3 % of the outputs): the model lacks
-            states, a delay or a nonlinearity.
+            states, a delay or a nonlinearity. If squares and cubes of the inputs, or of
+            what these do, explain errors of more than 3 % of an output (in open loop,
+            beyond chance): the system is not linear over the range of the record.
         """
         self.__dict__.pop("rates_", None)  # of an earlier fit
         if self.integrating is not None:
