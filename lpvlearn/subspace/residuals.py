@@ -88,8 +88,10 @@ _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligi
 _MUCH, _MUCH_OF_OUTPUT, _CERTAIN, _MAX_SAMPLES = 0.03, 0.003, 1e-6, 4_096
 
 # Powers of signals that a linear system does not know; what they explain is told where
-# it is larger than this share of the output; rows for each of all terms that are tried.
-_POWERS, _BENT, _ROWS_PER_TERM = (2, 3), 0.03, 2
+# it is larger than this share of the output. They are looked for in so many samples, at
+# least two for each of all terms, of the slowest modes and so many lagged inputs.
+_POWERS, _BENT = (2, 3), 0.03
+_BENT_SAMPLES, _ROWS_PER_TERM, _SLOWEST, _LAGGED = 2_048, 2, 4, 50
 
 # A spike is so many times what half of the errors stay within (8 standard deviations of
 # Gaussian noise); spikes are told that make this share of the squared errors, in no
@@ -485,7 +487,9 @@ def bent_outputs(evidence: Evidence) -> list[int]:
     poles = np.linalg.eigvals(evidence.model.A).astype(complex)
     if not np.isfinite(evidence.model.loss) or np.abs(poles).max(initial=0.0) > 1.0:
         return []  # errors of one that is unstable may be anything
-    records, free = thinned(evidence.records, _MAX_SAMPLES), evidence.free
+    poles = poles[poles.imag >= 0.0]
+    poles = poles[np.argsort(np.abs(1.0 - poles))[:_SLOWEST]]
+    records, free = thinned(evidence.records, _BENT_SAMPLES), evidence.free
     records = [record for record in records if record.u.shape[1] > 2 * _N_LAGS]
     if not records:
         return []
@@ -508,7 +512,7 @@ def bent_outputs(evidence: Evidence) -> list[int]:
     size = np.hstack([record.y for record in records]).std(axis=1)
     share = np.vstack(errors).std(axis=0) / np.where(size > 0.0, size, np.inf)
     m = len(records[0].u)
-    n_lags = min(_N_LAGS, len(whole) // (_WINDOWS_PER_LAG * m))
+    n_lags = min(_N_LAGS, _LAGGED // m, len(whole) // (_WINDOWS_PER_LAG * m))
     found = []
     for i in np.flatnonzero(share > _BENT):
         signals, n_own = [], 0
@@ -524,10 +528,10 @@ def bent_outputs(evidence: Evidence) -> list[int]:
             signals.append(part[n_lags:])  # the inputs before are not known
         n_linear = linear.shape[1]
         # What is left of the errors is filtered: what the model lacks is no noise.
-        whole = _rows(signals, np.ones(1), own.shape[1])
-        if len(whole) < _ROWS_PER_TERM * whole.shape[1]:
+        columns = _rows(signals, np.ones(1), own.shape[1])
+        if len(columns) < _ROWS_PER_TERM * columns.shape[1]:
             continue
-        noise = _without(_of_size_one(whole[:, :n_linear]), whole[:, -1:])[0]
+        noise = _without(_of_size_one(columns[:, :n_linear]), columns[:, -1:])[0]
         stops = np.cumsum([len(part) for part in signals])[:-1]
         (a,) = _whitening_filters(np.split(noise, stops))
         columns = _of_size_one(_rows(signals, a, own.shape[1]))
@@ -558,8 +562,9 @@ def _chance(columns: Array) -> float:
     and White, *Journal of Econometrics* 29, 1985).
     """
     Z, error = _basis(columns[:, :-1]), columns[:, -1]
-    explained = Z.T @ error
-    spread = Z * ((error - Z @ explained) / (1.0 - np.sum(Z**2, axis=1)))[:, None]
+    explained, leverage = Z.T @ error, np.sum(Z**2, axis=1)
+    left = (error - Z @ explained) / np.maximum(1.0 - leverage, _DEPENDENT)
+    spread = Z * left[:, None]
     statistic = explained @ scaled_lstsq(spread.T @ spread, explained)[0]
     return float(stats.chi2.sf(statistic, Z.shape[1]))
 
@@ -720,5 +725,6 @@ def _basis(columns: Array) -> Array:
     By singular values: which columns a pivoted factorisation leaves out turns on
     rounding where some are combinations of others, and so would what it spans.
     """
-    U, sizes, _ = linalg.svd(columns, full_matrices=False, check_finite=False)
-    return U[:, sizes > _DEPENDENT]
+    Q, R = linalg.qr(columns, mode="economic", check_finite=False)
+    U, sizes, _ = linalg.svd(R, full_matrices=False, check_finite=False)
+    return Q @ U[:, sizes > _DEPENDENT]
