@@ -481,8 +481,8 @@ def bent_outputs(evidence: Evidence) -> list[int]:
     loop they explain nothing, whatever its noise is: both are given by the inputs
     (after Ramsey, *Journal of the Royal Statistical Society B* 31, 1969). What lagged
     inputs explain, and the signals themselves, is taken from all of them before: states
-    that a model lacks are another thing. So is what initial states do: where little is
-    left of slow noise, much of that is of the first samples.
+    that a model lacks are another thing. So is what initial states and trends do: where
+    little is left of slow noise, much of that is of the first samples.
     """
     poles = np.linalg.eigvals(evidence.model.A).astype(complex)
     if not np.isfinite(evidence.model.loss) or np.abs(poles).max(initial=0.0) > 1.0:
@@ -510,11 +510,10 @@ def bent_outputs(evidence: Evidence) -> list[int]:
     centre, spread = whole.mean(axis=0)[moves], whole.std(axis=0)[moves]
     moved = [(z[:, moves] - centre) / spread for z in moved]
     size = np.hstack([record.y for record in records]).std(axis=1)
-    share = np.vstack(errors).std(axis=0) / np.where(size > 0.0, size, np.inf)
     m = len(records[0].u)
     n_lags = min(_N_LAGS, _LAGGED // m, len(whole) // (_WINDOWS_PER_LAG * m))
     found = []
-    for i in np.flatnonzero(share > _BENT):
+    for i in np.flatnonzero(np.vstack(errors).std(axis=0) > _BENT * size):
         signals, n_own = [], 0
         for record, z, e in zip(records, moved, errors, strict=True):
             u = record.u.T
@@ -522,7 +521,7 @@ def bent_outputs(evidence: Evidence) -> list[int]:
             linear = np.hstack([_through(poles, u, 2), *late, _through(poles, z), z])
             powers = np.hstack([z**power for power in _POWERS])
             bent = np.hstack([_through(poles, powers), powers])
-            own = free_responses(A, C, len(u), record.trend)[:, i]
+            own = free_responses(A, C, len(u), trend_signals(len(u), 2))[:, i]
             n_own += own.shape[1]
             part = np.column_stack([own, linear, bent, e[:, i]])
             signals.append(part[n_lags:])  # the inputs before are not known
@@ -532,16 +531,18 @@ def bent_outputs(evidence: Evidence) -> list[int]:
         if len(columns) < _ROWS_PER_TERM * columns.shape[1]:
             continue
         noise = _without(_of_size_one(columns[:, :n_linear]), columns[:, -1:])[0]
+        if not noise.std() > _BENT * size[i]:
+            continue
         stops = np.cumsum([len(part) for part in signals])[:-1]
         (a,) = _whitening_filters(np.split(noise, stops))
         columns = _of_size_one(_rows(signals, a, own.shape[1]))
         left, n_known = _without(columns[:, :n_linear], columns)
         n = len(columns) - n_own - n_known
         test = _f_test(left[:, n_linear:-1], left[:, -1], n)
-        explained = (test.statistic - test.dof) / (test.statistic + n)
-        much = explained * share[i] ** 2 > _BENT**2
-        if much and max(test.p_value, _chance(left[:, n_linear:])) < _CERTAIN:
-            found.append(int(i))
+        if test.p_value < _CERTAIN:
+            explained = _explained_elsewhere(left[:, n_linear:])
+            if explained * noise.var() > (_BENT * size[i]) ** 2:
+                found.append(int(i))
     return found
 
 
@@ -555,18 +556,18 @@ def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:
     return np.vstack(rows)
 
 
-def _chance(columns: Array) -> float:
-    """That of what the others explain of the last one, whose variance may vary.
+def _explained_elsewhere(columns: Array) -> float:
+    """Share of the last column that the others explain as they do in its other half.
 
-    As that of noise does which grows with the signals. By the covariance HC3 (MacKinnon
-    and White, *Journal of Econometrics* 29, 1985).
+    Noise that grows with the signals, or what changes over the record, may be explained
+    beyond the chance of noise that does not, but not by the same terms again.
     """
-    Z, error = _basis(columns[:, :-1]), columns[:, -1]
-    explained, leverage = Z.T @ error, np.sum(Z**2, axis=1)
-    left = (error - Z @ explained) / np.maximum(1.0 - leverage, _DEPENDENT)
-    spread = Z * left[:, None]
-    statistic = explained @ scaled_lstsq(spread.T @ spread, explained)[0]
-    return float(stats.chi2.sf(statistic, Z.shape[1]))
+    halves = np.array_split(columns, 2)
+    left = 0.0
+    for half, other in zip(halves, halves[::-1], strict=True):
+        fit = scaled_lstsq(other[:, :-1], other[:, -1], _DEPENDENT)[0]
+        left += float(np.sum((half[:, -1] - half[:, :-1] @ fit) ** 2))
+    return 1.0 - left / float(np.sum(columns[:, -1] ** 2))
 
 
 class Spikes(NamedTuple):
