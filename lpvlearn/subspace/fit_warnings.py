@@ -263,12 +263,12 @@ def warn_about(fitted: LocalFit, told: set[str]) -> None:
     choice_is_told = TESTS <= told or fitted.residual > USELESS
     if fitted.selection.held_out is not None and not choice_is_told:
         _warn_about_choice(fitted, fitted.selection.held_out, told)
-    if not told & _BENDS:
-        _warn_of_bends(fitted, told)
     feedback = None if fitted.method == "pbsid" else fitted.feedback
-    if feedback is None or fitted.stability_loss or "lack" in told:
+    if feedback is None or fitted.stability_loss:
         return
-    if not lacks(fitted.evidence, feedback.innovations):
+    if not feedback.found and not told & _BENDS:
+        _warn_of_bends(fitted, told)
+    if "lack" in told or not lacks(fitted.evidence, feedback.innovations):
         return
     rounded = _rounded_output(fitted.evidence)
     if rounded is not None:
@@ -371,12 +371,10 @@ def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
 
 
 def _warn_of_bends(fitted: LocalFit, told: set[str]) -> None:
-    """Tell of a plant that is not linear over the range of the record.
+    """Tell of a plant in open loop that is not linear over the range of the record.
 
     In a loop, inputs and what they do know the noise.
     """
-    if fitted.feedback is None or fitted.feedback.found or fitted.stability_loss:
-        return
     bent = bent_outputs(fitted.evidence)
     if bent:
         tell(
