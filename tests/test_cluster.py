@@ -84,7 +84,8 @@ def with_a_worker_killed(client, work):
         ended.set()
         killer.join()
     client.wait_for_workers(2)
-    assert killed[0] not in client.run(os.getpid).values()
+    # one that is gone may be asked before the scheduler knows, and does not answer
+    assert killed[0] not in client.run(os.getpid, on_error="ignore").values()
     return found
 
 
