@@ -15,10 +15,11 @@ from ..data.preparation import constant_columns, held_for, stays_put
 from ..exceptions import RankWarning, warn
 from .held_out import HeldOut
 from .identification import Settings
+from .linearity import bent_outputs
 from .local_fit import LocalFit
 from .offsets import CERTAIN, USELESS, follows_means_alone
 from .options import Choices
-from .residuals import bent_outputs, find_spikes, lacks
+from .residuals import find_spikes, lacks
 from .rounding import rounded_outputs
 from .selection import MAX_ORDER, better_horizon
 from .signals import thinned

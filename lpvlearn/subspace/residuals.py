@@ -43,12 +43,9 @@ from ..data.preparation import DETRENDS, remove_trends
 from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import StateSpace
-from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import (
-    delayed,
     estimate_initial_state,
     free_responses,
-    lti_response,
     trend_signals,
 )
 from ..systems.threads import one_blas_thread
@@ -62,16 +59,16 @@ from .statistics import Evidence
 
 Array = NDArray[np.float64]
 
-_N_LAGS = 25  # as in MATLAB's `resid`
+N_LAGS = 25  # as in MATLAB's `resid`
 
 # Windows for each lagged input: an autoregression of fewer errors is itself too
 # uncertain for the tail of the F distribution. A number of lags that the user wants is
 # held to the second, as are the sensitivities: so many, that a fair F test remains.
-_WINDOWS_PER_LAG, _FEWEST_WINDOWS = 10, 2
+WINDOWS_PER_LAG, _FEWEST_WINDOWS = 10, 2
 
 # Part of a regressor's size that others do not explain, below which it is taken for a
 # combination of them: inputs of a few sines, or held for many samples.
-_DEPENDENT = 1e-4
+DEPENDENT = 1e-4
 
 # Errors that are rounding, relative to the spread of the output (24-bit converters and
 # single precision resolve 6e-8) or to its largest value (double precision: 2e-16, some
@@ -85,13 +82,7 @@ _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligi
 # A lack is told that explains this share of the errors, is larger than this share of
 # the output, and so improbable by chance; it is looked for in so many samples. Of them
 # it moves a response by more than its stated deviation, or by far more.
-_MUCH, _MUCH_OF_OUTPUT, _CERTAIN, _MAX_SAMPLES = 0.03, 0.003, 1e-6, 4_096
-
-# Powers of signals that a linear system does not know; what they explain is told where
-# it is larger than this share of the output. They are looked for in so many samples, at
-# least two for each of all terms, of the slowest modes and so many lagged inputs.
-_POWERS, _BENT = (2, 3), 0.03
-_BENT_SAMPLES, _ROWS_PER_TERM, _SLOWEST, _LAGGED = 2_048, 2, 4, 50
+_MUCH, _MUCH_OF_OUTPUT, CERTAIN, _MAX_SAMPLES = 0.03, 0.003, 1e-6, 4_096
 
 # A spike is so many times what half of the errors stay within (8 standard deviations of
 # Gaussian noise); spikes are told that make this share of the squared errors, in no
@@ -266,7 +257,7 @@ def with_windows(residuals: Residuals, n_lags: int | None) -> tuple[Residuals, i
     if fitted is not None:
         n_filters = np.count_nonzero(np.abs(fitted.filter).sum(axis=0), axis=1).max()
         n_own = (2 * len(fitted.poles) + 1) * m * int(n_filters)
-    tried, each = range(_N_LAGS, 0, -1), _WINDOWS_PER_LAG
+    tried, each = range(N_LAGS, 0, -1), WINDOWS_PER_LAG
     if n_lags is not None:
         wanted = whole_number("n_lags", n_lags, 1)
         tried, each = range(wanted, wanted - 1, -1), _FEWEST_WINDOWS
@@ -353,7 +344,7 @@ def cross_correlations(
     little were to be seen. Causal filters leave past and future apart.
     """
     ny = errors[0].shape[1]
-    filters = _whitening_filters(errors) + _whitening_filters(inputs)
+    filters = whitening_filters(errors) + whitening_filters(inputs)
     start, n_samples = max(map(len, filters)) - 1, 0
     sums = np.zeros((n_lags + 1, len(filters), len(filters)))
     for pair in zip(errors, inputs, strict=True):
@@ -405,7 +396,7 @@ def input_tests(
     """Do errors depend on past, present and future inputs?"""
     m, n_rows = inputs[0].shape[1], 2 * n_lags + 1
     tests = InputTests([], [], [])
-    for i, a in enumerate(_whitening_filters(errors)):
+    for i, a in enumerate(whitening_filters(errors)):
         start, parts = len(a) - 1, []
         for e, u in zip(errors, inputs, strict=True):
             if len(e) < start + n_rows:
@@ -415,13 +406,13 @@ def input_tests(
             white = scipy.signal.lfilter(a, [1.0], present, axis=0)
             parts.append((white[start + n_lags : len(e) - n_lags].T, u[start:]))
         n = sum(white.shape[1] for white, _ in parts)
-        columns = _of_size_one(_factor(parts, n_rows))
+        columns = of_size_one(_factor(parts, n_rows))
         n_own = columns.shape[1] - 1 - n_rows * m
         starts = n_own + m * np.array([0, n_lags, n_lags + 1, n_rows])
         for found, first, stop in zip(tests, starts[:-1], starts[1:], strict=True):
-            left, n_known = _without(columns[:, :first], columns)
+            left, n_known = without(columns[:, :first], columns)
             added = [left[:, first + j : stop : m] for j in range(m)]
-            found.append([_f_test(part, left[:, -1], n - n_known) for part in added])
+            found.append([f_test(part, left[:, -1], n - n_known) for part in added])
     return tests
 
 
@@ -465,109 +456,11 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
     tests = input_tests(residuals.errors, residuals.inputs, n_lags, fitted).past
     n = sum(map(len, residuals.errors))
     return any(
-        test.p_value < _CERTAIN
+        test.p_value < CERTAIN
         and test.statistic - test.dof > _MUCH * (test.statistic + n)
         for i in suspects
         for test in tests[i]
     )
-
-
-@one_blas_thread
-def bent_outputs(evidence: Evidence) -> list[int]:
-    """Outputs whose errors clearly follow powers of signals, and not just by a little.
-
-    Squares and cubes of the inputs, and of what the model answers to these from rest,
-    that act through its modes as inputs do. Of the errors of a linear system in open
-    loop they explain nothing, whatever its noise is: both are given by the inputs
-    (after Ramsey, *Journal of the Royal Statistical Society B* 31, 1969). What lagged
-    inputs explain, and the signals themselves, is taken from all of them before: states
-    that a model lacks are another thing. So is what initial states and trends do: where
-    little is left of slow noise, much of that is of the first samples.
-    """
-    poles = np.linalg.eigvals(evidence.model.A).astype(complex)
-    if not np.isfinite(evidence.model.loss) or np.abs(poles).max(initial=0.0) > 1.0:
-        return []  # errors of one that is unstable may be anything
-    poles = poles[poles.imag >= 0.0]
-    poles = poles[np.argsort(np.abs(1.0 - poles))[:_SLOWEST]]
-    records, free = thinned(evidence.records, _BENT_SAMPLES), evidence.free
-    records = [record for record in records if record.u.shape[1] > 2 * _N_LAGS]
-    if not records:
-        return []
-    model = with_initial_states(
-        evidence.model, records, free, evidence.whitening.weight
-    )
-    A, B, C, D = model.A, model.B, model.C, model.D
-    rest = np.zeros(len(A))
-    with np.errstate(over="ignore", invalid="ignore"):
-        errors = simulation_errors(model, records)
-        moved = [
-            np.hstack([r.u.T, lti_response(A, B, C, D, r.u.T, rest)]) for r in records
-        ]
-    whole = np.vstack(moved)
-    if not all(np.isfinite(x).all() for x in (whole, *errors)):
-        return []
-    moves = whole.std(axis=0) > 0.0
-    centre, spread = whole.mean(axis=0)[moves], whole.std(axis=0)[moves]
-    moved = [(z[:, moves] - centre) / spread for z in moved]
-    size = np.hstack([record.y for record in records]).std(axis=1)
-    m = len(records[0].u)
-    n_lags = min(_N_LAGS, _LAGGED // m, len(whole) // (_WINDOWS_PER_LAG * m))
-    found = []
-    for i in np.flatnonzero(np.vstack(errors).std(axis=0) > _BENT * size):
-        signals, n_own = [], 0
-        for record, z, e in zip(records, moved, errors, strict=True):
-            u = record.u.T
-            late = [delayed(u, np.full(m, k)) for k in range(n_lags + 1)]
-            linear = np.hstack([_through(poles, u, 2), *late, _through(poles, z), z])
-            powers = np.hstack([z**power for power in _POWERS])
-            bent = np.hstack([_through(poles, powers), powers])
-            own = free_responses(A, C, len(u), trend_signals(len(u), 2))[:, i]
-            n_own += own.shape[1]
-            part = np.column_stack([own, linear, bent, e[:, i]])
-            signals.append(part[n_lags:])  # the inputs before are not known
-        n_linear = linear.shape[1]
-        # What is left of the errors is filtered: what the model lacks is no noise.
-        columns = _rows(signals, np.ones(1), own.shape[1])
-        if len(columns) < _ROWS_PER_TERM * columns.shape[1]:
-            continue
-        noise = _without(_of_size_one(columns[:, :n_linear]), columns[:, -1:])[0]
-        if not noise.std() > _BENT * size[i]:
-            continue
-        stops = np.cumsum([len(part) for part in signals])[:-1]
-        (a,) = _whitening_filters(np.split(noise, stops))
-        columns = _of_size_one(_rows(signals, a, own.shape[1]))
-        left, n_known = _without(columns[:, :n_linear], columns)
-        n = len(columns) - n_own - n_known
-        test = _f_test(left[:, n_linear:-1], left[:, -1], n)
-        if test.p_value < _CERTAIN:
-            explained = _explained_elsewhere(left[:, n_linear:])
-            if explained * noise.var() > (_BENT * size[i]) ** 2:
-                found.append(int(i))
-    return found
-
-
-def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:
-    """Filtered signals of all records, of each less what the first `n_own` explain."""
-    rows = []
-    for part in signals:
-        white = scipy.signal.lfilter(a, [1.0], part, axis=0)[len(a) - 1 :]
-        own = _of_size_one(white[:, :n_own])
-        rows.append(_without(own, white[:, n_own:])[0])
-    return np.vstack(rows)
-
-
-def _explained_elsewhere(columns: Array) -> float:
-    """Share of the last column that the others explain as they do in its other half.
-
-    Noise that grows with the signals, or what changes over the record, may be explained
-    beyond the chance of noise that does not, but not by the same terms again.
-    """
-    halves = np.array_split(columns, 2)
-    left = 0.0
-    for half, other in zip(halves, halves[::-1], strict=True):
-        fit = scaled_lstsq(other[:, :-1], other[:, -1], _DEPENDENT)[0]
-        left += float(np.sum((half[:, -1] - half[:, :-1] @ fit) ** 2))
-    return 1.0 - left / float(np.sum(columns[:, -1] ** 2))
 
 
 class Spikes(NamedTuple):
@@ -622,7 +515,7 @@ def find_spikes(evidence: Evidence) -> Spikes | None:
 def _predicted_variances(errors: Sequence[Array]) -> Array:
     """Variances of the errors of every output, given some of its last ones."""
     r = autocorrelations(errors, _N_SCREEN)
-    r[0] *= 1.0 + _DEPENDENT**2
+    r[0] *= 1.0 + DEPENDENT**2
     explained = [
         one[1:] @ linalg.solve_toeplitz(one[:-1], one[1:]) if one[0] else 0.0
         for one in r.T
@@ -639,7 +532,7 @@ def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:
     are orthogonal for a white input and close poles do no harm. Thrice would allow for
     curvature, but then a mode that is missing beside another one goes unseen.
     """
-    states = _through(fitted.poles, u, 2)
+    states = through_modes(fitted.poles, u, 2)
     driven = [np.hstack([states, u[:, free]]) for free in fitted.direct]
     return [
         scipy.signal.lfilter(h, [1.0], signals, axis=0)
@@ -648,7 +541,7 @@ def _sensitivities(fitted: Fitted, output: int, u: Array) -> list[Array]:
     ]
 
 
-def _through(poles: NDArray[np.complex128], u: Array, times: int = 1) -> Array:
+def through_modes(poles: NDArray[np.complex128], u: Array, times: int = 1) -> Array:
     """Answers of modes to signals, that go through every pole so many times."""
     poles = np.asarray(poles, dtype=complex)
     outside = np.abs(poles) > 1.0  # reflected: their own answers would overflow
@@ -686,7 +579,7 @@ def _factor(parts: Sequence[tuple[Array, Array]], n_rows: int) -> Array:
     return lower.T
 
 
-def _whitening_filters(errors: Sequence[Array]) -> list[Array]:
+def whitening_filters(errors: Sequence[Array]) -> list[Array]:
     """Coefficients ``[1, a_1, ..., a_p]`` that whiten the errors of every output."""
     models = [
         autoregression([e[:, [i]] for e in errors]) for i in range(errors[0].shape[1])
@@ -694,7 +587,7 @@ def _whitening_filters(errors: Sequence[Array]) -> list[Array]:
     return [np.concatenate([[1.0], -model.C[0]]) for model in models]
 
 
-def _f_test(added: Array, target: Array, dof: int) -> ResidualTest:
+def f_test(added: Array, target: Array, dof: int) -> ResidualTest:
     """What added columns explain of a target of so many degrees of freedom."""
     P = _basis(added)
     explained = P.T @ target
@@ -708,12 +601,12 @@ def _f_test(added: Array, target: Array, dof: int) -> ResidualTest:
     return ResidualTest(statistic, q, float(stats.f.sf(statistic / q, q, error)))
 
 
-def _of_size_one(columns: Array) -> Array:
+def of_size_one(columns: Array) -> Array:
     size = np.linalg.norm(columns, axis=0)
     return columns / np.where(size > 0.0, size, 1.0)
 
 
-def _without(known: Array, columns: Array) -> tuple[Array, int]:
+def without(known: Array, columns: Array) -> tuple[Array, int]:
     """What known ones, of size one, do not explain, and of how many directions."""
     Q = _basis(known)
     left = columns - Q @ (Q.T @ columns)
@@ -728,4 +621,4 @@ def _basis(columns: Array) -> Array:
     """
     Q, R = linalg.qr(columns, mode="economic", check_finite=False)
     U, sizes, _ = linalg.svd(R, full_matrices=False, check_finite=False)
-    return Q @ U[:, sizes > _DEPENDENT]
+    return Q @ U[:, sizes > DEPENDENT]

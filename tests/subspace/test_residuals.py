@@ -14,12 +14,12 @@ from lpvlearn.subspace.residuals import (
     Fitted,
     Residuals,
     _sensitivities,
-    _whitening_filters,
     autocorrelations,
     cross_correlations,
     input_tests,
     residual_tests,
     whiteness_tests,
+    whitening_filters,
     with_windows,
 )
 from lpvlearn.systems.simulation import lti_response
@@ -74,7 +74,7 @@ def test_autocorrelations_are_sums_within_experiments(two_experiments):
 
 def test_cross_correlations_are_sums_within_experiments(two_experiments):
     errors, inputs = two_experiments
-    filters = _whitening_filters(errors) + _whitening_filters(inputs)
+    filters = whitening_filters(errors) + whitening_filters(inputs)
     assert all(len(a) == 1 for a in filters)  # they are white
     found = cross_correlations(errors, inputs, 6)
     assert_allclose(found.deviation, 43**-0.5)
@@ -118,13 +118,13 @@ def test_errors_are_whitened_by_their_autoregression(n_experiments):
         lfilter([1.0], poles, rng.standard_normal((900, 1)), axis=0)
         for _ in range(n_experiments)
     ]
-    (a,) = _whitening_filters(errors)
+    (a,) = whitening_filters(errors)
     taper = tukey(902, 0.2)[1:-1, None]  # errors rise from zero and fall to it
     r = autocorrelations([taper * v for v in errors], 2)[:, 0]
     assert_allclose(a, [1.0, *np.linalg.solve(toeplitz(r[:2]), -r[1:])])
     assert_allclose(a, poles, atol=0.1)
     # A constant is its own past: nothing is divided by zero.
-    assert np.isfinite(_whitening_filters([np.ones((50, 1))])[0]).all()
+    assert np.isfinite(whitening_filters([np.ones((50, 1))])[0]).all()
 
 
 # -- tests of residuals ----------------------------------------------------------------
@@ -509,38 +509,3 @@ def test_noise_alone_is_no_lack(pole):
     for seed in range(8):
         u, y = resonance(np.random.default_rng(seed), 600, 0.3, pole)
         SubspaceLTI(4, horizon=12).fit(u, y)
-
-
-@pytest.mark.parametrize(
-    "bend, sensor",
-    [
-        (lambda u: np.tanh(1.5 * u), lambda y: y),
-        (lambda u: u + 0.3 * u**2, lambda y: y),
-        (lambda u: u - np.clip(u, -0.5, 0.5), lambda y: y),
-        (lambda u: u, lambda y: np.sqrt(y + 4.0)),
-    ],
-)
-def test_a_fit_tells_that_a_system_is_not_linear(bend, sensor):
-    rng = np.random.default_rng(5)
-    u = np.repeat(rng.uniform(-2.0, 2.0, (80, 1)), 5, axis=0)
-    system = StateSpace(modes(0.9 + 0.2j), [[0.0], [1.0]], [[0.3, 0.0]], [[0.0]], 1.0)
-    y = sensor(system.simulate(bend(u)))
-    y += 0.05 * y.std() * rng.standard_normal(y.shape)
-    with pytest.warns(UserWarning, match="of output 1 follow squares or cubes"):
-        SubspaceLTI(2, method="po-moesp", horizon=12, offset="constant").fit(u, y)
-
-
-@pytest.mark.parametrize("noise", ["t", "AR(.99)", "by the output", "walk"])
-def test_no_noise_makes_a_linear_system_seem_bent(noise):
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        u = np.repeat(rng.exponential(size=(160, 1)), 5, axis=0)
-        y = lfilter([0.0, 0.2], [1.0, -0.8], u, axis=0)
-        e = {
-            "t": rng.standard_t(4.0, y.shape),
-            "AR(.99)": coloured(rng, len(y), 0.99),
-            "by the output": rng.standard_normal(y.shape) * (0.3 + y),
-            "walk": rng.standard_normal(y.shape).cumsum(axis=0),
-        }[noise]
-        model = SubspaceLTI(1, horizon=8, offset="constant")
-        model.fit(u, y + 0.2 * y.std() / e.std() * e)  # silently

@@ -1,0 +1,158 @@
+"""Is a system linear over the range of its record? What its errors know of powers.
+
+Squares and cubes of the inputs, and of what a model answers to these from rest, act
+through its modes as inputs do. Of the errors of a linear system in open loop they
+explain nothing, whatever its noise is: both are given by the inputs (after Ramsey,
+*Journal of the Royal Statistical Society B* 31, 1969). What lagged inputs explain, and
+the signals themselves, is taken from all of them before: states that a model lacks are
+another thing. So is what initial states and trends do: where little is left of slow
+noise, much of that is of the first samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # which loads its signal package when that is first used: slowly
+from numpy.typing import NDArray
+
+from ..systems.least_squares import scaled_lstsq
+from ..systems.simulation import (
+    delayed,
+    free_responses,
+    lti_response,
+    trend_signals,
+)
+from ..systems.threads import one_blas_thread
+from .residuals import (
+    CERTAIN,
+    DEPENDENT,
+    N_LAGS,
+    WINDOWS_PER_LAG,
+    f_test,
+    of_size_one,
+    through_modes,
+    whitening_filters,
+    without,
+)
+from .signals import thinned
+from .simulation_fit import simulation_errors, with_initial_states
+from .statistics import Evidence
+
+Array = NDArray[np.float64]
+
+# Powers of signals that a linear system does not know; what they explain is told where
+# it is larger than this share of the output. They are looked for in so many samples, at
+# least two for each of all terms, of the slowest modes and so many lagged inputs.
+_POWERS, _BENT = (2, 3), 0.03
+_BENT_SAMPLES, _ROWS_PER_TERM, _SLOWEST, _LAGGED = 2_048, 2, 4, 50
+
+
+class _Terms(NamedTuple):
+    """What may explain the errors of an experiment, one row per sample."""
+
+    own: Array  # (n_rows, n_outputs, n_own), by initial states and trends
+    linear: Array
+    bent: Array
+
+
+@one_blas_thread
+def bent_outputs(evidence: Evidence) -> list[int]:
+    """Outputs whose errors clearly follow powers of signals, and not just by a little.
+
+    Those of a model that is unstable may be anything, and are not looked at.
+    """
+    poles = np.linalg.eigvals(evidence.model.A).astype(complex)
+    if not np.isfinite(evidence.model.loss) or np.abs(poles).max(initial=0.0) > 1.0:
+        return []
+    poles = poles[poles.imag >= 0.0]
+    poles = poles[np.argsort(np.abs(1.0 - poles))[:_SLOWEST]]
+    records, free = thinned(evidence.records, _BENT_SAMPLES), evidence.free
+    records = [record for record in records if record.u.shape[1] > 2 * N_LAGS]
+    if not records:
+        return []
+    model = with_initial_states(
+        evidence.model, records, free, evidence.whitening.weight
+    )
+    A, B, C, D = model.A, model.B, model.C, model.D
+    inputs, rest = [record.u.T for record in records], np.zeros(len(A))
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = simulation_errors(model, records)
+        moved = [np.hstack([u, lti_response(A, B, C, D, u, rest)]) for u in inputs]
+    whole = np.vstack(moved)
+    if not all(np.isfinite(x).all() for x in (whole, *errors)):
+        return []
+    least = _BENT * np.hstack([record.y for record in records]).std(axis=1)
+    large = np.flatnonzero(np.vstack(errors).std(axis=0) > least).tolist()
+    if not large:
+        return []
+    moves = whole.std(axis=0) > 0.0
+    centre, spread = whole.mean(axis=0)[moves], whole.std(axis=0)[moves]
+    m = inputs[0].shape[1]
+    n_lags = min(N_LAGS, _LAGGED // m, len(whole) // (WINDOWS_PER_LAG * m))
+    terms = []
+    for u, z in zip(inputs, moved, strict=True):
+        z = (z[:, moves] - centre) / spread
+        late = [delayed(u, np.full(m, k)) for k in range(n_lags + 1)]
+        linear = [through_modes(poles, u, 2), *late, through_modes(poles, z), z]
+        powers = np.hstack([z**power for power in _POWERS])
+        parts = (
+            free_responses(A, C, len(u), trend_signals(len(u), 2)),
+            np.hstack(linear),
+            np.hstack([through_modes(poles, powers), powers]),
+        )
+        terms.append(_Terms(*(x[n_lags:] for x in parts)))  # of inputs that are known
+    errors = [e[n_lags:] for e in errors]
+    return [i for i in large if _is_bent(terms, errors, i, least[i])]
+
+
+def _is_bent(
+    terms: Sequence[_Terms], errors: Sequence[Array], output: int, least: float
+) -> bool:
+    """Whether powers explain more of the errors of an output than `least`."""
+    n_linear, n_own = terms[0].linear.shape[1], terms[0].own.shape[2]
+    signals = [
+        np.column_stack([one.own[:, output], one.linear, one.bent, e[:, output]])
+        for one, e in zip(terms, errors, strict=True)
+    ]
+    # What is left of the errors is filtered: what the model lacks is no noise.
+    columns = _rows(signals, np.ones(1), n_own)
+    if len(columns) < _ROWS_PER_TERM * columns.shape[1]:
+        return False
+    noise = without(of_size_one(columns[:, :n_linear]), columns[:, -1:])[0]
+    if not noise.std() > least:
+        return False
+    stops = np.cumsum([len(part) for part in signals])[:-1]
+    (a,) = whitening_filters(np.split(noise, stops))
+    columns = of_size_one(_rows(signals, a, n_own))
+    left, n_known = without(columns[:, :n_linear], columns)
+    left, n = left[:, n_linear:], len(columns) - n_own * len(signals) - n_known
+    if not f_test(left[:, :-1], left[:, -1], n).p_value < CERTAIN:
+        return False
+    return bool(_explained_elsewhere(left) * noise.var() > least**2)
+
+
+def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:
+    """Filtered signals of all records, of each less what the first `n_own` explain."""
+    rows = []
+    for part in signals:
+        white = scipy.signal.lfilter(a, [1.0], part, axis=0)[len(a) - 1 :]
+        own = of_size_one(white[:, :n_own])
+        rows.append(without(own, white[:, n_own:])[0])
+    return np.vstack(rows)
+
+
+def _explained_elsewhere(columns: Array) -> float:
+    """Share of the last column that the others explain as they do in its other half.
+
+    Noise that grows with the signals, or what changes over the record, may be explained
+    beyond the chance of noise that does not, but not by the same terms again.
+    """
+    halves = np.array_split(columns, 2)
+    left = 0.0
+    for half, other in zip(halves, halves[::-1], strict=True):
+        fit = scaled_lstsq(other[:, :-1], other[:, -1], DEPENDENT)[0]
+        left += float(np.sum((half[:, -1] - half[:, :-1] @ fit) ** 2))
+    return 1.0 - left / float(np.sum(columns[:, -1] ** 2))

@@ -1,0 +1,45 @@
+"""Systems that bend are told of, and no noise makes a linear one seem to."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from lpvlearn import StateSpace, SubspaceLTI
+
+from ..conftest import modes
+from .test_residuals import coloured
+
+
+@pytest.mark.parametrize(
+    "bend, sensor",
+    [
+        (lambda u: np.tanh(1.5 * u), lambda y: y),
+        (lambda u: u + 0.3 * u**2, lambda y: y),
+        (lambda u: u - np.clip(u, -0.5, 0.5), lambda y: y),
+        (lambda u: u, lambda y: np.sqrt(y + 4.0)),
+    ],
+)
+def test_a_fit_tells_that_a_system_is_not_linear(bend, sensor):
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.uniform(-2.0, 2.0, (80, 1)), 5, axis=0)
+    system = StateSpace(modes(0.9 + 0.2j), [[0.0], [1.0]], [[0.3, 0.0]], [[0.0]], 1.0)
+    y = sensor(system.simulate(bend(u)))
+    y += 0.05 * y.std() * rng.standard_normal(y.shape)
+    with pytest.warns(UserWarning, match="of output 1 follow squares or cubes"):
+        SubspaceLTI(2, method="po-moesp", horizon=12, offset="constant").fit(u, y)
+
+
+@pytest.mark.parametrize("noise", ["t", "AR(.99)", "by the output", "walk"])
+def test_no_noise_makes_a_linear_system_seem_bent(noise):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.exponential(size=(160, 1)), 5, axis=0)
+        y = lfilter([0.0, 0.2], [1.0, -0.8], u, axis=0)
+        e = {
+            "t": rng.standard_t(4.0, y.shape),
+            "AR(.99)": coloured(rng, len(y), 0.99),
+            "by the output": rng.standard_normal(y.shape) * (0.3 + y),
+            "walk": rng.standard_normal(y.shape).cumsum(axis=0),
+        }[noise]
+        y += 0.2 * y.std() / e.std() * e
+        SubspaceLTI(1, horizon=8, offset="constant").fit(u, y)  # silently
