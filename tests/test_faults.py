@@ -174,13 +174,20 @@ def test_workers_end_with_the_process_that_started_them(fit, number, tmp_path):
     nothing_left(process)
 
 
-@pytest.mark.parametrize("fit", [ALONE, SEARCH])
-def test_workers_that_only_begin_end_as_well(fit):
+@pytest.mark.parametrize(
+    "fit, number, later",
+    [
+        (ALONE, signal.SIGHUP, 0.0),
+        (ALONE, signal.SIGKILL, 0.5),  # while they import, or the first has half a task
+        (SEARCH, signal.SIGKILL, 0.5),
+    ],
+)
+def test_workers_that_only_begin_end_as_well(fit, number, later):
     """Half of their first task is sent then: it is too large to be sent at once."""
     process = begun(script(fit, size=20_000, n_jobs=2 if fit == ALONE else None))
     until(lambda: len(workers(process)) == 2, "no workers")
-    time.sleep(0.5)  # while they import, or the first waits for the rest of its task
-    process.send_signal(signal.SIGKILL)
+    time.sleep(later)
+    process.send_signal(number)
     process.communicate(timeout=PATIENCE)
     nothing_left(process)
 
