@@ -82,8 +82,10 @@ if find_spec("pyarrow"):
 # figures are those of one process, to the bit. A worker that dies under
 # `LocalLPVPipeline.fit` or `run_paper_experiment` costs its points anew. Under a search
 # joblib gives the rows of a split to one worker, and the search ends in its error where
-# that one dies: send them to all of the workers, with the table::
+# that one dies: send them to all of the workers, with the table, and have dask, which
+# drops such copies every two seconds, keep them::
 #
+#     client.amm.stop()
 #     splits = list(cv.split(X, y))
 #     search = GridSearchCV(pipeline, grid, cv=splits, n_jobs=8)
 #     shared = [X, y, *(rows for split in splits for rows in split)]
