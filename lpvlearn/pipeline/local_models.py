@@ -107,30 +107,41 @@ def identify_points(
     # Where a record stood in the table does not matter: splits share their results.
     groups = [[_bare(e) for e in group] for group in points.experiments]
 
-    def identify(estimator: Any) -> list[Done | None]:
+    def identify(
+        estimator: Any, known: Sequence[Done | None] = ()
+    ) -> list[Done | None]:
         arguments = [(estimator, group) for group in groups]
         return runner.run(
-            "local models", identify_point, arguments, points.kappa, **options
+            "local models", identify_point, arguments, points.kappa, known, **options
         )
 
     found = identify(local)
     if chooses and structure is None:
         models = [done.result for done in found if done is not None]
         if len({model.order for model in models}) > 1:
-            found = identify(clone(local).set_params(order=_common_order(models)))
+            order = _common_order(models)
+            known = [
+                done if done is not None and _own_order(done.result) == order else None
+                for done in found
+            ]
+            found = identify(clone(local).set_params(order=order), known)
     tell_skipped(found, points.kappa)
     kept = [k for k, done in enumerate(found) if done is not None]
     return [done.result for done in found if done is not None], points.keep(kept)
 
 
+def _own_order(model: LocalModel) -> int:
+    """As the estimator counts, without integrators."""
+    return model.order - len(model.integrating)
+
+
 def _common_order(models: Sequence[LocalModel]) -> int:
     """The order of least cost to all points together, of those that one of them takes.
 
-    As the estimator counts, without integrators. Their records are independent:
-    likelihoods multiply, and a state that one point in nine takes from its noise is
-    not had by all. The highest one where costs are untold.
+    Their records are independent: likelihoods multiply, and a state that one point in
+    nine takes from its noise is not had by all. The highest one where costs are untold.
     """
-    orders = sorted({model.order - len(model.integrating) for model in models})
+    orders = sorted({_own_order(model) for model in models})
     if not all(model.costs for model in models):
         return orders[-1]
     total = dict.fromkeys(orders, 0.0)

@@ -42,9 +42,12 @@ class PointRunner:
         function: Callable[..., Any],
         arguments: Sequence[tuple[Any, ...]],
         kappa: Array,
+        known: Sequence[Done | None] = (),
         **shared: Any,
     ) -> list[Done | None]:
         """Results of a step at every operating point; None where it failed and may.
+
+        Those that are `known` stand for themselves, the step is taken where None does.
 
         What the points warn of comes with them: given at once, warnings would tear
         the progress bar, name no point, and be lost in other processes.
@@ -54,7 +57,7 @@ class PointRunner:
         A failure names the point (by `kappa`), unless another one fails in the same
         words: the cause is an option then.
         """
-        return self._start(QUEUED, what, function, arguments, kappa, **shared)()
+        return self._start(QUEUED, what, function, arguments, kappa, known, **shared)()
 
     def start(self, *args: Any, **shared: Any) -> Callable[[], list[Done | None]]:
         """As `run`, whose results a call of what is returned waits for.
@@ -70,15 +73,19 @@ class PointRunner:
         function: Callable[..., Any],
         arguments: Sequence[tuple[Any, ...]],
         kappa: Array,
+        known: Sequence[Done | None] = (),
         **shared: Any,
     ) -> Callable[[], list[Done | None]]:
         kept = self._remembered(function)
         stop = self.on_error == "raise"
+        known = known or [None] * len(arguments)
         tasks = (
             delayed(_attempt)(kept, args, shared, k if stop else None)
             for k, args in enumerate(arguments)
+            if known[k] is None
         )
-        results = results_of(tasks, self.n_jobs, sent)
+        new = results_of(tasks, self.n_jobs, sent)
+        results = (next(new) if done is None else done for done in known)
 
         def again(k: int) -> Any:
             return _attempt(kept, arguments[k], shared, None)

@@ -50,6 +50,18 @@ def test_different_failures_everywhere_tell_the_first(spring):
         pipeline.fit(X[unequal], y[unequal])
 
 
+def test_what_is_known_of_points_stands_for_itself():
+    runs = runner(Memory(None), on_error="skip")
+    old = Done("old", [Told("told before", UserWarning)])
+    with pytest.warns(UserWarning, match=r"left out operating point 1 .*: not here"):
+        found = runs.run("a step", _refuse, [(0,), (1,)], np.eye(2), [old, None])
+    assert found == [old, None]
+
+
+def _refuse(_):
+    raise ValueError("not here")
+
+
 def now_and_soon(_):
     """When this began, and when it ended."""
     began = time.time()
