@@ -787,17 +787,23 @@ def _tell_of_lead(
     n_trend = fitted.evidence.free.n_trend
     offset = DETRENDS[n_trend]
     plain = choices._replace(method="auto", offset=offset, estimated=())
-    try:
-        other = _fit(with_later_inputs(pairs, lead), plain, set(told), n_trend)
-    except TooFewSamples:
-        return
-    if other.feedback is None or other.feedback.found:
-        return
+    pairs, error = with_later_inputs(pairs, lead), _held_out(fitted, choices)
+    led = _OF_NOISE if fitted.grows() else _LED
+    # One order tells whether it is worth while to look for the best.
+    first = choices.order or max(1, fitted.selection.order)
+    for order, share in {first: _OF_NOISE, choices.order: led}.items():
+        plain = plain._replace(order=order)
+        try:
+            other = _fit(pairs, plain, set(told), n_trend)
+        except TooFewSamples:
+            return
+        if other.feedback is None or other.feedback.found:
+            return
+        found = _held_out(other, plain)
+        if not found.total < share * error.total:
+            return
     # A reference of a few lines is the free motion of modes that do not decay.
-    if 1.0 - spectral_radius(other.model.A) < _LINE / max(len(u) for u, _ in pairs):
-        return
-    found, error = _held_out(other, plain), _held_out(fitted, choices)
-    if found.total < (_OF_NOISE if fitted.grows() else _LED) * error.total:
+    if 1.0 - spectral_radius(other.model.A) >= _LINE / max(len(u) for u, _ in pairs):
         tell(
             told,
             "lead",

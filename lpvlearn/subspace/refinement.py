@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy.linalg import lapack
 
 from ..systems.least_squares import column_scale, scaled_lstsq
 from .signals import Record, SharedSignals, block_radius, output_energy
@@ -135,20 +135,18 @@ def _accepted(
 def _trial_steps(
     step: Array, jacobian: Array, residual: Array, dampings: Sequence[float]
 ) -> Iterator[Array]:
-    """The whole step, where it is not to be damped, then damped ones."""
+    """The whole step, where it is not to be damped, then damped ones.
+
+    These by normal equations, whose condition damping bounds: directions that the data
+    do not determine are damped away by the least of it.
+    """
     if dampings[0] == 0.0:
         yield step
     scale = column_scale(jacobian)
-    left, s, right = linalg.svd(  # by the driver that always converges
-        jacobian / scale,
-        full_matrices=False,
-        check_finite=False,
-        lapack_driver="gesvd",
-    )
-    kept = s > _RCOND * s[0]
-    left, s, right = left[:, kept], s[kept], right[kept]
-    projected = left.T @ residual
+    jacobian = jacobian / scale
+    gram, projected = jacobian.T @ jacobian, jacobian.T @ residual
+    largest = np.linalg.eigvalsh(gram)[-1]
     for damping in dampings:
         if damping > 0.0:
-            gain = s / (s**2 + damping * s[0] ** 2)
-            yield (right.T @ (gain * projected)) / scale
+            damped = gram + damping * largest * np.eye(len(gram))
+            yield lapack.dposv(damped, projected)[1] / scale
