@@ -620,5 +620,7 @@ def _basis(columns: Array) -> Array:
     rounding where some are combinations of others, and so would what it spans.
     """
     Q, R = linalg.qr(columns, mode="economic", check_finite=False)
-    U, sizes, _ = linalg.svd(R, full_matrices=False, check_finite=False)
+    U, sizes, _ = linalg.svd(  # by the driver that always converges
+        R, full_matrices=False, check_finite=False, lapack_driver="gesvd"
+    )
     return Q @ U[:, sizes > DEPENDENT]
