@@ -5,7 +5,8 @@ The experiments of every point make one model, or one each; these are averaged t
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,6 +28,7 @@ from ..models.statespace import (
 from ..restructuring.known_poles import integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
+from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
 from .runner import Done, PointRunner, label_of, tell_skipped
 
@@ -46,6 +48,10 @@ _STANDING = 0.05
 
 # One that much slower may be an integrator, known by samples that are not many.
 _ABOUT_ZERO = 0.25
+
+# Points that look for their order everywhere, and states fewer and more than theirs
+# among which the others look first.
+_SCOUTS, _FEWER, _MORE = 3, 1, 2
 
 _HELD = (
     "If only its controller holds the plant, identify the closed loop, with the "
@@ -115,8 +121,24 @@ def identify_points(
             "local models", identify_point, arguments, points.kappa, known, **options
         )
 
-    found = identify(local)
-    if chooses and structure is None:
+    def scouted() -> list[Done | None]:
+        found: list[Done | None] = [None] * len(groups)
+        some = np.linspace(0, len(groups) - 1, _SCOUTS).round().astype(int)
+        arguments = [(local, groups[k]) for k in some]
+        quiet = replace(runner, on_error="skip", verbose=0)
+        with collected(), suppress(ValueError):  # what fails is tried, and told, again
+            known = quiet.run(
+                "local models", identify_point, arguments, points.kappa[some], **options
+            )
+            for k, done in zip(some, known, strict=True):
+                found[k] = done
+        return found
+
+    if not chooses or structure is not None:
+        found = identify(local)
+    else:
+        search = len(groups) > _SCOUTS and type(local) is SubspaceLTI
+        found = _of_own_orders(local, identify, scouted() if search else [])
         models = [done.result for done in found if done is not None]
         if len({model.order for model in models}) > 1:
             order = _common_order(models)
@@ -128,6 +150,32 @@ def identify_points(
     tell_skipped(found, points.kappa)
     kept = [k for k, done in enumerate(found) if done is not None]
     return [done.result for done in found if done is not None], points.keep(kept)
+
+
+def _of_own_orders(
+    local: Any,
+    identify: Callable[..., list[Done | None]],
+    scouts: Sequence[Done | None],
+) -> list[Done | None]:
+    """Models of all points, each of the order that it takes itself.
+
+    What the `scouts` among them take tells the others where to look. One that finds its
+    order at an end of that looks everywhere.
+    """
+    orders = [_own_order(done.result) for done in scouts if done is not None]
+    if not orders:
+        return identify(local)
+    about = range(max(0, min(orders) - _FEWER), max(orders) + _MORE + 1)
+    found = identify(clone(local).set_params(order=about), scouts)
+    ends = {about[0], about[-1]} - {0}
+    unsure = [
+        scout is None and done is not None and _own_order(done.result) in ends
+        for scout, done in zip(scouts, found, strict=True)
+    ]
+    if not any(unsure):
+        return found
+    pairs = zip(found, unsure, strict=True)
+    return identify(local, [None if again else done for done, again in pairs])
 
 
 def _own_order(model: LocalModel) -> int:

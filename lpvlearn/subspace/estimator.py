@@ -134,10 +134,11 @@ class SubspaceLTI(
 
     Parameters
     ----------
-    order : int or "auto", default="auto"
+    order : int, "auto" or sequence of int, default="auto"
         Number of states. "auto" takes the order with the best criterion (minus
         twice the logarithm of the likelihood, and 4 for each parameter), or a lower one
-        that simulates parts held out clearly better, of at most 30. 0 is a pure gain.
+        that simulates parts held out clearly better, of at most 30; of several orders,
+        as ``range(2, 7)``, the choice is among these. 0 is a pure gain.
     method : {"auto", "po-moesp", "pi-moesp", "n4sid", "cva", "pbsid"}, default="auto"
         "auto" is "po-moesp", or "pbsid" where the data come from a closed loop, with a
         warning, and where noise that moves the states of the plant is likelier than
@@ -372,7 +373,7 @@ class SubspaceLTI(
 
     def __init__(
         self,
-        order: int | str = "auto",
+        order: int | str | Sequence[int] = "auto",
         *,
         method: str = "auto",
         horizon: int | str = "auto",

@@ -487,6 +487,10 @@ def _fit(
     if settings.method == "pbsid":
         try:
             plant = identify_closed_loop(scaled, basis, order, horizon, settings)
+            found = plant.selection.order
+            if order is None and found not in (settings.orders or [found]):
+                order = min(settings.orders, key=lambda n: abs(n - found))
+                plant = identify_closed_loop(scaled, basis, order, horizon, settings)
         except ValueError as error:
             raise TooFewSamples(str(error)) from None
     else:

@@ -78,6 +78,7 @@ class Settings(NamedTuple):
     # By output the share of errors that repeat those before, as those of rounding do.
     repeated: tuple[float, ...] = ()
     differences: bool = False  # of samples: most of these may be noise
+    orders: tuple[int, ...] = ()  # ascending, to choose among; (): all
 
     def max_horizon(self, lengths: Sequence[int]) -> int:
         """Largest horizon whose Hankel columns outnumber its rows (at least 1).
@@ -108,11 +109,15 @@ class Settings(NamedTuple):
     ) -> None:
         """Refuse a horizon or an order that the number of samples cannot carry.
 
+        Of several orders the lowest must be one of them.
+
         >>> Settings(Freedom(np.ones((1, 1), bool))).check_size([900], 9, 5)
         Traceback (most recent call last):
         ValueError: `order` must be at most 4 for 900 samples and horizon 5. Got 9.
         """
         longest = self.max_horizon(lengths)
+        if order is None and self.orders:
+            order = self.orders[0]
         if horizon is not None and horizon > longest:
             n_outputs, n_inputs = self.free.direct.shape
             raise ValueError(

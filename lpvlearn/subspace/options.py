@@ -21,6 +21,8 @@ REFINEMENTS = ("auto", "simulation", "prediction")
 
 MISSING = ("raise", "split", "estimate")
 
+_MOST = 1_000  # orders to choose among
+
 
 class Choices(NamedTuple):
     """Checked options that decide about a fit.
@@ -41,6 +43,7 @@ class Choices(NamedTuple):
     # of every experiment, (n_samples, n_outputs): outputs that are estimates; none: ()
     estimated: Sequence[NDArray[np.bool_]] = ()
     differences: bool = False  # whether the samples are those of others
+    orders: tuple[int, ...] = ()  # ascending, to choose among; (): all
 
     def settings(
         self, n_outputs: int, n_inputs: int, basis: Array, n_trend: int = 0
@@ -60,6 +63,7 @@ class Choices(NamedTuple):
             weigh=self.refine in ("auto", "prediction"),
             compare=self.refine == "auto",
             differences=self.differences,
+            orders=self.orders,
         )
 
 
@@ -83,8 +87,9 @@ def check_options(options: Mapping[str, Any]) -> Choices:
     offset = options["offset"]
     if options["detrend"] is not None and offset == "auto":
         offset = None  # what is to become of offsets was said
+    order, orders = _order(options["order"])
     return Choices(
-        _integer_or_auto("order", options["order"], 0),
+        order,
         _integer_or_auto("horizon", options["horizon"], 1),
         _integer_or_auto("n_noise_states", options["n_noise_states"], 0) or 0,
         options["method"],
@@ -93,7 +98,23 @@ def check_options(options: Mapping[str, Any]) -> Choices:
         options["stability"] == "enforce",
         options["initial_state"] == "estimate",
         offset,
+        orders=orders,
     )
+
+
+def _order(value: Any) -> tuple[int | None, tuple[int, ...]]:
+    """The order, or None and those among which it is to be chosen: () for "auto"."""
+    listed = isinstance(value, np.ndarray) and value.ndim == 1
+    if not listed and not isinstance(value, range | list | tuple):
+        return _integer_or_auto("order", value, 0), ()
+    some = value[: _MOST + 1]
+    if not 0 < len(some) <= _MOST or not all(is_whole(n) and n >= 0 for n in some):
+        raise ValueError(
+            f"`order` must be 'auto', an integer of at least 0, or 1 to {_MOST} such "
+            f"integers, as range(2, 7). Got {shown(value)}."
+        )
+    several = tuple(sorted({int(n) for n in some}))
+    return (several[0], ()) if len(several) == 1 else (None, several)
 
 
 def _integer_or_auto(name: str, value: Any, lowest: int) -> int | None:

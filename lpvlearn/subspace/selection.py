@@ -259,7 +259,7 @@ def _of_longer_time(
 class _Range(NamedTuple):
     """What is to be tried; one order, or one horizon, is given."""
 
-    orders: range
+    orders: Sequence[int]  # ascending
     horizon: int | None
     # of the records as they are, for orders up to the highest: by horizon, as found;
     # None for horizons that are left out
@@ -272,11 +272,7 @@ def _search(
     records: list[Record], order: int | None, horizon: int | None, settings: Settings
 ) -> Selection:
     """The choice for settings that suit all orders alike."""
-    highest = order
-    if highest is None:
-        horizons = [horizon] if horizon else _horizons(records, 0, settings)
-        highest = _highest_order(records, horizons, settings)
-    wanted = _Range(range(order or 0, highest + 1), horizon, {}, {})
+    wanted = _Range(_orders(records, order, horizon, settings), horizon, {}, {})
     pilot, slow = _pilot(records, wanted, settings)
     wanted = wanted._replace(slow=slow or settings.differences)
     repeated = tuple(rounded_outputs(pilot, records).repeated)
@@ -294,7 +290,8 @@ def _search(
             lowest = max(wanted.orders[0], least.order - _PATIENCE)
             end = min(last, least.order + _PATIENCE)
         noise = least.candidate.whitening
-        about = wanted._replace(orders=range(lowest, end + 1))
+        some = [k for k in wanted.orders if lowest <= k <= end]
+        about = wanted._replace(orders=some)
         tried = _try_orders(about, records, noise, settings)
         for k, one in _judged(tried, records, settings).items():
             orders[k] = min(orders.get(k, one), one, key=_criterion)
@@ -374,11 +371,14 @@ def _by_own_noise(
     """
     found, far = dict(found), {}
     least = min(found.values(), key=_criterion)
-    first = least.order
     limit = least.criterion + _FAR * sum(record.n_values for record in records)
-    for step in (-1, 1):
-        order, best, stale = first if step < 0 else first + 1, np.inf, 0
-        while order in found and stale <= _PATIENCE:
+    orders = sorted(found)
+    first = orders.index(least.order)
+    for side in (orders[first::-1], orders[first + 1 :]):
+        best, stale = np.inf, 0
+        for order in side:
+            if stale > _PATIENCE:
+                break
             one = found[order]
             if one.criterion > limit:
                 far[order] = one
@@ -386,7 +386,6 @@ def _by_own_noise(
                 found[order] = _with_own_noise(one, records, wanted, settings)
             stale = 0 if found[order].criterion < best else stale + 1
             best = min(best, found[order].criterion)
-            order += step
     return found, far
 
 
@@ -532,6 +531,22 @@ def _horizon_grid(lowest: int, highest: int) -> list[int]:
     return sorted(set(grid))
 
 
+def _orders(
+    records: Sequence[Record],
+    order: int | None,
+    horizon: int | None,
+    settings: Settings,
+) -> Sequence[int]:
+    """Orders to try."""
+    if order is not None:
+        return [order]
+    horizons = [horizon] if horizon else _horizons(records, 0, settings)
+    highest = _highest_order(records, horizons, settings)
+    if settings.orders:
+        return [n for n in settings.orders if n <= highest] or settings.orders[:1]
+    return range(highest + 1)
+
+
 def _highest_order(
     records: Sequence[Record], horizons: Sequence[int], settings: Settings
 ) -> int:
@@ -573,7 +588,8 @@ def _try_orders(
             break
         slow = slow_starts.best(order) if wanted.slow else None
         model = _refined(starts, slow, records, settings)[0]
-        below = tried[-1].candidate.model if tried else None
+        is_next = bool(tried) and tried[-1].order == order - 1
+        below = tried[-1].candidate.model if is_next else None
         if below is not None and model.loss > _AS_GOOD * below.loss:
             other = _with_more_states(below, records, settings)
             if other is not None and other.loss < model.loss:

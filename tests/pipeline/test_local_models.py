@@ -9,7 +9,12 @@ from sklearn.base import clone
 
 from lpvlearn import LocalLPVPipeline, StateSpace, SubspaceLTI
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.pipeline.local_models import LocalModel, identify_point
+from lpvlearn.pipeline.local_models import (
+    LocalModel,
+    _of_own_orders,
+    identify_point,
+)
+from lpvlearn.pipeline.runner import Done
 
 from ..conftest import ROLES, spring_tables
 
@@ -96,3 +101,52 @@ def test_without_a_structure_points_take_the_order_of_most_evidence(
     assert pipeline.report_["order"].tolist() == [order] * 4
     # those that took another one are fitted again
     assert GAIN["fits"] == 4 + (1 if order == 2 else 3)
+
+
+class Everywhere(SubspaceLTI):
+    """Looks for its order at every point as if it were alone."""
+
+
+def test_points_look_for_their_order_where_a_few_of_them_found_theirs():
+    kappas = 0.2 * np.arange(7)
+    X, y = spring_tables(noise=0.01, n_samples=300, kappas=kappas)
+    near, alone = (
+        LocalLPVPipeline(local, **ROLES).fit(X, y)
+        for local in (SubspaceLTI(), Everywhere())
+    )
+    assert (near.report_["order"] == 2).all() and (alone.report_["order"] == 2).all()
+    for one, other in zip(near.local_models_, alone.local_models_, strict=True):
+        omega = np.geomspace(1.0, 50.0, 30)
+        G, H = one.frequency_response(omega), other.frequency_response(omega)
+        assert np.linalg.norm(G - H) < 1e-3 * np.linalg.norm(H)
+
+
+@pytest.mark.parametrize(
+    ("own", "again"),
+    [((2, 2, 3, 2, 2), []), ((2, 5, 3, 4, 2), [1]), ((3, 3, 3, 1, 4), [3])],
+)
+def test_an_order_at_the_end_of_those_looked_at_is_looked_for_everywhere(own, again):
+    searched = []
+
+    def identify(local, known):
+        done = []
+        for k, (order, one) in enumerate(zip(own, known, strict=True)):
+            if one is None:
+                orders = range(31) if local.order == "auto" else local.order
+                if local.order == "auto":
+                    searched.append(k)
+                lti = StateSpace.__new__(StateSpace)
+                one = Done(
+                    LocalModel(lti, int(np.clip(order, orders[0], orders[-1])), 5), []
+                )
+            done.append(one)
+        return done
+
+    scouts = [
+        None if k % 2 else one
+        for k, one in enumerate(identify(SubspaceLTI(), [None] * 5))
+    ]
+    searched.clear()
+    found = _of_own_orders(SubspaceLTI(), identify, scouts)
+    assert [done.result.order for done in found] == list(own)
+    assert searched == again

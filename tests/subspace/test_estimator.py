@@ -262,6 +262,11 @@ def test_unrelated_outputs_warn(rng):
         ({"order": -1}, "`order` must be 'auto' or an integer of at least 0. Got -1"),
         ({"order": 2.0}, "`order` must be"),
         ({"order": True}, "`order` must be"),
+        ({"order": [2, 3.5]}, r"or 1 to 1000 such integers, .* Got \[2, 3.5\]"),
+        ({"order": range(0)}, r"`order` must be .* Got range\(0, 0\)"),
+        ({"order": range(10**30)}, "or 1 to 1000 such integers"),
+        ({"order": (4, -1)}, "integer of at least 0, or"),
+        ({"order": [30, 31]}, "`order` must be at most 4 for 40 samples"),
         ({"horizon": 0}, "`horizon` must be 'auto' or an integer of at least 1"),
         (
             {"method": "arx"},

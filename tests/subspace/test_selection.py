@@ -20,7 +20,7 @@ from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import Realization, with_initial_states
 from lpvlearn.systems.simulation import lti_response
 
-from ..conftest import modes
+from ..conftest import modes, stable_model
 from .conftest import POLES, example, experiment, freedom
 
 
@@ -233,6 +233,37 @@ def test_the_noise_of_the_choice_goes_with_it():
     plain = Settings(freedom(2, 1), weigh=False)
     other = select([coloured(2, 2000)], None, None, plain)
     assert other.candidate is None and other.order == chosen.order
+
+
+@pytest.mark.parametrize("method", ["po-moesp", "pbsid"])
+@pytest.mark.parametrize(
+    ("among", "chosen"),
+    [(range(2, 7), 4), ([9, 4, 2], 4), (np.arange(3), 2), ((6, 5), 5), ([3], 3)],
+)
+def test_the_order_is_chosen_among_those_given(method, among, chosen):
+    rng = np.random.default_rng(3)
+    truth = stable_model(3, 4, 1, 1, sampling_time=1.0)
+    u = rng.standard_normal((800, 1))
+    y = truth.simulate(u)
+    y += 1e-3 * y.std() * rng.standard_normal(y.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of orders that are not the system's
+        model = SubspaceLTI(among, method=method, sampling_time=1.0).fit(u, y)
+    assert model.order_ == chosen
+    tried = set(model.selection_["order"])
+    assert method == "pbsid" or tried <= set(among)
+
+
+def test_all_orders_given_are_as_none():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((300, 1))
+    y = stable_model(0, 3, 1, 2, sampling_time=1.0).simulate(u)
+    y += 0.1 * rng.standard_normal(y.shape)
+    whole, given = (SubspaceLTI(order).fit(u, y) for order in ("auto", range(31)))
+    for name in "ABCD":
+        np.testing.assert_array_equal(
+            getattr(whole.lti_, name), getattr(given.lti_, name)
+        )
 
 
 def test_a_given_order_is_kept_and_its_horizon_found():
