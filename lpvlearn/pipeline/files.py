@@ -42,6 +42,7 @@ _MOST_TEXT = 2**24
 _MOST_VALUES = 500_000
 
 _MOST_MEMBERS = 65_535  # what a zip has without extensions
+_LONGEST_RANGE = 1_000  # that becomes a tuple of its numbers
 _DEEPEST = 60  # of fields within fields: the deepest of today have 12
 
 _DTYPES = ("<f8", "<i8", "|b1", "<c16")  # of arrays in files
@@ -269,6 +270,8 @@ class _Writer:
                 for i, (k, v) in enumerate(value.items())
             ]
             return {"dict": pairs}
+        if isinstance(value, range) and not value[_LONGEST_RANGE:]:
+            value = tuple(value)
         if type(value) in (list, tuple):
             items = [self.node(v, f"{place}.{i}") for i, v in enumerate(value)]
             return items if isinstance(value, list) else {"tuple": items}

@@ -266,6 +266,14 @@ def test_bases_that_follow_the_scheduling_variables_are_functions_too(tmp_path):
     assert_same(model.at(0.3), other.at(0.3))
 
 
+def test_a_range_of_orders_becomes_their_tuple(tmp_path):
+    path = tmp_path / "model.zip"
+    save(SubspaceLTI(order=range(2, 7)), path)
+    assert load(path).order == (2, 3, 4, 5, 6)
+    with pytest.raises(ValueError, match="`model.order` must be something that a file"):
+        save(SubspaceLTI(order=range(10**30)), path)
+
+
 def pendulum_basis(kappa):
     return np.diag([1.0, 1.0 + kappa[0]])
 
@@ -279,6 +287,7 @@ def pendulum_basis(kappa):
         {"offset": "linear", "input_delay": 1, "inputs": "force"},
         {"feedthrough": np.array([[False]]), "inputs": ["force"]},
         {"inputs": ("force", "twice")},
+        {"order": (1, 2, 3), "inputs": ["force"]},
     ],
     ids=str,
 )
