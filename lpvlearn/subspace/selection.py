@@ -217,7 +217,7 @@ def select(
         chosen = _search(records, None, horizon, by_evidence)
         order = chosen.order
         rows = [row for row in chosen.rows if row.order != order]
-    wanted = _Range(range(order, order + 1), horizon, {}, {})
+    wanted = _Range([order], order, horizon, {}, {})
     starts = _starts(wanted, order, records, settings)
     best = _best_horizon(starts, settings.refine)
     errors = _relative_errors(starts, records)
@@ -260,6 +260,7 @@ class _Range(NamedTuple):
     """What is to be tried; one order, or one horizon, is given."""
 
     orders: Sequence[int]  # ascending
+    pilot: int  # its order
     horizon: int | None
     # of the records as they are, for orders up to the highest: by horizon, as found;
     # None for horizons that are left out
@@ -272,7 +273,7 @@ def _search(
     records: list[Record], order: int | None, horizon: int | None, settings: Settings
 ) -> Selection:
     """The choice for settings that suit all orders alike."""
-    wanted = _Range(_orders(records, order, horizon, settings), horizon, {}, {})
+    wanted = _wanted(records, order, horizon, settings)
     pilot, slow = _pilot(records, wanted, settings)
     wanted = wanted._replace(slow=slow or settings.differences)
     repeated = tuple(rounded_outputs(pilot, records).repeated)
@@ -425,7 +426,7 @@ def _pilot(
     And whether decimated records are why it is as good.
     """
     free, whitening = settings.free, Whitening.none(len(records[0].y))
-    order = max(wanted.orders[0], min(wanted.orders[-1], _PILOT_ORDER))
+    order = wanted.pilot
     _look_up(wanted, order, records, settings)  # for the orders to come as well
     is_cut = wanted.horizon is None and _is_cut_short(wanted, records, settings)
     only = wanted._replace(orders=range(order, order + 1))
@@ -488,7 +489,8 @@ def _look_up(
     wanted: _Range, lowest: int, records: Sequence[Record], settings: Settings
 ) -> dict[int, ObservabilitySubspace]:
     """Subspaces of every horizon that shows the lowest order, known ones or new."""
-    horizon, width = wanted.horizon, wanted.orders[-1] + settings.n_noise_states
+    horizon, width = wanted.horizon, max(wanted.orders[-1], wanted.pilot)
+    width += settings.n_noise_states
     horizons = [horizon] if horizon else _horizons(records, lowest, settings)
     new = [h for h in horizons if h not in wanted.spaces]
     if new:
@@ -531,20 +533,22 @@ def _horizon_grid(lowest: int, highest: int) -> list[int]:
     return sorted(set(grid))
 
 
-def _orders(
+def _wanted(
     records: Sequence[Record],
     order: int | None,
     horizon: int | None,
     settings: Settings,
-) -> Sequence[int]:
-    """Orders to try."""
+) -> _Range:
+    """The order, or those to try among the ones that are asked for."""
     if order is not None:
-        return [order]
+        return _Range([order], order, horizon, {}, {})
     horizons = [horizon] if horizon else _horizons(records, 0, settings)
     highest = _highest_order(records, horizons, settings)
+    orders: Sequence[int] = range(highest + 1)
     if settings.orders:
-        return [n for n in settings.orders if n <= highest] or settings.orders[:1]
-    return range(highest + 1)
+        orders = [n for n in settings.orders if n <= highest] or settings.orders[:1]
+    pilot = max(orders[0], min(highest, _PILOT_ORDER))
+    return _Range(orders, pilot, horizon, {}, {})
 
 
 def _highest_order(
