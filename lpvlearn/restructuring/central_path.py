@@ -13,7 +13,7 @@ primal-dual methods of semidefinite programming have them (Conn, Gould, Orban an
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +39,7 @@ _POSITIVE, _EXCESS, _CLOSE = 1e-13, 1e-14, 1.001
 _BISECTIONS = 60  # halve the logarithm of any bracket of doubles down to `_CLOSE`
 _NEGLIGIBLE = 1e-14  # decrease of psi, or radius, that is rounding noise
 _TAKEN = 1e-2  # part of the promised decrease that a step must bring
+_HELD = 0.999  # part of the radius from which a step is held back by it
 
 # of the trust region: longer after steps as good as promised, shorter after poor ones,
 # and shorter still after those that failed
@@ -97,13 +98,6 @@ class Quadratic:
     tau: float  # square of the level
     by_level: Array  # derivative of the gradient by tau
     level_curvature: float  # second derivative of psi by tau
-    level_slope: float = 0.0  # the first one
-
-    def at(self, mu: float, value: float) -> Quadratic:
-        """For another mu, of which this tau is not the best one, and psi `value`."""
-        slope = 0.5 * (1.0 - mu / self.mu) / self.tau
-        gradient = mu / self.mu * self.gradient - self._by_level(slope)
-        return replace(self, mu=mu, value=value, gradient=gradient, level_slope=slope)
 
     def corrected(self, bend: Complex) -> Array:
         """The gradient where the squares are off the linear ones by `bend`."""
@@ -139,8 +133,7 @@ class Quadratic:
 
     def _rise(self, d: Array, bend: Complex) -> Complex:
         """Change of ``tau I - X`` along the step `d`."""
-        slope = self.level_slope - self._level_bend(bend)
-        level = -(self.by_level @ d + slope) / self.level_curvature
+        level = (self._level_bend(bend) - self.by_level @ d) / self.level_curvature
         return np.asarray(level * np.eye(self.M.shape[1]) - self._linear(d) - bend)
 
 
@@ -330,8 +323,8 @@ def central_path(
     `theta` is stable: the least-squares fit, or a point met on the path. At `mu_end`
     the level is about ``mu_end * n_active`` (relative) above the minimum. The first
     `mu` is by default that of a level of twice the norm; `frequencies` are local maxima
-    known already; `max_iter` counts Newton steps. A stage ends when Newton's method
-    promises less than `decrement`, relative to mu: the steps that a point far from the
+    known already; `max_iter` counts Newton steps. A stage ends when the next one
+    may bring less than `decrement`, relative to mu: the steps that a point far from the
     path needs are longest while mu is large.
     """
     inside = theta if limits.strict(theta) else limits.inside(theta)
@@ -350,10 +343,7 @@ def central_path(
         barrier = Barrier(system, limits, omega, found.norm, carried)
         if mu is None:
             mu = barrier.mu_of_level(theta, _FIRST_LEVEL)
-        ahead = max(_SHRINK * mu, min(mu_end, mu))
-        theta, steps = _stage(
-            barrier, theta, mu, ahead, decrement * mu, max_iter - n_iter
-        )
+        theta, steps = _stage(barrier, theta, mu, decrement * mu, max_iter - n_iter)
         n_iter, carried = n_iter + steps, barrier.carried
         found = system.peaks(theta, _DEPTH)
         history.append({"objective": found.norm, "mu": mu, "steps": float(steps)})
@@ -361,38 +351,24 @@ def central_path(
             best, best_norm = theta, found.norm
         if mu <= mu_end:
             break
-        mu = ahead
+        mu = max(_SHRINK * mu, mu_end)
     if found.norm > _WORSE * best_norm:
         theta = best
     return PathPoint(theta, mu, seen, n_iter, history)
 
 
 def _stage(
-    barrier: Barrier,
-    theta: Array,
-    mu: float,
-    ahead: float,
-    enough: float,
-    max_iter: int,
+    barrier: Barrier, theta: Array, mu: float, enough: float, max_iter: int
 ) -> tuple[Array, int]:
-    """Newton's method at one mu, and a step towards the next one.
-
-    Returns the end and the number of steps.
-    """
+    """Newton's method at one mu: its end, and the number of steps."""
     radius, n_iter = 1.0, 0
     while n_iter < max_iter and not time_is_up():
         model = barrier.quadratic(theta, mu)
         n_iter += 1
         if not (np.isfinite(model.gradient).all() and np.isfinite(model.hessian).all()):
             break
-        eigen = np.linalg.eigh(0.5 * (model.hessian + model.hessian.T))
-        spectrum, slopes = eigen[0], eigen[1].T @ model.gradient
-        x = trust_region_step(spectrum, slopes, radius)
-        near = _promised(spectrum, slopes, x) < enough
-        if near and ahead < mu:
-            model = model.at(ahead, barrier.value(theta, ahead))
-        theta, radius, promised = _newton(barrier, theta, model, eigen, radius)
-        if near or promised < enough:
+        theta, radius, left = _newton(barrier, theta, model, radius)
+        if left < enough:
             break
     return theta, n_iter
 
@@ -402,17 +378,15 @@ def _promised(spectrum: Array, slopes: Array, x: Array) -> float:
 
 
 def _newton(
-    barrier: Barrier,
-    theta: Array,
-    model: Quadratic,
-    eigen: tuple[Array, Array],
-    radius: float,
+    barrier: Barrier, theta: Array, model: Quadratic, radius: float
 ) -> tuple[Array, float, float]:
-    """One step of the trust region: its end, the next radius, the promised decrease.
+    """One step of the trust region: its end, the next radius, and what it leaves.
 
-    The decrease is zero where no step lowers psi.
+    What is left is the decrease of psi that the next step may bring: what the model was
+    off by, or, where the radius held the step back, as much as was promised of it; zero
+    where no step lowers psi.
     """
-    spectrum, Q = eigen
+    eigen = spectrum, Q = np.linalg.eigh(0.5 * (model.hessian + model.hessian.T))
     slopes = Q.T @ model.gradient
     missed = np.zeros(0)
     while radius > _NEGLIGIBLE:
@@ -430,11 +404,13 @@ def _newton(
             barrier.carried = barrier.omega, model.multipliers(trial.d, trial.bend)
             if missed.size:
                 barrier.omega = np.union1d(barrier.omega, missed)
+            held = length > _HELD * radius
             if ratio > _GOOD:
                 radius = max(radius, _LONGER * length)
             elif ratio < _POOR:
                 radius *= _SHORTER
-            return trial.theta, radius, promised
+            left = promised if held else abs(1.0 - ratio) * promised
+            return trial.theta, radius, left
         radius = _FAILED * min(length, radius)
     return theta, radius, 0.0
 

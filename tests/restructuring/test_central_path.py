@@ -47,14 +47,17 @@ def test_the_quadratic_is_that_of_the_value_along_geodesics(case, mu, monkeypatc
 
 
 @pytest.mark.parametrize("case", SYSTEMS, ids=str)
-def test_the_gradient_follows_mu(case):
+def test_a_short_step_towards_the_next_mu_brings_what_it_promises(case):
     system, theta = system_of(**case)
-    barrier = Barrier(system, Limits(system, 0.01), system.grid, 0.1)
-    mu, h = 1e-2, 1e-7
-    up, down = (barrier.quadratic(theta, mu + s * h).gradient for s in (1, -1))
-    here = barrier.quadratic(theta, mu)
-    ahead = (here.at(mu + h, here.value).gradient - here.gradient) / h
-    assert np.allclose(ahead, (up - down) / (2 * h), rtol=1e-4, atol=1e-5)
+    limits, mu, radius = Limits(system, 0.01), 1e-2, 1e-6
+    omega = np.union1d(system.grid, system.peaks(theta, 0.5).frequencies)
+    Z = Barrier(system, limits, omega, 0.1).quadratic(theta, mu).Z
+    barrier = Barrier(system, limits, omega, 0.1, (omega, Z))
+    model = barrier.quadratic(theta, 0.3 * mu)
+    end, _, left = barrier_module._newton(barrier, theta, model, radius)
+    promised = radius * np.linalg.norm(model.gradient)
+    assert np.isclose(model.value - barrier.value(end, 0.3 * mu), promised, rtol=1e-3)
+    assert np.isclose(left, promised, rtol=1e-3)  # the radius holds the step back
 
 
 @pytest.mark.parametrize("case", SYSTEMS, ids=str)
