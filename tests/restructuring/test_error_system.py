@@ -42,6 +42,20 @@ def test_norm_is_that_of_the_difference_of_the_models(shape, dt):
     )
 
 
+@pytest.mark.parametrize("depths", [(0.9, 0.5, None), (None, 0.5, 0.9)])
+def test_peaks_that_are_remembered_are_those_of_a_search(depths):
+    rng = np.random.default_rng(4)
+    system, theta, *_ = error_system(rng, (2, 2))
+    for point in (theta, 0.9 * theta, theta):
+        for within in depths:
+            fresh = ErrorSystem(system.structure, system.target)
+            found, expected = (s.peaks(point, within) for s in (system, fresh))
+            assert np.isclose(found.norm, expected.norm, rtol=1e-9)
+            assert np.allclose(found.values, expected.values, rtol=1e-9)
+            assert np.allclose(found.frequencies, expected.frequencies, rtol=1e-4)
+    assert len(system.peaks(theta, 0.9).values) > 1
+
+
 @pytest.mark.parametrize("dt", [None, 0.1])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_gradients_equal_central_differences(shape, dt):
