@@ -30,7 +30,7 @@ Complex = NDArray[np.complex128]
 # weight of the logarithms of the limits, relative to mu: they keep steps off the limits
 # and hardly move the minimum
 _BARRIER = 1e-2
-_SHRINK = 0.3  # of mu, from one stage to the next
+_SHRINK, _FAST = 0.3, 0.1  # of mu, to the next stage; after one that took one step
 _FIRST_LEVEL = 2.0  # level of the first stage, relative to the largest singular value
 _SINGULAR = 1e-12  # relative curvature: flatter directions are taken as that steep
 # Of a trust-region step: relative curvature that still counts as positive, the excess
@@ -351,7 +351,7 @@ def central_path(
             best, best_norm = theta, found.norm
         if mu <= mu_end:
             break
-        mu = max(_SHRINK * mu, mu_end)
+        mu = max((_FAST if steps == 1 else _SHRINK) * mu, mu_end)
     if found.norm > _WORSE * best_norm:
         theta = best
     return PathPoint(theta, mu, seen, n_iter, history)
