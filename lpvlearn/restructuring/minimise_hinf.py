@@ -46,8 +46,9 @@ _LOWER = 1e-9  # relative decrease that leaves a saddle
 # the next round if these do not converge
 _ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
 # Of so many parameters an end too early costs more than the path to a better one, and
-# a further one brings no digit of the norm that the parameters hold.
-_MANY, _MANY_ROUNDS = 100, ((3e-8, 100), (1e-9, 60))
+# a further one brings no digit of the norm that the parameters hold. A solver that is
+# not there after ten iterations may need forty, of twice the time of the path's steps.
+_MANY, _MANY_ROUNDS = 100, ((3e-8, 10), (1e-9, 60))
 _BUNDLE_PACE = 10  # as many iterations of a first-order method
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
 _PROGRESS = 1e-9  # a round that converged and brings less is the last one
