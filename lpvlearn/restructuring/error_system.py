@@ -314,9 +314,10 @@ class ErrorSystem:
 
     def _target_response(self, omega: Array) -> Complex:
         """``G0`` at the frequencies, shape (k, n_outputs, n_inputs)."""
-        known = np.isin(omega, self.grid)
+        at = np.searchsorted(self.grid[:-1], omega)  # the last one of all beyond
+        known = self.grid[at] == omega
         G = np.empty((len(omega), self.n_outputs, self.n_inputs), complex)
-        G[known] = self._target_on_grid[np.searchsorted(self.grid, omega[known])]
+        G[known] = self._target_on_grid[at[known]]
         G[~known] = self._target_at(omega[~known])
         return G
 
