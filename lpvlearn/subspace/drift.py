@@ -100,17 +100,25 @@ def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
     )
 
 
-def drifts(whole: LocalFit, other: LocalFit) -> bool:
+def wanders(evidence: Evidence) -> bool:
+    """Whether noise beside which there may be more is as slow as drift."""
+    rates = _rates(evidence.noise.A) * _longest(evidence)
+    return bool((rates < _SLOW_BESIDE).any())
+
+
+def drifts(whole: LocalFit, other: LocalFit, doubt: float = 0.0) -> bool:
     """Whether the model of differences, `other`, is to be preferred.
 
-    Where errors wander, what further slow modes gain may be chance; and of equals that
-    model is taken which does not say that it knows where the outputs stand. Else it
-    must be better beyond chance.
+    Or one like it may be, whose criterion is better by as much as is in `doubt`. Where
+    errors wander, what further slow modes gain may be chance; and of equals that model
+    is taken which does not say that it knows where the outputs stand. Else it must be
+    better beyond chance.
     """
-    better = criterion_in_units(whole.evidence) - criterion_in_units(other.evidence)
-    n_samples = _longest(whole.evidence)
-    if not (_rates(other.evidence.noise.A) * n_samples < _SLOW_BESIDE).any():
+    better = doubt + criterion_in_units(whole.evidence)
+    better -= criterion_in_units(other.evidence)
+    if not wanders(other.evidence):
         return better > CERTAIN
+    n_samples = _longest(whole.evidence)
     # modes of the samples that are far slower than those of their differences
     rates, slowest = _rates(whole.model.A), _rates(other.model.A).min(initial=1.0)
     n_followed = int((rates < min(_FOLLOWS / n_samples, _FAR * slowest)).sum())

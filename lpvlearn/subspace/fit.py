@@ -26,7 +26,7 @@ from ..exceptions import RankWarning
 from ..systems.simulation import delayed, lti_response
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .delay import find_lead, first_samples, longest_delays, with_later_inputs
-from .drift import differences, drifts, may_drift, of_levels, outlasts
+from .drift import differences, drifts, may_drift, of_levels, outlasts, wanders
 from .fit_warnings import (
     Doubt,
     tell,
@@ -54,9 +54,11 @@ from .offsets import (
     constants_matter,
     criterion_in_units,
     follows_means_alone,
+    may_be_better,
     may_have_constants,
     shifts_matter,
     with_levels,
+    without_slow_modes,
 )
 from .options import Choices
 from .residuals import lacks
@@ -190,7 +192,16 @@ def _with_constants(
     hides |= choices.order is not None and fitted.residual > _HARDLY
     tested = fitted.evidence.one_step
     tried = [tested]
-    if choices.offset == "auto" and (hides or may_have_constants(tested)):
+
+    def may_matter() -> bool:
+        if hides:
+            return True
+        return may_have_constants(tested) and _is_worth_a_choice(
+            lambda near: may_be_better(tested, near.evidence),
+            *(pairs, judged, told, fitted, 1),
+        )
+
+    if choices.offset == "auto" and may_matter():
         other = _fit(pairs, judged, told, 1, fitted)
         tried.append(other.evidence.one_step)
         if constants_matter(tested, tried[-1]):
@@ -207,6 +218,44 @@ def _with_constants(
             if better > CERTAIN and not outlasts(other):
                 fitted, n_trend = other, 2
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
+
+
+def _is_worth_a_choice(
+    promising: Callable[[LocalFit], bool],
+    pairs: Pairs,
+    choices: Choices,
+    told: set[str],
+    fitted: LocalFit,
+    n_trend: int,
+) -> bool:
+    """Whether to choose among all orders again, with other trends or of differences.
+
+    That takes as long as the first choice. Few steps lead from the model found to one
+    of its order, and to those without each one of the modes that may be constants:
+    unless these tell nothing of other orders, one of them must be promising.
+    """
+    evidence, horizon = fitted.evidence, fitted.selection.horizon
+    others = without_slow_modes(evidence)
+    if others is None or not evidence.refined:
+        return True
+    free = evidence.free._replace(n_trend=n_trend)
+    told = told | {"collinear"}
+
+    def near(A: Array, C: Array) -> LocalFit:
+        model = evidence.model._replace(A=A, C=C, blocks=None)
+        start = fitted._replace(
+            evidence=replace(evidence, model=model, free=free),
+            selection=Selection(len(A), horizon, []),
+            residual=np.inf,  # whatever comes of it
+        )
+        same = choices._replace(order=len(A), horizon=horizon, refine="prediction")
+        return _fit(pairs, same._replace(method=fitted.method), told, n_trend, start)
+
+    try:
+        own = evidence.model.A, evidence.model.C
+        return any(promising(near(A, C)) for A, C in [own, *others])
+    except TooFewSamples:  # for that horizon
+        return True
 
 
 def _of_drifting_noise(
@@ -226,35 +275,34 @@ def _of_drifting_noise(
     innovations = whole.feedback.innovations
     same = choices._replace(method=whole.method, differences=True)
     n_trend = whole.evidence.free.n_trend
+    moved, n_left = differences(pairs), max(n_trend - 1, 0)
+    if choices.offset == "auto":  # where drift begins is anywhere
+        n_trend = max(n_trend, 1)
+
+    def may_be_better_so(near: LocalFit) -> bool:
+        return drifts(whole, _of_samples(pairs, choices, near, n_trend), CERTAIN)
+
+    # From a model whose noise is slow, steps on differences may lead astray.
+    if not wanders(whole.evidence) and not _is_worth_a_choice(
+        may_be_better_so, moved, same, told, whole, n_left
+    ):
+        return None
     try:
-        found = _fit(differences(pairs), same, set(told), max(n_trend - 1, 0))
+        found = _fit(moved, same, set(told), n_left)
     except TooFewSamples:
         return None
     if found.stability_loss:
         return None
-    if choices.offset == "auto":  # where drift begins is anywhere
-        n_trend = max(n_trend, 1)
-    moved, centres = centred(pairs, n_trend, choices.initial_states)
-    moved = [(u @ found.evidence.basis, y) for u, y in moved]
-    scaled = scale_records(moved, n_trend)
-    evidence = of_levels(found.evidence, scaled, n_trend)
-    evidence, offsets = with_levels(evidence, attributed(evidence, centres, pairs))
-    feedback = find_feedback(scaled.records)
+    other = _of_samples(pairs, choices, found, n_trend)
+    feedback = find_feedback(other.scaled.records)
     if feedback is None or feedback.found:
         return None
-    energy = output_energy(evidence.records) or 1.0
-    other = found._replace(
-        model=evidence.model,
-        residual=float(np.sqrt(evidence.model.loss / energy)),
-        evidence=evidence,
-        feedback=feedback,
-        offsets=offsets,
-        first_model=evidence.model,
-        scaled=scaled,
-    )
+    other = other._replace(feedback=feedback)
     if not drifts(whole, other):
         return None
-    if lacks(whole.evidence, innovations) or lacks(evidence, feedback.innovations):
+    if lacks(whole.evidence, innovations) or lacks(
+        other.evidence, feedback.innovations
+    ):
         return None  # errors that inputs explain are no drift
     held_out = found.selection.held_out
     if held_out is not None:  # its errors, by those of all differences
@@ -263,6 +311,26 @@ def _of_drifting_noise(
         selection = replace(found.selection, held_out=held_out)
         other = other._replace(selection=selection)
     return other
+
+
+def _of_samples(
+    pairs: Pairs, choices: Choices, found: LocalFit, n_trend: int
+) -> LocalFit:
+    """The model that was `found` of the differences of samples as one of these."""
+    moved, centres = centred(pairs, n_trend, choices.initial_states)
+    moved = [(u @ found.evidence.basis, y) for u, y in moved]
+    scaled = scale_records(moved, n_trend)
+    evidence = of_levels(found.evidence, scaled, n_trend)
+    evidence, offsets = with_levels(evidence, attributed(evidence, centres, pairs))
+    energy = output_energy(evidence.records) or 1.0
+    return found._replace(
+        model=evidence.model,
+        residual=float(np.sqrt(evidence.model.loss / energy)),
+        evidence=evidence,
+        offsets=offsets,
+        first_model=evidence.model,
+        scaled=scaled,
+    )
 
 
 def _tell_of_contradiction(

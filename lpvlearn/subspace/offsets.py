@@ -152,6 +152,33 @@ def may_have_constants(evidence: Evidence) -> bool:
     return _has_slow_mode(evidence) or chance_of_constants(evidence) < _SUSPICIOUS
 
 
+def without_slow_modes(evidence: Evidence) -> list[tuple[Array, Array]] | None:
+    """``(A, C)`` of a model without each one of the modes that may be constants.
+
+    None where that is not all that constants may change: of signals far from zero, and
+    of slow oscillations.
+    """
+    A, C = evidence.model.A, evidence.model.C
+    poles, left = linalg.eig(A.T)
+    slow = _is_slow(poles, evidence)
+    if _is_far(evidence.records) or poles[slow].imag.any():
+        return None
+    bases = [linalg.null_space(w.real[None]) for w in left.T[slow]]
+    return [(Z.T @ A @ Z, C @ Z) for Z in bases]
+
+
+def may_be_better(without: Evidence, other: Evidence) -> bool:
+    """Whether a model near `other`, which has constants, may be one where they matter.
+
+    Of as many states the chance of the constants tells; of fewer ones the criterion,
+    which other states with these may make better yet.
+    """
+    better = criterion_in_units(without) - criterion_in_units(other)
+    if len(other.model.A) < len(without.model.A):
+        return better > -CERTAIN
+    return better > 0.0 or chance_of_constants(other) < _SUSPICIOUS
+
+
 def _is_far(records: Sequence[Record]) -> bool:
     """Whether means are next to all there is of a channel."""
     level, motion = _levels([np.vstack((r.u, r.y)) for r in records])
@@ -253,9 +280,12 @@ def criterion_in_units(evidence: Evidence) -> float:
 
 def _has_slow_mode(evidence: Evidence) -> bool:
     """Whether a mode decays, or grows, too slowly to be told from a constant."""
+    return bool(_is_slow(np.linalg.eigvals(evidence.model.A), evidence).any())
+
+
+def _is_slow(poles: NDArray[np.inexact], evidence: Evidence) -> NDArray[np.bool_]:
     longest = max(record.u.shape[1] for record in evidence.records)
-    rates = 1.0 - np.linalg.eigvals(evidence.model.A).real
-    return bool((rates * longest <= _SLOW).any())
+    return (1.0 - poles.real) * longest <= _SLOW
 
 
 def chance_of_constants(evidence: Evidence, *, equal: bool = False) -> float:

@@ -11,7 +11,7 @@ from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
 from lpvlearn.metrics import bft_score
 from lpvlearn.subspace import hankel
 from lpvlearn.subspace.identification import centred
-from lpvlearn.subspace.offsets import _tail
+from lpvlearn.subspace.offsets import _tail, without_slow_modes
 from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import Freedom, _general_regression, block_fit
 from lpvlearn.systems.simulation import lti_response, trend_signals
@@ -526,3 +526,36 @@ def test_signals_without_any_noise_tell_of_no_constants():
     """Two outputs that are one signal leave a direction without errors."""
     nothing = np.zeros((1, 2, 3, 1))
     assert _tail(np.zeros(1), nothing, np.eye(2), 10.0) == 1.0
+
+
+def test_a_slow_mode_less_leaves_what_is_seen_of_the_others(rng):
+    A = modes(0.9 * np.exp(0.4j), 0.7, 0.9999)
+    B, C = rng.standard_normal((4, 1)), rng.standard_normal((2, 4))
+    u = rng.standard_normal((1000, 1))
+    y = StateSpace(A, B, C, None, 1.0).simulate(u)
+    evidence = SubspaceLTI(4, horizon=10, offset=None).fit(u, y)._evidence
+    ((found, seen),) = without_slow_modes(evidence)
+    values, vectors = np.linalg.eig(found)
+    poles, states = np.linalg.eig(evidence.model.A)
+    assert len(values) == 3
+    for value, vector in zip(values, (seen @ vectors).T, strict=True):
+        k = np.abs(poles - value).argmin()
+        assert poles[k] == pytest.approx(value, rel=1e-9) and poles[k].real < 0.99
+        other = evidence.model.C @ states[:, k]
+        ratio = vector / other
+        assert ratio[0] == pytest.approx(ratio[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.3])
+def test_a_mode_slower_than_the_record_is_told_from_a_constant(size):
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        A, B = modes(0.7, 1.0 - 1e-4), np.array([[0.7], [0.014]])
+        u = rng.standard_normal((3000, 1))
+        y = StateSpace(A[:1, :1], B[:1], [[1.0]], None, 1.0).simulate(u)
+        if size == 0.0:
+            y = StateSpace(A, B, [[1.0, 1.0]], None, 1.0).simulate(u)
+        noise = 0.3 * y.std() * rng.standard_normal(y.shape)
+        model = SubspaceLTI().fit(u, y + size + noise)
+        assert model.offset_ == (None if size == 0.0 else "constant")
+        assert model.order_ == (2 if size == 0.0 else 1)
