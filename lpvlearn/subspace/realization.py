@@ -39,6 +39,24 @@ class ObservabilitySubspace(NamedTuple):
 
     basis: Array  # (horizon * n_outputs, k): most important first, weighting undone
     singular_values: Array  # (horizon * n_outputs,): all of them, descending
+    # of the matrix that they are of, where its rows have no weight of their own
+    gram: Array | None = None
+
+    def weighted(self, weight: Array) -> ObservabilitySubspace | None:
+        """That of outputs times a `weight`, (n_outputs, n_outputs), of full rank.
+
+        It leaves the rows that past and future inputs span as they are. None where that
+        is not known, or squares are not exact enough for it.
+        """
+        if self.gram is None:
+            return None
+        size, gram = len(self.gram), self.gram
+        for _ in range(2):
+            gram = (weight @ gram.reshape(-1, len(weight), size)).reshape(size, size).T
+        values, vectors = _of_squares(gram, self.basis.shape[1])
+        if vectors is None:
+            return None
+        return ObservabilitySubspace(vectors, values, gram)
 
     def state_pair(
         self,
@@ -103,24 +121,35 @@ def observability_subspace(
         root = np.sqrt(np.maximum(values, floor))
         left, singular = _left_singular((vectors / root).T @ explained, max_order)
         return ObservabilitySubspace((vectors * root) @ left, singular)
-    return ObservabilitySubspace(*_left_singular(explained, max_order))
+    gram = None if method == "n4sid" else explained @ explained.T
+    return ObservabilitySubspace(*_left_singular(explained, max_order, gram), gram)
 
 
-def _left_singular(matrix: Array, max_order: int) -> tuple[Array, Array]:
+def _left_singular(
+    matrix: Array, max_order: int, gram: Array | None = None
+) -> tuple[Array, Array]:
     """Leading left singular vectors and all singular values of a wide matrix."""
-    gram = matrix @ matrix.T
+    if gram is None:
+        gram = matrix @ matrix.T
+    values, vectors = _of_squares(gram, max_order)
+    if vectors is None:
+        vectors, values, _ = linalg.svd(matrix, full_matrices=False, check_finite=False)
+    return vectors[:, :max_order], values
+
+
+def _of_squares(gram: Array, max_order: int) -> tuple[Array, Array | None]:
+    """All singular values, and leading vectors; None where these are not exact."""
     size = len(gram)
     wanted = min(max_order, size)
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
     if wanted == 0:
-        return np.zeros((size, 0)), values
-    if values[wanted - 1] > _MIN_RATIO * values[0]:
-        vectors = linalg.eigh(
-            gram, subset_by_index=[size - wanted, size - 1], check_finite=False
-        )[1]
-        return vectors[:, ::-1], values
-    vectors, values, _ = linalg.svd(matrix, full_matrices=False, check_finite=False)
-    return vectors[:, :wanted], values
+        return values, np.zeros((size, 0))
+    if not values[wanted - 1] > _MIN_RATIO * values[0]:
+        return values, None
+    vectors = linalg.eigh(
+        gram, subset_by_index=[size - wanted, size - 1], check_finite=False
+    )[1]
+    return values, vectors[:, ::-1]
 
 
 def shift_invariant_pair(

@@ -502,6 +502,18 @@ def _look_up(
     return {h: space for h, space in spaces.items() if space is not None}
 
 
+def _weighted(
+    wanted: _Range, whitening: Whitening
+) -> dict[int, ObservabilitySubspace | None]:
+    """The subspaces looked up already, where outputs were weighted and no more."""
+    found = {}
+    for horizon, space in wanted.spaces.items() if len(whitening.filter) == 1 else ():
+        new = None if space is None else space.weighted(whitening.weight)
+        if new is not None or space is None:
+            found[horizon] = new
+    return found
+
+
 def _horizons(records: Sequence[Record], order: int, settings: Settings) -> list[int]:
     """Horizons to try: those that show the order and that the data can fill."""
     highest = _highest_horizon(records, settings)
@@ -577,7 +589,7 @@ def _try_orders(
     orders, limit, n_pilot = wanted.orders, np.inf, 0
     if not whitening.is_none:
         records = whitening.records(records, settings.free)
-        wanted = wanted._replace(spaces={}, starts={})
+        wanted = wanted._replace(spaces=_weighted(wanted, whitening), starts={})
     if pilot is not None:
         model = with_initial_states(whitening.model(pilot), records, settings.free)
         limit = criterion_of(model, records, settings.free, settings.repeated)

@@ -1,11 +1,18 @@
 """State matrices from subspaces."""
 
 import numpy as np
+import pytest
+from scipy import linalg
 
-from lpvlearn.subspace.realization import reflect_unstable, shift_invariant_pair
+from lpvlearn.subspace.hankel import data_factor
+from lpvlearn.subspace.realization import (
+    observability_subspace,
+    reflect_unstable,
+    shift_invariant_pair,
+)
 
 from ..conftest import modes
-from .conftest import POLES, example, sorted_poles
+from .conftest import POLES, example, experiment, sorted_poles
 
 
 def test_result_does_not_depend_on_the_basis_of_the_subspace(rng):
@@ -28,3 +35,18 @@ def test_reflection_inverts_unstable_poles_and_keeps_the_others(rng):
     np.testing.assert_allclose(
         sorted_poles(reflect_unstable(A)), sorted_poles(expected), atol=1e-9
     )
+
+
+@pytest.mark.parametrize("method", ["po-moesp", "pi-moesp"])
+def test_weights_of_outputs_need_no_samples(rng, method):
+    u, y = experiment(rng, example(rng, modes(*POLES)), noise=0.1)
+    weight, past_outputs = rng.standard_normal((2, 2)), method == "po-moesp"
+
+    def space(y):
+        z = np.hstack([u, y])
+        factor = data_factor([z], 2, 6, past_outputs=past_outputs)
+        return observability_subspace(factor, 2, 2, 6, 5, method)
+
+    found, expected = space(y).weighted(weight), space(y @ weight.T)
+    np.testing.assert_allclose(found.singular_values, expected.singular_values)
+    assert linalg.subspace_angles(found.basis, expected.basis).max() < 1e-9
