@@ -90,7 +90,7 @@ PRICE = 4.0
 # states are why errors correlate.
 _SAMPLES_PER_LAG = 16
 
-_PATIENCE = 3  # orders tried on either side of the one with the best criterion so far
+_PATIENCE = 3  # orders looked at about the best one; a fourth ends the search beyond it
 
 _EXACT = 1e-18  # share of the outputs' energy (an error of 1e-9) that is rounding
 
