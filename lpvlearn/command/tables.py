@@ -377,6 +377,11 @@ def _dates(values: pd.Series) -> pd.Series:
         .str.strip()
         .str.replace(r"(:\d\d),(\d)", r"\1.\2", regex=True)
     )
+    # with a decimal, two fields are minutes and seconds
+    short = text.str.fullmatch(r"\d+:\d\d(\.\d+)?") | values.isna()
+    if short.all() and text.str.contains(".", regex=False).any():
+        fields = text.where(values.notna()).str.split(":", expand=True).astype(float)
+        return pd.to_datetime(60.0 * fields[0] + fields[1], unit="s")
     first = text.str.extract(r"^(\d{1,2})[./]", expand=False).astype(float)
     by_day = bool(text.str.match(r"^\d+\.\d+\.").any() or (first > 12).any())
     with warnings.catch_warnings():

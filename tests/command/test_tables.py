@@ -94,6 +94,16 @@ def test_numbers_since_1970_are_dates_and_others_have_their_unit(
     assert_allclose(read(path, unit=unit)[0]["Zeit"], 0.05 * np.arange(40))
 
 
+@pytest.mark.parametrize("text", ["{:02.0f}:{:04.1f}", "{:.0f}:{:05.2f}"])
+def test_two_fields_with_a_decimal_are_minutes_and_seconds(tmp_path, table, text):
+    path = tmp_path / "a.csv"
+    seconds = 58.0 + 0.1 * np.arange(40)
+    times = [text.format(s // 60, s % 60) for s in seconds.round(6)]
+    table.assign(Zeit=times).to_csv(path, index=False)
+    found = with_times(read(path)[0], "Zeit", None)["Zeit"]
+    assert_allclose((found - found[0]) / pd.Timedelta("1s"), seconds - 58.0, atol=1e-6)
+
+
 def test_tables_without_names_say_what_their_columns_are_called(tmp_path, table):
     path = tmp_path / "a.csv"
     table[NAMES[1:]].to_csv(path, index=False, header=False)
