@@ -17,7 +17,7 @@ from .interpolator import Interpolator
 from .polynomial import PolynomialLPV, chebyshev_terms, resolvable_powers
 from .rational import RationalLPV
 from .spline import SplineLPV
-from .weighting import WeightedPoints, inner_places, is_chance
+from .weighting import WeightedPoints, inner_levels, inner_places, is_chance
 
 Array = NDArray[np.float64]
 
@@ -201,7 +201,8 @@ def _foresees(form: Any, kappa: Array, points: WeightedPoints) -> bool:
     """Whether points left out are met as well as by interpolation of the others.
 
     Those within the range of the others, in the spread of every parameter that moves
-    by more than its noise.
+    by more than its noise. And on a grid all points of a level, next to which others
+    of the same level tell what only they do not.
     """
     theta, covariance = points.theta, points.covariance
     assert covariance is not None  # the forms were judged by it
@@ -209,7 +210,7 @@ def _foresees(form: Any, kappa: Array, points: WeightedPoints) -> bool:
     spread = np.ptp(theta, axis=0)
     moves = spread > _NOISE * np.sqrt(variance)
     squares = np.zeros(2)
-    for out in inner_places(kappa):
+    for out in (*inner_places(kappa), *inner_levels(kappa)):
         rest = kappa[~out]
         try:
             with collected():  # what few points do not determine

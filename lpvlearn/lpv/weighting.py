@@ -171,6 +171,20 @@ def inner_places(kappa: Array) -> Iterator[NDArray[np.bool_]]:
                 yield out
 
 
+def inner_levels(kappa: Array) -> Iterator[NDArray[np.bool_]]:
+    """The points (n_points,) of every level between others that several places share.
+
+    >>> kappa = np.array([[0, 0], [0, 1], [1, 0], [1, 1], [2, 0], [2, 1]], float)
+    >>> [np.flatnonzero(out).tolist() for out in inner_levels(kappa)]
+    [[2, 3]]
+    """
+    for values in kappa.T:
+        for level in np.unique(values)[1:-1]:
+            out = values == level
+            if len(np.unique(kappa[out], axis=0)) > 1:
+                yield out
+
+
 def is_chance(chi2: float, degrees_of_freedom: int) -> bool:
     """Whether errors may be those of the values, not of the form through them."""
     if degrees_of_freedom == 0:  # the form meets the points, whatever they are

@@ -141,3 +141,21 @@ def test_forms_with_nearly_a_coefficient_for_every_value_must_foresee_points():
     assert fitted(bump(kappa)).form_ == "pchip"
     true = np.column_stack([1 / (1.2 + kappa), 2 + kappa, 3 / (1.2 + kappa)])
     assert "rational" in fitted(true).form_
+
+
+def test_rational_forms_of_a_grid_must_foresee_whole_levels():
+    """Three levels determine no common denominator, whatever single points tell."""
+    kappa = np.array([[q, h] for q in (1.0, 4.0, 8.0) for h in (0.0, 0.5, 1.0)])
+
+    def truth(kappa):
+        q, h = kappa.T
+        laws = (1 + 0.2 * h, 1 - 0.1 * h**2, 0.2 + 0.2 / q, 0.4 * (1 - 0.3 * h), 0.1)
+        return np.column_stack([q * law for law in laws])
+
+    fine = np.array([[q, h] for q in (1.5, 2.5, 6.0, 7.0) for h in (0.25, 0.75)])
+    for seed in range(3):
+        clean, rng = truth(kappa), np.random.default_rng(seed)
+        theta = clean * (1.0 + 0.002 * rng.standard_normal(clean.shape))
+        covariance = np.array([np.diag((0.002 * row) ** 2) for row in clean])
+        model = AutoLPV().fit(kappa, theta, covariance=covariance)
+        assert np.abs(model.predict(fine) / truth(fine) - 1.0).max() < 0.1
