@@ -74,7 +74,7 @@ def tell_unforeseen(
         k = int(out.argmax())
         values = interpolated_without(k, form, kappa, theta, kappa[[k]])
         if values is not None:
-            errors[k] = _difference(lpv.structure.model(values[0]), models[k])
+            errors[k] = largest_difference(lpv.structure.model(values[0]), models[k])
     high = [(error, k) for k, error in errors.items() if error > _ELSEWHERE]
     worst = sorted(high, reverse=True)
     if worst and (worst[0][0] > _WORSE or 2 * len(worst) >= len(errors)):
@@ -92,7 +92,7 @@ def tell_unforeseen(
         )
 
 
-def _difference(one: StateSpace, other: StateSpace) -> float:
+def largest_difference(one: StateSpace, other: StateSpace) -> float:
     """Largest difference of responses, relative to the second one's largest gain.
 
     Of continuous-time models.

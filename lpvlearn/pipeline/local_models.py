@@ -30,7 +30,9 @@ from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
-from .runner import Done, PointRunner, label_of, tell_skipped
+from ..validation import listed
+from .left_out import largest_difference
+from .runner import Done, PointRunner, label_of, place_of, tell_skipped
 
 Array = NDArray[np.float64]
 
@@ -52,6 +54,10 @@ _ABOUT_ZERO = 0.25
 # Points that look for their order everywhere, and states fewer and more than theirs
 # among which the others look first.
 _SCOUTS, _FEWER, _MORE = 3, 1, 2
+
+# Change of a response, in its largest gain, by more states than a record tells, from
+# which it is told; operating points that a message lists.
+_FORCED, _NAMED = 0.5, 3
 
 _HELD = (
     "If only its controller holds the plant, identify the closed loop, with the "
@@ -101,11 +107,13 @@ def identify_points(
     """Local models of the operating points, and which of these did not fail.
 
     The order of the structure replaces ``order="auto"`` of the local estimator; without
-    one, "auto" becomes an order that a point takes: the one with the most evidence of
-    all points. Options as in `identify_point`.
+    one, "auto", or several orders, become an order that a point takes: the one with the
+    most evidence of all points. Options as in `identify_point`.
     """
-    chooses = local.get_params(deep=False).get("order") == "auto"
-    if chooses and isinstance(structure, GrayBoxStructure):
+    given = local.get_params(deep=False).get("order")
+    free = isinstance(given, str) and given == "auto"
+    chooses = free or isinstance(given, range | list | tuple | np.ndarray)
+    if free and isinstance(structure, GrayBoxStructure):
         rest = structure.order
         if _integrates(local):  # the model of the rates has not the integrators
             rest -= integrators(structure)
@@ -137,7 +145,7 @@ def identify_points(
     if not chooses or structure is not None:
         found = identify(local)
     else:
-        search = len(groups) > _SCOUTS and type(local) is SubspaceLTI
+        search = free and len(groups) > _SCOUTS and type(local) is SubspaceLTI
         found = _of_own_orders(local, identify, scouted() if search else [])
         models = [done.result for done in found if done is not None]
         if len({model.order for model in models}) > 1:
@@ -146,7 +154,8 @@ def identify_points(
                 done if done is not None and _own_order(done.result) == order else None
                 for done in found
             ]
-            found = identify(clone(local).set_params(order=order), known)
+            own, found = found, identify(clone(local).set_params(order=order), known)
+            _tell_of_forced(order, own, found, points.kappa)
     tell_skipped(found, points.kappa)
     kept = [k for k, done in enumerate(found) if done is not None]
     return [done.result for done in found if done is not None], points.keep(kept)
@@ -176,6 +185,31 @@ def _of_own_orders(
         return found
     pairs = zip(found, unsure, strict=True)
     return identify(local, [None if again else done for done, again in pairs])
+
+
+def _tell_of_forced(
+    order: int,
+    own: Sequence[Done | None],
+    found: Sequence[Done | None],
+    kappa: Array,
+) -> None:
+    """Warn of points whose models of the common order are not those of their own."""
+    forced = [
+        f"{place_of(k, kappa)}: {100.0 * change:.0f} %"
+        for k, (one, other) in enumerate(zip(own, found, strict=True))
+        if one is not None
+        and other is not None
+        and (change := largest_difference(other.result.lti, one.result.lti)) > _FORCED
+    ]
+    if forced:
+        warn(
+            f"with the order {order}, for which all points together speak, the model "
+            "of a point is far from the one of the order that its own record speaks "
+            f"for ({listed(forced, _NAMED)} of the largest gain): that record does not "
+            "tell so many states, and the LPV model may be wrong there and up to the "
+            "next points. Record for longer there, leave the point out, or give a "
+            "lower order: local=SubspaceLTI(order=...)."
+        )
 
 
 def _own_order(model: LocalModel) -> int:

@@ -137,8 +137,10 @@ class SubspaceLTI(
     order : int, "auto" or sequence of int, default="auto"
         Number of states. "auto" takes the order with the best criterion (minus
         twice the logarithm of the likelihood, and 4 for each parameter), or a lower one
-        that simulates parts held out clearly better, of at most 30; of several orders,
-        as ``range(2, 7)``, the choice is among these. 0 is a pure gain.
+        that simulates parts held out clearly better, of at most 30. Of several orders,
+        as ``range(2, 7)``, the choice is among those that the samples can carry; with
+        "pbsid" it is the first that has as many states as "auto" would take, or the
+        highest. 0 is a pure gain.
     method : {"auto", "po-moesp", "pi-moesp", "n4sid", "cva", "pbsid"}, default="auto"
         "auto" is "po-moesp", or "pbsid" where the data come from a closed loop, with a
         warning, and where noise that moves the states of the plant is likelier than

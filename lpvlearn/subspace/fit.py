@@ -557,7 +557,9 @@ def _fit(
             plant = identify_closed_loop(scaled, basis, order, horizon, settings)
             found = plant.selection.order
             if order is None and found not in (settings.orders or [found]):
-                order = min(settings.orders, key=lambda n: abs(n - found))
+                # a state too few spoils the plant, one too many costs little
+                enough = (n for n in settings.orders if n > found)
+                order = min(enough, default=settings.orders[-1])
                 plant = identify_closed_loop(scaled, basis, order, horizon, settings)
         except ValueError as error:
             raise TooFewSamples(str(error)) from None

@@ -407,7 +407,7 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "over the record or drifts, or the record is too short for it. Give a "
             "lower `order`, leave disturbed parts out, or use offset='linear'.",
         )
-    if len(fitted.model.A) == MAX_ORDER:
+    if len(fitted.model.A) == MAX_ORDER == max(r.order for r in fitted.selection.rows):
         tell(
             told,
             "highest",

@@ -566,13 +566,18 @@ def _wanted(
 def _highest_order(
     records: Sequence[Record], horizons: Sequence[int], settings: Settings
 ) -> int:
-    """Highest order to try: one that leaves enough values for each parameter."""
+    """Highest order to try: one that leaves enough values for each parameter.
+
+    Beyond `MAX_ORDER` where higher ones are asked for.
+    """
     ny, m = settings.free.direct.shape
     n_values = sum(record.y.size for record in records)
     affordable = n_values / _VALUES_PER_PARAMETER - m * ny
     affordable /= m + ny + 1 + _OF_OTHERS * (len(records) - 1)
     by_horizon = max(settings.max_order(h) for h in horizons)
-    return int(np.clip(affordable, 0, min(MAX_ORDER, by_horizon)))
+    return int(
+        np.clip(affordable, 0, min(max((MAX_ORDER, *settings.orders)), by_horizon))
+    )
 
 
 def _try_orders(

@@ -238,7 +238,7 @@ def test_the_noise_of_the_choice_goes_with_it():
 @pytest.mark.parametrize("method", ["po-moesp", "pbsid"])
 @pytest.mark.parametrize(
     ("among", "chosen"),
-    [(range(2, 7), 4), ([9, 4, 2], 4), (np.arange(3), 2), ((6, 5), 5), ([3], 3)],
+    [(range(2, 7), 4), ([9, 4, 2], 4), (np.arange(3), 2), ((3, 6, 5), 5), ([3], 3)],
 )
 def test_the_order_is_chosen_among_those_given(method, among, chosen):
     rng = np.random.default_rng(3)
@@ -252,6 +252,16 @@ def test_the_order_is_chosen_among_those_given(method, among, chosen):
     assert model.order_ == chosen
     tried = set(model.selection_["order"])
     assert method == "pbsid" or tried <= set(among)
+
+
+def test_orders_beyond_those_of_auto_are_tried_where_they_are_asked_for(rng):
+    u = rng.standard_normal((2000, 1))
+    y = lti_response(*(np.array([[v]]) for v in (0.9, 1.0, 1.0, 0.0)), u)
+    y += 0.1 * rng.standard_normal(y.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of states that the data do not tell
+        model = SubspaceLTI([31, 32], horizon=40, refine="simulation").fit(u, y)
+    assert set(model.selection_["order"]) == {31, 32}
 
 
 def test_all_orders_given_are_as_none():
