@@ -527,6 +527,7 @@ list, default=None
                 combine=self.combine,
                 discretization=self.discretization,
                 efficient=self.efficient or efficient,
+                deviate=not isinstance(restructurer, str),
             )
 
         with watch.step("restructuring", bar=True):  # step 4

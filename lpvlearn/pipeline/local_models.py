@@ -241,13 +241,15 @@ def identify_point(
     combine: str,
     discretization: str,
     efficient: bool = False,
+    deviate: bool = True,
 ) -> LocalModel:
     """Identify the local model of one operating point by a clone of `local`.
 
     Fitted, it has `lti_`, a discrete-time StateSpace. `combine` is "pool", one fit of
     all experiments, or "average": one model each, balanced, signs aligned, and the
     matrices averaged (the paper's Monte Carlo). Refuses outputs that do not vary, and
-    an unstable model, which cannot be balanced. `efficient` gives `estimates`.
+    an unstable model, which cannot be balanced. `efficient` gives `estimates`,
+    `deviate` the `pairs` of a pooled one, which these need.
     """
     if _integrates(local) and combine == "average":
         raise ValueError(
@@ -258,7 +260,7 @@ def identify_point(
     labels = list(dict.fromkeys(e.label for e in experiments))
     if combine == "pool" or len(labels) == 1:
         fitted = _fit_local(local, experiments, sampling_time)
-        pairs = _deviated(fitted)
+        pairs = _deviated(fitted) if deviate else []
         if _from_closed_loop(fitted):
             advice = _HELD + advice
         rates = getattr(fitted, "rates_", None)
