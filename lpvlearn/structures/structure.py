@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..exceptions import VersionedPickle
 from ..models.statespace import StateSpace
 from ..models.system_matrix import Blocks, blocks
 from ..validation import (
@@ -53,7 +52,7 @@ _MOST_COPIES = 1000  # of the outputs: one for each weight or model
 _LISTED = 8  # names that a message lists
 
 
-class GrayBoxStructure(VersionedPickle):
+class GrayBoxStructure:
     """The map from parameters to the matrices of a gray-box model, Eq. (2).
 
     Build one with :meth:`from_template` (entries affine in the parameters),
