@@ -60,6 +60,7 @@ _HOP_ROUNDS = 4  # from ever better fits
 _HOP_GAIN = 1e-3  # relative decrease of the cost that is worth another round
 _FAINT = 0.03  # size of modes that only fill the order: seen, but hardly disturbing
 _FAST = 3.0  # decay of these modes, relative to the fastest: they are out of the way
+_AMONG = 1.3  # the same of modes without effect, relative to the mean, and no pole's own
 _EXACT_PARTS = 1e-6  # distance of a start by parts that the black box itself is
 _SLOWEST = 1e-9  # poles smaller than that part of the largest are integrators
 
@@ -419,17 +420,21 @@ def _reduced(box: Target, order: int) -> Target:
 def _padded(
     box: Target, order: int, rng: np.random.Generator, faint: tuple[float, float]
 ) -> Target:
-    """The black box with `order` states: fast modes fill what is missing.
+    """The black box with `order` states: modes fill what is missing.
 
-    `faint` are the sizes of the inputs and outputs of these modes; with one of them
-    zero the transfer function does not change.
+    `faint` are the sizes of the inputs and outputs of these modes, which are fast. With
+    one of them zero the transfer function does not change, and they decay as the others
+    do: the coefficients of forms then differ least in size.
     """
     n, extra = len(box.A), order - len(box.A)
     if extra == 0:
         return box
     rates = growth(np.linalg.eigvals(box.A).astype(complex), box.dt)
-    fast = _FAST * float(np.abs(rates).max(initial=0.0)) or 1.0
-    decay = -fast * (1.0 + np.arange(extra))
+    if 0.0 in faint:
+        decay = -_mean_rate(np.abs(rates)) * (_AMONG + np.arange(extra))
+    else:
+        fast = _FAST * float(np.abs(rates).max(initial=0.0)) or 1.0
+        decay = -fast * (1.0 + np.arange(extra))
     A = np.zeros((order, order))
     A[:n, :n] = box.A
     A[n:, n:] = np.diag(np.exp(decay * box.dt) if box.dt else decay)
