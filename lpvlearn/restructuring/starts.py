@@ -60,7 +60,7 @@ _HOP_ROUNDS = 4  # from ever better fits
 _HOP_GAIN = 1e-3  # relative decrease of the cost that is worth another round
 _FAINT = 0.03  # size of modes that only fill the order: seen, but hardly disturbing
 _FAST = 3.0  # decay of these modes, relative to the fastest: they are out of the way
-_AMONG = 1.3  # the same of modes without effect, relative to the mean, and no pole's own
+_AMONG = 1.3  # of modes without effect, relative to the mean: no pole's own
 _EXACT_PARTS = 1e-6  # distance of a start by parts that the black box itself is
 _SLOWEST = 1e-9  # poles smaller than that part of the largest are integrators
 
