@@ -1,9 +1,10 @@
 """Black boxes of operating points in one state basis, without a structure.
 
-Balanced models have a basis that is unique up to signs where their singular values
-differ, and up to rotations where these come together: neighbours are turned to one
-another, by the orthogonal T that brings the matrices of a model nearest to those of its
-reference (subscript r), which is what interpolation between them asks for:
+Where singular values come together balanced models have a basis that is unique up to
+rotations, and so have models whose inputs move all states alike, or whose outputs show
+them alike. Neighbours are turned to one another, by the orthogonal T that brings the
+matrices of a model nearest to those of its reference (subscript r), which is what
+interpolation between them asks for:
 
     min over T:  (|D S^(1/2)|^2 + |S^(1/2) D|^2) / w + |T^T B - B_r|^2 + |C T - C_r|^2,
     D = T^T A T - A_r,    w^2 = tr(A_r S A_r^T) / tr(S).
@@ -21,6 +22,10 @@ of which the polar factor of X + Y is the nearest T (an orthogonal Procrustes pr
 Modes whose frequency differs by more than their decay lose their correlation without s;
 with much of it, only what inputs and outputs meet at once counts. Neighbours are those
 of a minimum spanning tree.
+
+Entries of B and C of a balanced model go with the square root of the size of a mode,
+which bends without end where that goes through zero. In "input-normal" states it is C
+alone that goes through zero, in "output-normal" ones B.
 """
 
 from __future__ import annotations
@@ -35,6 +40,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
 from ..models.statespace import StateSpace
+from ..systems.balancing import gramian_factor
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int32]
@@ -47,18 +53,39 @@ _FORGOTTEN = (0.0, 1e-3, 1e-2, 0.1, 1.0)
 _STEPS = 100  # neighbours take ten; models that are no neighbours have no nearest basis
 
 
-def aligned_models(models: Sequence[StateSpace], kappa: Array) -> list[StateSpace]:
+# States of which both Gramians are the Hankel singular values, or one is the identity
+STATES = ("balanced", "input-normal", "output-normal")
+
+
+def aligned_models(
+    models: Sequence[StateSpace], kappa: Array, states: str = STATES[0]
+) -> list[StateSpace]:
     """Stable balanced models of one order, each turned to its neighbour.
 
     From the point in the middle of `kappa` (n_points, n_scheduling) outward along a
-    minimum spanning tree, every variable in units of its range.
+    minimum spanning tree, every variable in units of its range. The `states` are one of
+    `STATES`, the identity in units of the largest singular value of all models.
     """
     order, parents = spanning_tree(kappa)
     aligned = list(models)
+    if states != STATES[0]:
+        largest = max(m.hankel_singular_values().max(initial=0.0) for m in models)
+        aligned = [_normal(model, largest, states == STATES[1]) for model in models]
     for k in order[1:]:
-        reference = aligned[parents[k]]
-        aligned[k] = models[k].transform(rotation_to(models[k], reference).T)
+        turn = rotation_to(aligned[k], aligned[parents[k]]).T
+        aligned[k] = aligned[k].transform(turn)
     return aligned
+
+
+def _normal(model: StateSpace, size: float, by_inputs: bool) -> StateSpace:
+    """With the Gramian ``size I`` of the inputs, or of the outputs."""
+    discrete = not model.is_continuous
+    if by_inputs:
+        L = gramian_factor(model.A, model.B, discrete)
+        return model.transform(np.sqrt(size) * np.linalg.inv(L))
+    return model.transform(
+        gramian_factor(model.A.T, model.C.T, discrete).T / np.sqrt(size)
+    )
 
 
 def spanning_tree(kappa: Array, *, outward: bool = True) -> tuple[Rows, Rows]:

@@ -26,10 +26,10 @@ from .. import (
     SubspaceLTI,
 )
 from ..datasets import make_flexible_arm
+from ..pipeline.black_boxes import balanced_entries
 from ..pipeline.estimator import Stopwatch
 from ..pipeline.local_models import experiments_of, identify_point
 from ..pipeline.runner import PointRunner
-from ..pipeline.structured_models import balanced_entries
 from ..pipeline.workers import started
 from .tables import (
     ParameterSet,

@@ -142,9 +142,11 @@ class LocalLPVPipeline(ScheduledEstimator):
         of most evidence, all their records together.
     restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
         Step 4. Without a structure, "aligned" (None) interpolates the entries of
-        the balanced local models, each turned to its neighbour by the rotation that
-        brings their matrices nearest; "passthrough" those whose signs alone agree, the
-        paper's baseline. ``GrayBoxRestructurer()`` is the observable canonical form.
+        the local models, each turned to its neighbour by the rotation that brings their
+        matrices nearest: of balanced ones, or, where points left out are clearly better
+        foreseen, of such whose inputs move all states alike, or whose outputs show them
+        alike. "passthrough": of balanced ones whose signs alone agree, the paper's
+        baseline. ``GrayBoxRestructurer()`` is the observable canonical form.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
         (n_points, n_params); None is ``AutoLPV()``, which chooses by the covariances

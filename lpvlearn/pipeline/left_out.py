@@ -16,6 +16,7 @@ from ..lpv.polynomial import PolynomialLPV
 from ..lpv.weighting import inner_places
 from ..models.statespace import StateSpace
 from ..restructuring.error_system import frequency_grid
+from ..structures.structure import GrayBoxStructure
 from ..validation import listed
 
 Array = NDArray[np.float64]
@@ -55,6 +56,26 @@ def interpolated_without(
         return None
 
 
+def errors_left_out(
+    structure: GrayBoxStructure,
+    models: Sequence[StateSpace],
+    form: Any,
+    kappa: Array,
+    theta: Array,
+) -> dict[int, float]:
+    """By points within the range of the others, the errors of what these make of them.
+
+    Of the response, in the largest gain of the point's model.
+    """
+    errors = {}
+    for out in inner_places(kappa):
+        k = int(out.argmax())
+        values = interpolated_without(k, form, kappa, theta, kappa[[k]])
+        if values is not None:
+            errors[k] = largest_difference(structure.model(values[0]), models[k])
+    return errors
+
+
 def tell_unforeseen(
     lpv: LPVStateSpace,
     models: Sequence[StateSpace],
@@ -69,12 +90,7 @@ def tell_unforeseen(
     """
     if not models[0].is_continuous:
         return
-    errors = {}
-    for out in inner_places(kappa):
-        k = int(out.argmax())
-        values = interpolated_without(k, form, kappa, theta, kappa[[k]])
-        if values is not None:
-            errors[k] = largest_difference(lpv.structure.model(values[0]), models[k])
+    errors = errors_left_out(lpv.structure, models, form, kappa, theta)
     high = [(error, k) for k, error in errors.items() if error > _ELSEWHERE]
     worst = sorted(high, reverse=True)
     if worst and (worst[0][0] > _WORSE or 2 * len(worst) >= len(errors)):

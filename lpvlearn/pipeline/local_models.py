@@ -30,9 +30,7 @@ from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
-from ..validation import listed
-from .left_out import largest_difference
-from .runner import Done, PointRunner, label_of, place_of, tell_skipped
+from .runner import Done, PointRunner, label_of, tell_skipped
 
 Array = NDArray[np.float64]
 
@@ -54,10 +52,6 @@ _ABOUT_ZERO = 0.25
 # Points that look for their order everywhere, and states fewer and more than theirs
 # among which the others look first.
 _SCOUTS, _FEWER, _MORE = 3, 1, 2
-
-# Change of a response, in its largest gain, by more states than a record tells, from
-# which it is told; operating points that a message lists.
-_FORCED, _NAMED = 0.5, 3
 
 _HELD = (
     "If only its controller holds the plant, identify the closed loop, with the "
@@ -81,6 +75,8 @@ class LocalModel:
     n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
     # inputs and outputs at rest, near the experiments; None: not looked for
     rest: tuple[Array, Array] | None = None
+    # that of the order that its record takes, where it is not the one of all points
+    own: LocalModel | None = None
     # the model as identified (of every realization) with models to either side of it,
     # where the covariance is known; with "zoh" in discrete time
     estimates: list[Estimate] = field(default_factory=list)
@@ -155,7 +151,7 @@ def identify_points(
                 for done in found
             ]
             own, found = found, identify(clone(local).set_params(order=order), known)
-            _tell_of_forced(order, own, found, points.kappa)
+            found = [_beside(*pair) for pair in zip(found, own, strict=True)]
     tell_skipped(found, points.kappa)
     kept = [k for k, done in enumerate(found) if done is not None]
     return [done.result for done in found if done is not None], points.keep(kept)
@@ -187,29 +183,11 @@ def _of_own_orders(
     return identify(local, [None if again else done for done, again in pairs])
 
 
-def _tell_of_forced(
-    order: int,
-    own: Sequence[Done | None],
-    found: Sequence[Done | None],
-    kappa: Array,
-) -> None:
-    """Warn of points whose models of the common order are not those of their own."""
-    forced = [
-        f"{place_of(k, kappa)}: {100.0 * change:.0f} %"
-        for k, (one, other) in enumerate(zip(own, found, strict=True))
-        if one is not None
-        and other is not None
-        and (change := largest_difference(other.result.lti, one.result.lti)) > _FORCED
-    ]
-    if forced:
-        warn(
-            f"with the order {order}, for which all points together speak, the model "
-            "of a point is far from the one of the order that its own record speaks "
-            f"for ({listed(forced, _NAMED)} of the largest gain): that record does not "
-            "tell so many states, and the LPV model may be wrong there and up to the "
-            "next points. Record for longer there, leave the point out, or give a "
-            "lower order: local=SubspaceLTI(order=...)."
-        )
+def _beside(found: Done | None, own: Done | None) -> Done | None:
+    """The model of the common order beside that of the order that its record takes."""
+    if found is None or own is None or own.result.order == found.result.order:
+        return found
+    return found._replace(result=replace(found.result, own=own.result))
 
 
 def _own_order(model: LocalModel) -> int:

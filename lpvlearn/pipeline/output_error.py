@@ -54,10 +54,11 @@ from ..validation import (
     whole_number,
 )
 from .bands import output_errors
+from .black_boxes import balanced_entries
 from .local_models import identify_point
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
-from .structured_models import StructuredModels, balanced_entries
+from .structured_models import StructuredModels
 from .workers import results_of
 
 Array = NDArray[np.float64]

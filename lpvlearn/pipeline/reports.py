@@ -284,8 +284,7 @@ def summarise(
             else "which have no common state basis"
         )
         lines.append(
-            "Restructuring: none; the entries of balanced models are interpolated, "
-            + basis
+            "Restructuring: none; the entries of black boxes are interpolated, " + basis
         )
     distance = 100 * report["interpolation_error"]
     form = getattr(lpv.interpolator, "form_", "")

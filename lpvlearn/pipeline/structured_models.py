@@ -7,7 +7,6 @@ basin, and branches are tied.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -18,14 +17,19 @@ from sklearn.base import clone
 
 from ..data.operating_points import OperatingPoints
 from ..exceptions import collected, warn
-from ..lpv.alignment import aligned_models
 from ..lpv.equilibria import points_of_work
-from ..models.statespace import DEVIATION, ModelPair, StateSpace, with_signs_of
+from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..restructuring.deadline import bounded, time_is_up
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..restructuring.uncertainty import ParameterUncertainty
 from ..structures.structure import GrayBoxStructure
+from .black_boxes import (
+    aligned_black_boxes,
+    balanced,
+    balanced_entries,
+    tell_of_forced,
+)
 from .branches import tied_branches
 from .local_models import LocalModel, motions
 from .runner import Done, PointRunner, place_of, tell_skipped
@@ -70,16 +74,18 @@ def restructure_points(
     """
     began = perf_counter()
     if isinstance(restructurer, str):
-        integrating = local[0].integrating
-        models = [_balanced(model) for model in local]
-        kappa = points.kappa if restructurer == "aligned" else None
-        structure, theta = balanced_entries(models, kappa, integrating)
-        balanced = [
-            structure.model(row).with_input_delay(model.input_delay)
-            for row, model in zip(theta, models, strict=True)
+        if restructurer == "aligned":
+            structure, theta = aligned_black_boxes(local, points.kappa)
+        else:
+            tell_of_forced(local, points.kappa)
+            models = [balanced(model) for model in local]
+            structure, theta = balanced_entries(models, local[0].integrating)
+        models = [
+            structure.model(row).with_input_delay(model.lti.input_delay)
+            for row, model in zip(theta, local, strict=True)
         ]
         unknown = _unknown_covariance(theta)
-        return StructuredModels(points, local, structure, theta, unknown, balanced, [])
+        return StructuredModels(points, local, structure, theta, unknown, models, [])
     restructurer = _with_structure(restructurer, local)
     if max_time is not None:
         at_once = min(effective_n_jobs(runner.n_jobs), len(local))
@@ -339,50 +345,3 @@ def covariance_of_parameters(
     found = ParameterUncertainty(problem, theta)
     T = found.changes(np.array(changes), norm) / (2.0 * DEVIATION)
     return T.T @ T + found.open_variances()
-
-
-def _balanced(local: LocalModel) -> StateSpace:
-    """The local model, balanced: that of the rates of outputs that integrate.
-
-    Its derivatives do not see the states on which nothing else depends, ``A v = 0``.
-    Poles on the negative real axis make the order grow in continuous time.
-    """
-    model, integrating = local.lti, local.integrating
-    C, D = model.C.copy(), model.D.copy()
-    C[integrating], D[integrating] = C[integrating] @ model.A, C[integrating] @ model.B
-    n = model.order - len(integrating)
-    seen = np.linalg.svd(model.A)[2][:n].T
-    A, B = seen.T @ model.A @ seen, seen.T @ model.B
-    rates = StateSpace(A, B, C @ seen, D, input_delay=model.input_delay)
-    return rates.balance(min(local.order - len(integrating), n))
-
-
-def balanced_entries(
-    models: Sequence[StateSpace],
-    kappa: Array | None = None,
-    integrating: Sequence[int] = (),
-) -> tuple[GrayBoxStructure, Array]:
-    """The entries of balanced models as parameters. Orders must agree.
-
-    Aligned with one another over `kappa`; without it their signs only, along the
-    points: the baseline of the paper, of no common state basis. Outputs `integrating`
-    are integrals of those of the models.
-    """
-    orders = sorted({model.order for model in models})
-    if len(orders) > 1:
-        raise ValueError(
-            "`local` must give models of one order, whose matrices are interpolated "
-            f"without a structure. Got orders {orders} of what inputs move and outputs "
-            f"show. Ask for the least: local=SubspaceLTI(order={orders[0]})."
-        )
-    if kappa is not None:
-        models = aligned_models(models, kappa)
-    else:
-        models = list(accumulate(models, with_signs_of))
-    first = models[0]
-    direct = any(model.D.any() for model in models)
-    sizes = (orders[0], first.n_inputs, first.n_outputs)
-    structure = GrayBoxStructure.full(*sizes, direct, integrating)
-    names = "ABCD" if direct else "ABC"
-    rows = [np.concatenate([getattr(m, M).ravel() for M in names]) for m in models]
-    return structure, np.array(rows)

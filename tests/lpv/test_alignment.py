@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.linalg import solve_continuous_lyapunov
 
 from lpvlearn import StateSpace
-from lpvlearn.lpv.alignment import _Distance, aligned_models, rotation_to
+from lpvlearn.lpv.alignment import STATES, _Distance, aligned_models, rotation_to
 
 from ..conftest import modes, stable_model
 
@@ -75,6 +76,19 @@ def test_modes_whose_frequency_moves_by_more_than_they_decay(damping):
     slow, fast = 5.0 + 5.0 * x, 20.0 - 6.0 * x
     found = np.sort(np.abs(middle.imag), axis=1)
     assert_allclose(found, np.hstack([slow, slow, fast, fast]), rtol=0.02)
+
+
+@pytest.mark.parametrize(("states", "name"), [*zip(STATES[1:], "BC", strict=True)])
+def test_one_gramian_of_normal_states_is_the_identity(states, name):
+    """In units of the largest Hankel singular value, whatever these are."""
+    points = np.array([[0.0], [1.0]])
+    models = [StateSpace(m.A, 1e6 * m.B, m.C) for m in family(points)]
+    models = [model.balance() for model in models]
+    size = max(m.hankel_singular_values().max() for m in models)
+    for model in aligned_models(models, points, states):
+        A, F = (model.A, model.B) if name == "B" else (model.A.T, model.C.T)
+        gramian = solve_continuous_lyapunov(A, -F @ F.T)
+        assert_allclose(gramian / size, np.eye(4), atol=1e-9)
 
 
 def test_models_without_states_have_nothing_to_turn():

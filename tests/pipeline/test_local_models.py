@@ -12,7 +12,6 @@ from lpvlearn.data.experiments import Experiment
 from lpvlearn.pipeline.local_models import (
     LocalModel,
     _of_own_orders,
-    _tell_of_forced,
     identify_point,
 )
 from lpvlearn.pipeline.runner import Done
@@ -158,25 +157,3 @@ def test_points_take_one_of_several_orders_together(order):
     X, y = spring_tables(noise=0.01, n_samples=300)
     fitted = LocalLPVPipeline(SubspaceLTI(order=order), **ROLES).fit(X, y)
     assert (fitted.report_["order"] == 2).all()
-
-
-def test_points_of_which_more_states_make_another_model_are_named():
-    lag = StateSpace([[-1.0]], [[1.0]], [[1.0]])
-    faint, loud = (
-        StateSpace(
-            [[-1.0, 0.0, 0.0], [0.0, -0.1, 5.0], [0.0, -5.0, -0.1]],
-            [[1.0], [gain], [0.0]],
-            [[1.0, 1.0, 0.0]],
-        )
-        for gain in (1e-3, 1.0)
-    )
-    own = [Done(LocalModel(lag, 1, 5), []) for _ in range(3)]
-    found = [None, *(Done(LocalModel(lti, 3, 5), []) for lti in (faint, loud))]
-    kappa = np.array([[0.0], [0.5], [1.0]])
-    with pytest.warns(
-        UserWarning, match=r"order 3.*\(operating point 2 \(sch.*: 5\d\d %"
-    ):
-        _tell_of_forced(3, own, found, kappa)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        _tell_of_forced(3, own[:2], found[:2], kappa[:2])

@@ -1,0 +1,126 @@
+"""Black boxes in one basis: modes that go through zero, records that tell little."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lpvlearn import LocalLPVPipeline, SplineLPV, StateSpace, from_trajectories
+from lpvlearn.lpv.alignment import aligned_models
+from lpvlearn.pipeline.black_boxes import (
+    _entries,
+    aligned_black_boxes,
+    tell_of_forced,
+)
+from lpvlearn.pipeline.local_models import LocalModel
+
+from ..conftest import modes
+
+STEP = 0.1
+
+
+def two_modes(kappa, nothing, by_inputs=False):
+    """The second one's gain is zero at `nothing`."""
+    gain = kappa - nothing
+    A = modes((-0.1 + 1j) * (2.0 + 0.3 * kappa), (-0.1 + 1j) * (6.0 + 0.8 * kappa))
+    B = np.array([[0.0], [2.0], [0.0], [6.0 * (gain if by_inputs else 1.0)]])
+    C = np.array([[1.0, 0.0, 1.0 if by_inputs else gain, 0.0]])
+    return StateSpace(A, B, C)
+
+
+def local(lti, own=None):
+    return LocalModel(lti, lti.order, 5, own=own)
+
+
+def errors_between(structure, theta, kappa, truth):
+    form = SplineLPV().fit(kappa, theta)
+    errors = []
+    for middle in (kappa[1:, 0] + kappa[:-1, 0]) / 2.0:
+        true = truth(middle)
+        model = structure.model(form.predict([[middle]])[0])
+        errors.append((model - true).hinf_norm() / true.hinf_norm())
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("by_inputs", [True, False])
+def test_a_gain_that_goes_through_zero_between_points_does_so_smoothly(by_inputs):
+    """Balanced, entries go with its square root."""
+    kappa = np.linspace(0.0, 2.0, 7)[:, None]
+
+    def truth(kappa):
+        return two_modes(kappa, 0.8, by_inputs)
+
+    models = [truth(*k).balance() for k in kappa]
+    structure, theta = aligned_black_boxes([local(m) for m in models], kappa)
+    errors = errors_between(structure, theta, kappa, truth)
+    balanced = _entries(aligned_models(models, kappa))
+    before = errors_between(structure, balanced, kappa, truth)
+    assert before.max() > 0.05 and errors.max() < 0.2 * before.max()
+
+
+def test_balanced_states_are_kept_where_others_are_no_better():
+    kappa = np.linspace(0.0, 1.0, 5)[:, None]
+    models = [two_modes(k, -1.0).balance() for k in kappa[:, 0]]
+    theta = aligned_black_boxes([local(m) for m in models], kappa)[1]
+    expected = _entries(aligned_models(models, kappa))
+    np.testing.assert_allclose(theta, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("place", [2, 4])
+def test_a_mode_that_vanishes_at_a_point_is_foretold_by_the_others(place):
+    kappas, rng = np.linspace(0.0, 2.0, 5), np.random.default_rng(0)
+    runs = []
+    for kappa in kappas:
+        u = rng.choice([-1.0, 1.0], (800, 1))
+        y = two_modes(kappa, kappas[place]).simulate(u, sampling_time=STEP)
+        noise = 0.03 * y.std() * rng.standard_normal(y.shape)
+        runs.append((u, kappa, y + noise))
+    X, y = from_trajectories(runs, sampling_time=STEP)
+    with pytest.warns(UserWarning, match=rf"fewer states.* operating point {place} "):
+        fitted = LocalLPVPipeline(
+            scheduling="kappa", experiment="experiment", time="time"
+        ).fit(X, y)
+    assert len(fitted.operating_points_) == 5 and (fitted.report_["order"] == 4).all()
+    size = two_modes(1.0, kappas[place]).hinf_norm()
+    for kappa in np.linspace(0.0, 2.0, 17):
+        true = two_modes(kappa, kappas[place])
+        assert (fitted.lpv_.at(kappa) - true).hinf_norm() < 0.05 * size
+
+
+def test_what_the_others_do_not_foretell_is_kept_and_told():
+    """A point of another gain, whose second mode is noise."""
+    kappa = np.linspace(0.0, 1.0, 7)[:, None]
+    models = [two_modes(k, -1.0) for k in kappa[:, 0]]
+    points = [local(model.balance()) for model in models]
+    A = modes(-0.2 + 2.0j, -3.0 + 40j)
+    odd = StateSpace(A, [[0.0], [6.0], [0.0], [0.1]], [[1.0, 0.0, 0.1, 0.0]])
+    own = StateSpace(A[:2, :2], odd.B[:2], odd.C[:, :2])
+    points[3] = local(odd.balance(), local(own))
+    with pytest.warns(UserWarning, match="may be wrong from there to the next points"):
+        structure, theta = aligned_black_boxes(points, kappa)
+    kept = structure.model(theta[3])
+    assert (kept - odd).hinf_norm() < 1e-9 * odd.hinf_norm()
+
+
+def test_points_of_which_more_states_make_another_model_are_named():
+    lag = StateSpace([[-1.0]], [[1.0]], [[1.0]])
+    faint, loud = (
+        StateSpace(
+            [[-1.0, 0.0, 0.0], [0.0, -0.1, 5.0], [0.0, -5.0, -0.1]],
+            [[1.0], [gain], [0.0]],
+            [[1.0, 1.0, 0.0]],
+        )
+        for gain in (1e-3, 1.0)
+    )
+    points = [local(faint), local(faint, local(lag)), local(loud, local(lag))]
+    kappa = np.array([[0.0], [0.5], [1.0]])
+    with pytest.warns(
+        UserWarning, match=r"order 3.*\(operating point 2 \(sch.*: 5\d\d %"
+    ):
+        tell_of_forced(points, kappa)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tell_of_forced(points[:2], kappa[:2])
+        tell_of_forced([replace(points[2], own=None)], kappa[2:])
+        tell_of_forced(points, kappa, mended=[2])
