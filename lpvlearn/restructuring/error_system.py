@@ -110,6 +110,8 @@ def frequency_grid(poles: NDArray, dt: float | None, n_points: int = 60) -> Arra
     size = np.abs(rates)
     size = size[size > 0]
     low, high = (size.min(), size.max()) if size.size else (1.0, 1.0)
+    if dt is not None:  # poles next to zero are faster than any frequency
+        low = min(low, np.pi / dt)
     around = pole_grid(rates, low / 20, high * 10, n_points, [-1.0, 0.0, 1.0])
     grid = np.append(around, size)
     if dt is not None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxStructure, StateSpace
-from lpvlearn.restructuring.error_system import ErrorSystem, Target
+from lpvlearn.restructuring.error_system import ErrorSystem, Target, frequency_grid
 from lpvlearn.restructuring.measured import MeasuredErrorSystem
 
 from .conftest import stable_model as sampled_model
@@ -181,3 +181,10 @@ def test_rounding_is_what_a_unit_in_the_last_place_makes(dt):
             squares += np.sum(np.abs(other - G) ** 2, axis=(1, 2)) / 200
     expected = np.finfo(float).eps * np.sqrt(squares.max()) / unit
     assert np.isclose(system.rounding(theta), expected, rtol=0.1)
+
+
+@pytest.mark.parametrize("pole", [0.0, 1e-300, -1e-30, 1e-12])
+def test_poles_next_to_zero_are_faster_than_any_frequency(pole):
+    """Their logarithms are beyond the Nyquist frequency; the grid is not empty."""
+    grid = frequency_grid(np.array([pole]), 0.1)
+    assert len(grid) > 10 and grid.max() < np.pi / 0.1
