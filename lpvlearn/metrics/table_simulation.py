@@ -23,6 +23,7 @@ from ..systems.simulation import (
     delayed,
     estimate_initial_state,
     free_responses,
+    sizes_of,
     state_trajectory,
     trend_signals,
     with_transit,
@@ -70,6 +71,7 @@ def fit_of(
     one length are simulated together; realizations of one input, once.
     """
     sampled = model.to_discrete(sampling_time)
+    size = sizes_of(np.vstack([_outputs(e, model.n_outputs) for e in group]))
     true, simulated = [], []
     for length in sorted({len(e.rows) for e in group}):
         part = [e for e in group if len(e.rows) == length]
@@ -87,7 +89,7 @@ def fit_of(
         # channel by channel in memory, as experiments are: (n_outputs, n_runs, length)
         forced = (sampled.C @ x + sampled.D @ u).transpose(1, 2, 0)
         y = np.stack([_outputs(e, model.n_outputs).T for e in part], axis=1)
-        own = estimate_initial_state(free, (y - forced).transpose(2, 0, 1))
+        own = estimate_initial_state(free, (y - forced).transpose(2, 0, 1), size)
         found = forced + own.T @ free.transpose(1, 2, 0)
         true.append(y.reshape(model.n_outputs, -1))
         simulated.append(found.reshape(model.n_outputs, -1))
@@ -132,8 +134,8 @@ def _simulate(
         if not estimate:
             return model.simulate(e.inputs, kappa, dt)
         rest, free = model.rest_and_free_responses(e.inputs, kappa, dt)
-        error = _outputs(e, model.n_outputs) - rest
-        return rest + free @ estimate_initial_state(free, error)
+        y = _outputs(e, model.n_outputs)
+        return rest + free @ estimate_initial_state(free, y - rest, sizes_of(y))
     return _simulate(model.to_discrete(dt), e, dt, estimate)
 
 

@@ -25,6 +25,7 @@ from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
     lti_response,
+    sizes_of,
     with_transit,
 )
 from ..validation import (
@@ -372,9 +373,9 @@ class StateSpace(VersionedPickle):
     def estimate_initial_state(self, u: ArrayLike, y: ArrayLike) -> Array:
         """Initial state of a discrete-time model with which it fits a record best.
 
-        The least-squares solution over all samples; of minimum norm where the record
-        does not determine it. With delays the inputs in transit, sent before the record
-        began, are estimated as well.
+        The least-squares solution over all samples, in which outputs count by how far
+        they move; of minimum norm where the record does not determine it. With delays
+        the inputs in transit, sent before the record began, are estimated as well.
 
         Parameters
         ----------
@@ -414,7 +415,7 @@ class StateSpace(VersionedPickle):
             free = free_responses(self.A, self.C, len(y))
             free = with_transit(free, self.B, self.D, self.input_delay)
         finite_simulation(free, self._why_it_diverges)
-        return estimate_initial_state(free, error)
+        return estimate_initial_state(free, error, sizes_of(y))
 
     def with_input_delay(self, input_delay: ArrayLike) -> StateSpace:
         """The model with other delays: `input_delay` as of the class, 0 for none.

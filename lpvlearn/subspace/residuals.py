@@ -46,6 +46,7 @@ from ..models.statespace import StateSpace
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
+    sizes_of,
     trend_signals,
 )
 from ..systems.threads import one_blas_thread
@@ -179,7 +180,8 @@ def model_residuals(
             if predictor is None:
                 free = free_responses(lti.A, lti.C, len(y), trend)
                 error = y - lti.simulate(u)
-                errors.append(error - free @ estimate_initial_state(free, error))
+                x0 = estimate_initial_state(free, error, sizes_of(y))
+                errors.append(error - free @ x0)
                 continue
             own = predictor.estimate_initial_state(u, y, trend)
             x0, trends = np.split(own, [len(own) - n_trend * y.shape[1]])

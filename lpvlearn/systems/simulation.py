@@ -148,14 +148,39 @@ def free_responses(
     return np.concatenate([free, *trends], axis=2)
 
 
-def estimate_initial_state(responses: Array, error: Array) -> Array:
+def sizes_of(outputs: Array) -> Array:
+    """How far outputs move (..., n_outputs), by which their errors count alike.
+
+    Their standard deviation over all samples; missing ones (NaN) are left out, and one
+    that stands still counts as moving by one.
+
+    >>> sizes_of(np.array([[1.0, 5.0], [-1.0, 5.0], [np.nan, 5.0]]))
+    array([1., 1.])
+    """
+    flat = outputs.reshape(-1, outputs.shape[-1])
+    known = ~np.isnan(flat)
+    count = np.maximum(known.sum(0), 1)
+    centred = np.where(known, flat, 0.0)
+    centred = np.where(known, flat - centred.sum(0) / count, 0.0)
+    largest = np.abs(centred).max(axis=0, initial=0.0)
+    unit = np.where(largest > 0, largest, 1.0)  # lest squares overflow
+    size = unit * np.sqrt(np.sum((centred / unit) ** 2, axis=0) / count)
+    return np.where(size > 0, size, 1.0)
+
+
+def estimate_initial_state(
+    responses: Array, error: Array, size: Array | None = None
+) -> Array:
     """Least-squares initial state behind what a simulation from rest leaves.
 
     ``min || error - sum_i responses[:, :, i] x0[i] ||``, of minimum norm where the
     responses (of every unit initial state) do not determine it. The error has shape
     (n_samples, n_outputs), and one more axis for several runs. Entries may be missing
-    (NaN).
+    (NaN). With the `size` of every output, errors count by these.
     """
+    if size is not None:
+        responses = responses / size[:, None]
+        error = (error.swapaxes(1, -1) / size).swapaxes(1, -1)
     n_rows = error.shape[0] * error.shape[1]
     columns = responses.reshape(n_rows, -1)
     if np.isnan(error).any():

@@ -418,13 +418,14 @@ def test_the_estimated_initial_state_is_the_one_simulated_from(n_outputs):
     u, x0 = rng.normal(size=30), np.array([2.0, -3.0])
     y = model.simulate(u, initial_state=x0)
     assert_allclose(model.estimate_initial_state(u, y), x0, rtol=1e-10)
-    # a least-squares solution: what remains is orthogonal to the free responses
+    # a least-squares solution: what remains, of outputs by how far they move, is
+    # orthogonal to the free responses
     noisy = y + rng.normal(size=y.shape)
     rest = noisy - model.simulate(
         u, initial_state=model.estimate_initial_state(u, noisy)
     )
     free = [model.simulate(0 * u, initial_state=unit) for unit in np.eye(2)]
-    assert_allclose(np.tensordot(free, rest, 2), 0.0, atol=1e-10)
+    assert_allclose(np.tensordot(free, rest / noisy.var(axis=0), 2), 0.0, atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -614,3 +615,17 @@ def test_python_control_knows_the_names():
     assert (taken.input_labels, taken.output_labels) == (["u_1"], ["speed"])
     assert model.to_control(inputs="force").input_labels == ["force"]
     assert StateSpace.from_control(taken).output_names == ["speed"]
+
+
+def test_units_of_outputs_do_not_change_an_initial_state():
+    """That of a mode that the small output alone shows."""
+    rng = np.random.default_rng(0)
+    A = np.diag([0.9, 0.8])
+    x0, u = np.array([1.0, -2.0]), rng.normal(size=(50, 1))
+    for unit in (1.0, 1e-6):
+        model = StateSpace(A, [[1], [1]], np.diag([1.0, unit]), sampling_time=1.0)
+        y = model.simulate(u, initial_state=x0)
+        y[:, 0] += rng.normal(size=50)
+        y[:, 1] += 1e-9 * unit * rng.normal(size=50)
+        found = model.estimate_initial_state(u, y)
+        assert_allclose(found[1], x0[1], rtol=1e-6)
