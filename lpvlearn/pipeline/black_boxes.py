@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..exceptions import warn
-from ..lpv.alignment import STATES, aligned_models
+from ..lpv.alignment import STATES, aligned_models, spanning_tree
 from ..lpv.spline import SplineLPV
 from ..models.statespace import StateSpace, with_signs_of
 from ..structures.structure import GrayBoxStructure
@@ -29,9 +29,12 @@ Array = NDArray[np.float64]
 # others as may be; and the share of the error that other states must leave
 _FORESEEN, _UNLIKE, _CLEARLY = 0.01, 2.0, 0.8
 
-# Of points whose records do not tell all states: the share of the errors of the others
-# that is left without them, and the error of what these foresee, for which it is taken
+# Of points whose states may be noise: the share of the errors of the others that is
+# left without them, and the error of what these foresee, for which it is taken
 _RELIEF, _NEAR = 0.5, 0.1
+
+# An error of the others beside points whose records tell fewer states that is told
+_SPOILT = 0.05
 
 # Change of a response, in its largest gain, by another order than a record takes, from
 # which it is told; operating points that a message lists
@@ -44,19 +47,41 @@ def aligned_black_boxes(
     """Entries of the models of all points in the states that are foreseen best.
 
     With what the other points foresee where the record of one does not tell its states.
-    Warns of points whose own records speak for another order.
+    Warns of points whose own records speak for another order. Inputs and outputs count
+    by how far they move, whatever their units.
     """
-    models = [balanced(model) for model in local]
+    u, y = _channels(local)
+    models = [_scaled(balanced(model), u, y).balance() for model in local]
     fewer = [
         k
         for k, model in enumerate(local)
         if model.own is not None and model.own.order < model.order
     ]
-    told = _foretold(local, models, fewer, kappa) if fewer else None
-    tell_of_forced(local, kappa, fewer if told is not None else ())
-    if told is None:
-        told = _foreseeable(_of_one_order(models), kappa).theta
-    return _full(models, local[0].integrating), told
+    own = [
+        model if one.own is None or k not in fewer else _scaled(balanced(one.own), u, y)
+        for k, (one, model) in enumerate(zip(local, models, strict=True))
+    ]
+    theta, mended = _foretold(models, own, fewer, kappa)
+    tell_of_forced(local, kappa, mended)
+    structure = _full(models)
+    rows = [structure.model(row) for row in theta]
+    entries = _entries([_scaled(model, 1.0 / u, 1.0 / y) for model in rows])
+    return _full(models, local[0].integrating), entries
+
+
+def _channels(local: Sequence[LocalModel]) -> tuple[Array, Array]:
+    """How far inputs and outputs move at the points, root mean squares of all."""
+    first, known = local[0].lti, [one.sizes for one in local if one.sizes is not None]
+    if not known:
+        return np.ones(first.n_inputs), np.ones(first.n_outputs)
+    u, y = (np.sqrt(np.mean(np.square(sizes), 0)) for sizes in zip(*known, strict=True))
+    return u, y
+
+
+def _scaled(model: StateSpace, u: Array, y: Array) -> StateSpace:
+    """The model of inputs in units of `u` and outputs in units of `y`."""
+    C, D, dt = model.C / y[:, None], model.D * u / y[:, None], model.sampling_time
+    return StateSpace(model.A, model.B * u, C, D, dt, input_delay=model.input_delay)
 
 
 def balanced_entries(
@@ -88,91 +113,125 @@ def balanced(local: LocalModel) -> StateSpace:
 
 
 class _Foreseeable(NamedTuple):
-    """Entries of models (n_points, n_entries), and errors of points left out."""
+    """Entries of models (n_points, n_entries), and how well points are foreseen."""
 
     theta: Array
-    errors: dict[int, float]  # by points within the range of the others
+    errors: dict[int, float]  # by points that the others can foresee
 
     def mean(self, points: Sequence[int] | None = None) -> float:
         """Of some points, or all; what is worse than no model counts as that."""
-        known = self.errors if points is None else self.errors.keys() & set(points)
+        known = [k for k in self.errors if points is None or k in points]
         errors = [min(self.errors[k], _UNLIKE) for k in known]
         return float(np.mean(errors)) if errors else 0.0
 
 
-def _foreseeable(models: Sequence[StateSpace], kappa: Array) -> _Foreseeable:
-    """In balanced states, or in others in which points are foreseen clearly better.
+def _foreseeable(
+    models: Sequence[StateSpace],
+    kappa: Array,
+    some: Sequence[int],
+    own: Sequence[StateSpace],
+) -> _Foreseeable:
+    """Of `some` points, in states in which they foresee the others best.
 
-    By an interpolation of the others. What states do while the scheduling moves no
-    point tells, and there balanced ones are as good a guess.
+    What the `own` models of these tell, or, where there are no others, of themselves
+    one left out at a time; by interpolation. States other than balanced ones must be
+    clearly better: what they do while the scheduling moves no point tells.
     """
-    structure = _full(models)
+    rest, places = [models[k] for k in some], kappa[list(some)]
+    structure, others = _full(rest), [k for k in range(len(models)) if k not in some]
     best, least = None, np.inf
     for states in STATES:
-        theta = _entries(aligned_models(models, kappa, states))
-        errors = errors_left_out(structure, models, SplineLPV(), kappa, theta)
+        known = _entries(aligned_models(rest, places, states))
+        left_out = errors_left_out(structure, rest, SplineLPV(), places, known)
+        theta = known
+        errors = {some[k]: error for k, error in left_out.items()}
+        if others:
+            theta = SplineLPV().fit(places, known).predict(kappa)
+            theta[list(some)] = known
+        for k in others:
+            model = structure.model(theta[k])
+            errors[k] = largest_difference(model, own[k]) if model.is_stable else np.inf
         found = _Foreseeable(theta, errors)
-        if best is None or found.mean() < least:
-            best, least = found, (_CLEARLY if best is None else 1.0) * found.mean()
-        if best.mean() < _FORESEEN:
+        error = found.mean(others or some)
+        if best is None or error < least:
+            best, least = found, _CLEARLY * error
+        if error < _FORESEEN:
             break
     assert best is not None
     return best
 
 
 def _foretold(
-    local: Sequence[LocalModel],
     models: Sequence[StateSpace],
+    own: Sequence[StateSpace],
     fewer: Sequence[int],
     kappa: Array,
-) -> Array | None:
-    """Entries with those that the others foresee where states are noise; None if none.
+) -> tuple[Array, Sequence[int]]:
+    """Entries with those that the others foresee where states are noise, and where.
 
     A record tells `fewer` states where a mode vanishes at a point, say; what the model
-    of the common order has beyond these may be anything, and spoils what is
-    interpolated. What the others foresee is taken where they foresee one another better
-    without these points, and what their records tell as well.
+    of the common order has beyond them may be anything, and spoils what is
+    interpolated. What the others foresee is taken where it is what the record does
+    tell, of which `own` are the models. Where nobody asked how many states a record
+    tells, the others must foresee one another much better without the point, too.
     """
-    some = [k for k in range(len(models)) if k not in fewer]
-    rest = [models[k] for k in some]
-    if len({model.order for model in rest}) != 1:
-        return None
-    alone, before = _foreseeable(rest, kappa[some]), _UNLIKE
+    every = range(len(models))
+    some = [k for k in every if k not in fewer]
+    whole, judged = None, False
     if len({model.order for model in models}) == 1:
-        before = _foreseeable(models, kappa).mean(some)
-    if not alone.errors or alone.mean() >= _RELIEF * before:
-        return None
-    theta = SplineLPV().fit(kappa[some], alone.theta).predict(kappa)
-    theta[some] = alone.theta
-    unlike = {k: _unlike(_full(rest).model(theta[k]), local[k]) for k in fewer}
-    worst = max(unlike.values())
-    names = listed([place_of(k, kappa) for k in fewer], _NAMED)
-    told = (
-        f"the record tells fewer states than those of the other points at {names}, as "
-        "where a mode vanishes: what is identified of the others there is noise. "
-    )
-    if worst < _NEAR:
+        whole = _foreseeable(models, kappa, every, own)
+        judged = any(k in whole.errors for k in some)
+        if judged and whole.mean(some) < _FORESEEN:
+            return whole.theta, ()
+    doubted = fewer
+    for group in [fewer] if fewer else _suspects(whole, kappa):
+        rest = [k for k in every if k not in group]
+        if len(rest) < 2 or len({models[k].order for k in rest}) != 1:
+            continue
+        alone = _foreseeable(models, kappa, rest, own)
+        inner = [k for k in rest if k in alone.errors]
+        if group is not fewer and not (
+            whole is not None
+            and inner
+            and alone.mean(inner) < _RELIEF * whole.mean(inner)
+        ):
+            continue
+        worst = max(alone.errors[k] for k in group)
+        names = listed([place_of(k, kappa) for k in group], _NAMED)
+        if worst < _NEAR:
+            warn(
+                f"the record at {names} does not tell all states of the other points, "
+                "as where a mode vanishes: what is identified of these there is noise. "
+                "The LPV model takes what the other points foresee there instead: "
+                f"within {100.0 * worst:.2g} % of the largest gain it is what the "
+                "record does tell. Give a structure, or a lower order: "
+                "local=SubspaceLTI(order=...)."
+            )
+            return alone.theta, group
+        doubted = doubted or group
+    if doubted and (whole is None or not judged or whole.mean(some) > _SPOILT):
+        names = listed([place_of(k, kappa) for k in doubted], _NAMED)
         warn(
-            f"{told}The LPV model takes what the other points foresee there instead: "
-            f"within {100.0 * worst:.2g} % of the largest gain it is what the record "
-            "does tell. Give a structure, or a lower order: "
+            f"the record at {names} tells fewer states than those of the other points, "
+            "as where a mode vanishes: what is identified of these there is noise, and "
+            "the LPV model may be wrong from there to the next points. Record for "
+            "longer there, leave the point out, give a structure, or a lower order: "
             "local=SubspaceLTI(order=...)."
         )
-        return theta
-    warn(
-        f"{told}The LPV model may be wrong from there to the next points, which "
-        "foresee one another better without. Record for longer there, leave the point "
-        "out, give a structure, or a lower order: local=SubspaceLTI(order=...)."
-    )
-    return None
+    if whole is None:
+        _of_one_order(models)
+    assert whole is not None
+    return whole.theta, ()
 
 
-def _unlike(foreseen: StateSpace, local: LocalModel) -> float:
-    """How far it is from what the record of a point tells, in the largest gain."""
-    own = local.own
-    if own is None or not foreseen.is_stable:
-        return np.inf
-    return largest_difference(foreseen, balanced(own))
+def _suspects(whole: _Foreseeable | None, kappa: Array) -> list[Sequence[int]]:
+    """The point that is foreseen worst, or a neighbour of it, may spoil the others."""
+    if whole is None or whole.mean() < _SPOILT:
+        return []
+    worst = max(whole.errors, key=whole.errors.__getitem__)
+    parents = spanning_tree(kappa)[1].tolist()
+    near = [k for k, parent in enumerate(parents) if parent == worst]
+    return [[k] for k in (worst, *near, parents[worst]) if k >= 0]
 
 
 def tell_of_forced(

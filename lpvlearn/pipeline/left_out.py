@@ -24,8 +24,9 @@ Array = NDArray[np.float64]
 _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 
 # Error of what the others make of a model, in its largest gain: that of a resonance
-# that is elsewhere, as may be at a point of many; and what is worse than that.
-_ELSEWHERE, _WORSE = 1.0, 1.5
+# that is elsewhere, as may be at a point of many; what is worse than that; and the mean
+# of several from which models between the points are seldom better than a tenth.
+_ELSEWHERE, _WORSE, _MEAN, _MANY = 1.0, 1.5, 0.3, 3
 
 _NAMED = 3  # operating points that a message lists
 
@@ -91,13 +92,15 @@ def tell_unforeseen(
     if not models[0].is_continuous:
         return
     errors = errors_left_out(lpv.structure, models, form, kappa, theta)
-    high = [(error, k) for k, error in errors.items() if error > _ELSEWHERE]
-    worst = sorted(high, reverse=True)
-    if worst and (worst[0][0] > _WORSE or 2 * len(worst) >= len(errors)):
+    worst = sorted(((error, k) for k, error in errors.items()), reverse=True)
+    high = [(error, k) for error, k in worst if error > _ELSEWHERE]
+    often = high and (high[0][0] > _WORSE or 2 * len(high) >= len(errors))
+    known = [min(error, _ELSEWHERE) for error, _ in worst]
+    if often or (len(known) >= _MANY and np.mean(known) > _MEAN):
         named = [
             f"{k} (scheduling {', '.join(f'{v:.4g}' for v in kappa[k])}: "
             f"{100.0 * error:.0f} %)"
-            for error, k in worst
+            for error, k in high or worst
         ]
         warn(
             "no form fits the parameters over the operating points, and the others do "

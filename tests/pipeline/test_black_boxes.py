@@ -6,7 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lpvlearn import LocalLPVPipeline, SplineLPV, StateSpace, from_trajectories
+from lpvlearn import (
+    LocalLPVPipeline,
+    SplineLPV,
+    StateSpace,
+    SubspaceLTI,
+    from_trajectories,
+)
 from lpvlearn.lpv.alignment import aligned_models
 from lpvlearn.pipeline.black_boxes import (
     _entries,
@@ -67,25 +73,61 @@ def test_balanced_states_are_kept_where_others_are_no_better():
     np.testing.assert_allclose(theta, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("place", [2, 4])
-def test_a_mode_that_vanishes_at_a_point_is_foretold_by_the_others(place):
-    kappas, rng = np.linspace(0.0, 2.0, 5), np.random.default_rng(0)
-    runs = []
+def vanishing(place, kappas):
+    """Tables of experiments; the mode vanishes at a point."""
+    rng, runs = np.random.default_rng(0), []
     for kappa in kappas:
         u = rng.choice([-1.0, 1.0], (800, 1))
         y = two_modes(kappa, kappas[place]).simulate(u, sampling_time=STEP)
         noise = 0.03 * y.std() * rng.standard_normal(y.shape)
         runs.append((u, kappa, y + noise))
-    X, y = from_trajectories(runs, sampling_time=STEP)
-    with pytest.warns(UserWarning, match=rf"fewer states.* operating point {place} "):
-        fitted = LocalLPVPipeline(
-            scheduling="kappa", experiment="experiment", time="time"
-        ).fit(X, y)
-    assert len(fitted.operating_points_) == 5 and (fitted.report_["order"] == 4).all()
+    return from_trajectories(runs, sampling_time=STEP)
+
+
+@pytest.mark.parametrize(
+    ("place", "n_points", "order", "most"),
+    [(2, 5, "auto", 0.05), (4, 5, "auto", 0.05), (2, 6, 4, 0.05), (1, 3, "auto", 0.1)],
+)
+def test_a_mode_that_vanishes_at_a_point_is_foretold_by_the_others(
+    place, n_points, order, most
+):
+    """Whether or not the order is known, and of three points as well."""
+    kappas = np.linspace(0.0, 2.0, n_points)
+    X, y = vanishing(place, kappas)
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(order), scheduling="kappa", experiment="experiment", time="time"
+    )
+    with pytest.warns(UserWarning, match=rf"operating point {place} .* does not tell"):
+        fitted = pipeline.fit(X, y)
+    assert len(fitted.operating_points_) == n_points
+    assert (fitted.report_["order"] == 4).all()
     size = two_modes(1.0, kappas[place]).hinf_norm()
     for kappa in np.linspace(0.0, 2.0, 17):
         true = two_modes(kappa, kappas[place])
-        assert (fitted.lpv_.at(kappa) - true).hinf_norm() < 0.05 * size
+        assert (fitted.lpv_.at(kappa) - true).hinf_norm() < most * size
+
+
+def test_units_of_the_channels_do_not_matter():
+    """The second output alone shows the mode that goes through zero."""
+    kappa = np.linspace(0.0, 2.0, 7)[:, None]
+
+    def points(unit):
+        for k in kappa[:, 0]:
+            one = two_modes(k, 0.8)
+            C = np.vstack([[1.0, 0.0, 0.0, 0.0], unit * one.C])
+            model = StateSpace(one.A, one.B, C).balance()
+            sizes = np.ones(1), np.array([1.0, unit])
+            yield replace(local(model), sizes=sizes)
+
+    responses = []
+    for unit in (1.0, 1e-6):
+        structure, theta = aligned_black_boxes(list(points(unit)), kappa)
+        form = SplineLPV().fit(kappa, theta)
+        between = [structure.model(row) for row in form.predict(kappa[1:] - 0.15)]
+        omega = np.geomspace(0.5, 20.0, 9)
+        G = np.array([model.frequency_response(omega) for model in between])
+        responses.append(G / np.array([[1.0], [unit]]))
+    np.testing.assert_allclose(responses[1], responses[0], atol=1e-6)
 
 
 def test_what_the_others_do_not_foretell_is_kept_and_told():
