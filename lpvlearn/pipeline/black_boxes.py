@@ -63,10 +63,11 @@ def aligned_black_boxes(
     ]
     theta, mended = _foretold(models, own, fewer, kappa)
     tell_of_forced(local, kappa, mended)
-    structure = _full(models)
-    rows = [structure.model(row) for row in theta]
-    entries = _entries([_scaled(model, 1.0 / u, 1.0 / y) for model in rows])
-    return _full(models, local[0].integrating), entries
+    direct = _has_feedthrough(models)
+    structure = _full(models[0], direct)
+    rows = [_scaled(structure.model(row), 1.0 / u, 1.0 / y) for row in theta]
+    whole = _full(models[0], direct, local[0].integrating)
+    return whole, _entries(rows, direct)
 
 
 def _channels(local: Sequence[LocalModel]) -> tuple[Array, Array]:
@@ -93,7 +94,8 @@ def balanced_entries(
     integrals of those of the models.
     """
     aligned = list(accumulate(_of_one_order(models), with_signs_of))
-    return _full(aligned, integrating), _entries(aligned)
+    direct = _has_feedthrough(aligned)
+    return _full(aligned[0], direct, integrating), _entries(aligned, direct)
 
 
 def balanced(local: LocalModel) -> StateSpace:
@@ -130,18 +132,21 @@ def _foreseeable(
     kappa: Array,
     some: Sequence[int],
     own: Sequence[StateSpace],
+    judges: Sequence[int],
 ) -> _Foreseeable:
-    """Of `some` points, in states in which they foresee the others best.
+    """Of `some` points, in states in which they foresee the `judges` best.
 
-    What the `own` models of these tell, or, where there are no others, of themselves
-    one left out at a time; by interpolation. States other than balanced ones must be
-    clearly better: what they do while the scheduling moves no point tells.
+    Of the other points what their `own` models tell, of themselves one left out at a
+    time; by interpolation. States other than balanced ones must be clearly better: what
+    they do while the scheduling moves no point tells.
     """
     rest, places = [models[k] for k in some], kappa[list(some)]
-    structure, others = _full(rest), [k for k in range(len(models)) if k not in some]
+    others = [k for k in range(len(models)) if k not in some]
+    direct = _has_feedthrough(models)
+    structure = _full(rest[0], direct)
     best, least = None, np.inf
     for states in STATES:
-        known = _entries(aligned_models(rest, places, states))
+        known = _entries(aligned_models(rest, places, states), direct)
         left_out = errors_left_out(structure, rest, SplineLPV(), places, known)
         theta = known
         errors = {some[k]: error for k, error in left_out.items()}
@@ -152,7 +157,7 @@ def _foreseeable(
             model = structure.model(theta[k])
             errors[k] = largest_difference(model, own[k]) if model.is_stable else np.inf
         found = _Foreseeable(theta, errors)
-        error = found.mean(others or some)
+        error = found.mean(judges)
         if best is None or error < least:
             best, least = found, _CLEARLY * error
         if error < _FORESEEN:
@@ -179,7 +184,7 @@ def _foretold(
     some = [k for k in every if k not in fewer]
     whole, judged = None, False
     if len({model.order for model in models}) == 1:
-        whole = _foreseeable(models, kappa, every, own)
+        whole = _foreseeable(models, kappa, every, own, some)
         judged = any(k in whole.errors for k in some)
         if judged and whole.mean(some) < _FORESEEN:
             return whole.theta, ()
@@ -188,7 +193,7 @@ def _foretold(
         rest = [k for k in every if k not in group]
         if len(rest) < 2 or len({models[k].order for k in rest}) != 1:
             continue
-        alone = _foreseeable(models, kappa, rest, own)
+        alone = _foreseeable(models, kappa, rest, own, group)
         inner = [k for k in rest if k in alone.errors]
         if group is not fewer and not (
             whole is not None
@@ -270,15 +275,19 @@ def _of_one_order(models: Sequence[StateSpace]) -> Sequence[StateSpace]:
     return models
 
 
+def _has_feedthrough(models: Sequence[StateSpace]) -> bool:
+    """Whether the entries of D are parameters, too."""
+    return any(bool(model.D.any()) for model in models)
+
+
 def _full(
-    models: Sequence[StateSpace], integrating: Sequence[int] = ()
+    first: StateSpace, direct: bool, integrating: Sequence[int] = ()
 ) -> GrayBoxStructure:
-    first, direct = models[0], any(model.D.any() for model in models)
     sizes = first.order, first.n_inputs, first.n_outputs
     return GrayBoxStructure.full(*sizes, direct, integrating)
 
 
-def _entries(models: Sequence[StateSpace]) -> Array:
-    names = "ABCD" if any(model.D.any() for model in models) else "ABC"
+def _entries(models: Sequence[StateSpace], direct: bool) -> Array:
+    names = "ABCD" if direct else "ABC"
     rows = [np.concatenate([getattr(m, M).ravel() for M in names]) for m in models]
     return np.array(rows)

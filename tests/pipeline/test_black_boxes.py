@@ -60,7 +60,7 @@ def test_a_gain_that_goes_through_zero_between_points_does_so_smoothly(by_inputs
     models = [truth(*k).balance() for k in kappa]
     structure, theta = aligned_black_boxes([local(m) for m in models], kappa)
     errors = errors_between(structure, theta, kappa, truth)
-    balanced = _entries(aligned_models(models, kappa))
+    balanced = _entries(aligned_models(models, kappa), False)
     before = errors_between(structure, balanced, kappa, truth)
     assert before.max() > 0.05 and errors.max() < 0.2 * before.max()
 
@@ -69,7 +69,7 @@ def test_balanced_states_are_kept_where_others_are_no_better():
     kappa = np.linspace(0.0, 1.0, 5)[:, None]
     models = [two_modes(k, -1.0).balance() for k in kappa[:, 0]]
     theta = aligned_black_boxes([local(m) for m in models], kappa)[1]
-    expected = _entries(aligned_models(models, kappa))
+    expected = _entries(aligned_models(models, kappa), False)
     np.testing.assert_allclose(theta, expected, atol=1e-9)
 
 
@@ -128,6 +128,24 @@ def test_units_of_the_channels_do_not_matter():
         G = np.array([model.frequency_response(omega) for model in between])
         responses.append(G / np.array([[1.0], [unit]]))
     np.testing.assert_allclose(responses[1], responses[0], atol=1e-6)
+
+
+def test_a_feedthrough_at_the_point_alone_is_no_parameter_of_it():
+    """The other points foresee none there."""
+    kappa = np.linspace(0.0, 2.0, 6)[:, None]
+    models = [two_modes(k, 0.8) for k in kappa[:, 0]]
+    points = [local(model.balance()) for model in models]
+    one = models[2]
+    own = StateSpace(one.A[:2, :2], one.B[:2], one.C[:, :2])
+    A = modes(-0.2 + 2.24j, -3.0 + 40j)
+    forced = StateSpace(A, [[0], [2.0], [0], [1e-3]], [[1, 0, 1e-3, 0]], [[1e-6]])
+    points[2] = local(forced.balance(), local(own))
+    with pytest.warns(UserWarning, match="does not tell all states"):
+        structure, theta = aligned_black_boxes(points, kappa)
+    assert structure.n_params == theta.shape[1] == 16 + 4 + 4 + 1
+    foreseen = structure.model(theta[2])
+    assert (foreseen - one).hinf_norm() < 0.05 * one.hinf_norm()
+    assert foreseen.D == 0.0
 
 
 def test_what_the_others_do_not_foretell_is_kept_and_told():
