@@ -23,7 +23,7 @@ from ..systems.simulation import (
     delayed,
     estimate_initial_state,
     free_responses,
-    sizes_of,
+    spread_of,
     state_trajectory,
     trend_signals,
     with_transit,
@@ -71,7 +71,7 @@ def fit_of(
     one length are simulated together; realizations of one input, once.
     """
     sampled = model.to_discrete(sampling_time)
-    size = sizes_of(np.vstack([_outputs(e, model.n_outputs) for e in group]))
+    size = spread_of(np.vstack([_outputs(e, model.n_outputs) for e in group]))
     true, simulated = [], []
     for length in sorted({len(e.rows) for e in group}):
         part = [e for e in group if len(e.rows) == length]
@@ -135,7 +135,7 @@ def _simulate(
             return model.simulate(e.inputs, kappa, dt)
         rest, free = model.rest_and_free_responses(e.inputs, kappa, dt)
         y = _outputs(e, model.n_outputs)
-        return rest + free @ estimate_initial_state(free, y - rest, sizes_of(y))
+        return rest + free @ estimate_initial_state(free, y - rest, spread_of(y))
     return _simulate(model.to_discrete(dt), e, dt, estimate)
 
 

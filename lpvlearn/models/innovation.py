@@ -15,7 +15,7 @@ from ..systems.simulation import (
     delayed,
     estimate_initial_state,
     free_responses,
-    sizes_of,
+    spread_of,
     state_trajectory,
     with_transit,
 )
@@ -271,7 +271,7 @@ class InnovationModel(VersionedPickle):
             states, trends = np.split(responses, [len(self.A)], axis=2)
             transit = self._transit_responses(gains, len(y))
             responses = np.concatenate([states, transit, trends], axis=2)
-        return estimate_initial_state(responses, error, sizes_of(y))
+        return estimate_initial_state(responses, error, spread_of(y))
 
     def _transit_responses(self, gains: Array, n_samples: int) -> Array:
         """Of one-step prediction to every input in transit, as of `with_transit`."""

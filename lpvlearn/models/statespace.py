@@ -25,7 +25,7 @@ from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
     lti_response,
-    sizes_of,
+    spread_of,
     with_transit,
 )
 from ..validation import (
@@ -415,7 +415,7 @@ class StateSpace(VersionedPickle):
             free = free_responses(self.A, self.C, len(y))
             free = with_transit(free, self.B, self.D, self.input_delay)
         finite_simulation(free, self._why_it_diverges)
-        return estimate_initial_state(free, error, sizes_of(y))
+        return estimate_initial_state(free, error, spread_of(y))
 
     def with_input_delay(self, input_delay: ArrayLike) -> StateSpace:
         """The model with other delays: `input_delay` as of the class, 0 for none.

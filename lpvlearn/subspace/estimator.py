@@ -46,6 +46,7 @@ from ..models.statespace import ModelPair, StateSpace
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
+    spread_of,
     trend_signals,
     with_transit,
 )
@@ -1446,7 +1447,7 @@ class SubspaceLTI(
             if experiment.estimated is not None:  # lest known ones leave states open
                 faint = np.where(experiment.estimated, _FAINT, 1.0)
                 responses, error = responses * faint[:, :, None], error * faint
-            own = estimate_initial_state(responses, error)
+            own = estimate_initial_state(responses, error, spread_of(y))
         else:
             u = experiment.inputs - u0
             own = predictor.estimate_initial_state(u, y - y0, trend)

@@ -46,7 +46,7 @@ from ..models.statespace import StateSpace
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
-    sizes_of,
+    spread_of,
     trend_signals,
 )
 from ..systems.threads import one_blas_thread
@@ -180,7 +180,7 @@ def model_residuals(
             if predictor is None:
                 free = free_responses(lti.A, lti.C, len(y), trend)
                 error = y - lti.simulate(u)
-                x0 = estimate_initial_state(free, error, sizes_of(y))
+                x0 = estimate_initial_state(free, error, spread_of(y))
                 errors.append(error - free @ x0)
                 continue
             own = predictor.estimate_initial_state(u, y, trend)

@@ -148,13 +148,13 @@ def free_responses(
     return np.concatenate([free, *trends], axis=2)
 
 
-def sizes_of(outputs: Array) -> Array:
+def spread_of(outputs: Array) -> Array:
     """How far outputs move (..., n_outputs), by which their errors count alike.
 
     Their standard deviation over all samples; missing ones (NaN) are left out, and one
     that stands still counts as moving by one.
 
-    >>> sizes_of(np.array([[1.0, 5.0], [-1.0, 5.0], [np.nan, 5.0]]))
+    >>> spread_of(np.array([[1.0, 5.0], [-1.0, 5.0], [np.nan, 5.0]]))
     array([1., 1.])
     """
     flat = outputs.reshape(-1, outputs.shape[-1])
