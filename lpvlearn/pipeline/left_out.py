@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 
 # Error of what the others make of a model, in its largest gain: that of a resonance
-# that is elsewhere, as may be at a point of many; what is worse than that; and the mean
-# of several from which models between the points are seldom better than a tenth.
-_ELSEWHERE, _WORSE, _MEAN, _MANY = 1.0, 1.5, 0.3, 3
+# that is elsewhere, as may be at a point of many; what is worse than that; and the
+# median of several from which models between the points are seldom good to a tenth.
+_ELSEWHERE, _WORSE, _MEDIAN, _MANY = 1.0, 1.5, 0.3, 4
 
 _NAMED = 3  # operating points that a message lists
 
@@ -95,8 +95,8 @@ def tell_unforeseen(
     worst = sorted(((error, k) for k, error in errors.items()), reverse=True)
     high = [(error, k) for error, k in worst if error > _ELSEWHERE]
     often = high and (high[0][0] > _WORSE or 2 * len(high) >= len(errors))
-    known = [min(error, _ELSEWHERE) for error, _ in worst]
-    if often or (len(known) >= _MANY and np.mean(known) > _MEAN):
+    most = len(errors) >= _MANY and np.median([*errors.values()]) > _MEDIAN
+    if often or most:
         named = [
             f"{k} (scheduling {', '.join(f'{v:.4g}' for v in kappa[k])}: "
             f"{100.0 * error:.0f} %)"
