@@ -79,13 +79,9 @@ def aligned_models(
 
 def _normal(model: StateSpace, size: float, by_inputs: bool) -> StateSpace:
     """With the Gramian ``size I`` of the inputs, or of the outputs."""
-    discrete = not model.is_continuous
-    if by_inputs:
-        L = gramian_factor(model.A, model.B, discrete)
-        return model.transform(np.sqrt(size) * np.linalg.inv(L))
-    return model.transform(
-        gramian_factor(model.A.T, model.C.T, discrete).T / np.sqrt(size)
-    )
+    pair = (model.A, model.B) if by_inputs else (model.A.T, model.C.T)
+    L, root = gramian_factor(*pair, discrete=False), np.sqrt(size)
+    return model.transform(root * np.linalg.inv(L) if by_inputs else L.T / root)
 
 
 def spanning_tree(kappa: Array, *, outward: bool = True) -> tuple[Rows, Rows]:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.experiments import Experiment
 from ..exceptions import warn
 from ..lpv.alignment import STATES, aligned_models, spanning_tree
 from ..lpv.spline import SplineLPV
@@ -20,7 +21,7 @@ from ..models.statespace import StateSpace, with_signs_of
 from ..structures.structure import GrayBoxStructure
 from ..validation import listed
 from .left_out import errors_left_out, largest_difference
-from .local_models import LocalModel
+from .local_models import LocalModel, motions
 from .runner import place_of
 
 Array = NDArray[np.float64]
@@ -42,15 +43,14 @@ _FORCED, _NAMED = 0.5, 3
 
 
 def aligned_black_boxes(
-    local: Sequence[LocalModel], kappa: Array
+    local: Sequence[LocalModel], kappa: Array, u: Array, y: Array
 ) -> tuple[GrayBoxStructure, Array]:
     """Entries of the models of all points in the states that are foreseen best.
 
     With what the other points foresee where the record of one does not tell its states.
     Warns of points whose own records speak for another order. Inputs and outputs count
-    by how far they move, whatever their units.
+    by how far they move, `u` and `y`, whatever their units.
     """
-    u, y = _channels(local)
     models = [_scaled(balanced(model), u, y).balance() for model in local]
     fewer = [
         k
@@ -70,12 +70,10 @@ def aligned_black_boxes(
     return whole, _entries(rows, direct)
 
 
-def _channels(local: Sequence[LocalModel]) -> tuple[Array, Array]:
+def channel_sizes(groups: Sequence[Sequence[Experiment]]) -> tuple[Array, Array]:
     """How far inputs and outputs move at the points, root mean squares of all."""
-    first, known = local[0].lti, [one.sizes for one in local if one.sizes is not None]
-    if not known:
-        return np.ones(first.n_inputs), np.ones(first.n_outputs)
-    u, y = (np.sqrt(np.mean(np.square(sizes), 0)) for sizes in zip(*known, strict=True))
+    both = zip(*(motions(group) for group in groups), strict=True)
+    u, y = (np.sqrt(np.mean([std**2 for _, std in one], axis=0)) for one in both)
     return u, y
 
 
@@ -194,12 +192,7 @@ def _foretold(
         if len(rest) < 2 or len({models[k].order for k in rest}) != 1:
             continue
         alone = _foreseeable(models, kappa, rest, own, group)
-        inner = [k for k in rest if k in alone.errors]
-        if group is not fewer and not (
-            whole is not None
-            and inner
-            and alone.mean(inner) < _RELIEF * whole.mean(inner)
-        ):
+        if group is not fewer and not _relieved(alone, whole, rest):
             continue
         worst = max(alone.errors[k] for k in group)
         names = listed([place_of(k, kappa) for k in group], _NAMED)
@@ -227,6 +220,16 @@ def _foretold(
         _of_one_order(models)
     assert whole is not None
     return whole.theta, ()
+
+
+def _relieved(
+    alone: _Foreseeable, whole: _Foreseeable | None, rest: Sequence[int]
+) -> bool:
+    """Whether points foresee one another much better than beside those left out."""
+    inner = [k for k in rest if k in alone.errors]
+    if whole is None or not inner:
+        return False
+    return alone.mean(inner) < _RELIEF * whole.mean(inner)
 
 
 def _suspects(whole: _Foreseeable | None, kappa: Array) -> list[Sequence[int]]:

@@ -75,8 +75,6 @@ class LocalModel:
     n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
     # inputs and outputs at rest, near the experiments; None: not looked for
     rest: tuple[Array, Array] | None = None
-    # root mean squares of how far inputs and outputs move in the experiments
-    sizes: tuple[Array, Array] | None = None
     # that of the order that its record takes, where it is not the one of all points
     own: LocalModel | None = None
     # the model as identified (of every realization) with models to either side of it,
@@ -259,7 +257,6 @@ def identify_point(
             integrating=_integrating(fitted),
             n_trend=_n_trend(fitted),
             rest=_equilibrium(lti, [fitted], experiments),
-            sizes=_sizes(experiments),
         )
         if efficient and pairs:
             found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
@@ -299,7 +296,6 @@ def identify_point(
         estimates=estimates if known else [],
         n_trend=max(map(_n_trend, kept)),
         rest=_equilibrium(lti, kept, experiments),
-        sizes=_sizes(experiments),
     )
 
 
@@ -375,11 +371,6 @@ def _tell_different_constants(
             "what drifted between experiments from y, or let the scheduling variables "
             "tell what the constants depend on."
         )
-
-
-def _sizes(experiments: Sequence[Experiment]) -> tuple[Array, Array]:
-    (_, u), (_, y) = motions(experiments)
-    return u, y
 
 
 def motions(

@@ -28,6 +28,7 @@ from .black_boxes import (
     aligned_black_boxes,
     balanced,
     balanced_entries,
+    channel_sizes,
     tell_of_forced,
 )
 from .branches import tied_branches
@@ -75,7 +76,8 @@ def restructure_points(
     began = perf_counter()
     if isinstance(restructurer, str):
         if restructurer == "aligned":
-            structure, theta = aligned_black_boxes(local, points.kappa)
+            sizes = channel_sizes(points.experiments)
+            structure, theta = aligned_black_boxes(local, points.kappa, *sizes)
         else:
             tell_of_forced(local, points.kappa)
             models = [balanced(model) for model in local]

@@ -160,8 +160,8 @@ def spread_of(outputs: Array) -> Array:
     flat = outputs.reshape(-1, outputs.shape[-1])
     known = ~np.isnan(flat)
     count = np.maximum(known.sum(0), 1)
-    centred = np.where(known, flat, 0.0)
-    centred = np.where(known, flat - centred.sum(0) / count, 0.0)
+    mean = np.where(known, flat, 0.0).sum(0) / count
+    centred = np.where(known, flat - mean, 0.0)
     largest = np.abs(centred).max(axis=0, initial=0.0)
     unit = np.where(largest > 0, largest, 1.0)  # lest squares overflow
     size = unit * np.sqrt(np.sum((centred / unit) ** 2, axis=0) / count)

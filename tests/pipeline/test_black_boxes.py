@@ -39,6 +39,11 @@ def local(lti, own=None):
     return LocalModel(lti, lti.order, 5, own=own)
 
 
+def aligned(points, kappa, outputs=(1.0,)):
+    """Of one input in units of one, and outputs in those given."""
+    return aligned_black_boxes(points, kappa, np.ones(1), np.array(outputs))
+
+
 def errors_between(structure, theta, kappa, truth):
     form = SplineLPV().fit(kappa, theta)
     errors = []
@@ -58,7 +63,7 @@ def test_a_gain_that_goes_through_zero_between_points_does_so_smoothly(by_inputs
         return two_modes(kappa, 0.8, by_inputs)
 
     models = [truth(*k).balance() for k in kappa]
-    structure, theta = aligned_black_boxes([local(m) for m in models], kappa)
+    structure, theta = aligned([local(m) for m in models], kappa)
     errors = errors_between(structure, theta, kappa, truth)
     balanced = _entries(aligned_models(models, kappa), False)
     before = errors_between(structure, balanced, kappa, truth)
@@ -68,7 +73,7 @@ def test_a_gain_that_goes_through_zero_between_points_does_so_smoothly(by_inputs
 def test_balanced_states_are_kept_where_others_are_no_better():
     kappa = np.linspace(0.0, 1.0, 5)[:, None]
     models = [two_modes(k, -1.0).balance() for k in kappa[:, 0]]
-    theta = aligned_black_boxes([local(m) for m in models], kappa)[1]
+    theta = aligned([local(m) for m in models], kappa)[1]
     expected = _entries(aligned_models(models, kappa), False)
     np.testing.assert_allclose(theta, expected, atol=1e-9)
 
@@ -115,13 +120,11 @@ def test_units_of_the_channels_do_not_matter():
         for k in kappa[:, 0]:
             one = two_modes(k, 0.8)
             C = np.vstack([[1.0, 0.0, 0.0, 0.0], unit * one.C])
-            model = StateSpace(one.A, one.B, C).balance()
-            sizes = np.ones(1), np.array([1.0, unit])
-            yield replace(local(model), sizes=sizes)
+            yield local(StateSpace(one.A, one.B, C).balance())
 
     responses = []
     for unit in (1.0, 1e-6):
-        structure, theta = aligned_black_boxes(list(points(unit)), kappa)
+        structure, theta = aligned(list(points(unit)), kappa, (1.0, unit))
         form = SplineLPV().fit(kappa, theta)
         between = [structure.model(row) for row in form.predict(kappa[1:] - 0.15)]
         omega = np.geomspace(0.5, 20.0, 9)
@@ -141,7 +144,7 @@ def test_a_feedthrough_at_the_point_alone_is_no_parameter_of_it():
     forced = StateSpace(A, [[0], [2.0], [0], [1e-3]], [[1, 0, 1e-3, 0]], [[1e-6]])
     points[2] = local(forced.balance(), local(own))
     with pytest.warns(UserWarning, match="does not tell all states"):
-        structure, theta = aligned_black_boxes(points, kappa)
+        structure, theta = aligned(points, kappa)
     assert structure.n_params == theta.shape[1] == 16 + 4 + 4 + 1
     foreseen = structure.model(theta[2])
     assert (foreseen - one).hinf_norm() < 0.05 * one.hinf_norm()
@@ -158,7 +161,7 @@ def test_what_the_others_do_not_foretell_is_kept_and_told():
     own = StateSpace(A[:2, :2], odd.B[:2], odd.C[:, :2])
     points[3] = local(odd.balance(), local(own))
     with pytest.warns(UserWarning, match="may be wrong from there to the next points"):
-        structure, theta = aligned_black_boxes(points, kappa)
+        structure, theta = aligned(points, kappa)
     kept = structure.model(theta[3])
     assert (kept - odd).hinf_norm() < 1e-9 * odd.hinf_norm()
 
