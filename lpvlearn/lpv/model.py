@@ -18,7 +18,12 @@ from ..models.system_matrix import blocks
 from ..structures.map import numerical_jacobian
 from ..structures.structure import GrayBoxStructure
 from ..systems.sampling import sample_zoh
-from ..systems.simulation import delayed, state_trajectory
+from ..systems.simulation import (
+    delayed,
+    estimate_initial_state,
+    spread_of,
+    state_trajectory,
+)
 from ..systems.tabulation import tabulate
 from ..systems.threads import one_blas_thread
 from ..validation import (
@@ -27,6 +32,7 @@ from ..validation import (
     frequencies,
     input_delays,
     matrix,
+    measured_samples,
     names_of,
     place,
     positive_time,
@@ -599,7 +605,7 @@ class LPVStateSpace(VersionedPickle):
         initial_state : array-like of shape (order,), default=None
             None is rest: zero, or the `state_offset` of the first sample. The inputs
             before that sample are zero, or its `input_offset`; those in transit may
-            follow the state, as `StateSpace.estimate_initial_state` has them.
+            follow the state, as `estimate_initial_state` has them.
 
         Returns
         -------
@@ -681,10 +687,66 @@ class LPVStateSpace(VersionedPickle):
         y = self._response(late, kappa, sampling_time, start)
         return y[:, :, 0], y[:, :, 1:]
 
+    def estimate_initial_state(
+        self,
+        u: ArrayLike,
+        scheduling: ArrayLike | Mapping[Any, ArrayLike],
+        y: ArrayLike,
+        sampling_time: float,
+    ) -> Array:
+        """Initial state with which the model fits a record best.
+
+        The least-squares solution over all samples, in which outputs count by how far
+        they move; what the record does not determine is at rest.
+
+        Parameters
+        ----------
+        u : array-like of shape (n_samples, n_inputs)
+        scheduling : array-like of shape (n_samples, n_scheduling) or (n_samples,)
+            As of `simulate`.
+        y : array-like of shape (n_samples, n_outputs) or (n_samples,)
+            Missing values (NaN) are left out.
+        sampling_time : float
+            Seconds.
+
+        Returns
+        -------
+        ndarray of shape (order + n_in_transit,)
+            To be given to `simulate` as `initial_state`: the state, then for one input
+            after another those that arrive with sample 0, 1, ....
+
+        Raises
+        ------
+        ValueError
+            As `simulate`, or if `y` does not fit `u`.
+        DivergenceError
+            If a response overflows.
+        """
+        u, kappa, delay, start = self._started(u, scheduling, sampling_time, None)
+        y = measured_samples(y, len(u), self.n_outputs)
+        rest, free = self.rest_and_free_responses(u, kappa, sampling_time)
+        basis = self._basis_at(kappa[0])
+        start[: self.order] = basis @ start[: self.order]
+        return start + estimate_initial_state(free, y - rest, spread_of(y))
+
     def _run(
         self, u: Any, scheduling: Any, dt: float, initial_state: Any
     ) -> tuple[Array, Array, Array, Array]:
         """Inputs, scheduling, all that drives the states, and their initial ones."""
+        u, kappa, delay, start = self._started(u, scheduling, dt, initial_state)
+        n = self.order
+        late = delayed(u, delay, start[n:])
+        if self.offsets is not None:
+            late = np.column_stack([late, np.ones(len(u))])
+        return u, kappa, late, start[:n]
+
+    def _started(
+        self, u: Any, scheduling: Any, dt: float, initial_state: Any
+    ) -> tuple[Array, Array, NDArray[np.intp], Array]:
+        """Inputs, scheduling, delay in samples, and the start of a run, checked.
+
+        The start is the state of the structure, then the inputs in transit.
+        """
         u = finite_samples("u", u, self.n_inputs)
         delay, n = self._samples_of_delay(dt), self.order
         kappa = self._scheduling(scheduling)
@@ -702,10 +764,7 @@ class LPVStateSpace(VersionedPickle):
                 x = np.linalg.solve(self._basis_at(kappa[0]), x)
             if np.size(initial_state) > n:
                 before = given[n:]
-        late = delayed(u, delay, before)
-        if self.offsets is not None:
-            late = np.column_stack([late, np.ones(len(u))])
-        return u, kappa, late, x
+        return u, kappa, delay, np.concatenate([x, before])
 
     def _unit_runs(self, kappa: Array, delay: NDArray[np.intp]) -> tuple[Array, Array]:
         """What drives runs from unit initial states, and units in transit."""

@@ -19,16 +19,6 @@ from ..data.experiments import (
 from ..data.preparation import read_runs
 from ..data.timestamps import TIME_TOL
 from ..models.statespace import StateSpace
-from ..systems.simulation import (
-    delayed,
-    estimate_initial_state,
-    free_responses,
-    spread_of,
-    state_trajectory,
-    trend_signals,
-    with_transit,
-)
-from .scores import best_fit
 
 Array = NDArray[np.float64]
 
@@ -50,50 +40,16 @@ class ScheduledModel(Protocol):
     def scheduling_range(self) -> Array: ...
 
     def simulate(
-        self, inputs: Any, scheduling: Any, sampling_time: float, /
+        self,
+        u: Any,
+        scheduling: Any,
+        sampling_time: float,
+        initial_state: Any = None,
     ) -> Array: ...
 
-    def rest_and_free_responses(
-        self, inputs: Any, scheduling: Any, sampling_time: float, /
-    ) -> tuple[Array, Array]: ...
-
-
-def fit_of(
-    model: StateSpace,
-    group: Sequence[Experiment],
-    sampling_time: float,
-    n_trend: int = 0,
-) -> float:
-    """BFT (percent, mean over the outputs) of a continuous model on experiments.
-
-    The initial state of every experiment is estimated by least squares, and with
-    `n_trend` a constant (1), a constant and a drift (2) of every output. Experiments of
-    one length are simulated together; realizations of one input, once.
-    """
-    sampled = model.to_discrete(sampling_time)
-    size = spread_of(np.vstack([_outputs(e, model.n_outputs) for e in group]))
-    true, simulated = [], []
-    for length in sorted({len(e.rows) for e in group}):
-        part = [e for e in group if len(e.rows) == length]
-        inputs = [e.inputs for e in part]
-        if all(np.array_equal(u, inputs[0]) for u in inputs[1:]):
-            inputs = inputs[:1]
-        u = delayed(np.stack(inputs, axis=-1), sampled.input_delay)
-        x = state_trajectory(
-            sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
-        )
-        free = free_responses(
-            sampled.A, sampled.C, length, trend_signals(length, n_trend)
-        )
-        free = with_transit(free, sampled.B, sampled.D, sampled.input_delay)
-        # channel by channel in memory, as experiments are: (n_outputs, n_runs, length)
-        forced = (sampled.C @ x + sampled.D @ u).transpose(1, 2, 0)
-        y = np.stack([_outputs(e, model.n_outputs).T for e in part], axis=1)
-        own = estimate_initial_state(free, (y - forced).transpose(2, 0, 1), size)
-        found = forced + own.T @ free.transpose(1, 2, 0)
-        true.append(y.reshape(model.n_outputs, -1))
-        simulated.append(found.reshape(model.n_outputs, -1))
-    return float(best_fit(np.hstack(true).T, np.hstack(simulated).T, "uniform_average"))
+    def estimate_initial_state(
+        self, u: Any, scheduling: Any, y: Any, sampling_time: float
+    ) -> Array: ...
 
 
 def simulate_experiments(
@@ -131,11 +87,10 @@ def _simulate(
         raise ValueError(NO_TIME.format("the model is"))
     if isinstance(model, ScheduledModel):
         kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
-        if not estimate:
-            return model.simulate(e.inputs, kappa, dt)
-        rest, free = model.rest_and_free_responses(e.inputs, kappa, dt)
-        y = _outputs(e, model.n_outputs)
-        return rest + free @ estimate_initial_state(free, y - rest, spread_of(y))
+        if estimate:
+            y = _outputs(e, model.n_outputs)
+            x0 = model.estimate_initial_state(e.inputs, kappa, y, dt)
+        return model.simulate(e.inputs, kappa, dt, x0)
     return _simulate(model.to_discrete(dt), e, dt, estimate)
 
 

@@ -13,9 +13,18 @@ from ..data.experiments import Experiment
 from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
 from ..metrics.reports import as_shown, readable_report
-from ..metrics.scores import parameter_fit
-from ..metrics.table_simulation import fit_of
+from ..metrics.scores import best_fit, parameter_fit
+from ..models.statespace import StateSpace
 from ..restructuring.estimator import GrayBoxRestructurer
+from ..systems.simulation import (
+    delayed,
+    estimate_initial_state,
+    free_responses,
+    spread_of,
+    state_trajectory,
+    trend_signals,
+    with_transit,
+)
 from .local_models import LocalModel, motions
 from .structured_models import StructuredModels
 
@@ -88,11 +97,11 @@ def tables(
             "n_samples": sum(len(e.rows) for e in group),
             "order": model.order,
             "horizon": model.horizon,
-            "local_BFT": fit_of(model.lti, group, sampling_time, model.n_trend),
+            "local_BFT": _fit_of(model.lti, group, sampling_time, model.n_trend),
         }
         missed |= lpv.offsets is None and _misses_constants(model, group, sampling_time)
         if found.restructurers:
-            structured = fit_of(gray_box, group, sampling_time, model.n_trend)
+            structured = _fit_of(gray_box, group, sampling_time, model.n_trend)
             row["structured_BFT"] = structured
             row |= _restructuring(found.restructurers[k])
         if delayed:
@@ -154,6 +163,49 @@ def tables(
     )
 
 
+def _fit_of(
+    model: StateSpace,
+    group: Sequence[Experiment],
+    sampling_time: float,
+    n_trend: int = 0,
+) -> float:
+    """BFT (percent, mean over the outputs) of a continuous model on experiments.
+
+    The initial state of every experiment is estimated by least squares, and with
+    `n_trend` a constant (1), a constant and a drift (2) of every output. Experiments of
+    one length are simulated together; realizations of one input, once.
+    """
+    sampled = model.to_discrete(sampling_time)
+    size = spread_of(np.vstack([_outputs(e) for e in group]))
+    true, simulated = [], []
+    for length in sorted({len(e.rows) for e in group}):
+        part = [e for e in group if len(e.rows) == length]
+        inputs = [e.inputs for e in part]
+        if all(np.array_equal(u, inputs[0]) for u in inputs[1:]):
+            inputs = inputs[:1]
+        u = delayed(np.stack(inputs, axis=-1), sampled.input_delay)
+        x = state_trajectory(
+            sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
+        )
+        free = free_responses(
+            sampled.A, sampled.C, length, trend_signals(length, n_trend)
+        )
+        free = with_transit(free, sampled.B, sampled.D, sampled.input_delay)
+        # channel by channel in memory, as experiments are: (n_outputs, n_runs, length)
+        forced = (sampled.C @ x + sampled.D @ u).transpose(1, 2, 0)
+        y = np.stack([_outputs(e).T for e in part], axis=1)
+        own = estimate_initial_state(free, (y - forced).transpose(2, 0, 1), size)
+        found = forced + own.T @ free.transpose(1, 2, 0)
+        true.append(y.reshape(model.n_outputs, -1))
+        simulated.append(found.reshape(model.n_outputs, -1))
+    return float(best_fit(np.hstack(true).T, np.hstack(simulated).T, "uniform_average"))
+
+
+def _outputs(experiment: Experiment) -> Array:
+    assert experiment.outputs is not None
+    return experiment.outputs
+
+
 def _misses_constants(
     model: LocalModel, group: Sequence[Experiment], sampling_time: float
 ) -> bool:
@@ -161,7 +213,9 @@ def _misses_constants(
     if model.rest is not None and not model.n_trend:
         return False  # they have been looked for
     group, constants = group[:_LOOKED_AT], max(1, model.n_trend)
-    best, without = (fit_of(model.lti, group, sampling_time, n) for n in (constants, 0))
+    best, without = (
+        _fit_of(model.lti, group, sampling_time, n) for n in (constants, 0)
+    )
     far = [(abs(mean) > _FAR * scale).any() for mean, scale in motions(group)]
     return best - without > _WORTH or (without < _POOR and any(far))
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..exceptions import VersionedPickle
 from ..models.statespace import StateSpace
 from ..models.system_matrix import Blocks, blocks
 from ..validation import (
@@ -52,7 +53,7 @@ _MOST_COPIES = 1000  # of the outputs: one for each weight or model
 _LISTED = 8  # names that a message lists
 
 
-class GrayBoxStructure:
+class GrayBoxStructure(VersionedPickle):
     """The map from parameters to the matrices of a gray-box model, Eq. (2).
 
     Build one with :meth:`from_template` (entries affine in the parameters),

@@ -383,6 +383,9 @@ def lpv_calls(w):
     yield "LPVStateSpace.rest_and_free_responses", model.rest_and_free_responses, {
         "u": w.U, "scheduling": w.K, "sampling_time": 0.02,
     }  # fmt: skip
+    yield "LPVStateSpace.estimate_initial_state", model.estimate_initial_state, {
+        "u": w.U, "scheduling": w.K, "y": w.Y, "sampling_time": 0.02,
+    }  # fmt: skip
     for method in ("parameters", "frozen_poles", "parameter_deviations"):
         yield f"LPVStateSpace.{method}", getattr(fitted, method), {"kappa": w.kappa}
     yield "LPVStateSpace.parameters(std)", fitted.parameters, {

@@ -677,6 +677,22 @@ def test_both_responses_come_in_one_pass(make):
     rest, free = model.rest_and_free_responses(u, kappa, DT)
     assert_allclose(rest, model.simulate(u, kappa, DT), atol=1e-13)
     assert_allclose(free, model.free_responses(kappa, DT), atol=1e-13)
+    start = np.arange(1.0, 1.0 + free.shape[2])
+    y = model.simulate(u, kappa, DT, start)
+    found = model.estimate_initial_state(u, kappa, y, DT)
+    assert_allclose(found, start, atol=1e-9)
+    y[5:9, 0] = np.nan
+    assert_allclose(model.estimate_initial_state(u, kappa, y, DT), start, atol=1e-9)
+
+
+def test_what_a_record_does_not_tell_of_its_start_is_at_rest():
+    model = about_offsets()
+    u, kappa = inputs(60)[:, : model.n_inputs], sweep(60)
+    x0 = model.state_offset(kappa[:1])[0]
+    none = np.full((60, model.n_outputs), np.nan)
+    assert_allclose(model.estimate_initial_state(u, kappa, none, DT), x0, atol=1e-13)
+    with pytest.raises(ValueError, match="one row for each of the same samples"):
+        model.estimate_initial_state(u, kappa, none[1:], DT)
 
 
 def test_extrapolated_offsets_are_told_once():
