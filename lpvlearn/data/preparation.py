@@ -259,9 +259,9 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
     if small:  # a model from it has huge entries
         k = small[0]
         raise ValueError(
-            f"Every input must reach {1.0 / SQUARED:g}, as what is below is zero when "
-            f"squared. Got input {k if names is None else names[k]!r} of at most "
-            f"{size[k]:.3g}: give it in a smaller unit."
+            f"Every column of `inputs` must reach {1.0 / SQUARED:g}, as what is below "
+            f"is zero when squared. Got {k if names is None else names[k]!r} of at "
+            f"most {size[k]:.3g}: give it in a smaller unit."
         )
 
 

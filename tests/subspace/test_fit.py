@@ -206,7 +206,7 @@ def test_inputs_that_are_next_to_nothing_are_named(unit):
     rng = np.random.default_rng(0)
     X = pd.DataFrame(rng.normal(size=(100, 2)), columns=["valve", "fan"])
     y = X.to_numpy().sum(axis=1)
-    with pytest.raises(ValueError, match="Got input 'fan' of at most .* smaller unit"):
+    with pytest.raises(ValueError, match="Got 'fan' of at most .* smaller unit"):
         SubspaceLTI(1).fit(X * [1.0, unit], y)
     SubspaceLTI(1).fit(X * [1.0, 1e-149], y)
 
