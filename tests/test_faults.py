@@ -11,6 +11,7 @@ import tempfile
 import time
 from functools import partial
 from multiprocessing.connection import Connection
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -217,6 +218,15 @@ def test_a_worker_killed_in_the_middle_of_its_result_is_told():
     tasks = [delayed(half_a_result)(), delayed(time.sleep)(0)]
     with pytest.raises(RuntimeError, match="A worker process was killed"):
         list(results_of(tasks, n_jobs=2))
+
+
+def test_a_module_that_workers_do_not_find_is_named(tmp_path, monkeypatch):
+    list(results_of([delayed(int)()] * 2, n_jobs=2))  # they begin without the path
+    (tmp_path / "only_here.py").write_text("def function():\n    return 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    task = delayed(import_module("only_here").function)()
+    with pytest.raises(RuntimeError, match="No module named 'only_here'. Install"):
+        list(results_of([task] * 2, n_jobs=2))
 
 
 def starved():

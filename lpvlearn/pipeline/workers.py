@@ -31,6 +31,12 @@ _KILLED = (
     "n_jobs=1. What was finished before is not lost where `memory` is a folder."
 )
 
+_UNREADABLE = (
+    "A worker process could not read its task, most often for a module that only this "
+    "one finds (by a path added to `sys.path`, say): {cause}. Install that module, "
+    "name its folder in PYTHONPATH, or take n_jobs=1."
+)
+
 
 def results_of(
     tasks: Iterable[Task], n_jobs: int | None, sent: str = QUEUED
@@ -90,7 +96,11 @@ def _guarded(results: Iterator[Any]) -> Iterator[Any]:
     try:
         yield from results
     except BrokenProcessPool as error:
-        raise RuntimeError(_KILLED) from error
+        cause = error.__cause__  # the traceback of a worker that lives, its last line
+        if "un-serialize" not in str(error) or cause is None:
+            raise RuntimeError(_KILLED) from error
+        last = str(cause).strip(' \n"').splitlines()[-1]
+        raise RuntimeError(_UNREADABLE.format(cause=last)) from error
     except MemoryError as error:
         raise MemoryError(
             f"The work takes more memory than there is ({error}). Take fewer `n_jobs`, "
