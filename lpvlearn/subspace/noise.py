@@ -260,7 +260,7 @@ def autoregression(
 
 @lru_cache(maxsize=8)
 def taper(n_samples: int) -> Array:
-    """Weights of the samples of an experiment, (n_samples, 1)."""
+    """Weights of the samples of an experiment, (n_samples, 1), not to be changed."""
     weights: Array = scipy.signal.windows.tukey(n_samples + 2, _TAPERED)[1:-1, None]
     return weights
 

@@ -59,7 +59,7 @@ from .statistics import Evidence
 
 Array = NDArray[np.float64]
 
-_HORIZON_RATIO = 1.5  # between horizons tried: the error changes little within it
+_HORIZON_RATIO = 2.0  # between horizons tried: the error changes little within it
 
 # Height of the Hankel matrix up to which horizons are tried: the cost of compression
 # grows with its third power.
@@ -535,7 +535,7 @@ def _horizon_grid(lowest: int, highest: int) -> list[int]:
     """Horizons to try, in a geometric progression that ends at the highest.
 
     >>> _horizon_grid(4, 30)
-    [4, 6, 9, 13, 20, 30]
+    [4, 8, 15, 30]
     """
     grid = [highest]
     while grid[-1] / _HORIZON_RATIO >= lowest + 0.5:
@@ -591,7 +591,13 @@ def _try_orders(
 
     A `pilot` that is better yet, a model of the records themselves, tells that they do.
     """
-    orders, limit, n_pilot = wanted.orders, np.inf, 0
+    orders, limit, n_pilot, free = wanted.orders, np.inf, 0, settings.free
+    # Least variance of what a model leaves: no start has to leave less.
+    n_values, variance = sum(record.n_values for record in records), 0.0
+
+    def left(order: int) -> int:
+        return max(n_values - _n_parameters(order, records, free), 1)
+
     if not whitening.is_none:
         records = whitening.records(records, settings.free)
         wanted = wanted._replace(spaces=_weighted(wanted, whitening), starts={})
@@ -599,12 +605,14 @@ def _try_orders(
         model = with_initial_states(whitening.model(pilot), records, settings.free)
         limit = criterion_of(model, records, settings.free, settings.repeated)
         n_pilot = len(model.A)
+        variance = model.loss / left(n_pilot)
     tried: list[_Tried] = []
     best, stale = np.inf, 0
     energy = output_energy(records)
     slow_starts = SlowStarts(records, orders[-1], settings)
     for order in orders:
-        starts = _starts(wanted, order, records, settings)
+        enough = _LOSS_SLACK[True] * variance * left(order)
+        starts = _starts(wanted, order, records, settings, enough)
         if not starts:
             break
         slow = slow_starts.best(order) if wanted.slow else None
@@ -615,6 +623,7 @@ def _try_orders(
             other = _with_more_states(below, records, settings)
             if other is not None and other.loss < model.loss:
                 model = other
+        variance = min(variance, model.loss / left(order))
         criterion = criterion_of(model, records, settings.free, settings.repeated)
         horizon = _best_horizon(starts, refine=True)
         candidate = Candidate(model, horizon, whitening, True)
@@ -667,11 +676,9 @@ def criterion_of(
     they are no noise of a memory, and tell as much as the others do alone. States may
     follow them in every part of a record whose inputs repeat themselves.
     """
-    n, (ny, m) = len(model.A), free.direct.shape
+    ny = len(model.C)
     n_values = sum(record.n_values for record in records)
-    n_samples = n_values // ny
-    own = len(model.initial_states) * free.n_own(n)
-    n_parameters = n * (m + ny) + int(free.direct.sum()) + own
+    n_samples, n_parameters = n_values // ny, _n_parameters(len(model.A), records, free)
     few = n_values / max(n_values - n_parameters, 1)
     if not np.isfinite(model.loss):
         return np.inf
@@ -690,6 +697,13 @@ def criterion_of(
         variance = max(variance, _EXACT * power) or 1.0
         misfit += told[i] * n_samples * np.log(variance) + PRICE * n_lags
     return float(misfit)
+
+
+def _n_parameters(order: int, records: Sequence[Record], free: Freedom) -> int:
+    """Of a model of that order, and unknowns of the records of their own."""
+    ny, m = free.direct.shape
+    own = len(records) * free.n_own(order)
+    return order * (m + ny) + int(free.direct.sum()) + own
 
 
 def _innovations(
@@ -759,9 +773,16 @@ def _with_more_states(
 
 
 def _starts(
-    wanted: _Range, order: int, records: Sequence[Record], settings: Settings
+    wanted: _Range,
+    order: int,
+    records: Sequence[Record],
+    settings: Settings,
+    enough: float = -np.inf,
 ) -> dict[int, Realization]:
-    """Model of an order, before refinement, from every horizon that can show it."""
+    """Model of an order, before refinement, from every horizon that can show it.
+
+    Up to the first one whose loss is `enough`.
+    """
     starts: dict[int, Realization] = {}
     for horizon, space in _look_up(wanted, wanted.orders[0], records, settings).items():
         if order <= settings.max_order(horizon):
@@ -772,6 +793,8 @@ def _starts(
                 found = realize(space, records, order, settings)
                 wanted.starts[order, horizon] = found
             starts[horizon] = wanted.starts[order, horizon]
+            if starts[horizon].loss <= enough:
+                break
     return starts
 
 

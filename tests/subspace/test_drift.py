@@ -82,16 +82,22 @@ class TestOfLevels:
 
 
 class TestDriftingOutputs:
-    @pytest.mark.parametrize("order", ["auto", 2])
-    def test_no_slow_state_follows_the_drift(self, order):
-        fits, deviations = [], []
+    @pytest.mark.parametrize(("order", "most_told"), [("auto", 1), (2, 0)])
+    def test_no_slow_state_follows_the_drift(self, order, most_told):
+        """Or it is told."""
+        fits, deviations, told = [], [], 0
         for seed in range(5):
-            model = _quiet_fit(*_record(seed), order=order)
+            try:
+                model = _quiet_fit(*_record(seed), order=order)
+            except UserWarning:
+                told += 1
+                continue
             std = np.abs(model.frequency_response_std([1e-6])).item()
             error = (model.lti_.dc_gain() - _plant().dc_gain()).item()
             deviations.append(abs(error) / std)
             fits.append(_fresh_bft(model))
             assert (np.abs(1.0 - model.lti_.poles()) * 1_000 > 5.0).all()
+        assert told <= most_told
         assert np.median(fits) > 85.0
         assert min(fits) > 50.0
         assert np.median(deviations) < 1.5
