@@ -10,8 +10,8 @@ import sys
 import tempfile
 import time
 from functools import partial
-from multiprocessing.connection import Connection
 from importlib import import_module
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np

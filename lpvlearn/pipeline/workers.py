@@ -97,7 +97,7 @@ def _guarded(results: Iterator[Any]) -> Iterator[Any]:
         yield from results
     except BrokenProcessPool as error:
         cause = error.__cause__  # the traceback of a worker that lives, its last line
-        if "un-serialize" not in str(error) or cause is None:
+        if "task has failed to un-serialize" not in str(error) or cause is None:
             raise RuntimeError(_KILLED) from error
         last = str(cause).strip(' \n"').splitlines()[-1]
         raise RuntimeError(_UNREADABLE.format(cause=last)) from error
