@@ -314,18 +314,18 @@ def stays_put(signals: Sequence[Array]) -> list[list[tuple[int, int]]]:
     ]
     value = np.concatenate([y[k[:-1]] for y, k in zip(signals, edges, strict=True)])
     length = np.concatenate([np.diff(k) for k in edges])
-    limits = value.min(), value.max()
-    others = length[~np.isin(value, limits)]
+    low, high = value.min(), value.max()
+    others = length[(low < value) & (value < high)]
     if others.sum() < _OTHERS * length.sum():
         return [[] for _ in signals]
     changes = np.count_nonzero(length == 1) > _CHANGES * length.sum()
     longest = 1 if changes else others.max(initial=1)
     least = max(_STAYS, _LONGER * longest + 1)
-    return [
-        [
-            (int(start), int(stop))
-            for start, stop in pairwise(k)
-            if stop - start >= least and (changes or y[start] in limits)
-        ]
-        for y, k in zip(signals, edges, strict=True)
-    ]
+    parts = []
+    for y, k in zip(signals, edges, strict=True):
+        long = np.diff(k) >= least
+        if not changes:
+            long &= (y[k[:-1]] == low) | (y[k[:-1]] == high)
+        start, stop = k[:-1][long].tolist(), k[1:][long].tolist()
+        parts.append(list(zip(start, stop, strict=True)))
+    return parts

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..exceptions import Told, collected, warn
 from ..systems.threads import one_blas_thread
 from .memory import Remembered
-from .workers import ALL_BUT_ONE, QUEUED, results_of
+from .workers import results_of
 
 Array = NDArray[np.float64]
 
@@ -57,18 +57,10 @@ class PointRunner:
         A failure names the point (by `kappa`), unless another one fails in the same
         words: the cause is an option then.
         """
-        return self._start(QUEUED, what, function, arguments, kappa, known, **shared)()
+        return self.start(what, function, arguments, kappa, known, **shared)()
 
-    def start(self, *args: Any, **shared: Any) -> Callable[[], list[Done | None]]:
-        """As `run`, whose results a call of what is returned waits for.
-
-        Other processes are at work in the meantime, one of `n_jobs` is this one.
-        """
-        return self._start(ALL_BUT_ONE, *args, **shared)
-
-    def _start(
+    def start(
         self,
-        sent: str,
         what: str,
         function: Callable[..., Any],
         arguments: Sequence[tuple[Any, ...]],
@@ -76,6 +68,10 @@ class PointRunner:
         known: Sequence[Done | None] = (),
         **shared: Any,
     ) -> Callable[[], list[Done | None]]:
+        """As `run`, whose results a call of what is returned waits for.
+
+        Other processes are at work in the meantime.
+        """
         kept = self._remembered(function)
         stop = self.on_error == "raise"
         known = known or [None] * len(arguments)
@@ -84,7 +80,7 @@ class PointRunner:
             for k, args in enumerate(arguments)
             if known[k] is None
         )
-        new = results_of(tasks, self.n_jobs, sent)
+        new = results_of(tasks, self.n_jobs)
         results = (next(new) if done is None else done for done in known)
 
         def again(k: int) -> Any:

@@ -21,10 +21,6 @@ from ..systems.worker import WATCH, end_with_parent
 # A call as `joblib.delayed` writes it down: function, arguments, keywords.
 Task = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
 
-# Tasks that processes have at a time, done or waiting: their next ones as well, or all
-# but one process, whose core is left to the one that sends them.
-QUEUED, ALL_BUT_ONE = "2 * n_jobs", "n_jobs - 1"
-
 _KILLED = (
     "A worker process was killed before its work was done, most often for want of "
     "memory. Take fewer `n_jobs` (each holds its own copy of what it works on), or "
@@ -38,18 +34,16 @@ _UNREADABLE = (
 )
 
 
-def results_of(
-    tasks: Iterable[Task], n_jobs: int | None, sent: str = QUEUED
-) -> Iterator[Any]:
+def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
     """Results of tasks in their order, as they come, from `n_jobs` processes.
 
     All at once where the backend of joblib cannot send them one by one, as Ray's.
-    These are at work from now on, and have `sent` tasks at a time. Raises a
-    RuntimeError where one of them is killed from outside.
+    These are at work from now on. Raises a RuntimeError where one of them is killed
+    from outside.
     """
     backend, _ = get_active_backend()
     as_they_come = "generator" if backend.supports_return_generator else "list"
-    parallel = Parallel(n_jobs=n_jobs, return_as=as_they_come, pre_dispatch=sent)
+    parallel = Parallel(n_jobs=n_jobs, return_as=as_they_come)
     return _guarded(iter(parallel(_watched(tasks))))
 
 
