@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from ..data.experiments import Experiment
 from ..data.preparation import (
@@ -229,7 +229,7 @@ def first_answers(pairs: Pairs, longest: int) -> Delay:
         left = np.maximum(left, least) / error
         count = np.arange(1, longest + 2)[:, None]
         F = np.cumsum(explained, axis=0) / count / left
-        certain = (stats.f.sf(F, count, error) < _CHANCE / (longest + 1)).any(axis=1)
+        certain = (special.fdtrc(count, error, F) < _CHANCE / (longest + 1)).any(axis=1)
         if certain.any():
             found[j] = np.argmax(certain)
     return found
@@ -402,7 +402,7 @@ class _Trial:
         certain = gain < -_WORSE
         if d == 1:
             dof = n_parameters(more) - n_parameters(size)
-            certain = gain < (stats.chi2.isf(_BY_CHANCE, dof) if dof else -_WORSE)
+            certain = gain < (special.chdtri(dof, _BY_CHANCE) if dof else -_WORSE)
             certain &= self.loss(at(0), same, j) > _CLEARLY * loss
         if not certain:
             return 0

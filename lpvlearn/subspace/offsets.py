@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from ..data.preparation import Pairs
 from ..systems.least_squares import column_scale
@@ -365,4 +365,4 @@ def _tail(score: Array, effect: Array, density: Array, n_error: float) -> float:
     inverse = np.linalg.pinv(covariance / scale[:, None] / scale, hermitian=True)
     statistic = float((score / scale) @ inverse @ (score / scale))
     q = len(score)
-    return float(stats.f.sf(statistic / q, q, n_error)) if n_error >= 1.0 else 1.0
+    return float(special.fdtrc(q, n_error, statistic / q)) if n_error >= 1.0 else 1.0

@@ -37,7 +37,7 @@ import numpy as np
 import pandas as pd
 import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from ..data.preparation import DETRENDS, remove_trends
 from ..exceptions import warn
@@ -384,7 +384,7 @@ def whiteness_tests(
     dof = max(1, int(seen.sum()) - n_fitted)
     statistics = n * (n + 2) * np.sum(r[seen] ** 2 / counts[seen, None], axis=0)
     return [
-        ResidualTest(float(q), dof, float(stats.chi2.sf(q, dof))) for q in statistics
+        ResidualTest(float(q), dof, float(special.chdtrc(dof, q))) for q in statistics
     ]
 
 
@@ -600,7 +600,7 @@ def f_test(added: Array, target: Array, dof: int) -> ResidualTest:
         return ResidualTest(0.0, q, 1.0)
     loss = max(float(left @ left), np.finfo(float).tiny)
     statistic = float(explained @ explained) / loss * error
-    return ResidualTest(statistic, q, float(stats.f.sf(statistic / q, q, error)))
+    return ResidualTest(statistic, q, float(special.fdtrc(q, error, statistic / q)))
 
 
 def of_size_one(columns: Array) -> Array:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from ..systems.least_squares import scaled_lstsq
 from .hankel import hankel_factor, without_trend
@@ -412,7 +412,7 @@ def _wilks(y: Array, known: Array, dof: int) -> _Correlated:
     explained = own @ known
     left = (1.0 + _EXACT) * np.eye(len(own)) - explained @ explained.T
     statistic = -(dof + 0.5 * (q - ny - 1)) * np.linalg.slogdet(left)[1]
-    p_value = float(stats.chi2.sf(max(statistic, 0.0), ny * q))
+    p_value = float(special.chdtrc(ny * q, max(statistic, 0.0)))
     unexplained = 1.0 - np.sum((y @ known) ** 2, axis=1) / np.sum(y**2, axis=1)
     share = 1.0 - unexplained * (dof + q) / dof
     return _Correlated(p_value, max(0.0, float(share.max())))
