@@ -23,7 +23,7 @@ from .realization import (
     observability_subspace,
     reflect_unstable,
 )
-from .refinement import refine_simulation
+from .refinement import ROUNDING, refine_simulation
 from .signals import (
     Record,
     SharedSignals,
@@ -270,7 +270,8 @@ def realize(
     n_values = sum(record.y.size for record in records)
     n_parameters = order * (len(records[0].u) + len(C) + len(records))
     limit = max(STABLE_LOSS, 1.0 + _BY_CHANCE * n_parameters / n_values)
-    return as_found if as_found.loss * limit < stable.loss else stable
+    rounding = ROUNDING * output_energy(records)  # which poles without effect follow
+    return as_found if as_found.loss * limit + rounding < stable.loss else stable
 
 
 class Fitted(NamedTuple):

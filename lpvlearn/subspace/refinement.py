@@ -41,7 +41,7 @@ _NEGLIGIBLE = 1e-2
 # squared) of the prediction.
 _MISS_WEIGHT, _LEAST_LEFT = 4.0, 2.5e-3
 
-_ROUNDING = 1e-22  # share of the outputs' energy below which the error is rounding
+ROUNDING = 1e-22  # share of the outputs' energy below which the error is rounding
 _STABLE_RADIUS = 1.0 - 1e-8  # of the circle that steps keep all poles in, once they are
 
 # Damping of the steps tried in turn, relative to the largest squared singular value:
@@ -83,7 +83,7 @@ def refine_simulation(
     dampings = _FINE_DAMPINGS if patient else _DAMPINGS
     level = 0  # of the damping: a valley is not left at the next step
     for _ in range(max_iter or (_MANY if patient else _MAX_ITER)):
-        if model.loss <= _ROUNDING * energy or model.blocks is None:
+        if model.loss <= ROUNDING * energy or model.blocks is None:
             return model
         regression = linearised(
             model, records, free, keep_one=True, signals=None if fitted else signals

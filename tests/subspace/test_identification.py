@@ -116,6 +116,16 @@ def test_truly_unstable_system_is_kept_unless_stability_is_enforced(rng):
     assert np.abs(np.linalg.eigvals(stable.A)).max() < 1.0
 
 
+def test_states_that_exact_samples_do_not_have_are_stable():
+    """An unstable pole may take the last bits of samples; it would blow up others."""
+    for rng in map(np.random.default_rng, range(30)):
+        system = example(rng, modes(0.988 * np.exp(0.04j)), 1, 1)
+        u = np.sign(rng.standard_normal((20, 1))).repeat(20, 0)
+        found = identify([(u, lti_response(*system, u, np.zeros(2)))], 6, 8)
+        assert found.residual < 1e-9
+        assert np.abs(np.linalg.eigvals(found.A)).max() < 1.0
+
+
 def test_limits_count_columns_rows_and_instruments():
     for lengths in ([100], [30, 40, 50]):
         h = Settings(freedom(1, 2)).max_horizon(lengths)
