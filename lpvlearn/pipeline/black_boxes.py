@@ -64,9 +64,10 @@ def aligned_black_boxes(
     theta, mended = _foretold(models, own, fewer, kappa)
     tell_of_forced(local, kappa, mended)
     direct = _has_feedthrough(models)
-    structure = _full(models[0], direct)
+    first = next(model for k, model in enumerate(models) if k not in mended)
+    structure = _full(first, direct)
     rows = [_scaled(structure.model(row), 1.0 / u, 1.0 / y) for row in theta]
-    whole = _full(models[0], direct, local[0].integrating)
+    whole = _full(first, direct, local[0].integrating)
     return whole, _entries(rows, direct)
 
 
@@ -273,7 +274,7 @@ def _of_one_order(models: Sequence[StateSpace]) -> Sequence[StateSpace]:
         raise ValueError(
             "`local` must give models of one order, whose matrices are interpolated "
             f"without a structure. Got orders {orders} of what inputs move and outputs "
-            f"show. Ask for the least: local=SubspaceLTI(order={orders[0]})."
+            "show. Ask for the one that the system has: local=SubspaceLTI(order=...)."
         )
     return models
 

@@ -499,6 +499,9 @@ def _without_shifts(
     if not any(shifts):
         return pairs, whole
     parts = cut_at(pairs, shifts)
+    rests = np.all([np.ptp(u, axis=0) == 0.0 for u, _ in parts], axis=0)
+    if rests.any():  # an input tells nothing of any part: its step made the shift
+        return pairs, whole
     try:
         fitted = _fit(parts, choices, told, 1, whole)
     except TooFewSamples:

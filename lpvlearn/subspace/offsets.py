@@ -71,6 +71,7 @@ _EXPLAINED = 1e-6
 
 _RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refinement`
 _ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
+_BEYOND = 100.0  # times the largest output: a constant that is none
 _FAR = 3.0  # standard deviations between the mean of a channel and zero
 _SLOW = 3.0  # time constants per experiment of a mode that may stand for a constant
 
@@ -186,11 +187,15 @@ def _is_far(records: Sequence[Record]) -> bool:
 
 
 def _stays_far(records: Sequence[Record]) -> bool:
-    """Whether outputs, where these are far from zero, begin far from it as well."""
-    level, motion = _levels([r.y for r in records])
-    far = np.abs(level) > _FAR * motion
-    begins = np.min([np.abs(r.y[:, 0]) for r in records], axis=0)
-    return _is_far(records) and bool((begins > 0.5 * np.abs(level))[far].all())
+    """Whether channels are far from zero, and all of these begin far from it as well.
+
+    A step from rest soon is far, and tells by how it begins that there is no constant.
+    """
+    both = [np.vstack((r.u, r.y)) for r in records]
+    level, motion = _levels(both)
+    far = level > _FAR * motion
+    begins = np.min([np.abs(part[:, 0]) for part in both], axis=0)
+    return bool(far.any() and (begins > 0.5 * level)[far].all())
 
 
 def follows_means_alone(evidence: Evidence) -> bool:
@@ -238,10 +243,17 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     zero, or the criterion says that the model with them is a poor one: the other is one
     with zeros. They are kept where they halve the squared errors of as few states:
     these follow the means else, and leave to the noise how outputs move.
+
+    A constant far beyond the outputs stands for a drift, together with the initial
+    state of a mode that does not decay over the record. Rounding tells nothing.
     """
+    if _is_beyond(other):
+        return False
     better = criterion_in_units(without) - criterion_in_units(other)
     if better > 0.0 and len(other.model.A) < len(without.model.A):
         return True
+    if motion_left(without) < _ROUNDING**2:
+        return False
     far = _stays_far(without.records)
     few = len(other.model.A) <= min(len(without.model.A), _FEW_STATES)
     decays = spectral_radius(other.model.A) <= 1.0
@@ -254,6 +266,13 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         return True
     chance = chance_of_constants(other)
     return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > CERTAIN))
+
+
+def _is_beyond(evidence: Evidence) -> bool:
+    """Whether constants are far beyond anything that the outputs reach."""
+    trends = evidence.model.trends
+    reached = np.max([np.abs(r.y).max(axis=1) for r in evidence.records], axis=0)
+    return bool((np.abs(trends) > _BEYOND * reached).any())
 
 
 def shifts_matter(whole: Evidence, parts: Evidence) -> bool:
@@ -360,7 +379,7 @@ def _squares(x: Array) -> float:
 def _tail(score: Array, effect: Array, density: Array, n_error: float) -> float:
     """Chance of such a score, by the F distribution."""
     covariance = np.einsum("eikp,ij,ejkq->pq", effect, density, effect, optimize=True)
-    scale = np.sqrt(np.diagonal(covariance))
+    scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     scale = np.where(scale > 0, scale, 1.0)  # zero of outputs that are one signal
     inverse = np.linalg.pinv(covariance / scale[:, None] / scale, hermitian=True)
     statistic = float((score / scale) @ inverse @ (score / scale))

@@ -287,14 +287,21 @@ class Evidence:
         radius = float(np.abs(np.linalg.eigvals(self.model.A)).max(initial=0.0))
         longest = max(record.u.shape[1] for record in self.records)
         known = self.refined and self.sections.blocks is not None
-        if not known or radius >= 1.0 - 1.0 / longest or not len(self.model.A):
+        known &= bool(len(self.model.A)) and self.basis.shape[1] > 0
+        if not known or radius >= 1.0 - 1.0 / longest:
             return None
         lti = self.state_space(self.model, 1.0)
         response = lti.frequency_response(np.linspace(0.0, np.pi, _N_FREQUENCIES))
         std = self.frequency_response_std(np.zeros(1))[0].real
-        power = np.mean(np.abs(response * self.input_scale) ** 2, axis=0)
-        size = np.sqrt(power.sum(axis=1, keepdims=True)) / self.input_scale
+        moved = self._input_sizes()
+        power = np.mean(np.abs(response * moved) ** 2, axis=0)
+        size = np.sqrt(power.sum(axis=1, keepdims=True)) / moved
         return StaticGain(response[0].real, std, size)
+
+    def _input_sizes(self) -> Array:
+        """How far the inputs move, collinear ones as well."""
+        of_independent = np.linalg.pinv(self.basis).T
+        return np.asarray(np.sqrt(of_independent**2 @ self.input_scale**2))
 
     def unknown_share(self, size: Array) -> tuple[float, float]:
         """Standard deviation of the response over all frequencies by its `size`.

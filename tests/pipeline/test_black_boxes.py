@@ -13,6 +13,7 @@ from lpvlearn import (
     SubspaceLTI,
     from_trajectories,
 )
+from lpvlearn.datasets import prbs
 from lpvlearn.lpv.alignment import aligned_models
 from lpvlearn.pipeline.black_boxes import (
     _entries,
@@ -187,3 +188,23 @@ def test_points_of_which_more_states_make_another_model_are_named():
         tell_of_forced(points[:2], kappa[:2])
         tell_of_forced([replace(points[2], own=None)], kappa[2:])
         tell_of_forced(points, kappa, mended=[2])
+
+
+@pytest.mark.parametrize("vanishes", [0, 1, 2])
+def test_a_mode_that_exact_records_do_not_have_at_a_point_is_foreseen(vanishes):
+    def plant(z):
+        return StateSpace(np.diag([-2.0, -8.0]), [[1.0], [1.0]], [[1.0, 2.0 * z]])
+
+    places = 0.5 * (np.arange(3) - vanishes)
+    inputs = [prbs(500, clock=5, random_state=i) for i in range(3)]
+    runs = [
+        (u, z, plant(z).simulate(u, sampling_time=0.03))
+        for u, z in zip(inputs, places, strict=True)
+    ]
+    X, y = from_trajectories(runs, sampling_time=0.03)
+    roles = {"scheduling": "kappa", "experiment": "experiment", "time": "time"}
+    with pytest.warns(UserWarning, match="does not tell all states"):
+        lpv = LocalLPVPipeline(**roles).fit(X, y).lpv_
+    for z in np.linspace(places[0], places[-1], 5):
+        true = plant(z)
+        assert (lpv.at(z) - true).hinf_norm() < 0.03 * true.hinf_norm()

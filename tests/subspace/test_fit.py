@@ -487,6 +487,16 @@ def test_an_order_that_the_likelihood_disputes_is_told(rng):
         assert [str(w.message)[:14] for w in told] == ["Parts held out"] * (excess > 30)
 
 
+def test_some_of_several_inputs_may_be_collinear(rng):
+    a, b = rng.standard_normal((2, 500))
+    y = StateSpace(0.8, [[1.0, 2.0]], 1, None, 1.0).simulate(np.column_stack([a, b]))
+    for third in (a + b, b, -b):
+        u = np.column_stack([a, b, third])
+        with pytest.warns(RankWarning, match=r"3 inputs are collinear \(rank 2\)"):
+            model = SubspaceLTI(sampling_time=1.0).fit(u, y)
+        assert model.score(u, y) > 1.0 - 1e-6
+
+
 @pytest.mark.parametrize("gains", [(1.0, -1.0), (1.0, 1.0)])
 def test_experiments_that_contradict_one_another_are_told(gains):
     """A sensor that changes its sign; equal ones, as noisy, are silent."""

@@ -522,6 +522,41 @@ def test_too_few_states_do_not_follow_the_level(seed):
         assert any("nothing of how they move" in str(w.message) for w in told)
 
 
+def test_a_step_from_rest_tells_that_there_is_no_constant():
+    """The input is far from zero nearly all the time, and began at it."""
+    u = (np.arange(500) >= 20).astype(float)[:, None]
+    for rng in map(np.random.default_rng, range(12)):
+        y = lfilter([0.0, 0.01], [1.0, -0.99], u, axis=0)
+        y += 0.003 * rng.standard_normal(y.shape)
+        model = SubspaceLTI().fit(u, y)
+        assert model.offset_ is None
+        assert model.score(u, y) > 0.95
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of the integrator
+def test_a_constant_and_an_integrator_do_not_stand_for_a_drift():
+    """An offset of the input behind an integrator is a ramp of the output."""
+    for rng in map(np.random.default_rng, range(4)):
+        u = np.repeat(np.sign(rng.standard_normal((200, 1))), 5, axis=0)
+        y = lfilter([0.0, 0.01], [1.0, -1.0], u, axis=0)
+        y += 1e-3 * y.std() * rng.standard_normal(y.shape)
+        model = SubspaceLTI().fit(u + 0.5, y)
+        assert np.abs(model.output_offset_).max() < 10.0 * np.abs(y).max()
+        assert np.abs(model.predict(u + 0.5)).max() < 20.0 * np.abs(y).max()
+
+
+@pytest.mark.parametrize("order", ["auto", 2])
+def test_a_step_is_no_shift_of_the_output(order):
+    """Of parts about it every one has an input that rests."""
+    p, q = np.exp([-0.01 * 2.0236432494005134, -0.01 * 14.554173266933418])
+    u = (np.arange(500) >= 50).astype(float)[:, None]
+    y = (1.0 - p) / 2.0236 * lfilter([0.0, 1.0], [1.0, -p], u, axis=0)
+    y += 0.459487 * (1.0 - q) / 14.554 * lfilter([0.0, 1.0], [1.0, -q], u, axis=0)
+    model = SubspaceLTI(order).fit(u, y)
+    assert model.offset_ is None
+    np.testing.assert_allclose(np.sort(model.lti_.poles()), [q, p], atol=1e-6)
+
+
 def test_signals_without_any_noise_tell_of_no_constants():
     """Two outputs that are one signal leave a direction without errors."""
     nothing = np.zeros((1, 2, 3, 1))
