@@ -72,6 +72,7 @@ _EXPLAINED = 1e-6
 _RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refinement`
 _ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
 _BEYOND = 100.0  # times the largest output: a constant that is none
+_LASTING = 0.1  # decay of a mode over a record, of one that may be a constant
 _FAR = 3.0  # standard deviations between the mean of a channel and zero
 _SLOW = 3.0  # time constants per experiment of a mode that may stand for a constant
 
@@ -244,6 +245,10 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     with zeros. They are kept where they halve the squared errors of as few states:
     these follow the means else, and leave to the noise how outputs move.
 
+    Of a given order one state may stand for the constants of all experiments, by its
+    initial values: it does not decay. The criterion does not mind that, until some
+    other mode is missing: such a state is to go where the test tells of constants.
+
     A constant far beyond the outputs stands for a drift, together with the initial
     state of a mode that does not decay over the record. Rounding tells nothing.
     """
@@ -260,12 +265,20 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     if far and few and decays:
         if motion_left(other) < _MOSTLY * motion_left(without):
             return True
-    if not better > (-CERTAIN if far else 0.0):
+    replaced = _lasts(without) and not _lasts(other)
+    if not better > (-CERTAIN if far or replaced else 0.0):
         return False
     if far and better > _BEYOND_DOUBT:
         return True
     chance = chance_of_constants(other)
     return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > CERTAIN))
+
+
+def _lasts(evidence: Evidence) -> bool:
+    """Whether a mode stays what it is over the longest record."""
+    longest = max(record.u.shape[1] for record in evidence.records)
+    distance = np.abs(1.0 - np.linalg.eigvals(evidence.model.A)).min(initial=np.inf)
+    return bool(distance * longest < _LASTING)
 
 
 def _is_beyond(evidence: Evidence) -> bool:

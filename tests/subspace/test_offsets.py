@@ -16,6 +16,8 @@ from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import Freedom, _general_regression, block_fit
 from lpvlearn.systems.simulation import lti_response, trend_signals
 
+from ..benchmarks.offsets import random_system, relative_error
+from ..benchmarks.offsets import table as offsets_table
 from ..conftest import modes
 from .conftest import fed, record
 
@@ -543,6 +545,16 @@ def test_a_constant_and_an_integrator_do_not_stand_for_a_drift():
         model = SubspaceLTI().fit(u + 0.5, y)
         assert np.abs(model.output_offset_).max() < 10.0 * np.abs(y).max()
         assert np.abs(model.predict(u + 0.5)).max() < 20.0 * np.abs(y).max()
+
+
+def test_a_given_order_has_no_state_that_stands_for_the_constants():
+    """Its initial values may be those of a state that does not decay."""
+    for rng in map(np.random.default_rng, range(6)):
+        system = random_system(rng, rng.uniform(1.0, 60.0))
+        model = SubspaceLTI(3, horizon=10, experiment="run")
+        model.fit(*offsets_table(rng, system, 10.0))
+        assert model.offset_ == "constant"
+        assert relative_error(model, system) < 0.07  # .11 to .15 without constants
 
 
 @pytest.mark.parametrize("order", ["auto", 2])
