@@ -255,8 +255,9 @@ class SubspaceLTI(
     input_delay_ : ndarray of shape (n_inputs,)
         Samples, as found or given; also that of `lti_`.
     selection_ : DataFrame
-        What was tried: columns order, horizon, error (relative, whitened, before
-        refinement), criterion (per value, above the best; NaN for horizons that
+        What was tried, of every order no horizon beyond one that leaves the noise
+        alone: columns order, horizon, error (relative, whitened, before refinement),
+        criterion (per value, above the best; NaN for horizons that
         lost within their order), validation_bft (percent, on parts held out; NaN
         where that was not looked at), chosen. Of "pbsid" orders are those of plant and
         noise together, error that of the regression on their states.
