@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
-from .identification import ScaledRecords
+from .identification import ScaledRecords, mode_rates
 from .local_fit import LocalFit
 from .noise import Whitening
 from .offsets import CERTAIN, criterion_in_units, motion_left
@@ -54,7 +54,7 @@ def differences(pairs: Pairs) -> Pairs:
 
 def outlasts(fitted: LocalFit) -> bool:
     """Whether a mode does not decay over the longest experiment, or grows."""
-    slow = (_rates(fitted.model.A) * _longest(fitted.evidence) < _LASTS).any()
+    slow = (mode_rates(fitted.model.A) * fitted.evidence.longest < _LASTS).any()
     return bool(slow) or fitted.grows()
 
 
@@ -67,8 +67,8 @@ def may_drift(fitted: LocalFit) -> bool:
     shortest = min(record.u.shape[1] for record in evidence.records)
     if shortest < _FEWEST or motion_left(evidence) < _EXPLAINED**2:
         return False
-    rates = _rates(evidence.noise.A)
-    slow = rates * _longest(evidence) < _SLOW
+    rates = mode_rates(evidence.noise.A)
+    slow = rates * evidence.longest < _SLOW
     return bool(slow.any()) or (len(rates) > 0 and outlasts(fitted))
 
 
@@ -102,7 +102,7 @@ def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
 
 def wanders(evidence: Evidence) -> bool:
     """Whether noise beside which there may be more is as slow as drift."""
-    rates = _rates(evidence.noise.A) * _longest(evidence)
+    rates = mode_rates(evidence.noise.A) * evidence.longest
     return bool((rates < _SLOW_BESIDE).any())
 
 
@@ -118,18 +118,9 @@ def drifts(whole: LocalFit, other: LocalFit, doubt: float = 0.0) -> bool:
     better -= criterion_in_units(other.evidence)
     if not wanders(other.evidence):
         return better > CERTAIN
-    n_samples = _longest(whole.evidence)
+    n_samples = whole.evidence.longest
     # modes of the samples that are far slower than those of their differences
-    rates, slowest = _rates(whole.model.A), _rates(other.model.A).min(initial=1.0)
+    rates = mode_rates(whole.model.A)
+    slowest = mode_rates(other.model.A).min(initial=1.0)
     n_followed = int((rates < min(_FOLLOWS / n_samples, _FAR * slowest)).sum())
     return better > -PRICE - CERTAIN * n_followed
-
-
-def _longest(evidence: Evidence) -> int:
-    """Samples of the longest experiment."""
-    return max(record.u.shape[1] for record in evidence.records)
-
-
-def _rates(A: Array) -> Array:
-    """Of modes, one over the samples in which they decay, grow or turn."""
-    return np.abs(1.0 - np.linalg.eigvals(A))

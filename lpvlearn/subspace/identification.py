@@ -477,6 +477,11 @@ def validate(
     )
 
 
+def mode_rates(A: Array) -> Array:
+    """Of modes, one over the samples in which they decay, grow or turn."""
+    return np.abs(1.0 - np.linalg.eigvals(A))
+
+
 def spectral_radius(A: Array) -> float:
     """Modulus of the farthest eigenvalue."""
     return float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))

@@ -277,20 +277,16 @@ def _log_determinant(covariance: Array) -> tuple[float, float]:
 def _scalar_regressions(lags: Array) -> Iterator[tuple[Array, Array]]:
     """As `_regressions` of one channel, whose predictions back mirror those forth."""
     r = lags[:, 0, 0]
-    backward = r[::-1].copy()
-    variance = float(r[0])
-    forth = np.zeros((1, 0))
-    yield forth, np.array([[variance]])
+    forth, variance = np.zeros(0), float(r[0])
+    yield forth[None], np.array([[variance]])
     for p in range(len(r) - 1):
         if variance == 0.0:  # nothing is left to explain
             return
-        last, forth = forth[0], np.empty((1, p + 1))
-        new = float(r[p + 1] - last @ backward[len(r) - 1 - p : -1])
-        forth[0, p] = gain = new / variance
-        np.multiply(last[::-1], -gain, out=forth[0, :p])
-        forth[0, :p] += last
+        new = float(r[p + 1]) - float(forth @ r[p:0:-1])
+        gain = new / variance
+        forth = np.append(forth - gain * forth[::-1], gain)
         variance -= gain * new
-        yield forth, np.array([[variance]])
+        yield forth[None], np.array([[variance]])
 
 
 def _regressions(lags: Array) -> Iterator[tuple[Array, Array]]:

@@ -31,7 +31,7 @@ from scipy import linalg, special
 from ..data.preparation import Pairs
 from ..systems.least_squares import column_scale
 from ..systems.simulation import lti_response, trend_signals
-from .identification import Centres, spectral_radius
+from .identification import Centres, mode_rates, spectral_radius
 from .noise import autoregression, spectral_density
 from .selection import criterion_of
 from .signals import Record, signal_factor
@@ -134,7 +134,7 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
     outputs, constants, drifts = trends[:, 0], trends[:, 0], none
     if n_trend > 1:
         drifts = trends[:, 1] * 2.0 / np.maximum(lengths - 1, 1)[:, None]
-    distance = np.abs(1.0 - np.linalg.eigvals(model.A)).min(initial=1.0)
+    distance = mode_rates(model.A).min(initial=1.0)
     if distance * lengths.max() > 1.0 and evidence.free.initial_states:
         means = np.array([u.mean(axis=0) for u, _ in pairs])
         gain = evidence.state_space(model, 1.0).dc_gain()
@@ -205,8 +205,7 @@ def follows_means_alone(evidence: Evidence) -> bool:
     What one that grows over the record simulates tells nothing.
     """
     stays = not evidence.free.n_trend and _stays_far(evidence.records)
-    longest = max(record.u.shape[1] for record in evidence.records)
-    stays &= longest * (spectral_radius(evidence.model.A) - 1.0) < 1.0
+    stays &= evidence.longest * (spectral_radius(evidence.model.A) - 1.0) < 1.0
     return stays and motion_left(evidence) > USELESS**2
 
 
@@ -257,13 +256,14 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     better = criterion_in_units(without) - criterion_in_units(other)
     if better > 0.0 and len(other.model.A) < len(without.model.A):
         return True
-    if motion_left(without) < _ROUNDING**2:
+    left = motion_left(without)
+    if left < _ROUNDING**2:
         return False
     far = _stays_far(without.records)
     few = len(other.model.A) <= min(len(without.model.A), _FEW_STATES)
     decays = spectral_radius(other.model.A) <= 1.0
     if far and few and decays:
-        if motion_left(other) < _MOSTLY * motion_left(without):
+        if motion_left(other) < _MOSTLY * left:
             return True
     replaced = _lasts(without) and not _lasts(other)
     if not better > (-CERTAIN if far or replaced else 0.0):
@@ -276,9 +276,7 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
 
 def _lasts(evidence: Evidence) -> bool:
     """Whether a mode stays what it is over the longest record."""
-    longest = max(record.u.shape[1] for record in evidence.records)
-    distance = np.abs(1.0 - np.linalg.eigvals(evidence.model.A)).min(initial=np.inf)
-    return bool(distance * longest < _LASTING)
+    return bool((mode_rates(evidence.model.A) * evidence.longest < _LASTING).any())
 
 
 def _is_beyond(evidence: Evidence) -> bool:
@@ -316,8 +314,7 @@ def _has_slow_mode(evidence: Evidence) -> bool:
 
 
 def _is_slow(poles: NDArray[np.inexact], evidence: Evidence) -> NDArray[np.bool_]:
-    longest = max(record.u.shape[1] for record in evidence.records)
-    return (1.0 - poles.real) * longest <= _SLOW
+    return (1.0 - poles.real) * evidence.longest <= _SLOW
 
 
 def chance_of_constants(evidence: Evidence, *, equal: bool = False) -> float:

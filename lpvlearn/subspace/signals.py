@@ -270,10 +270,6 @@ def signal_factors(
     Their places, and (n_records, k, n_signals) with the Gramians of the signals; None
     where they overflow. `driven` is (n_records, order, 1 + n_inputs).
     """
-    if len(records) == 1:
-        R = signal_factor(blocks, records[0], None if driven is None else driven[0])
-        yield np.zeros(1, int), None if R is None else R[None]
-        return
     lengths = np.array([record.u.shape[1] for record in records])
     groups: list[list[int]] = []
     for i in np.argsort(lengths, kind="stable").tolist():

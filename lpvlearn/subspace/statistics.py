@@ -204,6 +204,11 @@ class Evidence:
         return in_sections(self.whitening.model(self.model))
 
     @property
+    def longest(self) -> int:
+        """Samples of the longest record."""
+        return max(record.u.shape[1] for record in self.records)
+
+    @property
     def one_step(self) -> Evidence:
         """What tells of constants: itself, or a predictor, where inputs know errors."""
         return self
@@ -285,10 +290,9 @@ class Evidence:
         A mode as slow as the longest record is an integrator to it.
         """
         radius = float(np.abs(np.linalg.eigvals(self.model.A)).max(initial=0.0))
-        longest = max(record.u.shape[1] for record in self.records)
         known = self.refined and self.sections.blocks is not None
         known &= bool(len(self.model.A)) and self.basis.shape[1] > 0
-        if not known or radius >= 1.0 - 1.0 / longest:
+        if not known or radius >= 1.0 - 1.0 / self.longest:
             return None
         lti = self.state_space(self.model, 1.0)
         response = lti.frequency_response(np.linspace(0.0, np.pi, _N_FREQUENCIES))
