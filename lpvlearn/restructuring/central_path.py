@@ -13,13 +13,13 @@ primal-dual methods of semidefinite programming have them (Conn, Gould, Orban an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .coordinates import ResponseGeometry
+from .coordinates import ResponseGeometry, View
 from .deadline import time_is_up
 from .error_system import ErrorSystem
 from .limits import Limits
@@ -50,7 +50,8 @@ _DEPTH = 0.5  # local maxima down to there join the frequencies
 _BENT = 1.5  # a step whose geodesic bends more than that is too long
 _APART = 1e3  # factor by which multipliers may differ from those of psi
 _REACH = 0.99  # part of a distance to the level that a step may take
-_CORRECTIONS = 3  # of a step, for the bend of the errors' squares
+_CORRECTIONS = 3  # of a step, for the bend of the errors' squares, ...
+_WORTH = 0.1  # ... as long as each adds that part of the decrease
 
 
 def level_of(squares: Array, mu: float) -> float:
@@ -92,6 +93,7 @@ class Quadratic:
     hessian: Array  # that of psi where Z is mu M
     geometry: ResponseGeometry  # of which y are the coordinates
     E: Complex
+    C: Complex  # with M = C C^H
     M: Complex
     Z: Complex
     both: Complex  # (Z M + M Z) / 2
@@ -111,10 +113,10 @@ class Quadratic:
 
     def reach(self, d: Array, bend: Complex) -> float:
         """Part of the step `d` that leaves some of every distance to the level."""
-        rise = self.M @ self._rise(d, bend)
+        rise = _adjoint(self.C) @ self._rise(d, bend) @ self.C
         if not np.isfinite(rise).all():
             return 1.0
-        lowest = float(np.real(np.linalg.eigvals(rise)).min())
+        lowest = float(np.linalg.eigvalsh(rise).min())
         return _REACH / max(-lowest, _REACH)
 
     def multipliers(self, d: Array, bend: Complex) -> Complex:
@@ -265,7 +267,7 @@ class Barrier:
         hessian = hessian + geometry.second_derivatives(normal)
         value = _psi(s.ravel(), tau, mu) - weight * float(np.log(-c).sum())
         local = value, gradient, hessian, geometry
-        return Quadratic(mu, *local, E, M, Z, both, tau, by_level, level_curvature)
+        return Quadratic(mu, *local, E, C, M, Z, both, tau, by_level, level_curvature)
 
     def _factor(self, C: Complex, gaps: Array, mu: float) -> Complex:
         """F with ``Z = F F^H``: the multipliers carried, within reach of ``mu M``.
@@ -296,44 +298,41 @@ def _psi(squares: Array, tau: float, mu: float) -> float:
     return float(0.5 * np.log(tau) - mu * np.log1p(-squares / tau).sum())
 
 
-@dataclass
+@dataclass(frozen=True)
 class PathPoint:
-    """Where the central path was left."""
+    """Where the central path begins, or was left."""
 
-    theta: Array  # its end, or the point of least norm met if that is much lower
-    mu: float | None  # its last value; None for a point that is not on the path yet
-    frequencies: Array  # local maxima met on the way
-    n_iter: int  # Newton steps
-    history: list[dict[str, float]]  # a row per value of mu: objective, mu, steps
+    view: View  # its end, or the point of least norm met if that is much lower
+    mu: float | None = None  # its last value; None for a point not on the path yet
+    frequencies: Array = field(default_factory=lambda: np.zeros(0))  # local maxima met
+    n_iter: int = 0  # Newton steps of the last stretch
+    history: list[dict[str, float]] = field(default_factory=list)  # a row per mu of it
+
+    @property
+    def norm(self) -> float:
+        """The norm of the error there."""
+        return self.view.system.peaks(self.view.theta).norm
 
 
 def central_path(
-    system: ErrorSystem,
-    theta: Array,
-    limits: Limits,
-    *,
-    mu_end: float,
-    max_iter: int,
-    decrement: float = 1e-1,
-    mu: float | None = None,
-    frequencies: Array | None = None,
+    start: PathPoint, *, mu_end: float, max_iter: int, decrement: float = 1.0
 ) -> PathPoint:
-    """Follow the path from `theta` to `mu_end`.
+    """Follow the path from `start` to `mu_end`.
 
-    `theta` is stable: the least-squares fit, or a point met on the path. At `mu_end`
-    the level is about ``mu_end * n_active`` (relative) above the minimum. The first
-    `mu` is by default that of a level of twice the norm; `frequencies` are local maxima
-    known already; `max_iter` counts Newton steps. A stage ends when the next one
-    may bring less than `decrement`, relative to mu: the steps that a point far from the
-    path needs are longest while mu is large.
+    It starts at a stable point: the least-squares fit, or a point met on the path. At
+    `mu_end` the level is about ``mu_end * n_active`` (relative) above the minimum. The
+    first mu is by default that of a level of twice the norm; `max_iter` counts Newton
+    steps. A stage ends when the next one may bring less than `decrement`, relative to
+    mu: the steps that a point far from the path needs are longest while mu is large.
     """
+    view = start.view
+    system, limits, theta = view.system, view.limits, view.theta
     inside = theta if limits.strict(theta) else limits.inside(theta)
     if not limits.strict(inside):  # at the margin: nothing to follow
-        return PathPoint(theta, mu, np.zeros(0), 0, [])
-    theta = inside
+        return PathPoint(view, start.mu)
+    theta, mu, seen = inside, start.mu, start.frequencies
     found = system.peaks(theta, _DEPTH)
     best, best_norm = theta, found.norm
-    seen = np.zeros(0) if frequencies is None else frequencies
     history: list[dict[str, float]] = []
     n_iter, carried = 0, None
     while n_iter < max_iter and not time_is_up():
@@ -354,7 +353,7 @@ def central_path(
         mu = max((_FAST if steps == 1 else _SHRINK) * mu, mu_end)
     if found.norm > _WORSE * best_norm:
         theta = best
-    return PathPoint(theta, mu, seen, n_iter, history)
+    return PathPoint(view.at(theta), mu, seen, n_iter, history)
 
 
 def _stage(
@@ -445,10 +444,12 @@ def _tried(
         if end is None:
             break
         value = barrier.value(end, model.mu)
-        if best is not None and not value < best.value:
+        gain = np.inf if best is None else best.value - value
+        if not gain > 0:
             break
         best = _Trial(end, value, d, bend)
-        if not np.isfinite(value) or model.value - value > _GOOD * promised:
+        done = model.value - value > _GOOD * promised or gain < _WORTH * promised
+        if done or not np.isfinite(value):
             break
         bend = model.bend(d, barrier.error)
         x = trust_region_step(spectrum, Q.T @ model.corrected(bend), radius)

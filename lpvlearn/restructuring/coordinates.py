@@ -12,8 +12,7 @@ acceleration of Transtrum and Sethna, 2012, for Newton's method).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -159,14 +158,31 @@ class ResponseGeometry:
         ``d2E_ij = L S_i Phi S_j R``, its mirror image, and what bends the structure.
         """
         q, n = len(self.S), self.n
+        k, b, a = P.shape
+        flat = np.concatenate([P.real, P.imag]).reshape(2 * k, b * a)
         Phi = np.concatenate([self.at.Phi.real, -self.at.Phi.imag])
-        mixed = np.tensordot(np.concatenate([P.real, P.imag]), Phi, axes=(0, 0))
-        mixed = mixed.transpose(1, 2, 3, 0).reshape(P.shape[2] * n, n * P.shape[1])
+        Phi = Phi.reshape(2 * k, n * n)
+        span = row_space(Phi, n)
+        mixed = flat.T @ Phi if span is None else (flat.T @ (Phi @ span)) @ span.T
+        mixed = mixed.reshape(b, a, n, n).transpose(1, 2, 3, 0).reshape(a * n, n * b)
         H = self.S[:, :, :n].reshape(q, -1) @ mixed @ self.S[:, :n].reshape(q, -1).T
         H = H + H.T
         if self._bend is not None:
             H = H + np.tensordot(self._bend, np.real(P.sum(0)).T, axes=2)
         return self.T.T @ H @ self.T
+
+
+def row_space(Phi: Array, n: int) -> Array | None:
+    """Orthonormal columns that span the rows of `Phi`, where that saves work.
+
+    The real and imaginary parts of resolvents of one matrix A of order n are
+    polynomials of A, of which n are independent.
+    """
+    k, rank = len(Phi), n + 8
+    if 4 * rank > min(Phi.shape):
+        return None
+    mixture = np.cos(np.outer(np.arange(1, rank + 1), np.arange(k)) ** 2)
+    return np.linalg.qr((mixture @ Phi).T)[0]
 
 
 class Geodesics:
@@ -344,35 +360,58 @@ class CanonicalForm:
 
 @dataclass(frozen=True)
 class View:
-    """The problem near one point, in coordinates that suit it."""
+    """A point of the problem, in coordinates that suit it.
 
-    system: ErrorSystem
-    theta: Array  # the point
+    Those are the parameters themselves, or, of a canonical form, a chart of the models
+    around one.
+    """
+
+    outer: ErrorSystem  # of the structure
+    form: CanonicalForm | None
+    system: ErrorSystem  # of the coordinates
+    theta: Array  # the point, in these
     limits: Limits
-    back: Callable[[Array], Array | None]  # to the structure's parameters, or None
 
+    @classmethod
+    def of(
+        cls,
+        system: ErrorSystem,
+        theta: Array,
+        limits: Limits,
+        form: CanonicalForm | None = None,
+    ) -> View:
+        """The parameters of the structure, around which a chart may be laid."""
+        return cls(system, form, system, theta, limits)
 
-def view_at(
-    system: ErrorSystem, theta: Array, limits: Limits, form: CanonicalForm | None
-) -> View:
-    """The parameters themselves, or a chart around the model of a canonical form."""
-    plain = View(system, theta, limits, lambda x: x)
-    if form is None:
-        return plain
-    S = form.structure.system_matrix(theta)
-    try:
-        chart = LocalChart(S, form.structure.order, form.dt, form.feedthrough)
-    except (ValueError, np.linalg.LinAlgError):
-        return plain
-    if chart.n_params != len(theta):  # the basis changes are not independent
-        return plain
-    inner = system.restructured(chart)
+    def at(self, theta: Array) -> View:
+        """Another point, in the same coordinates."""
+        return replace(self, theta=theta)
 
-    def back(z: Array) -> Array | None:
-        found = form.refined(chart.system_matrix(z), system.grid)
+    def centred(self) -> View:
+        """The same point, at zero of the chart around it where there is one."""
+        if self.form is None:
+            return self
+        order, dt = self.form.structure.order, self.form.dt
+        S = self.system.structure.system_matrix(self.theta)
+        try:
+            chart = LocalChart(S, order, dt, self.form.feedthrough)
+        except (ValueError, np.linalg.LinAlgError):
+            return self
+        if chart.n_params != len(self.theta):  # the basis changes are not independent
+            return self
+        inner = self.outer.restructured(chart)
+        limits = Limits(inner, self.limits.margin)
+        zero = np.zeros(chart.n_params)
+        return replace(self, system=inner, theta=zero, limits=limits)
+
+    def back(self) -> Array | None:
+        """The structure's parameters; None where its form has none for that model."""
+        if self.form is None or self.system is self.outer:
+            return self.theta
+        S = self.system.structure.system_matrix(self.theta)
+        found = self.form.refined(S, self.outer.grid)
         if found is None:
             return None
-        there, here = system.peaks(found).norm, inner.peaks(z).norm
+        there = self.outer.peaks(found).norm
+        here = self.system.peaks(self.theta).norm
         return found if abs(there - here) <= _SAME_NORM * here else None
-
-    return View(inner, np.zeros(chart.n_params), Limits(inner, limits.margin), back)

@@ -10,6 +10,7 @@ the parameters and the frequency together.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -207,6 +208,11 @@ class _Remembered:
         self.curvature = remembering(structure.curvature)
 
 
+def _with_memory(structure: Structure) -> Structure:
+    affine = getattr(structure, "is_affine", False)
+    return structure if affine else _Remembered(structure)
+
+
 def response_point(model: Target, omega: Array) -> ResponsePoint:
     """The response of a model, and what its derivatives are made of."""
     Phi = resolvent(model.A, laplace_variable(omega, model.dt)[0])
@@ -231,8 +237,7 @@ class ErrorSystem:
     def __init__(
         self, structure: Structure, target: Target, weight: Target | None = None
     ) -> None:
-        affine = getattr(structure, "is_affine", False)
-        self.structure = structure if affine else _Remembered(structure)
+        self.structure = _with_memory(structure)
         self.target, self.dt = target, target.dt
         self.n = structure.order
         self._met: tuple[bytes, float, PeakSet] | None = None
@@ -296,8 +301,10 @@ class ErrorSystem:
         return parts if self.weight is None else series(*parts, self.weight)
 
     def restructured(self, structure: Structure) -> ErrorSystem:
-        """The error of another structure."""
-        return ErrorSystem(structure, self.target, self.weight)
+        """The error of another structure of that order."""
+        other = copy(self)  # with what is remembered of the target and the weight
+        other.structure, other._met = _with_memory(structure), None
+        return other
 
     def reweighted(self, weight: Target) -> ErrorSystem:
         """The same error behind one more weight (a scalar one)."""

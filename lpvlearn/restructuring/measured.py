@@ -76,10 +76,6 @@ class MeasuredErrorSystem(ErrorSystem):
         unit = np.broadcast_to(np.eye(n_outputs), (len(omega), n_outputs, n_outputs))
         self.W = (unit if weight is None else weight[order]).astype(complex)
 
-    def restructured(self, structure: Structure) -> ErrorSystem:
-        """The error of another structure."""
-        return MeasuredErrorSystem(structure, self.omega, self.G, self.W)
-
     def reweighted(self, weight: Target) -> ErrorSystem:
         """The same error behind one more weight (a scalar one)."""
         factor = model_derivatives(weight, self.omega)[0][:, :1, :1]

@@ -18,7 +18,7 @@ from ..minimax.bundle import proximal_bundle
 from ..minimax.problem import Flags, MinimaxProblem, MinimaxResult, Peaks
 from ..minimax.sqp import minimax_sqp
 from .central_path import PathPoint, central_path
-from .coordinates import CanonicalForm, Geodesics, ResponseGeometry, view_at
+from .coordinates import CanonicalForm, Geodesics, ResponseGeometry, View
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, vanishing_weight
 from .least_squares import LeastSquaresResult, fit_frequency_response
@@ -57,6 +57,8 @@ _AHEAD = 0.98  # the path is left for a point that much below it
 # mu to which the path is followed from several fits, how many are kept there, and the
 # most steps of each: its norm soon tells more of a basin than the least-squares error
 _EXPLORED = ((1e-2, 2, 40), (1e-3, 1, 60))
+_SAME_BASIN = 0.1  # difference of errors, relative to the norm, of paths that meet
+_HOPELESS = 2.0  # norm, relative to the least, of a path that is not followed further
 _FITS = 6  # basins that are followed at most
 _APART = 1e-4  # relative difference of the costs of different basins
 _ALIKE = 2.0  # fits of an error up to that multiple of the least are followed
@@ -265,47 +267,50 @@ def _from_least_squares(
     max_iter: int,
     options: dict[str, Any],
 ) -> tuple[Array, MinimaxResult, float]:
-    """Rounds of the central path and a solver; parameters, result and floor."""
+    """Parameters, result and floor, by way of the models near a canonical form's."""
     form = CanonicalForm.of(system, fits[0].x)
-    path, used = _best_path(system, fits, limits, form, max_iter)
+    while True:
+        start = View.of(system, fits[0].x, limits, form)
+        end, result, floor = _in_rounds(start, fits, solver, max_iter, options)
+        theta = end.back()
+        if theta is not None:
+            return theta, result, floor
+        form = None  # it has no parameters for that model
+
+
+def _in_rounds(
+    start: View,
+    fits: list[LeastSquaresResult],
+    solver: Solver,
+    max_iter: int,
+    options: dict[str, Any],
+) -> tuple[View, MinimaxResult, float]:
+    """Rounds of the central path and a solver; end, result and floor."""
+    path, used = _best_path(start, fits, max_iter)
     history, floor = list(path.history), 0.0
     pace = 1 if solver is minimax_sqp else _BUNDLE_PACE
-    best: tuple[Array, MinimaxResult] | None = None
-    many = len(path.theta) >= _MANY
+    best: tuple[View, MinimaxResult] | None = None
+    many = len(start.theta) >= _MANY
     rounds, proof = (_MANY_ROUNDS, NEARLY) if many else (_ROUNDS, _STATIONARY)
     for mu_end, solver_iter in rounds:
-        path = _followed(
-            system,
-            path,
-            limits,
-            form,
-            mu_end=mu_end,
-            max_iter=int(_PATH_SHARE * (max_iter - used)),
-        )
+        steps = int(_PATH_SHARE * (max_iter - used))
+        path = _followed(path, mu_end=mu_end, max_iter=steps)
         used, history = used + path.n_iter, history + path.history
-        size = max(system.peaks(path.theta).norm, 1e-300)
-        theta, result, high = _ended(
-            system,
-            path.theta,
-            limits,
-            form,
-            solver,
-            max_iter=min(pace * solver_iter, max_iter - used),
-            **options,
-        )
+        steps = min(pace * solver_iter, max_iter - used)
+        end, result, high = _ended(path.view, solver, max_iter=steps, **options)
         used, history = used + result.n_iter, history + result.history
         floor = max(floor, high)
         top = np.inf if best is None else best[1].peaks.top
         if best is None or result.peaks.top < top:
-            best = theta, result
+            best = end, result
         settled = result.stationarity <= proof and result.converged
         settled |= best[1].peaks.top <= options["negligible"]
         idle = result.converged and best[1].peaks.top >= (1.0 - _PROGRESS) * top
         if settled or idle or used >= max_iter or time_is_up():
             break
-        ahead = best[1].peaks.top < _AHEAD * size and limits.strict(best[0])
-        inner = best[0] if ahead else path.theta
-        path = replace(path, theta=inner, mu=mu_end)
+        ahead = best[1].peaks.top < _AHEAD * path.norm
+        ahead &= best[0].limits.strict(best[0].theta)
+        path = replace(path, view=best[0] if ahead else path.view, mu=mu_end)
     assert best is not None
     exact = best[1].peaks.top <= options["negligible"]
     # the end of a solver that failed needs the better proof
@@ -330,71 +335,50 @@ def promising(fits: list[LeastSquaresResult]) -> list[LeastSquaresResult]:
 
 
 def _best_path(
-    system: ErrorSystem,
-    fits: list[LeastSquaresResult],
-    limits: Limits,
-    form: CanonicalForm | None,
-    max_iter: int,
+    start: View, fits: list[LeastSquaresResult], max_iter: int
 ) -> tuple[PathPoint, int]:
     """The best point at a moderate mu, from several fits, and the steps of all."""
-    paths = [PathPoint(fit.x, None, np.zeros(0), 0, []) for fit in promising(fits)]
+    paths = [PathPoint(start.at(fit.x)) for fit in promising(fits)]
     used = 0
     for mu_end, kept, steps in _EXPLORED:
         if len(paths) == 1:
             break
-        paths = [
-            _followed(
-                system,
-                path,
-                limits,
-                form,
-                mu_end=mu_end,
-                max_iter=min(steps, max_iter // 10),
-            )
-            for path in paths
-        ]
+        most = min(steps, max_iter // 10)
+        paths = [_followed(path, mu_end=mu_end, max_iter=most) for path in paths]
         used += sum(path.n_iter for path in paths)
-        norms = [system.peaks(path.theta).norm for path in paths]
-        paths = [paths[i] for i in np.argsort(norms, kind="stable")[:kept]]
+        paths = _of_different_basins(paths)[:kept]
     return paths[0], used
 
 
-def _followed(
-    system: ErrorSystem,
-    path: PathPoint,
-    limits: Limits,
-    form: CanonicalForm | None,
-    **options: Any,
-) -> PathPoint:
-    """The central path from where it was left, in suitable coordinates."""
-    view = view_at(system, path.theta, limits, form)
-    end = central_path(
-        view.system,
-        view.theta,
-        view.limits,
-        mu=path.mu,
-        frequencies=path.frequencies,
-        **options,
-    )
-    theta = view.back(end.theta)
-    if theta is None:  # the form has no parameters for that model
-        return _followed(system, path, limits, None, **options)
-    return replace(end, theta=theta)
+def _of_different_basins(paths: list[PathPoint]) -> list[PathPoint]:
+    """Points by ascending norm, without hopeless ones and those that have met."""
+    kept: list[PathPoint] = []
+    errors: list[NDArray] = []
+    paths = sorted(paths, key=lambda path: path.norm)
+    for path in paths:
+        if path.norm > _HOPELESS * paths[0].norm:
+            break
+        system = path.view.system
+        E = system.weighted_error(path.view.theta, system.grid)
+        same = _SAME_BASIN * path.norm
+        if all(np.linalg.norm(E - e, 2, axis=(1, 2)).max() > same for e in errors):
+            kept, errors = [*kept, path], [*errors, E]
+    return kept
+
+
+def _followed(path: PathPoint, **options: Any) -> PathPoint:
+    """The central path from where it was left, in fresh coordinates."""
+    return central_path(replace(path, view=path.view.centred()), **options)
 
 
 def _ended(
-    system: ErrorSystem,
-    theta: Array,
-    limits: Limits,
-    form: CanonicalForm | None,
-    solver: Solver,
-    **options: Any,
-) -> tuple[Array, MinimaxResult, float]:
-    """End of a solver that starts at `theta`, its result, and the highest floor met."""
-    view = view_at(system, theta, limits, form)
-    size = max(view.system.peaks(view.theta).norm, 1e-300)
-    T = ResponseGeometry(view.system, view.theta, view.system.grid, size).T
-    objective = HinfObjective(view.system, view.theta, T, view.limits)
+    view: View, solver: Solver, **options: Any
+) -> tuple[View, MinimaxResult, float]:
+    """End of a solver that starts at a point, its result, and the highest floor met."""
+    view = view.centred()
+    system, size = view.system, max(view.system.peaks(view.theta).norm, 1e-300)
+    T = ResponseGeometry(system, view.theta, system.grid, size).T
+    objective = HinfObjective(system, view.theta, T, view.limits)
     result = solver(
         objective.problem(), np.zeros(len(view.theta)), radius=_RADIUS, **options
     )
@@ -403,10 +387,8 @@ def _ended(
         if lower is None:
             break
         result = lower
-    end = view.back(within_bounds(view.system, objective.theta(result.y)))
-    if end is None:
-        return _ended(system, theta, limits, None, solver, **options)
-    return end, result, objective.floor
+    end = within_bounds(system, objective.theta(result.y))
+    return view.at(end), result, objective.floor
 
 
 def is_saddle(result: MinimaxResult) -> bool:

@@ -20,7 +20,7 @@ from ..models.statespace import DEVIATION, StateSpace
 from ..structures.structure import GrayBoxStructure
 from ..systems.hinf_norm import hinf_norm
 from ..validation import weights
-from .coordinates import CanonicalForm, view_at
+from .coordinates import CanonicalForm, View
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Target, series
 from .known_poles import Division, divide
@@ -141,7 +141,8 @@ class RestructuringProblem:
         if self.system.values(fit.x, self.omega).max() <= rounding:
             return fit
         form = CanonicalForm.of(self.system, fit.x)
-        view = view_at(self.system, fit.x, Limits(self.system, self.margin), form)
+        limits = Limits(self.system, self.margin)
+        view = View.of(self.system, fit.x, limits, form).centred()
         if form is None or view.system is self.system:
             return fit
         near = fit_frequency_response(

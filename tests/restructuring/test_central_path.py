@@ -7,10 +7,12 @@ import lpvlearn.restructuring.central_path as barrier_module
 from lpvlearn import GrayBoxStructure, StateSpace
 from lpvlearn.restructuring.central_path import (
     Barrier,
+    PathPoint,
     central_path,
     level_of,
     trust_region_step,
 )
+from lpvlearn.restructuring.coordinates import View
 from lpvlearn.restructuring.error_system import ErrorSystem
 from lpvlearn.restructuring.least_squares import fit_frequency_response
 from lpvlearn.restructuring.limits import Limits
@@ -167,11 +169,10 @@ def test_the_path_of_a_gain_ends_at_its_chebyshev_approximation():
     model = StateSpace([[-1.0]], [[1.0]], [[1.0]])
     system = ErrorSystem(structure, target_of(model))
     limits = Limits(system, 0.0)
-    path = central_path(
-        system, np.array([0.3]), limits, mu_end=1e-8, max_iter=200, decrement=1e-3
-    )
-    assert np.allclose(path.theta, 0.5, atol=1e-4)
-    assert system.peaks(path.theta).norm <= 0.5 * (1 + 1e-4)
+    start = PathPoint(View.of(system, np.array([0.3]), limits))
+    path = central_path(start, mu_end=1e-8, max_iter=200, decrement=1e-3)
+    assert np.allclose(path.view.theta, 0.5, atol=1e-4)
+    assert path.norm <= 0.5 * (1 + 1e-4)
 
 
 def fitted(structure, model, theta):
@@ -185,13 +186,11 @@ def test_the_path_lowers_the_norm_of_the_least_squares_fit():
     model = stable_model(np.random.default_rng(5), 6, 1, 1)
     structure = GrayBoxStructure.modal(1, 1, 1)
     system, fit = fitted(structure, model, np.array([-1.0, 2.0, 1.0, 1.0]))
-    limits = Limits(system, 1e-3)
-    norms = []
-    for mu_end in (1e-1, 1e-2, 1e-4, 1e-6):
-        path = central_path(system, fit.x, limits, mu_end=mu_end, max_iter=500)
-        norms.append(system.peaks(path.theta).norm)
+    start = PathPoint(View.of(system, fit.x, Limits(system, 1e-3)))
+    ends = (1e-1, 1e-2, 1e-4, 1e-6)
+    norms = [central_path(start, mu_end=mu, max_iter=500).norm for mu in ends]
     assert (np.diff(norms) < 0).all()
-    assert norms[-1] < 0.95 * system.peaks(fit.x).norm
+    assert norms[-1] < 0.95 * start.norm
 
 
 def test_the_path_keeps_bounds_and_margin():
@@ -203,11 +202,12 @@ def test_the_path_keeps_bounds_and_margin():
     names = list(structure.parameter_names)
     start = np.array([{"k": 3.0, "c": 0.6, "b": 1.0}[name] for name in names])
     limits = Limits(system, 0.26)
-    path = central_path(system, start, limits, mu_end=1e-6, max_iter=300)
-    assert (path.theta >= structure.lower).all()
-    assert (path.theta <= structure.upper).all()
-    assert limits.strict(path.theta)
-    assert np.isclose(path.theta[names.index("k")], 3.0, rtol=1e-3)
+    path = PathPoint(View.of(system, start, limits))
+    end = central_path(path, mu_end=1e-6, max_iter=300).view.theta
+    assert (end >= structure.lower).all()
+    assert (end <= structure.upper).all()
+    assert limits.strict(end)
+    assert np.isclose(end[names.index("k")], 3.0, rtol=1e-3)
 
 
 def test_measured_responses_are_watched_at_their_own_frequencies_only():
@@ -215,11 +215,10 @@ def test_measured_responses_are_watched_at_their_own_frequencies_only():
     omega = np.linspace(0.5, 6, 23)
     structure = GrayBoxStructure.from_template([["-a"]], [["b"]], [[1]])
     system = MeasuredErrorSystem(structure, omega, model.frequency_response(omega))
-    path = central_path(
-        system, np.array([1.0, 1.0]), Limits(system, 1e-3), mu_end=1e-5, max_iter=200
-    )
+    start = PathPoint(View.of(system, np.array([1.0, 1.0]), Limits(system, 1e-3)))
+    path = central_path(start, mu_end=1e-5, max_iter=200)
     assert path.frequencies.size == 0
-    assert system.peaks(path.theta).norm < system.peaks(np.array([1.0, 1.0])).norm
+    assert path.norm < start.norm
 
 
 @pytest.mark.parametrize(

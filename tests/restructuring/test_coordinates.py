@@ -8,8 +8,9 @@ from lpvlearn.restructuring.coordinates import (
     CanonicalForm,
     LocalChart,
     ResponseGeometry,
+    View,
     real_form,
-    view_at,
+    row_space,
 )
 from lpvlearn.restructuring.error_system import ErrorSystem
 from lpvlearn.restructuring.limits import Limits
@@ -165,12 +166,17 @@ def test_a_view_and_its_point_are_the_same_model():
     system = ErrorSystem(structure, target_of(stable_model(rng, 6, 2, 2)))
     theta = CanonicalForm(structure, None).parameters(matrix_of(model))
     form = CanonicalForm.of(system, theta)
-    view = view_at(system, theta, Limits(system, 1e-3), form)
+    plain = View.of(system, theta, Limits(system, 1e-3), form)
+    assert plain.back() is theta
+    view = plain.centred()
     assert view.system is not system
-    assert np.allclose(view.back(view.theta), theta, rtol=1e-6)
-    moved = view.theta + 1e-3 * rng.normal(size=len(view.theta))
-    norm = view.system.peaks(moved).norm
-    assert np.isclose(system.peaks(view.back(moved)).norm, norm, rtol=1e-8)
+    assert np.allclose(view.back(), theta, rtol=1e-6)
+    moved = view.at(1e-3 * rng.normal(size=len(theta)))
+    norm = moved.system.peaks(moved.theta).norm
+    assert np.isclose(system.peaks(moved.back()).norm, norm, rtol=1e-8)
+    again = moved.centred()  # another chart, of the same model
+    assert not again.theta.any()
+    assert np.isclose(again.system.peaks(again.theta).norm, norm, rtol=1e-10)
 
 
 def test_all_canonical_forms_of_one_order_end_at_the_same_norm():
@@ -208,3 +214,19 @@ def test_a_canonical_form_of_many_states_keeps_digits_that_it_holds():
         )
     ]
     assert errors[1] < 0.01 * errors[0]
+
+
+@pytest.mark.parametrize("kind, digits", [("chain", 1e-13), ("stiff", 1e-10)])
+def test_resolvents_of_one_matrix_span_few_dimensions(kind, digits):
+    """As far as the inverse of a matrix of condition 1e6 has digits."""
+    n = 16
+    A = -np.eye(n) + np.eye(n, k=1)  # one eigenvector
+    if kind == "stiff":
+        mixing = np.random.default_rng(0).normal(size=(n, n))
+        A = np.linalg.solve(mixing, -np.geomspace(1e-2, 1e4, n)[:, None] * mixing)
+    omega = np.geomspace(1e-3, 1e5, 120)
+    Phi = np.linalg.inv(1j * omega[:, None, None] * np.eye(n) - A)
+    rows = np.concatenate([Phi.real, Phi.imag]).reshape(-1, n * n)
+    span = row_space(rows, n)
+    assert span.shape[1] < n**2 / 4
+    assert np.abs(rows @ span @ span.T - rows).max() < digits * np.abs(rows).max()
