@@ -50,8 +50,7 @@ _DEPTH = 0.5  # local maxima down to there join the frequencies
 _BENT = 1.5  # a step whose geodesic bends more than that is too long
 _APART = 1e3  # factor by which multipliers may differ from those of psi
 _REACH = 0.99  # part of a distance to the level that a step may take
-_CORRECTIONS = 3  # of a step, for the bend of the errors' squares, ...
-_WORTH = 0.1  # ... as long as each adds that part of the decrease
+_CORRECTIONS = 3  # of a step, for the bend of the errors' squares
 
 
 def level_of(squares: Array, mu: float) -> float:
@@ -315,7 +314,7 @@ class PathPoint:
 
 
 def central_path(
-    start: PathPoint, *, mu_end: float, max_iter: int, decrement: float = 1.0
+    start: PathPoint, *, mu_end: float, max_iter: int, decrement: float = 0.1
 ) -> PathPoint:
     """Follow the path from `start` to `mu_end`.
 
@@ -444,12 +443,10 @@ def _tried(
         if end is None:
             break
         value = barrier.value(end, model.mu)
-        gain = np.inf if best is None else best.value - value
-        if not gain > 0:
+        if best is not None and not value < best.value:
             break
         best = _Trial(end, value, d, bend)
-        done = model.value - value > _GOOD * promised or gain < _WORTH * promised
-        if done or not np.isfinite(value):
+        if not np.isfinite(value) or model.value - value > _GOOD * promised:
             break
         bend = model.bend(d, barrier.error)
         x = trust_region_step(spectrum, Q.T @ model.corrected(bend), radius)

@@ -39,6 +39,7 @@ _DAMPING = 1e-5  # of the acceleration along directions that the response hardly
 _BENT = 1.0  # part of a step that its bend may be at most
 _EXACT = 1e-7  # relative residual of a realisation in a canonical form
 _REFINEMENTS = 10  # steps that give such parameters their digits: three will mostly do
+_SEARCHED = 100  # the same where they are those of a model nearby
 _NUDGE = 1e-2  # relative change of all entries that makes a model a generic one
 _MINIMAL = 1e-4  # least share of the faintest state: beyond, models are no manifold
 _SAME_NORM = 1e-5  # relative difference that rounding may make: 3e-7 for 24 states
@@ -314,8 +315,12 @@ class CanonicalForm:
         near = S * np.where(inside, 1.0 + nudge, 1.0)
         return None if form.parameters(near) is None else form
 
-    def parameters(self, S: Array) -> Array | None:
-        """Those of the model with that system matrix; None where it has none."""
+    def parameters(self, S: Array, exact: float = _EXACT) -> Array | None:
+        """Those of the model with that system matrix; None where it has none.
+
+        Of a form that many models are nearly not in, those of one at a relative
+        distance of `exact`.
+        """
         n, structure = self.structure.order, self.structure
         A, B, C, D = S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:]
         problem = scaled_problem(
@@ -335,16 +340,22 @@ class CanonicalForm:
         d = new - problem.offset
         theta = nearest_parameters(problem, d.reshape(1, -1))[0]
         rest = d - np.tensordot(theta, problem.basis, axes=1)
-        exact = np.linalg.norm(rest) <= _EXACT * np.linalg.norm(d)
-        return theta if exact else None
+        near = np.linalg.norm(rest) <= exact * np.linalg.norm(d)
+        return theta if near else None
 
-    def refined(self, S: Array, omega: Array) -> Array | None:
+    def refined(
+        self,
+        S: Array,
+        omega: Array,
+        exact: float = _EXACT,
+        max_iter: int = _REFINEMENTS,
+    ) -> Array | None:
         """The same, fitted to the model's response once more.
 
         A realisation of 24 states has lost all but three of the digits, of which the
         form holds seven.
         """
-        theta, n = self.parameters(S), self.structure.order
+        theta, n = self.parameters(S, exact), self.structure.order
         if theta is None:
             return None
         model = Target(S[:n, :n], S[:n, n:], S[n:, :n], S[n:, n:], self.dt)
@@ -353,7 +364,7 @@ class CanonicalForm:
             theta,
             omega,
             admissible=lambda x: bool(np.isfinite(x).all()),
-            max_iter=_REFINEMENTS,
+            max_iter=max_iter,
         )
         return theta if fit is None else fit.x
 
@@ -404,14 +415,33 @@ class View:
         zero = np.zeros(chart.n_params)
         return replace(self, system=inner, theta=zero, limits=limits)
 
-    def back(self) -> Array | None:
-        """The structure's parameters; None where its form has none for that model."""
+    def back(self) -> View | None:
+        """The same point by its parameters; None where the form has none for it."""
         if self.form is None or self.system is self.outer:
-            return self.theta
+            return self
         S = self.system.structure.system_matrix(self.theta)
         found = self.form.refined(S, self.outer.grid)
         if found is None:
             return None
         there = self.outer.peaks(found).norm
         here = self.system.peaks(self.theta).norm
-        return found if abs(there - here) <= _SAME_NORM * here else None
+        near = abs(there - here) <= _SAME_NORM * here
+        return self._outside(found, self.form) if near else None
+
+    def beside(self, known: Array) -> View:
+        """The parameters of a model near by, or `known` ones; no chart from there on.
+
+        Whichever have the lower norm.
+        """
+        theta, form = known, self.form
+        if form is not None and self.system is not self.outer:
+            S = self.system.structure.system_matrix(self.theta)
+            near = form.refined(S, self.outer.grid, np.inf, _SEARCHED)
+            limits = Limits(self.outer, self.limits.margin)
+            if near is not None and limits.strict(near):
+                theta = min(known, near, key=lambda x: self.outer.peaks(x).norm)
+        return self._outside(theta, None)
+
+    def _outside(self, theta: Array, form: CanonicalForm | None) -> View:
+        limits = Limits(self.outer, self.limits.margin)
+        return View.of(self.outer, theta, limits, form)

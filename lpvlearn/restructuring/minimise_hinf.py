@@ -49,6 +49,7 @@ _ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
 # a further one brings no digit of the norm that the parameters hold. A solver that is
 # not there after ten iterations may need forty, of twice the time of the path's steps.
 _MANY, _MANY_ROUNDS = 100, ((3e-8, 10), (1e-9, 60))
+_CLOSELY, _ROUGHLY = 0.1, 1.0  # what a stage of the path may leave; of many parameters
 _BUNDLE_PACE = 10  # as many iterations of a first-order method
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
 _PROGRESS = 1e-9  # a round that converged and brings less is the last one
@@ -267,30 +268,14 @@ def _from_least_squares(
     max_iter: int,
     options: dict[str, Any],
 ) -> tuple[Array, MinimaxResult, float]:
-    """Parameters, result and floor, by way of the models near a canonical form's."""
+    """Rounds of the central path and a solver; parameters, result and floor."""
     form = CanonicalForm.of(system, fits[0].x)
-    while True:
-        start = View.of(system, fits[0].x, limits, form)
-        end, result, floor = _in_rounds(start, fits, solver, max_iter, options)
-        theta = end.back()
-        if theta is not None:
-            return theta, result, floor
-        form = None  # it has no parameters for that model
-
-
-def _in_rounds(
-    start: View,
-    fits: list[LeastSquaresResult],
-    solver: Solver,
-    max_iter: int,
-    options: dict[str, Any],
-) -> tuple[View, MinimaxResult, float]:
-    """Rounds of the central path and a solver; end, result and floor."""
-    path, used = _best_path(start, fits, max_iter)
+    starts = [View.of(system, fit.x, limits, form) for fit in promising(fits)]
+    path, used = _best_path(starts, max_iter)
     history, floor = list(path.history), 0.0
     pace = 1 if solver is minimax_sqp else _BUNDLE_PACE
     best: tuple[View, MinimaxResult] | None = None
-    many = len(start.theta) >= _MANY
+    many = len(fits[0].x) >= _MANY
     rounds, proof = (_MANY_ROUNDS, NEARLY) if many else (_ROUNDS, _STATIONARY)
     for mu_end, solver_iter in rounds:
         steps = int(_PATH_SHARE * (max_iter - used))
@@ -317,7 +302,7 @@ def _in_rounds(
     enough = _STATIONARY if best[1].cause else NEARLY
     converged = exact or best[1].stationarity <= enough
     result = replace(best[1], n_iter=used, history=history, converged=converged)
-    return best[0], result, floor
+    return best[0].theta, result, floor
 
 
 def promising(fits: list[LeastSquaresResult]) -> list[LeastSquaresResult]:
@@ -334,12 +319,9 @@ def promising(fits: list[LeastSquaresResult]) -> list[LeastSquaresResult]:
     return chosen
 
 
-def _best_path(
-    start: View, fits: list[LeastSquaresResult], max_iter: int
-) -> tuple[PathPoint, int]:
+def _best_path(starts: list[View], max_iter: int) -> tuple[PathPoint, int]:
     """The best point at a moderate mu, from several fits, and the steps of all."""
-    paths = [PathPoint(start.at(fit.x)) for fit in promising(fits)]
-    used = 0
+    paths, used = [PathPoint(start) for start in starts], 0
     for mu_end, kept, steps in _EXPLORED:
         if len(paths) == 1:
             break
@@ -368,14 +350,21 @@ def _of_different_basins(paths: list[PathPoint]) -> list[PathPoint]:
 
 def _followed(path: PathPoint, **options: Any) -> PathPoint:
     """The central path from where it was left, in fresh coordinates."""
-    return central_path(replace(path, view=path.view.centred()), **options)
+    many = len(path.view.theta) >= _MANY
+    start = replace(path, view=path.view.centred())
+    end = central_path(start, decrement=_ROUGHLY if many else _CLOSELY, **options)
+    view = end.view.back()
+    if view is None:  # the form has no parameters for that model
+        beside = end.view.beside(path.view.theta)
+        return _followed(replace(path, view=beside), **options)
+    return replace(end, view=view)
 
 
 def _ended(
     view: View, solver: Solver, **options: Any
 ) -> tuple[View, MinimaxResult, float]:
     """End of a solver that starts at a point, its result, and the highest floor met."""
-    view = view.centred()
+    known, view = view.theta, view.centred()
     system, size = view.system, max(view.system.peaks(view.theta).norm, 1e-300)
     T = ResponseGeometry(system, view.theta, system.grid, size).T
     objective = HinfObjective(system, view.theta, T, view.limits)
@@ -387,8 +376,11 @@ def _ended(
         if lower is None:
             break
         result = lower
-    end = within_bounds(system, objective.theta(result.y))
-    return view.at(end), result, objective.floor
+    end = view.at(within_bounds(system, objective.theta(result.y)))
+    found = end.back()
+    if found is None:
+        return _ended(end.beside(known), solver, **options)
+    return found, result, objective.floor
 
 
 def is_saddle(result: MinimaxResult) -> bool:

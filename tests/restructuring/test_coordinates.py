@@ -167,13 +167,13 @@ def test_a_view_and_its_point_are_the_same_model():
     theta = CanonicalForm(structure, None).parameters(matrix_of(model))
     form = CanonicalForm.of(system, theta)
     plain = View.of(system, theta, Limits(system, 1e-3), form)
-    assert plain.back() is theta
+    assert plain.back().theta is theta
     view = plain.centred()
     assert view.system is not system
-    assert np.allclose(view.back(), theta, rtol=1e-6)
+    assert np.allclose(view.back().theta, theta, rtol=1e-6)
     moved = view.at(1e-3 * rng.normal(size=len(theta)))
     norm = moved.system.peaks(moved.theta).norm
-    assert np.isclose(system.peaks(moved.back()).norm, norm, rtol=1e-8)
+    assert np.isclose(system.peaks(moved.back().theta).norm, norm, rtol=1e-8)
     again = moved.centred()  # another chart, of the same model
     assert not again.theta.any()
     assert np.isclose(again.system.peaks(again.theta).norm, norm, rtol=1e-10)
