@@ -74,7 +74,7 @@ from .missing_outputs import (
     warn_of_few,
     warn_of_many_pieces,
 )
-from .offsets import N_TRENDS
+from .offsets import N_TRENDS, of_rates
 from .options import Choices, check_options
 from .residuals import (
     Residuals,
@@ -222,8 +222,8 @@ class SubspaceLTI(
         identified in their place (`rates_`), and integrated: `lti_` has a pole at one
         for each, beside the `order` states of the model of the rates. Where all
         outputs integrate it is fitted to these, by sums of the inputs: differences
-        have more of the noise. Levels of these outputs are initial states; `offset`
-        finds none.
+        have more of the noise. Levels of these outputs are initial states; a constant
+        rate, which `offset` finds, is that of an offset of the inputs.
     time_tol : float, default=0.01
         Largest deviation of a time stamp from an even grid, relative to the step. For
         more, see `resample`.
@@ -306,11 +306,12 @@ class SubspaceLTI(
     Signals about a point (u0, y0) are ``y = G u + c`` with ``c = y0 - G(1) u0``, but
     for a transient that the initial state takes. So one unknown for each output stands
     for all offsets. Of a system that integrates, an offset of the input makes a
-    straight line: ``offset="linear"``. `predict` then begins at rest at the mean of
-    `input_offset_`, the outputs at that of `output_offset_` (of drifts it knows
-    nothing); where the constants of the experiments differ by more than their
-    uncertainty it warns, as inputs alone cannot tell which one it will be. What is
-    given outputs estimates constant (and drift) of every experiment anew:
+    straight line, ``offset="linear"``, which "auto" takes where it saves a state; it is
+    an `input_offset_`, as far as steps of the inputs explain it. `predict` begins at
+    rest at the mean of `input_offset_`, the outputs at that of `output_offset_` (of
+    drifts it knows nothing); where the constants of the experiments differ by more than
+    their uncertainty it warns, as inputs alone cannot tell which one it will be. What
+    is given outputs estimates constant (and drift) of every experiment anew:
     `predict_with_initial_state`, `residual_tests` and, from estimated initial states,
     `predict_ahead`.
 
@@ -655,10 +656,10 @@ class SubspaceLTI(
                 "`missing` must be 'raise' or 'split' with `integrating`: the rates of "
                 "missing outputs are not estimated. Got 'estimate'."
             )
-        if self.detrend is not None or self.offset not in (None, "auto"):
+        if self.detrend is not None or self.offset == "linear":
             raise ValueError(
-                "`integrating` needs detrend=None, and offset=None or 'auto': a "
-                "constant rate is no offset of an output. Got "
+                "`integrating` needs detrend=None, and another offset than 'linear': "
+                "constants of the rates are straight lines. Got "
                 f"detrend={self.detrend!r}, offset={self.offset!r}."
             )
         experiments = self._read(X, y, reset=True)
@@ -672,7 +673,6 @@ class SubspaceLTI(
         direct = np.broadcast_to(self.feedthrough, (len(flags), m)) | flags[:, None]
         rate_model = clone(self).set_params(
             integrating=None,
-            offset=None,
             missing="raise",
             feedthrough=direct,
             sampling_time=None if step is True else step,
@@ -694,12 +694,11 @@ class SubspaceLTI(
         self.selection_, self.residual_ = inner.selection_, inner.residual_
         self.singular_values_ = inner.singular_values_
         self.stability_loss_, self.n_outputs_ = inner.stability_loss_, len(flags)
-        self._offsets = inner._offsets  # zero
-        self.offset_: str | None = None
-        self.offsets_differ_ = False
-        self.input_offset_ = inner.input_offset_
-        self.output_offset_ = inner.output_offset_
-        self.output_drift_ = inner.output_drift_
+        self._offsets = of_rates(inner._offsets, inner.lti_.dc_gain(), flags)
+        self.offset_, self.offsets_differ_ = inner.offset_, inner.offsets_differ_
+        self.input_offset_ = self._offsets.inputs
+        self.output_offset_ = self._offsets.outputs
+        self.output_drift_ = self._offsets.drifts / float(step)
         return self
 
     def _of_sums(self, experiments: Sequence[Experiment], rates: Self) -> Self:
@@ -712,7 +711,9 @@ class SubspaceLTI(
         step = float(rates.lti_.sampling_time or 1.0)
         table, y = as_table(sums_of(experiments, step))
         sums = clone(rates).set_params(
-            order=rates.order_, offset="constant", method=rates.method_
+            order=rates.order_,
+            offset="linear" if rates.offset_ else "constant",
+            method=rates.method_,
         )
         try:
             with collected():  # said of the rates

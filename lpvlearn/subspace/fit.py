@@ -54,8 +54,10 @@ from .offsets import (
     constants_matter,
     criterion_in_units,
     follows_means_alone,
+    leaves_rounding,
     may_be_better,
     may_have_constants,
+    may_ramp,
     shifts_matter,
     with_levels,
     without_slow_modes,
@@ -210,14 +212,29 @@ def _with_constants(
     given = choices.order is not None and choices.initial_states and n_trend < 2
     given &= fitted.method != "pbsid" and not choices.enforce_stability
     lost = given and (outlasts(fitted) or fitted.residual > _HARDLY)
-    if choices.offset == "auto" and lost:
+    # Behind an integrator the offset of an input is a straight line, or a state.
+    ramps = choices.order is None and n_trend < 2 and not hides and may_ramp(tested)
+    lines = (lost or ramps) and choices.offset == "auto"
+    if lines and not leaves_rounding(fitted.evidence.one_step):
         with suppress(TooFewSamples):
             other = _fit(pairs, judged, told, 2, fitted)
             least = min(map(criterion_in_units, tried))
             better = least - criterion_in_units(other.evidence.one_step)
-            if better > CERTAIN and not outlasts(other):
+            by_inputs = not other.offsets.drifts.any()
+            if by_inputs and ramps and _is_simpler(fitted, other, better):
+                fitted, n_trend = other, 2
+            elif lost and better > CERTAIN and (by_inputs or not outlasts(other)):
                 fitted, n_trend = other, 2
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
+
+
+def _is_simpler(fitted: LocalFit, other: LocalFit, better: float) -> bool:
+    """Whether offsets of the inputs are to be taken, that may save a state.
+
+    Of equals that model is taken which needs no mode that inputs do not move.
+    """
+    spared = len(fitted.model.A) - len(other.model.A)
+    return spared >= 0 and better > (-CERTAIN if spared else 0.0)
 
 
 def _is_worth_a_choice(

@@ -30,7 +30,7 @@ from scipy import linalg, special
 
 from ..data.preparation import Pairs
 from ..systems.least_squares import column_scale
-from ..systems.simulation import lti_response, trend_signals
+from ..systems.simulation import free_responses, lti_response, trend_signals
 from .identification import Centres, mode_rates, spectral_radius
 from .noise import autoregression, spectral_density
 from .selection import criterion_of
@@ -72,6 +72,9 @@ _EXPLAINED = 1e-6
 _RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refinement`
 _ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
 _BEYOND = 100.0  # times the largest output: a constant that is none
+_SETTLED = 10.0  # time constants per experiment of a mode that forgets its beginning
+_RELUCTANTLY = 1e-4  # taken: initial states where offsets do as well
+_UNSEEN, _NEARLY = 0.1, 0.01  # of errors, and of a drift: what inputs need not explain
 _LASTING = 0.1  # decay of a mode over a record, of one that may be a constant
 _FAR = 3.0  # standard deviations between the mean of a channel and zero
 _SLOW = 3.0  # time constants per experiment of a mode that may stand for a constant
@@ -122,8 +125,9 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
     """Offsets of the experiments `pairs`, from a model of the centred ones.
 
     The inputs stand at their means, the outputs where the static gain then has them.
-    Where that is infinite (a mode slower than the longest experiment), and where
-    experiments are known to start at rest, inputs stand at zero.
+    Where a mode is not far faster than the longest experiment, means tell little of
+    where it rests, and the static gain may be infinite: both stand where experiments
+    begin nearest to rest. Where these are known to start there, inputs stand at zero.
     """
     model, lengths = evidence.model, np.array([len(u) for u, _ in pairs])
     n_trend, ny = centres.trends.shape[1:]
@@ -134,13 +138,67 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
     outputs, constants, drifts = trends[:, 0], trends[:, 0], none
     if n_trend > 1:
         drifts = trends[:, 1] * 2.0 / np.maximum(lengths - 1, 1)[:, None]
-    distance = mode_rates(model.A).min(initial=1.0)
-    if distance * lengths.max() > 1.0 and evidence.free.initial_states:
-        means = np.array([u.mean(axis=0) for u, _ in pairs])
-        gain = evidence.state_space(model, 1.0).dc_gain()
-        constants = outputs - levels @ gain.T
-        outputs, levels = constants + means @ gain.T, means
-    return Offsets(levels, outputs, drifts, constants, lengths)
+    if not evidence.free.initial_states:
+        return Offsets(levels, outputs, drifts, constants, lengths)
+    settled = mode_rates(model.A).min(initial=1.0) * lengths.max() > _SETTLED
+    if not settled and len(model.initial_states) == len(pairs):
+        found = _as_they_begin(evidence, trends, lengths)
+        if found is not None:
+            drifts, outputs, levels = none, found[1], levels + found[0]
+        return Offsets(levels, outputs, drifts, trends[:, 0], lengths)
+    means = np.array([u.mean(axis=0) for u, _ in pairs])
+    gain = evidence.state_space(model, 1.0).dc_gain()
+    constants = outputs - levels @ gain.T
+    return Offsets(means, constants + means @ gain.T, drifts, constants, lengths)
+
+
+def of_rates(rates: Offsets, gain: Array, flags: NDArray[np.bool_]) -> Offsets:
+    """Offsets of the outputs of which some, by `flags`, integrate those of `rates`.
+
+    A constant rate is the answer of the rates, of that static `gain`, to an offset of
+    the inputs; what they cannot make is a drift.
+    """
+    c, none = rates.constants, np.zeros_like(rates.drifts)
+    if not np.isfinite(gain).all() or not c.any():
+        return rates
+    inputs = -linalg.lstsq(gain[flags], c[:, flags].T)[0].T
+    left = c + inputs @ gain.T
+    left[np.abs(left) <= _ROUNDING * np.abs(c)] = 0.0
+    outputs, drifts = np.where(flags, 0.0, left), np.where(flags, left, 0.0)
+    return Offsets(inputs, outputs, drifts, none, rates.n_samples, rates.differ)
+
+
+def _as_they_begin(
+    evidence: Evidence, trends: Array, lengths: Array
+) -> tuple[Array, Array] | None:
+    """Offsets of inputs and outputs by which experiments begin nearest to rest.
+
+    With the answer S to steps of the inputs, ``trends + free x0 = y0 - S u0 + free x``:
+    behind an integrator u0 is a straight line. Least squares, with as little as may be
+    of x. Shapes (n_experiments, n_inputs) and (n_experiments, n_outputs); None where
+    drifts are left.
+    """
+    model, n_values = evidence.model, sum(r.n_values for r in evidence.records)
+    lti, scale = evidence.state_space(model, 1.0), evidence.output_scale
+    noise = np.sqrt(model.loss / n_values)
+    m, ny, found = lti.n_inputs, lti.n_outputs, []
+    for n, x0, trend in zip(lengths, model.initial_states, trends, strict=True):
+        free = free_responses(lti.A, lti.C, n)
+        target = (free @ x0 + trend_signals(n, len(trend)).T @ trend) / scale
+        steps = [-lti.simulate(np.tile(row, (n, 1))) for row in np.eye(m)]
+        constants = np.broadcast_to(np.eye(ny), (n, ny, ny))
+        columns = np.concatenate([np.stack(steps, axis=2), constants, free], axis=2)
+        columns = (columns / scale[:, None]).reshape(n * ny, -1)
+        size = column_scale(columns)
+        size[m + ny :] /= _RELUCTANTLY
+        x = linalg.lstsq(columns / size, target.ravel(), _RCOND)[0]
+        left = target.ravel() - columns / size @ x
+        most = _UNSEEN * noise + _NEARLY * target.std(axis=0).max()
+        if not np.sqrt(np.mean(left**2)) <= most:
+            return None
+        found.append((x / size)[: m + ny])
+    u0, y0 = np.split(np.array(found), [m], axis=1)
+    return u0, y0
 
 
 def may_have_constants(evidence: Evidence) -> bool:
@@ -220,6 +278,11 @@ def motion_left(evidence: Evidence) -> float:
     return part if np.isfinite(part) else np.inf
 
 
+def leaves_rounding(evidence: Evidence) -> bool:
+    """Whether what a model leaves tells nothing."""
+    return motion_left(evidence) < _ROUNDING**2
+
+
 def _levels(parts: Sequence[Array]) -> tuple[Array, Array]:
     """Size of the means of every channel, and of its motion about them."""
     n = sum(part.shape[1] for part in parts)
@@ -256,14 +319,13 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     better = criterion_in_units(without) - criterion_in_units(other)
     if better > 0.0 and len(other.model.A) < len(without.model.A):
         return True
-    left = motion_left(without)
-    if left < _ROUNDING**2:
+    if leaves_rounding(without):
         return False
     far = _stays_far(without.records)
     few = len(other.model.A) <= min(len(without.model.A), _FEW_STATES)
     decays = spectral_radius(other.model.A) <= 1.0
     if far and few and decays:
-        if motion_left(other) < _MOSTLY * left:
+        if motion_left(other) < _MOSTLY * motion_left(without):
             return True
     replaced = _lasts(without) and not _lasts(other)
     if not better > (-CERTAIN if far or replaced else 0.0):
@@ -272,6 +334,14 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         return True
     chance = chance_of_constants(other)
     return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > CERTAIN))
+
+
+def may_ramp(evidence: Evidence) -> bool:
+    """Whether two modes do not decay: together they make a straight line.
+
+    Behind an integrator that is what an offset of the input does.
+    """
+    return bool((mode_rates(evidence.model.A) * evidence.longest < 1.0).sum() > 1)
 
 
 def _lasts(evidence: Evidence) -> bool:

@@ -91,7 +91,7 @@ def test_what_is_known_of_the_rates_is_asked_of_them():
     with pytest.raises(ValueError, match="`integrating` must be None in partial_fit"):
         local.partial_fit(u, y)
     with pytest.raises(ValueError, match="needs detrend=None"):
-        SubspaceLTI(1, integrating=[0], offset="constant").fit(u, y)
+        SubspaceLTI(1, integrating=[0], offset="linear").fit(u, y)
     pairs = local.deviated_models()
     assert pairs and all(abs(m.poles() - 1.0).min() < 1e-12 for m in pairs[0])
 

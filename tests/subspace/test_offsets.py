@@ -291,8 +291,70 @@ def test_an_offset_of_an_integrators_input_is_a_line(rng):
         biased = SubspaceLTI(1, horizon=5, offset="linear").fit(u + 0.3, y)
     np.testing.assert_allclose(biased.lti_.poles(), 1.0, atol=1e-6)
     np.testing.assert_allclose(biased.lti_.B @ biased.lti_.C, 1.0, atol=1e-6)
-    np.testing.assert_allclose(biased.output_drift_, -0.3, atol=1e-6)
-    assert not biased.input_offset_.any()
+    np.testing.assert_allclose(biased.input_offset_, 0.3, atol=1e-6)
+    np.testing.assert_allclose(biased.output_drift_, 0.0)
+
+
+def driven(u, pole=0.9, slow=1.0, bias=0.3):
+    """A lag behind an integrator (or a slow lag), from rest, of an offset input."""
+    x = lfilter([0.0, 1.0 - pole], [1.0, -pole], u + bias, axis=0)
+    return lfilter([0.0, 0.1], [1.0, -slow], x, axis=0)
+
+
+def held(rng, n, every=10):
+    return np.repeat(rng.choice([-1.0, 1.0], (-(-n // every), 1)), every, axis=0)[:n]
+
+
+def fit_of(model, X, y):
+    left = np.linalg.norm(y - model.predict(X).reshape(y.shape))
+    return 1.0 - left / np.linalg.norm(y - y.mean())
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"order": 2}, {"order": 1, "integrating": True}]
+)
+def test_an_offset_of_a_motors_input_is_found_and_predicted(options):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        u, fresh = held(rng, 1500), held(rng, 1000)
+        y = driven(u) + 0.01 * rng.standard_normal(u.shape)
+        model = SubspaceLTI(**options).fit(u, y)
+        assert model.order_ == 2
+        np.testing.assert_allclose(model.input_offset_, -0.3, atol=5e-3)
+        np.testing.assert_allclose(model.output_drift_, 0.0)
+        assert fit_of(model, fresh, driven(fresh)) > 0.98
+
+
+def test_offsets_of_the_input_of_several_experiments_differ():
+    rng = np.random.default_rng(0)
+    u, biases = held(rng, 2400), (0.3, -0.1, 0.2)
+    y = [driven(part, bias=b) for part, b in zip(np.split(u, 3), biases, strict=True)]
+    y = np.vstack(y) + 0.01 * rng.standard_normal(u.shape)
+    X = np.column_stack([u, np.repeat(range(3), 800)])
+    model = SubspaceLTI(experiment=1).fit(X, y)
+    np.testing.assert_allclose(-model.input_offset_[:, 0], biases, atol=5e-3)
+
+
+def test_a_slow_plant_that_begins_at_rest_is_predicted_from_there():
+    """The constant alone does not tell where it rests: far from all it has reached."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        u, fresh = held(rng, 1500), held(rng, 1000)
+        y = driven(u, slow=1.0 - 1.0 / 3000)
+        y = y + 0.01 * rng.standard_normal(u.shape)
+        model = SubspaceLTI().fit(u, y)
+        assert fit_of(model, fresh, driven(fresh, slow=1.0 - 1.0 / 3000)) > 0.95
+
+
+def test_a_slow_plant_rests_where_it_began_not_at_the_means_of_its_inputs():
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        u, fresh = held(rng, 4000), held(rng, 1000)
+        y = 20.0 + driven(u, slow=0.999, bias=0.0)
+        model = SubspaceLTI().fit(u + 3.0, y + 0.01 * rng.standard_normal(u.shape))
+        there = 20.0 + driven(fresh, slow=0.999, bias=0.0)
+        assert model.offset_ == "constant"
+        assert fit_of(model, fresh + 3.0, there) > 0.95
 
 
 def test_short_step_responses_are_not_spoilt():
