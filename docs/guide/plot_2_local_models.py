@@ -214,15 +214,18 @@ print("offset_:", offset.offset_)
 pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round(3)
 
 # %%
-# ``output_offset_`` is where the outputs rest at the mean inputs, ``input_offset_``.
-# ``predict`` begins at rest there. A table of inputs does not tell which offset it will
+# ``output_offset_`` is where the outputs rest at the mean inputs, ``input_offset_``; of
+# a plant that hardly settles within a record, both are where the experiments begin
+# nearest to rest. ``predict`` begins there. Inputs alone do not tell which offset they
 # have, so where those of the experiments differ, ``predict`` takes their mean and
 # warns; with outputs at hand, ``predict_with_initial_state``, scores with
 # ``initial_state="estimate"`` and ``residual_tests`` estimate each experiment's own.
 #
 # * ``offset="linear"`` adds a drift (``output_drift_``, per second). It is also what a
-#   system that *integrates* needs: its answer to an offset of the input is a straight
-#   line. A constant of its output is a matter of the initial state.
+#   system that *integrates* needs, a motor whose amplifier has a bias: its answer to an
+#   offset of the input is a straight line, and is told as ``input_offset_``, which
+#   ``predict`` knows. ``"auto"`` takes it where a second integrator, which no input
+#   moves, would stand for it. With ``integrating`` it is a constant rate.
 # * A load that comes or goes, or a sensor that moves, shifts the level within an
 #   experiment. A slow mode would explain it, and simulate other records by what it made
 #   up. ``"auto"`` looks for such shifts, which no regression on the past foresees, ends

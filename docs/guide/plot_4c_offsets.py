@@ -131,6 +131,12 @@ round(bft_score(data.y_large, y), 1)
 #   the rest are offsets of sensors. **More inputs than outputs:** the smallest
 #   :math:`w`, for inputs of which the outputs tell nothing are what they are.
 #
+# Between the points :math:`u_0`, :math:`y_0` and :math:`x_0` are splines. Where the
+# equilibria bend more than the equations do (currents of a drive are rational in its
+# speed, the back-EMF is linear), the constants of :math:`\dot x = A x + B u + c` are
+# splines instead, if these tell points that are left out clearly better: of one
+# scheduling variable, from five points on.
+#
 # A rate alone does not tell where a system stands: if the scheduling variable is a
 # position, measure that as an output, too.
 #

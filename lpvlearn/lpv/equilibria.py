@@ -19,11 +19,17 @@ Where inputs stand about one level, all points are moved to one u0: what differs
 random would bend the interpolation.
 
 Models that integrate are at rest at any output, and their inputs are constants then.
+
+Between the points the equilibria follow from what is interpolated of them. Where they
+bend more than the models do (a drive, whose currents at rest are rational in a speed
+that its equations have as it is), that had better be the constants in ``dx/dt = A x + B
+u + c``, ``y = C x + D u + d``: of those that tell left-out points better.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +49,11 @@ _UNEXPLAINED = 0.1
 
 # Misfit of constants of the inputs, in that of constants of the sensors, that decides.
 _CLEAR = 10.0
+
+# Squared errors at points left out, relative, from which constants tell them better,
+# the fewest points for that, and places between points that equilibria are taken at
+_BETTER, _FEWEST, _BETWEEN = 0.25, 5, 8
+_BENT = 1e-4  # mean square of such an error, by the motion, that is worth it
 
 # Variance of the levels of inputs over the points, in that of their motion: none.
 _STANDING = 0.1
@@ -102,6 +113,81 @@ def points_of_work(
     bias = _constants_of_sensors(inputs, outputs, gains, inverse, u_scale)
     x0 = _times(states, outputs - bias) + _times(unseen, inputs)
     return np.hstack([inputs, outputs, x0])
+
+
+def interpolated(
+    spline: Callable[[], Any],
+    kappa: Array,
+    values: Array,
+    model_at: Callable[[Array], StateSpace],
+    y_scale: Array,
+) -> Any:
+    """A regressor of the `values` of points of work, by themselves or their constants.
+
+    `spline` makes a regressor that is to be fitted, `model_at` the frozen model at
+    scheduling values (n_scheduling,), `y_scale` the size of the motion of outputs.
+    """
+    by_themselves = spline().fit(kappa, values)
+    if kappa.shape[1] > 1 or len(kappa) < _FEWEST:
+        return by_themselves
+    models = [model_at(k) for k in kappa]
+    if any(np.linalg.matrix_rank(m.A) < m.order for m in models):
+        return by_themselves
+    work = [_Work.of(m, v) for m, v in zip(models, values, strict=True)]
+    constants = np.array(
+        [one.constants(m) for one, m in zip(work, models, strict=True)]
+    )
+    errors = np.zeros(2)
+    order = np.argsort(kappa[:, 0])
+    for i in order[1:-1]:  # the others foresee its outputs at rest
+        kept, model, point = np.delete(np.arange(len(kappa)), i), models[i], work[i]
+        at = [spline().fit(kappa[kept], v[kept]).predict(kappa[[i]])[0]
+              for v in (values, constants)]  # fmt: skip
+        there = _Work.of(model, at[0])
+        moved = there.y + model.dc_gain() @ (point.u - there.u)
+        rests = _Work.resting(model, point.u, at[1]).y
+        for k, y in enumerate((moved, rests)):
+            errors[k] += np.sum(((y - point.y) / y_scale) ** 2)
+    bends = errors[0] > _BENT * len(order[1:-1]) * len(y_scale)
+    if not (bends and errors[1] < _BETTER * errors[0]):
+        return by_themselves
+    places = np.sort(kappa[:, 0])
+    parts = [np.linspace(a, b, _BETWEEN, endpoint=False)
+             for a, b in zip(places[:-1], places[1:], strict=True)]  # fmt: skip
+    fine = np.append(np.concatenate(parts), places[-1])[:, None]
+    c = spline().fit(kappa, constants).predict(fine)
+    u = by_themselves.predict(fine)[:, : models[0].n_inputs]
+    found = [
+        np.concatenate(_Work.resting(model_at(k), *known))
+        for k, *known in zip(fine, u, c, strict=True)
+    ]
+    return spline().fit(fine, np.array(found))
+
+
+class _Work(NamedTuple):
+    """A point of work."""
+
+    u: Array
+    y: Array
+    x: Array
+
+    @classmethod
+    def of(cls, model: StateSpace, values: Array) -> _Work:
+        """From ``[u0, y0, x0]``."""
+        m = model.n_inputs
+        return cls(*np.split(values, [m, m + model.n_outputs]))
+
+    @classmethod
+    def resting(cls, model: StateSpace, u: Array, constants: Array) -> _Work:
+        """Where a model rests with the input `u`: ``A x + B u + c = 0``."""
+        c, d = np.split(constants, [model.order])
+        x = -np.asarray(np.linalg.solve(model.A, model.B @ u + c), float)
+        return cls(u, model.C @ x + model.D @ u + d, x)
+
+    def constants(self, model: StateSpace) -> Array:
+        """``[c, d]`` with which the model rests there."""
+        c = -model.A @ self.x - model.B @ self.u
+        return np.concatenate([c, self.y - model.C @ self.x - model.D @ self.u])
 
 
 def _state_at_rest(

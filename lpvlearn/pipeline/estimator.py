@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
@@ -38,6 +39,7 @@ from ..data.preparation import has_gaps, split_at_gaps
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, retold, warn
 from ..lpv.auto import INTERPOLATION, AutoLPV
+from ..lpv.equilibria import interpolated
 from ..lpv.extrapolation import warn_outside_hull
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
@@ -59,7 +61,12 @@ from ..validation import (
 )
 from .html_report import html_report
 from .left_out import tell_unforeseen
-from .local_models import common_delay, estimates_outputs, identify_points
+from .local_models import (
+    common_delay,
+    estimates_outputs,
+    identify_points,
+    motions,
+)
 from .memory import checked_memory
 from .output_error import (
     known_coefficients,
@@ -563,8 +570,8 @@ list, default=None
                 input_names=experiments[0].input_names,
                 output_names=self.output_names_,
                 units=self.units,
-                offsets=self._fit_offsets(models),
             )
+            self.lpv_ = replace(self.lpv_, offsets=self._fit_offsets(models))
             frozen = self.lpv_.silenced().at(kappa[0])
             names = frozen.input_names, frozen.output_names, frozen.units
             self.local_models_ = [m.lti.with_names(*names) for m in found.local]
@@ -765,7 +772,12 @@ list, default=None
             return None
         held = getattr(self.interpolator_, "extrapolation", None) == "clip"
         spline = SplineLPV("cubic", extrapolation="clip" if held else "ignore")
-        return spline.fit(found.points.kappa, values)
+        frozen = self.lpv_.silenced().at
+        y_scale = motions([e for group in found.points.experiments for e in group])[1][
+            1
+        ]
+        kappa = found.points.kappa
+        return interpolated(partial(clone, spline), kappa, values, frozen, y_scale)
 
     def _check_options(self) -> None:
         one_of("combine", self.combine, ("pool", "average"))

@@ -328,7 +328,8 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         if motion_left(other) < _MOSTLY * motion_left(without):
             return True
     replaced = _lasts(without) and not _lasts(other)
-    if not better > (-CERTAIN if far or replaced else 0.0):
+    doubt = CERTAIN if far or replaced else 0.0
+    if not better > -(_BEYOND_DOUBT if far and replaced else doubt):
         return False
     if far and better > _BEYOND_DOUBT:
         return True

@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace
-from lpvlearn.lpv.equilibria import points_of_work
+from lpvlearn.lpv.equilibria import interpolated, points_of_work
+from lpvlearn.lpv.spline import SplineLPV
 
 ONE = (np.ones(1), np.ones(1))
 KAPPA = np.linspace(-1.2, 1.2, 13)[:, None]
@@ -152,3 +153,57 @@ def test_what_integrates_rests_at_any_output():
     places = np.array([[0.0], [1.0]])
     values = points_of_work(models, places, np.ones((2, 1)), 7.0 + places, ONE)
     assert_allclose(values, [[1, 7, 7, 0], [1, 8, 8, 0]], atol=1e-9)
+
+
+def motor(speed):
+    """Currents of a synchronous motor: affine in its speed, as its back-EMF is."""
+    w = float(np.ravel(speed)[0])
+    A = [[-66.7, 1.5 * w], [-0.667 * w, -44.4]]
+    return StateSpace(A, np.diag([83.3, 55.6]), np.eye(2))
+
+
+def currents_at_rest(speed, u):
+    model = motor(speed)
+    return -np.linalg.solve(model.A, model.B @ u + [0.0, -6.67 * float(speed)])
+
+
+@pytest.mark.parametrize("n_points, error", [(6, 1e-3), (4, np.inf)])
+def test_equilibria_that_bend_follow_from_constants_that_do_not(n_points, error):
+    rng = np.random.default_rng(0)
+    speeds = np.linspace(0.0, 250.0, n_points)
+    inputs = np.column_stack([rng.normal(-2.0, 0.3, n_points), 6.0 + 0.12 * speeds])
+    rest = [currents_at_rest(w, u) for w, u in zip(speeds, inputs, strict=True)]
+    values = np.hstack([inputs, rest, rest])
+
+    def spline():
+        return SplineLPV("cubic")
+
+    kappa = speeds[:, None]
+    found = interpolated(spline, kappa, values, motor, np.ones(2))
+    assert_allclose(found.predict(kappa), values, atol=1e-6 if n_points > 4 else 1e-9)
+    between = 0.5 * (speeds[1:] + speeds[:-1])
+    far, near = 0.0, 0.0
+    alone = spline().fit(kappa, values)
+    for w in between:
+        for one in (alone, found):
+            u, y, x = np.split(one.predict([[w]])[0], [2, 4])
+            off = np.abs(y - currents_at_rest(w, u)).max()
+            assert_allclose(x, y, atol=1e-6)
+            far, near = (max(far, off), near) if one is alone else (far, max(near, off))
+    assert far > 0.1
+    assert near <= min(error, far)
+
+
+def test_equilibria_that_do_not_bend_are_interpolated_as_they_are():
+    """A spring: its point of work is linear in kappa, its constants are not."""
+
+    def spring(kappa):
+        return StateSpace(
+            [[0, 1], [-1.0 - float(kappa[0]), -0.5]], [[0], [1]], [[1, 0]]
+        )
+
+    kappa = np.linspace(0.0, 2.0, 6)[:, None]
+    y = 0.3 + kappa
+    values = np.hstack([(1.0 + kappa) * y, y, y, 0.0 * y])
+    found = interpolated(lambda: SplineLPV("cubic"), kappa, values, spring, np.ones(1))
+    assert found.n_points_ == 6
