@@ -733,16 +733,21 @@ def _believable(
             if better or best.grows(_CERTAIN) and not other.grows(_CERTAIN):
                 makeshift = found.total > error.total
                 best, error = other, found
+            # inputs of the same sample tell the noise in the outputs: of a free D, all
+            blind, of_blind = rival(method="po-moesp", feedthrough=False)
+        else:
+            blind, of_blind = open_loop, of_that
         # whoever says which entries of D act knows how the channels were sampled
         said = not isinstance(choices.feedthrough, bool)
-        better = not said and of_that.total < _OF_NOISE * error.total
+        better = not said and of_blind.total < _OF_NOISE * error.total
         # growing modes simulate bounded signals by what is to come of the inputs
-        better &= not open_loop.grows(_CERTAIN)
+        better &= not blind.grows(_CERTAIN)
         unsure = makeshift or (best.grows() and not best.grows(_CERTAIN))
-        if unsure and not open_loop.grows():
-            better |= of_that.clearly_better_than(error, _DOUBT)
+        if unsure and not open_loop.grows() and not better:
+            blind, of_blind = open_loop, of_that
+            better = of_that.clearly_better_than(error, _DOUBT)
         if better:
-            best, error = open_loop, of_that
+            best, error = blind, of_blind
     except TooFewSamples:
         pass
     if best is first:

@@ -10,7 +10,7 @@ from scipy import linalg
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from lpvlearn import SubspaceLTI
+from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.subspace.closed_loop import _Changes, _Innovation
 from lpvlearn.systems.simulation import lti_response
 
@@ -634,3 +634,27 @@ def test_a_reference_of_few_sines_is_told():
         x = 0.95 * x + 0.3 * u[t, 0]
     with pytest.warns(UserWarning, match="the inputs follow from the past"):
         assert SubspaceLTI().fit(u, y).method_ == "pbsid"
+
+
+@pytest.mark.parametrize("seed", [1, 7])
+def test_a_controller_is_not_taken_for_the_feedthrough_of_its_plant(seed):
+    """A ball on a beam: with D free, the inputs tell the noise that they answer."""
+    rng, step, gain = np.random.default_rng(seed), 0.1, 7.0
+    reference = np.repeat(rng.uniform(-0.3, 0.3, 40), rng.integers(15, 60, 40))[:1000]
+    A, B = np.array([[1.0, step], [0.0, 1.0]]), gain * np.array([step**2 / 2, step])
+    x, rate, before, u, y = np.zeros(2), 0.0, 0.0, [], []
+    for r in reference:
+        y.append(x[0] + 0.003 * rng.standard_normal())
+        rate = 0.6 * rate + 0.4 * (y[-1] - before) / step
+        before = y[-1]
+        u.append(0.12 * (r - before) - 0.22 * rate)
+        x = A @ x + B * u[-1] + [0.0, 0.002 * rng.standard_normal()]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = SubspaceLTI(sampling_time=step).fit(np.array(u)[:, None], y)
+    assert not model.lti_.D.any()
+    omega = np.geomspace(0.3, 15.0, 40)
+    true = StateSpace(A, B[:, None], [[1.0, 0.0]], None, step)
+    G = true.frequency_response(omega)
+    error = np.abs(model.lti_.frequency_response(omega) - G) / np.abs(G)
+    assert error.mean() < 0.15
