@@ -334,18 +334,22 @@ def _equilibrium(
 ) -> tuple[Array, Array] | None:
     """Inputs and outputs at which the model rests, nearest to the experiments' means.
 
-    In units of how far they move within the experiments. None where the estimator has
-    not looked for constants, or does not tell.
+    In units of how far they move within the experiments; where the experiments begin
+    nearest to rest if a mode does not decay over them, which rests nearly anywhere.
+    None where the estimator has not looked for constants, or does not tell.
     """
     first = fitted[0]
-    if _integrates(first):  # it rests anywhere
-        return None
     looked = getattr(first, "offset", None) or getattr(first, "detrend", None)
     if not looked or not hasattr(first, "resting_point"):
         return None
-    _tell_different_constants(lti, fitted, experiments)
+    if _integrates(first) and first.offset_ is None:
+        return None
     known = [own.resting_point() for own in fitted]
     u0, y0 = (np.mean(values, axis=0) for values in zip(*known, strict=True))
+    longest = max(len(e.inputs) for e in experiments)
+    if (np.abs(1.0 - first.lti_.poles()) * longest < 1.0).any():
+        return u0, y0
+    _tell_different_constants(lti, fitted, experiments)
     (u, u_scale), (y, y_scale) = motions(experiments)
     gain = lti.dc_gain()
     step, *_ = np.linalg.lstsq(

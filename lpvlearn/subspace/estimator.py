@@ -277,9 +277,10 @@ class SubspaceLTI(
     offset_ : {None, "constant", "linear"}
         What was estimated.
     input_offset_ : ndarray of shape (n_experiments, n_inputs)
-        Mean of the inputs of every experiment, as of `initial_states_`; zero without
-        `offset_` and `detrend`, with ``initial_state="rest"``, and where the static
-        gain is infinite: a mode slower than the longest experiment.
+        Mean of the inputs of every experiment, as of `initial_states_`. Of a plant
+        whose slowest mode takes a tenth of the longest experiment, or does not decay:
+        where the experiment begins nearest to rest. Zero without `offset_` and
+        `detrend`, and with ``initial_state="rest"``.
     output_offset_ : ndarray of shape (n_experiments, n_outputs)
         Where the outputs rest at these inputs: but for transients and drifts
         ``y - output_offset_ = G (u - input_offset_)``. With `detrend` their means, to
@@ -289,7 +290,8 @@ class SubspaceLTI(
         Whether the constants of the experiments do, by more than their uncertainty.
     output_drift_ : ndarray of shape (n_experiments, n_outputs)
         Change per second (per sample where no time is known), about the middle of
-        the experiment; zero without ``offset="linear"``.
+        the experiment; zero without ``offset="linear"``, and where an offset of the
+        inputs makes it.
     time_jitter_ : float
         Largest deviation of a time stamp of `fit` from an even grid, relative to the
         step; 0 without a `time` column.

@@ -5,7 +5,7 @@ free response, which is ``y = G(q) u + c`` with ``c = y0 - G(1) u0``: the transi
 constant input is a free response. So an experiment has one unknown for each output, c,
 that outputs are linear in, like the initial state; u0 and y0 need not be known. With an
 integrator G(1) is infinite: the answer to ``-u0`` is a straight line, which takes the
-drift (``offset="linear"``), and c itself is a matter of the initial state.
+drift (``offset="linear"``) and tells u0, and c itself is a matter of the initial state.
 
 All experiments have constants or none: where one has, another may well have, and one
 that is not needed costs what an unknown does.

@@ -1,4 +1,4 @@
-"""Step 3 at the operating points: plants in a loop."""
+"""Step 3 at the operating points: plants in a loop, plants that integrate."""
 
 import warnings
 
@@ -7,7 +7,14 @@ import pandas as pd
 import pytest
 from sklearn.base import clone
 
-from lpvlearn import LocalLPVPipeline, StateSpace, SubspaceLTI
+from lpvlearn import (
+    GrayBoxRestructurer,
+    GrayBoxStructure,
+    LocalLPVPipeline,
+    StateSpace,
+    SubspaceLTI,
+    from_trajectories,
+)
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.pipeline.local_models import (
     LocalModel,
@@ -157,3 +164,51 @@ def test_points_take_one_of_several_orders_together(order):
     X, y = spring_tables(noise=0.01, n_samples=300)
     fitted = LocalLPVPipeline(SubspaceLTI(order=order), **ROLES).fit(X, y)
     assert (fitted.report_["order"] == 2).all()
+
+
+SAMPLE, BIAS = 0.02, 0.2  # s, and of the drive
+
+
+def position(u, inertia):
+    """``inertia w' = 3 (u + bias) - w``, and its integral, from rest."""
+    w, angle, y = 0.0, 0.0, []
+    for force, J in zip(u + BIAS, inertia, strict=True):
+        y.append(angle)
+        decay = np.exp(-SAMPLE / J)
+        end = 3.0 * force
+        angle += end * SAMPLE + (w - end) * J * (1.0 - decay)
+        w = end + (w - end) * decay
+    return np.array(y)[:, None]
+
+
+# the black box has a pole beside one, the structure at one
+@pytest.mark.filterwarnings("ignore:the structure lies")
+@pytest.mark.parametrize("integrating", [None, True])
+def test_a_bias_is_known_to_the_lpv_model(integrating):
+    rng = np.random.default_rng(0)
+
+    def held(n):
+        return np.repeat(rng.choice([-1.0, 1.0], n // 8), 8)
+
+    runs = []
+    for J in np.linspace(0.3, 1.2, 5):
+        u = held(1600)
+        y = position(u, np.full(1600, J)) + 0.002 * rng.standard_normal((1600, 1))
+        runs.append((u[:, None], J, y))
+    X, y = from_trajectories(runs, sampling_time=SAMPLE)
+    J, u = 0.75 + 0.4 * np.sin(np.arange(2000) / 200), held(2000)
+    truth = position(u, J)
+    sweep, _ = from_trajectories([(u[:, None], J, truth)], sampling_time=SAMPLE)
+    structure = GrayBoxStructure.from_template(
+        [[0, 1], [0, "-d"]], [[0], ["k"]], [[1, 0]]
+    )
+    model = LocalLPVPipeline(
+        SubspaceLTI(integrating=integrating),
+        GrayBoxRestructurer(structure),
+        scheduling="kappa",
+        experiment="experiment",
+        time="time",
+    ).fit(X, y)
+    np.testing.assert_allclose(model.report_["u0_u1"], -BIAS, atol=5e-3)
+    error = truth - model.predict(sweep).reshape(truth.shape)
+    assert np.linalg.norm(error) < 0.03 * np.linalg.norm(truth - truth.mean())
