@@ -140,16 +140,19 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
         drifts = trends[:, 1] * 2.0 / np.maximum(lengths - 1, 1)[:, None]
     if not evidence.free.initial_states:
         return Offsets(levels, outputs, drifts, constants, lengths)
-    settled = mode_rates(model.A).min(initial=1.0) * lengths.max() > _SETTLED
-    if not settled and len(model.initial_states) == len(pairs):
+    slowest = mode_rates(model.A).min(initial=1.0) * lengths.max()
+    means = np.array([u.mean(axis=0) for u, _ in pairs])
+    rest = outputs
+    if slowest > 1.0:
+        gain = evidence.state_space(model, 1.0).dc_gain()
+        constants = outputs - levels @ gain.T
+        rest = constants + means @ gain.T
+    if slowest <= _SETTLED and len(model.initial_states) == len(pairs):
         found = _as_they_begin(evidence, trends, lengths)
         if found is not None:
-            drifts, outputs, levels = none, found[1], levels + found[0]
-        return Offsets(levels, outputs, drifts, trends[:, 0], lengths)
-    means = np.array([u.mean(axis=0) for u, _ in pairs])
-    gain = evidence.state_space(model, 1.0).dc_gain()
-    constants = outputs - levels @ gain.T
-    return Offsets(means, constants + means @ gain.T, drifts, constants, lengths)
+            return Offsets(levels + found[0], found[1], none, constants, lengths)
+    levels = means if slowest > 1.0 else levels
+    return Offsets(levels, rest, drifts, constants, lengths)
 
 
 def of_rates(rates: Offsets, gain: Array, flags: NDArray[np.bool_]) -> Offsets:

@@ -273,9 +273,10 @@ class StreamSummary:
     ) -> Offsets:
         """Offsets of a stretch, in the units of the data."""
         m, back = len(self._su), self._su[:, None] * np.linalg.pinv(self._basis)
-        evidence = replace(
-            self._first.evidence, model=model._replace(trends=found.trends[None])
-        )
+        # stretches begin where others end, not at rest
+        beginnings = np.zeros((0, len(model.A)))
+        model = model._replace(trends=found.trends[None], initial_states=beginnings)
+        evidence = replace(self._first.evidence, model=model)
         return attributed(
             evidence,
             Centres(centres.inputs @ back, centres.trends * self._sy),
