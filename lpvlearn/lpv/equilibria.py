@@ -37,6 +37,7 @@ from scipy.linalg import null_space
 
 from ..models.statespace import StateSpace
 from .alignment import spanning_tree
+from .weighting import inner_places
 
 Array = NDArray[np.float64]
 
@@ -84,7 +85,7 @@ def points_of_work(
            [2., 4., 4.]])
     """
     u_scale, y_scale = scales
-    if any(m.order and np.linalg.matrix_rank(m.A) < m.order for m in models):
+    if _any_integrates(models):
         found = zip(models, inputs, outputs, strict=True)
         x0 = np.array([_state_at_rest(*point, scales) for point in found])
         return np.hstack([inputs, outputs, x0])
@@ -115,6 +116,10 @@ def points_of_work(
     return np.hstack([inputs, outputs, x0])
 
 
+def _any_integrates(models: Sequence[StateSpace]) -> bool:
+    return any(m.order and np.linalg.matrix_rank(m.A) < m.order for m in models)
+
+
 def interpolated(
     spline: Callable[[], Any],
     kappa: Array,
@@ -122,39 +127,39 @@ def interpolated(
     model_at: Callable[[Array], StateSpace],
     y_scale: Array,
 ) -> Any:
-    """A regressor of the `values` of points of work, by themselves or their constants.
+    """The `values` of points of work over `kappa`, by themselves or their constants.
 
-    `spline` makes a regressor that is to be fitted, `model_at` the frozen model at
-    scheduling values (n_scheduling,), `y_scale` the size of the motion of outputs.
+    As the regressors that `spline` makes; `model_at` gives the frozen model at
+    scheduling values (n_scheduling,), `y_scale` is the size of the motion of outputs.
     """
     by_themselves = spline().fit(kappa, values)
     if kappa.shape[1] > 1 or len(kappa) < _FEWEST:
         return by_themselves
     models = [model_at(k) for k in kappa]
-    if any(np.linalg.matrix_rank(m.A) < m.order for m in models):
+    if _any_integrates(models):
         return by_themselves
-    work = [_Work.of(m, v) for m, v in zip(models, values, strict=True)]
+    work = [_Work.of(*one) for one in zip(models, values, strict=True)]
     constants = np.array(
-        [one.constants(m) for one, m in zip(work, models, strict=True)]
+        [point.constants(m) for point, m in zip(work, models, strict=True)]
     )
-    errors = np.zeros(2)
-    order = np.argsort(kappa[:, 0])
-    for i in order[1:-1]:  # the others foresee its outputs at rest
-        kept, model, point = np.delete(np.arange(len(kappa)), i), models[i], work[i]
-        at = [spline().fit(kappa[kept], v[kept]).predict(kappa[[i]])[0]
-              for v in (values, constants)]  # fmt: skip
-        there = _Work.of(model, at[0])
-        moved = there.y + model.dc_gain() @ (point.u - there.u)
-        rests = _Work.resting(model, point.u, at[1]).y
-        for k, y in enumerate((moved, rests)):
-            errors[k] += np.sum(((y - point.y) / y_scale) ** 2)
-    bends = errors[0] > _BENT * len(order[1:-1]) * len(y_scale)
-    if not (bends and errors[1] < _BETTER * errors[0]):
+    errors = []  # of outputs at rest at points that the others foresee
+    for out in inner_places(kappa):
+        k = int(out.argmax())
+        kept = [spline().fit(kappa[~out], v[~out]) for v in (values, constants)]
+        point, rest = (one.predict(kappa[[k]])[0] for one in kept)
+        there = _Work.of(models[k], point)
+        moved = there.y + models[k].dc_gain() @ (work[k].u - there.u)
+        both = moved, _Work.resting(models[k], work[k].u, rest).y
+        errors.append([(y - work[k].y) / y_scale for y in both])
+    own, by_constants = np.mean(np.square(errors), axis=(0, 2))
+    if not (own > _BENT and by_constants < _BETTER * own):
         return by_themselves
     places = np.sort(kappa[:, 0])
-    parts = [np.linspace(a, b, _BETWEEN, endpoint=False)
-             for a, b in zip(places[:-1], places[1:], strict=True)]  # fmt: skip
-    fine = np.append(np.concatenate(parts), places[-1])[:, None]
+    fine = np.interp(
+        np.arange(_BETWEEN * (len(places) - 1) + 1) / _BETWEEN,
+        np.arange(len(places)),
+        places,
+    )[:, None]
     c = spline().fit(kappa, constants).predict(fine)
     u = by_themselves.predict(fine)[:, : models[0].n_inputs]
     found = [

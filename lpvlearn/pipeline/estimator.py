@@ -61,12 +61,7 @@ from ..validation import (
 )
 from .html_report import html_report
 from .left_out import tell_unforeseen
-from .local_models import (
-    common_delay,
-    estimates_outputs,
-    identify_points,
-    motions,
-)
+from .local_models import common_delay, estimates_outputs, identify_points
 from .memory import checked_memory
 from .output_error import (
     known_coefficients,
@@ -767,17 +762,15 @@ list, default=None
 
     def _fit_offsets(self, found: StructuredModels) -> Any:
         """Interpolation of inputs, outputs and states at rest; None for none."""
-        values = offsets_of_points(found) if self.offsets == "auto" else None
-        if values is None:
+        known = offsets_of_points(found) if self.offsets == "auto" else None
+        if known is None:
             return None
         held = getattr(self.interpolator_, "extrapolation", None) == "clip"
-        spline = SplineLPV("cubic", extrapolation="clip" if held else "ignore")
+        beyond = "clip" if held else "ignore"
+        spline = partial(SplineLPV, "cubic", extrapolation=beyond)
+        values, y_scale = known
         frozen = self.lpv_.silenced().at
-        y_scale = motions([e for group in found.points.experiments for e in group])[1][
-            1
-        ]
-        kappa = found.points.kappa
-        return interpolated(partial(clone, spline), kappa, values, frozen, y_scale)
+        return interpolated(spline, found.points.kappa, values, frozen, y_scale)
 
     def _check_options(self) -> None:
         one_of("combine", self.combine, ("pool", "average"))

@@ -29,6 +29,7 @@ from ..restructuring.known_poles import integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
+from ..subspace.identification import mode_rates
 from ..subspace.integrating import integrating_flags
 from .runner import Done, PointRunner, label_of, tell_skipped
 
@@ -347,7 +348,7 @@ def _equilibrium(
     known = [own.resting_point() for own in fitted]
     u0, y0 = (np.mean(values, axis=0) for values in zip(*known, strict=True))
     longest = max(len(e.inputs) for e in experiments)
-    if (np.abs(1.0 - first.lti_.poles()) * longest < 1.0).any():
+    if (mode_rates(first.lti_.A) * longest < 1.0).any():
         return u0, y0
     _tell_different_constants(lti, fitted, experiments)
     (u, u_scale), (y, y_scale) = motions(experiments)

@@ -153,8 +153,11 @@ def restructure_points(
     )
 
 
-def offsets_of_points(found: StructuredModels) -> Array | None:
-    """``[u0, y0, x0]`` of every point, as `LPVStateSpace` has them; None for none."""
+def offsets_of_points(found: StructuredModels) -> tuple[Array, Array] | None:
+    """``[u0, y0, x0]`` of every point, as `LPVStateSpace` has them; None for none.
+
+    And the size of the motion of the outputs.
+    """
     if not any(model.n_trend and model.rest for model in found.local):
         return None
     runs = [run for group in found.points.experiments for run in group]
@@ -162,7 +165,8 @@ def offsets_of_points(found: StructuredModels) -> Array | None:
     rest = [model.rest or (np.zeros_like(u), np.zeros_like(y)) for model in found.local]
     inputs, outputs = (np.array(values) for values in zip(*rest, strict=True))
     scales = (u_scale, y_scale)
-    return points_of_work(found.models, found.points.kappa, inputs, outputs, scales)
+    kappa = found.points.kappa
+    return points_of_work(found.models, kappa, inputs, outputs, scales), y_scale
 
 
 def _covariance(fitted: Any, model: LocalModel, runner: PointRunner) -> Array | None:

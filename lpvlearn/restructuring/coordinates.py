@@ -403,9 +403,8 @@ class View:
         if self.form is None:
             return self
         order, dt = self.form.structure.order, self.form.dt
-        S = self.system.structure.system_matrix(self.theta)
         try:
-            chart = LocalChart(S, order, dt, self.form.feedthrough)
+            chart = LocalChart(self._matrix(), order, dt, self.form.feedthrough)
         except (ValueError, np.linalg.LinAlgError):
             return self
         if chart.n_params != len(self.theta):  # the basis changes are not independent
@@ -419,8 +418,7 @@ class View:
         """The same point by its parameters; None where the form has none for it."""
         if self.form is None or self.system is self.outer:
             return self
-        S = self.system.structure.system_matrix(self.theta)
-        found = self.form.refined(S, self.outer.grid)
+        found = self.form.refined(self._matrix(), self.outer.grid)
         if found is None:
             return None
         there = self.outer.peaks(found).norm
@@ -429,18 +427,19 @@ class View:
         return self._outside(found, self.form) if near else None
 
     def beside(self, known: Array) -> View:
-        """The parameters of a model near by, or `known` ones; no chart from there on.
+        """Of a point in a chart that has no way `back`: parameters, and no more charts.
 
-        Whichever have the lower norm.
+        Those of the nearest model that has some, or the `known` ones, by the norm.
         """
-        theta, form = known, self.form
-        if form is not None and self.system is not self.outer:
-            S = self.system.structure.system_matrix(self.theta)
-            near = form.refined(S, self.outer.grid, np.inf, _SEARCHED)
-            limits = Limits(self.outer, self.limits.margin)
-            if near is not None and limits.strict(near):
-                theta = min(known, near, key=lambda x: self.outer.peaks(x).norm)
-        return self._outside(theta, None)
+        assert self.form is not None
+        near = self.form.refined(self._matrix(), self.outer.grid, np.inf, _SEARCHED)
+        there = self._outside(known, None)
+        if near is None or not there.limits.strict(near):
+            return there
+        return there.at(min(known, near, key=lambda x: self.outer.peaks(x).norm))
+
+    def _matrix(self) -> Array:
+        return self.system.structure.system_matrix(self.theta)
 
     def _outside(self, theta: Array, form: CanonicalForm | None) -> View:
         limits = Limits(self.outer, self.limits.margin)

@@ -336,15 +336,14 @@ def _of_different_basins(paths: list[PathPoint]) -> list[PathPoint]:
     """Points by ascending norm, without hopeless ones and those that have met."""
     kept: list[PathPoint] = []
     errors: list[NDArray] = []
-    paths = sorted(paths, key=lambda path: path.norm)
-    for path in paths:
-        if path.norm > _HOPELESS * paths[0].norm:
+    norms = np.array([path.norm for path in paths])
+    for i in np.argsort(norms, kind="stable"):
+        if norms[i] > _HOPELESS * norms.min():
             break
-        system = path.view.system
-        E = system.weighted_error(path.view.theta, system.grid)
-        same = _SAME_BASIN * path.norm
+        view, same = paths[i].view, _SAME_BASIN * norms[i]
+        E = view.system.weighted_error(view.theta, view.system.grid)
         if all(np.linalg.norm(E - e, 2, axis=(1, 2)).max() > same for e in errors):
-            kept, errors = [*kept, path], [*errors, E]
+            kept, errors = [*kept, paths[i]], [*errors, E]
     return kept
 
 

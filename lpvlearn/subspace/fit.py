@@ -213,7 +213,7 @@ def _with_constants(
     given &= fitted.method != "pbsid" and not choices.enforce_stability
     lost = given and (outlasts(fitted) or fitted.residual > _HARDLY)
     # Behind an integrator the offset of an input is a straight line, or a state.
-    ramps = choices.order is None and n_trend < 2 and not hides and may_ramp(tested)
+    ramps = choices.order is None and not hides and may_ramp(tested)
     lines = (lost or ramps) and choices.offset == "auto"
     if lines and not leaves_rounding(fitted.evidence.one_step):
         with suppress(TooFewSamples):
@@ -221,9 +221,11 @@ def _with_constants(
             least = min(map(criterion_in_units, tried))
             better = least - criterion_in_units(other.evidence.one_step)
             by_inputs = not other.offsets.drifts.any()
-            if by_inputs and ramps and _is_simpler(fitted, other, better):
-                fitted, n_trend = other, 2
-            elif lost and better > CERTAIN and (by_inputs or not outlasts(other)):
+            if ramps:
+                matter = by_inputs and _is_simpler(fitted, other, better)
+            else:
+                matter = better > CERTAIN and (by_inputs or not outlasts(other))
+            if matter:
                 fitted, n_trend = other, 2
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
 
@@ -726,6 +728,7 @@ def _believable(
                 before = error = found
         if choices.method != "auto":
             return first, None
+        blind, of_blind = open_loop, of_that
         if without_d and choices.feedthrough is not False:
             other, found = rival(method="pbsid")
             better = found.total < _OF_NOISE * error.total
@@ -735,8 +738,6 @@ def _believable(
                 best, error = other, found
             # inputs of the same sample tell the noise in the outputs: of a free D, all
             blind, of_blind = rival(method="po-moesp", feedthrough=False)
-        else:
-            blind, of_blind = open_loop, of_that
         # whoever says which entries of D act knows how the channels were sampled
         said = not isinstance(choices.feedthrough, bool)
         better = not said and of_blind.total < _OF_NOISE * error.total

@@ -141,18 +141,18 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
     if not evidence.free.initial_states:
         return Offsets(levels, outputs, drifts, constants, lengths)
     slowest = mode_rates(model.A).min(initial=1.0) * lengths.max()
-    means = np.array([u.mean(axis=0) for u, _ in pairs])
-    rest = outputs
-    if slowest > 1.0:
+    decays = slowest > 1.0  # over the longest experiment
+    if decays:
         gain = evidence.state_space(model, 1.0).dc_gain()
         constants = outputs - levels @ gain.T
-        rest = constants + means @ gain.T
     if slowest <= _SETTLED and len(model.initial_states) == len(pairs):
         found = _as_they_begin(evidence, trends, lengths)
         if found is not None:
             return Offsets(levels + found[0], found[1], none, constants, lengths)
-    levels = means if slowest > 1.0 else levels
-    return Offsets(levels, rest, drifts, constants, lengths)
+    if not decays:
+        return Offsets(levels, outputs, drifts, constants, lengths)
+    means = np.array([u.mean(axis=0) for u, _ in pairs])
+    return Offsets(means, constants + means @ gain.T, drifts, constants, lengths)
 
 
 def of_rates(rates: Offsets, gain: Array, flags: NDArray[np.bool_]) -> Offsets:
@@ -331,8 +331,7 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         if motion_left(other) < _MOSTLY * motion_left(without):
             return True
     replaced = _lasts(without) and not _lasts(other)
-    doubt = CERTAIN if far or replaced else 0.0
-    if not better > -(_BEYOND_DOUBT if far and replaced else doubt):
+    if not better > -(0.0, CERTAIN, _BEYOND_DOUBT)[far + replaced]:
         return False
     if far and better > _BEYOND_DOUBT:
         return True
