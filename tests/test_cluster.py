@@ -4,15 +4,17 @@ import os
 import signal
 import threading
 import time
+from importlib import import_module
 
 import numpy as np
 import pandas as pd
 import pytest
-from joblib import parallel_config
+from joblib import delayed, parallel_config
 from sklearn.model_selection import GridSearchCV
 
 from lpvlearn import ExperimentSplit, PolynomialLPV, SubspaceLTI
 from lpvlearn.paper import run_paper_experiment
+from lpvlearn.pipeline.workers import results_of
 
 from .conftest import spring_pipeline, spring_tables
 
@@ -95,6 +97,20 @@ def test_a_chain_comes_out_to_the_bit(cluster, tables):
     alone = chain().fit(*tables)
     np.testing.assert_array_equal(fitted.parameters_, alone.parameters_)
     np.testing.assert_array_equal(fitted.predict(tables[0]), alone.predict(tables[0]))
+
+
+class Unreadable:
+    """What a process has to read by a module that it does not find."""
+
+    def __reduce__(self):
+        return import_module, ("a_module_of_one_machine",)
+
+
+def test_a_task_that_the_cluster_cannot_read_is_not_waited_for(cluster):
+    with parallel_config(backend="dask"):
+        results = results_of([delayed(len)([Unreadable()])], 2)
+        with pytest.raises(RuntimeError, match="different environments"):
+            list(results)
 
 
 def test_data_are_sent_once(cluster, sent):

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
 from importlib import import_module
@@ -44,7 +45,7 @@ def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
     backend, _ = get_active_backend()
     as_they_come = "generator" if backend.supports_return_generator else "list"
     parallel = Parallel(n_jobs=n_jobs, return_as=as_they_come)
-    return _guarded(iter(parallel(_watched(tasks))))
+    return _guarded(iter(parallel(_watched(tasks))), parallel)
 
 
 def _watched(tasks: Iterable[Task]) -> Iterator[Task]:
@@ -84,9 +85,10 @@ def _ready() -> None:
     import_module("scipy.signal")
 
 
-def _guarded(results: Iterator[Any]) -> Iterator[Any]:
+def _guarded(results: Iterator[Any], parallel: Parallel) -> Iterator[Any]:
     done = threading.Event()
-    threading.Thread(target=_watch_workers, args=(done,), daemon=True).start()
+    for watch, of in ((_watch_workers, ()), (_watch_tasks, (parallel,))):
+        threading.Thread(target=watch, args=(done, *of), daemon=True).start()
     try:
         yield from results
     except BrokenProcessPool as error:
@@ -122,6 +124,18 @@ def _watch_workers(done: threading.Event) -> None:
             results._writer.close()
             return
         seen_dead = dead
+
+
+def _watch_tasks(done: threading.Event, parallel: Parallel) -> None:
+    """Have joblib raise what a cluster itself says of a task, as of one it cannot read.
+
+    It waits for ever for one of dask that fails before its function is called.
+    """
+    while not done.wait(WATCH):
+        for task in list(parallel._jobs):
+            sent = task.job
+            if isinstance(sent, Future) and sent.done() and sent.exception():
+                task._register_outcome(dict(status="Error", result=sent.exception()))
 
 
 def _in_worker(
