@@ -205,10 +205,11 @@ class SubspaceLTI(
         "auto" takes constants of all experiments where the criterion of `order` is the
         better for them and they are significant, or save states, and where signals that
         stay three standard deviations or more from zero do not refute them; else (and
-        with `detrend`, which has dealt with them) none. A given order takes drifts
-        likewise, where its model is poor or does not decay without. Where levels shift
-        within an experiment, by a load or a sensor that moved, "auto" ends it there and
-        begins another, with a warning, if the criterion is clearly better for that.
+        with `detrend`, which has dealt with them) none. Drifts it takes where they save
+        a state or are beyond doubt; of a given order, where its model is poor or does
+        not decay without. Where levels shift within an experiment, by a load or a
+        sensor that moved, "auto" ends it there and begins another, with a warning, if
+        the criterion is clearly better for that.
     missing : {"raise", "split", "estimate"}, default="raise"
         "split" ends an experiment before a sample with NaN, or a row that the `time`
         column misses, and starts another after it, with an initial state of its own.
@@ -290,7 +291,7 @@ class SubspaceLTI(
         Whether the constants of the experiments do, by more than their uncertainty.
     output_drift_ : ndarray of shape (n_experiments, n_outputs)
         Change per second (per sample where no time is known), about the middle of
-        the experiment; zero without ``offset="linear"``, and where an offset of the
+        the experiment; zero unless `offset_` is "linear", and where an offset of the
         inputs makes it.
     time_jitter_ : float
         Largest deviation of a time stamp of `fit` from an even grid, relative to the

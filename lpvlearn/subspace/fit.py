@@ -57,7 +57,7 @@ from .offsets import (
     leaves_rounding,
     may_be_better,
     may_have_constants,
-    may_ramp,
+    may_have_drift,
     shifts_matter,
     with_levels,
     without_slow_modes,
@@ -193,7 +193,6 @@ def _with_constants(
     hides = fitted.method == "pbsid" or not choices.initial_states
     hides |= choices.order is not None and fitted.residual > _HARDLY
     tested = fitted.evidence.one_step
-    tried = [tested]
 
     def may_matter() -> bool:
         if hides:
@@ -205,38 +204,46 @@ def _with_constants(
 
     if choices.offset == "auto" and may_matter():
         other = _fit(pairs, judged, told, 1, fitted)
-        tried.append(other.evidence.one_step)
-        if constants_matter(tested, tried[-1]):
+        if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
     # The states of a given order that are to follow a drift are missing elsewhere.
     given = choices.order is not None and choices.initial_states and n_trend < 2
     given &= fitted.method != "pbsid" and not choices.enforce_stability
     lost = given and (outlasts(fitted) or fitted.residual > _HARDLY)
-    # Behind an integrator the offset of an input is a straight line, or a state.
-    ramps = choices.order is None and not hides and may_ramp(tested)
-    lines = (lost or ramps) and choices.offset == "auto"
-    if lines and not leaves_rounding(fitted.evidence.one_step):
+    tested = fitted.evidence.one_step
+    before = criterion_in_units(tested)
+
+    def may_drift_off() -> bool:
+        # errors that are rounding go with the inputs, slowly
+        if rounded_outputs(tested.model, tested.records).repeated.any():
+            return False
+        return may_have_drift(tested) and _is_worth_a_choice(
+            lambda near: criterion_in_units(near.evidence) < before + CERTAIN,
+            *(pairs, judged, told, fitted, 2),
+        )
+
+    lines = choices.offset == "auto" and not leaves_rounding(tested)
+    lines &= lost or (choices.order is None and not hides and may_drift_off())
+    if lines:
         with suppress(TooFewSamples):
             other = _fit(pairs, judged, told, 2, fitted)
-            least = min(map(criterion_in_units, tried))
-            better = least - criterion_in_units(other.evidence.one_step)
-            by_inputs = not other.offsets.drifts.any()
-            if ramps:
-                matter = by_inputs and _is_simpler(fitted, other, better)
-            else:
-                matter = better > CERTAIN and (by_inputs or not outlasts(other))
-            if matter:
+            better = before - criterion_in_units(other.evidence.one_step)
+            if _is_simpler(fitted, other, better):
                 fitted, n_trend = other, 2
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
 
 
 def _is_simpler(fitted: LocalFit, other: LocalFit, better: float) -> bool:
-    """Whether offsets of the inputs are to be taken, that may save a state.
+    """Whether a model with straight lines is to be taken, that may save a state.
 
-    Of equals that model is taken which needs no mode that inputs do not move.
+    Of equals that model is taken which needs no mode that inputs do not move, where
+    inputs explain the lines. Else these are a drift, which a mode that does not decay
+    would follow as well.
     """
     spared = len(fitted.model.A) - len(other.model.A)
-    return spared >= 0 and better > (-CERTAIN if spared else 0.0)
+    if not other.offsets.drifts.any():
+        return spared >= 0 and better > (-CERTAIN if spared else 0.0)
+    return not outlasts(other) and better > (0.0 if spared > 0 else CERTAIN)
 
 
 def _is_worth_a_choice(

@@ -116,7 +116,7 @@ def with_levels(evidence: Evidence, offsets: Offsets) -> tuple[Evidence, Offsets
         levels = offsets.constants / evidence.output_scale - trends[:, 0]
         evidence = replace(evidence, levels=levels)
         if len(trends) > 1:
-            chance = chance_of_constants(evidence.one_step, equal=True)
+            chance = chance_of_trend(evidence.one_step, equal=True)
             offsets = offsets._replace(differ=chance < _SIGNIFICANT)
     return evidence, offsets
 
@@ -212,7 +212,7 @@ def may_have_constants(evidence: Evidence) -> bool:
     """
     if _is_far(evidence.records):
         return True
-    return _has_slow_mode(evidence) or chance_of_constants(evidence) < _SUSPICIOUS
+    return _has_slow_mode(evidence) or chance_of_trend(evidence) < _SUSPICIOUS
 
 
 def without_slow_modes(evidence: Evidence) -> list[tuple[Array, Array]] | None:
@@ -239,7 +239,7 @@ def may_be_better(without: Evidence, other: Evidence) -> bool:
     better = criterion_in_units(without) - criterion_in_units(other)
     if len(other.model.A) < len(without.model.A):
         return better > -CERTAIN
-    return better > 0.0 or chance_of_constants(other) < _SUSPICIOUS
+    return better > 0.0 or chance_of_trend(other) < _SUSPICIOUS
 
 
 def _is_far(records: Sequence[Record]) -> bool:
@@ -335,16 +335,19 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         return False
     if far and better > _BEYOND_DOUBT:
         return True
-    chance = chance_of_constants(other)
+    chance = chance_of_trend(other)
     return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > CERTAIN))
 
 
-def may_ramp(evidence: Evidence) -> bool:
-    """Whether two modes do not decay: together they make a straight line.
+def may_have_drift(evidence: Evidence) -> bool:
+    """Whether a model without drifts should be tried with them.
 
-    Behind an integrator that is what an offset of the input does.
+    They show in its errors; or a mode does not decay, which stands for them, or for the
+    offset of an input that is integrated.
     """
-    return bool((mode_rates(evidence.model.A) * evidence.longest < 1.0).sum() > 1)
+    if (mode_rates(evidence.model.A) * evidence.longest < 1.0).any():
+        return True
+    return chance_of_trend(evidence, 2) < _SUSPICIOUS
 
 
 def _lasts(evidence: Evidence) -> bool:
@@ -368,7 +371,7 @@ def shifts_matter(whole: Evidence, parts: Evidence) -> bool:
     n, kept = (sum(r.u.shape[1] for r in e.records) for e in (whole, parts))
     if not criterion_in_units(whole) - n / kept * criterion_in_units(parts) > CERTAIN:
         return False
-    return chance_of_constants(parts, equal=True) < _SIGNIFICANT
+    return chance_of_trend(parts, equal=True) < _SIGNIFICANT
 
 
 def criterion_in_units(evidence: Evidence) -> float:
@@ -390,25 +393,28 @@ def _is_slow(poles: NDArray[np.inexact], evidence: Evidence) -> NDArray[np.bool_
     return (1.0 - poles.real) * evidence.longest <= _SLOW
 
 
-def chance_of_constants(evidence: Evidence, *, equal: bool = False) -> float:
+def chance_of_trend(
+    evidence: Evidence, n_trend: int = 1, *, equal: bool = False
+) -> float:
     """Chance of estimated constants as large as these, where there are none.
 
-    With `equal`: as different, where they are the same in all experiments. 1 where
-    nothing can be told.
+    With `n_trend` 2 of drifts, beside constants. With `equal`: as different, where they
+    are the same in all experiments. 1 where nothing can be told.
     """
-    model, free = in_sections(evidence.model), evidence.free._replace(n_trend=1)
+    model, free = in_sections(evidence.model), evidence.free._replace(n_trend=n_trend)
     if model.blocks is None or not np.isfinite(model.loss):
         return 1.0
     last, parts, errors = len(evidence.records) - 1, [], []
     for k in sorted({round(k) for k in np.linspace(0, last, _N_TESTED)}):
         whole, x0 = evidence.records[k], model.initial_states[k]
-        record = Record(whole.u, whole.y, trend_signals(whole.u.shape[1], 1))
+        record = Record(whole.u, whole.y, trend_signals(whole.u.shape[1], n_trend))
         driven = np.column_stack([x0, model.B])
         R = signal_factor(model.blocks, record, driven)
         if R is None:
             return 1.0
         regression = jacobian_regression(R, model, driven, free)
-        part = project_out(regression, free.n_states(len(model.A)))
+        beside = free.n_own(len(model.A)) - len(whole.y)
+        part = project_out(regression, beside)
         if evidence.levels is not None:
             part[:, -1] += part[:, : len(whole.y)] @ evidence.levels[k]
         parts.append(part)
@@ -420,7 +426,7 @@ def chance_of_constants(evidence: Evidence, *, equal: bool = False) -> float:
 def _chance(
     parts: Sequence[Array], errors: Sequence[Array], equal: bool, freed: bool
 ) -> float:
-    """As `chance_of_constants`, from regressions ``[constants, Jacobian, error]``.
+    """As `chance_of_trend`, from regressions ``[constants, Jacobian, error]``.
 
     `freed` errors are of a model with constants.
     """

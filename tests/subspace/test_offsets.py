@@ -325,6 +325,25 @@ def test_an_offset_of_a_motors_input_is_found_and_predicted(options):
         assert fit_of(model, fresh, driven(fresh)) > 0.98
 
 
+@pytest.mark.parametrize("size", [0.5, 10.0])
+@pytest.mark.parametrize("every", [1, 10])
+def test_a_drift_is_not_followed_by_a_state(size, every):
+    """A mode that does not decay would follow it, and go on where inputs drive it."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        u, fresh = held(rng, 1000, every), held(rng, 500, every)
+        y, there = (
+            lfilter([0.0, 0.2, 0.1], [1.0, -1.5, 0.7], v, 0) for v in (u, fresh)
+        )
+        drift = size * y.std() * np.linspace(-1.0, 1.0, len(y))[:, None]
+        noisy = y + drift + 0.05 * y.std() * rng.standard_normal(y.shape)
+        model = SubspaceLTI(sampling_time=0.5).fit(u, noisy)
+        assert model.order_ == 2 and model.offset_ == "linear"
+        found = model.output_drift_.item() * 0.5 * (len(y) - 1)
+        assert found == pytest.approx(np.ptp(drift), rel=0.05)
+        assert fit_of(model, fresh, there) > 0.95
+
+
 def test_offsets_of_the_input_of_several_experiments_differ():
     rng = np.random.default_rng(0)
     u, biases = held(rng, 2400), (0.3, -0.1, 0.2)
