@@ -7,7 +7,6 @@ The records are made regular, order and horizon chosen, the model identified
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +25,15 @@ from ..exceptions import RankWarning
 from ..systems.simulation import delayed, lti_response
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .delay import find_lead, first_samples, longest_delays, with_later_inputs
-from .drift import differences, drifts, may_drift, of_levels, outlasts, wanders
+from .drift import (
+    differences,
+    drifts,
+    may_drift,
+    of_levels,
+    outlasts,
+    unmoved_errors,
+    wanders,
+)
 from .fit_warnings import (
     Doubt,
     tell,
@@ -112,6 +119,11 @@ _OF_NOISE, _DOUBT, _CERTAIN = 0.5, 2.0, 3.0
 # Share of the squared errors of parts held out that further states leave there where
 # they are the plant's.
 _FAR_BETTER = 0.5
+
+
+# Units of the criterion by which models are no better than each other; times the
+# squared errors without what inputs do to modes that do not decay.
+_ALIKE, _NOT_MOVED, _HARDLY_MOVED = 10.0, 1.1, 3.0
 
 
 class TooFewSamples(ValueError):
@@ -210,40 +222,57 @@ def _with_constants(
     given = choices.order is not None and choices.initial_states and n_trend < 2
     given &= fitted.method != "pbsid" and not choices.enforce_stability
     lost = given and (outlasts(fitted) or fitted.residual > _HARDLY)
-    tested = fitted.evidence.one_step
-    before = criterion_in_units(tested)
-
-    def may_drift_off() -> bool:
-        # errors that are rounding go with the inputs, slowly
-        if rounded_outputs(tested.model, tested.records).repeated.any():
-            return False
-        return may_have_drift(tested) and _is_worth_a_choice(
-            lambda near: criterion_in_units(near.evidence) < before + CERTAIN,
-            *(pairs, judged, told, fitted, 2),
-        )
-
-    lines = choices.offset == "auto" and not leaves_rounding(tested)
-    lines &= lost or (choices.order is None and not hides and may_drift_off())
-    if lines:
-        with suppress(TooFewSamples):
-            other = _fit(pairs, judged, told, 2, fitted)
-            better = before - criterion_in_units(other.evidence.one_step)
-            if _is_simpler(fitted, other, better):
-                fitted, n_trend = other, 2
+    shown = choices.order is None and not hides and not rough
+    if choices.offset == "auto" and (
+        lost or (shown and _may_drift_off(pairs, judged, told, fitted))
+    ):
+        fitted = _with_drifts(pairs, judged, told, fitted)
+        n_trend = fitted.evidence.free.n_trend
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
 
 
-def _is_simpler(fitted: LocalFit, other: LocalFit, better: float) -> bool:
-    """Whether a model with straight lines is to be taken, that may save a state.
+def _may_drift_off(
+    pairs: Pairs, choices: Choices, told: set[str], fitted: LocalFit
+) -> bool:
+    """Whether to try drifts, of a model whose errors or modes may hide them."""
+    tested = fitted.evidence.one_step
+    # Errors that are rounding go with the inputs, slowly.
+    if rounded_outputs(tested.model, tested.records).repeated.any():
+        return False
+    most = criterion_in_units(tested) + CERTAIN
+    return (may_have_drift(tested) or wanders(tested)) and _is_worth_a_choice(
+        lambda near: criterion_in_units(near.evidence) < most,
+        *(pairs, choices, told, fitted, 2),
+    )
 
-    Of equals that model is taken which needs no mode that inputs do not move, where
-    inputs explain the lines. Else these are a drift, which a mode that does not decay
-    would follow as well.
+
+def _with_drifts(
+    pairs: Pairs, choices: Choices, told: set[str], fitted: LocalFit
+) -> LocalFit:
+    """The model with drifts, or offsets of inputs that are integrated, if that is it.
+
+    Of equals the model is taken which needs no mode that inputs do not move: it stands
+    for an offset of theirs, or for a drift. Noise that is as slow as that keeps drifts
+    no better than constants; else these must be beyond doubt.
     """
+    tested = fitted.evidence.one_step
+    if leaves_rounding(tested):
+        return fitted
+    try:
+        other = _fit(pairs, choices, told, 2, fitted)
+    except TooFewSamples:
+        return fitted
+    better = criterion_in_units(tested) - criterion_in_units(other.evidence.one_step)
     spared = len(fitted.model.A) - len(other.model.A)
     if not other.offsets.drifts.any():
-        return spared >= 0 and better > (-CERTAIN if spared else 0.0)
-    return not outlasts(other) and better > (0.0 if spared > 0 else CERTAIN)
+        simpler = spared >= 0 and better > (-_ALIKE if spared else _ALIKE)
+    else:
+        unmoved = unmoved_errors(tested)
+        slow = wanders(tested) and not outlasts(fitted) and len(other.model.A) > 0
+        least = _ALIKE if unmoved < _HARDLY_MOVED or slow else CERTAIN
+        least = -_ALIKE if unmoved < _NOT_MOVED else least
+        simpler = better > least and not outlasts(other)
+    return other if simpler else fitted
 
 
 def _is_worth_a_choice(
