@@ -224,8 +224,10 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 # * ``offset="linear"`` adds a drift (``output_drift_``, per second). It is also what a
 #   system that *integrates* needs, a motor whose amplifier has a bias: its answer to an
 #   offset of the input is a straight line, and is told as ``input_offset_``, which
-#   ``predict`` knows. ``"auto"`` takes it where a second integrator, which no input
-#   moves, would stand for it. With ``integrating`` it is a constant rate.
+#   ``predict`` knows. ``"auto"`` takes either where a mode that does not decay, and no
+#   input moves, would stand for it: on other records such a mode goes astray. Of a
+#   drift that is there beyond doubt it asks no more. With ``integrating`` it is a
+#   constant rate.
 # * A load that comes or goes, or a sensor that moves, shifts the level within an
 #   experiment. A slow mode would explain it, and simulate other records by what it made
 #   up. ``"auto"`` looks for such shifts, which no regression on the past foresees, ends

@@ -488,6 +488,8 @@ def drift(first: int, n_runs: int = 12) -> None:
                     std = abs(model.frequency_response_std([1e-6]).item())
                 except ValueError:  # kept stable: no deviations
                     continue
+                if not std:  # nothing was found
+                    continue
                 gap = model.lti_.frequency_response([1e-6]).item()
                 off.append(abs(gap - plant.frequency_response([1e-6]).item()) / std)
             print(
