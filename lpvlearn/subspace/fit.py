@@ -214,10 +214,13 @@ def _with_constants(
             *(pairs, judged, told, fitted, 1),
         )
 
+    refused = np.inf
     if choices.offset == "auto" and may_matter():
         other = _fit(pairs, judged, told, 1, fitted)
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
+        elif choices.order is not None:  # a poor model shows many things
+            refused = criterion_in_units(other.evidence.one_step)
     # The states of a given order that are to follow a drift are missing elsewhere.
     given = choices.order is not None and choices.initial_states and n_trend < 2
     given &= fitted.method != "pbsid" and not choices.enforce_stability
@@ -226,7 +229,7 @@ def _with_constants(
     if choices.offset == "auto" and (
         lost or (shown and _may_drift_off(pairs, judged, told, fitted))
     ):
-        fitted = _with_drifts(pairs, judged, told, fitted)
+        fitted = _with_drifts(pairs, judged, told, fitted, refused)
         n_trend = fitted.evidence.free.n_trend
     return _fit(pairs, choices, told, n_trend, fitted) if rough else fitted
 
@@ -247,13 +250,18 @@ def _may_drift_off(
 
 
 def _with_drifts(
-    pairs: Pairs, choices: Choices, told: set[str], fitted: LocalFit
+    pairs: Pairs,
+    choices: Choices,
+    told: set[str],
+    fitted: LocalFit,
+    refused: float = np.inf,
 ) -> LocalFit:
     """The model with drifts, or offsets of inputs that are integrated, if that is it.
 
     Of equals the model is taken which needs no mode that inputs do not move: it stands
     for an offset of theirs, or for a drift. Noise that is as slow as that keeps drifts
-    no better than constants; else these must be beyond doubt.
+    no better than constants; else these must be beyond doubt. The criterion of a model
+    that was `refused` is to be met as well.
     """
     tested = fitted.evidence.one_step
     if leaves_rounding(tested):
@@ -262,17 +270,20 @@ def _with_drifts(
         other = _fit(pairs, choices, told, 2, fitted)
     except TooFewSamples:
         return fitted
-    better = criterion_in_units(tested) - criterion_in_units(other.evidence.one_step)
+    before = min(criterion_in_units(tested), refused)
+    better = before - criterion_in_units(other.evidence.one_step)
     spared = len(fitted.model.A) - len(other.model.A)
     if not other.offsets.drifts.any():
-        simpler = spared >= 0 and better > (-_ALIKE if spared else _ALIKE)
+        least, simpler = -_ALIKE if spared else _ALIKE, spared >= 0
     else:
         unmoved = unmoved_errors(tested)
         slow = wanders(tested) and not outlasts(fitted) and len(other.model.A) > 0
         least = _ALIKE if unmoved < _HARDLY_MOVED or slow else CERTAIN
         least = -_ALIKE if unmoved < _NOT_MOVED else least
-        simpler = better > least and not outlasts(other)
-    return other if simpler else fitted
+        simpler = not outlasts(other)
+    if choices.order is not None:
+        least = CERTAIN
+    return other if simpler and better > least else fitted
 
 
 def _is_worth_a_choice(
