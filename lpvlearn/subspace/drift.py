@@ -65,7 +65,8 @@ def unmoved_errors(evidence: Evidence) -> float:
     """
     model, free = evidence.model, evidence.free
     poles, V = np.linalg.eig(model.A)
-    slow = (mode_rates(model.A) * evidence.longest < _LASTS) | (np.abs(poles) > 1.0)
+    lasts = np.abs(1.0 - poles) * evidence.longest < _LASTS  # as of `V`, by column
+    slow = lasts | (np.abs(poles) > 1.0)
     if not slow.any() or not free.initial_states:
         return np.inf
     try:

@@ -120,7 +120,6 @@ _OF_NOISE, _DOUBT, _CERTAIN = 0.5, 2.0, 3.0
 # they are the plant's.
 _FAR_BETTER = 0.5
 
-
 # Units of the criterion by which models are no better than each other; times the
 # squared errors without what inputs do to modes that do not decay.
 _ALIKE, _NOT_MOVED, _HARDLY_MOVED = 10.0, 1.1, 3.0
