@@ -317,7 +317,8 @@ class SubspaceLTI(
     their uncertainty it warns, as inputs alone cannot tell which one it will be. What
     is given outputs estimates constant (and drift) of every experiment anew:
     `predict_with_initial_state`, `residual_tests` and, from estimated initial states,
-    `predict_ahead`.
+    `predict_ahead`. The first and the last do so of "auto" that took no constants as
+    well: fits of models with and without them are those of as many unknowns.
 
     Without refinement, "po-moesp" with as many noise states as the noise has and
     "pi-moesp" at the order of the system are consistent under coloured noise, others
@@ -519,7 +520,10 @@ class SubspaceLTI(
         predictor = self._evidence.predictor(self.lti_, None)
         u0, y0 = self.resting_point()
         rest = self.initial_state == "rest"
-        own = [(None, y0) if rest else self._own_part(e, predictor) for e in completed]
+        own = [
+            (None, y0) if rest else self._own_part(e, predictor, of_fit=True)
+            for e in completed
+        ]
         found = list(zip(runs, own, strict=True))
         try:
             if predictor.gain is not None:
@@ -1059,11 +1063,11 @@ class SubspaceLTI(
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs, used for the initial state of every experiment (and of a
-            model with `offset_` for the constant and drift) only: least squares over
-            the whole experiment. Missing ones (NaN) are left out. Where inputs act
-            late, those in transit are estimated too: the first samples are then met
-            more or less exactly.
+            Measured outputs, used for the initial state of every experiment, for a
+            constant unless ``offset=None``, and for the drift of ``offset_ ==
+            "linear"`` only: least squares over the whole experiment. Missing ones (NaN)
+            are left out. Where inputs act late, those in transit are estimated too: the
+            first samples are then met more or less exactly.
 
         Returns
         -------
@@ -1116,9 +1120,10 @@ class SubspaceLTI(
         steps : int, default=1
             Prediction horizon in samples.
         initial_state : {"estimate", "rest"}, default="estimate"
-            "estimate" takes the deterministic initial state from the whole experiment,
-            as `predict_with_initial_state` does (with "pbsid" that of plant and noise,
-            from the errors of prediction); "rest" uses no later output.
+            "estimate" takes the deterministic initial state (and the constant) from the
+            whole experiment, as `predict_with_initial_state` does (with "pbsid" that of
+            plant and noise, from the errors of prediction); "rest" uses no later
+            output.
 
         Returns
         -------
@@ -1437,15 +1442,23 @@ class SubspaceLTI(
         return y0 + self.lti_.simulate(experiment.inputs - u0)
 
     def _own_part(
-        self, experiment: Experiment, predictor: InnovationModel | None = None
+        self,
+        experiment: Experiment,
+        predictor: InnovationModel | None = None,
+        *,
+        of_fit: bool = False,
     ) -> tuple[Array, Array]:
         """Initial state, inputs in transit; and the outputs their answers add to.
 
         Behind the errors of simulation, or of a predictor that has a gain, for which
-        inputs in transit are those at rest: what they miss dies out.
+        inputs in transit are those at rest: what they miss dies out. A level that did
+        not show in the samples `of_fit` may show in others.
         """
         (u0, y0), y = self.resting_point(), experiment.measured
-        lti, trend = self.lti_, trend_signals(len(y), self._evidence.free.n_trend)
+        n_trend = self._evidence.free.n_trend
+        if not n_trend and self.offset is not None and not of_fit:
+            n_trend = 1
+        lti, trend = self.lti_, trend_signals(len(y), n_trend)
         if predictor is None or predictor.gain is None:
             responses = free_responses(lti.A, lti.C, len(y), trend)
             responses = with_transit(responses, lti.B, lti.D, lti.input_delay)

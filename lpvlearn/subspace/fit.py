@@ -258,9 +258,8 @@ def _with_drifts(
     """The model with drifts, or offsets of inputs that are integrated, if that is it.
 
     Of equals the model is taken which needs no mode that inputs do not move: it stands
-    for an offset of theirs, or for a drift. Noise that is as slow as that keeps drifts
-    no better than constants; else these must be beyond doubt. The criterion of a model
-    that was `refused` is to be met as well.
+    for an offset of theirs, or for a drift. Else drifts must be beyond doubt: noise may
+    be as slow. The criterion of a model that was `refused` is to be met as well.
     """
     tested = fitted.evidence.one_step
     if leaves_rounding(tested):
@@ -276,8 +275,7 @@ def _with_drifts(
         least, simpler = -_ALIKE if spared else _ALIKE, spared >= 0
     else:
         unmoved = unmoved_errors(tested)
-        slow = wanders(tested) and not outlasts(fitted) and len(other.model.A) > 0
-        least = _ALIKE if unmoved < _HARDLY_MOVED or slow else CERTAIN
+        least = _ALIKE if unmoved < _HARDLY_MOVED else CERTAIN
         least = -_ALIKE if unmoved < _NOT_MOVED else least
         simpler = not outlasts(other)
     if choices.order is not None:
@@ -328,7 +326,8 @@ def _of_drifting_noise(
 ) -> LocalFit | None:
     """The model by differences of all samples; None where their noise does not drift.
 
-    Where a controller answers the outputs, its inputs follow the drift as well.
+    Or that of samples with as many states, where its noise does not. Where a
+    controller answers the outputs, its inputs follow the drift as well.
     """
     weighed = choices.refine in ("auto", "prediction") and not choices.estimated
     if whole.method == "pbsid" or not weighed or not choices.initial_states:
@@ -369,6 +368,11 @@ def _of_drifting_noise(
         other.evidence, feedback.innovations
     ):
         return None  # errors that inputs explain are no drift
+    level = _fit(pairs, choices._replace(order=len(other.model.A)), told, n_trend)
+    worse = criterion_in_units(level.evidence) - criterion_in_units(other.evidence)
+    if worse < _ALIKE and not wanders(level.evidence) and not outlasts(level):
+        # Of as many states: what wandered was what others had followed.
+        return level._replace(selection=level.selection.among(found.selection))
     held_out = found.selection.held_out
     if held_out is not None:  # its errors, by those of all differences
         share = held_out.residual / found.residual

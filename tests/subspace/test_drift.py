@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.metrics import bft_score
+from lpvlearn.subspace import fit
 from lpvlearn.subspace.drift import differences, of_levels
 from lpvlearn.subspace.fit import _fit
 from lpvlearn.subspace.options import Choices
@@ -163,6 +164,18 @@ class TestOutputsThatDoNotDrift:
         assert not _of_differences(model)
         std = np.abs(model.frequency_response_std([1e-6])).item()
         assert abs((model.lti_.dc_gain() - plant.dc_gain()).item()) < 3.5 * std
+
+    def test_nothing_drifts_beside_as_many_states(self, monkeypatch):
+        """Whatever the samples looked like with others."""
+        monkeypatch.setattr(fit, "may_drift", lambda fitted: True)
+        monkeypatch.setattr(fit, "drifts", lambda whole, other, doubt=0.0: True)
+        u, y = _record(0, drift=0.0, noise=0.3)
+        model = _quiet_fit(u, y)
+        assert not _of_differences(model)
+        assert model.offset_ == "constant"  # as beside differences
+        assert _fresh_bft(model) > 95.0
+        u, y = _record(0)
+        assert _of_differences(_quiet_fit(u, y))
 
     def test_what_was_said_of_the_refinement_is_heeded(self):
         u, y = _record(0)

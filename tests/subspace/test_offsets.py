@@ -423,6 +423,27 @@ def test_prediction_rests_at_the_common_offset(rng):
     np.testing.assert_allclose(found - y0, SYSTEM.simulate(u), atol=1e-8)
 
 
+@pytest.mark.parametrize("levels", [(0.0, 0.0, 0.0), (5.0, -3.0, 0.4)])
+def test_levels_of_other_records_are_estimated(rng, levels):
+    """Whether the samples of the fit had any, unless they are known to be zero."""
+    X, y = table(rng, levels=levels)
+    model = SubspaceLTI(3, horizon=6, **options()).fit(X, y)
+    assert (model.offset_ is None) == (not any(levels))
+    other = y + [7.0, -2.0]
+    simulated = model.predict_with_initial_state(X, other)
+    np.testing.assert_allclose(simulated, other, atol=1e-8)
+    ahead = model.predict_ahead(X, other, steps=50)
+    np.testing.assert_allclose(ahead, other, atol=1e-8)
+
+
+def test_levels_that_are_known_to_be_zero_are_not_estimated(rng):
+    X, y = table(rng, levels=(0.0, 0.0, 0.0))
+    model = SubspaceLTI(3, horizon=6, offset=None, **options()).fit(X, y)
+    np.testing.assert_allclose(model.predict_with_initial_state(X, y), y, atol=1e-8)
+    found = model.predict_with_initial_state(X, y + 7.0)
+    assert (np.abs(np.mean(y + 7.0 - found, axis=0)) > 5.0).all()
+
+
 @pytest.mark.parametrize("level", [1e2, 1e4, 1e6])
 def test_constants_are_found_far_from_zero(rng, level):
     u = rng.standard_normal((400, 2))
