@@ -58,30 +58,6 @@ def outlasts(fitted: LocalFit) -> bool:
     return bool(slow) or fitted.grows()
 
 
-def unmoved_errors(evidence: Evidence) -> float:
-    """Times the squared errors, without what inputs do to modes that do not decay.
-
-    Next to one of modes that follow a drift; infinite where there are none.
-    """
-    model, free = evidence.model, evidence.free
-    poles, V = np.linalg.eig(model.A)
-    lasts = np.abs(1.0 - poles) * evidence.longest < _LASTS  # as of `V`, by column
-    slow = lasts | (np.abs(poles) > 1.0)
-    if not slow.any() or not free.initial_states:
-        return np.inf
-    try:
-        part = (V[:, slow] @ np.linalg.inv(V)[slow]).real
-    except np.linalg.LinAlgError:
-        return np.inf
-    weight, losses = evidence.whitening.weight, []
-    for B in (model.B - part @ model.B, model.B):
-        moved = model._replace(B=B, blocks=None)
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = with_initial_states(moved, evidence.records, free, weight)
-        losses.append(found.loss)
-    return losses[0] / losses[1] if 0.0 < losses[1] < np.inf else np.inf
-
-
 def may_drift(fitted: LocalFit) -> bool:
     """Whether the errors of a model wander, or a mode of it may do so for them.
 

@@ -1163,8 +1163,9 @@ class SubspaceLTI(
             Measured outputs. Initial states and trends of `offset_` are estimated from
             them, `detrend` acts as in `fit`. Records are cut where samples are missing.
         errors : {"simulation", "prediction"}, default="simulation"
-            Of `predict_with_initial_state`, or of `predict_ahead`. Only the latter
-            should be white: they test the noise model too.
+            Of `predict_with_initial_state`, or of `predict_ahead`, beside no other
+            trends than those of `offset_`. Only the latter should be white: they test
+            the noise model too.
         n_lags : int, default=None
             Samples to the past and to the future that are looked at. None: 25, fewer
             where experiments are short. Experiments of ``4 * n_lags`` samples or fewer

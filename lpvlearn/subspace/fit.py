@@ -31,7 +31,6 @@ from .drift import (
     may_drift,
     of_levels,
     outlasts,
-    unmoved_errors,
     wanders,
 )
 from .fit_warnings import (
@@ -55,7 +54,9 @@ from .identification import (
 )
 from .local_fit import LocalFit
 from .offsets import (
+    ALIKE,
     CERTAIN,
+    HARDLY_MOVED,
     N_TRENDS,
     attributed,
     constants_matter,
@@ -66,6 +67,7 @@ from .offsets import (
     may_have_constants,
     may_have_drift,
     shifts_matter,
+    unmoved_errors,
     with_levels,
     without_slow_modes,
 )
@@ -120,9 +122,9 @@ _OF_NOISE, _DOUBT, _CERTAIN = 0.5, 2.0, 3.0
 # they are the plant's.
 _FAR_BETTER = 0.5
 
-# Units of the criterion by which models are no better than each other; times the
-# squared errors without what inputs do to modes that do not decay.
-_ALIKE, _NOT_MOVED, _HARDLY_MOVED = 10.0, 1.1, 3.0
+# Times the squared errors without what inputs do to modes that do not decay, of ones
+# that they do not move at all.
+_NOT_MOVED = 1.1
 
 
 class TooFewSamples(ValueError):
@@ -272,11 +274,11 @@ def _with_drifts(
     better = before - criterion_in_units(other.evidence.one_step)
     spared = len(fitted.model.A) - len(other.model.A)
     if not other.offsets.drifts.any():
-        least, simpler = -_ALIKE if spared else _ALIKE, spared >= 0
+        least, simpler = -ALIKE if spared else ALIKE, spared >= 0
     else:
         unmoved = unmoved_errors(tested)
-        least = _ALIKE if unmoved < _HARDLY_MOVED else CERTAIN
-        least = -_ALIKE if unmoved < _NOT_MOVED else least
+        least = ALIKE if unmoved < HARDLY_MOVED else CERTAIN
+        least = -ALIKE if unmoved < _NOT_MOVED else least
         simpler = not outlasts(other)
     if choices.order is not None:
         least = CERTAIN
@@ -370,7 +372,7 @@ def _of_drifting_noise(
         return None  # errors that inputs explain are no drift
     level = _fit(pairs, choices._replace(order=len(other.model.A)), told, n_trend)
     worse = criterion_in_units(level.evidence) - criterion_in_units(other.evidence)
-    if worse < _ALIKE and not wanders(level.evidence) and not outlasts(level):
+    if worse < ALIKE and not wanders(level.evidence) and not outlasts(level):
         # Of as many states: what wandered was what others had followed.
         return level._replace(selection=level.selection.among(found.selection))
     held_out = found.selection.held_out

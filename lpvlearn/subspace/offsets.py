@@ -40,6 +40,7 @@ from .simulation_fit import (
     jacobian_regression,
     project_out,
     simulation_errors,
+    with_initial_states,
 )
 from .statistics import Evidence
 
@@ -78,6 +79,10 @@ _UNSEEN, _NEARLY = 0.1, 0.01  # of errors, and of a drift: what inputs need not 
 _LASTING = 0.1  # decay of a mode over a record, of one that may be a constant
 _FAR = 3.0  # standard deviations between the mean of a channel and zero
 _SLOW = 3.0  # time constants per experiment of a mode that may stand for a constant
+
+# Units of the criterion by which models are no better than each other; times the
+# squared errors without what inputs do to such modes, of ones that they hardly move.
+ALIKE, HARDLY_MOVED = 10.0, 3.0
 
 
 class Offsets(NamedTuple):
@@ -331,7 +336,10 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         if motion_left(other) < _MOSTLY * motion_left(without):
             return True
     replaced = _lasts(without) and not _lasts(other)
-    if not better > -(0.0, CERTAIN, _BEYOND_DOUBT)[far + replaced]:
+    least = -(0.0, CERTAIN, _BEYOND_DOUBT)[far + replaced]
+    if not _has_slow_mode(other) and unmoved_errors(without) < HARDLY_MOVED:
+        least = min(least, -ALIKE)
+    if not better > least:
         return False
     if far and better > _BEYOND_DOUBT:
         return True
@@ -353,6 +361,30 @@ def may_have_drift(evidence: Evidence) -> bool:
 def _lasts(evidence: Evidence) -> bool:
     """Whether a mode stays what it is over the longest record."""
     return bool((mode_rates(evidence.model.A) * evidence.longest < _LASTING).any())
+
+
+def unmoved_errors(evidence: Evidence) -> float:
+    """Times the squared errors, without what inputs do to modes that do not decay.
+
+    Next to one of modes that follow a drift; infinite where there are none.
+    """
+    model, free = evidence.model, evidence.free
+    poles, V = np.linalg.eig(model.A)
+    lasts = np.abs(1.0 - poles) * evidence.longest < _SLOW  # as of `V`, by column
+    slow = lasts | (np.abs(poles) > 1.0)
+    if not slow.any() or not free.initial_states:
+        return np.inf
+    try:
+        part = (V[:, slow] @ np.linalg.inv(V)[slow]).real
+    except np.linalg.LinAlgError:
+        return np.inf
+    weight, losses = evidence.whitening.weight, []
+    for B in (model.B - part @ model.B, model.B):
+        moved = model._replace(B=B, blocks=None)
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = with_initial_states(moved, evidence.records, free, weight)
+        losses.append(found.loss)
+    return losses[0] / losses[1] if 0.0 < losses[1] < np.inf else np.inf
 
 
 def _is_beyond(evidence: Evidence) -> bool:

@@ -691,6 +691,23 @@ def test_signals_without_any_noise_tell_of_no_constants():
     assert _tail(np.zeros(1), nothing, np.eye(2), 10.0) == 1.0
 
 
+def test_a_mode_that_inputs_hardly_move_is_no_better_than_a_constant():
+    """Beside slow noise it seems as likely."""
+    rng = np.random.default_rng(24)
+    n_samples, hold = int(rng.integers(200, 900)), int(rng.integers(5, 40))
+    u = np.repeat(rng.uniform(0.0, 1.0, n_samples // hold + 1), hold)[:n_samples]
+    pole = np.exp(-rng.uniform(0.3, 2.0) / hold)
+    y = lfilter([0.0, 1.0 - pole], [1.0, -pole], u)
+    colour, size = rng.uniform(0.0, 0.95), y.std()
+    v = lfilter([1.0], [1.0, -colour], rng.standard_normal(n_samples))
+    y += rng.uniform(0.03, 0.4) * size * v / v.std()
+    y += rng.uniform(0.3, 2.0) * size * rng.choice([-1.0, 1.0])
+    model = SubspaceLTI(sampling_time=1.0).fit(u[:, None], y)
+    assert (model.order_, model.offset_) == (1, "constant")
+    assert model.lti_.poles().item().real == pytest.approx(pole, abs=0.002)
+    assert model.lti_.dc_gain().item() == pytest.approx(1.0, abs=0.01)
+
+
 def test_a_slow_mode_less_leaves_what_is_seen_of_the_others(rng):
     A = modes(0.9 * np.exp(0.4j), 0.7, 0.9999)
     B, C = rng.standard_normal((4, 1)), rng.standard_normal((2, 4))
