@@ -220,6 +220,8 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 # have, so where those of the experiments differ, ``predict`` takes their mean and
 # warns; with outputs at hand, ``predict_with_initial_state``, scores with
 # ``initial_state="estimate"`` and ``residual_tests`` estimate each experiment's own.
+# The first two do so unless ``offset=None``, whether or not the fit found any: another
+# record may stand elsewhere, and fits of models with and without constants compare.
 #
 # * ``offset="linear"`` adds a drift (``output_drift_``, per second). It is also what a
 #   system that *integrates* needs, a motor whose amplifier has a bias: its answer to an
@@ -235,7 +237,8 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 # * Where outputs wander (a temperature, a bias, loads that add up), a slow mode follows
 #   what no input did, whatever constants there are. The differences of the samples have
 #   the same plant, and a noise that does not wander: the model is theirs where that is
-#   likelier, or where the samples need a mode slower than the record to do better. Its
+#   likelier, or where the samples need a mode slower than the record to do better,
+#   unless they need no more states than their differences for a noise that stays. Its
 #   static gain is less certain, as its deviations say.
 # * An output that stays at its largest or smallest value while the inputs move is at a
 #   limit, of its sensor or of the plant. A fit tells of it; NaN for these samples and
