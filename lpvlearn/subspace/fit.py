@@ -240,11 +240,13 @@ def _may_drift_off(
 ) -> bool:
     """Whether to try drifts, of a model whose errors or modes may hide them."""
     tested = fitted.evidence.one_step
+    if not (may_have_drift(tested) or wanders(tested)):
+        return False
     # Errors that are rounding go with the inputs, slowly.
     if rounded_outputs(tested.model, tested.records).repeated.any():
         return False
     most = criterion_in_units(tested) + CERTAIN
-    return (may_have_drift(tested) or wanders(tested)) and _is_worth_a_choice(
+    return _is_worth_a_choice(
         lambda near: criterion_in_units(near.evidence) < most,
         *(pairs, choices, told, fitted, 2),
     )

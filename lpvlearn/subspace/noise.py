@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from math import log
+from operator import mul
 from typing import NamedTuple
 
 import numpy as np
@@ -276,17 +277,19 @@ def _log_determinant(covariance: Array) -> tuple[float, float]:
 
 def _scalar_regressions(lags: Array) -> Iterator[tuple[Array, Array]]:
     """As `_regressions` of one channel, whose predictions back mirror those forth."""
-    r = lags[:, 0, 0]
-    forth, variance = np.zeros(0), float(r[0])
-    yield forth[None], np.array([[variance]])
-    for p in range(len(r) - 1):
+    r = lags[:, 0, 0].tolist()
+    forth: list[float] = []
+    variance = r[0]
+    yield np.array([forth]), np.array([[variance]])
+    for p in range(1, len(r)):
         if variance == 0.0:  # nothing is left to explain
             return
-        new = float(r[p + 1]) - float(forth @ r[p:0:-1])
+        new = r[p] - sum(map(mul, forth, r[p - 1 : 0 : -1]))
         gain = new / variance
-        forth = np.append(forth - gain * forth[::-1], gain)
+        forth = [f - gain * b for f, b in zip(forth, reversed(forth), strict=True)]
+        forth.append(gain)
         variance -= gain * new
-        yield forth[None], np.array([[variance]])
+        yield np.array([forth]), np.array([[variance]])
 
 
 def _regressions(lags: Array) -> Iterator[tuple[Array, Array]]:

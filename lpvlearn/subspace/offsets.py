@@ -499,7 +499,8 @@ def _squares(x: Array) -> float:
 
 def _tail(score: Array, effect: Array, density: Array, n_error: float) -> float:
     """Chance of such a score, by the F distribution."""
-    covariance = np.einsum("eikp,ij,ejkq->pq", effect, density, effect, optimize=True)
+    by_sample = effect.transpose(0, 2, 1, 3)
+    covariance = np.tensordot(by_sample, density @ by_sample, ([0, 1, 2], [0, 1, 2]))
     scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     scale = np.where(scale > 0, scale, 1.0)  # zero of outputs that are one signal
     inverse = np.linalg.pinv(covariance / scale[:, None] / scale, hermitian=True)
