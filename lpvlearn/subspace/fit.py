@@ -273,7 +273,7 @@ def _with_drifts(
     except TooFewSamples:
         return fitted
     before = min(criterion_in_units(tested), refused)
-    better = before - criterion_in_units(other.evidence.one_step)
+    reached = criterion_in_units(other.evidence.one_step)
     spared = len(fitted.model.A) - len(other.model.A)
     if not other.offsets.drifts.any():
         least, simpler = -ALIKE if spared else ALIKE, spared >= 0
@@ -284,7 +284,15 @@ def _with_drifts(
         simpler = not outlasts(other)
     if choices.order is not None:
         least = CERTAIN
-    return other if simpler and better > least else fitted
+    if not (simpler and before - reached > least):
+        return fitted
+    if spared < 0 and choices.order is None:
+        # What more states gain is no drift.
+        n_trend = fitted.evidence.free.n_trend
+        level = _fit(pairs, choices._replace(order=len(other.model.A)), told, n_trend)
+        if not criterion_in_units(level.evidence.one_step) - reached > least:
+            return level._replace(selection=level.selection.among(other.selection))
+    return other
 
 
 def _is_worth_a_choice(
