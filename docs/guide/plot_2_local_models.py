@@ -220,8 +220,8 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 # have, so where those of the experiments differ, ``predict`` takes their mean and
 # warns; with outputs at hand, ``predict_with_initial_state``, scores with
 # ``initial_state="estimate"`` and ``residual_tests`` estimate each experiment's own.
-# The first two do so unless ``offset=None``, whether or not the fit found any: another
-# record may stand elsewhere, and fits of models with and without constants compare.
+# The first two do so too where ``"auto"`` found none in the samples of the fit, and a
+# level explains most of the errors in others, beyond chance.
 #
 # * ``offset="linear"`` adds a drift (``output_drift_``, per second). It is also what a
 #   system that *integrates* needs, a motor whose amplifier has a bias: its answer to an

@@ -29,6 +29,8 @@ _GAIN = 2.0
 # starts in motion that cost more than 10 points were found.)
 _MODE, _CHANCE = 2, 1e-3
 
+_AS_GOOD = 1.1  # times the errors: those of another level alone, beside a state and it
+
 _SETTLED = 0.99  # share of its energy within which a transient is over
 _WINDOWS = 8  # of that length in a record; of a longer transient the start will do
 
@@ -124,7 +126,10 @@ def _starts_in_motion(
     if not size.all():
         return False
     before, after = ((measured - x) / size for x in (from_rest, estimated))
+    about_level = np.where(known, before - np.nanmean(before, axis=0), 0.0)
     before, after = (np.where(known, x, 0.0) for x in (before, after))
+    if np.linalg.norm(about_level) <= _AS_GOOD * np.linalg.norm(after):
+        return False  # another level, and no motion
     transient = before - after
     if not np.abs(transient).max() < np.sqrt(SQUARED):  # it diverges
         return False

@@ -86,7 +86,7 @@ def make_bft_scorer(
     initial_state : {"rest", "estimate"}, default="rest"
         State at the start of each experiment. "rest" scores `estimator.predict(X)`;
         "estimate" scores `estimator.predict_with_initial_state(X, y)`, which fits the
-        initial state (and the level: see there) to the outputs by least squares: use it
+        initial state (and levels, see there) to the outputs by least squares: use it
         when a split starts in mid-trajectory, as `TimeSeriesSplit` does.
     burn_in : int, default=0
         Samples at the start of each experiment that are simulated but not scored. The

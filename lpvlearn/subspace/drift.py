@@ -106,6 +106,16 @@ def wanders(evidence: Evidence) -> bool:
     return bool((rates < _SLOW_BESIDE).any())
 
 
+def settles(level: LocalFit, other: LocalFit) -> bool:
+    """Whether as many states of the samples as `other` has, of differences, suffice.
+
+    For a noise that does not wander, and with none that may follow it.
+    """
+    slowest = mode_rates(other.model.A).min(initial=1.0)
+    follows = (mode_rates(level.model.A) < _FAR * slowest).any() or outlasts(level)
+    return not follows and not wanders(level.evidence)
+
+
 def drifts(whole: LocalFit, other: LocalFit, doubt: float = 0.0) -> bool:
     """Whether the model of differences, `other`, is to be preferred.
 

@@ -74,7 +74,7 @@ from .missing_outputs import (
     warn_of_few,
     warn_of_many_pieces,
 )
-from .offsets import N_TRENDS, of_rates
+from .offsets import N_TRENDS, level_matters, of_rates
 from .options import Choices, check_options
 from .residuals import (
     Residuals,
@@ -317,8 +317,8 @@ class SubspaceLTI(
     their uncertainty it warns, as inputs alone cannot tell which one it will be. What
     is given outputs estimates constant (and drift) of every experiment anew:
     `predict_with_initial_state`, `residual_tests` and, from estimated initial states,
-    `predict_ahead`. The first and the last do so of "auto" that took no constants as
-    well: fits of models with and without them are those of as many unknowns.
+    `predict_ahead`. The first and the last do so too where "auto" took none and an
+    experiment stands elsewhere.
 
     Without refinement, "po-moesp" with as many noise states as the noise has and
     "pi-moesp" at the order of the system are consistent under coloured noise, others
@@ -1063,11 +1063,12 @@ class SubspaceLTI(
         ----------
         X : DataFrame or array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Measured outputs, used for the initial state of every experiment, for a
-            constant unless ``offset=None``, and for the drift of ``offset_ ==
-            "linear"`` only: least squares over the whole experiment. Missing ones (NaN)
-            are left out. Where inputs act late, those in transit are estimated too: the
-            first samples are then met more or less exactly.
+            Measured outputs, used for the initial state of every experiment (and of a
+            model with `offset_` for the constant and drift) only: least squares over
+            the whole experiment. Where "auto" took no constants an experiment has one
+            nevertheless if that explains most of its errors, beyond chance. Missing
+            ones (NaN) are left out. Where inputs act late, those in transit are
+            estimated too: the first samples are then met more or less exactly.
 
         Returns
         -------
@@ -1120,7 +1121,7 @@ class SubspaceLTI(
         steps : int, default=1
             Prediction horizon in samples.
         initial_state : {"estimate", "rest"}, default="estimate"
-            "estimate" takes the deterministic initial state (and the constant) from the
+            "estimate" takes the deterministic initial state, and constants, from the
             whole experiment, as `predict_with_initial_state` does (with "pbsid" that of
             plant and noise, from the errors of prediction); "rest" uses no later
             output.
@@ -1163,9 +1164,9 @@ class SubspaceLTI(
             Measured outputs. Initial states and trends of `offset_` are estimated from
             them, `detrend` acts as in `fit`. Records are cut where samples are missing.
         errors : {"simulation", "prediction"}, default="simulation"
-            Of `predict_with_initial_state`, or of `predict_ahead`, beside no other
-            trends than those of `offset_`. Only the latter should be white: they test
-            the noise model too.
+            Of `predict_with_initial_state`, or of `predict_ahead`, with no other trends
+            than those of `offset_`. Only the latter should be white: they test the
+            noise model too.
         n_lags : int, default=None
             Samples to the past and to the future that are looked at. None: 25, fewer
             where experiments are short. Experiments of ``4 * n_lags`` samples or fewer
@@ -1458,21 +1459,50 @@ class SubspaceLTI(
         (u0, y0), y = self.resting_point(), experiment.measured
         n_trend = self._evidence.free.n_trend
         if not n_trend and self.offset is not None and not of_fit:
-            n_trend = 1
-        lti, trend = self.lti_, trend_signals(len(y), n_trend)
+            n_trend = int(self._stands_elsewhere(experiment))
         if predictor is None or predictor.gain is None:
-            responses = free_responses(lti.A, lti.C, len(y), trend)
-            responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
-            error = y - self._simulated(experiment)
-            if experiment.estimated is not None:  # lest known ones leave states open
-                faint = np.where(experiment.estimated, _FAINT, 1.0)
-                responses, error = responses * faint[:, :, None], error * faint
+            responses, error = self._unexplained(experiment, n_trend)
             own = estimate_initial_state(responses, error, spread_of(y))
         else:
-            u = experiment.inputs - u0
+            u, trend = experiment.inputs - u0, trend_signals(len(y), n_trend)
             own = predictor.estimate_initial_state(u, y - y0, trend)
-        x0, trends = np.split(own, [len(own) - len(trend) * len(y0)])
-        return x0, y0 + trend.T @ trends.reshape(len(trend), len(y0))
+        x0, trends = np.split(own, [len(own) - n_trend * len(y0)])
+        trend = trend_signals(len(y), n_trend)
+        return x0, y0 + trend.T @ trends.reshape(n_trend, len(y0))
+
+    def _unexplained(self, experiment: Experiment, n_trend: int) -> tuple[Array, Array]:
+        """Responses to own unknowns, and the errors of simulation they are to explain.
+
+        Shapes (n_samples, n_outputs, n_unknowns) and (n_samples, n_outputs).
+        """
+        lti, y = self.lti_, experiment.measured
+        trend = trend_signals(len(y), n_trend)
+        responses = free_responses(lti.A, lti.C, len(y), trend)
+        responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
+        error = y - self._simulated(experiment)
+        if experiment.estimated is not None:  # lest known ones leave states open
+            faint = np.where(experiment.estimated, _FAINT, 1.0)
+            responses, error = responses * faint[:, :, None], error * faint
+        return responses, error
+
+    def _stands_elsewhere(self, experiment: Experiment) -> bool:
+        """Whether an experiment has a level that those of the fit did not have."""
+        size, left = spread_of(experiment.measured), []
+        unknown = np.isnan(experiment.measured)
+        if experiment.estimated is not None:
+            unknown |= experiment.estimated
+        for n_trend in (0, 1):
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    responses, error = self._unexplained(experiment, n_trend)
+            except DivergenceError:
+                return False
+            finite = np.isfinite(error) | unknown
+            if not (np.isfinite(responses).all() and finite.all()):
+                return False
+            own = estimate_initial_state(responses, error, size)
+            left.append(np.where(unknown, np.nan, (error - responses @ own) / size))
+        return level_matters(left[0], left[1], len(own))
 
     def _in_table(
         self,

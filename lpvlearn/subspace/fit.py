@@ -31,6 +31,7 @@ from .drift import (
     may_drift,
     of_levels,
     outlasts,
+    settles,
     wanders,
 )
 from .fit_warnings import (
@@ -382,8 +383,7 @@ def _of_drifting_noise(
         return None  # errors that inputs explain are no drift
     level = _fit(pairs, choices._replace(order=len(other.model.A)), told, n_trend)
     worse = criterion_in_units(level.evidence) - criterion_in_units(other.evidence)
-    if worse < ALIKE and not wanders(level.evidence) and not outlasts(level):
-        # Of as many states: what wandered was what others had followed.
+    if worse < ALIKE and settles(level, other):
         return level._replace(selection=level.selection.among(found.selection))
     held_out = found.selection.held_out
     if held_out is not None:  # its errors, by those of all differences

@@ -406,6 +406,28 @@ def shifts_matter(whole: Evidence, parts: Evidence) -> bool:
     return chance_of_trend(parts, equal=True) < _SIGNIFICANT
 
 
+def level_matters(without: Array, other: Array, n_unknowns: int) -> bool:
+    """Whether a level explains most of what is left of a record, and no chance does.
+
+    Errors (n_samples, n_outputs) of outputs that count alike, NaN where these are not
+    known, without it and beside it, with so many unknowns. A few samples do not tell it
+    from a slow mode, and what they make of it is far off later.
+
+    >>> level = np.where(np.arange(40) % 2, 1.0, 1.2)[:, None]
+    >>> level_matters(level, level - level.mean(), 2), level_matters(level, level, 2)
+    (True, False)
+    >>> level_matters(level[:3], level[:3] - level[:3].mean(), 2)
+    False
+    """
+    before, after = (float(np.nansum(x**2)) for x in (without, other))
+    ny, n_error = other.shape[1], np.count_nonzero(~np.isnan(other)) - n_unknowns
+    if n_error < 1 or not after < _MOSTLY * before:
+        return False
+    after = max(after, np.finfo(float).tiny)
+    ratio = (before - after) / ny / (after / n_error)
+    return bool(special.fdtrc(ny, n_error, ratio) < _SIGNIFICANT)
+
+
 def criterion_in_units(evidence: Evidence) -> float:
     """That of the orders, of outputs in their units; minus infinity where one is 0."""
     records = evidence.records

@@ -62,6 +62,24 @@ def test_reports_warn_too(spring):
     fit_report(model, X[200:], y[200:], burn_in=250)
 
 
+@pytest.mark.parametrize("time_constant", [5.0, 30.0, 150.0])
+def test_a_level_is_not_taken_for_motion(time_constant):
+    """Of records of a system at rest, whose sensor stands elsewhere than in the fit."""
+    pole = np.exp(-1.0 / time_constant)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        u = rng.standard_normal((40, 1)).repeat(15, axis=0)
+        y = lfilter([0.0, 0.1], [1.0, -pole], u, axis=0)
+        size = y.std()
+        model = SubspaceLTI(sampling_time=1.0, order=1)
+        model.fit(u, y + 0.05 * size * rng.standard_normal(y.shape))
+        assert model.offset_ is None
+        y += 0.05 * size * rng.standard_normal(y.shape)
+        model.score(u, y + 0.7 * size)  # no warning
+        with pytest.warns(UserWarning, match=MOTION):
+            model.score(u, y + 1.5 * size * pole ** np.arange(len(y))[:, None])
+
+
 @pytest.mark.parametrize("order", [1, 3])
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 @pytest.mark.filterwarnings("ignore:The simulation error depends on past inputs")

@@ -41,7 +41,7 @@ def plant():
 
 @pytest.fixture(scope="module")
 def fitted(plant):
-    return SubspaceLTI(order=3, horizon=8, offset=None, **ROLES).fit(*plant)
+    return SubspaceLTI(order=3, horizon=8, **ROLES).fit(*plant)
 
 
 def drawn(display, place):

@@ -86,7 +86,7 @@ def test_modes_of_the_noise_are_told_from_the_plant(order):
 def test_a_plant_may_be_unstable():
     u, y = unstable_loop(0)
     with pytest.warns(UserWarning, match="predicted .* controller's reference"):
-        model = pbsid(offset=None).fit(u, y)
+        model = pbsid().fit(u, y)
     assert_allclose(model.lti_.poles(), [0.7, 1.1], atol=0.08)
     predictor = model.predictor_
     inner = predictor.A - predictor.K @ predictor.C
@@ -112,7 +112,7 @@ def test_a_plant_may_be_unstable():
 
 def test_stability_can_be_enforced():
     u, y = unstable_loop(1, 600)
-    model = pbsid(2, stability="enforce", offset=None).fit(u, y)
+    model = pbsid(2, stability="enforce").fit(u, y)
     assert model.lti_.is_stable and model.stability_loss_ > 0.0
     error = y - model.predict_with_initial_state(u, y)
     assert_allclose(np.sqrt(np.sum(error**2) / np.sum(y**2)), model.residual_)

@@ -436,6 +436,21 @@ def test_levels_of_other_records_are_estimated(rng, levels):
     np.testing.assert_allclose(ahead, other, atol=1e-8)
 
 
+@pytest.mark.parametrize("n_known", [5, 20])
+def test_few_known_samples_tell_no_level_from_a_slow_state(n_known):
+    rng, pole = np.random.default_rng(3), np.exp(-1.0 / 400.0)
+    plant = StateSpace([[pole]], [[0.1]], [[1.0]], None, 1.0)
+    u, fresh = (rng.standard_normal((40, 1)).repeat(20, axis=0) for _ in range(2))
+    y, target = plant.simulate(u), plant.simulate(fresh, initial_state=[3.0])
+    noise = 0.05 * y.std() * rng.standard_normal((2, *y.shape))
+    model = SubspaceLTI(sampling_time=1.0, missing="split").fit(u, y + noise[0])
+    assert model.offset_ is None
+    known = target + noise[1]
+    known[n_known:] = np.nan
+    error = (model.predict_with_initial_state(fresh, known) - target)[n_known:]
+    assert error.std() < 0.03 * y.std()
+
+
 def test_levels_that_are_known_to_be_zero_are_not_estimated(rng):
     X, y = table(rng, levels=(0.0, 0.0, 0.0))
     model = SubspaceLTI(3, horizon=6, offset=None, **options()).fit(X, y)
