@@ -1487,21 +1487,20 @@ class SubspaceLTI(
 
     def _stands_elsewhere(self, experiment: Experiment) -> bool:
         """Whether an experiment has a level that those of the fit did not have."""
-        size, left = spread_of(experiment.measured), []
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                responses, error = self._unexplained(experiment, 1)
+        except DivergenceError:
+            return False
         unknown = np.isnan(experiment.measured)
         if experiment.estimated is not None:
             unknown |= experiment.estimated
-        for n_trend in (0, 1):
-            try:
-                with np.errstate(over="ignore", invalid="ignore"):
-                    responses, error = self._unexplained(experiment, n_trend)
-            except DivergenceError:
-                return False
-            finite = np.isfinite(error) | unknown
-            if not (np.isfinite(responses).all() and finite.all()):
-                return False
-            own = estimate_initial_state(responses, error, size)
-            left.append(np.where(unknown, np.nan, (error - responses @ own) / size))
+        if not (np.isfinite(responses).all() and np.isfinite(error[~unknown]).all()):
+            return False
+        size, left = spread_of(experiment.measured), []
+        for free in (responses[:, :, : -len(size)], responses):
+            own = estimate_initial_state(free, error, size)
+            left.append(np.where(unknown, np.nan, (error - free @ own) / size))
         return level_matters(left[0], left[1], len(own))
 
     def _in_table(
