@@ -24,7 +24,7 @@ from ..data.preparation import Pairs
 from .identification import ScaledRecords, mode_rates
 from .local_fit import LocalFit
 from .noise import Whitening
-from .offsets import CERTAIN, criterion_in_units, motion_left
+from .offsets import CERTAIN, HARDLY_DECAYS, criterion_in_units, motion_left
 from .selection import PRICE
 from .signals import shorten
 from .simulation_fit import with_initial_states
@@ -40,8 +40,6 @@ _FEWEST = 3  # samples of an experiment, for more than one difference
 # it drifts: of measured records the samples tell more then than their differences.
 _SLOW, _SLOW_BESIDE, _FOLLOWS, _FAR = 12.0, 60.0, 1.0, 0.5
 
-_LASTS = 3.0  # of a mode that has not decayed at the end of the longest experiment
-
 _EXPLAINED = 0.02  # relative error below which drift does not matter
 
 _DIFFERENCE = np.array([1.0, -1.0])  # as a filter
@@ -54,7 +52,7 @@ def differences(pairs: Pairs) -> Pairs:
 
 def outlasts(fitted: LocalFit) -> bool:
     """Whether a mode does not decay over the longest experiment, or grows."""
-    slow = (mode_rates(fitted.model.A) * fitted.evidence.longest < _LASTS).any()
+    slow = (mode_rates(fitted.model.A) * fitted.evidence.longest < HARDLY_DECAYS).any()
     return bool(slow) or fitted.grows()
 
 

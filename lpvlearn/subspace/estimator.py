@@ -1457,26 +1457,26 @@ class SubspaceLTI(
         not show in the samples `of_fit` may show in others.
         """
         (u0, y0), y = self.resting_point(), experiment.measured
-        n_trend = self._evidence.free.n_trend
+        n_trend, own = self._evidence.free.n_trend, None
         if not n_trend and self.offset is not None and not of_fit:
-            n_trend = int(self._stands_elsewhere(experiment))
-        if predictor is None or predictor.gain is None:
-            responses, error = self._unexplained(experiment, n_trend)
-            own = estimate_initial_state(responses, error, spread_of(y))
-        else:
-            u, trend = experiment.inputs - u0, trend_signals(len(y), n_trend)
-            own = predictor.estimate_initial_state(u, y - y0, trend)
-        x0, trends = np.split(own, [len(own) - n_trend * len(y0)])
+            n_trend, own = self._as_it_stands(experiment)
         trend = trend_signals(len(y), n_trend)
+        if predictor is not None and predictor.gain is not None:
+            u = experiment.inputs - u0
+            own = predictor.estimate_initial_state(u, y - y0, trend)
+        elif own is None:
+            responses, error = self._unexplained(experiment, trend)
+            own = estimate_initial_state(responses, error, spread_of(y))
+        x0, trends = np.split(own, [len(own) - n_trend * len(y0)])
         return x0, y0 + trend.T @ trends.reshape(n_trend, len(y0))
 
-    def _unexplained(self, experiment: Experiment, n_trend: int) -> tuple[Array, Array]:
+    def _unexplained(self, experiment: Experiment, trend: Array) -> tuple[Array, Array]:
         """Responses to own unknowns, and the errors of simulation they are to explain.
 
-        Shapes (n_samples, n_outputs, n_unknowns) and (n_samples, n_outputs).
+        Shapes (n_samples, n_outputs, n_unknowns), those of trends last, and (n_samples,
+        n_outputs).
         """
         lti, y = self.lti_, experiment.measured
-        trend = trend_signals(len(y), n_trend)
         responses = free_responses(lti.A, lti.C, len(y), trend)
         responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
         error = y - self._simulated(experiment)
@@ -1485,23 +1485,31 @@ class SubspaceLTI(
             responses, error = responses * faint[:, :, None], error * faint
         return responses, error
 
-    def _stands_elsewhere(self, experiment: Experiment) -> bool:
-        """Whether an experiment has a level that those of the fit did not have."""
+    def _as_it_stands(self, experiment: Experiment) -> tuple[int, Array | None]:
+        """1 where an experiment has a level that those of the fit did not have, or 0.
+
+        And its own unknowns, by simulation; None where that diverges.
+        """
+        y = experiment.measured
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                responses, error = self._unexplained(experiment, 1)
+                responses, error = self._unexplained(
+                    experiment, trend_signals(len(y), 1)
+                )
         except DivergenceError:
-            return False
-        unknown = np.isnan(experiment.measured)
+            return 0, None
+        unknown = np.isnan(y)
         if experiment.estimated is not None:
             unknown |= experiment.estimated
         if not (np.isfinite(responses).all() and np.isfinite(error[~unknown]).all()):
-            return False
-        size, left = spread_of(experiment.measured), []
+            return 0, None
+        size, found, left = spread_of(y), [], []
         for free in (responses[:, :, : -len(size)], responses):
             own = estimate_initial_state(free, error, size)
+            found.append(own)
             left.append(np.where(unknown, np.nan, (error - free @ own) / size))
-        return level_matters(left[0], left[1], len(own))
+        level = int(level_matters(left[0], left[1], len(found[1])))
+        return level, found[level]
 
     def _in_table(
         self,

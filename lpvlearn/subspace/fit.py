@@ -274,26 +274,40 @@ def _with_drifts(
     except TooFewSamples:
         return fitted
     before = min(criterion_in_units(tested), refused)
-    reached = criterion_in_units(other.evidence.one_step)
+    better = before - criterion_in_units(other.evidence.one_step)
     spared = len(fitted.model.A) - len(other.model.A)
-    if not other.offsets.drifts.any():
-        least, simpler = -ALIKE if spared else ALIKE, spared >= 0
-    else:
-        unmoved = unmoved_errors(tested)
-        least = ALIKE if unmoved < HARDLY_MOVED else CERTAIN
-        least = -ALIKE if unmoved < _NOT_MOVED else least
-        simpler = not outlasts(other)
+    drifting = other.offsets.drifts.any()
+    simpler = not outlasts(other) if drifting else spared >= 0
     if choices.order is not None:
         least = CERTAIN
-    if not (simpler and before - reached > least):
+    elif not drifting:
+        least = -ALIKE if spared else ALIKE
+    elif (unmoved := unmoved_errors(tested)) < _NOT_MOVED:
+        least = -ALIKE
+    else:
+        least = ALIKE if unmoved < HARDLY_MOVED else CERTAIN
+    if not (simpler and better > least):
         return fitted
     if spared < 0 and choices.order is None:
         # What more states gain is no drift.
         n_trend = fitted.evidence.free.n_trend
-        level = _fit(pairs, choices._replace(order=len(other.model.A)), told, n_trend)
-        if not criterion_in_units(level.evidence.one_step) - reached > least:
-            return level._replace(selection=level.selection.among(other.selection))
+        level, worse = _of_as_many_states(pairs, choices, told, other, n_trend)
+        if not worse > least:
+            return level
     return other
+
+
+def _of_as_many_states(
+    pairs: Pairs, choices: Choices, told: set[str], other: LocalFit, n_trend: int
+) -> tuple[LocalFit, float]:
+    """The model of the samples with as many states as another one, and these trends.
+
+    And by how much its criterion is worse.
+    """
+    found = _fit(pairs, choices._replace(order=len(other.model.A)), told, n_trend)
+    worse = criterion_in_units(found.evidence.one_step)
+    worse -= criterion_in_units(other.evidence.one_step)
+    return found._replace(selection=found.selection.among(other.selection)), worse
 
 
 def _is_worth_a_choice(
@@ -381,10 +395,9 @@ def _of_drifting_noise(
         other.evidence, feedback.innovations
     ):
         return None  # errors that inputs explain are no drift
-    level = _fit(pairs, choices._replace(order=len(other.model.A)), told, n_trend)
-    worse = criterion_in_units(level.evidence) - criterion_in_units(other.evidence)
+    level, worse = _of_as_many_states(pairs, choices, told, other, n_trend)
     if worse < ALIKE and settles(level, other):
-        return level._replace(selection=level.selection.among(found.selection))
+        return level
     held_out = found.selection.held_out
     if held_out is not None:  # its errors, by those of all differences
         share = held_out.residual / found.residual

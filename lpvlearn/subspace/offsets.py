@@ -78,7 +78,9 @@ _RELUCTANTLY = 1e-4  # taken: initial states where offsets do as well
 _UNSEEN, _NEARLY = 0.1, 0.01  # of errors, and of a drift: what inputs need not explain
 _LASTING = 0.1  # decay of a mode over a record, of one that may be a constant
 _FAR = 3.0  # standard deviations between the mean of a channel and zero
-_SLOW = 3.0  # time constants per experiment of a mode that may stand for a constant
+
+# Time constants per longest experiment of a mode that may stand for a constant.
+HARDLY_DECAYS = 3.0
 
 # Units of the criterion by which models are no better than each other; times the
 # squared errors without what inputs do to such modes, of ones that they hardly move.
@@ -336,11 +338,10 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         if motion_left(other) < _MOSTLY * motion_left(without):
             return True
     replaced = _lasts(without) and not _lasts(other)
-    least = -(0.0, CERTAIN, _BEYOND_DOUBT)[far + replaced]
-    if not _has_slow_mode(other) and unmoved_errors(without) < HARDLY_MOVED:
-        least = min(least, -ALIKE)
-    if not better > least:
-        return False
+    if not better > -(0.0, CERTAIN, _BEYOND_DOUBT)[far + replaced]:
+        hardly = better > -ALIKE and not _has_slow_mode(other)
+        if not hardly or not unmoved_errors(without) < HARDLY_MOVED:
+            return False
     if far and better > _BEYOND_DOUBT:
         return True
     chance = chance_of_trend(other)
@@ -370,8 +371,9 @@ def unmoved_errors(evidence: Evidence) -> float:
     """
     model, free = evidence.model, evidence.free
     poles, V = np.linalg.eig(model.A)
-    lasts = np.abs(1.0 - poles) * evidence.longest < _SLOW  # as of `V`, by column
-    slow = lasts | (np.abs(poles) > 1.0)
+    # By column of `V`.
+    slow = np.abs(1.0 - poles) * evidence.longest < HARDLY_DECAYS
+    slow |= np.abs(poles) > 1.0
     if not slow.any() or not free.initial_states:
         return np.inf
     try:
@@ -444,7 +446,7 @@ def _has_slow_mode(evidence: Evidence) -> bool:
 
 
 def _is_slow(poles: NDArray[np.inexact], evidence: Evidence) -> NDArray[np.bool_]:
-    return (1.0 - poles.real) * evidence.longest <= _SLOW
+    return (1.0 - poles.real) * evidence.longest <= HARDLY_DECAYS
 
 
 def chance_of_trend(
