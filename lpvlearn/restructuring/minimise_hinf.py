@@ -49,6 +49,7 @@ _ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
 # a further one brings no digit of the norm that the parameters hold. A solver that is
 # not there after ten iterations may need forty, of twice the time of the path's steps.
 _MANY, _MANY_ROUNDS = 100, ((3e-8, 10), (1e-9, 60))
+_NO_DIGIT = 1e-6  # relative decrease promised of the norm, of many parameters
 _CLOSELY, _ROUGHLY = 0.1, 1.0  # what a stage of the path may leave; of many parameters
 _BUNDLE_PACE = 10  # as many iterations of a first-order method
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
@@ -288,7 +289,8 @@ def _from_least_squares(
         top = np.inf if best is None else best[1].peaks.top
         if best is None or result.peaks.top < top:
             best = end, result
-        settled = result.stationarity <= proof and result.converged
+        done = result.converged or many and _last_digits(result)
+        settled = done and result.stationarity <= proof
         settled |= best[1].peaks.top <= options["negligible"]
         idle = result.converged and best[1].peaks.top >= (1.0 - _PROGRESS) * top
         if settled or idle or used >= max_iter or time_is_up():
@@ -303,6 +305,11 @@ def _from_least_squares(
     converged = exact or best[1].stationarity <= enough
     result = replace(best[1], n_iter=used, history=history, converged=converged)
     return best[0].theta, result, floor
+
+
+def _last_digits(result: MinimaxResult) -> bool:
+    """Whether the last step of a solver promised no digit of the norm that tells."""
+    return bool(result.history) and result.history[-1]["predicted"] <= _NO_DIGIT
 
 
 def promising(fits: list[LeastSquaresResult]) -> list[LeastSquaresResult]:

@@ -1,5 +1,7 @@
 """The H-infinity norm as a minimax problem, and the curves of its steps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -8,8 +10,10 @@ from sklearn.exceptions import ConvergenceWarning
 from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
 from lpvlearn.minimax import problem as minimax_problem
 from lpvlearn.minimax.sqp import minimax_sqp
+from lpvlearn.restructuring import minimise_hinf
 from lpvlearn.restructuring.coordinates import ResponseGeometry
 from lpvlearn.restructuring.error_system import ErrorSystem, Target
+from lpvlearn.restructuring.least_squares import fit_frequency_response
 from lpvlearn.restructuring.limits import Limits
 from lpvlearn.restructuring.minimise_hinf import (
     SOLVERS,
@@ -124,6 +128,36 @@ def test_a_saddle_is_left_along_its_negative_curvature(solver):
     rates = np.sort(objective.theta(found.y))
     np.testing.assert_allclose(rates, [1.0, 4.0], rtol=10 * exact)
     assert _left_saddle(objective, found, SOLVERS[solver]) is None
+
+
+
+
+@pytest.mark.parametrize("promised, rounds", [(1e-7, 1), (1e-5, 2)])
+def test_many_parameters_need_no_round_for_digits_that_do_not_tell(
+    promised, rounds, monkeypatch
+):
+    """Of a solver that stops nearly at an optimum, its last step tells of the rest."""
+    monkeypatch.setattr(minimise_hinf, "_MANY", 1)
+    ends = []
+
+    def stopping(problem, y0, **options):
+        found = minimax_sqp(problem, y0, **options)
+        last = {**found.history[-1], "predicted": promised}
+        ends.append(found.peaks.top)
+        return replace(found, converged=False, stationarity=5e-4, history=[last])
+
+    objective, _ = objective_of()
+    start = fit_frequency_response(
+        objective.system,
+        objective.theta0,
+        objective.system.grid,
+        admissible=objective.admissible,
+    )
+    _, result, _ = minimise_hinf.minimise_hinf(
+        objective.system, [start], 1e-4, stopping, max_iter=200, tol=1e-10, negligible=0
+    )
+    assert len(ends) == rounds
+    assert result.peaks.top == min(ends)
 
 
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
