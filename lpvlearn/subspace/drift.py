@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
+from .criterion import PRICE
 from .identification import ScaledRecords, mode_rates
 from .local_fit import LocalFit
 from .noise import Whitening
 from .offsets import CERTAIN, HARDLY_DECAYS, criterion_in_units, motion_left
-from .selection import PRICE
 from .signals import shorten
 from .simulation_fit import with_initial_states
 from .statistics import Evidence

@@ -24,6 +24,7 @@ from ..data.preparation import (
 from ..exceptions import RankWarning
 from ..systems.simulation import delayed, lti_response
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
+from .criterion import PRICE
 from .delay import find_lead, first_samples, longest_delays, with_later_inputs
 from .drift import (
     differences,
@@ -68,6 +69,7 @@ from .offsets import (
     may_have_constants,
     may_have_drift,
     shifts_matter,
+    stands_by_chance,
     unmoved_errors,
     with_levels,
     without_slow_modes,
@@ -75,7 +77,7 @@ from .offsets import (
 from .options import Choices
 from .residuals import lacks
 from .rounding import rounded_outputs
-from .selection import PRICE, PlantFit, Row, Selection, select
+from .selection import PlantFit, Row, Selection, select
 from .shifts import cut_at, find_shifts
 from .signals import Record, SharedSignals, output_energy, share_known, shorten
 from .simulation_fit import Realization, simulation_errors, with_initial_states
@@ -209,7 +211,7 @@ def _with_constants(
     tested = fitted.evidence.one_step
 
     def may_matter() -> bool:
-        if hides:
+        if hides or stands_by_chance(tested):
             return True
         return may_have_constants(tested) and _is_worth_a_choice(
             lambda near: may_be_better(tested, near.evidence),
@@ -219,6 +221,9 @@ def _with_constants(
     refused = np.inf
     if choices.offset == "auto" and may_matter():
         other = _fit(pairs, judged, told, 1, fitted)
+        if len(other.model.A) > len(fitted.model.A) and stands_by_chance(tested):
+            as_many, worse = _of_as_many_states(pairs, judged, told, fitted, other, 1)
+            other = as_many if worse < 0.0 else other
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
         elif choices.order is not None:  # a poor model shows many things
@@ -288,23 +293,39 @@ def _with_drifts(
         least = ALIKE if unmoved < HARDLY_MOVED else CERTAIN
     if not (simpler and better > least):
         return fitted
+    if drifting and _takes_a_gain(fitted.evidence, other.evidence):
+        return fitted
     if spared < 0 and choices.order is None:
         # What more states gain is no drift.
         n_trend = fitted.evidence.free.n_trend
-        level, worse = _of_as_many_states(pairs, choices, told, other, n_trend)
+        level, worse = _of_as_many_states(pairs, choices, told, other, other, n_trend)
         if not worse > least:
             return level
     return other
 
 
-def _of_as_many_states(
-    pairs: Pairs, choices: Choices, told: set[str], other: LocalFit, n_trend: int
-) -> tuple[LocalFit, float]:
-    """The model of the samples with as many states as another one, and these trends.
+def _takes_a_gain(without: Evidence, other: Evidence) -> bool:
+    """Whether drifts stand for what inputs do slowly: static gains are lost to them."""
+    before, after = without.static_gain(), other.static_gain()
+    if before is None or after is None:
+        return False
+    return bool((after.unknown & ~before.unknown).any())
 
-    And by how much its criterion is worse.
+
+def _of_as_many_states(
+    pairs: Pairs,
+    choices: Choices,
+    told: set[str],
+    one: LocalFit,
+    other: LocalFit,
+    n_trend: int,
+) -> tuple[LocalFit, float]:
+    """The model of the samples with as many states as `one`, and these trends.
+
+    And by how much its criterion is worse than that of the `other`, whose choice of the
+    order it keeps.
     """
-    found = _fit(pairs, choices._replace(order=len(other.model.A)), told, n_trend)
+    found = _fit(pairs, choices._replace(order=len(one.model.A)), told, n_trend)
     worse = criterion_in_units(found.evidence.one_step)
     worse -= criterion_in_units(other.evidence.one_step)
     return found._replace(selection=found.selection.among(other.selection)), worse
@@ -395,7 +416,7 @@ def _of_drifting_noise(
         other.evidence, feedback.innovations
     ):
         return None  # errors that inputs explain are no drift
-    level, worse = _of_as_many_states(pairs, choices, told, other, n_trend)
+    level, worse = _of_as_many_states(pairs, choices, told, other, other, n_trend)
     if worse < ALIKE and settles(level, other):
         return level
     held_out = found.selection.held_out

@@ -17,13 +17,19 @@ from .held_out import HeldOut
 from .identification import Settings
 from .linearity import bent_outputs
 from .local_fit import LocalFit
-from .offsets import CERTAIN, USELESS, follows_means_alone
+from .offsets import (
+    CERTAIN,
+    USELESS,
+    follows_means_alone,
+    motions_left,
+    stays_far,
+)
 from .options import Choices
 from .residuals import find_spikes, lacks
 from .rounding import rounded_outputs
 from .selection import MAX_ORDER, better_horizon
 from .signals import thinned
-from .statistics import Evidence
+from .statistics import OPEN, Evidence
 from .varx import Feedback
 
 Array = NDArray[np.float64]
@@ -44,11 +50,9 @@ _HALF = 0.5  # share of their energy that enforced stability must cost to be rep
 # 200 samples at equal noise and signal a right model comes to two thirds.
 _CONFIRMED = 0.5
 
-_ENOUGH = 100  # samples, for parts of them to tell anything
+_NOTHING = 1.0  # best fit of parts held out, percent, that is none
 
-# A standard deviation of the static gain by the root mean square of the response of its
-# output to all inputs as they move: above it, a gain that is not known matters.
-_OPEN = 0.3
+_ENOUGH = 100  # samples, for parts of them to tell anything
 
 # Standard deviations of a pole, for its decay to be known; and one over the longest
 # experiment that matters: an integrator is known better.
@@ -339,7 +343,7 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
             "`horizon` or order='auto', and check that inputs and outputs belong "
             "together and in the order of time.",
         )
-    elif follows_means_alone(fitted.evidence):
+    elif follows_means_alone(fitted.evidence) or _confirms_means_alone(fitted):
         higher = "" if chose_order else ", order='auto'"
         tell(
             told,
@@ -347,6 +351,34 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
             "The model explains where the outputs stay, and next to nothing of how "
             f"they move. Try offset='constant'{higher} or a longer `horizon`, and "
             "check that inputs and outputs belong together and in the order of time.",
+        )
+    elif chose_order and len(fitted.model.A) and not whitening.of_differences:
+        _warn_of_outputs(fitted, told)
+
+
+def _confirms_means_alone(fitted: LocalFit) -> bool:
+    """Whether parts held out move as no model without constants foresees at all."""
+    held_out, evidence = fitted.selection.held_out, fitted.evidence
+    if held_out is None or evidence.free.n_trend or not stays_far(evidence.records):
+        return False
+    return bool(held_out.bft < _NOTHING)
+
+
+def _warn_of_outputs(fitted: LocalFit, told: set[str]) -> None:
+    """Tell of outputs that a model of several does not explain."""
+    model, records = fitted.evidence.model, fitted.evidence.records
+    if len(model.C) == 1 or len(model.initial_states) != len(records):
+        return
+    left = motions_left(fitted.evidence)
+    poor = [str(k + 1) for k in np.flatnonzero(left > USELESS**2)]
+    if poor and len(poor) < np.count_nonzero(~np.isnan(left)):
+        tell(
+            told,
+            "useless",
+            f"The model explains next to nothing of output(s) {', '.join(poor)}: what "
+            "moves these is mostly noise, or noise as slow as what the inputs do. Try "
+            "refine='simulation' or a higher `order`, identify them apart from the "
+            "others, or leave them out.",
         )
 
 
@@ -445,9 +477,8 @@ def _warn_of_unknown_response(fitted: LocalFit, told: set[str]) -> None:
     gain = fitted.evidence.static_gain()
     if gain is None:
         return
-    unknown = (gain.std > np.abs(gain.value)) & (gain.std > _OPEN * gain.size)
-    if unknown.any():
-        output, which = np.argwhere(unknown)[0] + 1
+    if gain.unknown.any():
+        output, which = np.argwhere(gain.unknown)[0] + 1
         tell(
             told,
             "static gain",
@@ -459,7 +490,7 @@ def _warn_of_unknown_response(fitted: LocalFit, told: set[str]) -> None:
         )
         return
     share, omega = fitted.evidence.unknown_share(gain.size)
-    if share > _OPEN:
+    if share > OPEN:
         period = f"{2.0 * np.pi / omega:.3g}" if omega else "many"
         tell(
             told,

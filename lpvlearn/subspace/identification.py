@@ -15,6 +15,7 @@ from scipy import linalg
 
 from ..data.preparation import Pairs
 from ..systems.simulation import trend_signals
+from .criterion import criterion_of
 from .hankel import data_factors
 from .held_out import HeldOut, held_out
 from .noise import Whitening
@@ -423,6 +424,8 @@ def identify(
         if not plain.whitening.is_none:
             plain = fit_once(records, order, horizon, as_found, none, chosen.model)[0]
         rivals = [chosen, plain, plain._replace(refined=False)]
+        if _is_astray(chosen, plain, records, settings):
+            rivals = rivals[1:]
         chosen = _best_held_out(rivals, records, as_found)
         if not chosen.refined:
             unrefined = as_found._replace(refine=False)
@@ -445,6 +448,28 @@ def identify(
         float(np.sqrt(model.loss / energy)),
         float(stability_loss),
     )
+
+
+# Times the squared errors of a model of plain ones, of one of whitened ones that may be
+# astray: in records where little but their beginning tells of the inputs, of which the
+# filter takes the first samples.
+_ASTRAY = 2.0
+
+
+def _is_astray(
+    chosen: Candidate, plain: Candidate, records: Sequence[Record], settings: Settings
+) -> bool:
+    """Whether a model of whitened errors is one that the likelihood refutes."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        own, other = (
+            sum(float(np.sum(e**2)) for e in simulation_errors(model, records))
+            for model in (chosen.model, plain.model)
+        )
+    if not own > _ASTRAY * other:
+        return False
+    free, repeated = settings.free, settings.repeated
+    least = criterion_of(plain.model, records, free, repeated)
+    return least < criterion_of(chosen.model, records, free, repeated)
 
 
 # Standard errors by which another way to the model must be better: errors that are not

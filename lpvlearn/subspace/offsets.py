@@ -31,9 +31,9 @@ from scipy import linalg, special
 from ..data.preparation import Pairs
 from ..systems.least_squares import column_scale
 from ..systems.simulation import free_responses, lti_response, trend_signals
+from .criterion import criterion_of
 from .identification import Centres, mode_rates, spectral_radius
 from .noise import autoregression, spectral_density
-from .selection import criterion_of
 from .signals import Record, signal_factor
 from .simulation_fit import (
     in_sections,
@@ -78,6 +78,10 @@ _RELUCTANTLY = 1e-4  # taken: initial states where offsets do as well
 _UNSEEN, _NEARLY = 0.1, 0.01  # of errors, and of a drift: what inputs need not explain
 _LASTING = 0.1  # decay of a mode over a record, of one that may be a constant
 _FAR = 3.0  # standard deviations between the mean of a channel and zero
+
+# Samples of a beginning at which inputs and outputs stand still, and the motion that a
+# state off rest would have made there, times what is seen.
+_STANDING, _AT_REST = 5, 5.0
 
 # Time constants per longest experiment of a mode that may stand for a constant.
 HARDLY_DECAYS = 3.0
@@ -217,9 +221,34 @@ def may_have_constants(evidence: Evidence) -> bool:
     They show in its errors, or a slow mode may stand for them; where a channel is far
     from zero, nothing but its mean may have been fitted.
     """
-    if _is_far(evidence.records):
+    if _is_far(evidence.records) or stands_by_chance(evidence):
         return True
     return _has_slow_mode(evidence) or chance_of_trend(evidence) < _SUSPICIOUS
+
+
+def stands_by_chance(evidence: Evidence) -> bool:
+    """Whether outputs stand still where a model without constants is not at rest.
+
+    While the inputs do not move yet, states that are as far from rest as the outputs
+    are would have moved these, unless they happen to balance each other.
+    """
+    model, radius = evidence.model, spectral_radius(evidence.model.A)
+    if not radius < 1.0 or evidence.free.n_trend:
+        return False
+    eye = np.eye(len(model.A))
+    gain = model.C @ np.linalg.solve(eye - model.A, model.B) + model.D
+    for record in evidence.records:
+        moved = (record.u != record.u[:, :1]).any(axis=0)
+        n = int(np.argmax(moved))
+        if n < _STANDING:
+            continue
+        y = record.y[:, :n]
+        first, second = y[:, : n // 2].mean(axis=1), y[:, n // 2 :].mean(axis=1)
+        motion = 2.0 * np.abs(second - first) + 2.0 * y.std(axis=1) / np.sqrt(n)
+        off = np.abs(y.mean(axis=1) - gain @ record.u[:, 0])
+        if (off * (1.0 - radius**n) > _AT_REST * motion).any():
+            return True
+    return False
 
 
 def without_slow_modes(evidence: Evidence) -> list[tuple[Array, Array]] | None:
@@ -255,7 +284,7 @@ def _is_far(records: Sequence[Record]) -> bool:
     return bool((np.abs(level) > _FAR * motion).any())
 
 
-def _stays_far(records: Sequence[Record]) -> bool:
+def stays_far(records: Sequence[Record]) -> bool:
     """Whether channels are far from zero, and all of these begin far from it as well.
 
     A step from rest soon is far, and tells by how it begins that there is no constant.
@@ -272,20 +301,25 @@ def follows_means_alone(evidence: Evidence) -> bool:
 
     What one that grows over the record simulates tells nothing.
     """
-    stays = not evidence.free.n_trend and _stays_far(evidence.records)
+    stays = not evidence.free.n_trend and stays_far(evidence.records)
     stays &= evidence.longest * (spectral_radius(evidence.model.A) - 1.0) < 1.0
     return stays and motion_left(evidence) > USELESS**2
 
 
 def motion_left(evidence: Evidence) -> float:
     """Part of the outputs' motion about their means, squared, that a model leaves."""
+    left = motions_left(evidence)
+    return float(np.nanmean(left)) if not np.isnan(left).all() else 0.0
+
+
+def motions_left(evidence: Evidence) -> Array:
+    """That of every output; NaN of one that does not move."""
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.vstack(simulation_errors(evidence.model, evidence.records))
         left = np.sum(errors**2, axis=0)
+    left = np.where(np.isfinite(left), left, np.inf)
     motion = np.sum([r.u.shape[1] * r.y.var(axis=1) for r in evidence.records], axis=0)
-    moves = motion > 0.0
-    part = float(np.mean(left[moves] / motion[moves])) if moves.any() else 0.0
-    return part if np.isfinite(part) else np.inf
+    return np.asarray(left / np.where(motion > 0.0, motion, np.nan))
 
 
 def leaves_rounding(evidence: Evidence) -> bool:
@@ -321,6 +355,10 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     initial values: it does not decay. The criterion does not mind that, until some
     other mode is missing: such a state is to go where the test tells of constants.
 
+    Of models that are alike, the one is right for which outputs that stand still are at
+    rest. Where constants of a model cannot be told from its slow modes, the criterion
+    alone decides.
+
     A constant far beyond the outputs stands for a drift, together with the initial
     state of a mode that does not decay over the record. Rounding tells nothing.
     """
@@ -331,7 +369,9 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         return True
     if leaves_rounding(without):
         return False
-    far = _stays_far(without.records)
+    if better > -ALIKE and stands_by_chance(without):
+        return True
+    far = stays_far(without.records)
     few = len(other.model.A) <= min(len(without.model.A), _FEW_STATES)
     decays = spectral_radius(other.model.A) <= 1.0
     if far and few and decays:
@@ -345,6 +385,8 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     if far and better > _BEYOND_DOUBT:
         return True
     chance = chance_of_trend(other)
+    if chance == 1.0:
+        return better > (ALIKE if far else CERTAIN)
     return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > CERTAIN))
 
 

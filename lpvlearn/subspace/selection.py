@@ -24,11 +24,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..systems.simulation import estimate_initial_state, free_responses
+from .criterion import EXACT, PRICE, criterion_of, n_parameters
 from .decimation import SlowStarts, decimated, full_rate
 from .hankel import correlation_sequence
 from .held_out import MATTERS, HeldOut
@@ -43,13 +42,12 @@ from .identification import (
     subspaces_of,
     validate,
 )
-from .noise import Whitening, autoregression, taper
+from .noise import Whitening
 from .realization import ObservabilitySubspace
 from .refinement import refine_simulation
 from .rounding import rounded_outputs
 from .signals import Record, output_energy, thinned
 from .simulation_fit import (
-    Freedom,
     Realization,
     simulation_errors,
     simulation_fit,
@@ -81,18 +79,7 @@ _WEIGHINGS = 4  # of the outputs, with the pilot: each brings a clean one nearer
 
 _MORE_ROUNDS = 2  # of an order about the best: with the noise that it leaves itself
 
-# Of a parameter, in squared standard deviations of its estimate: two of them. Akaike's
-# price of 2 takes a superfluous state in one fit of ten, Schwarz's of log(n) leaves
-# out states of a few thousand noisy samples that would improve the simulation.
-PRICE = 4.0
-
-# Samples of the longest experiment for each lag of the noise: in short ones initial
-# states are why errors correlate.
-_SAMPLES_PER_LAG = 16
-
 _PATIENCE = 3  # orders looked at about the best one; a fourth ends the search beyond it
-
-_EXACT = 1e-18  # share of the outputs' energy (an error of 1e-9) that is rounding
 
 # A start this close to the best one ends in the same minimum when it is refined; the
 # shorter horizon is then the cheaper one. Unrefined, a horizon must be as good.
@@ -596,7 +583,7 @@ def _try_orders(
     n_values, variance = sum(record.n_values for record in records), 0.0
 
     def left(order: int) -> int:
-        return max(n_values - _n_parameters(order, records, free), 1)
+        return max(n_values - n_parameters(order, records, free), 1)
 
     if not whitening.is_none:
         records = whitening.records(records, settings.free)
@@ -632,7 +619,7 @@ def _try_orders(
         stale = 0 if criterion < best else stale + 1
         best = min(best, criterion)
         known = best <= limit or order >= n_pilot
-        if (known and stale > _PATIENCE) or model.loss <= _EXACT * energy:
+        if (known and stale > _PATIENCE) or model.loss <= EXACT * energy:
             break
     return tried
 
@@ -657,98 +644,6 @@ def _refined(
         refine_simulation(one, records, settings.free, max_iter) for one in rivals
     ]
     return min(refined, key=_loss), rivals[0] is slow
-
-
-def criterion_of(
-    model: Realization,
-    records: Sequence[Record],
-    free: Freedom,
-    repeated: Sequence[float] = (),
-) -> float:
-    """Likelihood and number of parameters of a model of records, whitened or not.
-
-    Minus twice the logarithm of the likelihood, and the price of the parameters with
-    the correction that a ratio of sums of squares in few samples needs. The errors that
-    a model leaves tell the noise of every output anew: by that of the model before,
-    states that follow slow noise would prove themselves right.
-
-    Of errors that are mostly rounding a share, of every output, repeats those before:
-    they are no noise of a memory, and tell as much as the others do alone. States may
-    follow them in every part of a record whose inputs repeat themselves.
-    """
-    ny = len(model.C)
-    n_values = sum(record.n_values for record in records)
-    n_samples, n_parameters = n_values // ny, _n_parameters(len(model.A), records, free)
-    few = n_values / max(n_values - n_parameters, 1)
-    if not np.isfinite(model.loss):
-        return np.inf
-    # Of many lines of a spectrum one stands out by chance: an oscillation may be any of
-    # as many as its decay tells apart, and costs what the best of them gains.
-    longest = max(record.u.shape[1] for record in records)
-    poles = np.linalg.eigvals(model.A)
-    decay = np.maximum(1.0 - np.abs(poles[poles.imag > 0.0]), 2.0 / longest)
-    misfit = -2.0 * float(np.log(decay).sum())
-    misfit += few * PRICE * n_parameters
-    told = 1.0 - np.array(repeated or np.zeros(ny))
-    lags = np.where(told < 1.0, 0, longest // _SAMPLES_PER_LAG)
-    noise = _innovations(model, records, free, lags)
-    for i, (variance, n_lags) in enumerate(noise):
-        power = sum(float(record.y[i] @ record.y[i]) for record in records) / n_samples
-        variance = max(variance, _EXACT * power) or 1.0
-        misfit += told[i] * n_samples * np.log(variance) + PRICE * n_lags
-    return float(misfit)
-
-
-def _n_parameters(order: int, records: Sequence[Record], free: Freedom) -> int:
-    """Of a model of that order, and unknowns of the records of their own."""
-    ny, m = free.direct.shape
-    own = len(records) * free.n_own(order)
-    return order * (m + ny) + int(free.direct.sum()) + own
-
-
-def _innovations(
-    model: Realization,
-    records: Sequence[Record],
-    free: Freedom,
-    highest: NDArray[np.intp],
-) -> list[tuple[float, int]]:
-    """Variance and number of lags of the noise of every output, up to the highest.
-
-    The own unknowns are those that make the least of the innovations: of slow noise,
-    what makes the least of the errors leaves large ones in the first samples. These,
-    and the last, count for less: a transient that an experiment begins with tells of
-    modes, and next to nothing of how they answer to the inputs.
-    """
-    errors = simulation_errors(model, records)
-    first = len(model.A) - free.n_states(len(model.A))
-    filters, sizes = [], []
-    for i in range(len(model.C)):
-        parts = [error[:, [i]] for error in errors]
-        noise = autoregression(parts, highest=int(highest[i]))
-        filters.append(np.append(1.0, -noise.C[0]))
-        sizes.append(np.sqrt(noise.covariance[0, 0]) or 1.0)
-    lost, squares = max(map(len, filters)) - 1, np.zeros(len(sizes))
-    n_samples = np.zeros(len(sizes))
-    for record, error in zip(records, errors, strict=True):
-        if len(error) <= 2 * lost:
-            continue
-        with np.errstate(over="ignore", invalid="ignore"):
-            unknown = free_responses(model.A, model.C, len(error), record.trend)
-        unknown = unknown[:, :, first:]
-        unknown = unknown[:, :, np.isfinite(unknown).all(axis=(0, 1))]
-        signals = np.concatenate([error[:, :, None], unknown], axis=2)
-        for i, (f, size) in enumerate(zip(filters, sizes, strict=True)):
-            signals[:, i] = scipy.signal.lfilter(f, size, signals[:, i], axis=0)
-        weights = taper(len(error))[lost:]
-        signals = signals[lost:] * weights[:, :, None]
-        white, unknown = signals[:, :, 0], signals[:, :, 1:]
-        white = white - unknown @ estimate_initial_state(unknown, white)
-        squares += (white**2).sum(axis=0)
-        # What is expected of missing ones leaves the squares of the others, on average.
-        n_samples += (weights**2 * record.known[lost:]).sum(axis=0)
-    n_samples[n_samples == 0.0] = 1.0  # of an output that is not known
-    variances = np.array(sizes) ** 2 * squares / n_samples
-    return [(float(v), len(f) - 1) for v, f in zip(variances, filters, strict=True)]
 
 
 def _with_more_states(

@@ -54,6 +54,10 @@ _RCOND = 1e-15  # the weakest direction of the information that is told from rou
 # Over which a response is averaged, and its standard deviation
 _N_FREQUENCIES, _N_DEVIATIONS = 200, 33
 
+# Standard deviation of a response by its root mean square, all inputs as they move,
+# above which what is not known of it matters.
+OPEN = 0.3
+
 
 class StaticGain(NamedTuple):
     """Gain at frequency zero, each of shape (n_outputs, n_inputs)."""
@@ -61,6 +65,11 @@ class StaticGain(NamedTuple):
     value: Array
     std: Array
     size: Array  # root mean square of the output's response, per unit of the input
+
+    @property
+    def unknown(self) -> NDArray[np.bool_]:
+        """Where it is known no better than to its own size, nor to what matters."""
+        return (self.std > np.abs(self.value)) & (self.std > OPEN * self.size)
 
 
 class Known(NamedTuple):

@@ -130,8 +130,6 @@ def test_a_saddle_is_left_along_its_negative_curvature(solver):
     assert _left_saddle(objective, found, SOLVERS[solver]) is None
 
 
-
-
 @pytest.mark.parametrize("promised, rounds", [(1e-7, 1), (1e-5, 2)])
 def test_many_parameters_need_no_round_for_digits_that_do_not_tell(
     promised, rounds, monkeypatch

@@ -1,4 +1,5 @@
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ from lpvlearn.subspace import fit
 from lpvlearn.subspace.drift import differences, of_levels
 from lpvlearn.subspace.fit import _fit
 from lpvlearn.subspace.options import Choices
+from lpvlearn.subspace.statistics import StaticGain
 
 
 def _plant(slow=30.0, fast=6.0):
@@ -176,6 +178,19 @@ class TestOutputsThatDoNotDrift:
         assert _fresh_bft(model) > 95.0
         u, y = _record(0)
         assert _of_differences(_quiet_fit(u, y))
+
+    def test_a_drift_that_takes_the_static_gain_is_what_inputs_do(self):
+        """A gain known to 10 %, and one to 150 %, of a response of size one."""
+        known, lost = (
+            StaticGain(np.ones((1, 1)), np.full((1, 1), std), np.ones((1, 1)))
+            for std in (0.1, 1.5)
+        )
+        evidence = [
+            SimpleNamespace(static_gain=lambda gain=gain: gain)
+            for gain in (known, lost, None)
+        ]
+        takes = [[fit._takes_a_gain(a, b) for b in evidence] for a in evidence]
+        assert takes == [[False, True, False]] + [[False] * 3] * 2
 
     def test_what_was_said_of_the_refinement_is_heeded(self):
         u, y = _record(0)

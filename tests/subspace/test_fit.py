@@ -570,3 +570,29 @@ def lti_of(*factors):
         denominator = np.polymul(denominator, factor)
     A, B, C, D = tf2ss([2.0, 5.0, 10.0], denominator)
     return StateSpace(A, B, C, D).to_discrete(0.2)
+
+
+@pytest.mark.filterwarnings("ignore:The response is hardly known")
+def test_an_output_that_is_noise_beside_others_is_named():
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.standard_normal((60, 1)), 8, axis=0)
+    y = StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0).simulate(u)
+    y = y + 0.01 * rng.standard_normal(y.shape)
+    with pytest.warns(UserWarning, match=r"next to nothing of output\(s\) 2: what"):
+        SubspaceLTI().fit(u, np.column_stack([y, rng.standard_normal(len(y))]))
+
+
+@pytest.mark.parametrize("bft, told", [(0.0, 1), (50.0, 0)])
+def test_parts_that_only_means_explain_are_told(bft, told, rng):
+    """Without a constant; the level is many times the motion."""
+    u = np.repeat(rng.standard_normal((30, 1)), 10, axis=0)
+    y = 20.0 + StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0).simulate(u)
+    y = y + 0.01 * rng.standard_normal(y.shape)
+    fitted = fit_pairs([(u + 10.0, y)], Choices(), set())
+    held_out = fitted.selection.held_out._replace(bft=bft)
+    selection = replace(fitted.selection, held_out=held_out)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warn_about(fitted._replace(selection=selection), set())
+    heard = [w for w in caught if "explains where the outputs stay" in str(w.message)]
+    assert len(heard) == told

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
-from lpvlearn.subspace.identification import Settings
+from lpvlearn.subspace.identification import Candidate, Settings, _is_astray
+from lpvlearn.subspace.noise import Whitening
 from lpvlearn.subspace.realization import METHODS
+from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.simulation_fit import simulation_fit
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
@@ -133,3 +136,20 @@ def test_limits_count_columns_rows_and_instruments():
         assert columns[0] >= 6 * h and columns[1] < 6 * (h + 1)
     assert Settings(freedom(3, 1)).max_order(5) == 12
     assert Settings(freedom(3, 1), "pi-moesp").max_order(5) == 5
+
+
+def test_a_model_of_whitened_errors_that_the_likelihood_refutes_is_astray(rng):
+    """Far worse in plain errors, and in the criterion, than the one of these."""
+    right = example(rng, modes(0.95, 0.6 * np.exp(0.9j)), 1, 1)
+    u, y = experiment(rng, right, 300, noise=0.1)
+    record, settings = Record.of(u, y), Settings(freedom(1, 1))
+    A, _, C, _ = right
+    plain = Candidate(
+        simulation_fit(A, C, [record], settings.free), 9, Whitening.none(1), True
+    )
+    # another system: what is left of the outputs is slow, and whitened away
+    poor = simulation_fit(0.5 * A, C, [record], settings.free)
+    chosen = plain._replace(model=poor)
+    assert _is_astray(chosen, plain, [record], settings)
+    assert not _is_astray(plain, chosen, [record], settings)
+    assert not _is_astray(plain, plain, [record], settings)

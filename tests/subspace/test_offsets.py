@@ -9,9 +9,9 @@ from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
 from lpvlearn.metrics import bft_score
-from lpvlearn.subspace import hankel
+from lpvlearn.subspace import hankel, offsets
 from lpvlearn.subspace.identification import centred
-from lpvlearn.subspace.offsets import _tail, without_slow_modes
+from lpvlearn.subspace.offsets import _tail, stands_by_chance, without_slow_modes
 from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import Freedom, _general_regression, block_fit
 from lpvlearn.systems.simulation import lti_response, trend_signals
@@ -389,6 +389,53 @@ def test_a_slow_plant_rests_where_it_began_not_at_the_means_of_its_inputs():
         there = 20.0 + driven(fresh, slow=0.999, bias=0.0)
         assert model.offset_ == "constant"
         assert fit_of(model, fresh + 3.0, there) > 0.95
+
+
+@pytest.mark.filterwarnings("ignore:The response is hardly known")
+@pytest.mark.parametrize("seed", [7, 13])
+def test_a_step_from_rest_at_a_level_has_a_constant(seed):
+    """Without it, three lags or more balance each other until the step comes."""
+    rng = np.random.default_rng(seed)
+    u = 40.0 * (np.arange(200) >= 30)
+    y = u
+    for pole in np.exp(-1.0 / (200 * rng.uniform(0.05, 0.2, 3))):
+        y = lfilter([0.0, 1.0 - pole], [1.0, -pole], y)
+    y = 25.0 + 0.5 * y + 0.05 * rng.standard_normal(200)
+    model = SubspaceLTI().fit(u[:, None], y)
+    assert model.offset_ == "constant"
+    assert model.lti_.dc_gain().item() == pytest.approx(0.5, rel=0.3)  # without: 1.1
+
+
+@pytest.mark.filterwarnings("ignore:The model explains where the outputs stay")
+def test_what_stands_still_is_at_rest_in_a_model_that_explains_it():
+    """A start at a level, for which a model without constants needs a coincidence."""
+    u = np.zeros((60, 1))
+    u[20:] = 1.0
+    plant = StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0)
+    rng = np.random.default_rng(0)
+    told = []
+    for level in (0.0, 5.0):
+        y = plant.simulate(u) + level + 0.01 * rng.standard_normal(u.shape)
+        found = SubspaceLTI(1, offset=None).fit(u, y)
+        told.append(stands_by_chance(found._evidence.one_step))
+    assert told == [False, True]
+
+
+@pytest.mark.parametrize("better, taken", [(29.0, False), (31.0, True)])
+def test_where_slow_modes_hide_constants_the_criterion_decides(
+    better, taken, monkeypatch
+):
+    u = np.repeat(np.random.default_rng(0).standard_normal((50, 1)), 8, axis=0)
+    y = StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0).simulate(u)
+    y = y + 0.01 * np.random.default_rng(1).standard_normal(y.shape)
+    without, other = (
+        SubspaceLTI(1, offset=offset).fit(u, y)._evidence.one_step
+        for offset in (None, "constant")
+    )
+    monkeypatch.setattr(offsets, "chance_of_trend", lambda *_, **__: 1.0)
+    worth = {id(without): better, id(other): 0.0}
+    monkeypatch.setattr(offsets, "criterion_in_units", lambda e: worth[id(e)])
+    assert offsets.constants_matter(without, other) == taken
 
 
 def test_short_step_responses_are_not_spoilt():

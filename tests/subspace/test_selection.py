@@ -13,11 +13,9 @@ from lpvlearn.subspace.held_out import HeldOut, Part
 from lpvlearn.subspace.identification import Settings
 from lpvlearn.subspace.selection import (
     _horizon_grid,
-    criterion_of,
     select,
 )
 from lpvlearn.subspace.signals import Record
-from lpvlearn.subspace.simulation_fit import Realization, with_initial_states
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes, stable_model
@@ -45,44 +43,6 @@ def coloured(seed, n_samples, pole=0.9, level=0.3):
     u, y = experiment(rng, system, n_samples)
     e = lfilter([1.0], [1.0, -pole], rng.standard_normal(y.shape), axis=0)
     return Record.of(u, y + level * y.std(axis=0) * e / e.std(axis=0))
-
-
-def test_an_oscillation_of_any_frequency_costs_the_search_for_it(rng):
-    """The best of n / 2 lines of white noise gains about 2 log(n / 2) by chance.
-
-    Of those that decay within ten samples, as many are told apart.
-    """
-    u, y = rng.standard_normal((2, 400, 1))
-    criteria = []
-    for radius in (0.9999, 0.9):
-        A, B = modes(0.5, radius * np.exp(1.1j)), np.ones((3, 1))
-        C, D, x0 = np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 1)), np.zeros((1, 3))
-        model = Realization(A, B, C, D, x0, 1.0)
-        criteria.append(criterion_of(model, [Record.of(u, y)], freedom(1, 1)))
-    np.testing.assert_allclose(criteria[0] - criteria[1], 2.0 * np.log(200.0 / 10.0))
-
-
-def test_initial_states_are_those_that_innovations_ask_for(rng):
-    """White errors: whatever states are given. Slow ones: none leave a transient."""
-    A, B, C, D = example(rng, modes(0.95, 0.6 * np.exp(0.9j)), 1, 1)
-    free, criteria = freedom(1, 1), []
-    u, y = experiment(rng, (A, B, C, D), 300)
-    white = Record.of(u, y + rng.standard_normal(y.shape))
-    for x0 in np.zeros((1, 3)), 0.1 * rng.standard_normal((1, 3)):
-        model = Realization(A, B, C, D, x0, 1.0)
-        criteria.append(criterion_of(model, [white], free))
-    assert criteria[0] == pytest.approx(criteria[1], abs=1e-6)
-    excess = []
-    for _ in range(10):
-        e = rng.standard_normal((800, 1))
-        v = lfilter([1.0], [1.0, -1.6, 0.62], e, axis=0)[500:]
-        slow = [Record.of(u, y + v)]
-        model = with_initial_states(model, slow, free)
-        excess.append(
-            criterion_of(model, slow, free) - 300 * np.log(np.mean(e[500:] ** 2))
-        )
-    # Ten parameters and two lags cost four each; the five fitted here gain one.
-    assert np.mean(excess) == pytest.approx(40.0 * 300 / 290 + 8.0 - 5.0, abs=4.0)
 
 
 def test_coloured_noise_is_not_taken_for_states():
