@@ -126,7 +126,7 @@ def test_without_noise_the_system_is_found():
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.9])
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_third_of_the_outputs_is_hardly_missed(seed, colour):
     true, u, y = record(seed, colour=colour)
     whole = SubspaceLTI().fit(u, y)
