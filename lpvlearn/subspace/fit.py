@@ -571,8 +571,8 @@ def tell_of_delay(
         "delay",
         f"Input {int(delay.argmax()) + 1} shows in the outputs only after {cut} "
         "samples, for certain. With a delay in their place a model of order "
-        f"{orders[0]} {what}. Use input_delay='auto', which finds how many of them are "
-        "a delay.",
+        f"{orders[0]} {what}. Use input_delay='auto', which takes those that are a "
+        f"delay beyond doubt, or give it: {cut} at most.",
     )
 
 
