@@ -221,7 +221,7 @@ def may_have_constants(evidence: Evidence) -> bool:
     They show in its errors, or a slow mode may stand for them; where a channel is far
     from zero, nothing but its mean may have been fitted.
     """
-    if _is_far(evidence.records) or stands_by_chance(evidence):
+    if _is_far(evidence.records):
         return True
     return _has_slow_mode(evidence) or chance_of_trend(evidence) < _SUSPICIOUS
 
@@ -229,8 +229,9 @@ def may_have_constants(evidence: Evidence) -> bool:
 def stands_by_chance(evidence: Evidence) -> bool:
     """Whether outputs stand still where a model without constants is not at rest.
 
-    While the inputs do not move yet, states that are as far from rest as the outputs
-    are would have moved these, unless they happen to balance each other.
+    Neither with the inputs that it begins with nor, if these are a step, without any.
+    While inputs do not move yet, states that are as far from rest as the outputs are
+    would have moved these, unless they happen to balance each other.
     """
     model, radius = evidence.model, spectral_radius(evidence.model.A)
     if not radius < 1.0 or evidence.free.n_trend:
@@ -245,7 +246,8 @@ def stands_by_chance(evidence: Evidence) -> bool:
         y = record.y[:, :n]
         first, second = y[:, : n // 2].mean(axis=1), y[:, n // 2 :].mean(axis=1)
         motion = 2.0 * np.abs(second - first) + 2.0 * y.std(axis=1) / np.sqrt(n)
-        off = np.abs(y.mean(axis=1) - gain @ record.u[:, 0])
+        level = y.mean(axis=1)
+        off = np.minimum(np.abs(level - gain @ record.u[:, 0]), np.abs(level))
         if (off * (1.0 - radius**n) > _AT_REST * motion).any():
             return True
     return False
