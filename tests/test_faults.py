@@ -26,6 +26,7 @@ pytestmark = [
     pytest.mark.skipif(not Path("/proc/self").exists(), reason="reads /proc"),
 ]
 
+SHARED = Path("/dev/shm")
 PATIENCE = 60  # seconds for what takes a few: the machine may be busy
 
 PAPER = [sys.executable, "-m", "lpvlearn", "--realizations", "1", "--jobs", "2"]
@@ -54,7 +55,10 @@ SEARCH = """
 
 
 def begun(command, preexec_fn=None, **options):
-    """A process in a session of its own, which Ctrl-C ends even in the background."""
+    """A process in a session of its own, which Ctrl-C ends even in the background.
+
+    `there` is the shared memory that others left before it, of the same number maybe.
+    """
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
 
     def before():  # shells have what they run in the background ignore it
@@ -62,9 +66,12 @@ def begun(command, preexec_fn=None, **options):
         if preexec_fn is not None:
             preexec_fn()
 
-    return subprocess.Popen(
+    there = set(SHARED.glob("*"))
+    process = subprocess.Popen(
         command, start_new_session=True, preexec_fn=before, **pipes, **options
     )
+    process.there = there
+    return process
 
 
 def script(fit=ALONE, size=4000, **options):
@@ -113,9 +120,9 @@ def written(folder):
 
 def nothing_left(process):
     until(lambda: not session(process), "processes are left")
-    shared, own = Path("/dev/shm"), re.compile(rf"[-_]{process.pid}[-_]")
+    own = re.compile(rf"[-_]{process.pid}[-_]")
     until(
-        lambda: not [f for f in shared.glob("*") if own.search(f.name)],
+        lambda: not any(map(own.search, map(str, {*SHARED.glob("*")} - process.there))),
         "shared memory is left",
     )
 
