@@ -209,9 +209,10 @@ def _with_constants(
     hides = fitted.method == "pbsid" or not choices.initial_states
     hides |= choices.order is not None and fitted.residual > _HARDLY
     tested = fitted.evidence.one_step
+    stands = choices.offset == "auto" and stands_by_chance(tested)
 
     def may_matter() -> bool:
-        if hides or stands_by_chance(tested):
+        if hides or stands:
             return True
         return may_have_constants(tested) and _is_worth_a_choice(
             lambda near: may_be_better(tested, near.evidence),
@@ -221,8 +222,9 @@ def _with_constants(
     refused = np.inf
     if choices.offset == "auto" and may_matter():
         other = _fit(pairs, judged, told, 1, fitted)
-        if len(other.model.A) > len(fitted.model.A) and stands_by_chance(tested):
-            as_many, worse = _of_as_many_states(pairs, judged, told, fitted, other, 1)
+        order = len(fitted.model.A)
+        if stands and len(other.model.A) > order:
+            as_many, worse = _of_order(pairs, judged, told, order, other, 1)
             other = as_many if worse < 0.0 else other
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
@@ -297,8 +299,8 @@ def _with_drifts(
         return fitted
     if spared < 0 and choices.order is None:
         # What more states gain is no drift.
-        n_trend = fitted.evidence.free.n_trend
-        level, worse = _of_as_many_states(pairs, choices, told, other, other, n_trend)
+        order, n_trend = len(other.model.A), fitted.evidence.free.n_trend
+        level, worse = _of_order(pairs, choices, told, order, other, n_trend)
         if not worse > least:
             return level
     return other
@@ -312,20 +314,20 @@ def _takes_a_gain(without: Evidence, other: Evidence) -> bool:
     return bool((after.unknown & ~before.unknown).any())
 
 
-def _of_as_many_states(
+def _of_order(
     pairs: Pairs,
     choices: Choices,
     told: set[str],
-    one: LocalFit,
+    order: int,
     other: LocalFit,
     n_trend: int,
 ) -> tuple[LocalFit, float]:
-    """The model of the samples with as many states as `one`, and these trends.
+    """The model of the samples of that order, with these trends.
 
     And by how much its criterion is worse than that of the `other`, whose choice of the
     order it keeps.
     """
-    found = _fit(pairs, choices._replace(order=len(one.model.A)), told, n_trend)
+    found = _fit(pairs, choices._replace(order=order), told, n_trend)
     worse = criterion_in_units(found.evidence.one_step)
     worse -= criterion_in_units(other.evidence.one_step)
     return found._replace(selection=found.selection.among(other.selection)), worse
@@ -416,7 +418,8 @@ def _of_drifting_noise(
         other.evidence, feedback.innovations
     ):
         return None  # errors that inputs explain are no drift
-    level, worse = _of_as_many_states(pairs, choices, told, other, other, n_trend)
+    order = len(other.model.A)
+    level, worse = _of_order(pairs, choices, told, order, other, n_trend)
     if worse < ALIKE and settles(level, other):
         return level
     held_out = found.selection.held_out

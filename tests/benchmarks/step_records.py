@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import lfilter
@@ -19,8 +20,10 @@ from scipy.signal import lfilter
 from lpvlearn import SubspaceLTI
 from lpvlearn.metrics import bft_score
 
+Answer = Callable[[np.ndarray], np.ndarray]
 
-def plant(rng: np.random.Generator, n: int):
+
+def plant(rng: np.random.Generator, n: int) -> tuple[Answer, float]:
     """Answers of random lags and a delay to an input; and their static gain."""
     poles = np.exp(-1.0 / (n * rng.uniform(0.05, 0.25, rng.integers(1, 4))))
     delay, gain = int(rng.integers(10)), rng.uniform(0.2, 3.0) * rng.choice([-1, 1])
@@ -34,7 +37,7 @@ def plant(rng: np.random.Generator, n: int):
     return answer, gain
 
 
-def test_input(rng: np.random.Generator, n: int, size: float) -> np.ndarray:
+def excitation(rng: np.random.Generator, n: int, size: float) -> np.ndarray:
     """One step, a pulse or two steps, from zero."""
     start, kind = int(n * rng.uniform(0.02, 0.25)), rng.integers(3)
     u = size * (np.arange(n) >= start)
@@ -44,14 +47,11 @@ def test_input(rng: np.random.Generator, n: int, size: float) -> np.ndarray:
     return u
 
 
-def measure(seed: int, offset: str | None) -> tuple[float, float, bool, str | None]:
+def measure(seed: int, offset: str) -> tuple[float, float, bool, str | None]:
     """Best fit, gain by the true one, whether anything was told, and constants."""
     rng = np.random.default_rng([seed, 39])
-    n, size, level = (
-        int(rng.integers(100, 500)),
-        rng.uniform(10, 60),
-        rng.uniform(0, 60),
-    )
+    n = int(rng.integers(100, 500))
+    size, level = rng.uniform(10, 60), rng.uniform(0, 60)
     answer, gain = plant(rng, n)
     noise = 10 ** rng.uniform(-3, -1.5) * abs(gain) * size
     step = noise * rng.choice([0.0, 0.0, 1.0])
@@ -60,7 +60,7 @@ def measure(seed: int, offset: str | None) -> tuple[float, float, bool, str | No
         y = y + level + noise * rng.standard_normal(len(y))
         return np.round(y / step) * step if step else y
 
-    u = test_input(rng, n, size)
+    u = excitation(rng, n, size)
     fresh = np.repeat(size * (0.5 + 0.5 * rng.standard_normal(12)), n // 8)
     target = answer(fresh)
     with warnings.catch_warnings(record=True) as caught:
@@ -79,12 +79,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--records", type=int, default=140)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--offset", choices=["auto", "constant", "None"])
+    parser.add_argument("--offset", choices=["auto", "constant"], default="auto")
     options = parser.parse_args()
-    offset = {None: "auto", "None": None}.get(options.offset, options.offset)
     seeds = range(options.first, options.first + options.records)
     scores, gains, told, offsets = zip(
-        *(measure(k, offset) for k in seeds), strict=True
+        *(measure(k, options.offset) for k in seeds), strict=True
     )
     fits, silent = np.maximum(scores, -100.0), ~np.array(told)
     far = np.abs(np.array(gains) - 1.0) > 0.3
