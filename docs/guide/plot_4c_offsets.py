@@ -92,6 +92,35 @@ display = SimulationDisplay.from_predictions(
 {name: round(bft_score(data.y_large, y), 1) for name, y in simulated.items()}
 
 # %%
+# Where predictions begin
+# -----------------------
+# ``predict`` has no outputs to look at: it begins at rest at the point of work of the
+# first scheduling value. Step tests do not: they stand where their first inputs hold
+# the system, and the point of work is near the means, of which most comes after the
+# step. The experiments tell; ``lpv_.steady_start`` says which it is. With it every run
+# whose inputs stand still at first (for five samples) and move later begins where these
+# hold the model. A :class:`~lpvlearn.SubspaceLTI` does the same (``steady_start_``).
+
+import matplotlib.pyplot as plt
+
+time = np.arange(300) / 10.0
+X_step = pd.DataFrame({"heating": np.where(time < 5.0, 30.0, 50.0)})
+lag = 1.0 - np.exp(-np.maximum(time - 5.0, 0.0) / 3.0)
+noise = 0.1 * np.random.default_rng(0).standard_normal(len(time))
+y_step = pd.Series(25.0 + 0.4 * (30.0 + 20.0 * lag) + noise, name="temperature")
+heater = SubspaceLTI(1, sampling_time=0.1).fit(X_step, y_step)
+
+other = pd.DataFrame({"heating": np.where(time < 8.0, 45.0, 20.0)})
+fig, ax = plt.subplots(figsize=(7, 2.6), layout="constrained")
+ax.plot(time, y_step, color="0.6", label="measured")
+ax.plot(time, heater.predict(X_step), label="predicted")
+ax.plot(time, heater.predict(other), label="predicted, of another step")
+ax.set_xlabel("Time (s)")
+ax.set_ylabel("Temperature (°C)")
+ax.legend()
+print(heater.steady_start_)
+
+# %%
 # What the experiments do not tell
 # --------------------------------
 # An experiment at one point tells an equilibrium :math:`(u_0, y_0)`. Where the *state*
@@ -145,9 +174,9 @@ round(bft_score(data.y_large, y), 1)
 #
 # In practice
 # -----------
-# * ``predict`` begins at rest at the point of work of the first sample, and takes
-#   :math:`u_0` for the inputs before it; ``predict_with_initial_state`` estimates the
-#   state.
+# * ``predict`` begins at rest at the point of work of the first sample, with
+#   :math:`u_0` for the inputs before it, or where the first inputs hold the model (see
+#   above); ``predict_with_initial_state`` estimates the state.
 # * ``lpv_.at(kappa)`` is a model of deviations. ``lpv_.to_mat`` takes the points of
 #   work along to MATLAB's ``ssInterpolant``.
 # * ``offsets=None`` is a model whose outputs are zero at rest at input zero; where the

@@ -66,7 +66,7 @@ def simulation_std(model: LPVStateSpace, u: Array, kappa: Array, dt: float) -> A
     """
     root = model.covariance_root()
     own = replace(model.silenced(), bases=())
-    x0 = own.state_offset(kappa[:1])[0]
+    x0 = own.beginning(u, kappa)[0]
     std = np.empty((len(u), model.n_outputs))
     every = np.ones(len(root), bool)
     for rows, J in output_slopes(own, u, kappa, dt, x0, every):

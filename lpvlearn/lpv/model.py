@@ -17,6 +17,7 @@ from ..models.statespace import StateSpace, sorted_poles, split_delay
 from ..models.system_matrix import blocks
 from ..structures.map import numerical_jacobian
 from ..structures.structure import GrayBoxStructure
+from ..systems.beginnings import first_inputs, held_state, standing
 from ..systems.sampling import sample_zoh
 from ..systems.simulation import (
     delayed,
@@ -106,6 +107,10 @@ class LPVStateSpace(VersionedPickle):
     units : dict of str to str, default=None
         Units of signals, scheduling variables and parameters, by name: those of
         displays, reports and files of MATLAB.
+    steady_start : bool, default=False
+        Where a simulation begins whose inputs stand still at first and move later: at
+        rest at the point of work, or, as step tests do, where its first inputs hold the
+        model at the first scheduling value.
 
     Attributes
     ----------
@@ -169,6 +174,7 @@ class LPVStateSpace(VersionedPickle):
     rate_terms: Any = None
     covariance: ArrayLike | None = None
     units: Mapping[str, str] | None = None
+    steady_start: bool = False
     order: int = field(init=False)
     n_inputs: int = field(init=False)
     n_outputs: int = field(init=False)
@@ -207,6 +213,8 @@ class LPVStateSpace(VersionedPickle):
             if names is not None:
                 names_of(f"{signal}_names", names, n)
         object.__setattr__(self, "units", units_by_name(self.units))
+        steady = flag("steady_start", self.steady_start)
+        object.__setattr__(self, "steady_start", steady)
         delay = input_delays(self.input_delay, self.n_inputs, samples=False)
         object.__setattr__(self, "input_delay", delay)
         if self.covariance is not None:
@@ -603,9 +611,10 @@ class LPVStateSpace(VersionedPickle):
         sampling_time : float
             Seconds.
         initial_state : array-like of shape (order,), default=None
-            None is rest: zero, or the `state_offset` of the first sample. The inputs
-            before that sample are zero, or its `input_offset`; those in transit may
-            follow the state, as `estimate_initial_state` has them.
+            None is rest: zero, or the `state_offset` of the first sample, or with
+            `steady_start` where the first inputs hold the model. The inputs before that
+            sample are zero, or its `input_offset`, or the first ones; those in transit
+            may follow the state, as `estimate_initial_state` has them.
 
         Returns
         -------
@@ -755,16 +764,31 @@ class LPVStateSpace(VersionedPickle):
                 f"`scheduling` must have one row for each of the {len(u)} samples of "
                 f"`u`. Got {len(kappa)}."
             )
-        u0, _, x0 = self.silenced()._point_of_work(kappa[:1])
-        x, before = x0.sum(axis=0), np.repeat(u0.sum(axis=0), delay)
+        x, first = self.beginning(u, kappa)
+        before = np.asarray(np.repeat(first, delay), dtype=float)
         if initial_state is not None:
             given = state_vector(initial_state, n, int(delay.sum()))
             x = given[:n]
             if self.bases and len(kappa):
-                x = np.linalg.solve(self._basis_at(kappa[0]), x)
+                x = np.asarray(np.linalg.solve(self._basis_at(kappa[0]), x), float)
             if np.size(initial_state) > n:
                 before = given[n:]
         return u, kappa, delay, np.concatenate([x, before])
+
+    def beginning(self, u: Array, kappa: Array) -> tuple[Array, Array]:
+        """State of the structure where a run begins by itself, and inputs before it.
+
+        Of checked inputs and scheduling, a row for every sample.
+        """
+        quiet = self.silenced()
+        u0, _, x0 = (np.sum(p, axis=0) for p in quiet._point_of_work(kappa[:1]))
+        if self.steady_start and standing(u):
+            A, B, *_ = self.structure.matrices(quiet.parameters(kappa[:1])[0])
+            first = first_inputs(u)
+            held = held_state(A, B, first - u0, discrete=False)
+            if held is not None:
+                return x0 + held, first
+        return x0, u0
 
     def _unit_runs(self, kappa: Array, delay: NDArray[np.intp]) -> tuple[Array, Array]:
         """What drives runs from unit initial states, and units in transit."""

@@ -147,7 +147,7 @@ def initial_state(
     model: LPVStateSpace, record: Record, own: Own, found: Array
 ) -> Array:
     """State at the first sample, by the unknowns of the record."""
-    x0 = model.state_offset(record.kappa[:1])[0]
+    x0 = model.beginning(record.u, record.kappa)[0]
     return x0 + found[: model.order] if own.initial_state else x0
 
 

@@ -82,7 +82,8 @@ def output_slopes(
     dt : float
         Seconds.
     x0 : ndarray of shape (order,)
-        Initial state.
+        Initial state: where runs begin by themselves, and what is added to that, which
+        the coefficients do not change.
     free : ndarray of bool, shape (n_coefficients,)
         Coefficients to differentiate by.
 
@@ -91,14 +92,14 @@ def output_slopes(
     slice, ndarray of shape (n_block, n_outputs, order + n_free)
         Samples, and derivatives by the initial state and the free coefficients.
     """
-    n, n_free = model.order, int(free.sum())
-    delay = split_delay(model.input_delay, dt)[0]
-    u0 = model.input_offset(kappa)
-    late = delayed(u, delay, np.repeat(u0[0], delay)) - u0
+    n, delay = model.order, split_delay(model.input_delay, dt)[0]
+    u0, before = model.input_offset(kappa), model.beginning(u, kappa)[1]
+    late = delayed(u, delay, np.repeat(before, delay)) - u0
     rates = rates_of_change(kappa, dt)
     unit = _units(model, kappa, rates)
-    x, own, X = x0 / unit, np.diag(1.0 / unit), np.zeros((n, n_free))
     moved_by = _moving_entries(model, free)
+    x, own = x0 / unit, np.diag(1.0 / unit)
+    X = _slopes_of_beginning(model, before - u0[0], kappa[:1], unit, free, moved_by)
     size = max(_FEWEST, _ENTRIES // ((n + model.n_outputs) * (n + len(free))))
     for start in range(0, len(u), size):
         rows = slice(start, min(start + size, len(u)))
@@ -125,6 +126,28 @@ def output_slopes(
         x = Ad[-1] @ states[-1] + moved[-1] + Bd[-1] @ w[-1]
         own = Ad[-1] @ free_states[-1]
         X = Ad[-1] @ slopes[-1] + F[-1, :n]
+
+
+def _slopes_of_beginning(
+    model: LPVStateSpace,
+    w: Array,
+    kappa: Array,
+    unit: Array,
+    free: Flags,
+    moved_by: NDArray[np.intp],
+) -> Array:
+    """Derivatives (order, n_free) of the state in which inputs `w` hold the model.
+
+    ``A x + B w = 0``, ``A dx + dA x + dB w = 0``; in units of the states.
+    """
+    n, rates = model.order, np.zeros_like(kappa)
+    if not w.any():
+        return np.zeros((n, int(free.sum())))
+    A, B, _, _, E = _linearised(model, kappa, rates, unit, moved_by)
+    x = -np.linalg.solve(A[0], B[0] @ w)
+    moved = _directed(E[..., :n, :], np.concatenate([x, w])[None])
+    slopes = np.asarray(-np.linalg.solve(A, moved), dtype=float)
+    return _by_coefficients(model, kappa, rates, slopes, free, moved_by)[0]
 
 
 def _linearised(

@@ -73,7 +73,12 @@ from .reports import Summary, Tables, summarise, tables
 from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
-from .structured_models import StructuredModels, offsets_of_points, restructure_points
+from .structured_models import (
+    StructuredModels,
+    begins_held,
+    offsets_of_points,
+    restructure_points,
+)
 from .together import through_black_boxes
 
 Array = NDArray[np.float64]
@@ -302,7 +307,8 @@ list, default=None
     everywhere are those of the sensors, and so is that of an output which does not
     answer at rest, ``G(0) = 0``. `lpv_` is linear about these points, which its
     `input_offset`, `output_offset` and `state_offset` tell; `predict` begins at rest at
-    that of the first sample. See :ref:`guide_points_of_work`.
+    that of the first sample, or, where the local experiments do so, where its first
+    inputs hold the model (`lpv_.steady_start`). See :ref:`guide_points_of_work`.
 
     Examples
     --------
@@ -579,6 +585,8 @@ list, default=None
         if moving:
             with watch.step("refinement", bar=True):  # on data that moves
                 self._refine(moving, found, runner)
+        steady = begins_held(self.lpv_, found.points, self.sampling_time_)
+        self.lpv_ = replace(self.lpv_, steady_start=steady)
 
         with watch.step("interpolation and report"):
             self.output_errors_ = (

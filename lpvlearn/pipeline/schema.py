@@ -128,6 +128,7 @@ FORMS: dict[type, dict[str, str]] = {
         "input_names": "any?",
         "output_names": "any?",
         "units": "any?",
+        "steady_start": "flag?",
     },
     PolynomialLPV: _POINTS
     | _MISFIT
@@ -198,6 +199,7 @@ FORMS: dict[type, dict[str, str]] = {
         "input_offset_": "float[n_experiments, n_inputs]",
         "output_offset_": "float[n_experiments, n_outputs]",
         "output_drift_": "float[n_experiments, n_outputs]",
+        "steady_start_": "flag?",
         "time_jitter_": "number",
         "n_outputs_": "size[n_outputs]",
         "n_features_in_": "whole",

@@ -6,7 +6,7 @@ basin, and branches are tied.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -18,12 +18,14 @@ from sklearn.base import clone
 from ..data.operating_points import OperatingPoints
 from ..exceptions import collected, warn
 from ..lpv.equilibria import points_of_work
+from ..lpv.model import LPVStateSpace
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..restructuring.deadline import bounded, time_is_up
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..restructuring.uncertainty import ParameterUncertainty
 from ..structures.structure import GrayBoxStructure
+from ..systems.beginnings import begin_held, first_inputs, standing
 from .black_boxes import (
     aligned_black_boxes,
     balanced,
@@ -167,6 +169,31 @@ def offsets_of_points(found: StructuredModels) -> tuple[Array, Array] | None:
     scales = (u_scale, y_scale)
     kappa = found.points.kappa
     return points_of_work(found.models, kappa, inputs, outputs, scales), y_scale
+
+
+def begins_held(model: LPVStateSpace, points: OperatingPoints, dt: float) -> bool:
+    """Whether local experiments begin where their first inputs hold the model.
+
+    And not at rest about zero, or, where there are points of work, about their means.
+    """
+    model = model.silenced()
+
+    def beginnings() -> Iterator[tuple[Array, Array, Array]]:
+        for kappa, group in zip(points.kappa, points.experiments, strict=True):
+            frozen, place = model.at(kappa), kappa[None]
+            (u0,), (y0,) = model.input_offset(place), model.output_offset(place)
+            for e in group:
+                u, n = e.inputs, standing(e.inputs)
+                rest = u0 if model.offsets is None else u.mean(axis=0)
+                at_rest, held = (
+                    y0 + frozen.dc_gain() @ (v - u0) for v in (rest, first_inputs(u))
+                )
+                moved = frozen.simulate(u[:n] - rest, sampling_time=dt)
+                yield e.measured[:n], at_rest + moved, held
+
+    if not all(model.at(kappa).is_stable for kappa in points.kappa):
+        return False
+    return begin_held(beginnings())
 
 
 def _covariance(fitted: Any, model: LocalModel, runner: PointRunner) -> Array | None:

@@ -43,6 +43,7 @@ from ..exceptions import (
 )
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
+from ..systems.beginnings import begin_held, first_inputs, held_state, standing
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
@@ -109,6 +110,7 @@ _TAKEN = (
     "output_offset_",
     "output_drift_",
     "offsets_differ_",
+    "steady_start_",
 )
 
 
@@ -290,6 +292,10 @@ class SubspaceLTI(
         mean of all.
     offsets_differ_ : bool
         Whether the constants of the experiments do, by more than their uncertainty.
+    steady_start_ : bool
+        Whether the experiments begin where their first inputs hold the model, as step
+        tests do, and not at rest at `input_offset_`. `predict` begins likewise, where
+        inputs stand still at first and move later.
     output_drift_ : ndarray of shape (n_experiments, n_outputs)
         Change per second (per sample where no time is known), about the middle of
         the experiment; zero unless `offset_` is "linear", and where an offset of the
@@ -650,6 +656,7 @@ class SubspaceLTI(
                 known=known,
             )
         self._take(fitted, self._step_of(experiments), delay)
+        self.steady_start_ = choices.initial_states and self._begin_held(experiments)
         warn_about(fitted, told)
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
@@ -704,6 +711,7 @@ class SubspaceLTI(
         self.stability_loss_, self.n_outputs_ = inner.stability_loss_, len(flags)
         self._offsets = of_rates(inner._offsets, inner.lti_.dc_gain(), flags)
         self.offset_, self.offsets_differ_ = inner.offset_, inner.offsets_differ_
+        self.steady_start_ = False
         self.input_offset_ = self._offsets.inputs
         self.output_offset_ = self._offsets.outputs
         self.output_drift_ = self._offsets.drifts / float(step)
@@ -1001,6 +1009,7 @@ class SubspaceLTI(
         self.output_offset_ = fitted.offsets.outputs
         self.output_drift_ = fitted.offsets.drifts / step
         self.offsets_differ_ = fitted.offsets.differ
+        self.steady_start_ = False  # but for experiments that are all there
 
     def _name(self, inputs: Any, outputs: Any) -> None:
         """Let the model know the names of the columns, where they have some."""
@@ -1024,6 +1033,10 @@ class SubspaceLTI(
 
     def predict(self, X: Any) -> Array:
         """Simulate the outputs of every experiment from rest, inputs before it zero.
+
+        With offsets these are about `input_offset_`. Where the experiments of `fit`
+        stood still at first (`steady_start_`) so do those whose first inputs do: at
+        rest at these.
 
         Parameters
         ----------
@@ -1137,7 +1150,7 @@ class SubspaceLTI(
 
         def predicted(e: Experiment) -> Array:
             u0, level = self.resting_point()
-            x0 = None
+            x0 = self._beginning(e) if predictor.gain is None else None
             if initial_state == "estimate":
                 x0, level = self._own_part(e, predictor)
             u, y = e.inputs - u0, e.measured - level
@@ -1438,7 +1451,47 @@ class SubspaceLTI(
             **options,
         )
 
+    def _begin_held(self, experiments: Sequence[Experiment]) -> bool:
+        """Whether experiments begin where their first inputs hold the model.
+
+        And not at rest about zero, or, where there are levels, about their means.
+        """
+        lti = self.lti_
+        if not (lti.is_stable and any(standing(e.inputs) for e in experiments)):
+            return False
+        known = self.input_offset_, self.output_offset_, self._offsets.drifts
+        levels = (np.broadcast_to(v, (len(experiments), v.shape[1])) for v in known)
+
+        def beginning(
+            e: Experiment, u0: Array, y0: Array, drift: Array
+        ) -> tuple[Array, Array, Array]:
+            u, n = e.inputs, standing(e.inputs)
+            y = e.measured[:n] - np.outer(np.arange(n) - (len(u) - 1) / 2.0, drift)
+            rest = u0 if self.offset_ is None else u.mean(axis=0)
+            at_rest, held = (
+                y0 + lti.dc_gain() @ (v - u0) for v in (rest, first_inputs(u))
+            )
+            return y, at_rest + lti.simulate(u[:n] - rest), held
+
+        return begin_held(map(beginning, experiments, *levels))
+
     def _simulated(self, experiment: Experiment) -> Array:
+        """Outputs from the beginning that the experiments of `fit` let expect."""
+        u0, y0 = self.resting_point()
+        return y0 + self.lti_.simulate(
+            experiment.inputs - u0, initial_state=self._beginning(experiment)
+        )
+
+    def _beginning(self, experiment: Experiment) -> Array | None:
+        """State and inputs in transit where the first inputs hold it; None for rest."""
+        u, lti = experiment.inputs, self.lti_
+        if not (getattr(self, "steady_start_", False) and standing(u)):
+            return None
+        first = first_inputs(u) - self.resting_point()[0]
+        x0 = held_state(lti.A, lti.B, first, discrete=True)
+        return None if x0 is None else np.append(x0, np.repeat(first, lti.input_delay))
+
+    def _from_rest(self, experiment: Experiment) -> Array:
         """Outputs from rest at the mean offsets."""
         u0, y0 = self.resting_point()
         return y0 + self.lti_.simulate(experiment.inputs - u0)
@@ -1479,7 +1532,7 @@ class SubspaceLTI(
         lti, y = self.lti_, experiment.measured
         responses = free_responses(lti.A, lti.C, len(y), trend)
         responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
-        error = y - self._simulated(experiment)
+        error = y - self._from_rest(experiment)
         if experiment.estimated is not None:  # lest known ones leave states open
             faint = np.where(experiment.estimated, _FAINT, 1.0)
             responses, error = responses * faint[:, :, None], error * faint

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy import linalg, special
 
 from ..data.preparation import Pairs
+from ..systems.beginnings import standing
 from ..systems.least_squares import column_scale
 from ..systems.simulation import free_responses, lti_response, trend_signals
 from .criterion import criterion_of
@@ -79,9 +80,9 @@ _UNSEEN, _NEARLY = 0.1, 0.01  # of errors, and of a drift: what inputs need not 
 _LASTING = 0.1  # decay of a mode over a record, of one that may be a constant
 _FAR = 3.0  # standard deviations between the mean of a channel and zero
 
-# Samples of a beginning at which inputs and outputs stand still, and the motion that a
-# state off rest would have made there, times what is seen.
-_STANDING, _AT_REST = 5, 5.0
+# Motion that a state off rest would have made where inputs and outputs stand still at
+# the beginning, times what is seen.
+_AT_REST = 5.0
 
 # Time constants per longest experiment of a mode that may stand for a constant.
 HARDLY_DECAYS = 3.0
@@ -239,9 +240,8 @@ def stands_by_chance(evidence: Evidence) -> bool:
     eye = np.eye(len(model.A))
     gain = model.C @ np.linalg.solve(eye - model.A, model.B) + model.D
     for record in evidence.records:
-        moved = (record.u != record.u[:, :1]).any(axis=0)
-        n = int(np.argmax(moved))
-        if n < _STANDING:
+        n = standing(record.u.T)
+        if not n:
             continue
         y = record.y[:, :n]
         first, second = y[:, : n // 2].mean(axis=1), y[:, n // 2 :].mean(axis=1)

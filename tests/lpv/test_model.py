@@ -809,3 +809,37 @@ def test_a_covariance_is_one_of_the_coefficients():
     ):
         with pytest.raises(ValueError, match="`covariance` is None.*AutoLPV"):
             call()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1])
+def test_runs_begin_where_their_first_inputs_hold_them(delay):
+    """As after a long time with these; in any basis, and with inputs in transit."""
+    kappa = np.linspace(0, 1.5, 5)[:, None]
+    values = np.hstack([1 + kappa, kappa**2, 0.3 * kappa, 0.1 - kappa])
+    lpv = replace(
+        spring_lpv(),
+        offsets=PolynomialLPV(2).fit(kappa, values),
+        input_delay=delay,
+        steady_start=True,
+    )
+    lpv = lpv.change_basis(lambda k: np.array([[1.0, k[0]], [0.0, 2.0]]))
+    u = np.repeat([[2.0], [-1.0], [3.0]], [2000, 10, 30], axis=0)
+    path = np.concatenate([np.full(2000, 0.4), np.linspace(0.4, 1.2, 40)])
+    y = lpv.simulate(u, path, 0.05)
+    np.testing.assert_allclose(
+        lpv.simulate(u[1990:], path[1990:], 0.05), y[1990:], atol=1e-9
+    )
+    np.testing.assert_allclose(y[:2000], np.tile(y[0], (2000, 1)), atol=1e-9)
+    x0 = lpv.estimate_initial_state(u[1990:], path[1990:], y[1990:], 0.05)
+    found = lpv.simulate(u[1990:], path[1990:], 0.05, x0)
+    np.testing.assert_allclose(found, y[1990:], atol=1e-9)
+
+
+def test_step_responses_begin_at_rest():
+    """Inputs that never move, or move at once, do not tell of a time before."""
+    lpv = replace(spring_lpv(), steady_start=True)
+    for u in (np.ones(50), np.repeat([1.0, 2.0], [3, 47])):
+        found = lpv.simulate(u, np.zeros(50), 0.05)
+        np.testing.assert_array_equal(
+            found, spring_lpv().simulate(u, np.zeros(50), 0.05)
+        )

@@ -96,6 +96,32 @@ def test_slopes_equal_differences(name, rates):
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("name", ["affine", "delayed", "function", "offsets"])
+@pytest.mark.parametrize("rates", [False, True])
+def test_slopes_of_runs_that_begin_where_their_inputs_hold_them(name, rates):
+    model = MODELS[name]()
+    if rates:
+        model = with_rate_terms(model)[0]
+    model = replace(model, steady_start=True)
+    u, kappa = trajectory(model)
+    u[:9] = 0.7
+    rng = np.random.default_rng(1)
+    c = coefficients_of(model)
+    c = c + 0.02 * rng.normal(size=len(c))
+
+    def outputs(c):
+        return with_coefficients(model, c).simulate(u, kappa, STEP)
+
+    h, model = 1e-5, with_coefficients(model, c)
+    columns = [(outputs(c + d) - outputs(c - d)) / (2 * h) for d in h * np.eye(len(c))]
+    expected = np.stack(columns, axis=-1)
+    x0, free = model.beginning(u, kappa)[0], np.ones(len(c), bool)
+    found = [J for _, J in output_slopes(model, u, kappa, STEP, x0, free)]
+    found = np.concatenate(found)[:, :, model.order :]
+    assert np.abs(expected[0]).max() > 1e-3  # it matters from the beginning
+    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
+
+
 def test_long_tables_and_short_ones_agree(monkeypatch):
     """With 300 samples matrices and directions come from a table over kappa."""
     found, expected = slopes_and_differences(with_function(), 300)

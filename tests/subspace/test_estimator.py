@@ -9,7 +9,7 @@ from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from lpvlearn import StateSpace, SubspaceLTI, from_trajectories
+from lpvlearn import StateSpace, SubspaceLTI, bft_score, from_trajectories
 from lpvlearn.exceptions import DivergenceError, RankWarning
 from lpvlearn.systems.simulation import lti_response
 
@@ -403,3 +403,41 @@ def test_each_needs_outputs_that_do_not_integrate(rng):
     X, y = realizations(rng, 2)
     with pytest.raises(ValueError, match="`integrating` must be None in fit_each"):
         SubspaceLTI(3, integrating=True, experiment="experiment").fit_each(X, y)
+
+
+def step_test(first, last, level, n=300, delay=0):
+    """A lag of gain one that stands at an input until it steps to another."""
+    u = np.where(np.arange(n) < 60, first, last)[:, None]
+    y = StateSpace([[0.95]], [[0.05]], [[1.0]], sampling_time=1.0).simulate(u - first)
+    y = np.vstack([np.zeros((delay, 1)), y])[:n] + first + level
+    return u, y + 0.05 * np.random.default_rng(0).standard_normal(y.shape)
+
+
+@pytest.mark.parametrize("level", [0.0, 7.0])
+@pytest.mark.parametrize("delay", [0, 4])
+def test_step_tests_begin_where_they_stood(level, delay):
+    """Not at rest about the means, of which most comes after the step."""
+    u, y = step_test(30.0, 50.0, level, delay=delay)
+    model = SubspaceLTI(1, input_delay=delay).fit(u, y)
+    assert model.steady_start_
+    assert model.score(u, y) > 0.999  # and no warning of mid-motion
+    other, truth = step_test(45.0, 20.0, level, delay=delay)
+    found = model.predict(other)
+    np.testing.assert_allclose(found[0], 45.0 + level, atol=0.3)
+    assert bft_score(truth, found) > 98.0
+    ahead = model.predict_ahead(other, truth, initial_state="rest")
+    np.testing.assert_allclose(ahead[0], 45.0 + level, atol=0.3)
+    known = model.predict_with_initial_state(u, y)
+    np.testing.assert_allclose(known, model.predict(u), atol=0.1)
+
+
+def test_records_that_begin_at_rest_go_on_doing_so():
+    """With inputs that are held for long, too, and without a level."""
+    rng = np.random.default_rng(0)
+    u = rng.choice([-1.0, 1.0], (20, 1)).repeat(25, axis=0)
+    y = StateSpace([[0.95]], [[0.05]], [[1.0]], sampling_time=1.0).simulate(u)
+    y = y + 0.01 * rng.standard_normal(y.shape)
+    for level in (0.0, 5.0):
+        model = SubspaceLTI().fit(u, y + level)
+        assert not model.steady_start_
+    assert SubspaceLTI().fit(u, y).score(u, y) > 0.99

@@ -1,0 +1,79 @@
+"""How records begin: at rest about one point, or where their first inputs hold them.
+
+A step test stands still until the step comes, but seldom where the model is at rest:
+that is about the means of the record, of which most comes after the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_STANDING = 5  # samples in which inputs that move later stand still
+_STILL = 0.02  # part of their range that measured ones may move meanwhile
+_NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
+
+
+def standing(u: Array) -> int:
+    """Samples in which inputs stand still before they move; 0 if few, or to the end.
+
+    >>> u = np.repeat([[2.0], [3.0]], 8, axis=0)
+    >>> standing(u), standing(u[4:]), standing(u[8:])
+    (8, 0, 0)
+    """
+    if not len(u):
+        return 0
+    with np.errstate(over="ignore"):
+        moved = (np.abs(u - u[0]) > _STILL * np.ptp(u, axis=0)).any(axis=1)
+    n = int(moved.argmax())
+    return n if n >= _STANDING else 0
+
+
+def first_inputs(u: Array) -> Array:
+    """Inputs at the beginning, their median as long as they stand still."""
+    return np.asarray(np.median(u[: standing(u) or 1], axis=0))
+
+
+def held_state(A: Array, B: Array, u: Array, *, discrete: bool) -> Array | None:
+    """The state in which constant inputs hold a model; None if that is nowhere.
+
+    >>> held_state(np.array([[-2.0]]), np.eye(1), np.array([6.0]), discrete=False)
+    array([3.])
+    """
+    try:
+        x = np.linalg.solve(np.eye(len(A)) - A if discrete else -A, B @ u)
+    except np.linalg.LinAlgError:  # an integrator
+        return None
+    return np.asarray(x) if np.isfinite(x).all() else None
+
+
+def begin_held(beginnings: Iterable[tuple[Array, Array, Array]]) -> bool:
+    """Whether records begin where their first inputs hold them, and not at rest.
+
+    Parameters
+    ----------
+    beginnings : iterable of (y, at_rest, held)
+        Outputs (n_samples, n_outputs) as long as the inputs stand still, NaN where they
+        are missing; those of a simulation from rest; and the held ones (n_outputs,).
+
+    Examples
+    --------
+    >>> begin_held([(np.full((8, 1), 20.0), np.linspace(25, 20, 8)[:, None], [20.0])])
+    True
+    """
+    records = list(beginnings)
+    apart = [at_rest - held for _, at_rest, held in records]
+    if not records or not all(np.isfinite(a).all() for a in apart):
+        return False
+    size = np.max([np.abs(a).max(axis=0, initial=0.0) for a in apart], axis=0)
+    weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    nearer = total = 0.0
+    for (y, at_rest, held), a in zip(records, apart, strict=True):
+        change = weight**2 * ((y - at_rest) ** 2 - (y - held) ** 2)
+        nearer += float(np.nansum(change))
+        total += float(np.sum(np.where(np.isnan(y), 0.0, weight * a) ** 2))
+    return nearer > _NEARER * total

@@ -1,0 +1,53 @@
+"""How records begin."""
+
+import numpy as np
+import pytest
+
+from lpvlearn.systems.beginnings import (
+    begin_held,
+    first_inputs,
+    held_state,
+    standing,
+)
+
+
+def test_measured_inputs_stand_still_but_for_their_noise():
+    u = np.repeat([[20.0], [40.0]], 10, axis=0)
+    noise = 0.1 * np.random.default_rng(0).standard_normal(u.shape)
+    assert standing(u + noise) == 10
+    np.testing.assert_allclose(first_inputs(u + noise), [20.0], atol=0.1)
+    assert standing(u + 10.0 * noise) == 0
+    np.testing.assert_array_equal(first_inputs(u[8:] + 0.0), [20.0])
+
+
+@pytest.mark.parametrize("u", [np.zeros((0, 1)), np.ones((20, 2)), np.eye(20)[:, :1]])
+def test_inputs_that_never_move_or_at_once_do_not_stand_still(u):
+    assert standing(u) == 0
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_held_states_stay(discrete):
+    A = np.array([[0.5, 0.2], [-0.1, 0.3]])
+    B, u = np.array([[1.0, 0.0], [0.5, 2.0]]), np.array([3.0, -1.0])
+    x = held_state(A, B, u, discrete=discrete)
+    np.testing.assert_allclose(A @ x + B @ u, x if discrete else 0.0, atol=1e-12)
+
+
+def test_integrators_are_held_nowhere():
+    assert held_state(np.eye(1), np.ones((1, 1)), np.ones(1), discrete=True) is None
+
+
+def test_of_two_beginnings_the_nearer_is_taken():
+    """By all records together; not where either is as good, or none is known."""
+    held, at_rest = np.array([20.0]), np.linspace(25.0, 20.0, 8)[:, None]
+    still = np.full((8, 1), 20.0)
+    assert begin_held([(still, at_rest, held), (at_rest[:0], at_rest[:0], held)])
+    assert not begin_held([(at_rest, at_rest, held)])
+    assert not begin_held([(still, at_rest, held), (at_rest, at_rest, held)])
+    assert not begin_held([(still, still, held)])
+    assert not begin_held([(still, at_rest, np.array([np.inf]))])
+    assert not begin_held([(np.full_like(still, np.nan), at_rest, held)])
+    assert not begin_held([])
+    noise = 5.0 * np.random.default_rng(0).standard_normal((8, 1))
+    assert begin_held([(still + noise, at_rest, held)] * 9)
+    assert not begin_held([(at_rest + noise, at_rest, held)] * 9)
