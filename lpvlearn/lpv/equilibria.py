@@ -56,8 +56,9 @@ _CLEAR = 10.0
 _BETTER, _FEWEST, _BETWEEN = 0.25, 5, 8
 _BENT = 1e-4  # mean square of such an error, by the motion, that is worth it
 
-# Variance of the levels of inputs over the points, in that of their motion: none.
-_STANDING = 0.1
+# Variance of the levels of inputs over the points, in that of their motion: none. And
+# how far, in that of the outputs, a gain that is known takes them to a common one.
+_STANDING, _FAR = 0.1, 3.0
 
 
 def points_of_work(
@@ -97,7 +98,10 @@ def points_of_work(
     unseen = moved_states @ (np.eye(len(u_scale)) - seen)
     if np.sum(np.var(inputs / u_scale, axis=0)) <= _STANDING:
         common = np.broadcast_to(inputs.mean(axis=0), inputs.shape)
-        outputs = outputs + _times(gains, common - inputs)
+        change = _times(gains, common - inputs)
+        # what hardly settles rests nearly anywhere, and by its gain anywhere else
+        far = np.any(np.abs(change) > _FAR * y_scale, axis=1)
+        outputs = outputs + np.where(far[:, None], 0.0, change)
         inputs = common
     order, parents = spanning_tree(kappa)
     child, parent = order[1:], parents[order[1:]]

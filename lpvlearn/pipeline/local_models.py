@@ -41,6 +41,7 @@ _OFFSET = 5.0
 
 # Standard deviation of the constants of experiments at a point, in those of outputs,
 # that a user should know of.
+_FAR = 5.0  # from the mean of the outputs, in their motion: not where they rest
 _APART = 0.1
 
 # A pole that much slower than the others is an integrator, and an output shows it by
@@ -336,7 +337,8 @@ def _equilibrium(
     """Inputs and outputs at which the model rests, nearest to the experiments' means.
 
     In units of how far they move within the experiments; where the experiments begin
-    nearest to rest if a mode does not decay over them, which rests nearly anywhere.
+    nearest to rest if a mode does not decay over them, which rests nearly anywhere, but
+    for one that stands for constants and would have that far from all outputs.
     None where the estimator has not looked for constants, or does not tell.
     """
     first = fitted[0]
@@ -348,11 +350,13 @@ def _equilibrium(
     known = [own.resting_point() for own in fitted]
     u0, y0 = (np.mean(values, axis=0) for values in zip(*known, strict=True))
     longest = max(len(e.inputs) for e in experiments)
-    if (mode_rates(first.lti_.A) * longest < 1.0).any():
-        return u0, y0
-    _tell_different_constants(lti, fitted, experiments)
     (u, u_scale), (y, y_scale) = motions(experiments)
     gain = lti.dc_gain()
+    if (mode_rates(first.lti_.A) * longest < 1.0).any():
+        far = np.abs(y0 - y) > _FAR * y_scale
+        if not (far.any() and np.isfinite(gain).all()):
+            return u0, y0
+    _tell_different_constants(lti, fitted, experiments)
     step, *_ = np.linalg.lstsq(
         np.vstack([np.diag(1.0 / u_scale), gain / y_scale[:, None]]),
         np.concatenate([(u - u0) / u_scale, (y - y0) / y_scale]),

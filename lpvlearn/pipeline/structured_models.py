@@ -178,18 +178,20 @@ def begins_held(model: LPVStateSpace, points: OperatingPoints, dt: float) -> boo
     """
     model = model.silenced()
 
-    def beginnings() -> Iterator[tuple[Array, Array, Array]]:
+    def beginnings() -> Iterator[tuple[Array, Array, Array, Array]]:
         for kappa, group in zip(points.kappa, points.experiments, strict=True):
             frozen, place = model.at(kappa), kappa[None]
             (u0,), (y0,) = model.input_offset(place), model.output_offset(place)
             for e in group:
                 u, n = e.inputs, standing(e.inputs)
-                rest = u0 if model.offsets is None else u.mean(axis=0)
-                at_rest, held = (
-                    y0 + frozen.dc_gain() @ (v - u0) for v in (rest, first_inputs(u))
+                mean = u0 if model.offsets is None else u.mean(axis=0)
+                at_mean, held = (
+                    y0 + frozen.dc_gain() @ (v - u0) for v in (mean, first_inputs(u))
                 )
-                moved = frozen.simulate(u[:n] - rest, sampling_time=dt)
-                yield e.measured[:n], at_rest + moved, held
+                at_rest, moved = (
+                    frozen.simulate(u[:n] - v, sampling_time=dt) for v in (u0, mean)
+                )
+                yield e.measured[:n], y0 + at_rest, at_mean + moved, held
 
     if not all(model.at(kappa).is_stable for kappa in points.kappa):
         return False

@@ -1464,14 +1464,15 @@ class SubspaceLTI(
 
         def beginning(
             e: Experiment, u0: Array, y0: Array, drift: Array
-        ) -> tuple[Array, Array, Array]:
+        ) -> tuple[Array, Array, Array, Array]:
             u, n = e.inputs, standing(e.inputs)
             y = e.measured[:n] - np.outer(np.arange(n) - (len(u) - 1) / 2.0, drift)
-            rest = u0 if self.offset_ is None else u.mean(axis=0)
-            at_rest, held = (
-                y0 + lti.dc_gain() @ (v - u0) for v in (rest, first_inputs(u))
+            mean = u0 if self.offset_ is None else u.mean(axis=0)
+            at_mean, held = (
+                y0 + lti.dc_gain() @ (v - u0) for v in (mean, first_inputs(u))
             )
-            return y, at_rest + lti.simulate(u[:n] - rest), held
+            at_mean = at_mean + lti.simulate(u[:n] - mean)
+            return y, y0 + lti.simulate(u[:n] - u0), at_mean, held
 
         return begin_held(map(beginning, experiments, *levels))
 

@@ -452,14 +452,16 @@ def identify(
 
 # Times the squared errors of a model of plain ones, of one of whitened ones that may be
 # astray: in records where little but their beginning tells of the inputs, of which the
-# filter takes the first samples.
-_ASTRAY = 2.0
+# filter takes the first samples. And of one that is, for it takes what the inputs do
+# for noise: of an order that is too low, which leaves errors that look like it.
+_ASTRAY, _FAR_ASTRAY = 1.1, 4.0
+_SETTLES = 5.0  # time constants per record, of modes that follow no drift
 
 
 def _is_astray(
     chosen: Candidate, plain: Candidate, records: Sequence[Record], settings: Settings
 ) -> bool:
-    """Whether a model of whitened errors is one that the likelihood refutes."""
+    """Whether a model of whitened errors is one that errors, or likelihood, refute."""
     with np.errstate(over="ignore", invalid="ignore"):
         own, other = (
             sum(float(np.sum(e**2)) for e in simulation_errors(model, records))
@@ -467,6 +469,11 @@ def _is_astray(
         )
     if not own > _ASTRAY * other:
         return False
+    longest = max(record.u.shape[1] for record in records)
+    A = plain.model.A
+    settles = mode_rates(A).min(initial=1.0) * longest > _SETTLES
+    if own > _FAR_ASTRAY * other and settles and spectral_radius(A) < 1.0:
+        return True
     free, repeated = settings.free, settings.repeated
     least = criterion_of(plain.model, records, free, repeated)
     return least < criterion_of(chosen.model, records, free, repeated)

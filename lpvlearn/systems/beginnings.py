@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 _STANDING = 5  # samples in which inputs that move later stand still
 _STILL = 0.02  # part of their range that measured ones may move meanwhile
 _NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
+_WORSE = 2.0  # times the squared errors of a beginning at rest, in any record
 
 
 def standing(u: Array) -> int:
@@ -51,29 +52,36 @@ def held_state(A: Array, B: Array, u: Array, *, discrete: bool) -> Array | None:
     return np.asarray(x) if np.isfinite(x).all() else None
 
 
-def begin_held(beginnings: Iterable[tuple[Array, Array, Array]]) -> bool:
-    """Whether records begin where their first inputs hold them, and not at rest.
+def begin_held(beginnings: Iterable[tuple[Array, Array, Array, Array]]) -> bool:
+    """Whether records begin where their first inputs hold them.
 
     Parameters
     ----------
-    beginnings : iterable of (y, at_rest, held)
+    beginnings : iterable of (y, at_rest, at_mean, held)
         Outputs (n_samples, n_outputs) as long as the inputs stand still, NaN where they
-        are missing; those of a simulation from rest; and the held ones (n_outputs,).
+        are missing; those of simulations from rest, and from the steady state of the
+        inputs' mean, where a step test is not; and the held ones (n_outputs,).
 
     Examples
     --------
-    >>> begin_held([(np.full((8, 1), 20.0), np.linspace(25, 20, 8)[:, None], [20.0])])
+    >>> y, decay = np.full((8, 1), 20.0), np.linspace(25, 20, 8)[:, None]
+    >>> begin_held([(y, decay, decay, np.array([20.0]))])
     True
     """
     records = list(beginnings)
-    apart = [at_rest - held for _, at_rest, held in records]
+    apart = [at_mean - held for _, _, at_mean, held in records]
     if not records or not all(np.isfinite(a).all() for a in apart):
         return False
     size = np.max([np.abs(a).max(axis=0, initial=0.0) for a in apart], axis=0)
     weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
     nearer = total = 0.0
-    for (y, at_rest, held), a in zip(records, apart, strict=True):
-        change = weight**2 * ((y - at_rest) ** 2 - (y - held) ** 2)
-        nearer += float(np.nansum(change))
+    for (y, at_rest, at_mean, held), a in zip(records, apart, strict=True):
+        to_rest, to_mean, to_held = (
+            float(np.nansum((weight * (y - other)) ** 2))
+            for other in (at_rest, at_mean, held)
+        )
+        if to_held > _WORSE * to_rest:  # its gain is too poorly known for that
+            return False
+        nearer += to_mean - to_held
         total += float(np.sum(np.where(np.isnan(y), 0.0, weight * a) ** 2))
     return nearer > _NEARER * total

@@ -64,6 +64,15 @@ def test_inputs_about_one_level_are_moved_to_it():
     assert_allclose(values[:, 2:], x0, atol=1e-12)
 
 
+def test_what_hardly_settles_rests_where_it_was_found():
+    """Its gain, of 1e4 and hardly known, would take the output beyond all others."""
+    models = [StateSpace(-rate, 1.0, 1.0) for rate in (1.0, 1e-4, 0.5)]
+    u0, y0 = np.array([[0.0], [0.3], [-0.3]]), np.array([[3.0], [3.1], [3.2]])
+    values = points_of_work(models, np.arange(3.0)[:, None], u0, y0, ONE)
+    assert_allclose(values[:, 0], 0.0, atol=1e-15)
+    assert_allclose(values[:, 1], [3.0, 3.1, 3.8])
+
+
 @pytest.mark.parametrize("softer", [1.0, 4.0])
 @pytest.mark.parametrize("u_zero, y_zero", [(0.0, 3.0), (2.0, 0.0)])
 def test_zeros_of_sensors_move_no_state(u_zero, y_zero, softer):

@@ -16,6 +16,7 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.data.experiments import Experiment
+from lpvlearn.pipeline import local_models
 from lpvlearn.pipeline.local_models import (
     LocalModel,
     _of_own_orders,
@@ -212,3 +213,19 @@ def test_a_bias_is_known_to_the_lpv_model(integrating):
     np.testing.assert_allclose(model.report_["u0_u1"], -BIAS, atol=5e-3)
     error = truth - model.predict(sweep).reshape(truth.shape)
     assert np.linalg.norm(error) < 0.03 * np.linalg.norm(truth - truth.mean())
+
+
+def test_a_mode_that_stands_for_constants_does_not_tell_where_outputs_rest():
+    """A battery of 3.5 V, whose model has a pole of 1e-5 for that and no constant."""
+    rng = np.random.default_rng(0)
+    u = rng.choice([-1.0, 1.0], (60, 1)).repeat(5, axis=0)
+    y = 3.5 + 0.1 * u
+    run = Experiment(0, np.arange(300), u, y, sampling_time=1.0)
+    fitted = SubspaceLTI(1, offset=None).fit(u, y - 3.5)
+    fitted.offset, fitted.lti_ = "auto", StateSpace(1.0 - 1e-5, 0.1, 1.0, None, 1.0)
+    lti = fitted.lti_.to_continuous()
+    ((u0,), (y0,)) = local_models._equilibrium(lti, [fitted], [run])
+    assert y0 == pytest.approx(3.5, abs=0.1)
+    assert y0 == pytest.approx(lti.dc_gain().item() * u0)
+    low = Experiment(0, np.arange(300), u, y - 3.5, sampling_time=1.0)
+    assert local_models._equilibrium(lti, [fitted], [low]) == (0.0, 0.0)

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from lpvlearn import SubspaceLTI, bft_score
 from lpvlearn.subspace.identification import Candidate, Settings, _is_astray
 from lpvlearn.subspace.noise import Whitening
 from lpvlearn.subspace.realization import METHODS
@@ -136,6 +138,19 @@ def test_limits_count_columns_rows_and_instruments():
         assert columns[0] >= 6 * h and columns[1] < 6 * (h + 1)
     assert Settings(freedom(3, 1)).max_order(5) == 12
     assert Settings(freedom(3, 1), "pi-moesp").max_order(5) == 5
+
+
+def test_a_step_is_not_noise_for_an_order_that_is_too_low(rng):
+    """Three lags by one: what it leaves is smooth, and so is the whole answer."""
+    u = np.repeat([20.0, 40.0], [12, 120])
+    y = u - 20.0
+    for pole in (0.8, 0.85, 0.7):
+        y = lfilter([0.0, 1.0 - pole], [1.0, -pole], y)
+    y = 3.0 + 0.04 * (y + 20.0) + 0.004 * rng.standard_normal(len(y))
+    with pytest.warns(UserWarning, match="the model of order 1 lacks states"):
+        model = SubspaceLTI(1).fit(u[:, None], y)
+    assert model.lti_.dc_gain().item() == pytest.approx(0.04, rel=0.03)
+    assert bft_score(y, model.predict(u[:, None])) > 85.0
 
 
 def test_a_model_of_whitened_errors_that_the_likelihood_refutes_is_astray(rng):

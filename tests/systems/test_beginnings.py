@@ -39,15 +39,25 @@ def test_integrators_are_held_nowhere():
 
 def test_of_two_beginnings_the_nearer_is_taken():
     """By all records together; not where either is as good, or none is known."""
-    held, at_rest = np.array([20.0]), np.linspace(25.0, 20.0, 8)[:, None]
-    still = np.full((8, 1), 20.0)
-    assert begin_held([(still, at_rest, held), (at_rest[:0], at_rest[:0], held)])
-    assert not begin_held([(at_rest, at_rest, held)])
-    assert not begin_held([(still, at_rest, held), (at_rest, at_rest, held)])
-    assert not begin_held([(still, still, held)])
-    assert not begin_held([(still, at_rest, np.array([np.inf]))])
-    assert not begin_held([(np.full_like(still, np.nan), at_rest, held)])
-    assert not begin_held([])
+    held, moving = np.array([20.0]), np.linspace(25.0, 20.0, 8)[:, None]
+    still, none = np.full((8, 1), 20.0), np.zeros((0, 1))
+
+    def nearer(*outputs, rest=moving, mean=moving, held=held):
+        return begin_held([(y, rest[: len(y)], mean[: len(y)], held) for y in outputs])
+
+    assert nearer(still, none) and nearer(still, rest=still)
+    assert not nearer(moving)
+    assert not nearer(still, moving)
+    assert not nearer(still, rest=still, mean=still)
+    assert not nearer(still, held=np.array([np.inf]))
+    assert not nearer(np.full_like(still, np.nan))
+    assert not nearer()
     noise = 5.0 * np.random.default_rng(0).standard_normal((8, 1))
-    assert begin_held([(still + noise, at_rest, held)] * 9)
-    assert not begin_held([(at_rest + noise, at_rest, held)] * 9)
+    assert nearer(*9 * [still + noise])
+    assert not nearer(*9 * [moving + noise])
+
+
+def test_a_gain_that_takes_the_beginning_elsewhere_is_not_trusted():
+    """That of a mode which hardly decays: nearer than the mean is not near."""
+    still = np.full((8, 1), 3.5)
+    assert not begin_held([(still, still, still - 900.0, np.array([-180.0]))])
