@@ -30,6 +30,10 @@ DETRENDS = (None, "constant", "linear")  # by the number of signals in a trend
 # ratios of singular values below 1e-8, well above the first.
 _COLLINEAR, _SUSPECTED = 1e-10, 1e-12
 
+# The same of inputs that only rounding tells apart, the part of its step that what it
+# leaves moves by, and decimal places of numbers that are looked for.
+_FAINT, _ROUNDED, _PLACES = 1e-3, 0.5, 9
+
 # A signal is held for so many samples where this share of so many intervals between its
 # changes are multiples of them; longer ones than the last are not looked for.
 _HELD, _ENOUGH_CHANGES, _LONGEST_HELD = 0.95, 20, 1000
@@ -231,6 +235,59 @@ def independent_inputs(inputs: Sequence[Array]) -> Array | None:
     _, s, right = np.linalg.svd(np.linalg.qr(gram)[1])
     rank = int(np.sum(s > _COLLINEAR * s[0]))
     return None if rank == n_inputs else (right[:rank] / scale).T
+
+
+def without_rounding(inputs: Sequence[Array]) -> list[Array] | None:
+    """Inputs without what only the rounding of numbers tells apart; None mostly.
+
+    As shares of a whole, whose sum is constant in every experiment but for the last
+    digit: that ripple is no excitation, and a model would make of it what it likes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> parts = np.random.default_rng(0).dirichlet([1, 1, 1], 50).round(4)
+    >>> found = without_rounding([parts])[0]
+    >>> [int(np.linalg.matrix_rank(np.cov(u.T), 1e-12)) for u in (parts, found)]
+    [3, 2]
+    >>> bool(np.abs(found - parts).max() < 1e-4)
+    True
+    """
+    stacked = np.vstack(inputs)
+    if len(stacked) <= stacked.shape[1] or stacked.shape[1] == 1:
+        return None
+    centred = [u - u.mean(axis=0) for u in inputs]
+    moved = np.vstack(centred)
+    scale = moved.std(axis=0)
+    scale[scale == 0.0] = 1.0
+    values, V = np.linalg.eigh((moved / scale).T @ (moved / scale) / len(moved))
+    faint = V[:, values <= _FAINT**2 * values[-1]]
+    if not faint.size:
+        return None
+    step = np.array([decimal_step(u) for u in stacked.T]) / scale
+    ripple = (moved / scale @ faint).std(axis=0)
+    faint = faint[:, ripple <= _ROUNDED * np.linalg.norm(faint.T * step, axis=1)]
+    if not faint.size:
+        return None
+    return [
+        u - ((c / scale) @ faint @ faint.T) * scale
+        for u, c in zip(inputs, centred, strict=True)
+    ]
+
+
+def decimal_step(values: Array) -> float:
+    """The last decimal place of numbers that were rounded to one; 0 if they were not.
+
+    >>> decimal_step(np.array([0.5, 20.25])), decimal_step(np.array([100.0, 3.0]))
+    (0.01, 1.0)
+    >>> decimal_step(np.array([1.0 / 3.0, 2.0]))
+    0.0
+    """
+    for places in range(_PLACES):
+        step = 10.0**-places
+        if np.allclose(values, np.round(values, places), rtol=1e-12, atol=1e-9 * step):
+            return step
+    return 0.0
 
 
 def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> None:

@@ -20,6 +20,7 @@ from ..data.preparation import (
     far_out,
     independent_inputs,
     remove_trends,
+    without_rounding,
 )
 from ..exceptions import RankWarning
 from ..systems.simulation import delayed, lti_response
@@ -129,6 +130,8 @@ _FAR_BETTER = 0.5
 # that they do not move at all.
 _NOT_MOVED = 1.1
 
+_PART = 0.05  # of the ripple of an input by rounding, from which another one has a part
+
 
 class TooFewSamples(ValueError):
     """The samples do not tell enough for a model; more of them may."""
@@ -156,6 +159,7 @@ def fit_pairs(
         check_excitation(pairs, names)
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
+    pairs = _without_rounding(pairs, told, names)
     outputs = [y for _, y in pairs]
     if "still" not in told:
         tell_of_still_outputs(outputs, told)
@@ -1013,6 +1017,28 @@ def _tell_of_lead(
             "Or a controller makes it of the outputs and leaves little to its "
             "reference: that must move more for a plant to be found.",
         )
+
+
+def _without_rounding(
+    pairs: Pairs, told: set[str], names: Sequence[Hashable] | None
+) -> Pairs:
+    """Records of inputs that are collinear where only rounding hides that; says so."""
+    exact = without_rounding([u for u, _ in pairs])
+    if exact is None:
+        return pairs
+    moved = [np.abs(u - v).max(axis=0) for u, (v, _) in zip(exact, pairs, strict=True)]
+    ripple = np.max(moved, axis=0)
+    some = np.flatnonzero(ripple > _PART * ripple.max())
+    listed = ", ".join(str(k + 1 if names is None else names[int(k)]) for k in some)
+    tell(
+        told,
+        "rounded",
+        f"The inputs {listed} add up, weighted, to a constant but for the rounding of "
+        "their numbers: what each of them does is not identifiable, and the smallest "
+        "solution was taken. Excite them independently, or leave one out.",
+        RankWarning,
+    )
+    return [(u, y) for u, (_, y) in zip(exact, pairs, strict=True)]
 
 
 def _with_independent_inputs(pairs: Pairs, told: set[str]) -> tuple[Pairs, Array]:

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from scipy.signal import lfilter, tf2ss
 
-from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn import StateSpace, SubspaceLTI, bft_score
 from lpvlearn.data.preparation import remove_trends, stays_put
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace.fit import fit_pairs
@@ -596,3 +596,31 @@ def test_parts_that_only_means_explain_are_told(bft, told, rng):
         warn_about(fitted._replace(selection=selection), set())
     heard = [w for w in caught if "explains where the outputs stay" in str(w.message)]
     assert len(heard) == told
+
+
+@pytest.mark.parametrize("offset", ["auto", "constant", None])
+def test_what_only_rounding_tells_apart_is_not_told_apart(offset):
+    """Shares of a whole: their sum ripples by the last digit, of which D made 66."""
+    rng = np.random.default_rng(1)
+    X, fresh = (
+        pd.DataFrame(rng.dirichlet([1, 1, 1], 30).repeat(10, axis=0), columns=[*"abc"])
+        for _ in range(2)
+    )
+
+    def outputs(X):
+        y = lfilter([0.0, 0.2], [1.0, -0.8], 3.0 * X["a"] - X["b"])
+        return y + 0.02 * rng.standard_normal(len(X))
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = SubspaceLTI(1, offset=offset).fit(X.round(4), outputs(X))
+    assert "The inputs a, b, c add up, weighted" in str(caught[0].message)
+    assert caught[0].category is RankWarning
+    assert np.abs(model.lti_.D).max() < 1.0 and np.abs(model.lti_.B).max() < 3.0
+    fresh, y = fresh.round(4), outputs(fresh)
+    assert bft_score(y, model.predict_with_initial_state(fresh, y)) > 95.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        warnings.simplefilter("error", RankWarning)
+        u = X.assign(c=X["c"] + 0.02 * rng.standard_normal(len(X))).round(4)
+        SubspaceLTI(1, offset=offset).fit(u, outputs(X))  # that is not rounding
