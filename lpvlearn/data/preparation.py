@@ -266,7 +266,8 @@ def without_rounding(inputs: Sequence[Array]) -> list[Array] | None:
         return None
     step = np.array([decimal_step(u) for u in stacked.T]) / scale
     ripple = (moved / scale @ faint).std(axis=0)
-    faint = faint[:, ripple <= _ROUNDED * np.linalg.norm(faint.T * step, axis=1)]
+    rounded = ripple <= _ROUNDED * np.linalg.norm(faint.T * step, axis=1)
+    faint = faint[:, rounded & (ripple > _COLLINEAR)]
     if not faint.size:
         return None
     return [

@@ -1460,7 +1460,10 @@ class SubspaceLTI(
         if not (lti.is_stable and any(standing(e.inputs) for e in experiments)):
             return False
         known = self.input_offset_, self.output_offset_, self._offsets.drifts
-        levels = (np.broadcast_to(v, (len(experiments), v.shape[1])) for v in known)
+        k = len(experiments)  # fewer than levels, where a record is cut at shifts
+        levels = (
+            np.broadcast_to(v if len(v) == k else v[:1], (k, v.shape[1])) for v in known
+        )
 
         def beginning(
             e: Experiment, u0: Array, y0: Array, drift: Array
