@@ -18,6 +18,11 @@ _SIGNALLED = 128  # a shell's status of a program that a signal ended, and its n
 _OPTIONS = (
     (r"missing='split' \(of SubspaceLTI\)|missing='split'", "--missing split"),
     (r"norm='hinf' \(in a pipeline, efficient=False\)", "--hinf"),
+    (
+        r"(score with )?make_bft_scorer\(initial_state='estimate'\)"
+        r"( or, of samples after the transient, make_bft_scorer\(burn_in=\.\.\.\))?",
+        "take --initial-state estimate",
+    ),
     (r"initial_state='estimate'", "--initial-state estimate"),
     (r"`tol`", "`--levels`"),
     (r"`(inputs|scheduling|experiment|time|order|missing)`", r"`--\1`"),
