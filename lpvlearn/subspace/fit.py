@@ -611,7 +611,8 @@ def _without_shifts(
     """Cut the experiments where levels shift, if that explains them clearly better.
 
     One step ahead, where noise alone explains all that moves slowly: parts that leave
-    inputs nothing to explain must simulate as much of what is held out as the whole.
+    inputs nothing to explain, or models of a given order, whose errors may be its lack
+    of states, must simulate as much of what is held out as the whole.
     Short ones hide in their initial states that a mode would grow.
     """
     feedback = whole.feedback
@@ -632,7 +633,8 @@ def _without_shifts(
         return pairs, whole
     if fitted.grows() and not whole.grows():
         return pairs, whole
-    if whole.selection.order and not fitted.selection.order:
+    given = choices.order is not None
+    if whole.selection.order and (given or not fitted.selection.order):
         if _held_out(fitted, choices).bft < _held_out(whole, choices).bft:
             return pairs, whole
     samples = "; ".join(

@@ -111,6 +111,27 @@ def test_a_record_is_cut_as_by_hand():
     assert len(whole.initial_states_) == 1
 
 
+@pytest.mark.parametrize("better", [True, False])
+def test_cuts_for_a_given_order_must_simulate_as_much_held_out(better, monkeypatch):
+    """One lag for a motor with dead time: what it lacks looks like shifts."""
+    rng = np.random.default_rng(3)
+    u, y = slow_record(rng, 900)
+    y = y + np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
+    order = SubspaceLTI(offset="constant").fit(u, y).order_
+    told = fit._held_out
+
+    def held_out(fitted, choices):
+        found = told(fitted, choices)
+        cut = len(fitted.scaled.records) > 1
+        return found._replace(bft=found.bft if better or not cut else -1e3)
+
+    monkeypatch.setattr(fit, "_held_out", held_out)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = SubspaceLTI(order).fit(u, y)
+    assert len(found.output_offset_) == (3 if better else 1)
+
+
 def test_cuts_that_leave_inputs_nothing_to_explain_are_not_made(monkeypatch):
     """Noise may explain, one step ahead, all that moves between them."""
     rng = np.random.default_rng(3)
