@@ -7,6 +7,7 @@ basin, and branches are tied.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..restructuring.uncertainty import ParameterUncertainty
 from ..structures.structure import GrayBoxStructure
-from ..systems.beginnings import begin_held, first_inputs, standing
+from ..systems.beginnings import Beginning, begin_held
 from .black_boxes import (
     aligned_black_boxes,
     balanced,
@@ -178,20 +179,19 @@ def begins_held(model: LPVStateSpace, points: OperatingPoints, dt: float) -> boo
     """
     model = model.silenced()
 
-    def beginnings() -> Iterator[tuple[Array, Array, Array, Array]]:
+    def beginnings() -> Iterator[Beginning]:
         for kappa, group in zip(points.kappa, points.experiments, strict=True):
             frozen, place = model.at(kappa), kappa[None]
-            (u0,), (y0,) = model.input_offset(place), model.output_offset(place)
+            rest = model.input_offset(place)[0], model.output_offset(place)[0]
+            simulated = partial(frozen.simulate, sampling_time=dt)
             for e in group:
-                u, n = e.inputs, standing(e.inputs)
-                mean = u0 if model.offsets is None else u.mean(axis=0)
-                at_mean, held = (
-                    y0 + frozen.dc_gain() @ (v - u0) for v in (mean, first_inputs(u))
+                yield Beginning.of(
+                    (e.inputs, e.measured),
+                    rest,
+                    frozen.dc_gain(),
+                    simulated,
+                    about_mean=model.offsets is not None,
                 )
-                at_rest, moved = (
-                    frozen.simulate(u[:n] - v, sampling_time=dt) for v in (u0, mean)
-                )
-                yield e.measured[:n], y0 + at_rest, at_mean + moved, held
 
     if not all(model.at(kappa).is_stable for kappa in points.kappa):
         return False

@@ -43,7 +43,13 @@ from ..exceptions import (
 )
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
-from ..systems.beginnings import begin_held, first_inputs, held_state, standing
+from ..systems.beginnings import (
+    Beginning,
+    begin_held,
+    first_inputs,
+    held_state,
+    standing,
+)
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
@@ -1465,17 +1471,16 @@ class SubspaceLTI(
             np.broadcast_to(v if len(v) == k else v[:1], (k, v.shape[1])) for v in known
         )
 
-        def beginning(
-            e: Experiment, u0: Array, y0: Array, drift: Array
-        ) -> tuple[Array, Array, Array, Array]:
-            u, n = e.inputs, standing(e.inputs)
-            y = e.measured[:n] - np.outer(np.arange(n) - (len(u) - 1) / 2.0, drift)
-            mean = u0 if self.offset_ is None else u.mean(axis=0)
-            at_mean, held = (
-                y0 + lti.dc_gain() @ (v - u0) for v in (mean, first_inputs(u))
+        def beginning(e: Experiment, u0: Array, y0: Array, drift: Array) -> Beginning:
+            n = len(e.inputs)
+            y = e.measured - np.outer(np.arange(n) - (n - 1) / 2.0, drift)
+            return Beginning.of(
+                (e.inputs, y),
+                (u0, y0),
+                lti.dc_gain(),
+                lti.simulate,
+                about_mean=self.offset_ is not None,
             )
-            at_mean = at_mean + lti.simulate(u[:n] - mean)
-            return y, y0 + lti.simulate(u[:n] - u0), at_mean, held
 
         return begin_held(map(beginning, experiments, *levels))
 

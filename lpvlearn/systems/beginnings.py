@@ -6,7 +6,8 @@ that is about the means of the record, of which most comes after the step.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,9 @@ Array = NDArray[np.float64]
 _STANDING = 5  # samples in which inputs that move later stand still
 _STILL = 0.02  # part of their range that measured ones may move meanwhile
 _NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
-_WORSE = 2.0  # times the squared errors of a beginning at rest, in any record
+# Times the squared errors of a beginning at rest, in any record; part of what there is
+# between two beginnings that is none.
+_WORSE, _ROUNDING = 2.0, 1e-6
 
 
 def standing(u: Array) -> int:
@@ -52,36 +55,61 @@ def held_state(A: Array, B: Array, u: Array, *, discrete: bool) -> Array | None:
     return np.asarray(x) if np.isfinite(x).all() else None
 
 
-def begin_held(beginnings: Iterable[tuple[Array, Array, Array, Array]]) -> bool:
+class Beginning(NamedTuple):
+    """Outputs (n_samples, n_outputs) of a record as long as its inputs stand still."""
+
+    measured: Array  # NaN where they are missing
+    at_rest: Array  # of a simulation from rest
+    at_mean: Array  # from where the mean of the inputs holds the model
+    held: Array  # (n_outputs,), where the first inputs do
+
+    @classmethod
+    def of(
+        cls,
+        record: tuple[Array, Array],
+        rest: tuple[Array, Array],
+        gain: Array,
+        simulated: Callable[[Array], Array],
+        *,
+        about_mean: bool,
+    ) -> Beginning:
+        """Of a record (u, y) and a model, at rest at (u0, y0), by its static gain.
+
+        `simulated` gives its answer to inputs from rest at zero. A record that is not
+        `about_mean` is about the point of rest.
+        """
+        (u, y), (u0, y0) = record, rest
+        n, mean = standing(u), u.mean(axis=0) if about_mean else u0
+        at_mean, held = (y0 + gain @ (v - u0) for v in (mean, first_inputs(u)))
+        at_rest, moved = (simulated(u[:n] - v) for v in (u0, mean))
+        return cls(y[:n], y0 + at_rest, at_mean + moved, held)
+
+
+def begin_held(beginnings: Iterable[Beginning]) -> bool:
     """Whether records begin where their first inputs hold them.
 
-    Parameters
-    ----------
-    beginnings : iterable of (y, at_rest, at_mean, held)
-        Outputs (n_samples, n_outputs) as long as the inputs stand still, NaN where they
-        are missing; those of simulations from rest, and from the steady state of the
-        inputs' mean, where a step test is not; and the held ones (n_outputs,).
+    And not where the mean of the inputs would, as records about that do.
 
     Examples
     --------
     >>> y, decay = np.full((8, 1), 20.0), np.linspace(25, 20, 8)[:, None]
-    >>> begin_held([(y, decay, decay, np.array([20.0]))])
+    >>> begin_held([Beginning(y, decay, decay, np.array([20.0]))])
     True
     """
     records = list(beginnings)
-    apart = [at_mean - held for _, _, at_mean, held in records]
+    apart = [one.at_mean - one.held for one in records]
     if not records or not all(np.isfinite(a).all() for a in apart):
         return False
     size = np.max([np.abs(a).max(axis=0, initial=0.0) for a in apart], axis=0)
     weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
     nearer = total = 0.0
-    for (y, at_rest, at_mean, held), a in zip(records, apart, strict=True):
+    for one, a in zip(records, apart, strict=True):
         to_rest, to_mean, to_held = (
-            float(np.nansum((weight * (y - other)) ** 2))
-            for other in (at_rest, at_mean, held)
+            float(np.nansum((weight * (one.measured - other)) ** 2))
+            for other in (one.at_rest, one.at_mean, one.held)
         )
-        if to_held > _WORSE * to_rest:  # its gain is too poorly known for that
-            return False
-        nearer += to_mean - to_held
-        total += float(np.sum(np.where(np.isnan(y), 0.0, weight * a) ** 2))
+        own = float(np.sum(np.where(np.isnan(one.measured), 0.0, weight * a) ** 2))
+        if to_held > _WORSE * to_rest + _ROUNDING * own:
+            return False  # its gain is too poorly known for that
+        nearer, total = nearer + to_mean - to_held, total + own
     return nearer > _NEARER * total

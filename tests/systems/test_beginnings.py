@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lpvlearn.systems.beginnings import (
+    Beginning,
     begin_held,
     first_inputs,
     held_state,
@@ -43,7 +44,9 @@ def test_of_two_beginnings_the_nearer_is_taken():
     still, none = np.full((8, 1), 20.0), np.zeros((0, 1))
 
     def nearer(*outputs, rest=moving, mean=moving, held=held):
-        return begin_held([(y, rest[: len(y)], mean[: len(y)], held) for y in outputs])
+        return begin_held(
+            Beginning(y, rest[: len(y)], mean[: len(y)], held) for y in outputs
+        )
 
     assert nearer(still, none) and nearer(still, rest=still)
     assert not nearer(moving)
@@ -60,4 +63,6 @@ def test_of_two_beginnings_the_nearer_is_taken():
 def test_a_gain_that_takes_the_beginning_elsewhere_is_not_trusted():
     """That of a mode which hardly decays: nearer than the mean is not near."""
     still = np.full((8, 1), 3.5)
-    assert not begin_held([(still, still, still - 900.0, np.array([-180.0]))])
+    far = Beginning(still, still, still - 900.0, np.array([-180.0]))
+    assert not begin_held([far])
+    assert begin_held([far._replace(held=np.array([3.5 + 1e-6]))])
