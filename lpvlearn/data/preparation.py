@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -237,43 +237,55 @@ def independent_inputs(inputs: Sequence[Array]) -> Array | None:
     return None if rank == n_inputs else (right[:rank] / scale).T
 
 
-def without_rounding(inputs: Sequence[Array]) -> list[Array] | None:
-    """Inputs without what only the rounding of numbers tells apart; None mostly.
+class Rounded(NamedTuple):
+    """Inputs of which some differ from collinear ones by the rounding of numbers alone.
 
     As shares of a whole, whose sum is constant in every experiment but for the last
-    digit: that ripple is no excitation, and a model would make of it what it likes.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> parts = np.random.default_rng(0).dirichlet([1, 1, 1], 50).round(4)
-    >>> found = without_rounding([parts])[0]
-    >>> [int(np.linalg.matrix_rank(np.cov(u.T), 1e-12)) for u in (parts, found)]
-    [3, 2]
-    >>> bool(np.abs(found - parts).max() < 1e-4)
-    True
+    digit. Directions are columns, in units of the inputs.
     """
-    stacked = np.vstack(inputs)
-    if len(stacked) <= stacked.shape[1] or stacked.shape[1] == 1:
-        return None
-    centred = [u - u.mean(axis=0) for u in inputs]
-    moved = np.vstack(centred)
-    scale = moved.std(axis=0)
-    scale[scale == 0.0] = 1.0
-    values, V = np.linalg.eigh((moved / scale).T @ (moved / scale) / len(moved))
-    faint = V[:, values <= _FAINT**2 * values[-1]]
-    if not faint.size:
-        return None
-    step = np.array([decimal_step(u) for u in stacked.T]) / scale
-    ripple = (moved / scale @ faint).std(axis=0)
-    rounded = ripple <= _ROUNDED * np.linalg.norm(faint.T * step, axis=1)
-    faint = faint[:, rounded & (ripple > _COLLINEAR)]
-    if not faint.size:
-        return None
-    return [
-        u - ((c / scale) @ faint @ faint.T) * scale
-        for u, c in zip(inputs, centred, strict=True)
-    ]
+
+    exact: list[Array]  # the inputs without that ripple
+    faint: Array  # directions of the ripple
+    others: Array
+
+    @classmethod
+    def of(cls, inputs: Sequence[Array]) -> Rounded | None:
+        """None, mostly, where there is no such direction.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> parts = np.random.default_rng(0).dirichlet([1, 1, 1], 50).round(4)
+        >>> found = Rounded.of([parts])
+        >>> both = parts, found.exact[0]
+        >>> [int(np.linalg.matrix_rank(np.cov(u.T), 1e-12)) for u in both]
+        [3, 2]
+        >>> bool(np.abs(found.exact[0] - parts).max() < 1e-4), found.faint.shape
+        (True, (3, 1))
+        """
+        stacked = np.vstack(inputs)
+        if len(stacked) <= stacked.shape[1] or stacked.shape[1] == 1:
+            return None
+        centred = [u - u.mean(axis=0) for u in inputs]
+        moved = np.vstack(centred)
+        scale = moved.std(axis=0)
+        scale[scale == 0.0] = 1.0
+        values, V = np.linalg.eigh((moved / scale).T @ (moved / scale) / len(moved))
+        is_faint = values <= _FAINT**2 * values[-1]
+        if not is_faint.any():
+            return None
+        step = np.array([decimal_step(u) for u in stacked.T]) / scale
+        ripple = (moved / scale @ V).std(axis=0)
+        is_faint &= ripple <= _ROUNDED * np.linalg.norm(V.T * step, axis=1)
+        is_faint &= ripple > _COLLINEAR
+        if not is_faint.any():
+            return None
+        faint = V[:, is_faint]
+        exact = [
+            u - ((c / scale) @ faint @ faint.T) * scale
+            for u, c in zip(inputs, centred, strict=True)
+        ]
+        return cls(exact, faint * scale[:, None], V[:, ~is_faint] * scale[:, None])
 
 
 def decimal_step(values: Array) -> float:

@@ -301,7 +301,7 @@ class SubspaceLTI(
     steady_start_ : bool
         Whether the experiments begin where their first inputs hold the model, as step
         tests do, and not at rest at `input_offset_`. `predict` begins likewise, where
-        inputs stand still at first and move later.
+        inputs stand still at first and move later. False of batches.
     output_drift_ : ndarray of shape (n_experiments, n_outputs)
         Change per second (per sample where no time is known), about the middle of
         the experiment; zero unless `offset_` is "linear", and where an offset of the

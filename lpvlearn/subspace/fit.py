@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from ..data.preparation import (
     DETRENDS,
     Pairs,
+    Rounded,
     check_excitation,
     far_out,
     independent_inputs,
     remove_trends,
-    without_rounding,
 )
 from ..exceptions import RankWarning
 from ..systems.simulation import delayed, lti_response
@@ -130,7 +130,10 @@ _FAR_BETTER = 0.5
 # that they do not move at all.
 _NOT_MOVED = 1.1
 
-_PART = 0.05  # of the ripple of an input by rounding, from which another one has a part
+# Of inputs that only rounding tells apart: times the gain of all others, of a model
+# that makes of the ripple what it likes, at these frequencies (rad per sample); and the
+# part of the largest ripple from which an input is one of them.
+_WILD, _LOOKED_AT, _PART = 10.0, np.geomspace(1e-2, 3.0, 8), 0.05
 
 
 class TooFewSamples(ValueError):
@@ -159,12 +162,19 @@ def fit_pairs(
         check_excitation(pairs, names)
     except ValueError as error:
         raise TooFewSamples(str(error)) from None
-    pairs = _without_rounding(pairs, told, names)
     outputs = [y for _, y in pairs]
     if "still" not in told:
         tell_of_still_outputs(outputs, told)
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = _with_constants(pairs, choices, told, known)
+    rounded = Rounded.of([u for u, _ in pairs])
+    if rounded is not None and _is_wild(fitted, rounded):
+        exact = list(zip(rounded.exact, (y for _, y in pairs), strict=True))
+        other = _with_constants(exact, choices, told | {"collinear"}, known)
+        units = (criterion_in_units(one.evidence.one_step) for one in (other, fitted))
+        if next(units) < next(units) + CERTAIN:  # or the ripple is what drives outputs
+            _tell_of_rounding(rounded, pairs, told, names)
+            pairs, fitted = exact, other
     drifting = _of_drifting_noise(pairs, choices, told, fitted)
     fitted = drifting or fitted
     if fitted.selection.order:
@@ -1021,14 +1031,22 @@ def _tell_of_lead(
         )
 
 
-def _without_rounding(
-    pairs: Pairs, told: set[str], names: Sequence[Hashable] | None
-) -> Pairs:
-    """Records of inputs that are collinear where only rounding hides that; says so."""
-    exact = without_rounding([u for u, _ in pairs])
-    if exact is None:
-        return pairs
-    moved = [np.abs(u - v).max(axis=0) for u, (v, _) in zip(exact, pairs, strict=True)]
+def _is_wild(fitted: LocalFit, rounded: Rounded) -> bool:
+    """Whether a model makes far more of a ripple than of all that inputs do else."""
+    model = fitted.evidence.state_space(fitted.model, 1.0)
+    G = model.frequency_response(_LOOKED_AT)
+    gains = (np.abs(G @ v).max() for v in (rounded.faint, rounded.others))
+    of_ripple, of_others = (float(gain) for gain in gains)
+    return of_ripple > _WILD * of_others
+
+
+def _tell_of_rounding(
+    rounded: Rounded, pairs: Pairs, told: set[str], names: Sequence[Hashable] | None
+) -> None:
+    moved = [
+        np.abs(u - v).max(axis=0)
+        for u, (v, _) in zip(rounded.exact, pairs, strict=True)
+    ]
     ripple = np.max(moved, axis=0)
     some = np.flatnonzero(ripple > _PART * ripple.max())
     listed = ", ".join(str(k + 1 if names is None else names[int(k)]) for k in some)
@@ -1040,7 +1058,6 @@ def _without_rounding(
         "solution was taken. Excite them independently, or leave one out.",
         RankWarning,
     )
-    return [(u, y) for u, (_, y) in zip(exact, pairs, strict=True)]
 
 
 def _with_independent_inputs(pairs: Pairs, told: set[str]) -> tuple[Pairs, Array]:

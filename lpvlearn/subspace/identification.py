@@ -454,7 +454,7 @@ def identify(
 # astray: in records where little but their beginning tells of the inputs, of which the
 # filter takes the first samples. And of one that is, for it takes what the inputs do
 # for noise: of an order that is too low, which leaves errors that look like it.
-_ASTRAY, _FAR_ASTRAY = 1.1, 4.0
+_ASTRAY, _FAR_ASTRAY = 2.0, 4.0
 _SETTLES = 5.0  # time constants per record, of modes that follow no drift
 
 
@@ -470,9 +470,8 @@ def _is_astray(
     if not own > _ASTRAY * other:
         return False
     longest = max(record.u.shape[1] for record in records)
-    A = plain.model.A
-    settles = mode_rates(A).min(initial=1.0) * longest > _SETTLES
-    if own > _FAR_ASTRAY * other and settles and spectral_radius(A) < 1.0:
+    settles = (1.0 - spectral_radius(plain.model.A)) * longest > _SETTLES
+    if own > _FAR_ASTRAY * other and settles:
         return True
     free, repeated = settings.free, settings.repeated
     least = criterion_of(plain.model, records, free, repeated)

@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 _STANDING = 5  # samples in which inputs that move later stand still
 _STILL = 0.02  # part of their range that measured ones may move meanwhile
 _NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
+# Of outputs that move: part of what there is between two beginnings, and standard
+# deviations of the means of noise
+_MOVING, _CHANCE = 0.1, 3.0
 # Times the squared errors of a beginning at rest, in any record; part of what there is
 # between two beginnings that is none.
 _WORSE, _ROUNDING = 2.0, 1e-6
@@ -109,7 +112,25 @@ def begin_held(beginnings: Iterable[Beginning]) -> bool:
             for other in (one.at_rest, one.at_mean, one.held)
         )
         own = float(np.sum(np.where(np.isnan(one.measured), 0.0, weight * a) ** 2))
+        if _moves(one.measured * weight, own):
+            continue
         if to_held > _WORSE * to_rest + _ROUNDING * own:
             return False  # its gain is too poorly known for that
         nearer, total = nearer + to_mean - to_held, total + own
     return nearer > _NEARER * total
+
+
+def _moves(y: Array, apart: float) -> bool:
+    """Whether outputs move beyond noise, by a part of what is between two beginnings.
+
+    `apart` is the sum of squares of that. Records in motion are often near to where
+    inputs that have been held for long would lead them.
+    """
+    n, change, noise = len(y), 0.0, 0.0
+    for column in y.T:
+        known = column[~np.isnan(column)]
+        if len(known) > 2:
+            first, second = np.array_split(known, 2)
+            change += float((second.mean() - first.mean()) ** 2)
+            noise += float(np.mean(np.diff(known) ** 2)) / 2.0
+    return n * change > _MOVING**2 * apart + _CHANCE**2 * 4.0 * noise

@@ -50,7 +50,7 @@ def test_of_two_beginnings_the_nearer_is_taken():
 
     assert nearer(still, none) and nearer(still, rest=still)
     assert not nearer(moving)
-    assert not nearer(still, moving)
+    assert nearer(still, moving)  # of which the latter tells nothing
     assert not nearer(still, rest=still, mean=still)
     assert not nearer(still, held=np.array([np.inf]))
     assert not nearer(np.full_like(still, np.nan))
