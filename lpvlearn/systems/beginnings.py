@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 _STANDING = 5  # samples in which inputs that move later stand still
 _STILL = 0.02  # part of their range that measured ones may move meanwhile
+_OFTEN = 10  # moves of inputs that are no step test's
 _NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
 # Of outputs that move: part of what there is between two beginnings, and standard
 # deviations of the means of noise
@@ -38,6 +39,12 @@ def standing(u: Array) -> int:
         moved = (np.abs(u - u[0]) > _STILL * np.ptp(u, axis=0)).any(axis=1)
     n = int(moved.argmax())
     return n if n >= _STANDING else 0
+
+
+def _held_again(u: Array) -> int:
+    """Samples for which inputs are held at the longest later, if they move often."""
+    moves = np.flatnonzero((np.abs(np.diff(u, axis=0)) > _STILL * np.ptp(u, 0)).any(1))
+    return int(np.diff(moves).max()) if len(moves) > _OFTEN else 0
 
 
 def first_inputs(u: Array) -> Array:
@@ -83,6 +90,8 @@ class Beginning(NamedTuple):
         """
         (u, y), (u0, y0) = record, rest
         n, mean = standing(u), u.mean(axis=0) if about_mean else u0
+        if n <= _held_again(u):  # as they go on to do
+            n = 0
         at_mean, held = (y0 + gain @ (v - u0) for v in (mean, first_inputs(u)))
         at_rest, moved = (simulated(u[:n] - v) for v in (u0, mean))
         return cls(y[:n], y0 + at_rest, at_mean + moved, held)

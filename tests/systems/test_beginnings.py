@@ -66,3 +66,17 @@ def test_a_gain_that_takes_the_beginning_elsewhere_is_not_trusted():
     far = Beginning(still, still, still - 900.0, np.array([-180.0]))
     assert not begin_held([far])
     assert begin_held([far._replace(held=np.array([3.5 + 1e-6]))])
+
+
+def test_the_first_of_many_steps_does_not_tell_where_a_record_began():
+    """Random steps from mid-motion are near to where they lead by chance."""
+    u = np.tile([[1.0], [-1.0]], (15, 1)).repeat(20, axis=0)
+    gain, rest = np.eye(1), (np.zeros(1), np.zeros(1))
+
+    def told(u):
+        one = Beginning.of((u, u), rest, gain, lambda v: 0.0 * v, about_mean=False)
+        return begin_held([one])
+
+    assert not told(u)
+    assert told(u[:120])
+    assert told(np.vstack([np.ones((200, 1)), u]))
