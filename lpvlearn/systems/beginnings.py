@@ -43,7 +43,9 @@ def standing(u: Array) -> int:
 
 def _held_again(u: Array) -> int:
     """Samples for which inputs are held at the longest later, if they move often."""
-    moves = np.flatnonzero((np.abs(np.diff(u, axis=0)) > _STILL * np.ptp(u, 0)).any(1))
+    with np.errstate(over="ignore"):
+        moved = np.abs(np.diff(u, axis=0)) > _STILL * np.ptp(u, axis=0)
+    moves = np.flatnonzero(moved.any(axis=1))
     return int(np.diff(moves).max()) if len(moves) > _OFTEN else 0
 
 
