@@ -263,37 +263,35 @@ class Rounded(NamedTuple):
         >>> bool(np.abs(found.exact[0] - parts).max() < 1e-4), found.faint.shape
         (True, (3, 1))
         """
-        stacked = np.vstack(inputs)
-        if len(stacked) <= stacked.shape[1] or stacked.shape[1] == 1:
+        n_inputs = inputs[0].shape[1]
+        if n_inputs == 1 or sum(map(len, inputs)) <= n_inputs:
             return None
-        centred = [u - u.mean(axis=0) for u in inputs]
-        moved = np.vstack(centred)
+        moved = np.vstack([u - u.mean(axis=0) for u in inputs])
         scale = moved.std(axis=0)
         scale[scale == 0.0] = 1.0
-        values, V = np.linalg.eigh((moved / scale).T @ (moved / scale) / len(moved))
+        moved /= scale
+        values, V = np.linalg.eigh(moved.T @ moved / len(moved))
         is_faint = values <= _FAINT**2 * values[-1]
         if not is_faint.any():
             return None
-        step = np.array([decimal_step(u) for u in stacked.T]) / scale
-        ripple = (moved / scale @ V).std(axis=0)
+        step = np.array([_decimal_step(u) for u in np.vstack(inputs).T]) / scale
+        ripple = (moved @ V).std(axis=0)
         is_faint &= ripple <= _ROUNDED * np.linalg.norm(V.T * step, axis=1)
         is_faint &= ripple > _COLLINEAR
         if not is_faint.any():
             return None
         faint = V[:, is_faint]
-        exact = [
-            u - ((c / scale) @ faint @ faint.T) * scale
-            for u, c in zip(inputs, centred, strict=True)
-        ]
+        exact = np.vstack(inputs) - (moved @ faint @ faint.T) * scale
+        exact = np.split(exact, np.cumsum([len(u) for u in inputs])[:-1])
         return cls(exact, faint * scale[:, None], V[:, ~is_faint] * scale[:, None])
 
 
-def decimal_step(values: Array) -> float:
+def _decimal_step(values: Array) -> float:
     """The last decimal place of numbers that were rounded to one; 0 if they were not.
 
-    >>> decimal_step(np.array([0.5, 20.25])), decimal_step(np.array([100.0, 3.0]))
+    >>> _decimal_step(np.array([0.5, 20.25])), _decimal_step(np.array([100.0, 3.0]))
     (0.01, 1.0)
-    >>> decimal_step(np.array([1.0 / 3.0, 2.0]))
+    >>> _decimal_step(np.array([1.0 / 3.0, 2.0]))
     0.0
     """
     for places in range(_PLACES):

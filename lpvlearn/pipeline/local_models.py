@@ -39,9 +39,10 @@ Array = NDArray[np.float64]
 # that rises steadily from rest has a mean of 1.7).
 _OFFSET = 5.0
 
+_FAR = 5.0  # from the mean of the outputs, in their motion: not where they rest
+
 # Standard deviation of the constants of experiments at a point, in those of outputs,
 # that a user should know of.
-_FAR = 5.0  # from the mean of the outputs, in their motion: not where they rest
 _APART = 0.1
 
 # A pole that much slower than the others is an integrator, and an output shows it by

@@ -26,7 +26,7 @@ from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..restructuring.uncertainty import ParameterUncertainty
 from ..structures.structure import GrayBoxStructure
-from ..systems.beginnings import Beginning, begin_held
+from ..systems.beginnings import Beginning, begin_held, standing
 from .black_boxes import (
     aligned_black_boxes,
     balanced,
@@ -179,22 +179,27 @@ def begins_held(model: LPVStateSpace, points: OperatingPoints, dt: float) -> boo
     """
     model = model.silenced()
 
+    groups = [[e for e in group if standing(e.inputs)] for group in points.experiments]
+    if not any(groups):
+        return False
+    models = [model.at(kappa) for kappa in points.kappa]
+    if not all(frozen.is_stable for frozen in models):
+        return False
+
     def beginnings() -> Iterator[Beginning]:
-        for kappa, group in zip(points.kappa, points.experiments, strict=True):
-            frozen, place = model.at(kappa), kappa[None]
-            rest = model.input_offset(place)[0], model.output_offset(place)[0]
+        levels = model.input_offset(points.kappa), model.output_offset(points.kappa)
+        for frozen, group, u0, y0 in zip(models, groups, *levels, strict=True):
+            gain = frozen.dc_gain()
             simulated = partial(frozen.simulate, sampling_time=dt)
             for e in group:
                 yield Beginning.of(
                     (e.inputs, e.measured),
-                    rest,
-                    frozen.dc_gain(),
+                    (u0, y0),
+                    gain,
                     simulated,
                     about_mean=model.offsets is not None,
                 )
 
-    if not all(model.at(kappa).is_stable for kappa in points.kappa):
-        return False
     return begin_held(beginnings())
 
 

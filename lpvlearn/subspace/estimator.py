@@ -1156,9 +1156,11 @@ class SubspaceLTI(
 
         def predicted(e: Experiment) -> Array:
             u0, level = self.resting_point()
-            x0 = self._beginning(e) if predictor.gain is None else None
+            x0 = None
             if initial_state == "estimate":
                 x0, level = self._own_part(e, predictor)
+            elif predictor.gain is None:
+                x0 = self._beginning(e)
             u, y = e.inputs - u0, e.measured - level
             return level + predictor.predict(u, y, steps=steps, initial_state=x0)
 
@@ -1465,6 +1467,7 @@ class SubspaceLTI(
         lti = self.lti_
         if not (lti.is_stable and any(standing(e.inputs) for e in experiments)):
             return False
+        gain = lti.dc_gain()
         known = self.input_offset_, self.output_offset_, self._offsets.drifts
         k = len(experiments)  # fewer than levels, where a record is cut at shifts
         levels = (
@@ -1477,7 +1480,7 @@ class SubspaceLTI(
             return Beginning.of(
                 (e.inputs, y),
                 (u0, y0),
-                lti.dc_gain(),
+                gain,
                 lti.simulate,
                 about_mean=self.offset_ is not None,
             )
@@ -1486,10 +1489,7 @@ class SubspaceLTI(
 
     def _simulated(self, experiment: Experiment) -> Array:
         """Outputs from the beginning that the experiments of `fit` let expect."""
-        u0, y0 = self.resting_point()
-        return y0 + self.lti_.simulate(
-            experiment.inputs - u0, initial_state=self._beginning(experiment)
-        )
+        return self._from(self._beginning(experiment), experiment)
 
     def _beginning(self, experiment: Experiment) -> Array | None:
         """State and inputs in transit where the first inputs hold it; None for rest."""
@@ -1500,10 +1500,10 @@ class SubspaceLTI(
         x0 = held_state(lti.A, lti.B, first, discrete=True)
         return None if x0 is None else np.append(x0, np.repeat(first, lti.input_delay))
 
-    def _from_rest(self, experiment: Experiment) -> Array:
-        """Outputs from rest at the mean offsets."""
+    def _from(self, x0: Array | None, experiment: Experiment) -> Array:
+        """Outputs about the mean offsets from a state there; None is rest."""
         u0, y0 = self.resting_point()
-        return y0 + self.lti_.simulate(experiment.inputs - u0)
+        return y0 + self.lti_.simulate(experiment.inputs - u0, initial_state=x0)
 
     def _own_part(
         self,
@@ -1541,7 +1541,7 @@ class SubspaceLTI(
         lti, y = self.lti_, experiment.measured
         responses = free_responses(lti.A, lti.C, len(y), trend)
         responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
-        error = y - self._from_rest(experiment)
+        error = y - self._from(None, experiment)
         if experiment.estimated is not None:  # lest known ones leave states open
             faint = np.where(experiment.estimated, _FAINT, 1.0)
             responses, error = responses * faint[:, :, None], error * faint

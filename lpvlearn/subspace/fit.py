@@ -171,8 +171,9 @@ def fit_pairs(
     if rounded is not None and _is_wild(fitted, rounded):
         exact = list(zip(rounded.exact, (y for _, y in pairs), strict=True))
         other = _with_constants(exact, choices, told | {"collinear"}, known)
-        units = (criterion_in_units(one.evidence.one_step) for one in (other, fitted))
-        if next(units) < next(units) + CERTAIN:  # or the ripple is what drives outputs
+        worse = criterion_in_units(other.evidence.one_step)
+        worse -= criterion_in_units(fitted.evidence.one_step)
+        if worse < CERTAIN:  # or the ripple is what drives outputs
             _tell_of_rounding(rounded, pairs, told, names)
             pairs, fitted = exact, other
     drifting = _of_drifting_noise(pairs, choices, told, fitted)
@@ -1035,19 +1036,15 @@ def _is_wild(fitted: LocalFit, rounded: Rounded) -> bool:
     """Whether a model makes far more of a ripple than of all that inputs do else."""
     model = fitted.evidence.state_space(fitted.model, 1.0)
     G = model.frequency_response(_LOOKED_AT)
-    gains = (np.abs(G @ v).max() for v in (rounded.faint, rounded.others))
-    of_ripple, of_others = (float(gain) for gain in gains)
-    return of_ripple > _WILD * of_others
+    of_ripple = np.abs(G @ rounded.faint).max()
+    return bool(of_ripple > _WILD * np.abs(G @ rounded.others).max())
 
 
 def _tell_of_rounding(
     rounded: Rounded, pairs: Pairs, told: set[str], names: Sequence[Hashable] | None
 ) -> None:
-    moved = [
-        np.abs(u - v).max(axis=0)
-        for u, (v, _) in zip(rounded.exact, pairs, strict=True)
-    ]
-    ripple = np.max(moved, axis=0)
+    exact, inputs = np.vstack(rounded.exact), np.vstack([u for u, _ in pairs])
+    ripple = np.abs(exact - inputs).max(axis=0)
     some = np.flatnonzero(ripple > _PART * ripple.max())
     listed = ", ".join(str(k + 1 if names is None else names[int(k)]) for k in some)
     tell(
