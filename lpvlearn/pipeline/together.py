@@ -10,13 +10,14 @@ box of point k (`restructuring.minimise_covariance`), and the parameters
 
 .. math:: \min_c \sum_k |z_k(S_k c)|^2,
 
-a chi-square if the structure and the polynomial are true. From a model of constant
-parameters the degree is raised, one after another; Akaike's criterion chooses.
+a chi-square if the structure and the polynomial are true. The search starts at
+parameters that follow the black boxes from one point to its neighbours, and at constant
+ones, from which the degree is raised. Akaike's criterion chooses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg import pinvh
 
 from ..exceptions import warn
+from ..lpv.alignment import spanning_tree
 from ..lpv.auto import AutoLPV
 from ..lpv.interpolator import grid_over
 from ..lpv.polynomial import PolynomialLPV, resolvable_powers
@@ -35,6 +37,7 @@ from .structured_models import StructuredModels
 Array = NDArray[np.float64]
 
 _DEGREES = (1, 2, 3, 4)
+_PLAIN = 2  # degrees that the points may just determine
 _FEWEST = 3  # points whose uncertainty is known
 _STARTS, _KEPT = 5, 2  # points whose parameters are tried throughout, and gone on with
 # Chi-squares per degree of freedom: of parameters, from which a form is far from them;
@@ -116,39 +119,60 @@ def fitted_together(
     known = [box for box in boxes if box is not None]
     if len(known) < _FEWEST:
         return None
-    places = kappa[[box is not None for box in boxes]]
-    some = np.linspace(0, len(theta) - 1, min(_STARTS, len(theta))).astype(int)
-    starts = [_fitted(known, places, theta[[k] * len(places)], 0) for k in some]
-    best = _best_of(structure, known, places, starts)
-    if best is None:  # far from all black boxes, constant parameters are alike
-        lines = [_fitted(known, places, one.form.predict(places), 1) for one in starts]
-        best = _best_of(structure, known, places, lines)
-    return best
-
-
-def _best_of(
-    structure: GrayBoxStructure,
-    known: Sequence[UncertainBoxes],
-    places: Array,
-    starts: Sequence[_Found],
-) -> Together | None:
-    """The polynomial of any degree that the best starts lead to."""
+    there = np.array([box is not None for box in boxes])
+    places, theta = kappa[there], theta[there]
     n_values = sum(box.n_directions for box in known)
     best, least = None, np.inf
-    for found in sorted(starts, key=lambda found: found.cost)[:_KEPT]:
-        for degree in _DEGREES:
-            n_terms = len(resolvable_powers(degree, places))
-            n = n_terms * structure.n_params
-            free = n_values - n
-            if n_terms >= len(places) or free <= 0 or time_is_up():
-                break
-            found = _fitted(known, places, found.form.predict(places), degree)
-            likely = found.cost < _FAR * free and found.cost + 2.0 * n < least
-            if likely and _holds(structure, found.form):
-                misfit, least = found.cost / free, found.cost + 2.0 * n
-                covariance = max(misfit, 1.0) * pinvh(found.information)
-                best = Together(found.form, covariance, misfit)
+    for found in _candidates(known, places, theta):
+        n = found.form.coefficients().size
+        likely = found.cost < _FAR * (n_values - n) and found.cost + 2.0 * n < least
+        if likely and _holds(structure, found.form):
+            misfit, least = found.cost / (n_values - n), found.cost + 2.0 * n
+            covariance = max(misfit, 1.0) * pinvh(found.information)
+            best = Together(found.form, covariance, misfit)
     return best
+
+
+def _candidates(
+    boxes: Sequence[UncertainBoxes], kappa: Array, theta: Array
+) -> Iterator[_Found]:
+    """Polynomials of all degrees that several starts lead to."""
+    degrees = [d for d in _DEGREES if _may_have(d, kappa)]
+    for outward in (True, False):
+        values = _along_the_points(boxes, kappa, theta, outward)
+        for degree in degrees:
+            if time_is_up():
+                return
+            yield _fitted(boxes, kappa, values, degree)
+    some = np.linspace(0, len(theta) - 1, min(_STARTS, len(theta))).astype(int)
+    starts = [_fitted(boxes, kappa, theta[[k] * len(kappa)], 0) for k in some]
+    for found in sorted(starts, key=lambda found: found.cost)[:_KEPT]:
+        for degree in degrees:
+            if time_is_up():
+                return
+            found = _fitted(boxes, kappa, found.form.predict(kappa), degree)
+            yield found
+
+
+def _may_have(degree: int, kappa: Array) -> bool:
+    """Whether there are points enough: those of a high degree meet any errors."""
+    n_terms = len(resolvable_powers(degree, kappa))
+    return n_terms < len(kappa) if degree <= _PLAIN else 2 * n_terms <= len(kappa)
+
+
+def _along_the_points(
+    boxes: Sequence[UncertainBoxes], kappa: Array, theta: Array, outward: bool
+) -> Array:
+    """Parameters of all points, each nearest to its black box from its neighbour's on.
+
+    The first has its own. What the boxes hardly determine changes little on the way.
+    """
+    order, parents = spanning_tree(kappa, outward=outward)
+    values = theta.copy()
+    for k in order[1:]:
+        start = values[[parents[k]]]
+        values[k] = _fitted([boxes[k]], kappa[[k]], start, 0).form.predict(kappa[[k]])
+    return values
 
 
 class _Found(NamedTuple):

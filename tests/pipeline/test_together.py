@@ -8,7 +8,11 @@ from lpvlearn import AutoLPV, GrayBoxStructure
 from lpvlearn.models.statespace import DEVIATION
 from lpvlearn.pipeline.local_models import LocalModel
 from lpvlearn.pipeline.structured_models import StructuredModels
-from lpvlearn.pipeline.together import fitted_together, through_black_boxes
+from lpvlearn.pipeline.together import (
+    _along_the_points,
+    fitted_together,
+    through_black_boxes,
+)
 from lpvlearn.restructuring.minimise_covariance import UncertainBoxes
 
 LAGS = GrayBoxStructure.from_template(
@@ -99,3 +103,26 @@ def test_a_form_that_the_black_boxes_refute_is_not_kept():
     with pytest.warns(UserWarning, match="on no smooth function.*The LPV model takes"):
         form, _, _ = through_black_boxes(rough, structured(TRUTH, P))
     assert_allclose(form.predict(KAPPA), TRUTH, rtol=1e-5)
+
+
+@pytest.mark.parametrize("outward", [True, False])
+def test_parameters_follow_the_black_boxes_from_one_point_to_its_neighbours(outward):
+    """Parts that changed places, or went astray, at other points are those of one."""
+    rng = np.random.default_rng(1)
+    first = 2 if outward else 0
+    theta = TRUTH * np.exp(0.3 * rng.normal(size=TRUTH.shape))
+    theta[first] = TRUTH[first]
+    theta[1] = TRUTH[1, [2, 3, 0, 1]]
+    known = boxes([[estimate(row)] for row in TRUTH])
+    assert_allclose(_along_the_points(known, KAPPA, theta, outward), TRUTH, rtol=1e-6)
+
+
+def test_a_high_degree_needs_twice_as_many_points_as_it_has_terms():
+    """One black box that is off is no reason to bend through all of them."""
+    kappa = np.linspace(-1.0, 1.0, 6)[:, None]
+    truth = np.array([1.0, 2.0, 4.0, -1.0]) + kappa * [0.2, -0.3, 0.5, 0.1]
+    off = truth.copy()
+    off[3] *= 1.0 + 3.0 * STD
+    found = fitted_together(LAGS, boxes([[estimate(t)] for t in off]), kappa, off)
+    assert found.form.degree <= 2 and 1.0 < found.misfit
+    assert_allclose(found.form.predict(kappa), truth, rtol=3 * STD)
