@@ -171,9 +171,10 @@ class SubspaceLTI(
     feedthrough : bool or array-like of bool, default=True
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
         shape (n_outputs, n_inputs) single entries of D. A feedthrough in a closed loop
-        can be told only where the controller needs a sample to answer: method="auto"
-        takes ``D = 0`` instead of True where something acts within the sample, unless
-        parts held out refute it.
+        can be told from a controller that answers within the sample only where signals
+        are not Gaussian, as held references are: else method="auto" takes ``D = 0``
+        instead of True where something acts within the sample, unless parts held out
+        refute it.
     input_delay : int, array-like of shape (n_inputs,) or "auto", default=0
         Samples by which the inputs, or each of them, act late: ``y[t]`` depends on
         ``u[t - input_delay]`` through D, on earlier inputs through the state. A sampled
@@ -201,7 +202,9 @@ class SubspaceLTI(
         noise drives is told from that, or a number of states besides `order`.
     initial_state : {"estimate", "rest"}, default="estimate"
         State in which every experiment of `fit` starts: estimated along with B and D,
-        or zero, which is worth knowing of short experiments that start at rest.
+        or zero, which is worth knowing of short experiments that start at rest. Where
+        all experiments begin at a stand, as step tests do, "estimate" has them start
+        at rest at their first inputs, unless likelihood refutes it.
     detrend : {None, "constant", "linear"}, default=None
         Subtract its mean or straight line from every channel of every experiment
         beforehand. A mean is not where a system rests: what transients add to it stays
@@ -289,8 +292,9 @@ class SubspaceLTI(
     input_offset_ : ndarray of shape (n_experiments, n_inputs)
         Mean of the inputs of every experiment, as of `initial_states_`. Of a plant
         whose slowest mode takes a tenth of the longest experiment, or does not decay:
-        where the experiment begins nearest to rest. Zero without `offset_` and
-        `detrend`, and with ``initial_state="rest"``.
+        where the experiment begins nearest to rest. What they begin with, where the
+        experiments begin at a stand. Zero without `offset_` and `detrend`, and with
+        ``initial_state="rest"``.
     output_offset_ : ndarray of shape (n_experiments, n_outputs)
         Where the outputs rest at these inputs: but for transients and drifts
         ``y - output_offset_ = G (u - input_offset_)``. With `detrend` their means, to
@@ -353,15 +357,18 @@ class SubspaceLTI(
 
     Data are taken for those of a closed loop where future inputs tell of the errors
     of a long regression of the outputs on the past, with a p-value below 1e-4, and
-    nonlinear terms of the past do not tell more. What minimises the simulation error
+    nonlinear terms of the past do not tell more; and of one whose controller answers
+    within the sample where errors of a straight line from what inputs do to what
+    outputs do within it depend on nonlinear functions of the inputs, with a p-value
+    below 1e-8, and the other way round they do not. What minimises the simulation error
     has then a bias that no number of samples removes. A loop through which nothing but
-    white noise of the sensors goes does not show; it does no harm with
+    Gaussian white noise of the sensors goes does not show; it does no harm with
     ``feedthrough=False``. Channels that are not sampled at once look like a loop. So
     "auto" looks how the plant of "pbsid" does on parts held out (its growing modes are
     simulated backward), where inputs seem to explain a quarter of its simulation errors
     or it is unstable: D is left free, or "po-moesp" taken, where that leaves less than
     half of the squared errors, or makes a plant stable that is so within its
-    uncertainty.
+    uncertainty; or "po-moesp" with D free, where that leaves less than a tenth.
 
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.
@@ -376,6 +383,9 @@ class SubspaceLTI(
 
     A. Chiuso, "The role of vector autoregressive modeling in predictor-based subspace
     identification", Automatica 43, 2007.
+
+    S. Shimizu, P. O. Hoyer, A. Hyvarinen and A. Kerminen, "A linear non-Gaussian
+    acyclic model for causal discovery", Journal of Machine Learning Research 7, 2006.
 
     Examples
     --------

@@ -23,6 +23,7 @@ from ..data.preparation import (
     remove_trends,
 )
 from ..exceptions import RankWarning
+from ..systems.beginnings import stands
 from ..systems.simulation import delayed, lti_response
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .criterion import PRICE
@@ -69,6 +70,7 @@ from .offsets import (
     may_be_better,
     may_have_constants,
     may_have_drift,
+    motion_left,
     shifts_matter,
     stands_by_chance,
     unmoved_errors,
@@ -129,6 +131,9 @@ _FAR_BETTER = 0.5
 # Times the squared errors without what inputs do to modes that do not decay, of ones
 # that they do not move at all.
 _NOT_MOVED = 1.1
+
+# Times the squared errors of free initial states, of rest at the beginning.
+_NOT_FAR_WORSE = 3.0
 
 # Of inputs that only rounding tells apart: times the gain of all others, of a model
 # that makes of the ripple what it likes, at these frequencies (rad per sample); and the
@@ -191,6 +196,19 @@ def fit_pairs(
     cuts = choices.offset == "auto" and choices.initial_states and choices.refine
     if cuts and not choices.estimated:
         pairs, fitted = _without_shifts(pairs, choices, told, fitted)
+    at_first = None
+    if not drifting and "shifts" not in told and _may_begin_at_rest(choices, fitted):
+        at_first = stands(pairs)
+    if at_first is not None:
+        moved = [(u - v, y) for (u, y), v in zip(pairs, at_first.first, strict=True)]
+        at_rest = choices._replace(initial_states=False)
+        if at_first.first.any():  # a level is that of the answer to these
+            at_rest = at_rest._replace(offset="constant")
+        found = _at_rest(moved, at_rest, told, fitted, at_first.seen)
+        if found is None:
+            at_first = None
+        else:
+            pairs, choices, fitted = moved, at_rest, found
     doubt = None
     foreseen = fitted.feedback is not None and fitted.feedback.foreseen
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
@@ -204,9 +222,49 @@ def fit_pairs(
         tell_of_feedback(feedback, fitted, choices, doubt, told)
         if known is None and not foreseen:
             _tell_of_lead(pairs, choices, told, fitted)
+    if at_first is not None:
+        fitted = _moved_back(fitted, at_first.first)
     if detrend is None:
         return fitted
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
+
+
+def _may_begin_at_rest(choices: Choices, fitted: LocalFit) -> bool:
+    free = choices.initial_states and choices.offset in ("auto", "constant")
+    known = bool(choices.estimated) or fitted.method == "pbsid"
+    return free and not known and fitted.selection.order > 0
+
+
+def _at_rest(
+    pairs: Pairs, choices: Choices, told: set[str], free: LocalFit, seen: bool
+) -> LocalFit | None:
+    """The model of experiments that begin at rest; None where likelihood refutes that.
+
+    Free initial states and a constant may balance each other for as long as inputs
+    stand still, and leave of the static gain what noise makes of it. Of rest that is
+    not `seen` in the outputs, or instead of a drift, likelihood is asked for more.
+    """
+    try:
+        fitted = _with_constants(pairs, choices, told, free)
+    except TooFewSamples:
+        return None
+    worse = criterion_in_units(fitted.evidence.one_step)
+    worse -= criterion_in_units(free.evidence.one_step)
+    left = motion_left(fitted.evidence) / (motion_left(free.evidence) or 1.0)
+    stable = fitted.evidence.state_space(fitted.model, 1.0).is_stable
+    seen = seen and free.evidence.free.n_trend < 2
+    most = CERTAIN if stands_by_chance(free.evidence.one_step) else ALIKE
+    likely = worse <= most * (seen or left < 1.0)
+    likely &= left < _NOT_FAR_WORSE  # noise that takes what states do is likely, too
+    return fitted if likely and fitted.selection.order and stable else None
+
+
+def _moved_back(fitted: LocalFit, first: Array) -> LocalFit:
+    """The model of inputs as they are, from that of inputs less the first ones."""
+    offsets = fitted.offsets.shifted(first, np.zeros(1))
+    gain = fitted.evidence.state_space(fitted.model, 1.0).dc_gain()
+    constants = offsets.constants - first @ gain.T
+    return fitted._replace(offsets=offsets._replace(constants=constants))
 
 
 def _with_constants(
@@ -800,7 +858,7 @@ def _heed(feedback: Feedback | None, settings: Settings, by_default: bool) -> Se
     if feedback is None or not feedback.found or feedback.cut_off:
         return settings._replace(method="po-moesp")
     free = settings.free
-    if by_default and feedback.instantaneous:
+    if by_default and feedback.instantaneous and not feedback.direct:
         free = free._replace(direct=np.zeros_like(free.direct))
     return settings._replace(method="pbsid", free=free)
 
@@ -816,12 +874,15 @@ def _believable(
     the model of "po-moesp". The latter minimises the simulation error, and so does
     better than the plant itself by what the inputs tell of the noise: that does not
     refute the plant unless inputs were to be noise more than anything else
-    (`_OF_NOISE`), and how they act at once was not said; or the plant is unstable, by
-    no more than chance, and the other is not; or D was left free for a stable plant,
-    but fits these parts no better.
+    (`_OF_NOISE`), and how they act at once was not said, nor shown by a controller that
+    answers at once; or the plant is unstable, by no more than chance, and the other is
+    not; or D was left free for a stable plant, but fits these parts no better.
     """
     n_trend = first.evidence.free.n_trend
     without_d = not first.evidence.free.direct.any()
+    answered = first.feedback is not None and first.feedback.answered
+    if answered and without_d:
+        choices = choices._replace(feedthrough=False)
     same = choices._replace(offset=DETRENDS[n_trend])
 
     def rival(**chosen: Any) -> tuple[LocalFit, HeldOut]:
@@ -855,11 +916,13 @@ def _believable(
             # inputs of the same sample tell the noise in the outputs: of a free D, all
             blind, of_blind = rival(method="po-moesp", feedthrough=False)
         # whoever says which entries of D act knows how the channels were sampled
-        said = not isinstance(choices.feedthrough, bool)
+        said = answered or not isinstance(choices.feedthrough, bool)
         better = not said and of_blind.total < _OF_NOISE * error.total
         # growing modes simulate bounded signals by what is to come of the inputs
         better &= not blind.grows(_CERTAIN)
         unsure = makeshift or (best.grows() and not best.grows(_CERTAIN))
+        # nor do inputs that were made from later outputs as well
+        unsure |= not said and not best.grows() and of_that.total < _LED * error.total
         if unsure and not open_loop.grows() and not better:
             blind, of_blind = open_loop, of_that
             better = of_that.clearly_better_than(error, _DOUBT)
@@ -958,7 +1021,8 @@ def _deviance(fitted: LocalFit) -> float:
 def _held_out(fitted: LocalFit, choices: Choices) -> HeldOut:
     """Errors of a fit's like on parts held out."""
     evidence, scaled = fitted.evidence, fitted.scaled
-    free, horizon = evidence.free, fitted.selection.horizon
+    horizon = fitted.selection.horizon
+    free = evidence.free._replace(initial_states=True)  # what is left begins in motion
     settings = Settings(
         free,
         fitted.method,
@@ -973,7 +1037,7 @@ def _held_out(fitted: LocalFit, choices: Choices) -> HeldOut:
 
     refitted: Callable[[list[Record]], Realization]
     if isinstance(evidence, ClosedLoopEvidence) and evidence.refined:
-        refitted = evidence.of_others
+        refitted = replace(evidence, free=free).of_others
     else:
 
         def refitted(train: list[Record]) -> Realization:
@@ -984,7 +1048,7 @@ def _held_out(fitted: LocalFit, choices: Choices) -> HeldOut:
             ).evidence.model
 
     try:
-        return held_out(refitted, scaled.records, at_rest=not free.initial_states)
+        return held_out(refitted, scaled.records)
     except ValueError:  # too few samples are left
         return HeldOut([], np.nan)
 

@@ -164,21 +164,31 @@ def tell_of_feedback(
         f"{100.0 * feedback.share:.2g} % of the innovations, p = "
         f"{feedback.p_value:.1g}): the data come from a closed loop. "
     )
+    if feedback.answered:
+        what = (
+            "The inputs answer the noise of the outputs within the sample (p = "
+            f"{feedback.p_direct:.1g} that these answer them): the data come from a "
+            "closed loop. "
+        )
     loop = choices.feedthrough is True and feedback.instantaneous
+    loop &= not feedback.direct
     within = (
-        "Inputs and outputs also depend on each other within the sample, and the data "
-        "do not tell a feedthrough from a controller that answers at once"
+        "A free D takes the controller's answer for what inputs do"
+        if feedback.answered
+        else "Inputs and outputs also depend on each other within the sample, and the "
+        "data do not tell a feedthrough from a controller that answers at once"
     )
     if method not in ("auto", "pbsid"):
         what += (
-            f"That biases method={method!r} however many samples there are. "
-            "Use method='pbsid' (of `fit`, with the whole table), or identify with the "
-            "controller's reference as input."
+            f"That biases method={method!r} however many samples there are. Use "
+            f"method='pbsid'{', feedthrough=False' if feedback.answered else ''} (of "
+            "`fit`, with the whole table), or identify with the controller's reference "
+            "as input."
         )
     elif method == "pbsid" and loop:
         what += (
-            f"{within}. "
-            "Use feedthrough=False unless the controller needs a sample to answer."
+            f"{within}. Use feedthrough=False"
+            f"{'' if feedback.answered else ' unless the controller needs a sample'}."
         )
     elif method == "pbsid":
         return
@@ -203,9 +213,11 @@ def tell_of_feedback(
     else:
         what += "method='pbsid' was taken, which that does not bias."
         if loop:
+            what += f" {within}: D = 0 was taken."
+        if loop and not feedback.answered:
             what += (
-                f" {within}: D = 0 was taken. If the controller needs a sample to "
-                "answer, say method='pbsid' yourself, which leaves D free."
+                " If the controller needs a sample to answer, say method='pbsid' "
+                "yourself, which leaves D free."
             )
         if feedback.foreseen:
             what += (

@@ -99,13 +99,11 @@ def held_out(
     records: Sequence[Record],
     *,
     weight: Array | None = None,
-    at_rest: bool = False,
 ) -> HeldOut:
     """Errors of a model on pieces of scaled records that it was not fitted to.
 
-    `refitted` makes the model of other records; `weight` (n_outputs, n_outputs) is that
-    of the errors by which initial states are found; `at_rest` says that there are none
-    to find.
+    `refitted` makes the model of other records, which may begin in mid-motion; `weight`
+    (n_outputs, n_outputs) is that of the errors by which initial states are found.
     """
     W = np.eye(len(records[0].y)) if weight is None else weight
     parts: list[Part] = []
@@ -123,15 +121,14 @@ def held_out(
         for record, (start, stop) in zip(records, cuts, strict=True):
             if start == stop:
                 continue
-            begin = 0 if at_rest else start
-            u, y = record.u.T[begin:stop], record.y.T[start:stop]
-            trend, known = record.trend[:, begin:stop], record.known[start:stop]
+            u, y = record.u.T[start:stop], record.y.T[start:stop]
+            trend, known = record.trend[:, start:stop], record.known[start:stop]
             if not known.any():
                 continue
             with np.errstate(over="ignore", invalid="ignore"):
-                answer, free = _answers(model, u, trend, at_rest)
-                error = np.where(known, y - answer[start - begin :], 0.0)
-                free = np.where(known[:, :, None], free[start - begin :], 0.0)
+                answer, free = _answers(model, u, trend)
+                error = np.where(known, y - answer, 0.0)
+                free = np.where(known[:, :, None], free, 0.0)
                 part = Part(error, free, W)
                 error = part.without(part.free)
                 # What these unknowns take of the noise is made up for.
@@ -158,9 +155,7 @@ def held_out(
     return HeldOut(parts, bft, total, float(np.sqrt(total / n_known)))
 
 
-def _answers(
-    model: Realization, u: Array, trend: Array, at_rest: bool
-) -> tuple[Array, Array]:
+def _answers(model: Realization, u: Array, trend: Array) -> tuple[Array, Array]:
     """Outputs to inputs (n_samples, n_inputs), and to what is unknown.
 
     Modes that grow are simulated backward, from rest at the end: the free responses
@@ -173,9 +168,8 @@ def _answers(
     edges = np.concatenate([[1.0], edges, [_GROWS]])
     widest = int(np.argmax(np.diff(edges)))
     limit = edges[widest : widest + 2].mean()
-    if at_rest or not sizes.max(initial=0.0) > limit:
-        free = free_responses(A, C, len(u), trend)
-        return lti_response(A, B, C, D, u), free[:, :, len(A) * at_rest :]
+    if not sizes.max(initial=0.0) > limit:
+        return lti_response(A, B, C, D, u), free_responses(A, C, len(u), trend)
     try:
         R, Z, k = linalg.schur(A, sort=lambda re, im=0.0: np.hypot(re, im) < limit)
         X = np.zeros((k, len(A) - k))

@@ -500,11 +500,11 @@ def validate(
     candidate: Candidate, records: Sequence[Record], settings: Settings
 ) -> HeldOut:
     """Errors of a candidate's like on parts of the records."""
+    in_motion = settings._replace(free=settings.free._replace(initial_states=True))
     return held_out(
-        lambda train: _refitted(candidate, train, settings),
+        lambda train: _refitted(candidate, train, in_motion),
         records,
         weight=candidate.whitening.weight,
-        at_rest=not settings.free.initial_states,
     )
 
 

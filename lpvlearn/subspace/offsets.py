@@ -139,7 +139,8 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
     The inputs stand at their means, the outputs where the static gain then has them.
     Where a mode is not far faster than the longest experiment, means tell little of
     where it rests, and the static gain may be infinite: both stand where experiments
-    begin nearest to rest. Where these are known to start there, inputs stand at zero.
+    begin nearest to rest, if that is near where outputs go, unlike in mid-motion. Where
+    these are known to start at rest, inputs stand at zero.
     """
     model, lengths = evidence.model, np.array([len(u) for u, _ in pairs])
     n_trend, ny = centres.trends.shape[1:]
@@ -159,12 +160,22 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
         constants = outputs - levels @ gain.T
     if slowest <= _SETTLED and len(model.initial_states) == len(pairs):
         found = _as_they_begin(evidence, trends, lengths)
-        if found is not None:
+        if found is not None and not (decays and _far_off(found[1], pairs)):
             return Offsets(levels + found[0], found[1], none, constants, lengths)
     if not decays:
         return Offsets(levels, outputs, drifts, constants, lengths)
     means = np.array([u.mean(axis=0) for u, _ in pairs])
     return Offsets(means, constants + means @ gain.T, drifts, constants, lengths)
+
+
+def _far_off(y0: Array, pairs: Pairs) -> bool:
+    """Whether an output is to rest farther from its range than that is wide."""
+    least, most = (
+        np.array([f(y, axis=0) for _, y in pairs]) for f in (np.nanmin, np.nanmax)
+    )
+    least, most = least.min(axis=0), most.max(axis=0)
+    wide = most - least
+    return bool(((y0 < least - wide) | (y0 > most + wide)).any())
 
 
 def of_rates(rates: Offsets, gain: Array, flags: NDArray[np.bool_]) -> Offsets:

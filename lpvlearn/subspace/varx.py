@@ -12,6 +12,14 @@ no alarm: all that is asked of p is to be long enough, which the data choose.
 Where a few kicks are most of what the past does not foresee of an input, the samples
 that none of them follows are asked as well: inputs alone choose these.
 
+Within the sample, what the past does not foresee of inputs and outputs, a and b, may
+depend on each other because inputs act at once, ``b = D a + w`` with w independent of
+a, or because a controller answers at once, ``a = L b + r`` with r independent of b.
+Covariances are the same either way. Of signals that are not Gaussian only one of the
+two has errors that are independent of what they are errors beside (Shimizu, Hoyer,
+Hyvarinen and Kerminen, 2006); those of the other depend on nonlinear functions of it.
+References that are steps, held or binary are far from Gaussian.
+
 Constants of the experiments, and drifts, are regressors too, projected out of all rows.
 Everything follows from the triangular factor of one Hankel matrix. In the columns
 beyond those of some first rows stand the other rows less what the first explain: of
@@ -53,6 +61,11 @@ _LEVEL, _BEYOND_DOUBT, _N_CURVED = 1e-4, 1e-20, 3
 
 _INSTANTANEOUS = 0.01  # p-value below which something acts within the sample
 
+# p-values above which it acts in one direction, if in the other they are below; root
+# mean squares from which the cubes of the nonlinear terms grow no more; moves that a
+# channel must have, as the fourth power of its size counts them: a few may be no moves
+_LIKELY, _REFUTED, _CLIPPED, _SEVERAL = 0.01, 1e-8, 5.0, 8.0
+
 # Part of a future input that the past does not explain, below which it is known
 # beforehand: sines, or values that are held.
 _FORESEEN = 1e-3
@@ -85,6 +98,8 @@ class Feedback(NamedTuple):
     cut_off: bool = False  # whether the samples carry no longer past than they chose
     regression: Regression | None = None  # of outputs on inputs and the past
     foreseen: bool = False  # whether every input follows from the past and the outputs
+    p_direct: float = 1.0  # of outputs on a straight line over inputs of the sample
+    p_answer: float = 1.0  # of inputs on a straight line over outputs of the sample
 
     @property
     def found(self) -> bool:
@@ -96,7 +111,17 @@ class Feedback(NamedTuple):
         cut off, future inputs may tell that follow the same past.
         """
         level = _BEYOND_DOUBT if self.cut_off else _LEVEL
-        return self.p_value < level and self.share > self.curved
+        return self.answered or (self.p_value < level and self.share > self.curved)
+
+    @property
+    def answered(self) -> bool:
+        """Whether a controller answers within the sample, and no input acts in it."""
+        return self.p_direct < _REFUTED and self.p_answer > _LIKELY
+
+    @property
+    def direct(self) -> bool:
+        """Whether an input acts within the sample, and no controller answers in it."""
+        return self.p_answer < _REFUTED and self.p_direct > _LIKELY
 
     @property
     def instantaneous(self) -> bool:
@@ -198,8 +223,12 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
         found = max(found, of_most)
     innovations = np.sum(y**2, axis=1) / max(dof, 1)
     regression = _coefficients(factor, past, longest, m, ny)
-    acting = within.p_value
-    return Feedback(*found, acting, curved, innovations, cut_off, regression, foreseen)
+    acting, lines = within.p_value, (1.0, 1.0)
+    if acting < _INSTANTANEOUS and noisy.any():
+        before = scaled_lstsq(factor[: past * c].T, rows[:c].T, _DEPENDENT)[0]
+        lines = _straight_lines(windows, before, m, noisy)
+    told = *found, acting, curved, innovations, cut_off, regression, foreseen
+    return Feedback(*told, *lines)
 
 
 def regression_of(records: Sequence[Record]) -> Regression | None:
@@ -225,6 +254,36 @@ def _coefficients(factor: Array, past: int, longest: int, m: int, ny: int) -> Ar
     P[0] = np.hstack([-direct.T, np.eye(ny)])
     P[1:] = -before.reshape(past, c, ny).swapaxes(1, 2)
     return P
+
+
+def _straight_lines(
+    windows: Sequence[_Windows], before: Array, m: int, noisy: NDArray[np.bool_]
+) -> tuple[float, float]:
+    """Tests whether outputs lie on a straight line over inputs of the sample, and back.
+
+    Of what `before` (n_regressors, n_inputs + n_outputs) does not foresee a sample
+    ahead, the errors of a straight line are tested for nonlinear functions.
+    """
+    left = []
+    for linear, outputs, _ in windows:
+        left.append(np.vstack([linear[:m], outputs]) - before.T @ linear[m:-1])
+    a, b = np.split(np.hstack(left), [m])
+    b = b[noisy]  # others have no noise to be answered
+    return _on_a_line(b, a, len(before)), _on_a_line(a, b, len(before))
+
+
+def _on_a_line(rows: Array, over: Array, n_regressors: int) -> float:
+    """p-value of rows that are linear in others, but for independent errors."""
+    size = np.sqrt(np.mean(over**2, axis=1, keepdims=True))
+    x = over / np.where(size > 0.0, size, 1.0)
+    line = np.vstack([np.ones(over.shape[1]), x])
+    x = x[np.sum(x**4, axis=1) * _SEVERAL < np.sum(x**2, axis=1) ** 2]
+    near, far = np.clip(x, -1.0, 1.0), np.clip(x, -_CLIPPED, _CLIPPED)
+    bent = np.vstack([near, np.abs(x) * x, far**3])
+    Q = _basis(line, line, _DEPENDENT)
+    rows, left = (r - (r @ Q) @ Q.T for r in (rows, bent))
+    dof = over.shape[1] - n_regressors - Q.shape[1]
+    return _wilks(rows, _basis(left, bent, _FORESEEN), dof).p_value
 
 
 class _Windows(NamedTuple):

@@ -17,10 +17,12 @@ Array = NDArray[np.float64]
 _STANDING = 5  # samples in which inputs that move later stand still
 _STILL = 0.02  # part of their range that measured ones may move meanwhile
 _OFTEN = 10  # moves of inputs that are no step test's
+_SELDOM = 4  # moves of inputs that are one, whatever they begin with
 _NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
 # Of outputs that move: part of what there is between two beginnings, and standard
 # deviations of the means of noise
 _MOVING, _CHANCE = 0.1, 3.0
+_STIRRING = 0.3  # the same of records that may begin at rest: that is of their motion
 # Times the squared errors of a beginning at rest, in any record; part of what there is
 # between two beginnings that is none.
 _WORSE, _ROUNDING = 2.0, 1e-6
@@ -43,15 +45,53 @@ def standing(u: Array) -> int:
 
 def _held_again(u: Array) -> int:
     """Samples for which inputs are held at the longest later, if they move often."""
+    moves = _moved(u)
+    return int(np.diff(moves).max()) if len(moves) > _OFTEN else 0
+
+
+def _moved(u: Array) -> NDArray[np.intp]:
+    """Samples after which inputs move."""
     with np.errstate(over="ignore"):
         moved = np.abs(np.diff(u, axis=0)) > _STILL * np.ptp(u, axis=0)
-    moves = np.flatnonzero(moved.any(axis=1))
-    return int(np.diff(moves).max()) if len(moves) > _OFTEN else 0
+    return np.flatnonzero(moved.any(axis=1))
 
 
 def first_inputs(u: Array) -> Array:
     """Inputs at the beginning, their median as long as they stand still."""
     return np.asarray(np.median(u[: standing(u) or 1], axis=0))
+
+
+class Stands(NamedTuple):
+    """How records begin that may begin at rest."""
+
+    first: Array  # (n_records, n_inputs): inputs that they begin with
+    seen: bool  # whether outputs show it, for as long as inputs stand still
+
+
+def stands(records: Iterable[tuple[Array, Array]]) -> Stands | None:
+    """How records (u, y) begin, if all may at a stand.
+
+    Few samples before the first of few moves show nothing, and may be one all the same.
+    None where inputs of a record go on to move, or outputs do while inputs stand still.
+
+    >>> u, y = np.repeat([[2.0], [3.0]], 8, axis=0), np.repeat([[20.0], [25.0]], 8, 0)
+    >>> stands([(u, y), (u[7:], y[7:])])
+    Stands(first=array([[2.],
+           [2.]]), seen=False)
+    >>> stands([(u, u.cumsum()[:, None])]), stands([(y.cumsum()[:, None], y)])
+    (None, None)
+    """
+    first, seen = [], True
+    for u, y in records:
+        n, size = standing(u), np.nanmax(y, axis=0) - np.nanmin(y, axis=0)
+        n = n if n > _held_again(u) else 0  # as they go on to do
+        if n and _moves(y[:n] / np.where(size > 0.0, size, 1.0), _STIRRING**2 * n):
+            return None
+        if not n and len(_moved(u)) > _SELDOM:
+            return None
+        seen &= n > 0
+        first.append(first_inputs(u))
+    return Stands(np.array(first), seen)
 
 
 def held_state(A: Array, B: Array, u: Array, *, discrete: bool) -> Array | None:

@@ -126,3 +126,10 @@ def test_a_high_degree_needs_twice_as_many_points_as_it_has_terms():
     found = fitted_together(LAGS, boxes([[estimate(t)] for t in off]), kappa, off)
     assert found.form.degree <= 2 and 1.0 < found.misfit
     assert_allclose(found.form.predict(kappa), truth, rtol=3 * STD)
+
+
+def test_degrees_are_those_that_few_points_tell():
+    """Four points have no polynomial of the fourth degree, and need none."""
+    known = boxes([[estimate(row)] for row in TRUTH[:4]])
+    found = fitted_together(LAGS, known, KAPPA[:4], TRUTH[:4])
+    assert found.form.degree == 1

@@ -315,6 +315,32 @@ def test_auto_takes_it_where_there_is_feedback():
     assert streamed.method_ == "po-moesp"
 
 
+def test_a_controller_that_answers_at_once_is_no_feedthrough():
+    """A free D would be minus one over the gain of the controller."""
+    for rng in map(np.random.default_rng, range(3)):
+        x, n = 0.0, 1000
+        r, e = np.repeat(rng.choice([-0.5, 0.5], n // 20), 20), rng.standard_normal(n)
+        u, y = np.zeros((2, n, 1))
+        for t in range(n):
+            y[t] = x + 0.3 * e[t]
+            u[t] = 2.0 * (r[t] - y[t])
+            x = 0.8 * x + 0.2 * u[t, 0]
+        told = "answer the noise .* within the sample .*'pbsid' was taken.*D = 0"
+        with pytest.warns(UserWarning, match=told):
+            model = SubspaceLTI().fit(u, y)
+        assert_allclose(model.lti_.dc_gain(), 1.0, rtol=0.15)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            biased = SubspaceLTI(method="po-moesp").fit(u, y)
+        remedy = "Use method='pbsid', feedthrough=False"
+        assert any(remedy in str(w.message) for w in caught)
+        assert abs(biased.lti_.D.item()) > 0.1
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            pbsid().fit(u, y)
+        assert any("A free D takes" in str(w.message) for w in caught)
+
+
 def sampled_early(seed, n_samples=400):
     """Outputs that are means over the sample to come, of slow inputs: no feedback."""
     rng = np.random.default_rng(seed)

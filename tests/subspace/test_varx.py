@@ -84,6 +84,52 @@ def test_feedback_is_found():
         assert late.found and not late.instantaneous
 
 
+def within_the_sample(rng, kind, steps=True, n_samples=1000):
+    """A lag with an input that acts at once, or a controller that answers at once."""
+    r = np.repeat(rng.choice([-1.0, 1.0], n_samples // 5), 5)
+    r = r if steps else rng.standard_normal(n_samples)
+    e = 0.3 * rng.standard_normal(n_samples)
+    x, u, y = 0.0, np.zeros(n_samples), np.zeros(n_samples)
+    for t in range(n_samples):
+        if kind == "answer":
+            y[t] = x + e[t]
+            u[t] = 2.0 * (r[t] - y[t])
+        else:
+            u[t] = r[t]
+            y[t] = x - u[t] + e[t]
+        x = 0.8 * x + 0.2 * u[t]
+    return u[:, None], y[:, None]
+
+
+@pytest.mark.parametrize("kind", ["answer", "feedthrough"])
+def test_steps_tell_a_feedthrough_from_a_controller_that_answers_at_once(kind):
+    answers = kind == "answer"
+    for rng in map(np.random.default_rng, range(5)):
+        found = find_feedback(records_of(within_the_sample(rng, kind)))
+        assert found.instantaneous
+        assert (found.answered, found.direct) == (answers, not answers)
+        assert found.found == answers
+        found = find_feedback(records_of(within_the_sample(rng, kind, steps=False)))
+        assert found.instantaneous and not (found.answered or found.direct)
+
+
+def test_lines_within_the_sample_are_hardly_refuted_by_chance():
+    p = []
+    for rng in map(np.random.default_rng, range(60)):
+        found = find_feedback(records_of(within_the_sample(rng, "feedthrough")))
+        p.append(found.p_direct)
+        found = find_feedback(records_of(within_the_sample(rng, "answer")))
+        p.append(found.p_answer)
+    assert min(p) > 1e-4 and np.mean(np.array(p) < 0.05) < 0.1
+
+
+def test_a_few_spikes_tell_nothing_of_what_acts_within_the_sample():
+    """They may be no moves of the input: nothing answers them."""
+    u, y = within_the_sample(np.random.default_rng(0), "feedthrough")
+    u[[100, 400, 700]] = 60.0
+    assert not find_feedback(records_of((u, y))).answered
+
+
 def test_units_and_order_of_channels_do_not_matter():
     rng = np.random.default_rng(3)
     u, y = closed_loop(rng, 800)

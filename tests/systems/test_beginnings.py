@@ -9,6 +9,7 @@ from lpvlearn.systems.beginnings import (
     first_inputs,
     held_state,
     standing,
+    stands,
 )
 
 
@@ -24,6 +25,21 @@ def test_measured_inputs_stand_still_but_for_their_noise():
 @pytest.mark.parametrize("u", [np.zeros((0, 1)), np.ones((20, 2)), np.eye(20)[:, :1]])
 def test_inputs_that_never_move_or_at_once_do_not_stand_still(u):
     assert standing(u) == 0
+
+
+def test_records_that_begin_at_a_stand():
+    u = np.repeat([[20.0], [40.0]], 10, axis=0)
+    y = np.repeat([[5.0], [9.0]], 10, axis=0)
+    y += 0.1 * np.random.default_rng(0).standard_normal(y.shape)
+    found = stands([(u, y), (u[::-1], y[::-1])])
+    assert found.seen
+    np.testing.assert_array_equal(found.first, [[20.0], [40.0]])
+    assert not stands([(u, y), (u[8:], y[8:])]).seen  # two samples show nothing
+    assert stands([(u, y), (u, y + np.linspace(0.0, 9.0, 20)[:, None])]) is None
+    moving = np.random.default_rng(1).standard_normal(u.shape)
+    assert stands([(u, y), (moving, y)]) is None
+    unknown = np.where(y > 8.9, np.nan, y)
+    assert stands([(u, unknown)]).seen
 
 
 @pytest.mark.parametrize("discrete", [False, True])
