@@ -306,7 +306,7 @@ display = BodeDisplay.from_models(
 #   Constants and drifts of the experiments (``offset``) are estimated there as well.
 # * Say ``feedthrough=False`` unless the controller needs a sample to answer: a
 #   feedthrough and a controller that answers within the sample can be told apart where
-#   the reference moves by steps, as "auto" does, but not where all signals are Gaussian.
+#   the reference moves by steps, as "auto" does, but not where signals are Gaussian.
 # * The warning may be false where channels are not sampled at once: outputs that are
 #   means over the sample to come know the next inputs, too. "auto" then leaves D free,
 #   or takes ``"po-moesp"``, where parts held out speak clearly for it, and says both
