@@ -40,6 +40,7 @@ from .drift import (
 from .fit_warnings import (
     Doubt,
     tell,
+    tell_of_answers,
     tell_of_feedback,
     tell_of_held_outputs,
     tell_of_limits,
@@ -60,6 +61,7 @@ from .local_fit import LocalFit
 from .offsets import (
     ALIKE,
     CERTAIN,
+    HARDLY_DECAYS,
     HARDLY_MOVED,
     N_TRENDS,
     attributed,
@@ -70,7 +72,6 @@ from .offsets import (
     may_be_better,
     may_have_constants,
     may_have_drift,
-    motion_left,
     shifts_matter,
     stands_by_chance,
     unmoved_errors,
@@ -123,6 +124,9 @@ _LAGS, _PLENTY, _AUDIBLE = 2, 20_000, 0.01
 # model not to refute it; standard errors by which a lesser one must be better where the
 # plant grows; standard deviations by which a pole does so for certain.
 _OF_NOISE, _DOUBT, _CERTAIN = 0.5, 2.0, 3.0
+
+# The same of one with D free, where nothing but answers within the sample shows a loop.
+_OF_ANSWERS = 0.25
 
 # Share of the squared errors of parts held out that further states leave there where
 # they are the plant's.
@@ -196,9 +200,15 @@ def fit_pairs(
     cuts = choices.offset == "auto" and choices.initial_states and choices.refine
     if cuts and not choices.estimated:
         pairs, fitted = _without_shifts(pairs, choices, told, fitted)
-    at_first = None
-    if not drifting and "shifts" not in told and _may_begin_at_rest(choices, fitted):
-        at_first = stands(pairs)
+    at_first, differ = None, fitted.offsets.differ
+    if not drifting and "shifts" not in told:
+        if _may_begin_at_rest(choices, fitted, known):
+            at_first = stands(pairs)
+        if at_first is not None and at_first.first.any():
+            # without a constant their answer is that to zero
+            sure = fitted.evidence.free.n_trend or choices.offset == "constant"
+            if not (sure or stands_by_chance(fitted.evidence.one_step)):
+                at_first = None
     if at_first is not None:
         moved = [(u - v, y) for (u, y), v in zip(pairs, at_first.first, strict=True)]
         at_rest = choices._replace(initial_states=False)
@@ -219,20 +229,30 @@ def fit_pairs(
         fitted = _with_shared_noise(pairs, choices, told, fitted)
     feedback = fitted.feedback
     if feedback is not None and feedback.found and "feedback" not in told:
-        tell_of_feedback(feedback, fitted, choices, doubt, told)
+        if feedback.shown or not fitted.model.D.any():
+            tell_of_feedback(feedback, fitted, choices, doubt, told)
+        else:
+            tell_of_answers(feedback, told)
         if known is None and not foreseen:
             _tell_of_lead(pairs, choices, told, fitted)
     if at_first is not None:
-        fitted = _moved_back(fitted, at_first.first)
+        fitted = _moved_back(fitted, at_first.first, differ)
     if detrend is None:
         return fitted
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
 
 
-def _may_begin_at_rest(choices: Choices, fitted: LocalFit) -> bool:
-    free = choices.initial_states and choices.offset in ("auto", "constant")
-    known = bool(choices.estimated) or fitted.method == "pbsid"
-    return free and not known and fitted.selection.order > 0
+def _may_begin_at_rest(
+    choices: Choices, fitted: LocalFit, known: LocalFit | None
+) -> bool:
+    """Whether it is open how experiments begin, but as others that are known do."""
+    asked = choices.offset in ("auto", "constant")
+    if known is not None:
+        asked = not known.evidence.free.initial_states
+    estimated = bool(choices.estimated) or fitted.method == "pbsid"
+    return (
+        choices.initial_states and asked and not estimated and len(fitted.model.A) > 0
+    )
 
 
 def _at_rest(
@@ -242,29 +262,65 @@ def _at_rest(
 
     Free initial states and a constant may balance each other for as long as inputs
     stand still, and leave of the static gain what noise makes of it. Of rest that is
-    not `seen` in the outputs, or instead of a drift, likelihood is asked for more.
+    not `seen` in the outputs, or instead of a drift, likelihood is asked for more. The
+    criterion, to which the first errors count little, may be met by noise that takes
+    what states do: so the errors themselves must hardly be larger.
     """
     try:
         fitted = _with_constants(pairs, choices, told, free)
     except TooFewSamples:
         return None
-    worse = criterion_in_units(fitted.evidence.one_step)
-    worse -= criterion_in_units(free.evidence.one_step)
-    left = motion_left(fitted.evidence) / (motion_left(free.evidence) or 1.0)
-    stable = fitted.evidence.state_space(fitted.model, 1.0).is_stable
-    seen = seen and free.evidence.free.n_trend < 2
-    most = CERTAIN if stands_by_chance(free.evidence.one_step) else ALIKE
-    likely = worse <= most * (seen or left < 1.0)
-    likely &= left < _NOT_FAR_WORSE  # noise that takes what states do is likely, too
-    return fitted if likely and fitted.selection.order and stable else None
+    own, other = fitted.evidence, free.evidence
+    by_chance, drifts_off = stands_by_chance(other.one_step), other.free.n_trend > 1
+    rate = 1.0 - spectral_radius(own.model.A)
+    settles = rate * own.longest > (HARDLY_DECAYS if drifts_off else 1.0)
+    if not (len(own.model.A) and settles):
+        return None
+    left, plainly = _plain_errors(own, other)
+    worse = criterion_in_units(own.one_step) - criterion_in_units(other.one_step)
+    most = CERTAIN if by_chance else ALIKE
+    if not worse <= most * ((seen and not drifts_off) or left < 1.0):
+        return None
+    if by_chance:
+        return fitted if left < _NOT_FAR_WORSE else None
+    order = len(other.model.A)
+    allowed = ALIKE + PRICE * order * len(pairs)
+    if plainly > allowed and len(own.model.A) < order:  # a state is missing, not rest
+        as_many, _ = _of_order(pairs, choices, told, order, fitted, own.free.n_trend)
+        left, plainly = _plain_errors(as_many.evidence, other)
+    return fitted if plainly <= allowed else None
 
 
-def _moved_back(fitted: LocalFit, first: Array) -> LocalFit:
-    """The model of inputs as they are, from that of inputs less the first ones."""
+def _plain_errors(own: Evidence, other: Evidence) -> tuple[float, float]:
+    """Squared errors of simulation by another's; and how much less likely they are.
+
+    Twice the logarithm of that, as of fewer values that are white: by how much errors
+    of the other correlate with those a sample before.
+    """
+    errors, others = (
+        np.vstack(simulation_errors(e.model, e.records)) * e.output_scale
+        for e in (own, other)
+    )
+    ratios, unlikely = [], 0.0
+    for e, before in zip(errors.T, others.T, strict=True):
+        squares = float(before @ before)
+        if squares > 0.0:
+            ratios.append(float(e @ e) / squares)
+            r = min(max(float(before[1:] @ before[:-1]) / squares, 0.0), 1.0)
+            unlikely += len(before) * (1.0 - r) / (1.0 + r) * np.log(ratios[-1])
+    return float(np.mean(ratios or [1.0])), float(unlikely)
+
+
+def _moved_back(fitted: LocalFit, first: Array, differ: bool) -> LocalFit:
+    """The model of inputs as they are, from that of inputs less the first ones.
+
+    Whether constants `differ` was told without these.
+    """
     offsets = fitted.offsets.shifted(first, np.zeros(1))
     gain = fitted.evidence.state_space(fitted.model, 1.0).dc_gain()
     constants = offsets.constants - first @ gain.T
-    return fitted._replace(offsets=offsets._replace(constants=constants))
+    offsets = offsets._replace(constants=constants, differ=differ)
+    return fitted._replace(offsets=offsets)
 
 
 def _with_constants(
@@ -850,7 +906,7 @@ def _identify_open_loop(
 def _heed(feedback: Feedback | None, settings: Settings, by_default: bool) -> Settings:
     """The settings with their method chosen; and D, which is free `by_default`.
 
-    Where inputs and outputs depend on each other within the sample, data do not tell a
+    Where inputs and outputs depend on each other within the sample, data hardly tell a
     feedthrough from a controller that answers at once: the latter is taken for it.
     """
     if settings.method != "auto":
@@ -858,7 +914,7 @@ def _heed(feedback: Feedback | None, settings: Settings, by_default: bool) -> Se
     if feedback is None or not feedback.found or feedback.cut_off:
         return settings._replace(method="po-moesp")
     free = settings.free
-    if by_default and feedback.instantaneous and not feedback.direct:
+    if by_default and feedback.instantaneous:
         free = free._replace(direct=np.zeros_like(free.direct))
     return settings._replace(method="pbsid", free=free)
 
@@ -881,6 +937,7 @@ def _believable(
     n_trend = first.evidence.free.n_trend
     without_d = not first.evidence.free.direct.any()
     answered = first.feedback is not None and first.feedback.answered
+    as_said = choices.feedthrough
     if answered and without_d:
         choices = choices._replace(feedthrough=False)
     same = choices._replace(offset=DETRENDS[n_trend])
@@ -921,13 +978,19 @@ def _believable(
         # growing modes simulate bounded signals by what is to come of the inputs
         better &= not blind.grows(_CERTAIN)
         unsure = makeshift or (best.grows() and not best.grows(_CERTAIN))
-        # nor do inputs that were made from later outputs as well
-        unsure |= not said and not best.grows() and of_that.total < _LED * error.total
+        if not said and not best.grows() and of_that.total < _LED * error.total:
+            unsure |= find_lead(pairs)[0] > 0  # inputs were made of later outputs, too
         if unsure and not open_loop.grows() and not better:
             blind, of_blind = open_loop, of_that
             better = of_that.clearly_better_than(error, _DOUBT)
         if better:
             best, error = blind, of_blind
+        shown = first.feedback is not None and first.feedback.shown
+        if answered and not shown and as_said is True:
+            # noise of a measured input answers outputs as well
+            other, found = rival(method="po-moesp", feedthrough=True)
+            if found.total < _OF_ANSWERS * error.total:
+                best, error = other, found
     except TooFewSamples:
         pass
     if best is first:

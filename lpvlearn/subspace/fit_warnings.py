@@ -164,16 +164,12 @@ def tell_of_feedback(
         f"{100.0 * feedback.share:.2g} % of the innovations, p = "
         f"{feedback.p_value:.1g}): the data come from a closed loop. "
     )
-    if feedback.answered:
-        what = (
-            "The inputs answer the noise of the outputs within the sample (p = "
-            f"{feedback.p_direct:.1g} that these answer them): the data come from a "
-            "closed loop. "
-        )
+    if not feedback.shown:
+        what = "The data seem to come from a closed loop. "
     loop = choices.feedthrough is True and feedback.instantaneous
-    loop &= not feedback.direct
     within = (
-        "A free D takes the controller's answer for what inputs do"
+        "The input answers outputs within the sample, and these do not answer it (p = "
+        f"{feedback.p_direct:.1g}): a free D would be that of the controller"
         if feedback.answered
         else "Inputs and outputs also depend on each other within the sample, and the "
         "data do not tell a feedthrough from a controller that answers at once"
@@ -231,6 +227,18 @@ def tell_of_feedback(
             "better by method='po-moesp'."
         )
     tell(told, "feedback", what)
+
+
+def tell_of_answers(feedback: Feedback, told: set[str]) -> None:
+    """Tell of an input that answers outputs, where D has it the other way round."""
+    tell(
+        told,
+        "feedback",
+        "The input answers outputs within the sample, and these do not answer it (p = "
+        f"{feedback.p_direct:.1g}). If a controller makes it of them, D of this model "
+        "is that of the controller: use method='pbsid', feedthrough=False. Else it is "
+        "measured with noise, or the system is not linear.",
+    )
 
 
 def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:

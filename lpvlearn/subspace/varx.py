@@ -18,7 +18,8 @@ a, or because a controller answers at once, ``a = L b + r`` with r independent o
 Covariances are the same either way. Of signals that are not Gaussian only one of the
 two has errors that are independent of what they are errors beside (Shimizu, Hoyer,
 Hyvarinen and Kerminen, 2006); those of the other depend on nonlinear functions of it.
-References that are steps, held or binary are far from Gaussian.
+References that are steps, held or binary are far from Gaussian. That is asked of a
+single input: of several some may act at once, and others answer.
 
 Constants of the experiments, and drifts, are regressors too, projected out of all rows.
 Everything follows from the triangular factor of one Hankel matrix. In the columns
@@ -61,10 +62,11 @@ _LEVEL, _BEYOND_DOUBT, _N_CURVED = 1e-4, 1e-20, 3
 
 _INSTANTANEOUS = 0.01  # p-value below which something acts within the sample
 
-# p-values above which it acts in one direction, if in the other they are below; root
+# p-values above which inputs answer, if below them outputs do not answer inputs; root
 # mean squares from which the cubes of the nonlinear terms grow no more; moves that a
-# channel must have, as the fourth power of its size counts them: a few may be no moves
-_LIKELY, _REFUTED, _CLIPPED, _SEVERAL = 0.01, 1e-8, 5.0, 8.0
+# channel must have, as the fourth power of its size counts them: a few may be no moves;
+# share of what the past does not foresee that the sample before does
+_LIKELY, _REFUTED, _CLIPPED, _SEVERAL, _FOLLOWS = 0.01, 1e-8, 5.0, 8.0, 0.2
 
 # Part of a future input that the past does not explain, below which it is known
 # beforehand: sines, or values that are held.
@@ -103,7 +105,12 @@ class Feedback(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether there is feedback.
+        """Whether there is feedback."""
+        return self.shown or self.answered
+
+    @property
+    def shown(self) -> bool:
+        """Whether future inputs show it.
 
         Errors of a nonlinearity know future inputs, too, where these follow from
         the past nonlinearly (chirps, values that are held); but they follow from
@@ -111,17 +118,16 @@ class Feedback(NamedTuple):
         cut off, future inputs may tell that follow the same past.
         """
         level = _BEYOND_DOUBT if self.cut_off else _LEVEL
-        return self.answered or (self.p_value < level and self.share > self.curved)
+        return self.p_value < level and self.share > self.curved
 
     @property
     def answered(self) -> bool:
-        """Whether a controller answers within the sample, and no input acts in it."""
-        return self.p_direct < _REFUTED and self.p_answer > _LIKELY
+        """Whether the input answers outputs within the sample, which do not answer it.
 
-    @property
-    def direct(self) -> bool:
-        """Whether an input acts within the sample, and no controller answers in it."""
-        return self.p_answer < _REFUTED and self.p_direct > _LIKELY
+        As a controller makes it do. In open loop noise of a measured input does, too.
+        """
+        line = self.p_direct < _REFUTED and self.p_answer > _LIKELY
+        return line and not self.cut_off
 
     @property
     def instantaneous(self) -> bool:
@@ -224,7 +230,7 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
     innovations = np.sum(y**2, axis=1) / max(dof, 1)
     regression = _coefficients(factor, past, longest, m, ny)
     acting, lines = within.p_value, (1.0, 1.0)
-    if acting < _INSTANTANEOUS and noisy.any():
+    if acting < _INSTANTANEOUS and noisy.any() and m == 1:
         before = scaled_lstsq(factor[: past * c].T, rows[:c].T, _DEPENDENT)[0]
         lines = _straight_lines(windows, before, m, noisy)
     told = *found, acting, curved, innovations, cut_off, regression, foreseen
@@ -268,6 +274,8 @@ def _straight_lines(
     for linear, outputs, _ in windows:
         left.append(np.vstack([linear[:m], outputs]) - before.T @ linear[m:-1])
     a, b = np.split(np.hstack(left), [m])
+    if (np.sum(a[:, 1:] * a[:, :-1], axis=1) > _FOLLOWS * np.sum(a**2, axis=1)).any():
+        return 1.0, 1.0  # a slow input, of which a longer past would foresee that
     b = b[noisy]  # others have no noise to be answered
     return _on_a_line(b, a, len(before)), _on_a_line(a, b, len(before))
 

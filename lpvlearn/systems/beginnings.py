@@ -72,7 +72,8 @@ def stands(records: Iterable[tuple[Array, Array]]) -> Stands | None:
     """How records (u, y) begin, if all may at a stand.
 
     Few samples before the first of few moves show nothing, and may be one all the same.
-    None where inputs of a record go on to move, or outputs do while inputs stand still.
+    None where inputs of a record go on to move, or move slowly; and where outputs move
+    while inputs stand still.
 
     >>> u, y = np.repeat([[2.0], [3.0]], 8, axis=0), np.repeat([[20.0], [25.0]], 8, 0)
     >>> stands([(u, y), (u[7:], y[7:])])
@@ -83,14 +84,19 @@ def stands(records: Iterable[tuple[Array, Array]]) -> Stands | None:
     """
     first, seen = [], True
     for u, y in records:
-        n, size = standing(u), np.nanmax(y, axis=0) - np.nanmin(y, axis=0)
-        n = n if n > _held_again(u) else 0  # as they go on to do
-        if n and _moves(y[:n] / np.where(size > 0.0, size, 1.0), _STIRRING**2 * n):
+        moves, width = _moved(u), np.ptp(u, axis=0)
+        n = int(moves[0]) + 1 if len(moves) else 0
+        if not n or (np.abs(u[:n] - u[0]) > _STILL * width).any():
+            return None  # they go on slowly
+        shown = n >= _STANDING and n > _held_again(u)  # not as they go on to do
+        size = np.nanmax(y, axis=0) - np.nanmin(y, axis=0)
+        size = np.where(size > 0.0, size, 1.0)
+        if len(moves) > _SELDOM and not shown:
             return None
-        if not n and len(_moved(u)) > _SELDOM:
+        if shown and _moves(y[:n] / size, _STIRRING**2 * n):
             return None
-        seen &= n > 0
-        first.append(first_inputs(u))
+        seen &= shown
+        first.append(np.median(u[:n], axis=0))
     return Stands(np.array(first), seen)
 
 

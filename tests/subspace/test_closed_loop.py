@@ -325,20 +325,33 @@ def test_a_controller_that_answers_at_once_is_no_feedthrough():
             y[t] = x + 0.3 * e[t]
             u[t] = 2.0 * (r[t] - y[t])
             x = 0.8 * x + 0.2 * u[t, 0]
-        told = "answer the noise .* within the sample .*'pbsid' was taken.*D = 0"
+        told = "closed loop.*'pbsid' was taken.*input answers outputs within.*D = 0"
         with pytest.warns(UserWarning, match=told):
             model = SubspaceLTI().fit(u, y)
         assert_allclose(model.lti_.dc_gain(), 1.0, rtol=0.15)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             biased = SubspaceLTI(method="po-moesp").fit(u, y)
-        remedy = "Use method='pbsid', feedthrough=False"
+        remedy = "se method='pbsid', feedthrough=False"
         assert any(remedy in str(w.message) for w in caught)
         assert abs(biased.lti_.D.item()) > 0.1
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             pbsid().fit(u, y)
-        assert any("A free D takes" in str(w.message) for w in caught)
+        assert any(remedy in str(w.message) for w in caught)
+
+
+def test_noise_of_a_measured_input_answers_as_a_controller_does():
+    """Covariances and more are alike: what is simulated decides, and that is told."""
+    for rng in map(np.random.default_rng, range(3)):
+        u = rng.choice([-1.0, 1.0], (2000, 1))
+        y = lfilter([1.0, -0.6], [1.0, -0.8], u, axis=0)
+        y += 0.01 * rng.standard_normal(y.shape)
+        told = "answers outputs within the sample.*Else it is measured with noise"
+        with pytest.warns(UserWarning, match=told):
+            model = SubspaceLTI().fit(u + 0.1 * rng.standard_normal(u.shape), y)
+        assert_allclose(model.lti_.D, 1.0, rtol=0.05)
+        assert_allclose(model.lti_.dc_gain(), 2.0, rtol=0.05)
 
 
 def sampled_early(seed, n_samples=400):
