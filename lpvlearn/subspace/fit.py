@@ -23,7 +23,7 @@ from ..data.preparation import (
     remove_trends,
 )
 from ..exceptions import RankWarning
-from ..systems.beginnings import stands
+from ..systems.beginnings import Stands, stands
 from ..systems.simulation import delayed, lti_response
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .criterion import PRICE
@@ -136,8 +136,9 @@ _FAR_BETTER = 0.5
 # that they do not move at all.
 _NOT_MOVED = 1.1
 
-# Times the squared errors of free initial states, of rest at the beginning.
-_NOT_FAR_WORSE = 3.0
+# Times the squared errors of free initial states, of rest at the beginning; and the
+# least of it that is told from none.
+_NOT_FAR_WORSE, _LEAST = 3.0, 1e-30
 
 # Of inputs that only rounding tells apart: times the gain of all others, of a model
 # that makes of the ripple what it likes, at these frequencies (rad per sample); and the
@@ -198,27 +199,14 @@ def fit_pairs(
         _tell_of_input_spikes(pairs, choices, told, fitted)
     # The errors of a rough model are not the noise that shifts must stand out of.
     cuts = choices.offset == "auto" and choices.initial_states and choices.refine
+    whole, stand, differ = pairs, None, fitted.offsets.differ
     if cuts and not choices.estimated:
         pairs, fitted = _without_shifts(pairs, choices, told, fitted)
-    at_first, differ = None, fitted.offsets.differ
-    if not drifting and "shifts" not in told:
-        if _may_begin_at_rest(choices, fitted, known):
-            at_first = stands(pairs)
-        if at_first is not None and at_first.first.any():
-            # without a constant their answer is that to zero
-            sure = fitted.evidence.free.n_trend or choices.offset == "constant"
-            if not (sure or stands_by_chance(fitted.evidence.one_step)):
-                at_first = None
-    if at_first is not None:
-        moved = [(u - v, y) for (u, y), v in zip(pairs, at_first.first, strict=True)]
-        at_rest = choices._replace(initial_states=False)
-        if at_first.first.any():  # a level is that of the answer to these
-            at_rest = at_rest._replace(offset="constant")
-        found = _at_rest(moved, at_rest, told, fitted, at_first.seen)
-        if found is None:
-            at_first = None
-        else:
-            pairs, choices, fitted = moved, at_rest, found
+    if not drifting and pairs is whole:
+        stand = _stand_of(pairs, choices, fitted, known)
+    if stand is not None:
+        pairs, choices, found = _at_rest(pairs, choices, told, fitted, stand)
+        stand, fitted = (None, fitted) if found is None else (stand, found)
     doubt = None
     foreseen = fitted.feedback is not None and fitted.feedback.foreseen
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
@@ -235,36 +223,59 @@ def fit_pairs(
             tell_of_answers(feedback, told)
         if known is None and not foreseen:
             _tell_of_lead(pairs, choices, told, fitted)
-    if at_first is not None:
-        fitted = _moved_back(fitted, at_first.first, differ)
+    if stand is not None:
+        fitted = _moved_back(fitted, stand.first, differ)
     if detrend is None:
         return fitted
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
 
 
-def _may_begin_at_rest(
-    choices: Choices, fitted: LocalFit, known: LocalFit | None
-) -> bool:
-    """Whether it is open how experiments begin, but as others that are known do."""
+def _stand_of(
+    pairs: Pairs, choices: Choices, fitted: LocalFit, known: LocalFit | None
+) -> Stands | None:
+    """How experiments begin, where they may at rest; others that are `known` tell."""
     asked = choices.offset in ("auto", "constant")
     if known is not None:
         asked = not known.evidence.free.initial_states
-    estimated = bool(choices.estimated) or fitted.method == "pbsid"
-    return (
-        choices.initial_states and asked and not estimated and len(fitted.model.A) > 0
-    )
+    asked &= choices.initial_states and not choices.estimated
+    if not asked or fitted.method == "pbsid" or not len(fitted.model.A):
+        return None
+    stand = stands(pairs)
+    if stand is not None and stand.first.any() and choices.offset != "constant":
+        # without a constant their answer is that to zero
+        evidence = fitted.evidence
+        if not (evidence.free.n_trend or stands_by_chance(evidence.one_step)):
+            return None
+    return stand
 
 
 def _at_rest(
-    pairs: Pairs, choices: Choices, told: set[str], free: LocalFit, seen: bool
-) -> LocalFit | None:
+    pairs: Pairs, choices: Choices, told: set[str], free: LocalFit, stand: Stands
+) -> tuple[Pairs, Choices, LocalFit | None]:
     """The model of experiments that begin at rest; None where likelihood refutes that.
 
-    Free initial states and a constant may balance each other for as long as inputs
-    stand still, and leave of the static gain what noise makes of it. Of rest that is
-    not `seen` in the outputs, or instead of a drift, likelihood is asked for more. The
-    criterion, to which the first errors count little, may be met by noise that takes
-    what states do: so the errors themselves must hardly be larger.
+    And the samples less the inputs that these begin with, and the choices that are its.
+    """
+    moved = [(u - first, y) for (u, y), first in zip(pairs, stand.first, strict=True)]
+    at_rest = choices._replace(initial_states=False)
+    if stand.first.any():  # a level is that of the answer to these
+        at_rest = at_rest._replace(offset="constant")
+    fitted = _as_likely(moved, at_rest, told, free, stand.seen)
+    if fitted is None:
+        return pairs, choices, None
+    return moved, at_rest, fitted
+
+
+def _as_likely(
+    pairs: Pairs, choices: Choices, told: set[str], free: LocalFit, seen: bool
+) -> LocalFit | None:
+    """The model from rest, unless that is less likely than `free` initial states.
+
+    These and a constant may balance each other for as long as inputs stand still, and
+    leave of the static gain what noise makes of it. Of rest that is not `seen` in the
+    outputs, or instead of a drift, likelihood is asked for more. The criterion, to
+    which the first errors count little, may be met by noise that takes what states do:
+    so the errors themselves must hardly be larger.
     """
     try:
         fitted = _with_constants(pairs, choices, told, free)
@@ -305,7 +316,7 @@ def _plain_errors(own: Evidence, other: Evidence) -> tuple[float, float]:
     for e, before in zip(errors.T, others.T, strict=True):
         squares = float(before @ before)
         if squares > 0.0:
-            ratios.append(float(e @ e) / squares)
+            ratios.append(max(float(e @ e) / squares, _LEAST))
             r = min(max(float(before[1:] @ before[:-1]) / squares, 0.0), 1.0)
             unlikely += len(before) * (1.0 - r) / (1.0 + r) * np.log(ratios[-1])
     return float(np.mean(ratios or [1.0])), float(unlikely)

@@ -37,10 +37,15 @@ def standing(u: Array) -> int:
     """
     if not len(u):
         return 0
-    with np.errstate(over="ignore"):
-        moved = (np.abs(u - u[0]) > _STILL * np.ptp(u, axis=0)).any(axis=1)
-    n = int(moved.argmax())
+    n = int(_left(u, len(u)).argmax())
     return n if n >= _STANDING else 0
+
+
+def _left(u: Array, n: int) -> NDArray[np.bool_]:
+    """Which of the first n samples are far from the first one, by the range of all."""
+    with np.errstate(over="ignore"):
+        far = np.abs(u[:n] - u[0]) > _STILL * np.ptp(u, axis=0)
+    return np.asarray(far.any(axis=1))
 
 
 def _held_again(u: Array) -> int:
@@ -84,9 +89,9 @@ def stands(records: Iterable[tuple[Array, Array]]) -> Stands | None:
     """
     first, seen = [], True
     for u, y in records:
-        moves, width = _moved(u), np.ptp(u, axis=0)
+        moves = _moved(u)
         n = int(moves[0]) + 1 if len(moves) else 0
-        if not n or (np.abs(u[:n] - u[0]) > _STILL * width).any():
+        if not n or _left(u, n).any():
             return None  # they go on slowly
         shown = n >= _STANDING and n > _held_again(u)  # not as they go on to do
         size = np.nanmax(y, axis=0) - np.nanmin(y, axis=0)
