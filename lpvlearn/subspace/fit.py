@@ -602,7 +602,11 @@ def _tell_of_contradiction(
     n_values = model.C.size + model.B.size + np.count_nonzero(free.direct)
     least = _VALUES_EACH * (n_values + len(model.A))
     lengths = np.array([record.y.size for record in records])
-    some = [k for k in np.argsort(-lengths)[:_MOST_ALONE] if lengths[k] >= least]
+    some = [
+        k
+        for k in np.argsort(-lengths)[:_MOST_ALONE]
+        if lengths[k] >= least and np.ptp(pairs[k][0], axis=0).all()  # inputs move
+    ]
     found = simulation_errors(with_initial_states(model, records, free), records)
     energies = []
     for k in some:

@@ -519,6 +519,19 @@ def test_experiments_that_contradict_one_another_are_told(gains):
     assert n_told >= 8 if gains[0] != gains[1] else n_told == 0
 
 
+def test_experiments_whose_inputs_rest_contradict_none(rng):
+    """Alone they tell nothing of a model."""
+    u = np.repeat(rng.standard_normal((3, 60)), 5, axis=1)
+    u[1] = 0.3
+    e = lfilter([1.0], [1.0, -0.9], rng.standard_normal(u.shape))
+    y = 10.0 + lfilter([0.0, 0.3], [1.0, -0.7], u) + e
+    table = np.column_stack([u.ravel(), np.repeat([0, 1, 2], 300)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        model = SubspaceLTI(1, experiment=1).fit(table, y.ravel())
+    assert model.order_ == 1
+
+
 # -- what is wrong with channels, or not excited ---------------------------------------
 
 
