@@ -90,6 +90,10 @@ _MUCH, _MUCH_OF_OUTPUT, CERTAIN, _MAX_SAMPLES = 0.03, 0.003, 1e-6, 4_096
 # more than this share of the samples: others may be what the noise is.
 _SPIKE, _MUCH_OF_SPIKES, _FEW = 12.0, 0.25, 0.05
 
+# A move of an input, in parts of its range; samples that are soon after one; share of
+# all samples that are, where inputs move seldom, and of the spikes, where these follow.
+_MOVES, _SOON, _SELDOM, _MOSTLY = 0.02, 4, 0.3, 0.7
+
 # Lags by which it is seen at little cost that errors are no larger than need be.
 _N_SCREEN = 10
 
@@ -473,6 +477,7 @@ class Spikes(NamedTuple):
     sample: int  # in that experiment
     n_found: int
     share: float  # of the squared errors of the output
+    follow: bool  # most of them moves of the inputs, which move seldom
 
 
 def find_spikes(evidence: Evidence) -> Spikes | None:
@@ -511,7 +516,18 @@ def find_spikes(evidence: Evidence) -> Spikes | None:
     k = int(np.searchsorted(ends, at, side="right"))
     sample = at - (int(ends[k - 1]) if k else 0)
     most = min(float(share[output]), 1.0)
-    return Spikes(output, k, sample, int(count[output]), most)
+    after = np.concatenate([_after_moves(record.u) for record in evidence.records])
+    follow = after.mean() < _SELDOM and after[size[:, output] > 0.0].mean() > _MOSTLY
+    return Spikes(output, k, sample, int(count[output]), most, bool(follow))
+
+
+def _after_moves(u: Array) -> NDArray[np.bool_]:
+    """Samples soon after inputs (n_inputs, n_samples) move."""
+    moved = np.abs(np.diff(u, axis=1, prepend=u[:, :1])) > _MOVES * np.ptp(
+        u, axis=1, keepdims=True
+    )
+    soon = np.convolve(moved.any(axis=0), np.ones(_SOON))
+    return np.asarray(soon[: u.shape[1]] > 0.5)
 
 
 def _predicted_variances(errors: Sequence[Array]) -> Array:

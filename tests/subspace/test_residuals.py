@@ -1,5 +1,8 @@
 """Residual tests: exact regressions, uniform p-values, and the power to see."""
 
+import re
+import warnings
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -469,6 +472,18 @@ def test_a_fit_tells_of_missing_states():
     with pytest.warns(UserWarning, match="order 2 lacks states.*order='auto'"):
         SubspaceLTI(2, horizon=12).fit(u, y)
     SubspaceLTI(4, horizon=12).fit(u, y)  # silently
+
+
+def test_spikes_that_follow_moves_of_the_input_are_no_sensors():
+    u = np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, 20), 40)[:, None]
+    late = np.vstack([np.zeros((3, 1)), u[:-3]])
+    y = lfilter([0.5], [1.0, -0.5], late, axis=0)
+    y += 0.002 * np.random.default_rng(1).standard_normal(y.shape)
+    told = "stand far out .* Most come right after inputs move: .* `input_delay`"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        SubspaceLTI(1, refine="simulation").fit(u, y)
+    assert any(re.search(told, str(w.message)) for w in caught)
 
 
 def test_spikes_are_told_and_where_the_farthest_is():
