@@ -104,6 +104,10 @@ _FAR = 1.0
 # in each of these take a tenth or so of slow noise.
 _BEYOND = 100.0
 
+# Times the squared errors on parts held out, beyond which those on the samples of the
+# fit are of what these parts do not show: a step that comes before all of them.
+_EASIER = 10.0
+
 
 class Row(NamedTuple):
     """One row of the selection table.
@@ -301,7 +305,7 @@ def _search(
             orders[order] = min(own, orders[order], key=_criterion)
         errors[order] = validate(orders[order].candidate, records, settings)
         share = 0.0 if order > best else MATTERS
-        tells = errors[order].bft > 0.0  # or inputs rest where it is held out
+        tells = _shows(orders[order], errors[order], records)
         if tells and errors[order].clearly_better_than(errors[chosen], _DOUBT, share):
             chosen = order
     candidate = orders[chosen].candidate
@@ -324,6 +328,16 @@ def _is_beyond(
     n_values = sum(record.n_values for record in records)
     least = max(chosen.candidate.model.loss, error.residual**2 * n_values)
     return one.candidate.model.loss > _BEYOND * least
+
+
+def _shows(one: _Tried, error: HeldOut, records: Sequence[Record]) -> bool:
+    """Whether parts held out show what a model lacks as samples of the fit do.
+
+    Inputs may rest there.
+    """
+    n_values = sum(record.n_values for record in records)
+    easier = one.candidate.model.loss > _EASIER * error.residual**2 * n_values
+    return error.bft > 0.0 and not easier
 
 
 def _judged(

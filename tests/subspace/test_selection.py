@@ -173,6 +173,19 @@ def test_losses_do_not_rise_with_the_order():
     assert (loss.diff().dropna() < 1e-3).all()
 
 
+def test_parts_where_nothing_happens_do_not_overrule_the_step_before_them():
+    """Noise is all that is left of a lag there: an order too low does as well."""
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        u = (np.arange(66) >= 5).astype(float)[:, None]
+        y = lfilter([0.0, 0.0, 0.4], [1.0, -0.6], u, axis=0)
+        y += 0.01 * rng.standard_normal(y.shape)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            model = SubspaceLTI().fit(u, y)
+        assert model.order_ >= 2 and model.residual_ < 0.05
+
+
 def test_orders_out_of_the_question_are_not_simulated_on_parts_held_out(rng):
     """Of errors a thousandth of the outputs they are, of half of these they are not."""
     system = example(rng, modes(0.9 * np.exp(0.5j)), 1, 1)
