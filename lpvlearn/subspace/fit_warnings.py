@@ -411,22 +411,23 @@ def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
     if rounded.variances[spikes.output]:
         return  # some errors of that are larger than others
     several, n = len(fitted.evidence.records) > 1, spikes.n_found
-    remedy = (
-        "Most come right after inputs move: the model lacks a delay or states. Use "
-        "`input_delay` or a higher `order`."
-        if spikes.follow
-        else "If a sensor got them wrong, they spoil the model: replace them by NaN "
-        "and use missing='estimate'."
-    )
-    tell(
-        told,
-        "spikes",
+    stands_out = (
         f"{n} sample(s) of output {spikes.output + 1} stand far out of the "
         f"errors of the model and make {100.0 * spikes.share:.0f} % of their squares; "
         f"the farthest is sample {spikes.sample}"
         f"{f' of experiment {spikes.experiment}' if several else ''}, counted from 0. "
-        f"{remedy}",
     )
+    if spikes.follow:
+        stands_out += (
+            "Most come right after inputs move: the model lacks a delay or states. Use "
+            "`input_delay` or a higher `order`."
+        )
+    else:
+        stands_out += (
+            "If a sensor got them wrong, they spoil the model: replace them by NaN and "
+            "use missing='estimate'."
+        )
+    tell(told, "spikes", stands_out)
 
 
 def _warn_of_bends(fitted: LocalFit, told: set[str]) -> None:
