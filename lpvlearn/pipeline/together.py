@@ -156,7 +156,7 @@ def _candidates(
 
 def _may_have(degree: int, kappa: Array) -> bool:
     """Whether there are points enough: those of a high degree meet any errors."""
-    if any(degree >= len(np.unique(column)) for column in kappa.T):
+    if degree >= max(len(np.unique(column)) for column in kappa.T):
         return False
     n_terms = len(resolvable_powers(degree, kappa))
     return n_terms < len(kappa) if degree <= _PLAIN else 2 * n_terms <= len(kappa)

@@ -171,10 +171,10 @@ class SubspaceLTI(
     feedthrough : bool or array-like of bool, default=True
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
         shape (n_outputs, n_inputs) single entries of D. A feedthrough in a closed loop
-        can be told from a controller that answers within the sample only where signals
-        are not Gaussian, as held references are: else method="auto" takes ``D = 0``
-        instead of True where something acts within the sample, unless parts held out
-        refute it.
+        can be told from a controller that answers within the sample only of a single
+        input, where signals are not Gaussian, as held references are: else
+        method="auto" takes ``D = 0`` instead of True where something acts within the
+        sample, unless parts held out refute it.
     input_delay : int, array-like of shape (n_inputs,) or "auto", default=0
         Samples by which the inputs, or each of them, act late: ``y[t]`` depends on
         ``u[t - input_delay]`` through D, on earlier inputs through the state. A sampled
@@ -368,7 +368,10 @@ class SubspaceLTI(
     simulated backward), where inputs seem to explain a quarter of its simulation errors
     or it is unstable: D is left free, or "po-moesp" taken, where that leaves less than
     half of the squared errors, or makes a plant stable that is so within its
-    uncertainty; or "po-moesp" with D free, where that leaves less than a tenth.
+    uncertainty. "po-moesp" with D free is taken where that leaves less than a tenth of
+    them and outputs seem to know later inputs, as of inputs that were filtered; and
+    where nothing but answers within the sample shows a loop, as noise of measured
+    inputs makes them, and it leaves less than a quarter.
 
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.

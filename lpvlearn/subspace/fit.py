@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from ..data.preparation import (
     remove_trends,
 )
 from ..exceptions import RankWarning
-from ..systems.beginnings import Stands, stands
+from ..systems.beginnings import stands
 from ..systems.simulation import delayed, lti_response
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .criterion import PRICE
@@ -199,14 +199,13 @@ def fit_pairs(
         _tell_of_input_spikes(pairs, choices, told, fitted)
     # The errors of a rough model are not the noise that shifts must stand out of.
     cuts = choices.offset == "auto" and choices.initial_states and choices.refine
-    whole, stand, differ = pairs, None, fitted.offsets.differ
+    whole, rest, differ = pairs, None, fitted.offsets.differ
     if cuts and not choices.estimated:
         pairs, fitted = _without_shifts(pairs, choices, told, fitted)
     if not drifting and pairs is whole:
-        stand = _stand_of(pairs, choices, fitted, known)
-    if stand is not None:
-        pairs, choices, found = _at_rest(pairs, choices, told, fitted, stand)
-        stand, fitted = (None, fitted) if found is None else (stand, found)
+        rest = _at_rest(pairs, choices, told, fitted, known)
+    if rest is not None:
+        pairs, choices, fitted, first = rest
     doubt = None
     foreseen = fitted.feedback is not None and fitted.feedback.foreseen
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
@@ -223,47 +222,51 @@ def fit_pairs(
             tell_of_answers(feedback, told)
         if known is None and not foreseen:
             _tell_of_lead(pairs, choices, told, fitted)
-    if stand is not None:
-        fitted = _moved_back(fitted, stand.first, differ)
+    if rest is not None:
+        fitted = _moved_back(fitted, first, differ)
     if detrend is None:
         return fitted
     return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
 
 
-def _stand_of(
-    pairs: Pairs, choices: Choices, fitted: LocalFit, known: LocalFit | None
-) -> Stands | None:
-    """How experiments begin, where they may at rest; others that are `known` tell."""
+class _AtRest(NamedTuple):
+    """A model of experiments that begin at rest, and what it is one of."""
+
+    pairs: Pairs  # inputs less those that the experiments begin with
+    choices: Choices
+    fitted: LocalFit
+    first: Array  # (n_experiments, n_inputs): those inputs
+
+
+def _at_rest(
+    pairs: Pairs,
+    choices: Choices,
+    told: set[str],
+    free: LocalFit,
+    known: LocalFit | None,
+) -> _AtRest | None:
+    """The model of experiments that begin at a stand, if as likely as the `free` one.
+
+    Others that are `known` tell how these begin.
+    """
     asked = choices.offset in ("auto", "constant")
     if known is not None:
         asked = not known.evidence.free.initial_states
     asked &= choices.initial_states and not choices.estimated
-    if not asked or fitted.method == "pbsid" or not len(fitted.model.A):
+    if not asked or free.method == "pbsid" or not len(free.model.A):
         return None
-    stand = stands(pairs)
-    if stand is not None and stand.first.any() and choices.offset != "constant":
-        # without a constant their answer is that to zero
-        evidence = fitted.evidence
-        if not (evidence.free.n_trend or stands_by_chance(evidence.one_step)):
-            return None
-    return stand
-
-
-def _at_rest(
-    pairs: Pairs, choices: Choices, told: set[str], free: LocalFit, stand: Stands
-) -> tuple[Pairs, Choices, LocalFit | None]:
-    """The model of experiments that begin at rest; None where likelihood refutes that.
-
-    And the samples less the inputs that these begin with, and the choices that are its.
-    """
-    moved = [(u - first, y) for (u, y), first in zip(pairs, stand.first, strict=True)]
-    at_rest = choices._replace(initial_states=False)
-    if stand.first.any():  # a level is that of the answer to these
+    stand, evidence = stands(pairs), free.evidence
+    if stand is None:
+        return None
+    first, at_rest = stand.first, choices._replace(initial_states=False)
+    if first.any():  # a level is that of the answer to these
+        sure = choices.offset == "constant" or evidence.free.n_trend
+        if not sure and not stands_by_chance(evidence.one_step):
+            return None  # without a constant it is that to zero
         at_rest = at_rest._replace(offset="constant")
+    moved = [(u - level, y) for (u, y), level in zip(pairs, first, strict=True)]
     fitted = _as_likely(moved, at_rest, told, free, stand.seen)
-    if fitted is None:
-        return pairs, choices, None
-    return moved, at_rest, fitted
+    return None if fitted is None else _AtRest(moved, at_rest, fitted, first)
 
 
 def _as_likely(
@@ -951,8 +954,9 @@ def _believable(
     """
     n_trend = first.evidence.free.n_trend
     without_d = not first.evidence.free.direct.any()
-    answered = first.feedback is not None and first.feedback.answered
-    as_said = choices.feedthrough
+    feedback, as_said = first.feedback, choices.feedthrough
+    answered = feedback is not None and feedback.answered
+    shown = feedback is not None and feedback.shown
     if answered and without_d:
         choices = choices._replace(feedthrough=False)
     same = choices._replace(offset=DETRENDS[n_trend])
@@ -1000,7 +1004,6 @@ def _believable(
             better = of_that.clearly_better_than(error, _DOUBT)
         if better:
             best, error = blind, of_blind
-        shown = first.feedback is not None and first.feedback.shown
         if answered and not shown and as_said is True:
             # noise of a measured input answers outputs as well
             other, found = rival(method="po-moesp", feedthrough=True)

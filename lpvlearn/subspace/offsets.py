@@ -170,10 +170,8 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
 
 def _far_off(y0: Array, pairs: Pairs) -> bool:
     """Whether an output is to rest farther from its range than that is wide."""
-    least, most = (
-        np.array([f(y, axis=0) for _, y in pairs]) for f in (np.nanmin, np.nanmax)
-    )
-    least, most = least.min(axis=0), most.max(axis=0)
+    y = np.vstack([y for _, y in pairs])
+    least, most = np.nanmin(y, axis=0), np.nanmax(y, axis=0)
     wide = most - least
     return bool(((y0 < least - wide) | (y0 > most + wide)).any())
 

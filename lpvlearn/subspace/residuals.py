@@ -43,6 +43,7 @@ from ..data.preparation import DETRENDS, remove_trends
 from ..exceptions import warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import StateSpace
+from ..systems.beginnings import moves_of
 from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
@@ -90,9 +91,9 @@ _MUCH, _MUCH_OF_OUTPUT, CERTAIN, _MAX_SAMPLES = 0.03, 0.003, 1e-6, 4_096
 # more than this share of the samples: others may be what the noise is.
 _SPIKE, _MUCH_OF_SPIKES, _FEW = 12.0, 0.25, 0.05
 
-# A move of an input, in parts of its range; samples that are soon after one; share of
-# all samples that are, where inputs move seldom, and of the spikes, where these follow.
-_MOVES, _SOON, _SELDOM, _MOSTLY = 0.02, 4, 0.3, 0.7
+# Samples that are soon after a move of the inputs; share of all samples that are, where
+# these move seldom, and of the spikes, where they follow.
+_SOON, _SELDOM, _MOSTLY = 4, 0.3, 0.7
 
 # Lags by which it is seen at little cost that errors are no larger than need be.
 _N_SCREEN = 10
@@ -522,12 +523,11 @@ def find_spikes(evidence: Evidence) -> Spikes | None:
 
 
 def _after_moves(u: Array) -> NDArray[np.bool_]:
-    """Samples soon after inputs (n_inputs, n_samples) move."""
-    moved = np.abs(np.diff(u, axis=1, prepend=u[:, :1])) > _MOVES * np.ptp(
-        u, axis=1, keepdims=True
-    )
-    soon = np.convolve(moved.any(axis=0), np.ones(_SOON))
-    return np.asarray(soon[: u.shape[1]] > 0.5)
+    """Which samples come soon after inputs (n_inputs, n_samples) move."""
+    after = np.zeros(u.shape[1], dtype=bool)
+    for k in moves_of(u.T) + 1:
+        after[k : k + _SOON] = True
+    return after
 
 
 def _predicted_variances(errors: Sequence[Array]) -> Array:

@@ -48,14 +48,17 @@ def _left(u: Array, n: int) -> NDArray[np.bool_]:
     return np.asarray(far.any(axis=1))
 
 
-def _held_again(u: Array) -> int:
+def _held_again(moves: NDArray[np.intp]) -> int:
     """Samples for which inputs are held at the longest later, if they move often."""
-    moves = _moved(u)
     return int(np.diff(moves).max()) if len(moves) > _OFTEN else 0
 
 
-def _moved(u: Array) -> NDArray[np.intp]:
-    """Samples after which inputs move."""
+def moves_of(u: Array) -> NDArray[np.intp]:
+    """Samples after which inputs (n_samples, n_inputs) move.
+
+    >>> moves_of(np.repeat([[2.0], [3.0], [2.0]], 4, axis=0))
+    array([3, 7])
+    """
     with np.errstate(over="ignore"):
         moved = np.abs(np.diff(u, axis=0)) > _STILL * np.ptp(u, axis=0)
     return np.flatnonzero(moved.any(axis=1))
@@ -89,11 +92,11 @@ def stands(records: Iterable[tuple[Array, Array]]) -> Stands | None:
     """
     first, seen = [], True
     for u, y in records:
-        moves = _moved(u)
+        moves = moves_of(u)
         n = int(moves[0]) + 1 if len(moves) else 0
         if not n or _left(u, n).any():
             return None  # they go on slowly
-        shown = n >= _STANDING and n > _held_again(u)  # not as they go on to do
+        shown = n >= _STANDING and n > _held_again(moves)  # not as they go on to do
         size = np.nanmax(y, axis=0) - np.nanmin(y, axis=0)
         size = np.where(size > 0.0, size, 1.0)
         if len(moves) > _SELDOM and not shown:
@@ -143,7 +146,7 @@ class Beginning(NamedTuple):
         """
         (u, y), (u0, y0) = record, rest
         n, mean = standing(u), u.mean(axis=0) if about_mean else u0
-        if n <= _held_again(u):  # as they go on to do
+        if n <= _held_again(moves_of(u)):  # as they go on to do
             n = 0
         at_mean, held = (y0 + gain @ (v - u0) for v in (mean, first_inputs(u)))
         at_rest, moved = (simulated(u[:n] - v) for v in (u0, mean))

@@ -10,6 +10,7 @@ from lpvlearn.pipeline.local_models import LocalModel
 from lpvlearn.pipeline.structured_models import StructuredModels
 from lpvlearn.pipeline.together import (
     _along_the_points,
+    _may_have,
     fitted_together,
     through_black_boxes,
 )
@@ -133,3 +134,5 @@ def test_degrees_are_those_that_few_points_tell():
     known = boxes([[estimate(row)] for row in TRUTH[:4]])
     found = fitted_together(LAGS, known, KAPPA[:4], TRUTH[:4])
     assert found.form.degree == 1
+    grid = np.array([[x, y] for x in (0.0, 1.0) for y in range(5)])
+    assert [_may_have(d, grid) for d in (1, 2, 3, 4)] == [True, True, False, False]
