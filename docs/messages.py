@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1] / "lpvlearn"
 GAP = "…"  # what a message fills in
 
 # Which argument of a call is the text that the user sees.
-_FUNNELS = {"warn": 0, "Told": 0, "tell": 2}
+_FUNNELS = {"warn": 0, "Told": 0, "once": 1}
 
 # Texts that were raised elsewhere and are handed on: they stand on the page once.
 RELAYS = {

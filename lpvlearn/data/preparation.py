@@ -7,7 +7,7 @@ replaced by independent ones.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -301,10 +301,10 @@ def _decimal_step(values: Array) -> float:
     return 0.0
 
 
-def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> None:
+def check_excitation(pairs: Pairs, called: Callable[[int], str]) -> None:
     """Refuse a single sample, and inputs that never change or are next to nothing.
 
-    Without `names` the inputs are numbered.
+    Messages have an input as it is `called` by its column.
     """
     inputs = [u for u, _ in pairs]
     if max(len(u) for u in inputs) < 2:
@@ -316,7 +316,7 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
     if len(constant):
         k = constant[0]
         raise ValueError(
-            f"Every input must vary. Got input {k if names is None else names[k]!r} "
+            f"Every input must vary. Got input {called(k)} "
             f"constant at {inputs[0][0, k]:g}: "
             "its effect cannot be told from the initial state. Excite it, or leave it "
             "out of `inputs`; a column that is no input needs its role (`scheduling=`, "
@@ -328,7 +328,7 @@ def check_excitation(pairs: Pairs, names: Sequence[Hashable] | None = None) -> N
         k = small[0]
         raise ValueError(
             f"Every column of `inputs` must reach {1.0 / SQUARED:g}, as what is below "
-            f"is zero when squared. Got {k if names is None else names[k]!r} of at "
+            f"is zero when squared. Got input {called(k)} of at "
             f"most {size[k]:.3g}: give it in a smaller unit."
         )
 

@@ -22,13 +22,31 @@ from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
 from .criterion import PRICE
-from .identification import ScaledRecords, mode_rates
+from .identification import ScaledRecords, centred, mode_rates, scale_records
 from .local_fit import LocalFit
 from .noise import Whitening
-from .offsets import CERTAIN, HARDLY_DECAYS, criterion_in_units, motion_left
-from .signals import shorten
+from .offsets import (
+    ALIKE,
+    CERTAIN,
+    HARDLY_DECAYS,
+    attributed,
+    criterion_in_units,
+    motion_left,
+    with_levels,
+)
+from .one_fit import (
+    TooFewSamples,
+    fit_once,
+    is_worth_a_choice,
+    of_order,
+)
+from .options import Choices
+from .residuals import lacks
+from .signals import output_energy, shorten
 from .simulation_fit import with_initial_states
 from .statistics import Evidence
+from .telling import Telling
+from .varx import find_feedback
 
 Array = NDArray[np.float64]
 
@@ -132,3 +150,83 @@ def drifts(whole: LocalFit, other: LocalFit, doubt: float = 0.0) -> bool:
     slowest = mode_rates(other.model.A).min(initial=1.0)
     n_followed = int((rates < min(_FOLLOWS / n_samples, _FAR * slowest)).sum())
     return better > -PRICE - CERTAIN * n_followed
+
+
+def of_drifting_noise(
+    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
+) -> LocalFit | None:
+    """The model by differences of all samples; None where their noise does not drift.
+
+    Or that of samples with as many states, where its noise does not. Where a
+    controller answers the outputs, its inputs follow the drift as well.
+    """
+    weighed = choices.refine in ("auto", "prediction") and not choices.estimated
+    if whole.method == "pbsid" or not weighed or not choices.initial_states:
+        return None
+    if whole.feedback is None or whole.feedback.found or whole.stability_loss:
+        return None
+    if not may_drift(whole):
+        return None
+    innovations = whole.feedback.innovations
+    same = choices._replace(method=whole.method, differences=True)
+    n_trend = whole.evidence.free.n_trend
+    moved, n_left = differences(pairs), max(n_trend - 1, 0)
+    if choices.offset == "auto":  # where drift begins is anywhere
+        n_trend = max(n_trend, 1)
+
+    def may_be_better_so(near: LocalFit) -> bool:
+        return drifts(whole, _of_samples(pairs, choices, near, n_trend), CERTAIN)
+
+    # From a model whose noise is slow, steps on differences may lead astray.
+    if not wanders(whole.evidence) and not is_worth_a_choice(
+        may_be_better_so, moved, same, telling, whole, n_left
+    ):
+        return None
+    try:
+        found = fit_once(moved, same, telling.aside(), n_left)
+    except TooFewSamples:
+        return None
+    if found.stability_loss:
+        return None
+    other = _of_samples(pairs, choices, found, n_trend)
+    feedback = find_feedback(other.scaled.records)
+    if feedback is None or feedback.found:
+        return None
+    other = other._replace(feedback=feedback)
+    if not drifts(whole, other):
+        return None
+    if lacks(whole.evidence, innovations) or lacks(
+        other.evidence, feedback.innovations
+    ):
+        return None  # errors that inputs explain are no drift
+    order = len(other.model.A)
+    level, worse = of_order(pairs, choices, telling, order, other, n_trend)
+    if worse < ALIKE and settles(level, other):
+        return level
+    held_out = found.selection.held_out
+    if held_out is not None:  # its errors, by those of all differences
+        share = held_out.residual / found.residual
+        held_out = held_out._replace(residual=share * other.residual)
+        selection = replace(found.selection, held_out=held_out)
+        other = other._replace(selection=selection)
+    return other
+
+
+def _of_samples(
+    pairs: Pairs, choices: Choices, found: LocalFit, n_trend: int
+) -> LocalFit:
+    """The model that was `found` of the differences of samples as one of these."""
+    moved, centres = centred(pairs, n_trend, choices.initial_states)
+    moved = [(u @ found.evidence.basis, y) for u, y in moved]
+    scaled = scale_records(moved, n_trend)
+    evidence = of_levels(found.evidence, scaled, n_trend)
+    evidence, offsets = with_levels(evidence, attributed(evidence, centres, pairs))
+    energy = output_energy(evidence.records) or 1.0
+    return found._replace(
+        model=evidence.model,
+        residual=float(np.sqrt(evidence.model.loss / energy)),
+        evidence=evidence,
+        offsets=offsets,
+        first_model=evidence.model,
+        scaled=scaled,
+    )

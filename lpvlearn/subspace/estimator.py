@@ -59,8 +59,9 @@ from ..systems.simulation import (
 )
 from ..systems.threads import one_blas_thread
 from ..validation import frequencies, input_delays, naming_argument, one_of
+from .cross_checks import tell_of_delay
 from .delay import Delay, find_delays, with_late_inputs
-from .fit import fit_pairs, tell_of_delay
+from .fit import fit_pairs
 from .fit_warnings import TESTS, warn_about, warn_about_horizon
 from .integrating import (
     RateEvidence,
@@ -92,6 +93,7 @@ from .residuals import (
 )
 from .selection import selection_text
 from .stream import SampleStream, fit_as_stream
+from .telling import Telling
 
 Array = NDArray[np.float64]
 
@@ -490,6 +492,7 @@ class SubspaceLTI(
         choices = check_options(self.get_params(deep=False))
         experiments = self._read(X, y, reset=True, cut=False)
         self._single_output = np.asarray(y).ndim == 1
+        telling = Telling(*_names_of(experiments, y))
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
             if self.detrend is not None:
                 raise ValueError(
@@ -497,16 +500,16 @@ class SubspaceLTI(
                     f"that are not there are not known. Got {self.detrend!r}. Use "
                     f"offset={self.detrend!r}."
                 )
-            experiments = self._completed(experiments, choices)
+            experiments = self._completed(experiments, choices, telling)
         elif self.missing == "split":
             warn_of_many_pieces(experiments)
-        delay, told = self._delay_of(experiments, choices), set[str]()
-        self._identify(experiments, choices, delay, told)
-        self._name(*_names_of(experiments, y))
+        delay = self._delay_of(experiments, choices)
+        self._identify(experiments, choices, delay, telling)
+        self._name(telling.inputs, telling.outputs)
         return self
 
     def _completed(
-        self, experiments: list[Experiment], choices: Choices
+        self, experiments: list[Experiment], choices: Choices, telling: Telling
     ) -> list[Experiment]:
         """Experiments with missing outputs as the model of the completed ones expects.
 
@@ -515,7 +518,7 @@ class SubspaceLTI(
         runs = runs_to_complete(experiments, at_rest=not choices.initial_states)
         if not any(map(has_gaps, runs)):
             return runs
-        warn_of_few(runs)
+        warn_of_few(runs, telling)
         completed = first_guess(runs)
         delay = self._delay_of(completed, choices)
         chosen: tuple[int, str] | None = None
@@ -523,7 +526,7 @@ class SubspaceLTI(
         moved = np.inf
         for k in range(_MOST_ROUNDS):
             with collected():  # said of the completed samples
-                fitted = self._identify(completed, choices, delay, set(), known)
+                fitted = self._identify(completed, choices, delay, Telling(), known)
             before, completed = completed, self._expected(runs, completed)
             noise = self.predictor_.covariance
             last, moved = moved, movement(runs, before, completed, noise)
@@ -629,13 +632,14 @@ class SubspaceLTI(
         experiments = first._read(X, y, reset=True, cut=False)
         first._single_output = np.asarray(y).ndim == 1
         others = [copy(first) for _ in experiments[1:]]
-        delay, told = first._delay_of(experiments[:1], choices), set[str]()
-        known = first._identify(experiments[:1], choices, delay, told)
-        told |= TESTS  # once is enough
+        delay = first._delay_of(experiments[:1], choices)
+        telling = Telling(*_names_of(experiments, y))
+        known = first._identify(experiments[:1], choices, delay, telling)
+        telling.kinds |= TESTS  # once is enough
         for other, experiment in zip(others, experiments[1:], strict=True):
-            other._identify([experiment], choices, delay, told, known)
+            other._identify([experiment], choices, delay, telling, known)
         for model in (first, *others):
-            model._name(*_names_of(experiments, y))
+            model._name(telling.inputs, telling.outputs)
         return [first, *others]
 
     @one_blas_thread
@@ -644,7 +648,7 @@ class SubspaceLTI(
         experiments: list[Experiment],
         choices: Choices,
         delay: Delay,
-        told: set[str],
+        telling: Telling,
         known: LocalFit | None = None,
     ) -> LocalFit:
         """Identify the model of experiments, by what is `known` of others like them."""
@@ -664,23 +668,24 @@ class SubspaceLTI(
         gaps |= bool(delay.any()) and choices.initial_states
         if known is not None:
             choices = known.chosen(choices)
-        fitted = fit_as_stream(pairs, choices, told, detrend=self.detrend, gaps=gaps)
+        fitted = fit_as_stream(pairs, choices, telling, detrend=self.detrend, gaps=gaps)
         if fitted is None:
             fitted = fit_pairs(
                 pairs,
                 choices,
-                told,
+                telling,
                 detrend=self.detrend,
-                names=experiments[0].input_names,
                 known=known,
             )
         self._take(fitted, self._step_of(experiments), delay)
         self.steady_start_ = choices.initial_states and self._begin_held(experiments)
-        warn_about(fitted, told)
+        warn_about(fitted, telling)
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
         if known is None and not isinstance(self.input_delay, str) and not delay.any():
-            tell_of_delay(remove_trends(pairs, self.detrend)[0], choices, told, fitted)
+            tell_of_delay(
+                remove_trends(pairs, self.detrend)[0], choices, telling, fitted
+            )
         return fitted
 
     def _fit_rates(self, X: Any, y: Any) -> Self:
@@ -851,8 +856,9 @@ class SubspaceLTI(
         self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
         if before is None:
             step, options = self._step_of(experiments), self.get_params(deep=False)
-            stream = SampleStream(choices, options, experiments, step)
-            stream.names = _names_of(experiments, y)
+            stream = SampleStream(
+                choices, options, experiments, step, _names_of(experiments, y)
+            )
             self._single_output = np.asarray(y).ndim == 1
         else:
             stream = before.branch()

@@ -30,6 +30,7 @@ from .rounding import rounded_outputs
 from .selection import MAX_ORDER, better_horizon
 from .signals import thinned
 from .statistics import OPEN, Evidence
+from .telling import Telling
 from .varx import Feedback
 
 Array = NDArray[np.float64]
@@ -73,45 +74,43 @@ _MUCH_WORSE, _POOR = 5.0, 0.2
 _GROWN = 1.1
 
 
-def tell(
-    told: set[str], kind: str, message: str, category: type[Warning] = UserWarning
-) -> None:
-    """Warn of a kind of thing that was not told before; from now on it was."""
-    if kind not in told:
-        told.add(kind)
-        warn(message, category)
-
-
-def tell_of_still_outputs(outputs: Sequence[Array], told: set[str]) -> None:
+def tell_of_still_outputs(outputs: Sequence[Array], telling: Telling) -> None:
     """Tell of outputs that never change beside others that do."""
+    if "still" in telling:
+        return
     still = constant_columns(outputs)
     if 0 < len(still) < outputs[0].shape[1]:
         k = int(still[0])
-        tell(
-            told,
+        telling.once(
             "still",
-            f"Output {k + 1} is {outputs[0][0, k]:.6g} in all samples: no input "
-            "acts on it. Check its sensor and its column, or leave it out of `y`.",
+            f"Output {telling.output(k)} is {outputs[0][0, k]:.6g} in all samples: no "
+            "input acts on it. Check its sensor and its column, or leave it out of "
+            "`y`.",
         )
 
 
-def tell_of_held_outputs(outputs: Sequence[Array], told: set[str]) -> None:
+def tell_of_held_outputs(outputs: Sequence[Array], telling: Telling) -> None:
     """Tell of outputs that are sampled more slowly than the table."""
+    if "held" in telling:
+        return
     held = [held_for([y[:, i] for y in outputs]) for i in range(outputs[0].shape[1])]
     slowest = max(held)
     if slowest > 1:
-        tell(
-            told,
+        telling.once(
             "held",
-            f"Output {held.index(slowest) + 1} keeps its values for {slowest} samples: "
-            "it was sampled more slowly than the table, and held in between as the "
-            f"response of no linear system is. Take one row of every {slowest} (the "
-            "first of each value), or `resample`.",
+            f"Output {telling.output(held.index(slowest))} keeps its values for "
+            f"{slowest} samples: it was sampled more slowly than the table, and held "
+            "in between as the response of no linear system is. Take one row of every "
+            f"{slowest} (the first of each value), or `resample`.",
         )
 
 
-def tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) -> None:
+def tell_of_limits(
+    outputs: Sequence[Array], fitted: LocalFit, telling: Telling
+) -> None:
     """Tell of an output that stays where it is though its model moves on."""
+    if "limit" in telling:
+        return
     model, records = fitted.evidence.model, fitted.scaled.records
     stays = [stays_put([y[:, i] for y in outputs]) for i in range(outputs[0].shape[1])]
     if not any(map(any, stays)) or len(model.initial_states) != len(records):
@@ -131,13 +130,12 @@ def tell_of_limits(outputs: Sequence[Array], fitted: LocalFit, told: set[str]) -
             values = sorted({v for v, _ in passed})
             some = ", ".join(f"{v:.6g}" for v in values[:_SOME])
             some += ", ..." if len(values) > _SOME else ""
-            tell(
-                told,
+            telling.once(
                 "limit",
-                f"Output {i + 1} stays at {some} for {n_passed} samples in which "
-                "its model moves on: it is at a limit, of its sensor or of the plant, "
-                "or its sensor hangs, as no linear system does. Record within the "
-                "limits, or use NaN for these samples and missing='estimate', and "
+                f"Output {telling.output(i)} stays at {some} for {n_passed} samples in "
+                "which its model moves on: it is at a limit, of its sensor or of the "
+                "plant, or its sensor hangs, as no linear system does. Record within "
+                "the limits, or use NaN for these samples and missing='estimate', and "
                 "compare.",
             )
 
@@ -155,7 +153,7 @@ def tell_of_feedback(
     fitted: LocalFit,
     choices: Choices,
     doubt: Doubt | None,
-    told: set[str],
+    telling: Telling,
 ) -> None:
     """Tell the user of feedback, and what was done about it."""
     method = choices.method
@@ -226,13 +224,12 @@ def tell_of_feedback(
             " A model that is only to simulate records of the same loop may do so "
             "better by method='po-moesp'."
         )
-    tell(told, "feedback", what)
+    telling.once("feedback", what)
 
 
-def tell_of_answers(feedback: Feedback, told: set[str]) -> None:
+def tell_of_answers(feedback: Feedback, telling: Telling) -> None:
     """Tell of an input that answers outputs, where D has it the other way round."""
-    tell(
-        told,
+    telling.once(
         "feedback",
         "The input answers outputs within the sample, and these do not answer it (p = "
         f"{feedback.p_direct:.1g}). If a controller makes it of them, D of this model "
@@ -266,51 +263,49 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
         )
 
 
-def warn_about(fitted: LocalFit, told: set[str]) -> None:
+def warn_about(fitted: LocalFit, telling: Telling) -> None:
     """Tell the user what is wrong with a model that is returned all the same.
 
-    `told` are the kinds of warnings that are not repeated; it grows by these.
+    No kind of which something was told is told of again.
     """
     model = fitted.model
     chose_order = len({row.order for row in fitted.selection.rows}) > 1
     if model.rank_deficit:
-        tell(
-            told,
+        telling.once(
             "rank",
             f"The data leave {model.rank_deficit} directions of B and D "
             "undetermined; the smallest solution was taken. Excite the inputs "
             "more richly, or lower `order`.",
             RankWarning,
         )
-    warn_about_pole(model.A, told, fitted.method)
-    _warn_of_error(fitted, chose_order, told)
-    _warn_of_spikes(fitted, told)
-    choice_is_told = TESTS <= told or fitted.residual > USELESS
+    warn_about_pole(model.A, telling, fitted.method)
+    _warn_of_error(fitted, chose_order, telling)
+    _warn_of_spikes(fitted, telling)
+    choice_is_told = TESTS <= telling.kinds or fitted.residual > USELESS
     if fitted.selection.held_out is not None and not choice_is_told:
-        _warn_about_choice(fitted, fitted.selection.held_out, told)
+        _warn_about_choice(fitted, fitted.selection.held_out, telling)
     feedback = None if fitted.method == "pbsid" else fitted.feedback
     if feedback is None or fitted.stability_loss:
         return
-    if not feedback.found and not told & _BENDS:
-        _warn_of_bends(fitted, told)
-    if "lack" in told or not lacks(fitted.evidence, feedback.innovations):
+    if not feedback.found and not telling.kinds & _BENDS:
+        _warn_of_bends(fitted, telling)
+    if "lack" in telling or not lacks(fitted.evidence, feedback.innovations):
         return
     rounded = _rounded_output(fitted.evidence)
     if rounded is not None:
         output, share = rounded
-        tell(
-            told,
+        telling.once(
             "lack",
-            f"Output {output + 1} is rounded to steps of {100.0 * share:.2g} % of its "
-            "size, and the errors of the model are hardly larger: more states would "
-            "follow what rounding does wherever the inputs repeat themselves. Keep "
-            "the `order` low, or use larger inputs or a finer sensor.",
+            f"Output {telling.output(output)} is rounded to steps of "
+            f"{100.0 * share:.2g} % of its size, and the errors of the model are "
+            "hardly larger: more states would follow what rounding does wherever the "
+            "inputs repeat themselves. Keep the `order` low, or use larger inputs or a "
+            "finer sensor.",
         )
     else:
         remedy = "a higher `order`" if chose_order else "order='auto'"
         # Without figures, so that a search over orders says it once of each.
-        tell(
-            told,
+        telling.once(
             "lack",
             "The simulation error depends on past inputs, beyond chance and by more "
             f"than a little: the model of order {len(model.A)} lacks states, a delay "
@@ -330,13 +325,12 @@ def _rounded_output(evidence: Evidence) -> tuple[int, float] | None:
     return output, float(np.sqrt(12.0 * variances[output]) / size)
 
 
-def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
+def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> None:
     """Tell of a model that explains next to nothing, or only without its stability."""
     residual, whitening = fitted.residual, fitted.evidence.whitening
     as_found = residual - fitted.stability_loss
     if residual**2 - as_found**2 > _HALF:
-        tell(
-            told,
+        telling.once(
             "enforced",
             "No stable model explains these outputs: the simulation error is "
             f"{100.0 * residual:.0f} % of their size with stability='enforce', "
@@ -345,8 +339,7 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
             "with the controller's reference as input.",
         )
     elif residual > USELESS and len(fitted.model.A) and whitening.of_differences:
-        tell(
-            told,
+        telling.once(
             "useless",
             "The outputs drift, by what the inputs do not do and more than by what "
             f"they do: the simulation error is {100.0 * residual:.0f} % of their size. "
@@ -355,8 +348,7 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
             "input, or use `predict_ahead`.",
         )
     elif residual > USELESS:
-        tell(
-            told,
+        telling.once(
             "useless",
             "The model explains next to nothing of the outputs: its simulation "
             f"error is {100.0 * residual:.0f} % of their size. Try a longer "
@@ -365,15 +357,14 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, told: set[str]) -> None:
         )
     elif follows_means_alone(fitted.evidence) or _confirms_means_alone(fitted):
         higher = "" if chose_order else ", order='auto'"
-        tell(
-            told,
+        telling.once(
             "useless",
             "The model explains where the outputs stay, and next to nothing of how "
             f"they move. Try offset='constant'{higher} or a longer `horizon`, and "
             "check that inputs and outputs belong together and in the order of time.",
         )
     elif chose_order and len(fitted.model.A) and not whitening.of_differences:
-        _warn_of_outputs(fitted, told)
+        _warn_of_outputs(fitted, telling)
 
 
 def _confirms_means_alone(fitted: LocalFit) -> bool:
@@ -384,16 +375,15 @@ def _confirms_means_alone(fitted: LocalFit) -> bool:
     return bool(held_out.bft < _NOTHING)
 
 
-def _warn_of_outputs(fitted: LocalFit, told: set[str]) -> None:
+def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
     """Tell of outputs that a model of several does not explain."""
     model, records = fitted.evidence.model, fitted.evidence.records
     if len(model.C) == 1 or len(model.initial_states) != len(records):
         return
     left = motions_left(fitted.evidence)
-    poor = [str(k + 1) for k in np.flatnonzero(left > USELESS**2)]
+    poor = [telling.output(k) for k in np.flatnonzero(left > USELESS**2)]
     if poor and len(poor) < np.count_nonzero(~np.isnan(left)):
-        tell(
-            told,
+        telling.once(
             "useless",
             f"The model explains next to nothing of output(s) {', '.join(poor)}: what "
             "moves these is mostly noise, or noise as slow as what the inputs do. Try "
@@ -402,9 +392,9 @@ def _warn_of_outputs(fitted: LocalFit, told: set[str]) -> None:
         )
 
 
-def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
+def _warn_of_spikes(fitted: LocalFit, telling: Telling) -> None:
     """Tell of samples that a sensor may have got wrong: the model follows them."""
-    spikes = None if "spikes" in told else find_spikes(fitted.evidence)
+    spikes = None if "spikes" in telling else find_spikes(fitted.evidence)
     if spikes is None:
         return
     rounded = rounded_outputs(fitted.evidence.model, fitted.evidence.records)
@@ -412,7 +402,7 @@ def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
         return  # some errors of that are larger than others
     several, n = len(fitted.evidence.records) > 1, spikes.n_found
     stands_out = (
-        f"{n} sample(s) of output {spikes.output + 1} stand far out of the "
+        f"{n} sample(s) of output {telling.output(spikes.output)} stand far out of the "
         f"errors of the model and make {100.0 * spikes.share:.0f} % of their squares; "
         f"the farthest is sample {spikes.sample}"
         f"{f' of experiment {spikes.experiment}' if several else ''}, counted from 0. "
@@ -427,30 +417,29 @@ def _warn_of_spikes(fitted: LocalFit, told: set[str]) -> None:
             "If a sensor got them wrong, they spoil the model: replace them by NaN and "
             "use missing='estimate'."
         )
-    tell(told, "spikes", stands_out)
+    telling.once("spikes", stands_out)
 
 
-def _warn_of_bends(fitted: LocalFit, told: set[str]) -> None:
+def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
     """Tell of a plant in open loop that is not linear over the range of the record.
 
     In a loop, inputs and what they do know the noise.
     """
     bent = bent_outputs(fitted.evidence)
     if bent:
-        tell(
-            told,
+        telling.once(
             "bent",
-            f"The errors of output {bent[0] + 1} follow squares or cubes of the inputs "
-            "or of what these do, beyond chance and by more than a little: over the "
-            "range of this record the system is not linear, and the model, which "
-            "stands in for it there, simulates larger, smaller or other motions "
-            "worse. Use inputs that move less, about one operating point at a time "
-            "(`split_levels` cuts a record by a signal's level), or give what bends it "
-            "as a scheduling variable.",
+            f"The errors of output {telling.output(bent[0])} follow squares or cubes "
+            "of the inputs or of what these do, beyond chance and by more than a "
+            "little: over the range of this record the system is not linear, and the "
+            "model, which stands in for it there, simulates larger, smaller or other "
+            "motions worse. Use inputs that move less, about one operating point at a "
+            "time (`split_levels` cuts a record by a signal's level), or give what "
+            "bends it as a scheduling variable.",
         )
 
 
-def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> None:
+def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, telling: Telling) -> None:
     """Tell what the samples do not confirm of a model of automatic order.
 
     Without figures, so that a search says it once.
@@ -458,8 +447,7 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
     if sum(record.u.shape[1] for record in fitted.evidence.records) < _ENOUGH:
         return
     if 1.0 - held_out.residual < _CONFIRMED * (1.0 - fitted.residual):
-        tell(
-            told,
+        telling.once(
             "held out",
             "The model simulates parts of the record that it was not fitted to far "
             "worse than the others (`selection_`): the system is nonlinear, changes "
@@ -467,16 +455,14 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "lower `order`, leave disturbed parts out, or use offset='linear'.",
         )
     if len(fitted.model.A) == MAX_ORDER == max(r.order for r in fitted.selection.rows):
-        tell(
-            told,
+        telling.once(
             "highest",
             f"The automatic order is the highest that is tried, {MAX_ORDER}: the "
             "system may have more states. Give a higher `order`, or use fewer outputs "
             "or a narrower band of frequencies.",
         )
     if _disputed(fitted):
-        tell(
-            told,
+        telling.once(
             "orders",
             "Parts held out took fewer states than the likelihood asks for, by more "
             "than chance explains (`selection_`): the system is not quite linear, or "
@@ -485,8 +471,7 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "more often, and less far if the system is not linear.",
         )
     if _may_last(fitted):
-        tell(
-            told,
+        telling.once(
             "decay",
             "A mode of the model does not decay over the longest experiment, nor by "
             "more than the standard deviation of its poles (`poles_std_`). It may be "
@@ -496,20 +481,20 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, told: set[str]) -> N
             "longer, with inputs that move more often.",
         )
 
-    _warn_of_unknown_response(fitted, told)
+    _warn_of_unknown_response(fitted, telling)
 
 
-def _warn_of_unknown_response(fitted: LocalFit, told: set[str]) -> None:
+def _warn_of_unknown_response(fitted: LocalFit, telling: Telling) -> None:
     """Tell where the inputs excite the system too little to tell its response."""
     gain = fitted.evidence.static_gain()
     if gain is None:
         return
     if gain.unknown.any():
-        output, which = np.argwhere(gain.unknown)[0] + 1
-        tell(
-            told,
+        output, which = np.argwhere(gain.unknown)[0]
+        telling.once(
             "static gain",
-            f"The static gain (from input {which} to output {output}) is known no "
+            f"The static gain (from input {telling.input(which)} to output "
+            f"{telling.output(output)}) is known no "
             "better than to its own size: the record excites slow motions too little "
             "to tell it. Record for longer, with inputs that are held for longer, or "
             "lower `order`; at higher frequencies the model may be right "
@@ -519,8 +504,7 @@ def _warn_of_unknown_response(fitted: LocalFit, told: set[str]) -> None:
     share, omega = fitted.evidence.unknown_share(gain.size)
     if share > OPEN:
         period = f"{2.0 * np.pi / omega:.3g}" if omega else "many"
-        tell(
-            told,
+        telling.once(
             "response",
             "The response is hardly known (`frequency_response_std`) at frequencies "
             "that the record hardly excites, least for oscillations with a period of "
@@ -559,7 +543,7 @@ def _may_last(fitted: LocalFit) -> bool:
     return bool((lasting & unknown).any())
 
 
-def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
+def warn_about_pole(A: Array, telling: Telling, method: str = "po-moesp") -> None:
     """Tell the user that a model is unstable, or on the border of that."""
     poles = np.linalg.eigvals(A)
     moduli = np.abs(poles)
@@ -580,16 +564,14 @@ def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
                 "for long nor brought into a structure: for that, identify the closed "
                 "loop, with the controller's reference as input."
             )
-        tell(
-            told,
+        telling.once(
             "pole",
             f"The identified model is unstable: a pole has modulus {radius:.6g}. "
             + remedy,
         )
     elif radius >= 1.0 - _INSIDE:
         count = int((moduli >= 1.0 - _INSIDE).sum())
-        tell(
-            told,
+        telling.once(
             "border",
             "The identified model is on the border of stability, by integrators or "
             f"undamped oscillations: {count} of its poles at modulus 1, to rounding. "
@@ -600,7 +582,7 @@ def warn_about_pole(A: Array, told: set[str], method: str = "po-moesp") -> None:
 
 
 def warn_about_drift(
-    error: float, first: float, n_samples: int, told: set[str]
+    error: float, first: float, n_samples: int, telling: Telling
 ) -> None:
     """Tell the user where a stream does not go on as its first samples began.
 
@@ -609,8 +591,7 @@ def warn_about_drift(
     """
     poor = error > min(USELESS, max(_POOR, _MUCH_WORSE * first))
     if poor and error > _GROWN * first:
-        tell(
-            told,
+        telling.once(
             "drift",
             f"The simulation error of the stream is {100.0 * error:.3g} % of the "
             f"outputs, after {100.0 * first:.3g} % over its first {n_samples:,} "

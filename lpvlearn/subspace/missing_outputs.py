@@ -27,6 +27,7 @@ from ..exceptions import warn
 from ..models.innovation import InnovationModel, NoiseModel
 from ..systems.simulation import lti_response, state_trajectory
 from .noise import autoregression
+from .telling import Telling
 
 Array = NDArray[np.float64]
 
@@ -95,16 +96,17 @@ def warn_of_many_pieces(experiments: Sequence[Experiment]) -> None:
         )
 
 
-def warn_of_few(runs: Sequence[Experiment]) -> None:
+def warn_of_few(runs: Sequence[Experiment], telling: Telling) -> None:
     """Tell of an output that is hardly there."""
     known = np.mean(np.vstack([np.isfinite(run.measured) for run in runs]), axis=0)
     rarest = int(np.argmin(known))
     if known[rarest] < _FEW:
         warn(
-            f"Output {rarest + 1} is missing in {100.0 * (1.0 - known[rarest]):.0f} % "
-            "of the samples: so few tell little of the order, and the model may be far "
-            "from the system without its bands (`frequency_response_std`) showing it. "
-            "Give `order`, record that output more often, or leave it out."
+            f"Output {telling.output(rarest)} is missing in "
+            f"{100.0 * (1.0 - known[rarest]):.0f} % of the samples: so few tell little "
+            "of the order, and the model may be far from the system without its bands "
+            "(`frequency_response_std`) showing it. Give `order`, record that output "
+            "more often, or leave it out."
         )
 
 

@@ -31,7 +31,16 @@ import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
+from .local_fit import LocalFit
+from .offsets import shifts_matter
+from .one_fit import (
+    TooFewSamples,
+    errors_held_out,
+    fit_once,
+)
+from .options import Choices
 from .signals import Record
+from .telling import Telling
 from .varx import Regression, regression_of, samples_of
 
 Array = NDArray[np.float64]
@@ -189,3 +198,53 @@ def cut_at(pairs: Pairs, shifts: Sequence[Sequence[int]]) -> Pairs:
         )
         if stop > start
     ]
+
+
+def without_shifts(
+    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
+) -> tuple[Pairs, LocalFit]:
+    """Cut the experiments where levels shift, if that explains them clearly better.
+
+    One step ahead, where noise alone explains all that moves slowly: parts that leave
+    inputs nothing to explain, or models of a given order, whose errors may be its lack
+    of states, must simulate as much of what is held out as the whole.
+    Short ones hide in their initial states that a mode would grow.
+    """
+    feedback = whole.feedback
+    # The errors of a rough model are not the noise that shifts must stand out of.
+    asked = choices.offset == "auto" and choices.initial_states and choices.refine
+    if not asked or choices.estimated or feedback is None:
+        return pairs, whole
+    shifts = find_shifts(whole.scaled.records, feedback.regression)
+    if not any(shifts):
+        return pairs, whole
+    parts = cut_at(pairs, shifts)
+    rests = np.all([np.ptp(u, axis=0) == 0.0 for u, _ in parts], axis=0)
+    if rests.any():  # an input tells nothing of any part: its step made the shift
+        return pairs, whole
+    try:
+        fitted = fit_once(parts, choices, telling, 1, whole)
+    except TooFewSamples:
+        return pairs, whole
+    if not shifts_matter(whole.evidence.one_step, fitted.evidence.one_step):
+        return pairs, whole
+    if fitted.grows() and not whole.grows():
+        return pairs, whole
+    given = choices.order is not None
+    if whole.selection.order and (given or not fitted.selection.order):
+        if errors_held_out(fitted, choices).bft < errors_held_out(whole, choices).bft:
+            return pairs, whole
+    samples = "; ".join(
+        f"{', '.join(map(str, cuts))}{f' of experiment {k}' if len(pairs) > 1 else ''}"
+        for k, cuts in enumerate(shifts)
+        if cuts
+    )
+    telling.once(
+        "shifts",
+        f"The outputs shift at sample(s) {samples}, counted from 0, by what the inputs "
+        "do not explain: a load came or went, a sensor moved, or the system is not "
+        "linear. What lies between was fitted as experiments of their own, each with "
+        "its constant (`output_offset_`). Give a load that you know as an input; "
+        "offset='constant' or None fits the whole.",
+    )
+    return parts, fitted

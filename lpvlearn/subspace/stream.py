@@ -37,10 +37,11 @@ from ..systems.threads import one_blas_thread
 from ..validation import SQUARED, input_delays
 from .delay import late_inputs
 from .fit import TooFewSamples, fit_pairs
-from .fit_warnings import tell, warn_about, warn_about_drift, warn_about_pole
+from .fit_warnings import warn_about, warn_about_drift, warn_about_pole
 from .local_fit import LocalFit
 from .options import Choices
 from .stream_summary import Piece, StreamSummary
+from .telling import Telling
 
 Array = NDArray[np.float64]
 
@@ -260,14 +261,15 @@ class SampleStream:
         options: Mapping[str, Any],
         first: Sequence[Experiment],
         step: float,
+        names: tuple[Any, Any],
     ) -> None:
         self._choices, self._options = choices, deepcopy(options)
         self._given_step, self._names = step, first[0].input_names
-        self.names: tuple[Any, Any] = (None, None)  # of the model's inputs and outputs
+        self.names = names  # of inputs and outputs, or None
         n_inputs, self._n_outputs = first[0].inputs.shape[1], first[0].measured.shape[1]
         settings = choices.settings(self._n_outputs, n_inputs, np.eye(n_inputs))
         settings.check_size([BUFFER], choices.order, choices.horizon)
-        self._told: set[str] = set()
+        self._telling = Telling(*names)
         gaps = options["missing"] == "split"
         self._clock = StreamClock(options["time_tol"], gaps)
         self._label: Hashable = None  # of the sample that came last
@@ -298,7 +300,7 @@ class SampleStream:
         What waits is taken up.
         """
         other = copy(self)
-        other._told, other._clock = set(self._told), copy(self._clock)
+        other._telling, other._clock = self._telling.aside(), copy(self._clock)
         other._buffer, other._summary = self._buffer.branch(), copy(self._summary)
         if self._n_waiting:
             batches = zip(*self._waiting[: self._n_batches], strict=True)
@@ -463,22 +465,21 @@ class SampleStream:
         while True:
             full = bool(left) or buffer.n_samples >= BUFFER
             try:
-                fitted = fit_pairs(buffer.pairs, choices, self._told, names=self._names)
+                fitted = fit_pairs(buffer.pairs, choices, self._telling)
                 break
             except TooFewSamples as error:
                 if not full:
                     return None, left  # more samples may come
                 if not choices.initial_states:
                     raise  # what is cut off at its start did not start from rest
-                tell(
-                    self._told,
+                self._telling.once(
                     "waiting",
                     f"The first {BUFFER:,} samples of the stream leave it without a "
                     "model, and its oldest samples are left out until it has one. "
                     f"{error}",
                 )
                 left = buffer.slide(left)
-        warn_about(fitted, self._told)
+        warn_about(fitted, self._telling)
         if full:
             self._summary = StreamSummary(fitted, choices, buffer.n_samples)
             self._first_residual = fitted.residual
@@ -488,10 +489,10 @@ class SampleStream:
     @one_blas_thread
     def _fit_summaries(self, summary: StreamSummary) -> LocalFit:
         fitted = summary.fit()
-        warn_about_pole(fitted.model.A, self._told)
+        warn_about_pole(fitted.model.A, self._telling)
         # A linearisation may not see itself how far off it is.
         error = np.fmax(fitted.residual, summary.latest_error(fitted.model))
-        warn_about_drift(float(error), self._first_residual, BUFFER, self._told)
+        warn_about_drift(float(error), self._first_residual, BUFFER, self._telling)
         return fitted
 
 
@@ -512,12 +513,12 @@ def _same(first: Any, other: Any) -> bool:
 
 
 def fit_as_stream(
-    pairs: Pairs, choices: Choices, told: set[str], *, detrend: str | None, gaps: bool
+    pairs: Pairs, choices: Choices, telling: Telling, *, detrend: str | None, gaps: bool
 ) -> LocalFit | None:
     """Fit a long table as a stream of its samples; `gaps` as in `SampleBuffer`.
 
     None where that would not do: few samples, first ones that say too little, or a
-    closed loop. `told` as in `fit_pairs`.
+    closed loop.
     """
     if sum(len(u) for u, _ in pairs) <= BUFFER or choices.method == "pbsid":
         return None
@@ -528,7 +529,7 @@ def fit_as_stream(
     if not _as_independent(first, pairs):
         return None
     try:
-        begun = fit_pairs(first, choices, told)
+        begun = fit_pairs(first, choices, telling)
         if begun.method == "pbsid":
             return None
         choices = choices._replace(method=begun.method)

@@ -8,11 +8,12 @@ from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.metrics import bft_score
-from lpvlearn.subspace import fit
+from lpvlearn.subspace import drift, trends
 from lpvlearn.subspace.drift import differences, of_levels
-from lpvlearn.subspace.fit import _fit
+from lpvlearn.subspace.one_fit import fit_once
 from lpvlearn.subspace.options import Choices
 from lpvlearn.subspace.statistics import StaticGain
+from lpvlearn.subspace.telling import Telling
 
 
 def _plant(slow=30.0, fast=6.0):
@@ -54,8 +55,8 @@ class TestOfLevels:
         y = plant.simulate(u, initial_state=[0.3, -1.0]) + 2.0 * (offset is not None)
         choices = Choices(order=2, horizon=8, offset=offset)
         n_trend = int(offset is not None)
-        whole = _fit([(u, y)], choices, set(), n_trend)
-        found = _fit(differences([(u, y)]), choices, set(), 0)
+        whole = fit_once([(u, y)], choices, Telling(), n_trend)
+        found = fit_once(differences([(u, y)]), choices, Telling(), 0)
         evidence = of_levels(found.evidence, whole.scaled, n_trend)
         omega = np.linspace(1e-3, np.pi, 20)
         response = evidence.state_space(evidence.model, 1.0)
@@ -74,8 +75,8 @@ class TestOfLevels:
         u = np.cumsum(rng.standard_normal((400, 2)), axis=0) * [1e-3, 1e2]
         y = plant.simulate(u)
         choices = Choices(order=3, horizon=8)
-        whole = _fit([(u, y)], choices, set(), 0)
-        found = _fit(differences([(u, y)]), choices, set(), 0)
+        whole = fit_once([(u, y)], choices, Telling(), 0)
+        found = fit_once(differences([(u, y)]), choices, Telling(), 0)
         evidence = of_levels(found.evidence, whole.scaled, 0)
         assert_allclose(
             evidence.state_space(evidence.model, 1.0).dc_gain(),
@@ -169,8 +170,8 @@ class TestOutputsThatDoNotDrift:
 
     def test_nothing_drifts_beside_as_many_states(self, monkeypatch):
         """Whatever the samples looked like with others."""
-        monkeypatch.setattr(fit, "may_drift", lambda fitted: True)
-        monkeypatch.setattr(fit, "drifts", lambda whole, other, doubt=0.0: True)
+        monkeypatch.setattr(drift, "may_drift", lambda fitted: True)
+        monkeypatch.setattr(drift, "drifts", lambda whole, other, doubt=0.0: True)
         u, y = _record(0, drift=0.0, noise=0.3)
         model = _quiet_fit(u, y)
         assert not _of_differences(model)
@@ -189,7 +190,7 @@ class TestOutputsThatDoNotDrift:
             SimpleNamespace(static_gain=lambda gain=gain: gain)
             for gain in (known, lost, None)
         ]
-        takes = [[fit._takes_a_gain(a, b) for b in evidence] for a in evidence]
+        takes = [[trends._takes_a_gain(a, b) for b in evidence] for a in evidence]
         assert takes == [[False, True, False]] + [[False] * 3] * 2
 
     def test_what_was_said_of_the_refinement_is_heeded(self):

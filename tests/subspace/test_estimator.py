@@ -290,7 +290,7 @@ def test_options_are_refused_with_the_remedy(rng, options, message):
 
 def test_constant_input_is_refused(rng):
     X = np.column_stack([rng.standard_normal(50), np.full(50, 2.0)])
-    with pytest.raises(ValueError, match="Every input must vary. Got input 1"):
+    with pytest.raises(ValueError, match="Every input must vary. Got input 2"):
         SubspaceLTI().fit(X, X[:, 0])
 
 

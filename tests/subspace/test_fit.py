@@ -15,6 +15,7 @@ from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace.fit import fit_pairs
 from lpvlearn.subspace.fit_warnings import warn_about
 from lpvlearn.subspace.options import Choices, check_options
+from lpvlearn.subspace.telling import Telling
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
@@ -206,7 +207,7 @@ def test_inputs_that_are_next_to_nothing_are_named(unit):
     rng = np.random.default_rng(0)
     X = pd.DataFrame(rng.normal(size=(100, 2)), columns=["valve", "fan"])
     y = X.to_numpy().sum(axis=1)
-    with pytest.raises(ValueError, match="Got 'fan' of at most .* smaller unit"):
+    with pytest.raises(ValueError, match="Got input 'fan' of at most .* smaller unit"):
         SubspaceLTI(1).fit(X * [1.0, unit], y)
     SubspaceLTI(1).fit(X * [1.0, 1e-149], y)
 
@@ -405,6 +406,9 @@ def test_a_sensor_that_hangs_is_told():
         y[start : start + 30] = y[start]
     with pytest.warns(UserWarning, match="Output 1 stays at .* for 60 samples"):
         SubspaceLTI(1, offset=None).fit(u, y)
+    X, named = pd.DataFrame(u, columns=["pump"]), pd.Series(y[:, 0], name="level")
+    with pytest.warns(UserWarning, match="Output 'level' stays at .* for 60 samples"):
+        SubspaceLTI(1, offset=None).fit(X, named)
     y[100:130] = y[300:330] = np.nan
     SubspaceLTI(1, missing="estimate").fit(u, y)
 
@@ -439,13 +443,13 @@ def test_a_fit_that_parts_held_out_do_not_confirm_is_told(rng):
     u, y = record(rng, 300)
     y = y + 0.1 * rng.standard_normal(y.shape)
     choices = check_options(SubspaceLTI().get_params())
-    fitted = fit_pairs([(u, y)], choices, set())
+    fitted = fit_pairs([(u, y)], choices, Telling())
     for residual, expected in ((0.05, 0), (0.4, 0), (0.6, 1)):
         held_out = fitted.selection.held_out._replace(residual=residual)
         poor = fitted._replace(selection=replace(fitted.selection, held_out=held_out))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            warn_about(poor, set())
+            warn_about(poor, Telling())
         assert sum("far worse" in str(w.message) for w in told) == expected
 
 
@@ -473,7 +477,7 @@ def test_an_order_that_the_likelihood_disputes_is_told(rng):
     """By more than 30: of a chance of 1e-7."""
     u, e = rng.standard_normal((2, 300, 1))
     y = lfilter([0.0, 1.0], [1.0, -0.7], u, axis=0) + 0.1 * e
-    fitted = fit_pairs([(u, y)], check_options(SubspaceLTI().get_params()), set())
+    fitted = fit_pairs([(u, y)], check_options(SubspaceLTI().get_params()), Telling())
     chosen = fitted.selection.order, fitted.selection.horizon
     for excess in (29.0, 31.0):
         rows = [
@@ -483,7 +487,7 @@ def test_an_order_that_the_likelihood_disputes_is_told(rng):
         disputed = fitted._replace(selection=replace(fitted.selection, rows=rows))
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            warn_about(disputed, set())
+            warn_about(disputed, Telling())
         assert [str(w.message)[:14] for w in told] == ["Parts held out"] * (excess > 30)
 
 
@@ -508,7 +512,7 @@ def test_experiments_that_contradict_one_another_are_told(gains):
             u = rng.standard_normal((400, 1))
             y = gain * system.simulate(u)
             pairs.append((u, y + 0.3 * y.std() * rng.standard_normal(y.shape)))
-        told = set()
+        told = Telling()
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             fit_pairs(pairs, Choices(order=2), told)
@@ -601,12 +605,12 @@ def test_parts_that_only_means_explain_are_told(bft, told, rng):
     u = np.repeat(rng.standard_normal((30, 1)), 10, axis=0)
     y = 20.0 + StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0).simulate(u)
     y = y + 0.01 * rng.standard_normal(y.shape)
-    fitted = fit_pairs([(u + 10.0, y)], Choices(), set())
+    fitted = fit_pairs([(u + 10.0, y)], Choices(), Telling())
     held_out = fitted.selection.held_out._replace(bft=bft)
     selection = replace(fitted.selection, held_out=held_out)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        warn_about(fitted._replace(selection=selection), set())
+        warn_about(fitted._replace(selection=selection), Telling())
     heard = [w for w in caught if "explains where the outputs stay" in str(w.message)]
     assert len(heard) == told
 
@@ -627,7 +631,7 @@ def test_what_only_rounding_tells_apart_is_not_told_apart(offset):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model = SubspaceLTI(1, offset=offset).fit(X.round(4), outputs(X))
-    (told,) = (w for w in caught if "The inputs a, b, c add up" in str(w.message))
+    (told,) = (w for w in caught if "The inputs 'a', 'b', 'c' add up" in str(w.message))
     assert told.category is RankWarning
     assert np.abs(model.lti_.D).max() < 1.0 and np.abs(model.lti_.B).max() < 3.0
     fresh, y = fresh.round(4), outputs(fresh)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI
-from lpvlearn.subspace import fit
+from lpvlearn.subspace import shifts
 from lpvlearn.subspace.shifts import _statistics, cut_at, find_shifts
 from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.varx import find_feedback, longest_past, regression_of
@@ -118,14 +118,14 @@ def test_cuts_for_a_given_order_must_simulate_as_much_held_out(better, monkeypat
     u, y = slow_record(rng, 900)
     y = y + np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
     order = SubspaceLTI(offset="constant").fit(u, y).order_
-    told = fit._held_out
+    told = shifts.errors_held_out
 
     def held_out(fitted, choices):
         found = told(fitted, choices)
         cut = len(fitted.scaled.records) > 1
         return found._replace(bft=found.bft if better or not cut else -1e3)
 
-    monkeypatch.setattr(fit, "_held_out", held_out)
+    monkeypatch.setattr(shifts, "errors_held_out", held_out)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found = SubspaceLTI(order).fit(u, y)
@@ -138,12 +138,12 @@ def test_cuts_that_leave_inputs_nothing_to_explain_are_not_made(monkeypatch):
     u, y = slow_record(rng, 900)
     y = y + 0.1 * np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
 
-    def fitted(pairs, choices, *args, like=fit._fit):
+    def fitted(pairs, choices, *args, like=shifts.fit_once):
         order = 0 if len(pairs) > 1 else choices.order
         return like(pairs, choices._replace(order=order), *args)
 
-    monkeypatch.setattr(fit, "_fit", fitted)
-    monkeypatch.setattr(fit, "shifts_matter", lambda whole, parts: True)
+    monkeypatch.setattr(shifts, "fit_once", fitted)
+    monkeypatch.setattr(shifts, "shifts_matter", lambda whole, parts: True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the shifts do
         found = SubspaceLTI().fit(u, y)
@@ -156,7 +156,7 @@ def test_cuts_that_make_a_stable_model_grow_are_not_made(monkeypatch):
     u, y = slow_record(rng, 900)
     y = y + 0.1 * np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
 
-    def fitted(pairs, *args, like=fit._fit):
+    def fitted(pairs, *args, like=shifts.fit_once):
         found = like(pairs, *args)
         if len(pairs) == 1:
             return found
@@ -165,8 +165,8 @@ def test_cuts_that_make_a_stable_model_grow_are_not_made(monkeypatch):
         evidence = replace(evidence, model=grown)
         return found._replace(evidence=evidence, model=grown)
 
-    monkeypatch.setattr(fit, "_fit", fitted)
-    monkeypatch.setattr(fit, "shifts_matter", lambda whole, parts: True)
+    monkeypatch.setattr(shifts, "fit_once", fitted)
+    monkeypatch.setattr(shifts, "shifts_matter", lambda whole, parts: True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the shifts do
         found = SubspaceLTI(2).fit(u, y)

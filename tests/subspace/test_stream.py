@@ -415,7 +415,7 @@ def test_errors_of_the_linear_algebra_are_not_taken_for_few_samples(
     u, y = record(system, 900)
     model = SubspaceLTI(5, horizon=8).partial_fit(u[:300], y[:300])
     with monkeypatch.context() as patched:
-        patched.setattr("lpvlearn.subspace.fit.identify", diverge)
+        patched.setattr("lpvlearn.subspace.one_fit.identify", diverge)
         refused(model, u[300:], y[300:], "did not converge")
     model.partial_fit(u[300:], y[300:])
     whole = SubspaceLTI(5, horizon=8).fit(u, y)

@@ -1,0 +1,135 @@
+"""Experiments that begin at a stand: models of which these begin at rest."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.preparation import Pairs
+from ..systems.beginnings import stands
+from .criterion import PRICE
+from .identification import spectral_radius
+from .local_fit import LocalFit
+from .offsets import ALIKE, CERTAIN, HARDLY_DECAYS, criterion_in_units, stands_by_chance
+from .one_fit import TooFewSamples, of_order
+from .options import Choices
+from .simulation_fit import simulation_errors
+from .statistics import Evidence
+from .telling import Telling
+from .trends import with_trends
+
+Array = NDArray[np.float64]
+
+# Times the squared errors of free initial states, of rest at the beginning; and the
+# least of it that is told from none.
+_NOT_FAR_WORSE, _LEAST = 3.0, 1e-30
+
+
+class AtRest(NamedTuple):
+    """A model of experiments that begin at rest, and what it is one of."""
+
+    pairs: Pairs  # inputs less those that the experiments begin with
+    choices: Choices
+    fitted: LocalFit
+    first: Array  # (n_experiments, n_inputs): those inputs
+
+
+def from_rest(
+    pairs: Pairs,
+    choices: Choices,
+    telling: Telling,
+    free: LocalFit,
+    known: LocalFit | None,
+) -> AtRest | None:
+    """The model of experiments that begin at a stand, if as likely as the `free` one.
+
+    Others that are `known` tell how these begin.
+    """
+    asked = choices.offset in ("auto", "constant")
+    if known is not None:
+        asked = not known.evidence.free.initial_states
+    asked &= choices.initial_states and not choices.estimated
+    if not asked or free.method == "pbsid" or not len(free.model.A):
+        return None
+    stand, evidence = stands(pairs), free.evidence
+    if stand is None:
+        return None
+    first, at_rest = stand.first, choices._replace(initial_states=False)
+    if first.any():  # a level is that of the answer to these
+        sure = choices.offset == "constant" or evidence.free.n_trend
+        if not sure and not stands_by_chance(evidence.one_step):
+            return None  # without a constant it is that to zero
+        at_rest = at_rest._replace(offset="constant")
+    moved = [(u - level, y) for (u, y), level in zip(pairs, first, strict=True)]
+    fitted = _as_likely(moved, at_rest, telling, free, stand.seen)
+    return None if fitted is None else AtRest(moved, at_rest, fitted, first)
+
+
+def _as_likely(
+    pairs: Pairs, choices: Choices, telling: Telling, free: LocalFit, seen: bool
+) -> LocalFit | None:
+    """The model from rest, unless that is less likely than `free` initial states.
+
+    These and a constant may balance each other for as long as inputs stand still, and
+    leave of the static gain what noise makes of it. Of rest that is not `seen` in the
+    outputs, or instead of a drift, likelihood is asked for more. The criterion, to
+    which the first errors count little, may be met by noise that takes what states do:
+    so the errors themselves must hardly be larger.
+    """
+    try:
+        fitted = with_trends(pairs, choices, telling, free)
+    except TooFewSamples:
+        return None
+    own, other = fitted.evidence, free.evidence
+    by_chance, drifts_off = stands_by_chance(other.one_step), other.free.n_trend > 1
+    rate = 1.0 - spectral_radius(own.model.A)
+    settles = rate * own.longest > (HARDLY_DECAYS if drifts_off else 1.0)
+    if not (len(own.model.A) and settles):
+        return None
+    left, plainly = _plain_errors(own, other)
+    worse = criterion_in_units(own.one_step) - criterion_in_units(other.one_step)
+    most = CERTAIN if by_chance else ALIKE
+    if not worse <= most * ((seen and not drifts_off) or left < 1.0):
+        return None
+    if by_chance:
+        return fitted if left < _NOT_FAR_WORSE else None
+    order = len(other.model.A)
+    allowed = ALIKE + PRICE * order * len(pairs)
+    if plainly > allowed and len(own.model.A) < order:  # a state is missing, not rest
+        as_many, _ = of_order(pairs, choices, telling, order, fitted, own.free.n_trend)
+        left, plainly = _plain_errors(as_many.evidence, other)
+    return fitted if plainly <= allowed else None
+
+
+def _plain_errors(own: Evidence, other: Evidence) -> tuple[float, float]:
+    """Squared errors of simulation by another's; and how much less likely they are.
+
+    Twice the logarithm of that, as of fewer values that are white: by how much errors
+    of the other correlate with those a sample before.
+    """
+    errors, others = (
+        np.vstack(simulation_errors(e.model, e.records)) * e.output_scale
+        for e in (own, other)
+    )
+    ratios, unlikely = [], 0.0
+    for e, before in zip(errors.T, others.T, strict=True):
+        squares = float(before @ before)
+        if squares > 0.0:
+            ratios.append(max(float(e @ e) / squares, _LEAST))
+            r = min(max(float(before[1:] @ before[:-1]) / squares, 0.0), 1.0)
+            unlikely += len(before) * (1.0 - r) / (1.0 + r) * np.log(ratios[-1])
+    return float(np.mean(ratios or [1.0])), float(unlikely)
+
+
+def moved_back(fitted: LocalFit, first: Array, differ: bool) -> LocalFit:
+    """The model of inputs as they are, from that of inputs less the first ones.
+
+    Whether constants `differ` was told without these.
+    """
+    offsets = fitted.offsets.shifted(first, np.zeros(1))
+    gain = fitted.evidence.state_space(fitted.model, 1.0).dc_gain()
+    constants = offsets.constants - first @ gain.T
+    offsets = offsets._replace(constants=constants, differ=differ)
+    return fitted._replace(offsets=offsets)

@@ -1,0 +1,243 @@
+"""What is wrong with samples, as fits of other or changed ones show."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..data.preparation import DETRENDS, Pairs, Rounded, far_out
+from ..exceptions import RankWarning
+from ..systems.simulation import delayed, lti_response
+from .delay import first_samples, longest_delays
+from .local_fit import LocalFit
+from .offsets import CERTAIN, criterion_in_units
+from .one_fit import TooFewSamples, errors_held_out, fit_once
+from .options import Choices
+from .simulation_fit import simulation_errors, with_initial_states
+from .telling import Telling
+from .trends import with_trends
+
+_ROUGH = 0.1  # share of the outputs' size, left by a model, that is looked into
+
+# Experiments contradict one another where models of each leave less than this share of
+# the squared errors of the one for all. That is looked into for the longest ones, of so
+# many samples a parameter.
+_CONTRADICTED, _MOST_ALONE, _VALUES_EACH = 0.25, 6, 10
+
+# Share of the error that is left without samples of inputs that are not answered.
+_ANSWERED = 0.6
+
+# Samples of a delay, or states in its place, that are told: fewer cost next to nothing.
+# The response of the model comes to half its height within so many times a delay, over
+# so many times of which that is looked for, and is not so high yet half the way there.
+_LATE, _FEWER = 3, 2
+
+_RISEN, _WHOLE, _EARLY = 4, 20, 0.25
+
+# Standard errors by which parts held out must be simulated better.
+_CLEARLY = 2.0
+
+# Of inputs that only rounding tells apart: times the gain of all others, of a model
+# that makes of the ripple what it likes, at these frequencies (rad per sample); and the
+# part of the largest ripple from which an input is one of them.
+_WILD, _LOOKED_AT, _PART = 10.0, np.geomspace(1e-2, 3.0, 8), 0.05
+
+
+def tell_of_contradiction(
+    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
+) -> None:
+    """Tell of experiments that one model cannot explain, and models of each do."""
+    free, same = whole.evidence.free, whole.chosen(choices)
+    records, model = whole.scaled.records, whole.evidence.model
+    if len(pairs) < 2 or not whole.residual > _ROUGH or "contradiction" in telling:
+        return
+    if whole.method == "pbsid" or choices.estimated or len(records) != len(pairs):
+        return
+    n_values = model.C.size + model.B.size + np.count_nonzero(free.direct)
+    least = _VALUES_EACH * (n_values + len(model.A))
+    lengths = np.array([record.y.size for record in records])
+    some = [
+        k
+        for k in np.argsort(-lengths)[:_MOST_ALONE]
+        if lengths[k] >= least and np.ptp(pairs[k][0], axis=0).all()  # inputs move
+    ]
+    found = simulation_errors(with_initial_states(model, records, free), records)
+    energies = []
+    for k in some:
+        try:
+            other = fit_once(
+                [pairs[k]], same, telling.aside("collinear"), free.n_trend, whole
+            )
+        except TooFewSamples:
+            continue
+        own = other.scaled.records
+        scale = other.evidence.output_scale / whole.evidence.output_scale
+        errors = simulation_errors(other.evidence.model, own)[0] * scale
+        size = np.sum(records[k].y ** 2)
+        energies.append([np.sum(found[k] ** 2), np.sum(errors**2), size])
+    if len(energies) < 2:
+        return
+    together, apart, size = np.sum(energies, axis=0)
+    if apart < _CONTRADICTED * together:
+        left, alone = 100.0 * np.sqrt([together / size, apart / size])
+        telling.once(
+            "contradiction",
+            "The experiments contradict one another: of their outputs one model leaves "
+            f"{left:.2g} %, models of each alone leave {max(alone, 0.01):.2g} %. The "
+            "system was not the same in them (a load, a setting, the sign of a "
+            "sensor), or it is not linear. Check them, give what differs as a "
+            "scheduling variable, or leave out those that do not belong here.",
+        )
+
+
+def tell_of_input_spikes(
+    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
+) -> None:
+    """Tell of single samples of an input that the outputs do not answer."""
+    if not whole.residual > _ROUGH or "input spikes" in telling:
+        return
+    without, found = [], []
+    for k, (u, y) in enumerate(pairs):
+        spikes = far_out(u)
+        u = u.copy()
+        for i, j in np.argwhere(spikes):
+            u[i, j] = 0.5 * (u[i - 1, j] + u[i + 1, j])
+            found.append((j, k, i))
+        without.append((u, y))
+    if not found:
+        return
+    n_trend = whole.evidence.free.n_trend
+    try:
+        other = fit_once(without, whole.chosen(choices), telling.aside(), n_trend)
+    except TooFewSamples:
+        return
+    if other.residual < _ANSWERED * whole.residual:
+        j, k, i = found[0]
+        where = f"sample {i}{f' of experiment {k}' if len(pairs) > 1 else ''}"
+        telling.once(
+            "input spikes",
+            f"{len(found)} sample(s) of the inputs stand far out, and the outputs do "
+            f"not answer them; the first is {where} of input {telling.input(j)}, "
+            "counted from 0. With what their neighbours have in their place a model "
+            "leaves "
+            f"{100.0 * other.residual:.2g} % of the outputs, not "
+            f"{100.0 * whole.residual:.2g} %. If they were logged wrongly, replace "
+            "them by NaN and use missing='split', or by what was sent.",
+        )
+
+
+def tell_of_delay(
+    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
+) -> None:
+    """Tell of inputs that arrive late, where no delay was asked for.
+
+    Each sample of a delay takes a state, or blurs the response. The first answer that
+    is certain may come later than the input arrives: with that much delay a model must
+    simulate parts held out clearly better, or no worse with fewer states.
+    """
+    if whole.method == "pbsid" or choices.estimated or "delay" in telling:
+        return
+    pairs = first_samples(pairs)
+    channels = pairs[0][1].shape[1], pairs[0][0].shape[1]
+    direct = np.broadcast_to(choices.feedthrough, channels)
+    delay = longest_delays(pairs, np.any(direct, axis=0))
+    cut = int(delay.max())
+    # A model that lacks something tells nothing of how the plant begins to answer.
+    if cut < _LATE or not ("lack" in telling or _answers_late(whole, cut)):
+        return
+    n_trend = whole.evidence.free.n_trend
+    given = choices._replace(method=whole.method, offset=DETRENDS[n_trend])
+    known = slice(cut if choices.initial_states else 0, None)  # from rest, all are
+    pairs = [(u, y) for u, y in pairs if len(u) > cut + 1]
+    late = [(delayed(u, delay)[known], y[known]) for u, y in pairs]
+    early = [(u[known], y[known]) for u, y in pairs]
+    try:
+        other = fit_once(late, given, telling.aside(), n_trend)
+        first = fit_once(early, whole.chosen(choices), telling.aside(), n_trend)
+    except TooFewSamples:
+        return
+    error, found = errors_held_out(first, given), errors_held_out(other, given)
+    if [p.error.shape for p in error.parts] != [p.error.shape for p in found.parts]:
+        return  # late inputs move in other parts
+    n_saved = first.selection.order - other.selection.order
+    better = n_saved >= _FEWER and not error.clearly_better_than(found, 0.0)
+    if not better and not found.clearly_better_than(error, _CLEARLY):
+        return
+    orders = other.selection.order, first.selection.order
+    if better:
+        what = f"does as well on parts held out as this one of order {orders[1]}"
+    else:
+        what = (
+            f"simulates {found.bft:.3g} % of parts held out, this one {error.bft:.3g} %"
+        )
+    telling.once(
+        "delay",
+        f"Input {telling.input(delay.argmax())} shows in the outputs only after {cut} "
+        "samples, for certain. With a delay in their place a model of order "
+        f"{orders[0]} {what}. Use input_delay='auto', which takes those that are a "
+        f"delay beyond doubt, or give it: {cut} at most.",
+    )
+
+
+def _answers_late(fitted: LocalFit, delay: int) -> bool:
+    """Whether the impulse response of a model may be that of a delay.
+
+    Of a slow system the first samples are as small, beside what comes later.
+    """
+    A, B, C, D = fitted.model[:4]
+    impulse = np.zeros((_WHOLE * delay + 1, 1))
+    impulse[0] = 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        heights = np.column_stack(
+            [
+                np.abs(lti_response(A, B[:, [j]], C, D[:, [j]], impulse)).max(axis=1)
+                for j in range(B.shape[1])
+            ]
+        )
+    if not np.isfinite(heights).all():
+        return False
+    heights = heights / np.maximum(heights.max(axis=0), np.finfo(float).tiny)
+    late = (heights[: delay // 2 + 1] < _EARLY).all(axis=0)
+    return bool((late & (heights[: _RISEN * delay] > 0.5).any(axis=0)).any())
+
+
+def without_rounding(
+    pairs: Pairs,
+    choices: Choices,
+    telling: Telling,
+    whole: LocalFit,
+    known: LocalFit | None,
+) -> tuple[Pairs, LocalFit]:
+    """Take out a ripple of inputs that only the rounding of their numbers makes.
+
+    A model makes of it what it likes, unless the ripple is what drives outputs.
+    """
+    rounded = Rounded.of([u for u, _ in pairs])
+    if rounded is None or not _is_wild(whole, rounded):
+        return pairs, whole
+    exact = list(zip(rounded.exact, (y for _, y in pairs), strict=True))
+    fitted = with_trends(exact, choices, telling.aside("collinear"), known)
+    worse = criterion_in_units(fitted.evidence.one_step)
+    worse -= criterion_in_units(whole.evidence.one_step)
+    if not worse < CERTAIN:
+        return pairs, whole
+    ripple = np.abs(np.vstack([u for u, _ in pairs]) - np.vstack(rounded.exact)).max(
+        axis=0
+    )
+    some = np.flatnonzero(ripple > _PART * ripple.max())
+    listed = ", ".join(telling.input(k) for k in some)
+    telling.once(
+        "rounded",
+        f"The inputs {listed} add up, weighted, to a constant but for the rounding of "
+        "their numbers: what each of them does is not identifiable, and the smallest "
+        "solution was taken. Excite them independently, or leave one out.",
+        RankWarning,
+    )
+    return exact, fitted
+
+
+def _is_wild(fitted: LocalFit, rounded: Rounded) -> bool:
+    """Whether a model makes far more of a ripple than of all that inputs do else."""
+    model = fitted.evidence.state_space(fitted.model, 1.0)
+    G = model.frequency_response(_LOOKED_AT)
+    of_ripple = np.abs(G @ rounded.faint).max()
+    return bool(of_ripple > _WILD * np.abs(G @ rounded.others).max())

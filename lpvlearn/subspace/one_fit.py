@@ -1,0 +1,300 @@
+"""One fit: of these samples, with these trends.
+
+Order and horizon are chosen where they are not given, the method by whether inputs know
+the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.preparation import Pairs, independent_inputs
+from ..exceptions import RankWarning
+from .closed_loop import ClosedLoopEvidence, identify_closed_loop
+from .held_out import HeldOut, held_out
+from .identification import (
+    Candidate,
+    ScaledRecords,
+    Settings,
+    centred,
+    identify,
+    scale_records,
+    validate,
+)
+from .local_fit import LocalFit
+from .offsets import attributed, criterion_in_units, with_levels, without_slow_modes
+from .options import Choices
+from .selection import PlantFit, Row, Selection, select
+from .signals import Record, SharedSignals, share_known, shorten
+from .simulation_fit import Realization, simulation_errors
+from .statistics import Evidence
+from .telling import Telling
+from .varx import Feedback, find_feedback
+
+Array = NDArray[np.float64]
+
+# A model of like samples has led into another minimum where the error ends this many
+# times as large as theirs; between realizations of noise it varies by a few per cent.
+_WORSE = 1.2
+
+
+class TooFewSamples(ValueError):
+    """The samples do not tell enough for a model; more of them may."""
+
+
+def fit_once(
+    pairs: Pairs,
+    choices: Choices,
+    telling: Telling,
+    n_trend: int,
+    known: LocalFit | None = None,
+) -> LocalFit:
+    """Choose and identify, with `n_trend` trends of every output and experiment.
+
+    What is `known` of the same samples with other trends, or of others like them, is
+    the feedback, whose test gives every experiment a constant.
+    """
+    n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
+    order, horizon = choices.order, choices.horizon
+    whole, (pairs, centres) = pairs, centred(pairs, n_trend, choices.initial_states)
+    try:
+        pairs, basis = _with_independent_inputs(pairs, telling)
+        settings = choices.settings(n_outputs, n_inputs, basis, n_trend)
+        if settings.method != "pbsid":
+            settings.check_size([len(u) for u, _ in pairs], order, horizon)
+    except ValueError as error:
+        raise TooFewSamples(str(error)) from None
+    scaled = scale_records(pairs, n_trend, choices.estimated)
+    feedback = find_feedback(scaled.records) if known is None else known.feedback
+    settings = _heed(feedback, settings, choices.feedthrough is True)
+    if settings.method == "pbsid":
+        try:
+            plant = identify_closed_loop(scaled, basis, order, horizon, settings)
+            found = plant.selection.order
+            if order is None and found not in (settings.orders or [found]):
+                # a state too few spoils the plant, one too many costs little
+                enough = (n for n in settings.orders if n > found)
+                order = min(enough, default=settings.orders[-1])
+                plant = identify_closed_loop(scaled, basis, order, horizon, settings)
+        except ValueError as error:
+            raise TooFewSamples(str(error)) from None
+    else:
+        plant = _identify_open_loop(scaled, basis, order, horizon, settings, known)
+    offsets = attributed(plant.evidence, centres, whole)
+    evidence, offsets = with_levels(plant.evidence, offsets)
+    residual = plant.residual
+    if choices.estimated:
+        residual = _residual_of_known(evidence, settings.method, residual)
+    return LocalFit(
+        evidence.model,
+        plant.singular_values,
+        residual,
+        plant.stability_loss,
+        plant.selection,
+        evidence,
+        settings.method,
+        feedback,
+        offsets,
+        evidence.model,
+        scaled,
+        SharedSignals(),
+    )
+
+
+def of_order(
+    pairs: Pairs,
+    choices: Choices,
+    telling: Telling,
+    order: int,
+    other: LocalFit,
+    n_trend: int,
+) -> tuple[LocalFit, float]:
+    """The model of the samples of that order, with these trends.
+
+    And by how much its criterion is worse than that of the `other`, whose choice of the
+    order it keeps.
+    """
+    found = fit_once(pairs, choices._replace(order=order), telling, n_trend)
+    worse = criterion_in_units(found.evidence.one_step)
+    worse -= criterion_in_units(other.evidence.one_step)
+    return found._replace(selection=found.selection.among(other.selection)), worse
+
+
+def is_worth_a_choice(
+    promising: Callable[[LocalFit], bool],
+    pairs: Pairs,
+    choices: Choices,
+    telling: Telling,
+    fitted: LocalFit,
+    n_trend: int,
+) -> bool:
+    """Whether to choose among all orders again, with other trends or of differences.
+
+    That takes as long as the first choice. Few steps lead from the model found to one
+    of its order, and to those without each one of the modes that may be constants:
+    unless these tell nothing of other orders, one of them must be promising.
+    """
+    evidence, horizon = fitted.evidence, fitted.selection.horizon
+    others = without_slow_modes(evidence)
+    if others is None or not evidence.refined:
+        return True
+    free = evidence.free._replace(n_trend=n_trend)
+    telling = telling.aside("collinear")
+
+    def near(A: Array, C: Array) -> LocalFit:
+        model = evidence.model._replace(A=A, C=C, blocks=None)
+        start = fitted._replace(
+            evidence=replace(evidence, model=model, free=free),
+            selection=Selection(len(A), horizon, []),
+            residual=np.inf,  # whatever comes of it
+        )
+        same = choices._replace(order=len(A), horizon=horizon, refine="prediction")
+        return fit_once(
+            pairs, same._replace(method=fitted.method), telling, n_trend, start
+        )
+
+    try:
+        own = evidence.model.A, evidence.model.C
+        return any(promising(near(A, C)) for A, C in [own, *others])
+    except TooFewSamples:  # for that horizon
+        return True
+
+
+def errors_held_out(fitted: LocalFit, choices: Choices) -> HeldOut:
+    """Errors of a fit's like on parts held out."""
+    evidence, scaled = fitted.evidence, fitted.scaled
+    horizon = fitted.selection.horizon
+    free = evidence.free._replace(initial_states=True)  # what is left begins in motion
+    settings = Settings(
+        free,
+        fitted.method,
+        choices.refine is not False,
+        choices.enforce_stability,
+        choices.n_noise_states,
+    )
+    if fitted.method != "pbsid":
+        whitening, refined = evidence.whitening, evidence.refined
+        like = Candidate(evidence.model, horizon, whitening, refined)
+        return validate(like, scaled.records, settings)
+
+    refitted: Callable[[list[Record]], Realization]
+    if isinstance(evidence, ClosedLoopEvidence) and evidence.refined:
+        refitted = replace(evidence, free=free).of_others
+    else:
+
+        def refitted(train: list[Record]) -> Realization:
+            part = scaled._replace(records=train)
+            basis, order = evidence.basis, choices.order
+            return identify_closed_loop(
+                part, basis, order, choices.horizon, settings
+            ).evidence.model
+
+    try:
+        return held_out(refitted, scaled.records)
+    except ValueError:  # too few samples are left
+        return HeldOut([], np.nan)
+
+
+def _identify_open_loop(
+    scaled: ScaledRecords,
+    basis: Array,
+    order: int | None,
+    horizon: int | None,
+    settings: Settings,
+    like: LocalFit | None = None,
+) -> PlantFit:
+    """Identify a plant whose inputs do not know the noise, by choice where not given.
+
+    `basis` is that of the `Evidence`. From the model of samples `like` these a few
+    steps lead to that of these, unless it fits them worse.
+    """
+    chosen = found = None
+    if order is None or horizon is None:
+        chosen = select(scaled.records, order, horizon, settings)
+        order, horizon = chosen.order, chosen.horizon
+    elif like is not None and like.follows(order, settings):
+        chosen, start = like.selection, like.candidate(scaled.output_scale)
+        found = identify(scaled.records, order, horizon, settings, start, near=True)
+        found = found._replace(singular_values=like.singular_values)
+        if found.residual > _WORSE * like.residual:
+            chosen = found = None
+    if found is None:
+        known = None if chosen is None else chosen.candidate
+        found = identify(scaled.records, order, horizon, settings, known)
+    if chosen is None:
+        only = Row(order, horizon, found.residual, 0.0, np.nan)
+        chosen = Selection(order, horizon, [only])
+    records, share = shorten(scaled.records)
+    evidence = Evidence(
+        model=found.model,
+        records=records,
+        input_scale=scaled.input_scale,
+        output_scale=scaled.output_scale,
+        basis=basis,
+        free=settings.free,
+        whitening=found.whitening,
+        refined=found.refined and found.stability_loss == 0.0,
+        share=share,
+    )
+    return PlantFit(
+        evidence, chosen, found.singular_values, found.residual, found.stability_loss
+    )
+
+
+def _residual_of_known(evidence: Evidence, method: str, found: float) -> float:
+    """What was `found` for errors relative to outputs, of those that are no estimates.
+
+    Of one-step errors those of estimates are next to nothing.
+    """
+    model, records = evidence.model, evidence.records
+    if method == "pbsid" or len(model.initial_states) != len(records):
+        return found / float(np.sqrt(share_known(records)))
+    errors = simulation_errors(model, records)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = sum(
+            float(np.sum(e[record.known] ** 2))
+            for e, record in zip(errors, records, strict=True)
+        )
+    power = sum(float(np.sum(r.y.T[r.known] ** 2)) for r in records)
+    known = float(np.sqrt(squares / power)) if power else found
+    return known if np.isfinite(known) else found
+
+
+def _heed(feedback: Feedback | None, settings: Settings, by_default: bool) -> Settings:
+    """The settings with their method chosen; and D, which is free `by_default`.
+
+    Where inputs and outputs depend on each other within the sample, data hardly tell a
+    feedthrough from a controller that answers at once: the latter is taken for it.
+    """
+    if settings.method != "auto":
+        return settings
+    if feedback is None or not feedback.found or feedback.cut_off:
+        return settings._replace(method="po-moesp")
+    free = settings.free
+    if by_default and feedback.instantaneous:
+        free = free._replace(direct=np.zeros_like(free.direct))
+    return settings._replace(method="pbsid", free=free)
+
+
+def _with_independent_inputs(pairs: Pairs, telling: Telling) -> tuple[Pairs, Array]:
+    """Replace collinear inputs by independent combinations of them, and say so.
+
+    The input matrix in the original inputs is that of the new ones times ``basis.T``,
+    the second value; the identity in the usual case.
+    """
+    n_inputs = pairs[0][0].shape[1]
+    basis = independent_inputs([u for u, _ in pairs])
+    if basis is None:
+        return pairs, np.eye(n_inputs)
+    telling.once(
+        "collinear",
+        f"The {n_inputs} inputs are collinear (rank {basis.shape[1]}): their separate "
+        "effects are not identifiable and the smallest solution was taken. Excite the "
+        "inputs independently.",
+        RankWarning,
+    )
+    return [(u @ basis, y) for u, y in pairs], basis

@@ -1,0 +1,249 @@
+"""Other models of the same samples, and whether these refute the first one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..data.preparation import DETRENDS, Pairs
+from .closed_loop import ClosedLoopEvidence
+from .criterion import PRICE
+from .delay import find_lead, with_later_inputs
+from .fit_warnings import Doubt
+from .held_out import HeldOut
+from .identification import spectral_radius
+from .local_fit import LocalFit
+from .offsets import CERTAIN, follows_means_alone
+from .one_fit import TooFewSamples, errors_held_out, fit_once
+from .options import Choices
+from .rounding import rounded_outputs
+from .telling import Telling
+from .trends import with_trends
+
+# Share of the squared errors that later inputs leave where the outputs lead them; time
+# constants per experiment of a mode that may be a line of a reference
+_LED, _LINE = 0.1, 3.0
+
+# Share of the squared errors of a plant in a loop that must be left of them for another
+# model not to refute it; standard errors by which a lesser one must be better where the
+# plant grows; standard deviations by which a pole does so for certain.
+_OF_NOISE, _DOUBT, _CERTAIN = 0.5, 2.0, 3.0
+
+# The same of one with D free, where nothing but answers within the sample shows a loop.
+_OF_ANSWERS = 0.25
+
+# Lags of a noise that may be more than that of a sensor; samples of which more tell the
+# plant without it; share of the outputs' size below which either model is as good.
+_LAGS, _PLENTY, _AUDIBLE = 2, 20_000, 0.01
+
+# Share of the squared errors of parts held out that further states leave there where
+# they are the plant's.
+_FAR_BETTER = 0.5
+
+
+def believable(
+    pairs: Pairs, choices: Choices, telling: Telling, first: LocalFit
+) -> tuple[LocalFit, Doubt | None]:
+    """The first model of a closed loop, or one that refutes it on parts held out.
+
+    Its like of the order that "po-moesp" takes is one: prediction, by which the order
+    in a loop is chosen, hardly sees of a plant what outputs tell themselves. Where the
+    method is free, that with D free where the first has none by default is another, and
+    the model of "po-moesp". The latter minimises the simulation error, and so does
+    better than the plant itself by what the inputs tell of the noise: that does not
+    refute the plant unless inputs were to be noise more than anything else
+    (`_OF_NOISE`), and how they act at once was not said, nor shown by a controller that
+    answers at once; or the plant is unstable, by no more than chance, and the other is
+    not; or D was left free for a stable plant, but fits these parts no better.
+    """
+    n_trend = first.evidence.free.n_trend
+    without_d = not first.evidence.free.direct.any()
+    feedback, as_said = first.feedback, choices.feedthrough
+    answered = feedback is not None and feedback.answered
+    shown = feedback is not None and feedback.shown
+    if answered and without_d:
+        choices = choices._replace(feedthrough=False)
+    same = choices._replace(offset=DETRENDS[n_trend])
+
+    def rival(**chosen: Any) -> tuple[LocalFit, HeldOut]:
+        chosen_so = same._replace(**chosen)
+        other = fit_once(pairs, chosen_so, telling, n_trend, first)
+        return other, errors_held_out(other, chosen_so)
+
+    best, error = first, errors_held_out(first, choices)
+    before, makeshift = error, False
+    try:
+        if not error.parts:
+            return first, None
+        open_loop, of_that = rival(method="po-moesp")
+        if (order := open_loop.selection.order) != first.selection.order:
+            free = False if without_d else choices.feedthrough
+            other, found = rival(method="pbsid", order=order, feedthrough=free)
+            if found.clearly_better_than(error, _DOUBT):
+                tried = other.selection.among(first.selection)
+                first = best = other._replace(selection=tried)
+                before = error = found
+        if choices.method != "auto":
+            return first, None
+        blind, of_blind = open_loop, of_that
+        if without_d and choices.feedthrough is not False:
+            other, found = rival(method="pbsid")
+            better = found.total < _OF_NOISE * error.total
+            # data do not tell it apart from the first
+            if better or best.grows(_CERTAIN) and not other.grows(_CERTAIN):
+                makeshift = found.total > error.total
+                best, error = other, found
+            # inputs of the same sample tell the noise in the outputs: of a free D, all
+            blind, of_blind = rival(method="po-moesp", feedthrough=False)
+        # whoever says which entries of D act knows how the channels were sampled
+        said = answered or not isinstance(choices.feedthrough, bool)
+        better = not said and of_blind.total < _OF_NOISE * error.total
+        # growing modes simulate bounded signals by what is to come of the inputs
+        better &= not blind.grows(_CERTAIN)
+        unsure = makeshift or (best.grows() and not best.grows(_CERTAIN))
+        if not said and not best.grows() and of_that.total < _LED * error.total:
+            unsure |= find_lead(pairs)[0] > 0  # inputs were made of later outputs, too
+        if unsure and not open_loop.grows() and not better:
+            blind, of_blind = open_loop, of_that
+            better = of_that.clearly_better_than(error, _DOUBT)
+        if better:
+            best, error = blind, of_blind
+        if answered and not shown and as_said is True:
+            # noise of a measured input answers outputs as well
+            other, found = rival(method="po-moesp", feedthrough=True)
+            if found.total < _OF_ANSWERS * error.total:
+                best, error = other, found
+    except TooFewSamples:
+        pass
+    if best is first:
+        return first, None
+    doubt = Doubt(before.bft, error.bft, first.grows())
+    if n_trend and choices.offset == "auto":  # constants are judged anew
+        chosen = choices._replace(method=best.method)
+        best = with_trends(pairs, chosen, telling, best)
+    return best, doubt
+
+
+def tell_of_lead(
+    pairs: Pairs, choices: Choices, telling: Telling, fitted: LocalFit
+) -> None:
+    """Tell of outputs that lead the inputs, where these seem to know the noise.
+
+    Beside later inputs a model simulates parts held out far better, and there is no
+    feedback. So does the inverse of a controller that leaves little to its reference.
+    """
+    lead, latest = find_lead(pairs)
+    if not lead:
+        return
+    n_trend = fitted.evidence.free.n_trend
+    offset = DETRENDS[n_trend]
+    plain = choices._replace(method="auto", offset=offset, estimated=())
+    pairs, error = with_later_inputs(pairs, lead), errors_held_out(fitted, choices)
+    led = _OF_NOISE if fitted.grows() else _LED
+    # One order tells whether it is worth while to look for the best.
+    first = choices.order or max(1, fitted.selection.order)
+    for order, share in {first: _OF_NOISE, choices.order: led}.items():
+        plain = plain._replace(order=order)
+        try:
+            other = fit_once(pairs, plain, telling.aside(), n_trend)
+        except TooFewSamples:
+            return
+        if other.feedback is None or other.feedback.found:
+            return
+        found = errors_held_out(other, plain)
+        if not found.total < share * error.total:
+            return
+    # A reference of a few lines is the free motion of modes that do not decay.
+    if 1.0 - spectral_radius(other.model.A) >= _LINE / max(len(u) for u, _ in pairs):
+        telling.once(
+            "lead",
+            f"The outputs seem to know input {telling.input(latest)} at least {lead} "
+            "sample(s) ahead: beside inputs that come so much later, a model without "
+            f"feedback simulates {found.bft:.3g} % of parts held out, this one "
+            f"{error.bft:.3g} %. Either the outputs lead it, by clocks or filters: "
+            "move it by as much. Or a controller makes it of the outputs and leaves "
+            "little to its reference: that must move more for a plant to be found.",
+        )
+
+
+def may_share_noise(fitted: LocalFit, choices: Choices) -> bool:
+    """Whether noise of more than a lag may be what else moves the plant."""
+    feedback, records = fitted.feedback, fitted.scaled.records
+    return bool(
+        choices.method == "auto"
+        and sum(record.u.shape[1] for record in records) <= _PLENTY
+        and choices.refine in ("auto", "prediction")
+        and fitted.selection.order
+        and not choices.estimated
+        and feedback is not None
+        and not feedback.found
+        and fitted.residual > _AUDIBLE
+        and len(fitted.evidence.noise.A) >= _LAGS * len(fitted.model.C)
+        and not rounded_outputs(fitted.model, records).repeated.any()
+    )
+
+
+def with_shared_noise(
+    pairs: Pairs, choices: Choices, telling: Telling, first: LocalFit
+) -> LocalFit:
+    """The model of which noise moves the states of the plant, if that is likelier.
+
+    Such noise tells of the poles what inputs do not. A model of the simulation error
+    has no use for that, and takes what noise does in a mode that inputs hardly excite
+    for their doing. Parts held out hardly tell: there, that noise is all that is left
+    of either. The states of the plant must explain all of the noise, and where outputs
+    are several be no more than without, as further ones may be those of a noise that
+    the outputs share; unless parts held out are simulated far better with these. Noise
+    that drifts makes some models likelier by chance than a chi-square tells.
+    """
+    n_trend = first.evidence.free.n_trend
+    several, own = pairs[0][1].shape[1] > 1, first.selection.order
+    tried = [choices._replace(method="pbsid", offset=DETRENDS[n_trend])]
+    if choices.order is None:  # as many states at least, of which the inputs reach all
+        tried += [tried[0]._replace(n_noise_states=n) for n in (own, own + 1)]
+    least = _deviance(first)
+    least -= CERTAIN if first.evidence.whitening.of_differences else 0.0
+    best, error, n_joint = first, None, -1
+    for chosen in tried:
+        if chosen.n_noise_states <= n_joint:
+            continue  # as many states were chosen before
+        try:
+            other = fit_once(pairs, chosen, telling, n_trend, first)
+        except TooFewSamples:
+            continue
+        evidence = other.evidence
+        if not isinstance(evidence, ClosedLoopEvidence):
+            continue
+        n_joint, deviance = len(evidence.kept), _deviance(other)
+        if not evidence.kept.all() or other.grows():
+            continue
+        if len(evidence.one_step.noise.A) or not deviance < least:
+            continue
+        if follows_means_alone(evidence):
+            continue  # what moves it is all called noise
+        error, its = (
+            error or errors_held_out(first, choices),
+            errors_held_out(other, chosen),
+        )
+        more = several and other.selection.order > own
+        if more and not its.total < _FAR_BETTER * error.total:
+            continue
+        if not error.clearly_better_than(its, _DOUBT):
+            best, least = other, deviance
+    return best
+
+
+def _deviance(fitted: LocalFit) -> float:
+    """Minus twice the logarithm of the likelihood, and the price of the parameters.
+
+    That of the innovations of all outputs together: what one of them tells of another's
+    noise is no evidence of states.
+    """
+    evidence = fitted.evidence.one_step
+    noise, (ny, n) = evidence.noise, evidence.model.C.shape
+    n_samples = sum(record.u.shape[1] for record in evidence.records)
+    n_parameters = n * (evidence.model.B.shape[1] + ny) + ny * len(noise.A)
+    n_parameters += evidence.free.n_own(n) * len(evidence.records)
+    volume = float(np.linalg.slogdet(noise.covariance)[1])
+    return n_samples * volume + PRICE * n_parameters

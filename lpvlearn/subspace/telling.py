@@ -1,0 +1,52 @@
+"""How a fit tells the user of things: each kind once, channels by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from copy import copy
+from dataclasses import dataclass, field
+from operator import index
+from typing import Self, SupportsIndex
+
+from ..exceptions import warn
+
+
+@dataclass
+class Telling:
+    """What was told, and how the columns of inputs and outputs are called.
+
+    Channels without names (None) are numbered, counted from 1.
+    """
+
+    inputs: Sequence[Hashable] | None = None
+    outputs: Sequence[Hashable] | None = None
+    kinds: set[str] = field(default_factory=set)  # of warnings that were given
+
+    def __contains__(self, kind: str) -> bool:
+        return kind in self.kinds
+
+    def once(
+        self, kind: str, message: str, category: type[Warning] = UserWarning
+    ) -> None:
+        """Warn of a kind of thing that was not told before; from now on it was."""
+        if kind not in self:
+            self.kinds.add(kind)
+            warn(message, category)
+
+    def aside(self, *silent: str) -> Self:
+        """What tells the same but of these kinds, and is not remembered here."""
+        other = copy(self)
+        other.kinds = self.kinds | set(silent)
+        return other
+
+    def input(self, k: SupportsIndex) -> str:
+        """How a message calls the input in column `k`."""
+        return _called(self.inputs, k)
+
+    def output(self, k: SupportsIndex) -> str:
+        """How a message calls the output in column `k`."""
+        return _called(self.outputs, k)
+
+
+def _called(names: Sequence[Hashable] | None, k: SupportsIndex) -> str:
+    return str(index(k) + 1) if names is None else repr(names[index(k)])

@@ -1,0 +1,155 @@
+"""Constants and drifts of experiments, where these matter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..data.preparation import Pairs
+from .drift import outlasts, wanders
+from .local_fit import LocalFit
+from .offsets import (
+    ALIKE,
+    CERTAIN,
+    HARDLY_MOVED,
+    N_TRENDS,
+    constants_matter,
+    criterion_in_units,
+    leaves_rounding,
+    may_be_better,
+    may_have_constants,
+    may_have_drift,
+    stands_by_chance,
+    unmoved_errors,
+)
+from .one_fit import TooFewSamples, fit_once, is_worth_a_choice, of_order
+from .options import Choices
+from .rounding import rounded_outputs
+from .statistics import Evidence
+from .telling import Telling
+
+# Share of the outputs' size left unexplained that constants may be the reason of
+_HARDLY = 0.4
+
+# Times the squared errors without what inputs do to modes that do not decay, of ones
+# that they do not move at all.
+_NOT_MOVED = 1.1
+
+
+def with_trends(
+    pairs: Pairs, choices: Choices, telling: Telling, known: LocalFit | None
+) -> LocalFit:
+    """Choose and identify, with constants of the experiments where these matter."""
+    n_trend = N_TRENDS[choices.offset]
+    # The errors of a rough model are not the noise that constants must stand out of.
+    rough = choices.offset == "auto" and choices.refine is False
+    judged = choices._replace(refine="simulation") if rough else choices
+    fitted = fit_once(pairs, judged, telling, n_trend, known)
+    # A slow mode of the noise, which outputs drive, stands for constants only too well;
+    # so does one of a model that has to start at rest. In the errors of a poor model of
+    # a given order nothing stands out.
+    hides = fitted.method == "pbsid" or not choices.initial_states
+    hides |= choices.order is not None and fitted.residual > _HARDLY
+    tested = fitted.evidence.one_step
+    stands = choices.offset == "auto" and stands_by_chance(tested)
+
+    def may_matter() -> bool:
+        if hides or stands:
+            return True
+        return may_have_constants(tested) and is_worth_a_choice(
+            lambda near: may_be_better(tested, near.evidence),
+            *(pairs, judged, telling, fitted, 1),
+        )
+
+    refused = np.inf
+    if choices.offset == "auto" and may_matter():
+        other = fit_once(pairs, judged, telling, 1, fitted)
+        order = len(fitted.model.A)
+        if stands and len(other.model.A) > order:
+            as_many, worse = of_order(pairs, judged, telling, order, other, 1)
+            other = as_many if worse < 0.0 else other
+        if constants_matter(tested, other.evidence.one_step):
+            fitted, n_trend = other, 1
+        elif choices.order is not None:  # a poor model shows many things
+            refused = criterion_in_units(other.evidence.one_step)
+    # The states of a given order that are to follow a drift are missing elsewhere.
+    given = choices.order is not None and choices.initial_states and n_trend < 2
+    given &= fitted.method != "pbsid" and not choices.enforce_stability
+    lost = given and (outlasts(fitted) or fitted.residual > _HARDLY)
+    shown = choices.order is None and not hides and not rough
+    if choices.offset == "auto" and (
+        lost or (shown and _may_drift_off(pairs, judged, telling, fitted))
+    ):
+        fitted = _with_drifts(pairs, judged, telling, fitted, refused)
+        n_trend = fitted.evidence.free.n_trend
+    return fit_once(pairs, choices, telling, n_trend, fitted) if rough else fitted
+
+
+def _may_drift_off(
+    pairs: Pairs, choices: Choices, telling: Telling, fitted: LocalFit
+) -> bool:
+    """Whether to try drifts, of a model whose errors or modes may hide them."""
+    tested = fitted.evidence.one_step
+    if not (may_have_drift(tested) or wanders(tested)):
+        return False
+    # Errors that are rounding go with the inputs, slowly.
+    if rounded_outputs(tested.model, tested.records).repeated.any():
+        return False
+    most = criterion_in_units(tested) + CERTAIN
+    return is_worth_a_choice(
+        lambda near: criterion_in_units(near.evidence) < most,
+        *(pairs, choices, telling, fitted, 2),
+    )
+
+
+def _with_drifts(
+    pairs: Pairs,
+    choices: Choices,
+    telling: Telling,
+    fitted: LocalFit,
+    refused: float = np.inf,
+) -> LocalFit:
+    """The model with drifts, or offsets of inputs that are integrated, if that is it.
+
+    Of equals the model is taken which needs no mode that inputs do not move: it stands
+    for an offset of theirs, or for a drift. Else drifts must be beyond doubt: noise may
+    be as slow. The criterion of a model that was `refused` is to be met as well.
+    """
+    tested = fitted.evidence.one_step
+    if leaves_rounding(tested):
+        return fitted
+    try:
+        other = fit_once(pairs, choices, telling, 2, fitted)
+    except TooFewSamples:
+        return fitted
+    before = min(criterion_in_units(tested), refused)
+    better = before - criterion_in_units(other.evidence.one_step)
+    spared = len(fitted.model.A) - len(other.model.A)
+    drifting = other.offsets.drifts.any()
+    simpler = not outlasts(other) if drifting else spared >= 0
+    if choices.order is not None:
+        least = CERTAIN
+    elif not drifting:
+        least = -ALIKE if spared else ALIKE
+    elif (unmoved := unmoved_errors(tested)) < _NOT_MOVED:
+        least = -ALIKE
+    else:
+        least = ALIKE if unmoved < HARDLY_MOVED else CERTAIN
+    if not (simpler and better > least):
+        return fitted
+    if drifting and _takes_a_gain(fitted.evidence, other.evidence):
+        return fitted
+    if spared < 0 and choices.order is None:
+        # What more states gain is no drift.
+        order, n_trend = len(other.model.A), fitted.evidence.free.n_trend
+        level, worse = of_order(pairs, choices, telling, order, other, n_trend)
+        if not worse > least:
+            return level
+    return other
+
+
+def _takes_a_gain(without: Evidence, other: Evidence) -> bool:
+    """Whether drifts stand for what inputs do slowly: static gains are lost to them."""
+    before, after = without.static_gain(), other.static_gain()
+    if before is None or after is None:
+        return False
+    return bool((after.unknown & ~before.unknown).any())
