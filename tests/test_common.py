@@ -26,6 +26,7 @@ ESTIMATORS = [
 # The checks fit tables of independent samples, which no dynamic model explains.
 @pytest.mark.filterwarnings("ignore:The model explains next to nothing")
 @pytest.mark.filterwarnings("ignore:A mode of the model does not")
+@pytest.mark.filterwarnings("ignore:The model simulates parts of the record")
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 @pytest.mark.filterwarnings("ignore:`lpv_` is unstable at values within its range")
 @parametrize_with_checks(

@@ -176,6 +176,13 @@ TABLES = {
             "missing='split'",
         ],
     ),
+    "a logger that changed its rate": (
+        lambda: SubspaceLTI(1, time="time").fit(
+            pd.DataFrame({"u": U[:, 0], "time": np.cumsum([0.5] * 30 + [0.1] * 50)}),
+            U[:, 0],
+        ),
+        ["evenly spaced", "changed its rate, lpvlearn.resample with sampling_time=0.5"],
+    ),
     "a clock that jitters": (
         lambda: fit(X.assign(time=X["time"].mask(X.index == 7, 0.1414))),
         [

@@ -382,6 +382,12 @@ def _dates(values: pd.Series) -> pd.Series:
     if short.all() and text.str.contains(".", regex=False).any():
         fields = text.where(values.notna()).str.split(":", expand=True).astype(float)
         return pd.to_datetime(60.0 * fields[0] + fields[1], unit="s")
+    if short.all():
+        warnings.warn(
+            f"Times as {text[values.notna()].iloc[0]!r} are read as hours and minutes. "
+            "If they are minutes and seconds, give hours as well: 00:00:07.",
+            stacklevel=2,
+        )
     first = text.str.extract(r"^(\d{1,2})[./]", expand=False).astype(float)
     by_day = bool(text.str.match(r"^\d+\.\d+\.").any() or (first > 12).any())
     with warnings.catch_warnings():

@@ -101,11 +101,12 @@ def warn_of_motion(estimator: Any, X: Any, y: Any, simulated: Array) -> None:
         known = np.where(np.isnan(estimated[rows]), np.nan, measured[rows])
         if _starts_in_motion(known, simulated[rows], estimated[rows], n_late):
             warn(
-                "The scored table starts in mid-motion: a simulation from rest misses "
-                "what the system brings along, and its score is too low. Splits "
-                "must keep experiments whole (ExperimentSplit); where they cannot, "
-                "score with make_bft_scorer(initial_state='estimate') or, of samples "
-                "after the transient, make_bft_scorer(burn_in=...)."
+                "The scored table starts in mid-motion, or rests elsewhere than the "
+                "model: a simulation from rest misses what the system brings along, "
+                "and its score is too low. Splits must keep experiments whole "
+                "(ExperimentSplit); where they cannot, or are whole, score with "
+                "make_bft_scorer(initial_state='estimate') or, of samples after the "
+                "transient, make_bft_scorer(burn_in=...)."
             )
             return
 

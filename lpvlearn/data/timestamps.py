@@ -209,6 +209,12 @@ def read_clock(
             remedy = (
                 f"{_USE_INSTEAD} If a logger lost them: {remedy[0].lower()}{remedy[1:]}"
             )
+            if np.sum(missing[1:] & missing[:-1]) > missing.sum() // 2:
+                longest = np.quantile(steps[missing], 0.9)
+                remedy = (
+                    "If the logger changed its rate, lpvlearn.resample with "
+                    f"sampling_time={longest:.3g} puts all of it on one grid. {remedy}"
+                )
         n_missing = np.maximum(1, np.rint(steps[missing] / step) - 1).sum()
         raise ValueError(
             f"{where} must be evenly spaced. Got a step of {steps[k]:.9g} s after its "

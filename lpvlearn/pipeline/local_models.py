@@ -237,7 +237,7 @@ def identify_point(
             "`combine` must be 'pool' for a local estimator with `integrating`: models "
             "with integrators cannot be balanced. Got 'average'."
         )
-    advice = _look_at_outputs(experiments)
+    advice = _look_at_outputs(experiments, local)
     labels = list(dict.fromkeys(e.label for e in experiments))
     if combine == "pool" or len(labels) == 1:
         fitted = _fit_local(local, experiments, sampling_time)
@@ -527,8 +527,11 @@ def _far_from_zero(records: Sequence[Array]) -> bool:
     return bool((np.abs(mean) > _OFFSET * np.sqrt(variance)).any())
 
 
-def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
-    """What to try first if the model turns out unstable: offsets make it so."""
+def _look_at_outputs(experiments: Sequence[Experiment], local: Any) -> str:
+    """What to try first if the model turns out unstable: offsets make it so.
+
+    But for those that the estimator finds itself.
+    """
     inputs = [e.inputs for e in experiments]
     outputs = [e.measured for e in experiments]
     still = all((y == outputs[0][0]).all() for y in outputs)
@@ -542,7 +545,7 @@ def _look_at_outputs(experiments: Sequence[Experiment]) -> str:
         for name, place, values in (("outputs", "y", outputs), ("inputs", "X", inputs))
         if _far_from_zero(values)
     ]
-    if not far:
+    if not far or local.get_params(deep=False).get("offset") is not None:
         return "Try "
     names, places = (" and ".join(words) for words in zip(*far, strict=True))
     return (

@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 # least of it that is told from none.
 _NOT_FAR_WORSE, _LEAST = 3.0, 1e-30
 
+_MAY_BE = 2.0  # times that states must balance each other, of what may be by chance
+
 
 class AtRest(NamedTuple):
     """A model of experiments that begin at rest, and what it is one of."""
@@ -45,12 +47,13 @@ def from_rest(
 ) -> AtRest | None:
     """The model of experiments that begin at a stand, if as likely as the `free` one.
 
-    Others that are `known` tell how these begin.
+    Or as that of experiments which are said to begin at rest, at inputs of zero. Others
+    that are `known` tell how these begin.
     """
-    asked = choices.offset in ("auto", "constant")
+    asked, said = choices.offset in ("auto", "constant"), not choices.initial_states
     if known is not None:
-        asked = not known.evidence.free.initial_states
-    asked &= choices.initial_states and not choices.estimated
+        of_others = known.evidence.free.initial_states, known.offsets.inputs.any()
+        asked = bool(of_others[1]) if said else not of_others[0]
     if not asked or free.method == "pbsid" or not len(free.model.A):
         return None
     stand, evidence = stands(pairs), free.evidence
@@ -58,10 +61,12 @@ def from_rest(
         return None
     first, at_rest = stand.first, choices._replace(initial_states=False)
     if first.any():  # a level is that of the answer to these
-        sure = choices.offset == "constant" or evidence.free.n_trend
-        if not sure and not stands_by_chance(evidence.one_step):
+        sure = said or choices.offset == "constant" or evidence.free.n_trend
+        if not sure and not stands_by_chance(evidence.one_step, _MAY_BE):
             return None  # without a constant it is that to zero
         at_rest = at_rest._replace(offset="constant")
+    elif said:
+        return None
     moved = [(u - level, y) for (u, y), level in zip(pairs, first, strict=True)]
     fitted = _as_likely(moved, at_rest, telling, free, stand.seen)
     return None if fitted is None else AtRest(moved, at_rest, fitted, first)
@@ -83,24 +88,41 @@ def _as_likely(
     except TooFewSamples:
         return None
     own, other = fitted.evidence, free.evidence
+    if _is_as_likely(own, other, seen):
+        return fitted
+    order = len(other.model.A)
+    if len(own.model.A) in (0, order):
+        return None
+    # states may be missing, or follow a drift
+    as_many, _ = of_order(pairs, choices, telling, order, fitted, own.free.n_trend)
+    return as_many if _is_as_likely(as_many.evidence, other, seen) else None
+
+
+def _is_as_likely(own: Evidence, other: Evidence, seen: bool) -> bool:
+    """Whether rest explains samples as well as the initial states of the `other`.
+
+    Where these leave the static gain unknown, or stand for a constant, they must be
+    likelier beyond chance: it is they that take the gain. Rest elsewhere, at inputs of
+    zero, has as many unknowns, and moves outputs at once.
+    """
+    worse = criterion_in_units(own.one_step) - criterion_in_units(other.one_step)
+    if not other.free.initial_states:
+        return worse < (CERTAIN if seen else 0.0)
     by_chance, drifts_off = stands_by_chance(other.one_step), other.free.n_trend > 1
     rate = 1.0 - spectral_radius(own.model.A)
     settles = rate * own.longest > (HARDLY_DECAYS if drifts_off else 1.0)
     if not (len(own.model.A) and settles):
-        return None
+        return False
     left, plainly = _plain_errors(own, other)
-    worse = criterion_in_units(own.one_step) - criterion_in_units(other.one_step)
-    most = CERTAIN if by_chance else ALIKE
+    gain = other.static_gain()
+    loses = by_chance or gain is None or bool(gain.unknown.any())
+    most = CERTAIN if loses else ALIKE
     if not worse <= most * ((seen and not drifts_off) or left < 1.0):
-        return None
+        return False
     if by_chance:
-        return fitted if left < _NOT_FAR_WORSE else None
-    order = len(other.model.A)
-    allowed = ALIKE + PRICE * order * len(pairs)
-    if plainly > allowed and len(own.model.A) < order:  # a state is missing, not rest
-        as_many, _ = of_order(pairs, choices, telling, order, fitted, own.free.n_trend)
-        left, plainly = _plain_errors(as_many.evidence, other)
-    return fitted if plainly <= allowed else None
+        return left < _NOT_FAR_WORSE
+    n_more = other.free.n_own(len(other.model.A)) - own.free.n_own(len(own.model.A))
+    return plainly <= ALIKE + PRICE * max(n_more, 0) * len(other.records)
 
 
 def _plain_errors(own: Evidence, other: Evidence) -> tuple[float, float]:

@@ -173,8 +173,8 @@ def tell_of_delay(
         "delay",
         f"Input {telling.input(delay.argmax())} shows in the outputs only after {cut} "
         "samples, for certain. With a delay in their place a model of order "
-        f"{orders[0]} {what}. Use input_delay='auto', which takes those that are a "
-        f"delay beyond doubt, or give it: {cut} at most.",
+        f"{orders[0]} {what}. Give it as `input_delay`, {cut} at most, and compare on "
+        "another record; input_delay='auto' takes only what is a delay beyond doubt.",
     )
 
 

@@ -49,6 +49,7 @@ from ..systems.beginnings import (
     first_inputs,
     held_state,
     standing,
+    stands,
 )
 from ..systems.simulation import (
     estimate_initial_state,
@@ -204,9 +205,11 @@ class SubspaceLTI(
         noise drives is told from that, or a number of states besides `order`.
     initial_state : {"estimate", "rest"}, default="estimate"
         State in which every experiment of `fit` starts: estimated along with B and D,
-        or zero, which is worth knowing of short experiments that start at rest. Where
-        all experiments begin at a stand, as step tests do, "estimate" has them start
-        at rest at their first inputs, unless likelihood refutes it.
+        or zero, which is worth knowing of short experiments that start at rest: at
+        inputs of zero, or, with constants (`offset`), at their first inputs where that
+        is likelier, as where outputs stand still. Where all experiments begin at a
+        stand, as step tests do, "estimate" has them start at rest at their first
+        inputs, unless likelihood refutes it.
     detrend : {None, "constant", "linear"}, default=None
         Subtract its mean or straight line from every channel of every experiment
         beforehand. A mean is not where a system rests: what transients add to it stays
@@ -678,7 +681,8 @@ class SubspaceLTI(
                 known=known,
             )
         self._take(fitted, self._step_of(experiments), delay)
-        self.steady_start_ = choices.initial_states and self._begin_held(experiments)
+        asked = choices.initial_states or bool(fitted.offsets.inputs.any())
+        self.steady_start_ = asked and self._begin_held(experiments)
         warn_about(fitted, telling)
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
@@ -1008,10 +1012,15 @@ class SubspaceLTI(
     def _with_late_inputs(
         self, experiments: list[Experiment], delay: Delay, gaps: bool
     ) -> list[Experiment]:
-        rest, at_mean = self.initial_state == "rest", self.detrend is not None
-        return with_late_inputs(
-            experiments, delay, rest=rest, gaps=gaps, at_mean=at_mean
-        )
+        rest = self.initial_state == "rest"
+        before: Callable[[Array], Array] | None = None
+        if self.detrend is not None:
+            before = _mean
+        elif rest and delay.any() and self.offset in ("auto", "constant"):
+            stand = stands((e.inputs, e.measured) for e in experiments)
+            if stand is not None and stand.seen:  # rather than that a step comes first
+                before = first_inputs
+        return with_late_inputs(experiments, delay, rest=rest, gaps=gaps, before=before)
 
     def _take(self, fitted: LocalFit, step: float, delay: Delay) -> None:
         """Set the fitted attributes."""
@@ -1605,6 +1614,10 @@ class SubspaceLTI(
                 out[e.rows] = outputs(e)
         out = out[:, 0] if self._single_output else out
         return self._contained(out, X, self.lti_.output_names)
+
+
+def _mean(u: Array) -> Array:
+    return np.asarray(u.mean(axis=0))
 
 
 def _names_of(experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:

@@ -53,8 +53,7 @@ def fit_pairs(
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = with_trends(pairs, choices, telling, known)
     pairs, fitted = without_rounding(pairs, choices, telling, fitted, known)
-    drifting = of_drifting_noise(pairs, choices, telling, fitted)
-    fitted = drifting or fitted
+    fitted = of_drifting_noise(pairs, choices, telling, fitted) or fitted
     if fitted.selection.order:
         tell_of_held_outputs(outputs, telling)
         tell_of_limits(outputs, fitted, telling)
@@ -62,7 +61,7 @@ def fit_pairs(
     tell_of_input_spikes(pairs, choices, telling, fitted)
     whole, rest, differ = pairs, None, fitted.offsets.differ
     pairs, fitted = without_shifts(pairs, choices, telling, fitted)
-    if not drifting and pairs is whole:
+    if pairs is whole:
         rest = from_rest(pairs, choices, telling, fitted, known)
     if rest is not None:
         pairs, choices, fitted, first = rest

@@ -53,8 +53,6 @@ _CONFIRMED = 0.5
 
 _NOTHING = 1.0  # best fit of parts held out, percent, that is none
 
-_ENOUGH = 100  # samples, for parts of them to tell anything
-
 # Standard deviations of a pole, for its decay to be known; and one over the longest
 # experiment that matters: an integrator is known better.
 _DECAYS, _MATTERS = 2.0, 0.1
@@ -444,8 +442,6 @@ def _warn_about_choice(fitted: LocalFit, held_out: HeldOut, telling: Telling) ->
 
     Without figures, so that a search says it once.
     """
-    if sum(record.u.shape[1] for record in fitted.evidence.records) < _ENOUGH:
-        return
     if 1.0 - held_out.residual < _CONFIRMED * (1.0 - fitted.residual):
         telling.once(
             "held out",

@@ -422,7 +422,11 @@ def identify(
     if settings.compare and not chosen.whitening.is_none:
         plain = fitted.candidate
         if not plain.whitening.is_none:
-            plain = fit_once(records, order, horizon, as_found, none, chosen.model)[0]
+            found = [  # that which begins at the other goes astray with it
+                fit_once(records, order, horizon, as_found, none, start).candidate
+                for start in (chosen.model, None)
+            ]
+            plain = min(found, key=lambda candidate: candidate.model.loss)
         rivals = [chosen, plain, plain._replace(refined=False)]
         if _is_astray(chosen, plain, records, settings):
             rivals = rivals[1:]
@@ -453,8 +457,9 @@ def identify(
 # Times the squared errors of a model of plain ones, of one of whitened ones that may be
 # astray: in records where little but their beginning tells of the inputs, of which the
 # filter takes the first samples. And of one that is, for it takes what the inputs do
-# for noise: of an order that is too low, which leaves errors that look like it.
-_ASTRAY, _FAR_ASTRAY = 2.0, 4.0
+# for noise: of an order that is too low, which leaves errors that look like it. One
+# with a state to no use has hardly larger ones: units of the criterion by which then.
+_ASTRAY, _FAR_ASTRAY, _LIKELIER = 2.0, 4.0, 10.0
 _SETTLES = 5.0  # time constants per record, of modes that follow no drift
 
 
@@ -462,20 +467,15 @@ def _is_astray(
     chosen: Candidate, plain: Candidate, records: Sequence[Record], settings: Settings
 ) -> bool:
     """Whether a model of whitened errors is one that errors, or likelihood, refute."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        own, other = (
-            sum(float(np.sum(e**2)) for e in simulation_errors(model, records))
-            for model in (chosen.model, plain.model)
-        )
-    if not own > _ASTRAY * other:
-        return False
     longest = max(record.u.shape[1] for record in records)
     settles = (1.0 - spectral_radius(plain.model.A)) * longest > _SETTLES
-    if own > _FAR_ASTRAY * other and settles:
+    if settles and chosen.model.loss > _FAR_ASTRAY * plain.model.loss:
         return True
     free, repeated = settings.free, settings.repeated
-    least = criterion_of(plain.model, records, free, repeated)
-    return least < criterion_of(chosen.model, records, free, repeated)
+    better = criterion_of(chosen.model, records, free, repeated)
+    better -= criterion_of(plain.model, records, free, repeated)
+    strays = chosen.model.loss > _ASTRAY * plain.model.loss
+    return better > (0.0 if strays else _LIKELIER)
 
 
 # Standard errors by which another way to the model must be better: errors that are not

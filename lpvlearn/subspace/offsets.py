@@ -236,15 +236,16 @@ def may_have_constants(evidence: Evidence) -> bool:
     return _has_slow_mode(evidence) or chance_of_trend(evidence) < _SUSPICIOUS
 
 
-def stands_by_chance(evidence: Evidence) -> bool:
+def stands_by_chance(evidence: Evidence, times: float = _AT_REST) -> bool:
     """Whether outputs stand still where a model without constants is not at rest.
 
     Neither with the inputs that it begins with nor, if these are a step, without any.
     While inputs do not move yet, states that are as far from rest as the outputs are
-    would have moved these, unless they happen to balance each other.
+    would have moved these, by so many `times` what is seen, unless they happen to
+    balance each other.
     """
-    model, radius = evidence.model, spectral_radius(evidence.model.A)
-    if not radius < 1.0 or evidence.free.n_trend:
+    model, poles = evidence.model, np.linalg.eigvals(evidence.model.A)
+    if np.abs(1.0 - poles).min(initial=1.0) < _RCOND or evidence.free.n_trend:
         return False
     eye = np.eye(len(model.A))
     gain = model.C @ np.linalg.solve(eye - model.A, model.B) + model.D
@@ -257,7 +258,9 @@ def stands_by_chance(evidence: Evidence) -> bool:
         motion = 2.0 * np.abs(second - first) + 2.0 * y.std(axis=1) / np.sqrt(n)
         level = y.mean(axis=1)
         off = np.minimum(np.abs(level - gain @ record.u[:, 0]), np.abs(level))
-        if (off * (1.0 - radius**n) > _AT_REST * motion).any():
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = np.abs(1.0 - poles**n).min(initial=1.0)
+        if (off * moved > times * motion).any():
             return True
     return False
 

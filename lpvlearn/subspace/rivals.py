@@ -176,8 +176,7 @@ def may_share_noise(fitted: LocalFit, choices: Choices) -> bool:
         and choices.refine in ("auto", "prediction")
         and fitted.selection.order
         and not choices.estimated
-        and feedback is not None
-        and not feedback.found
+        and not (feedback is not None and feedback.found)
         and fitted.residual > _AUDIBLE
         and len(fitted.evidence.noise.A) >= _LAGS * len(fitted.model.C)
         and not rounded_outputs(fitted.model, records).repeated.any()

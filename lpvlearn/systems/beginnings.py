@@ -170,7 +170,7 @@ def begin_held(beginnings: Iterable[Beginning]) -> bool:
         return False
     size = np.max([np.abs(a).max(axis=0, initial=0.0) for a in apart], axis=0)
     weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-    nearer = total = 0.0
+    nearer = worse = total = 0.0
     for one, a in zip(records, apart, strict=True):
         to_rest, to_mean, to_held = (
             float(np.nansum((weight * (one.measured - other)) ** 2))
@@ -179,9 +179,10 @@ def begin_held(beginnings: Iterable[Beginning]) -> bool:
         own = float(np.sum(np.where(np.isnan(one.measured), 0.0, weight * a) ** 2))
         if _moves(one.measured * weight, own):
             continue
-        if to_held > _WORSE * to_rest + _ROUNDING * own:
-            return False  # its gain is too poorly known for that
         nearer, total = nearer + to_mean - to_held, total + own
+        worse += to_held - _WORSE * to_rest
+    if worse > _ROUNDING * total:
+        return False  # gains are too poorly known for that
     return nearer > _NEARER * total
 
 

@@ -1,11 +1,13 @@
 """Step tests: records that begin at rest at a level, one step, a pulse or two steps.
 
     python tests/benchmarks/step_records.py [--records 140] [--first 0] [--offset auto]
+                                            [--anywhere]
 
 One to three lags and a delay of up to 9 samples, 100 to 500 samples, noise of .1 to 3 %
 of the step, rounded in every third. `SubspaceLTI` without options: the static gain by
 the true one, and the best fit to fresh steps without noise, whose level and initial
-state are estimated from a noisy record (`predict_with_initial_state`).
+state are estimated from a noisy record (`predict_with_initial_state`). Inputs begin at
+zero, or `--anywhere`.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ def excitation(rng: np.random.Generator, n: int, size: float) -> np.ndarray:
     return u
 
 
-def measure(seed: int, offset: str) -> tuple[float, float, bool, str | None]:
+def measure(
+    seed: int, offset: str, anywhere: bool
+) -> tuple[float, float, bool, str | None]:
     """Best fit, gain by the true one, whether anything was told, and constants."""
     rng = np.random.default_rng([seed, 39])
     n = int(rng.integers(100, 500))
@@ -61,14 +65,15 @@ def measure(seed: int, offset: str) -> tuple[float, float, bool, str | None]:
         return np.round(y / step) * step if step else y
 
     u = excitation(rng, n, size)
+    first = np.random.default_rng([seed, 7]).uniform(-60, 60) if anywhere else 0.0
     fresh = np.repeat(size * (0.5 + 0.5 * rng.standard_normal(12)), n // 8)
     target = answer(fresh)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model = SubspaceLTI(offset=offset).fit(u[:, None], recorded(answer(u)))
+        model = SubspaceLTI(offset=offset).fit(first + u[:, None], recorded(answer(u)))
         told = bool(caught)
         known = recorded(target)
-        found = model.predict_with_initial_state(fresh[:, None], known)
+        found = model.predict_with_initial_state(first + fresh[:, None], known)
     found_gain = model.lti_.frequency_response([1e-9]).real.item()
     score = bft_score(target + level, np.ravel(found))
     return score, found_gain / gain, told, model.offset_
@@ -80,10 +85,11 @@ def main() -> None:
     parser.add_argument("--records", type=int, default=140)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--offset", choices=["auto", "constant"], default="auto")
+    parser.add_argument("--anywhere", action="store_true")
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.records)
     scores, gains, told, offsets = zip(
-        *(measure(k, options.offset) for k in seeds), strict=True
+        *(measure(k, options.offset, options.anywhere) for k in seeds), strict=True
     )
     fits, silent = np.maximum(scores, -100.0), ~np.array(told)
     far = np.abs(np.array(gains) - 1.0) > 0.3

@@ -104,6 +104,16 @@ def test_two_fields_with_a_decimal_are_minutes_and_seconds(tmp_path, table, text
     assert_allclose((found - found[0]) / pd.Timedelta("1s"), seconds - 58.0, atol=1e-6)
 
 
+def test_two_fields_without_are_hours_and_minutes_and_that_is_told(tmp_path, table):
+    path = tmp_path / "a.csv"
+    table.assign(Zeit=[f"00:{k:02d}" for k in range(40)]).to_csv(path, index=False)
+    with pytest.warns(
+        UserWarning, match="'00:00' are read as hours and minutes.*give hours as well"
+    ):
+        found = with_times(read(path)[0], "Zeit", None)["Zeit"]
+    assert_allclose(found.diff()[1:] / pd.Timedelta("1s"), 60.0)
+
+
 def test_tables_without_names_say_what_their_columns_are_called(tmp_path, table):
     path = tmp_path / "a.csv"
     table[NAMES[1:]].to_csv(path, index=False, header=False)

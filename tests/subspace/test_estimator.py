@@ -19,6 +19,7 @@ from ..conftest import modes
 @pytest.mark.filterwarnings("ignore:The model explains:UserWarning")
 @pytest.mark.filterwarnings("ignore:The data leave:lpvlearn.exceptions.RankWarning")
 @pytest.mark.filterwarnings("ignore:A mode of the model does not:UserWarning")
+@pytest.mark.filterwarnings("ignore:The model simulates parts of the:UserWarning")
 @pytest.mark.filterwarnings("ignore:The identified model is unstable:UserWarning")
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.SkipTestWarning")
 @parametrize_with_checks([SubspaceLTI(), SubspaceLTI(method="pi-moesp", refine=False)])

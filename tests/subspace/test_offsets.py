@@ -813,84 +813,8 @@ def test_a_mode_slower_than_the_record_is_told_from_a_constant(size):
         assert model.order_ == (2 if size == 0.0 else 1)
 
 
-# -- records that begin at a stand -----------------------------------------------------
-
-
-def step_test(seed, first=0.0, level=20.0, n=240, at=25, noise=0.01, decay=0.0):
-    """Two lags in series, a step by 30; what an unknown state leaves decays slowly."""
-    rng, gain = np.random.default_rng(seed), 0.5 + 0.3 * (seed % 4)
-    u = np.full((n, 1), first)
-    u[at:] += 30.0
-    step = lfilter([0.0, 0.15], [1.0, -0.85], u - first, axis=0)
-    y = level + gain * lfilter([0.0, 0.03], [1.0, -0.97], step, axis=0)
-    y += decay * 0.99 ** np.arange(n)[:, None]
-    return u, y + noise * 30.0 * gain * rng.standard_normal(y.shape), gain
-
-
-@pytest.mark.parametrize("order", ["auto", 2])
-@pytest.mark.parametrize("first", [0.0, 30.0])
-def test_step_tests_tell_the_static_gain(first, order):
-    """Free states and a constant would balance each other until the step comes."""
-    errors = []
-    for seed in range(8):
-        u, y, gain = step_test(seed, first)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            model = SubspaceLTI(order).fit(u, y)
-        errors.append(model.lti_.dc_gain().item() / gain - 1.0)
-        assert model.offset_ == "constant" and model.steady_start_
-        assert not model.initial_states_.any()
-        np.testing.assert_array_equal(model.input_offset_, [[first]])
-        np.testing.assert_allclose(model.output_offset_, 20.0, atol=0.2 * gain)
-        assert model.score(u, y) > 0.99
-    assert np.median(np.abs(errors)) < 0.02 and np.max(np.abs(errors)) < 0.1
-
-
-def test_a_level_of_zero_is_no_constant():
-    u, y, gain = step_test(1, level=0.0)
-    model = SubspaceLTI().fit(u, y)
-    assert model.offset_ is None
-    np.testing.assert_allclose(model.lti_.dc_gain(), gain, rtol=0.05)
-
-
-def test_records_in_mid_motion_do_not_begin_at_rest():
-    """Their inputs stand still, their outputs move on."""
-    for seed in range(4):
-        u, y, _ = step_test(seed, n=600, noise=0.003, decay=20.0)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            assert SubspaceLTI().fit(u, y).initial_states_.any()
-
-
-def test_a_logger_that_begins_soon_before_the_step_is_none_the_worse():
-    for seed in range(4):
-        u, y, gain = step_test(seed, at=3)
-        model = SubspaceLTI().fit(u, y)
-        np.testing.assert_allclose(model.lti_.dc_gain(), gain, rtol=0.1)
-
-
-@pytest.mark.parametrize("offset", [None, "linear"])
-def test_what_is_said_of_offsets_is_kept_where_records_begin_at_a_stand(offset):
-    u, y, _ = step_test(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        assert SubspaceLTI(2, offset=offset).fit(u, y).offset_ == offset
-
-
 def test_an_output_far_off_its_range_is_no_place_to_rest():
     y = np.array([[2.0], [10.0], [4.0]])
     pairs = [(y, y), (y, y + 1.0)]
     assert not _far_off(np.array([[-5.0], [18.0]]), pairs)
     assert _far_off(np.array([[-24.0], [5.0]]), pairs)
-
-
-def test_the_order_of_records_that_begin_at_rest_is_that_of_the_plant():
-    """What follows a part held out begins in mid-motion, though."""
-    for rng in map(np.random.default_rng, range(3)):
-        u = np.repeat(rng.uniform(0.0, 100.0, 6), 50)[:, None]
-        u[:10] = 0.0
-        y = lfilter([0.0, 0.15], [1.0, -0.85], u, axis=0)
-        y = lfilter([0.0, 0.004], [1.0, -0.985], y, axis=0)
-        y += 0.003 * y.std() * rng.standard_normal(y.shape)
-        model = SubspaceLTI(initial_state="rest").fit(u, y)
-        assert model.order_ >= 2 and model.score(u, y) > 0.99

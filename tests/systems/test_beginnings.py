@@ -74,6 +74,9 @@ def test_of_two_beginnings_the_nearer_is_taken():
     noise = 5.0 * np.random.default_rng(0).standard_normal((8, 1))
     assert nearer(*9 * [still + noise])
     assert not nearer(*9 * [moving + noise])
+    others = 3 * [Beginning(still, moving, moving, held)]
+    poor = Beginning(still, still, moving, held + 2.0)  # by a gain that is poorly known
+    assert not begin_held([poor]) and begin_held([*others, poor])
 
 
 def test_a_gain_that_takes_the_beginning_elsewhere_is_not_trusted():

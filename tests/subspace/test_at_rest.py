@@ -1,0 +1,162 @@
+"""Experiments that begin at a stand, as step tests do."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from lpvlearn import SubspaceLTI
+
+
+def step_test(seed, first=0.0, level=20.0, n=240, at=25, noise=0.01, decay=0.0):
+    """Two lags in series, a step by 30; what an unknown state leaves decays slowly."""
+    rng, gain = np.random.default_rng(seed), 0.5 + 0.3 * (seed % 4)
+    u = np.full((n, 1), first)
+    u[at:] += 30.0
+    step = lfilter([0.0, 0.15], [1.0, -0.85], u - first, axis=0)
+    y = level + gain * lfilter([0.0, 0.03], [1.0, -0.97], step, axis=0)
+    y += decay * 0.99 ** np.arange(n)[:, None]
+    return u, y + noise * 30.0 * gain * rng.standard_normal(y.shape), gain
+
+
+@pytest.mark.parametrize("order", ["auto", 2])
+@pytest.mark.parametrize("first", [0.0, 30.0])
+def test_step_tests_tell_the_static_gain(first, order):
+    """Free states and a constant would balance each other until the step comes."""
+    errors = []
+    for seed in range(8):
+        u, y, gain = step_test(seed, first)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            model = SubspaceLTI(order).fit(u, y)
+        errors.append(model.lti_.dc_gain().item() / gain - 1.0)
+        assert model.offset_ == "constant" and model.steady_start_
+        assert not model.initial_states_.any()
+        np.testing.assert_array_equal(model.input_offset_, [[first]])
+        np.testing.assert_allclose(model.output_offset_, 20.0, atol=0.2 * gain)
+        assert model.score(u, y) > 0.99
+    assert np.median(np.abs(errors)) < 0.02 and np.max(np.abs(errors)) < 0.1
+
+
+def test_a_level_of_zero_is_no_constant():
+    u, y, gain = step_test(1, level=0.0)
+    model = SubspaceLTI().fit(u, y)
+    assert model.offset_ is None
+    np.testing.assert_allclose(model.lti_.dc_gain(), gain, rtol=0.05)
+
+
+def test_records_in_mid_motion_do_not_begin_at_rest():
+    """Their inputs stand still, their outputs move on."""
+    for seed in range(4):
+        u, y, _ = step_test(seed, n=600, noise=0.003, decay=20.0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            assert SubspaceLTI().fit(u, y).initial_states_.any()
+
+
+def test_a_logger_that_begins_soon_before_the_step_is_none_the_worse():
+    for seed in range(4):
+        u, y, gain = step_test(seed, at=3)
+        model = SubspaceLTI().fit(u, y)
+        np.testing.assert_allclose(model.lti_.dc_gain(), gain, rtol=0.1)
+
+
+@pytest.mark.parametrize("offset", [None, "linear"])
+def test_what_is_said_of_offsets_is_kept_where_records_begin_at_a_stand(offset):
+    u, y, _ = step_test(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        assert SubspaceLTI(2, offset=offset).fit(u, y).offset_ == offset
+
+
+def test_the_order_of_records_that_begin_at_rest_is_that_of_the_plant():
+    """What follows a part held out begins in mid-motion, though."""
+    for rng in map(np.random.default_rng, range(3)):
+        u = np.repeat(rng.uniform(0.0, 100.0, 6), 50)[:, None]
+        u[:10] = 0.0
+        y = lfilter([0.0, 0.15], [1.0, -0.85], u, axis=0)
+        y = lfilter([0.0, 0.004], [1.0, -0.985], y, axis=0)
+        y += 0.003 * y.std() * rng.standard_normal(y.shape)
+        model = SubspaceLTI(initial_state="rest").fit(u, y)
+        assert model.order_ >= 2 and model.score(u, y) > 0.99
+
+
+# -- a slow plant with dead time behind a coarse sensor -------------------------------
+
+
+def heater(seed, size=10.0, first=36.0, n=310):
+    """Two lags, a dead time, a step by `size`, an output in steps of 1/16."""
+    rng = np.random.default_rng(seed)
+    gain, dead = rng.uniform(0.3, 0.5), int(rng.integers(5, 15))
+    u = np.full((n, 1), first)
+    u[9:] += size
+    y = np.vstack([np.zeros((dead, 1)), u - first])[:n]
+    for pole in np.exp(-1.0 / np.array([rng.uniform(50, 80), rng.uniform(5, 15)])):
+        y = lfilter([0.0, 1.0 - pole], [1.0, -pole], y, axis=0)
+    y = 35.6 + gain * y + 0.03 * rng.standard_normal(y.shape)
+    return u, np.round(16.0 * y) / 16.0, gain
+
+
+HEATERS = [heater(seed, size) for seed, size in enumerate([5.0, 10.0, 15.0, 20.0] * 3)]
+
+
+def gains(heaters=HEATERS, **options):
+    """Static gains by the true ones."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        models = [SubspaceLTI(**options).fit(u, y) for u, y, _ in heaters]
+    assert all(model.steady_start_ for model in models)
+    found = [model.lti_.dc_gain().item() for model in models]
+    return np.array(found) / [gain for *_, gain in heaters]
+
+
+@pytest.mark.parametrize("options", [{}, {"order": 2}, {"order": 3}])
+def test_states_of_a_dead_time_take_nothing_of_the_gain(options):
+    """Free ones stand for a level of any size, with and without a constant."""
+    np.testing.assert_allclose(gains(**options), 1.0, atol=0.1)
+
+
+@pytest.mark.parametrize("delay", [0, 5])
+def test_rest_that_is_said_is_at_the_first_inputs(delay):
+    """Where outputs stand still, and not at rest at zero with a step of 36 before."""
+    options = {"initial_state": "rest", "feedthrough": False, "input_delay": delay}
+    np.testing.assert_allclose(gains(order=2, **options), 1.0, atol=0.1)
+    u, y, _ = HEATERS[0]
+    model = SubspaceLTI(2, **options).fit(u, y)
+    np.testing.assert_array_equal(model.input_offset_, [[36.0]])
+    assert model.score(u, y) > 0.98
+    each = SubspaceLTI(2, experiment=1, **options)
+    X = np.column_stack([np.tile(u[:, 0], 2), np.repeat([0, 1], len(u))])
+    for one in each.fit_each(X, np.vstack([y, y])):
+        np.testing.assert_array_equal(one.input_offset_, [[36.0]])
+        np.testing.assert_allclose(one.lti_.poles(), model.lti_.poles(), rtol=0.02)
+
+
+def test_rest_at_zero_is_kept_where_outputs_move_at_once():
+    """The first inputs are a step from zero."""
+    for rng in map(np.random.default_rng, range(4)):
+        u = np.repeat(rng.uniform(2.0, 10.0, (5, 1)), 40, axis=0)
+        y = lfilter([0.0, 0.1], [1.0, -0.9], u, axis=0)
+        y += 0.01 * rng.standard_normal(y.shape)
+        model = SubspaceLTI(initial_state="rest").fit(u, y)
+        np.testing.assert_allclose(model.lti_.dc_gain(), 1.0, atol=0.02)
+        assert not model.input_offset_.any() and not model.steady_start_
+
+
+def test_a_missing_output_takes_nothing_of_the_gain():
+    for k, (u, y, gain) in enumerate(HEATERS[:4]):
+        y = y.copy()
+        y[[5, 40, 90, 200][k]] = np.nan
+        model = SubspaceLTI(2, feedthrough=False, missing="estimate").fit(u, y)
+        np.testing.assert_allclose(model.lti_.dc_gain(), gain, rtol=0.1)
+
+
+def test_a_gap_that_cuts_off_the_step_is_told():
+    u, y, _ = HEATERS[0]
+    y = y.copy()
+    y[90] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        with pytest.warns(UserWarning, match="in 1 of 2 pieces no input moves.*estim"):
+            SubspaceLTI(2, missing="split").fit(u, y)
