@@ -162,6 +162,7 @@ _READABLE = {
     "horizon": ("horizon", "{:.0f}"),
     "local_BFT": ("local BFT", "{:.2f}"),
     "structured_BFT": ("gray-box BFT", "{:.2f}"),
+    "lpv_BFT": ("LPV BFT", "{:.2f}"),
     "relative_error": ("relative error", "{:.2e}"),
     "relative_floor": ("floor", "{:.2e}"),
     "remaining_error": ("remaining error", "{:.2e}"),

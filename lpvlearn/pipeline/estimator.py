@@ -255,10 +255,12 @@ list, default=None
     input_delay_ : ndarray of shape (n_inputs,)
         Of `lpv_`, in samples.
     report_ : DataFrame
-        One row per operating point: experiments, samples, order, BFT of the local and
-        of the gray-box model on the estimation data (percent, mean over the outputs),
-        restructuring error, its structural floor and what remains apart from that, all
-        relative to the black box's norm, the active frequency (rad/s) of what
+        One row per operating point: experiments, samples, order, BFT of the local model
+        ("local_BFT"), of the gray-box model ("structured_BFT") and of `lpv_` there
+        ("lpv_BFT", NaN where it is unstable) on the estimation data (percent, mean over
+        the outputs, from estimated initial states), restructuring error, its structural
+        floor and what remains apart from that, all relative to the black box's norm,
+        the active frequency (rad/s) of what
         remains, stationarity; with `efficient`, the error of the H-infinity optimum
         ("relative_hinf_error"; floor, remainder and stationarity are its own), and
         "chi2", "degrees_of_freedom" and "p_value" of the gray-box model's distance in

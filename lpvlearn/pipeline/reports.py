@@ -25,7 +25,9 @@ from ..systems.simulation import (
     trend_signals,
     with_transit,
 )
+from ..validation import listed
 from .local_models import LocalModel, motions
+from .runner import place_of
 from .structured_models import StructuredModels
 
 Array = NDArray[np.float64]
@@ -33,6 +35,12 @@ Array = NDArray[np.float64]
 # Constants are missed that are worth so many points of BFT, or where a local model is
 # this poor, and was fitted to signals with means so many times their motion.
 _WORTH, _POOR, _FAR = 5.0, 50.0, 2.0
+
+# Times what a local model leaves of outputs, and points of BFT besides, that the LPV
+# model leaves of them; operating points that a message lists.
+_FAR_WORSE, _LOST, _NAMED = 2.0, 10.0, 3
+
+_ABOUT_ZERO = 1e-9  # of a pole by the fastest one: it is an integrator's
 
 _LOOKED_AT = 10  # experiments of an operating point: more tell the same of constants
 
@@ -86,7 +94,7 @@ def tables(
     interpolated = lpv.parameters(points.kappa)
     deviations = pd.DataFrame(spread, index, list(names))
 
-    missed = False
+    missed, lost = False, list[tuple[int, float, float]]()
     delayed = any(model.lti.input_delay.any() for model in found.local)
     rows = []
     for k, (group, model, gray_box) in enumerate(
@@ -104,6 +112,14 @@ def tables(
             structured = _fit_of(gray_box, group, sampling_time, model.n_trend)
             row["structured_BFT"] = structured
             row |= _restructuring(found.restructurers[k])
+        frozen = lpv.at(points.kappa[k])
+        row["lpv_BFT"] = np.nan
+        if not frozen.poles().real.max(initial=0.0) > 0.0:
+            own = _fit_of(frozen, group, sampling_time, model.n_trend)
+            row["lpv_BFT"] = own
+            best = max(row.get("structured_BFT", row["local_BFT"]), 0.0)
+            if 100.0 - own > _FAR_WORSE * (100.0 - best) + _LOST:
+                lost.append((k, own, best))
         if delayed:
             samples = np.round(model.lti.input_delay / sampling_time).astype(int)
             inputs = group[0].input_names
@@ -145,6 +161,18 @@ def tables(
             "found by offsets='auto', with local=SubspaceLTI(offset='auto'), or "
             "subtract from X and y where the system rests."
         )
+    if lost:
+        told = [
+            f"{place_of(k, points.kappa)}: {own:.3g} instead of {best:.3g} %"
+            for k, own, best in lost
+        ]
+        whose = "gray-box" if found.restructurers else "local"
+        warn(
+            "`lpv_` simulates the records of an operating point far worse than its "
+            f"{whose} model does ({listed(told, _NAMED)}): the interpolation does not "
+            "go through the points. Use a higher `degree`, AutoLPV(), or, of black "
+            "boxes, a lower order: local=SubspaceLTI(order=...)."
+        )
     by_parameter = {
         "lowest": theta.min(axis=0),
         "highest": theta.max(axis=0),
@@ -163,6 +191,11 @@ def tables(
     )
 
 
+def _integrates(model: StateSpace) -> bool:
+    rates = np.abs(model.poles())
+    return bool(rates.min(initial=1.0) <= _ABOUT_ZERO * rates.max(initial=0.0))
+
+
 def _fit_of(
     model: StateSpace,
     group: Sequence[Experiment],
@@ -176,6 +209,8 @@ def _fit_of(
     one length are simulated together; realizations of one input, once.
     """
     sampled = model.to_discrete(sampling_time)
+    if n_trend and _integrates(model):  # what offsets of the inputs add up to
+        n_trend = 2
     size = spread_of(np.vstack([_outputs(e) for e in group]))
     true, simulated = [], []
     for length in sorted({len(e.rows) for e in group}):
@@ -287,7 +322,17 @@ def summarise(
         names = [name for name in report if name.startswith(("u0_", "y0_"))]
         spans = [f"{name[3:]} {_span(report[name])}" for name in names]
         lines.append(f"Points of work: {', '.join(spans)}")
-    hidden = ["u0_", "y0_", "param_", "std_", "n_", "stationarity", "horizon", "order"]
+    hidden = [
+        "u0_",
+        "y0_",
+        "lpv_BFT",
+        "param_",
+        "std_",
+        "n_",
+        "stationarity",
+        "horizon",
+        "order",
+    ]
     hidden += ["relative_hinf_error", "chi2", "degrees_of_freedom"]
     if report["growth_rate"].max() <= 0:
         hidden.append("growth_rate")
@@ -348,10 +393,11 @@ def summarise(
         f"parameter fit (FIT) {fit:.2f} %",
     ]
     if distance.max() > _THROUGH:
-        lines.append(
+        lines += [
             f"    H-infinity error {_span(distance)} % of the model's norm, the "
-            f"largest at {_label_of_largest(distance)}"
-        )
+            f"largest at {_label_of_largest(distance)}",
+            f"    simulation fit (BFT) there {_span(report['lpv_BFT'])} %",
+        ]
     elif len(kappa) > 1 and distance.notna().all():  # no norm is where it integrates
         lines.append(
             "    through the local models: how good it is between them only data there "
