@@ -382,7 +382,7 @@ def _dates(values: pd.Series) -> pd.Series:
     if short.all() and text.str.contains(".", regex=False).any():
         fields = text.where(values.notna()).str.split(":", expand=True).astype(float)
         return pd.to_datetime(60.0 * fields[0] + fields[1], unit="s")
-    if short.all():
+    if short.all() and values.notna().any():
         warnings.warn(
             f"Times as {text[values.notna()].iloc[0]!r} are read as hours and minutes. "
             "If they are minutes and seconds, give hours as well: 00:00:07.",

@@ -47,13 +47,12 @@ def from_rest(
 ) -> AtRest | None:
     """The model of experiments that begin at a stand, if as likely as the `free` one.
 
-    Or as that of experiments which are said to begin at rest, at inputs of zero. Others
-    that are `known` tell how these begin.
+    Or likelier than that of experiments which are said to begin at rest, at inputs of
+    zero. Else others that are `known` tell how these begin.
     """
     asked, said = choices.offset in ("auto", "constant"), not choices.initial_states
-    if known is not None:
-        of_others = known.evidence.free.initial_states, known.offsets.inputs.any()
-        asked = bool(of_others[1]) if said else not of_others[0]
+    if known is not None and not said:
+        asked = not known.evidence.free.initial_states
     if not asked or free.method == "pbsid" or not len(free.model.A):
         return None
     stand, evidence = stands(pairs), free.evidence
@@ -88,9 +87,10 @@ def _as_likely(
     except TooFewSamples:
         return None
     own, other = fitted.evidence, free.evidence
-    if _is_as_likely(own, other, seen):
+    order, said = len(other.model.A), not other.free.initial_states
+    more = said and len(own.model.A) > order  # which may be why it is likelier
+    if not more and _is_as_likely(own, other, seen):
         return fitted
-    order = len(other.model.A)
     if len(own.model.A) in (0, order):
         return None
     # states may be missing, or follow a drift
@@ -103,17 +103,17 @@ def _is_as_likely(own: Evidence, other: Evidence, seen: bool) -> bool:
 
     Where these leave the static gain unknown, or stand for a constant, they must be
     likelier beyond chance: it is they that take the gain. Rest elsewhere, at inputs of
-    zero, has as many unknowns, and moves outputs at once.
+    zero, has as many unknowns.
     """
     worse = criterion_in_units(own.one_step) - criterion_in_units(other.one_step)
-    if not other.free.initial_states:
-        return worse < (CERTAIN if seen else 0.0)
     by_chance, drifts_off = stands_by_chance(other.one_step), other.free.n_trend > 1
     rate = 1.0 - spectral_radius(own.model.A)
     settles = rate * own.longest > (HARDLY_DECAYS if drifts_off else 1.0)
     if not (len(own.model.A) and settles):
         return False
     left, plainly = _plain_errors(own, other)
+    if not other.free.initial_states:
+        return worse < 0.0 and left <= 1.0
     gain = other.static_gain()
     loses = by_chance or gain is None or bool(gain.unknown.any())
     most = CERTAIN if loses else ALIKE

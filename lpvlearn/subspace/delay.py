@@ -16,7 +16,7 @@ same order on samples held out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -102,23 +102,22 @@ def with_late_inputs(
     *,
     rest: bool,
     gaps: bool,
-    before: Callable[[Array], Array] | None = None,
+    at_mean: bool = False,
 ) -> list[Experiment]:
     """Experiments with inputs as they arrive, cut at gaps where there may be some.
 
-    With `rest` the inputs `before` are zero, or what that makes of all of them. Without
-    `rest` the first samples, to which unknown inputs arrive, are left out. A ValueError
-    where that leaves no two samples of any experiment.
+    With `rest` the inputs before are zero, or `at_mean`, where that is to be removed.
+    Without `rest` the first samples, to which unknown inputs arrive, are left out. A
+    ValueError where that leaves no two samples of any experiment.
     """
     if not delay.any():
         return split_at_gaps(experiments) if gaps else list(experiments)
     late = []
     for e in experiments:
         first, *others = unbroken_runs(e)
-        sent = None
-        if rest and before is not None:
-            sent = np.tile(before(first.inputs), (delay.max(), 1))
-        late.append(late_inputs(first, delay, rest=rest, before=sent)[0])
+        mean = np.tile(first.inputs.mean(axis=0), (delay.max(), 1))
+        before = mean if rest and at_mean else None
+        late.append(late_inputs(first, delay, rest=rest, before=before)[0])
         late += [late_inputs(run, delay, rest=False)[0] for run in others]
     if rest and not gaps:
         return late

@@ -49,7 +49,6 @@ from ..systems.beginnings import (
     first_inputs,
     held_state,
     standing,
-    stands,
 )
 from ..systems.simulation import (
     estimate_initial_state,
@@ -207,9 +206,9 @@ class SubspaceLTI(
         State in which every experiment of `fit` starts: estimated along with B and D,
         or zero, which is worth knowing of short experiments that start at rest: at
         inputs of zero, or, with constants (`offset`), at their first inputs where that
-        is likelier, as where outputs stand still. Where all experiments begin at a
-        stand, as step tests do, "estimate" has them start at rest at their first
-        inputs, unless likelihood refutes it.
+        is likelier. Where all experiments begin at a stand, as step tests do,
+        "estimate" has them start at rest at their first inputs, unless likelihood
+        refutes it.
     detrend : {None, "constant", "linear"}, default=None
         Subtract its mean or straight line from every channel of every experiment
         beforehand. A mean is not where a system rests: what transients add to it stays
@@ -495,7 +494,7 @@ class SubspaceLTI(
         choices = check_options(self.get_params(deep=False))
         experiments = self._read(X, y, reset=True, cut=False)
         self._single_output = np.asarray(y).ndim == 1
-        telling = Telling(*_names_of(experiments, y))
+        telling = Telling(*_labels_of(X, experiments, y))
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
             if self.detrend is not None:
                 raise ValueError(
@@ -508,7 +507,7 @@ class SubspaceLTI(
             warn_of_many_pieces(experiments)
         delay = self._delay_of(experiments, choices)
         self._identify(experiments, choices, delay, telling)
-        self._name(telling.inputs, telling.outputs)
+        self._name(*_names_of(experiments, y))
         return self
 
     def _completed(
@@ -552,7 +551,9 @@ class SubspaceLTI(
         u0, y0 = self.resting_point()
         rest = self.initial_state == "rest"
         own = [
-            (None, y0) if rest else self._own_part(e, predictor, of_fit=True)
+            (self._beginning(e), y0)
+            if rest
+            else self._own_part(e, predictor, of_fit=True)
             for e in completed
         ]
         found = list(zip(runs, own, strict=True))
@@ -636,13 +637,13 @@ class SubspaceLTI(
         first._single_output = np.asarray(y).ndim == 1
         others = [copy(first) for _ in experiments[1:]]
         delay = first._delay_of(experiments[:1], choices)
-        telling = Telling(*_names_of(experiments, y))
+        telling = Telling(*_labels_of(X, experiments, y))
         known = first._identify(experiments[:1], choices, delay, telling)
         telling.kinds |= TESTS  # once is enough
         for other, experiment in zip(others, experiments[1:], strict=True):
             other._identify([experiment], choices, delay, telling, known)
         for model in (first, *others):
-            model._name(telling.inputs, telling.outputs)
+            model._name(*_names_of(experiments, y))
         return [first, *others]
 
     @one_blas_thread
@@ -861,7 +862,12 @@ class SubspaceLTI(
         if before is None:
             step, options = self._step_of(experiments), self.get_params(deep=False)
             stream = SampleStream(
-                choices, options, experiments, step, _names_of(experiments, y)
+                choices,
+                options,
+                experiments,
+                step,
+                _names_of(experiments, y),
+                Telling(*_labels_of(X, experiments, y)),
             )
             self._single_output = np.asarray(y).ndim == 1
         else:
@@ -1012,15 +1018,10 @@ class SubspaceLTI(
     def _with_late_inputs(
         self, experiments: list[Experiment], delay: Delay, gaps: bool
     ) -> list[Experiment]:
-        rest = self.initial_state == "rest"
-        before: Callable[[Array], Array] | None = None
-        if self.detrend is not None:
-            before = _mean
-        elif rest and delay.any() and self.offset in ("auto", "constant"):
-            stand = stands((e.inputs, e.measured) for e in experiments)
-            if stand is not None and stand.seen:  # rather than that a step comes first
-                before = first_inputs
-        return with_late_inputs(experiments, delay, rest=rest, gaps=gaps, before=before)
+        rest, at_mean = self.initial_state == "rest", self.detrend is not None
+        return with_late_inputs(
+            experiments, delay, rest=rest, gaps=gaps, at_mean=at_mean
+        )
 
     def _take(self, fitted: LocalFit, step: float, delay: Delay) -> None:
         """Set the fitted attributes."""
@@ -1616,13 +1617,15 @@ class SubspaceLTI(
         return self._contained(out, X, self.lti_.output_names)
 
 
-def _mean(u: Array) -> Array:
-    return np.asarray(u.mean(axis=0))
-
-
 def _names_of(experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:
     """Names of inputs and outputs, as columns have them; None for those of arrays."""
     inputs = experiments[0].input_names
     numbered = any(isinstance(name, Integral) for name in inputs)
     named = hasattr(y, "columns") or getattr(y, "name", None) is not None
     return None if numbered else inputs, read_outputs(y)[1] if named else None
+
+
+def _labels_of(X: Any, experiments: Sequence[Experiment], y: Any) -> tuple[Any, Any]:
+    """What messages call the columns, numbers too; None for those of arrays."""
+    inputs = experiments[0].input_names if hasattr(X, "columns") else None
+    return inputs, _names_of(experiments, y)[1]

@@ -262,6 +262,7 @@ class SampleStream:
         first: Sequence[Experiment],
         step: float,
         names: tuple[Any, Any],
+        telling: Telling,
     ) -> None:
         self._choices, self._options = choices, deepcopy(options)
         self._given_step, self._names = step, first[0].input_names
@@ -269,7 +270,7 @@ class SampleStream:
         n_inputs, self._n_outputs = first[0].inputs.shape[1], first[0].measured.shape[1]
         settings = choices.settings(self._n_outputs, n_inputs, np.eye(n_inputs))
         settings.check_size([BUFFER], choices.order, choices.horizon)
-        self._telling = Telling(*names)
+        self._telling = telling
         gaps = options["missing"] == "split"
         self._clock = StreamClock(options["time_tol"], gaps)
         self._label: Hashable = None  # of the sample that came last

@@ -200,6 +200,8 @@ def test_constant_inputs_are_called_by_their_names(rng):
         SubspaceLTI(inputs=["valve", "pump"]).fit(X, y)
     with pytest.raises(ValueError, match="Got input 2 constant at 2:"):
         SubspaceLTI(time=0).fit(X.to_numpy(), y)
+    with pytest.raises(ValueError, match="Got input 7 constant at 2:"):
+        SubspaceLTI(time=3).fit(X.set_axis([3, 5, 7], axis=1), y)
 
 
 @pytest.mark.parametrize("unit", [1e-290, 1e-308, 1e-310])
