@@ -393,11 +393,12 @@ def summarise(
         f"parameter fit (FIT) {fit:.2f} %",
     ]
     if distance.max() > _THROUGH:
-        lines += [
+        lines.append(
             f"    H-infinity error {_span(distance)} % of the model's norm, the "
-            f"largest at {_label_of_largest(distance)}",
-            f"    simulation fit (BFT) there {_span(report['lpv_BFT'])} %",
-        ]
+            f"largest at {_label_of_largest(distance)}"
+        )
+        if report["lpv_BFT"].notna().any():
+            lines.append(f"    simulation fit (BFT) {_span(report['lpv_BFT'])} %")
     elif len(kappa) > 1 and distance.notna().all():  # no norm is where it integrates
         lines.append(
             "    through the local models: how good it is between them only data there "

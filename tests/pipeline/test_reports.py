@@ -7,7 +7,9 @@ from lpvlearn import (
     GrayBoxRestructurer,
     GrayBoxStructure,
     LocalLPVPipeline,
+    PolynomialLPV,
     SubspaceLTI,
+    bft_score,
     from_trajectories,
     parameter_fit,
 )
@@ -90,6 +92,21 @@ def test_parameters_are_reported_one_by_one(fitted):
     np.testing.assert_allclose(report["interpolation_RMSE"], rmse)
     assert report.loc["k", "interpolation_FIT"] > 99
     np.testing.assert_array_equal(report["std"], fitted.parameters_std_.median())
+
+
+def test_what_an_interpolation_loses_at_the_points_is_told(fitted):
+    report = fitted.report_
+    np.testing.assert_allclose(report["lpv_BFT"], report["structured_BFT"], atol=0.5)
+    X, y = spring_tables(n_samples=200)
+    with pytest.warns(UserWarning, match="`lpv_` simulates .* far worse than its gray"):
+        constant = spring_pipeline(interpolator=PolynomialLPV(0)).fit(X, y)
+    report = constant.report_
+    assert (report["lpv_BFT"] < 90.0).all() and (report["structured_BFT"] > 90.0).all()
+    run = X["kappa"] == 0.0
+    found = constant.predict_with_initial_state(X[run], y[run])
+    assert bft_score(y[run], found) == pytest.approx(report["lpv_BFT"][0.0], abs=1e-6)
+    spans = f"{report['lpv_BFT'].min():.4g} to {report['lpv_BFT'].max():.4g}"
+    assert f"simulation fit (BFT) {spans} %" in constant.summary()
 
 
 @FAR_OFF
