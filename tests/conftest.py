@@ -17,9 +17,6 @@ from lpvlearn import (
 ROLES = {"scheduling": "kappa", "experiment": "run", "time": "time"}
 KAPPA = (0.0, 0.5, 1.0, 1.5)
 
-# Of interpolations that are not to go through the points.
-FAR_OFF = pytest.mark.filterwarnings("ignore:`lpv_` simulates the records")
-
 
 def modes(*poles):
     """Real block-diagonal matrix with the given poles, one of each complex pair."""

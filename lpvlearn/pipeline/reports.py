@@ -25,9 +25,7 @@ from ..systems.simulation import (
     trend_signals,
     with_transit,
 )
-from ..validation import listed
 from .local_models import LocalModel, motions
-from .runner import place_of
 from .structured_models import StructuredModels
 
 Array = NDArray[np.float64]
@@ -35,10 +33,6 @@ Array = NDArray[np.float64]
 # Constants are missed that are worth so many points of BFT, or where a local model is
 # this poor, and was fitted to signals with means so many times their motion.
 _WORTH, _POOR, _FAR = 5.0, 50.0, 2.0
-
-# Times what a local model leaves of outputs, and points of BFT besides, that the LPV
-# model leaves of them; operating points that a message lists.
-_FAR_WORSE, _LOST, _NAMED = 2.0, 10.0, 3
 
 _ABOUT_ZERO = 1e-9  # of a pole by the fastest one: it is an integrator's
 
@@ -94,7 +88,7 @@ def tables(
     interpolated = lpv.parameters(points.kappa)
     deviations = pd.DataFrame(spread, index, list(names))
 
-    missed, lost = False, list[tuple[int, float, float]]()
+    missed = False
     delayed = any(model.lti.input_delay.any() for model in found.local)
     rows = []
     for k, (group, model, gray_box) in enumerate(
@@ -117,9 +111,6 @@ def tables(
         if not frozen.poles().real.max(initial=0.0) > 0.0:
             own = _fit_of(frozen, group, sampling_time, model.n_trend)
             row["lpv_BFT"] = own
-            best = max(row.get("structured_BFT", row["local_BFT"]), 0.0)
-            if 100.0 - own > _FAR_WORSE * (100.0 - best) + _LOST:
-                lost.append((k, own, best))
         if delayed:
             samples = np.round(model.lti.input_delay / sampling_time).astype(int)
             inputs = group[0].input_names
@@ -160,18 +151,6 @@ def tables(
             "it misses what a constant of every experiment would explain. Have it "
             "found by offsets='auto', with local=SubspaceLTI(offset='auto'), or "
             "subtract from X and y where the system rests."
-        )
-    if lost:
-        told = [
-            f"{place_of(k, points.kappa)}: {own:.3g} instead of {best:.3g} %"
-            for k, own, best in lost
-        ]
-        whose = "gray-box" if found.restructurers else "local"
-        warn(
-            "`lpv_` simulates the records of an operating point far worse than its "
-            f"{whose} model does ({listed(told, _NAMED)}): the interpolation does not "
-            "go through the points. Use a higher `degree`, AutoLPV(), or, of black "
-            "boxes, a lower order: local=SubspaceLTI(order=...)."
         )
     by_parameter = {
         "lowest": theta.min(axis=0),

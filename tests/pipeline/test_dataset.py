@@ -8,7 +8,7 @@ import pytest
 
 from lpvlearn import GrayBoxRestructurer, LocalLPVPipeline, PolynomialLPV, SubspaceLTI
 
-from ..conftest import FAR_OFF, ROLES, spring_structure, spring_tables
+from ..conftest import ROLES, spring_structure, spring_tables
 
 pytest.importorskip("pyarrow")
 
@@ -36,7 +36,6 @@ def assert_same_fit(one, other):
 
 
 @pytest.mark.parametrize("combine", ["pool", "average"])
-@FAR_OFF
 def test_a_file_and_a_table_give_one_fit(tables, tmp_path, combine):
     X, y = tables
     X.join(y).to_parquet(tmp_path / "all.parquet", row_group_size=170)
@@ -46,7 +45,6 @@ def test_a_file_and_a_table_give_one_fit(tables, tmp_path, combine):
     np.testing.assert_array_equal(found.predict(X), whole.predict(X))
 
 
-@FAR_OFF
 def test_a_folder_of_partitions_is_read_by_its_names(tables, tmp_path):
     X, y = tables
     table = X.join(y)
@@ -58,7 +56,6 @@ def test_a_folder_of_partitions_is_read_by_its_names(tables, tmp_path):
     assert found.predict(table[X.columns]).ndim == 1
 
 
-@FAR_OFF
 def test_a_dataset_of_arrow_is_one(tables):
     pa, arrow = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.dataset")
     X, y = tables

@@ -26,7 +26,6 @@ from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
 from lpvlearn.pipeline.estimator import Stopwatch
 
 from ..conftest import (
-    FAR_OFF,
     KAPPA,
     ROLES,
     spring_pipeline,
@@ -132,7 +131,6 @@ def test_a_restructurer_without_structure_takes_the_canonical_form(spring):
     assert bft_score(y_sweep, pipeline.predict(X_sweep)) > 99.9
 
 
-@FAR_OFF
 def test_any_regressor_interpolates(spring, memory):
     X, y, X_sweep, y_sweep = spring
     linear = spring_pipeline(interpolator=LinearRegression(), memory=memory).fit(X, y)
@@ -174,7 +172,6 @@ def test_points_of_few_samples_count_by_their_covariances():
     assert errors[0] < errors[1] / 1.5
 
 
-@FAR_OFF
 def test_sub_estimators_are_cloned(spring):
     X, y, _, _ = spring
     pipeline = spring_pipeline(local=SubspaceLTI(), interpolator=PolynomialLPV(1))
@@ -573,7 +570,6 @@ def test_a_stopwatch_adds_up_the_times_of_the_steps():
 
 
 @pytest.mark.filterwarnings("ignore:Scheduling variable 'kappa' must be within")
-@FAR_OFF
 def test_a_prediction_that_diverges_names_the_experiment(spring):
     X, y, _, _ = spring
     line = PolynomialLPV(1)  # whose stiffness is negative far below
@@ -750,7 +746,6 @@ def test_no_delay_is_imagined():
     assert "Input delay" not in pipeline.summary()
 
 
-@FAR_OFF
 def test_delays_that_differ_between_points_are_told():
     X, y = late_springs([5, 5, 6, 5])
     local = SubspaceLTI(input_delay="auto")

@@ -18,7 +18,6 @@ from lpvlearn.exceptions import Told, warn
 from lpvlearn.pipeline.runner import Done, PointRunner, tell_skipped
 
 from ..conftest import (
-    FAR_OFF,
     spring_pipeline,
     spring_tables,
 )
@@ -147,7 +146,6 @@ def test_what_differs_in_numbers_is_told_once_with_their_ranges():
     ]
 
 
-@FAR_OFF
 def test_a_progress_bar_stays_whole(capsys):
     """Warnings come after the bar, once, at the points that they are about."""
     X, y = spring_tables(n_samples=150)

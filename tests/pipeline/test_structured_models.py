@@ -27,7 +27,6 @@ from lpvlearn.pipeline.structured_models import (
 )
 
 from ..conftest import (
-    FAR_OFF,
     KAPPA,
     spring_pipeline,
     spring_structure,
@@ -194,7 +193,6 @@ TWO_LAGS = GrayBoxStructure.from_template(
     "restructurer",
     [None, GrayBoxRestructurer(), "passthrough", GrayBoxRestructurer(TWO_LAGS)],
 )
-@FAR_OFF
 def test_an_order_that_grows_in_continuous_time_is_that_of_the_others(
     with_a_negative_pole, restructurer
 ):
@@ -278,7 +276,6 @@ def test_the_rates_of_a_double_integrator_have_one_integrator():
     assert_allclose(pipeline.parameters_["b"], [5.0, 2.0], rtol=1e-2)
 
 
-@FAR_OFF
 def test_nothing_is_said_of_distances_between_integrators():
     rng, runs = np.random.default_rng(5), []
     structure = GrayBoxStructure.from_template(
