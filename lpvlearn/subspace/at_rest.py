@@ -58,16 +58,18 @@ def from_rest(
     stand, evidence = stands(pairs), free.evidence
     if stand is None:
         return None
-    first, at_rest = stand.first, choices._replace(initial_states=False)
+    first, seen = stand
+    at_rest = choices._replace(initial_states=False)
     if first.any():  # a level is that of the answer to these
-        sure = said or choices.offset == "constant" or evidence.free.n_trend
+        sure = said or choices.offset == "constant" or bool(evidence.free.n_trend)
         if not sure and not stands_by_chance(evidence.one_step, _MAY_BE):
             return None  # without a constant it is that to zero
+        seen &= sure or stands_by_chance(evidence.one_step)
         at_rest = at_rest._replace(offset="constant")
     elif said:
         return None
     moved = [(u - level, y) for (u, y), level in zip(pairs, first, strict=True)]
-    fitted = _as_likely(moved, at_rest, telling, free, stand.seen)
+    fitted = _as_likely(moved, at_rest, telling, free, seen)
     return None if fitted is None else AtRest(moved, at_rest, fitted, first)
 
 
@@ -114,12 +116,14 @@ def _is_as_likely(own: Evidence, other: Evidence, seen: bool) -> bool:
     left, plainly = _plain_errors(own, other)
     if not other.free.initial_states:
         return worse < 0.0 and left <= 1.0
+    if other.whitening.of_differences and left >= 1.0:
+        return False  # it is meant to leave more
     gain = other.static_gain()
     loses = by_chance or gain is None or bool(gain.unknown.any())
     most = CERTAIN if loses else ALIKE
     if not worse <= most * ((seen and not drifts_off) or left < 1.0):
         return False
-    if by_chance:
+    if by_chance or (worse > ALIKE and left >= _NOT_FAR_WORSE):
         return left < _NOT_FAR_WORSE
     n_more = other.free.n_own(len(other.model.A)) - own.free.n_own(len(own.model.A))
     return plainly <= ALIKE + PRICE * max(n_more, 0) * len(other.records)
