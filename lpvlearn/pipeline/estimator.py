@@ -260,18 +260,17 @@ list, default=None
         ("lpv_BFT", NaN where it is unstable) on the estimation data (percent, mean over
         the outputs, from estimated initial states), restructuring error, its structural
         floor and what remains apart from that, all relative to the black box's norm,
-        the active frequency (rad/s) of what
-        remains, stationarity; with `efficient`, the error of the H-infinity optimum
-        ("relative_hinf_error"; floor, remainder and stationarity are its own), and
-        "chi2", "degrees_of_freedom" and "p_value" of the gray-box model's distance in
-        standard deviations of the black box; the delays of the inputs in samples
-        ("delay_"), where there are any; the point of work, where `lpv_` has offsets
-        ("u0_" of every input, "y0_" of every output); the distance from the gray-box
-        model to the interpolated one (H-infinity norm, relative), and the FIT (percent,
-        Eq. (36)) of its parameters; the largest real part (1/s) of the poles of `lpv_`
-        from there half-way to the neighbours ("growth_rate", above zero unstable); the
-        parameters ("param_"), and their standard
-        deviations ("std_") where known.
+        the active frequency (rad/s) of what remains, stationarity; with `efficient`,
+        the error of the H-infinity optimum ("relative_hinf_error"; floor, remainder and
+        stationarity are its own), and "chi2", "degrees_of_freedom" and "p_value" of the
+        gray-box model's distance in standard deviations of the black box; the delays of
+        the inputs in samples ("delay_"), where there are any; the point of work, where
+        `lpv_` has offsets ("u0_" of every input, "y0_" of every output); the distance
+        from the gray-box model to the interpolated one (H-infinity norm, relative), and
+        the FIT (percent, Eq. (36)) of its parameters; the largest real part (1/s) of
+        the poles of `lpv_` from there half-way to the neighbours ("growth_rate", above
+        zero unstable); the parameters ("param_"), and their standard deviations
+        ("std_") where known.
     parameter_report_ : DataFrame
         One row per parameter: lowest and highest value over the points, median
         standard deviation, RMSE and FIT (percent) of the interpolation.

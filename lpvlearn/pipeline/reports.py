@@ -109,8 +109,7 @@ def tables(
         frozen = lpv.at(points.kappa[k])
         row["lpv_BFT"] = np.nan
         if not frozen.poles().real.max(initial=0.0) > 0.0:
-            own = _fit_of(frozen, group, sampling_time, model.n_trend)
-            row["lpv_BFT"] = own
+            row["lpv_BFT"] = _fit_of(frozen, group, sampling_time, model.n_trend)
         if delayed:
             samples = np.round(model.lti.input_delay / sampling_time).astype(int)
             inputs = group[0].input_names
@@ -301,18 +300,8 @@ def summarise(
         names = [name for name in report if name.startswith(("u0_", "y0_"))]
         spans = [f"{name[3:]} {_span(report[name])}" for name in names]
         lines.append(f"Points of work: {', '.join(spans)}")
-    hidden = [
-        "u0_",
-        "y0_",
-        "lpv_BFT",
-        "param_",
-        "std_",
-        "n_",
-        "stationarity",
-        "horizon",
-        "order",
-    ]
-    hidden += ["relative_hinf_error", "chi2", "degrees_of_freedom"]
+    hidden = ["u0_", "y0_", "param_", "std_", "n_", "stationarity", "horizon", "order"]
+    hidden += ["relative_hinf_error", "chi2", "degrees_of_freedom", "lpv_BFT"]
     if report["growth_rate"].max() <= 0:
         hidden.append("growth_rate")
     restructured = "structured_BFT" in report

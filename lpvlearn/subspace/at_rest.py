@@ -123,10 +123,11 @@ def _is_as_likely(own: Evidence, other: Evidence, seen: bool) -> bool:
     most = CERTAIN if loses else ALIKE
     if not worse <= most * ((seen and not drifts_off) or left < 1.0):
         return False
-    if by_chance or (worse > ALIKE and left >= _NOT_FAR_WORSE):
-        return left < _NOT_FAR_WORSE
+    if (by_chance or worse > ALIKE) and not left < _NOT_FAR_WORSE:
+        return False
     n_more = other.free.n_own(len(other.model.A)) - own.free.n_own(len(own.model.A))
-    return plainly <= ALIKE + PRICE * max(n_more, 0) * len(other.records)
+    allowed = ALIKE + PRICE * max(n_more, 0) * len(other.records)
+    return by_chance or plainly <= allowed
 
 
 def _plain_errors(own: Evidence, other: Evidence) -> tuple[float, float]:

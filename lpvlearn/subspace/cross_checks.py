@@ -8,9 +8,10 @@ from ..data.preparation import DETRENDS, Pairs, Rounded, far_out
 from ..exceptions import RankWarning
 from ..systems.simulation import delayed, lti_response
 from .delay import first_samples, longest_delays
+from .held_out import DOUBT
 from .local_fit import LocalFit
 from .offsets import CERTAIN, criterion_in_units
-from .one_fit import TooFewSamples, errors_held_out, fit_once
+from .one_fit import TooFewSamples, choose_and_identify, errors_held_out
 from .options import Choices
 from .simulation_fit import simulation_errors, with_initial_states
 from .telling import Telling
@@ -30,11 +31,7 @@ _ANSWERED = 0.6
 # The response of the model comes to half its height within so many times a delay, over
 # so many times of which that is looked for, and is not so high yet half the way there.
 _LATE, _FEWER = 3, 2
-
 _RISEN, _WHOLE, _EARLY = 4, 20, 0.25
-
-# Standard errors by which parts held out must be simulated better.
-_CLEARLY = 2.0
 
 # Of inputs that only rounding tells apart: times the gain of all others, of a model
 # that makes of the ripple what it likes, at these frequencies (rad per sample); and the
@@ -64,7 +61,7 @@ def tell_of_contradiction(
     energies = []
     for k in some:
         try:
-            other = fit_once(
+            other = choose_and_identify(
                 [pairs[k]], same, telling.aside("collinear"), free.n_trend, whole
             )
         except TooFewSamples:
@@ -107,7 +104,9 @@ def tell_of_input_spikes(
         return
     n_trend = whole.evidence.free.n_trend
     try:
-        other = fit_once(without, whole.chosen(choices), telling.aside(), n_trend)
+        other = choose_and_identify(
+            without, whole.chosen(choices), telling.aside(), n_trend
+        )
     except TooFewSamples:
         return
     if other.residual < _ANSWERED * whole.residual:
@@ -118,8 +117,7 @@ def tell_of_input_spikes(
             f"{len(found)} sample(s) of the inputs stand far out, and the outputs do "
             f"not answer them; the first is {where} of input {telling.input(j)}, "
             "counted from 0. With what their neighbours have in their place a model "
-            "leaves "
-            f"{100.0 * other.residual:.2g} % of the outputs, not "
+            f"leaves {100.0 * other.residual:.2g} % of the outputs, not "
             f"{100.0 * whole.residual:.2g} %. If they were logged wrongly, replace "
             "them by NaN and use missing='split', or by what was sent.",
         )
@@ -151,8 +149,10 @@ def tell_of_delay(
     late = [(delayed(u, delay)[known], y[known]) for u, y in pairs]
     early = [(u[known], y[known]) for u, y in pairs]
     try:
-        other = fit_once(late, given, telling.aside(), n_trend)
-        first = fit_once(early, whole.chosen(choices), telling.aside(), n_trend)
+        other = choose_and_identify(late, given, telling.aside(), n_trend)
+        first = choose_and_identify(
+            early, whole.chosen(choices), telling.aside(), n_trend
+        )
     except TooFewSamples:
         return
     error, found = errors_held_out(first, given), errors_held_out(other, given)
@@ -160,7 +160,7 @@ def tell_of_delay(
         return  # late inputs move in other parts
     n_saved = first.selection.order - other.selection.order
     better = n_saved >= _FEWER and not error.clearly_better_than(found, 0.0)
-    if not better and not found.clearly_better_than(error, _CLEARLY):
+    if not better and not found.clearly_better_than(error, DOUBT):
         return
     orders = other.selection.order, first.selection.order
     if better:

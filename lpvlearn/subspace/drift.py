@@ -34,12 +34,7 @@ from .offsets import (
     motion_left,
     with_levels,
 )
-from .one_fit import (
-    TooFewSamples,
-    fit_once,
-    is_worth_a_choice,
-    of_order,
-)
+from .one_fit import TooFewSamples, choose_and_identify, is_worth_a_choice, of_order
 from .options import Choices
 from .residuals import lacks
 from .signals import output_energy, shorten
@@ -183,7 +178,7 @@ def of_drifting_noise(
     ):
         return None
     try:
-        found = fit_once(moved, same, telling.aside(), n_left)
+        found = choose_and_identify(moved, same, telling.aside(), n_left)
     except TooFewSamples:
         return None
     if found.stability_loss:

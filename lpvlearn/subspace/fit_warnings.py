@@ -490,11 +490,10 @@ def _warn_of_unknown_response(fitted: LocalFit, telling: Telling) -> None:
         telling.once(
             "static gain",
             f"The static gain (from input {telling.input(which)} to output "
-            f"{telling.output(output)}) is known no "
-            "better than to its own size: the record excites slow motions too little "
-            "to tell it. Record for longer, with inputs that are held for longer, or "
-            "lower `order`; at higher frequencies the model may be right "
-            "(`frequency_response_std`).",
+            f"{telling.output(output)}) is known no better than to its own size: the "
+            "record excites slow motions too little to tell it. Record for longer, "
+            "with inputs that are held for longer, or lower `order`; at higher "
+            "frequencies the model may be right (`frequency_response_std`).",
         )
         return
     share, omega = fitted.evidence.unknown_share(gain.size)

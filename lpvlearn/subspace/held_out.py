@@ -37,6 +37,9 @@ _TOO_SHORT = 8  # samples of an experiment of which nothing is held out
 # By which an error must be less to matter, and by which it is so beyond doubt.
 MATTERS, _MUCH = 0.03, 0.5
 
+# Standard errors by which another way to a model must be better.
+DOUBT = 2.0
+
 _GROWS = 1.001  # modulus of a pole by which its mode is one that grows
 
 _FAR_MORE = 4.0  # times the errors: more than an initial state takes of slow noise

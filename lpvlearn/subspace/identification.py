@@ -17,7 +17,7 @@ from ..data.preparation import Pairs
 from ..systems.simulation import trend_signals
 from .criterion import criterion_of
 from .hankel import data_factors
-from .held_out import HeldOut, held_out
+from .held_out import DOUBT, HeldOut, held_out
 from .noise import Whitening
 from .realization import (
     ObservabilitySubspace,
@@ -478,20 +478,19 @@ def _is_astray(
     return better > (0.0 if strays else _LIKELIER)
 
 
-# Standard errors by which another way to the model must be better: errors that are not
-# whitened, or no refinement, lose to whitened ones unless the system is not linear.
-_DOUBT = 2.0
-
-
 def _best_held_out(
     candidates: Sequence[Candidate], records: Sequence[Record], settings: Settings
 ) -> Candidate:
-    """The first, unless a later one simulates parts held out clearly better."""
+    """The first, unless a later one simulates parts held out clearly better.
+
+    Errors that are not whitened, or no refinement, lose to whitened ones unless the
+    system is not linear.
+    """
     best = candidates[0]
     error = validate(best, records, settings)
     for candidate in candidates[1:]:
         other = validate(candidate, records, settings)
-        if other.clearly_better_than(error, _DOUBT):
+        if other.clearly_better_than(error, DOUBT):
             best, error = candidate, other
     return best
 

@@ -98,7 +98,7 @@ def warn_of_many_pieces(experiments: Sequence[Experiment]) -> None:
     moves = np.array([np.ptp(part.inputs, axis=0).any() for part in pieces])
     if len(pieces) > len(whole) and not moves.all():
         warn(
-            f"missing='split' cuts at outputs that are missing, and in "
+            "missing='split' cuts at outputs that are missing, and in "
             f"{np.sum(~moves)} of {len(pieces)} pieces no input moves: as each has an "
             "initial state and a constant of its own, these tell nothing of the gain. "
             "Use missing='estimate', which cuts where inputs are missing alone."

@@ -46,7 +46,7 @@ class TooFewSamples(ValueError):
     """The samples do not tell enough for a model; more of them may."""
 
 
-def fit_once(
+def choose_and_identify(
     pairs: Pairs,
     choices: Choices,
     telling: Telling,
@@ -118,7 +118,7 @@ def of_order(
     And by how much its criterion is worse than that of the `other`, whose choice of the
     order it keeps.
     """
-    found = fit_once(pairs, choices._replace(order=order), telling, n_trend)
+    found = choose_and_identify(pairs, choices._replace(order=order), telling, n_trend)
     worse = criterion_in_units(found.evidence.one_step)
     worse -= criterion_in_units(other.evidence.one_step)
     return found._replace(selection=found.selection.among(other.selection)), worse
@@ -153,7 +153,7 @@ def is_worth_a_choice(
             residual=np.inf,  # whatever comes of it
         )
         same = choices._replace(order=len(A), horizon=horizon, refine="prediction")
-        return fit_once(
+        return choose_and_identify(
             pairs, same._replace(method=fitted.method), telling, n_trend, start
         )
 

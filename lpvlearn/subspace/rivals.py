@@ -11,11 +11,11 @@ from .closed_loop import ClosedLoopEvidence
 from .criterion import PRICE
 from .delay import find_lead, with_later_inputs
 from .fit_warnings import Doubt
-from .held_out import HeldOut
+from .held_out import DOUBT, HeldOut
 from .identification import spectral_radius
 from .local_fit import LocalFit
 from .offsets import CERTAIN, follows_means_alone
-from .one_fit import TooFewSamples, errors_held_out, fit_once
+from .one_fit import TooFewSamples, choose_and_identify, errors_held_out
 from .options import Choices
 from .rounding import rounded_outputs
 from .telling import Telling
@@ -26,9 +26,8 @@ from .trends import with_trends
 _LED, _LINE = 0.1, 3.0
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
-# model not to refute it; standard errors by which a lesser one must be better where the
-# plant grows; standard deviations by which a pole does so for certain.
-_OF_NOISE, _DOUBT, _CERTAIN = 0.5, 2.0, 3.0
+# model not to refute it; standard deviations by which a pole grows for certain.
+_OF_NOISE, _CERTAIN = 0.5, 3.0
 
 # The same of one with D free, where nothing but answers within the sample shows a loop.
 _OF_ANSWERS = 0.25
@@ -68,7 +67,7 @@ def believable(
 
     def rival(**chosen: Any) -> tuple[LocalFit, HeldOut]:
         chosen_so = same._replace(**chosen)
-        other = fit_once(pairs, chosen_so, telling, n_trend, first)
+        other = choose_and_identify(pairs, chosen_so, telling, n_trend, first)
         return other, errors_held_out(other, chosen_so)
 
     best, error = first, errors_held_out(first, choices)
@@ -80,7 +79,7 @@ def believable(
         if (order := open_loop.selection.order) != first.selection.order:
             free = False if without_d else choices.feedthrough
             other, found = rival(method="pbsid", order=order, feedthrough=free)
-            if found.clearly_better_than(error, _DOUBT):
+            if found.clearly_better_than(error, DOUBT):
                 tried = other.selection.among(first.selection)
                 first = best = other._replace(selection=tried)
                 before = error = found
@@ -106,7 +105,7 @@ def believable(
             unsure |= find_lead(pairs)[0] > 0  # inputs were made of later outputs, too
         if unsure and not open_loop.grows() and not better:
             blind, of_blind = open_loop, of_that
-            better = of_that.clearly_better_than(error, _DOUBT)
+            better = of_that.clearly_better_than(error, DOUBT)
         if better:
             best, error = blind, of_blind
         if answered and not shown and as_said is True:
@@ -146,7 +145,7 @@ def tell_of_lead(
     for order, share in {first: _OF_NOISE, choices.order: led}.items():
         plain = plain._replace(order=order)
         try:
-            other = fit_once(pairs, plain, telling.aside(), n_trend)
+            other = choose_and_identify(pairs, plain, telling.aside(), n_trend)
         except TooFewSamples:
             return
         if other.feedback is None or other.feedback.found:
@@ -208,7 +207,7 @@ def with_shared_noise(
         if chosen.n_noise_states <= n_joint:
             continue  # as many states were chosen before
         try:
-            other = fit_once(pairs, chosen, telling, n_trend, first)
+            other = choose_and_identify(pairs, chosen, telling, n_trend, first)
         except TooFewSamples:
             continue
         evidence = other.evidence
@@ -221,14 +220,12 @@ def with_shared_noise(
             continue
         if follows_means_alone(evidence):
             continue  # what moves it is all called noise
-        error, its = (
-            error or errors_held_out(first, choices),
-            errors_held_out(other, chosen),
-        )
+        error = error or errors_held_out(first, choices)
+        its = errors_held_out(other, chosen)
         more = several and other.selection.order > own
         if more and not its.total < _FAR_BETTER * error.total:
             continue
-        if not error.clearly_better_than(its, _DOUBT):
+        if not error.clearly_better_than(its, DOUBT):
             best, least = other, deviance
     return best
 

@@ -35,8 +35,8 @@ from .local_fit import LocalFit
 from .offsets import shifts_matter
 from .one_fit import (
     TooFewSamples,
+    choose_and_identify,
     errors_held_out,
-    fit_once,
 )
 from .options import Choices
 from .signals import Record
@@ -223,7 +223,7 @@ def without_shifts(
     if rests.any():  # an input tells nothing of any part: its step made the shift
         return pairs, whole
     try:
-        fitted = fit_once(parts, choices, telling, 1, whole)
+        fitted = choose_and_identify(parts, choices, telling, 1, whole)
     except TooFewSamples:
         return pairs, whole
     if not shifts_matter(whole.evidence.one_step, fitted.evidence.one_step):

@@ -36,9 +36,10 @@ from ..data.timestamps import TIME_TOL, Clock, read_clock, time_in_seconds
 from ..systems.threads import one_blas_thread
 from ..validation import SQUARED, input_delays
 from .delay import late_inputs
-from .fit import TooFewSamples, fit_pairs
+from .fit import fit_pairs
 from .fit_warnings import warn_about, warn_about_drift, warn_about_pole
 from .local_fit import LocalFit
+from .one_fit import TooFewSamples
 from .options import Choices
 from .stream_summary import Piece, StreamSummary
 from .telling import Telling

@@ -21,7 +21,7 @@ from .offsets import (
     stands_by_chance,
     unmoved_errors,
 )
-from .one_fit import TooFewSamples, fit_once, is_worth_a_choice, of_order
+from .one_fit import TooFewSamples, choose_and_identify, is_worth_a_choice, of_order
 from .options import Choices
 from .rounding import rounded_outputs
 from .statistics import Evidence
@@ -43,7 +43,7 @@ def with_trends(
     # The errors of a rough model are not the noise that constants must stand out of.
     rough = choices.offset == "auto" and choices.refine is False
     judged = choices._replace(refine="simulation") if rough else choices
-    fitted = fit_once(pairs, judged, telling, n_trend, known)
+    fitted = choose_and_identify(pairs, judged, telling, n_trend, known)
     # A slow mode of the noise, which outputs drive, stands for constants only too well;
     # so does one of a model that has to start at rest. In the errors of a poor model of
     # a given order nothing stands out.
@@ -62,7 +62,7 @@ def with_trends(
 
     refused = np.inf
     if choices.offset == "auto" and may_matter():
-        other = fit_once(pairs, judged, telling, 1, fitted)
+        other = choose_and_identify(pairs, judged, telling, 1, fitted)
         order = len(fitted.model.A)
         if stands and len(other.model.A) > order:
             as_many, worse = of_order(pairs, judged, telling, order, other, 1)
@@ -81,7 +81,11 @@ def with_trends(
     ):
         fitted = _with_drifts(pairs, judged, telling, fitted, refused)
         n_trend = fitted.evidence.free.n_trend
-    return fit_once(pairs, choices, telling, n_trend, fitted) if rough else fitted
+    return (
+        choose_and_identify(pairs, choices, telling, n_trend, fitted)
+        if rough
+        else fitted
+    )
 
 
 def _may_drift_off(
@@ -118,7 +122,7 @@ def _with_drifts(
     if leaves_rounding(tested):
         return fitted
     try:
-        other = fit_once(pairs, choices, telling, 2, fitted)
+        other = choose_and_identify(pairs, choices, telling, 2, fitted)
     except TooFewSamples:
         return fitted
     before = min(criterion_in_units(tested), refused)

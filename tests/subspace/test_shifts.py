@@ -138,11 +138,11 @@ def test_cuts_that_leave_inputs_nothing_to_explain_are_not_made(monkeypatch):
     u, y = slow_record(rng, 900)
     y = y + 0.1 * np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
 
-    def fitted(pairs, choices, *args, like=shifts.fit_once):
+    def fitted(pairs, choices, *args, like=shifts.choose_and_identify):
         order = 0 if len(pairs) > 1 else choices.order
         return like(pairs, choices._replace(order=order), *args)
 
-    monkeypatch.setattr(shifts, "fit_once", fitted)
+    monkeypatch.setattr(shifts, "choose_and_identify", fitted)
     monkeypatch.setattr(shifts, "shifts_matter", lambda whole, parts: True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the shifts do
@@ -156,7 +156,7 @@ def test_cuts_that_make_a_stable_model_grow_are_not_made(monkeypatch):
     u, y = slow_record(rng, 900)
     y = y + 0.1 * np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
 
-    def fitted(pairs, *args, like=shifts.fit_once):
+    def fitted(pairs, *args, like=shifts.choose_and_identify):
         found = like(pairs, *args)
         if len(pairs) == 1:
             return found
@@ -165,7 +165,7 @@ def test_cuts_that_make_a_stable_model_grow_are_not_made(monkeypatch):
         evidence = replace(evidence, model=grown)
         return found._replace(evidence=evidence, model=grown)
 
-    monkeypatch.setattr(shifts, "fit_once", fitted)
+    monkeypatch.setattr(shifts, "choose_and_identify", fitted)
     monkeypatch.setattr(shifts, "shifts_matter", lambda whole, parts: True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the shifts do
