@@ -166,6 +166,7 @@ def test_constants_and_initial_states_are_told_apart():
     np.testing.assert_allclose(found.own, [[0.5, 0, 2], [0.5, 1, 3]], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_their_covariance_says():
     truth = spring_lpv()
     c, distances = coefficients_of(truth), []

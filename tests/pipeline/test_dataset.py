@@ -45,6 +45,7 @@ def test_a_file_and_a_table_give_one_fit(tables, tmp_path, combine):
     np.testing.assert_array_equal(found.predict(X), whole.predict(X))
 
 
+@pytest.mark.slow
 def test_a_folder_of_partitions_is_read_by_its_names(tables, tmp_path):
     X, y = tables
     table = X.join(y)

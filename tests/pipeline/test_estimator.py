@@ -487,6 +487,7 @@ def test_gaps_are_split_where_the_local_estimator_splits(spring, combine):
     assert (pipeline.report_["n_experiments"] == 2).all()
 
 
+@pytest.mark.slow
 def test_deviations_of_averaged_parameters_cover_their_errors():
     """Errors are of the size of the deviations."""
     X, y = spring_tables(noise=0.05, n_samples=300, n_repeats=12)

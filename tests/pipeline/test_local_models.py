@@ -183,6 +183,7 @@ def position(u, inertia):
 
 
 # the black box has a pole beside one, the structure at one
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the structure lies")
 @pytest.mark.parametrize("integrating", [None, True])
 def test_a_bias_is_known_to_the_lpv_model(integrating):

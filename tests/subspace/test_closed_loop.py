@@ -315,6 +315,7 @@ def test_auto_takes_it_where_there_is_feedback():
     assert streamed.method_ == "po-moesp"
 
 
+@pytest.mark.slow
 def test_a_controller_that_answers_at_once_is_no_feedthrough():
     """A free D would be minus one over the gain of the controller."""
     for rng in map(np.random.default_rng, range(3)):
@@ -363,6 +364,7 @@ def sampled_early(seed, n_samples=400):
     return u[:-1], 0.5 * (y[:-1] + y[1:]) + noise
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The outputs seem to know")
 def test_auto_gives_up_what_parts_held_out_refute():
     for seed in range(3):
@@ -394,6 +396,7 @@ def modes_sampled_early(seed, n_samples=500):
     return u[:-1], y + 0.005 * y.std() * rng.standard_normal(y.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The outputs seem to know")
 def test_a_free_d_that_only_makes_the_plant_stable_competes_with_the_open_loop():
     for seed in (0, 1):
@@ -426,6 +429,7 @@ def test_outputs_that_lead_the_inputs_are_told(lead):
         assert f"at least {lead - 1} sample(s) ahead" in message
 
 
+@pytest.mark.slow
 def test_the_inputs_of_a_loop_with_a_reference_do_not_come_too_late():
     for seed in range(3):
         u, y = closed_loop(np.random.default_rng(seed), 2000)
@@ -486,6 +490,7 @@ def test_the_order_in_a_loop_is_one_that_simulates(seed):
     assert error(model) < 0.15
 
 
+@pytest.mark.slow
 def test_auto_keeps_a_plant_that_only_the_loop_holds():
     for delay in (0, 1):
         rng, drive = np.random.default_rng(0), np.array([0.5, 0.2])

@@ -136,7 +136,8 @@ def test_experiments_with_constants_are_fitted_alike():
     assert bft_score(plant.simulate(u), model.lti_.simulate(u)) > 99.0
 
 
-@pytest.mark.parametrize("seed", [8, pytest.param(9, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [8, 9])
 def test_orders_of_long_records_are_chosen_over_all_of_their_time(seed):
     # The twelve thousand samples of a choice, at most, are too few of so slow a motion.
     rng = np.random.default_rng(seed)

@@ -86,6 +86,7 @@ class TestOfLevels:
 
 
 class TestDriftingOutputs:
+    @pytest.mark.slow
     @pytest.mark.parametrize(("order", "most_told"), [("auto", 1), (2, 0)])
     def test_no_slow_state_follows_the_drift(self, order, most_told):
         """Or it is told."""
@@ -107,11 +108,13 @@ class TestDriftingOutputs:
         assert np.median(deviations) < 1.5
         assert max(deviations) < 4.0
 
+    @pytest.mark.slow
     def test_where_the_outputs_stand_does_not_matter(self):
         models = [_quiet_fit(*_record(3, start=k)) for k in (0.0, 500.0)]
         gains = [model.lti_.dc_gain().item() for model in models]
         assert gains[0] == pytest.approx(gains[1], rel=1e-6)
 
+    @pytest.mark.slow
     def test_outputs_drift_apart(self):
         u, y = _record(0)
         other = 20.0 * _record(10)[1] - 20.0 * _plant().simulate(_record(10)[0])[:, 0]
@@ -122,6 +125,7 @@ class TestDriftingOutputs:
         std = np.abs(model.frequency_response_std([1e-6])).ravel() / [1.0, 20.0]
         assert (np.abs(gains - _plant().dc_gain().item()) < 3.5 * std).all()
 
+    @pytest.mark.slow
     def test_experiments_wander_on_their_own(self):
         taken = 0
         for first in (0, 4, 8):
@@ -168,6 +172,7 @@ class TestOutputsThatDoNotDrift:
         std = np.abs(model.frequency_response_std([1e-6])).item()
         assert abs((model.lti_.dc_gain() - plant.dc_gain()).item()) < 3.5 * std
 
+    @pytest.mark.slow
     def test_nothing_drifts_beside_as_many_states(self, monkeypatch):
         """Whatever the samples looked like with others."""
         monkeypatch.setattr(drift, "may_drift", lambda fitted: True)

@@ -120,6 +120,7 @@ def test_prediction_does_not_depend_on_the_order_of_experiments(table):
     np.testing.assert_allclose(model.predict(kept), whole.loc[kept.index], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The scored table starts in mid-motion")
 def test_grid_search_over_orders_with_experiments_as_groups(table):
     X, y = table
@@ -152,6 +153,7 @@ def test_resonant_system_in_noise_reaches_the_accuracy_of_maximum_likelihood(hor
     assert np.median(scores) > 99.7
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:horizon=.* ends in a poor model:UserWarning")
 @pytest.mark.parametrize("method", ["po-moesp", "pi-moesp"])
 @pytest.mark.parametrize("refine", [True, False])

@@ -214,6 +214,7 @@ def test_inputs_that_are_next_to_nothing_are_named(unit):
     SubspaceLTI(1).fit(X * [1.0, 1e-149], y)
 
 
+@pytest.mark.slow
 def test_a_given_horizon_that_ends_in_a_poor_minimum_warns():
     """A pole a hundred times slower than the horizon, past inputs as instruments."""
     poles = np.exp(1e-3 * np.array([-0.7, -45.0, -3.8 + 52.6j, -46.0 + 121.0j]))
@@ -503,6 +504,7 @@ def test_some_of_several_inputs_may_be_collinear(rng):
         assert model.score(u, y) > 1.0 - 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gains", [(1.0, -1.0), (1.0, 1.0)])
 def test_experiments_that_contradict_one_another_are_told(gains):
     """A sensor that changes its sign; equal ones, as noisy, are silent."""

@@ -96,6 +96,7 @@ def test_what_is_known_of_the_rates_is_asked_of_them():
     assert pairs and all(abs(m.poles() - 1.0).min() < 1e-12 for m in pairs[0])
 
 
+@pytest.mark.slow
 def test_deviations_of_integrated_models_are_those_of_the_estimates():
     """White noise on an angle is that of its model; its rates have it differenced."""
     found = {"angle": [], "rates": []}

@@ -125,6 +125,7 @@ def test_without_noise_the_system_is_found():
     assert distance(model, true) < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colour", [0.0, 0.9])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_third_of_the_outputs_is_hardly_missed(seed, colour):
@@ -165,6 +166,7 @@ def test_deviations_know_what_is_missing():
     assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kept", ["all every fifth", "one every fifth", "none for long"]
 )
@@ -183,6 +185,7 @@ def test_outputs_that_come_in_a_rhythm_or_stay_away(kept):
     assert distance(model, true) < 0.03
 
 
+@pytest.mark.slow
 def test_inputs_and_outputs_missing_with_delay_and_offset():
     true, u, y = record(6, 1500)
     late = np.vstack([np.zeros((3, 1)), u[:-3]])
@@ -197,6 +200,7 @@ def test_inputs_and_outputs_missing_with_delay_and_offset():
     assert distance(model, true.with_input_delay(3)) < 0.03
 
 
+@pytest.mark.slow
 def test_a_plant_in_a_loop():
     rng = np.random.default_rng(0)
     plant = StateSpace([[1.2, -0.5], [1.0, 0.0]], [[1.0], [0.0]], [[0.5, 0.3]], None, 1)
@@ -214,6 +218,7 @@ def test_a_plant_in_a_loop():
     assert distance(model, plant) < 0.05
 
 
+@pytest.mark.slow
 def test_residuals_of_gappy_records_are_tested():
     _, u, y = record(7)
     gappy = without(y, 0.2)
@@ -226,6 +231,7 @@ def test_residuals_of_gappy_records_are_tested():
     assert not tests.loc[tests["test"] == "past inputs", "passed"].any()
 
 
+@pytest.mark.slow
 def test_a_chain_of_local_models():
     X, y = spring_tables(noise=1e-2, n_samples=400)
     local = SubspaceLTI(2, horizon=10, missing="estimate")
@@ -312,6 +318,7 @@ def test_rows_that_are_lost_leave_nothing_to_estimate():
     np.testing.assert_allclose(*(m.lti_.poles() for m in models), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_predictor_is_that_of_the_noise():
     _, u, y = record(13, 3000, noise=0.3, colour=0.9)
     whole = SubspaceLTI(4, horizon=8).fit(u, y)

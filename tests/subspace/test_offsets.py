@@ -316,6 +316,7 @@ def fit_of(model, X, y):
     return 1.0 - left / np.linalg.norm(y - y.mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [{}, {"order": 2}, {"order": 1, "integrating": True}]
 )
@@ -331,6 +332,7 @@ def test_an_offset_of_a_motors_input_is_found_and_predicted(options):
         assert fit_of(model, fresh, driven(fresh)) > 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.5, 10.0])
 @pytest.mark.parametrize("every", [1, 10])
 def test_a_drift_is_not_followed_by_a_state(size, every):
@@ -350,6 +352,7 @@ def test_a_drift_is_not_followed_by_a_state(size, every):
         assert fit_of(model, fresh, there) > 0.95
 
 
+@pytest.mark.slow
 def test_a_ramp_that_an_early_step_makes_of_an_integrator_is_no_drift():
     """As a line it would be as likely: inputs that explain it have the first word."""
     f = np.sign(np.sin(6 * np.pi * np.arange(300) / 300 + 1e-9))[:, None]
@@ -374,6 +377,7 @@ def test_offsets_of_the_input_of_several_experiments_differ():
     np.testing.assert_allclose(-model.input_offset_[:, 0], biases, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_slow_plant_that_begins_at_rest_is_predicted_from_there():
     """The constant alone does not tell where it rests: far from all it has reached."""
     for seed in range(3):
@@ -385,6 +389,7 @@ def test_a_slow_plant_that_begins_at_rest_is_predicted_from_there():
         assert fit_of(model, fresh, driven(fresh, slow=1.0 - 1.0 / 3000)) > 0.95
 
 
+@pytest.mark.slow
 def test_a_slow_plant_rests_where_it_began_not_at_the_means_of_its_inputs():
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -396,6 +401,7 @@ def test_a_slow_plant_rests_where_it_began_not_at_the_means_of_its_inputs():
         assert fit_of(model, fresh + 3.0, there) > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The response is hardly known")
 @pytest.mark.parametrize("seed", [7, 13])
 def test_a_step_from_rest_at_a_level_has_a_constant(seed):
@@ -712,6 +718,7 @@ def test_too_few_states_do_not_follow_the_level(seed):
         assert any("nothing of how they move" in str(w.message) for w in told)
 
 
+@pytest.mark.slow
 def test_a_step_from_rest_tells_that_there_is_no_constant():
     """The input is far from zero nearly all the time, and began at it."""
     u = (np.arange(500) >= 20).astype(float)[:, None]
@@ -798,6 +805,7 @@ def test_a_slow_mode_less_leaves_what_is_seen_of_the_others(rng):
         assert ratio[0] == pytest.approx(ratio[1], rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0, 0.3])
 def test_a_mode_slower_than_the_record_is_told_from_a_constant(size):
     for seed in range(3):

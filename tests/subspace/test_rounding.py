@@ -31,6 +31,7 @@ def test_what_no_step_divides_is_not_rounded(rng, kind):
     np.testing.assert_array_equal(Rounding.of([Record.of(y, y)]), [[0.0], [0.0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n_levels", "fit"), [(5, 75.0), (10, 85.0), (20, 93.0)])
 def test_rounding_is_not_followed_by_states(n_levels, fit):
     # It repeats where inputs do: in parts held out as well.

@@ -173,6 +173,7 @@ def test_losses_do_not_rise_with_the_order():
     assert (loss.diff().dropna() < 1e-3).all()
 
 
+@pytest.mark.slow
 def test_parts_where_nothing_happens_do_not_overrule_the_step_before_them():
     """Noise is all that is left of a lag there: an order too low does as well."""
     rng = np.random.default_rng(0)
@@ -266,6 +267,7 @@ def test_a_given_horizon_bounds_the_orders_that_are_tried():
     assert chosen.order == 3
 
 
+@pytest.mark.slow
 def test_many_short_experiments_tell_the_order():
     """Every twentieth output is missing at random, which leaves some 20 in a row."""
     rng, A = np.random.default_rng(0), modes(0.95 * np.exp(0.3j), 0.8)

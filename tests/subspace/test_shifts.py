@@ -111,6 +111,7 @@ def test_a_record_is_cut_as_by_hand():
     assert len(whole.initial_states_) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("better", [True, False])
 def test_cuts_for_a_given_order_must_simulate_as_much_held_out(better, monkeypatch):
     """One lag for a motor with dead time: what it lacks looks like shifts."""
@@ -132,6 +133,7 @@ def test_cuts_for_a_given_order_must_simulate_as_much_held_out(better, monkeypat
     assert len(found.output_offset_) == (3 if better else 1)
 
 
+@pytest.mark.slow
 def test_cuts_that_leave_inputs_nothing_to_explain_are_not_made(monkeypatch):
     """Noise may explain, one step ahead, all that moves between them."""
     rng = np.random.default_rng(3)
