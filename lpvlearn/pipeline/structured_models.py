@@ -26,7 +26,7 @@ from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..restructuring.uncertainty import ParameterUncertainty
 from ..structures.structure import GrayBoxStructure
-from ..systems.beginnings import Beginning, begin_held, standing
+from ..systems.beginnings import Beginning, begin_held, waiting
 from .black_boxes import (
     aligned_black_boxes,
     balanced,
@@ -179,7 +179,7 @@ def begins_held(model: LPVStateSpace, points: OperatingPoints, dt: float) -> boo
     """
     model = model.silenced()
 
-    groups = [[e for e in group if standing(e.inputs)] for group in points.experiments]
+    groups = [[e for e in group if waiting(e.inputs)] for group in points.experiments]
     if not any(groups):
         return False
     models = [model.at(kappa) for kappa in points.kappa]

@@ -8,7 +8,7 @@ from ..data.preparation import DETRENDS, Pairs, Rounded, far_out
 from ..exceptions import RankWarning
 from ..systems.simulation import delayed, lti_response
 from .delay import first_samples, longest_delays
-from .held_out import DOUBT
+from .held_out import DOUBT, HeldOut
 from .local_fit import LocalFit
 from .offsets import CERTAIN, criterion_in_units
 from .one_fit import TooFewSamples, choose_and_identify, errors_held_out
@@ -148,34 +148,50 @@ def tell_of_delay(
     pairs = [(u, y) for u, y in pairs if len(u) > cut + 1]
     late = [(delayed(u, delay)[known], y[known]) for u, y in pairs]
     early = [(u[known], y[known]) for u, y in pairs]
+    same, order = whole.chosen(choices), whole.selection.order
+
+    def with_errors(
+        pairs: Pairs, choices: Choices, known: LocalFit | None = None
+    ) -> tuple[int, HeldOut]:
+        """Order, and errors on parts held out."""
+        aside = telling.aside()
+        other = choose_and_identify(pairs, choices, aside, n_trend, known)
+        return other.selection.order, errors_held_out(other, given)
+
     try:
-        other = choose_and_identify(late, given, telling.aside(), n_trend)
-        first = choose_and_identify(
-            early, whole.chosen(choices), telling.aside(), n_trend
-        )
+        own = with_errors(early, same, whole)
+        # a choice among all orders takes many times as long as one of these
+        fewer = order - _FEWER if choices.order is None else 0
+        some = (same._replace(order=n) for n in (order, fewer) if n > 0)
+        if not any(_gain(own, with_errors(late, one)) for one in some):
+            return
+        other = with_errors(late, given)
     except TooFewSamples:
         return
-    error, found = errors_held_out(first, given), errors_held_out(other, given)
-    if [p.error.shape for p in error.parts] != [p.error.shape for p in found.parts]:
-        return  # late inputs move in other parts
-    n_saved = first.selection.order - other.selection.order
-    better = n_saved >= _FEWER and not error.clearly_better_than(found, 0.0)
-    if not better and not found.clearly_better_than(error, DOUBT):
+    gained, fits = _gain(own, other), (other[1].bft, own[1].bft)
+    if not gained:
         return
-    orders = other.selection.order, first.selection.order
-    if better:
-        what = f"does as well on parts held out as this one of order {orders[1]}"
+    if gained == "states":
+        what = f"does as well on parts held out as this one of order {order}"
     else:
-        what = (
-            f"simulates {found.bft:.3g} % of parts held out, this one {error.bft:.3g} %"
-        )
+        what = f"simulates {fits[0]:.3g} % of parts held out, this one {fits[1]:.3g} %"
     telling.once(
         "delay",
         f"Input {telling.input(delay.argmax())} shows in the outputs only after {cut} "
         "samples, for certain. With a delay in their place a model of order "
-        f"{orders[0]} {what}. Give it as `input_delay`, {cut} at most, and compare on "
+        f"{other[0]} {what}. Give it as `input_delay`, {cut} at most, and compare on "
         "another record; input_delay='auto' takes only what is a delay beyond doubt.",
     )
+
+
+def _gain(own: tuple[int, HeldOut], other: tuple[int, HeldOut]) -> str:
+    """What another model has of a delay: fewer "states", less "errors", or ""."""
+    (order, error), (another, found) = own, other
+    if [p.error.shape for p in error.parts] != [p.error.shape for p in found.parts]:
+        return ""  # late inputs move in other parts
+    if order - another >= _FEWER and not error.clearly_better_than(found, 0.0):
+        return "states"
+    return "errors" if found.clearly_better_than(error, DOUBT) else ""
 
 
 def _answers_late(fitted: LocalFit, delay: int) -> bool:

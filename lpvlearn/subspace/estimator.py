@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import replace
+from itertools import compress, starmap
 from numbers import Integral
 from typing import Any, Self, cast
 
@@ -49,6 +50,7 @@ from ..systems.beginnings import (
     first_inputs,
     held_state,
     standing,
+    waiting,
 )
 from ..systems.simulation import (
     estimate_initial_state,
@@ -1494,7 +1496,8 @@ class SubspaceLTI(
         And not at rest about zero, or, where there are levels, about their means.
         """
         lti = self.lti_
-        if not (lti.is_stable and any(standing(e.inputs) for e in experiments)):
+        wait = [waiting(e.inputs) > 0 for e in experiments]
+        if not (lti.is_stable and any(wait)):
             return False
         gain = lti.dc_gain()
         known = self.input_offset_, self.output_offset_, self._offsets.drifts
@@ -1514,7 +1517,9 @@ class SubspaceLTI(
                 about_mean=self.offset_ is not None,
             )
 
-        return begin_held(map(beginning, experiments, *levels))
+        return begin_held(
+            starmap(beginning, compress(zip(experiments, *levels, strict=True), wait))
+        )
 
     def _simulated(self, experiment: Experiment) -> Array:
         """Outputs from the beginning that the experiments of `fit` let expect."""

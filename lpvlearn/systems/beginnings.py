@@ -53,6 +53,17 @@ def _held_again(moves: NDArray[np.intp]) -> int:
     return int(np.diff(moves).max()) if len(moves) > _OFTEN else 0
 
 
+def waiting(u: Array) -> int:
+    """As `standing`, but 0 where inputs that move often are held as long later.
+
+    >>> u = np.repeat([2.0, 3.0] * 9, 8)[:, None]
+    >>> standing(u), waiting(u), waiting(u[:40])
+    (8, 0, 8)
+    """
+    n = standing(u)
+    return n if n and n > _held_again(moves_of(u)) else 0
+
+
 def moves_of(u: Array) -> NDArray[np.intp]:
     """Samples after which inputs (n_samples, n_inputs) move.
 
@@ -145,9 +156,7 @@ class Beginning(NamedTuple):
         `about_mean` is about the point of rest.
         """
         (u, y), (u0, y0) = record, rest
-        n, mean = standing(u), u.mean(axis=0) if about_mean else u0
-        if n <= _held_again(moves_of(u)):  # as they go on to do
-            n = 0
+        n, mean = waiting(u), u.mean(axis=0) if about_mean else u0
         at_mean, held = (y0 + gain @ (v - u0) for v in (mean, first_inputs(u)))
         at_rest, moved = (simulated(u[:n] - v) for v in (u0, mean))
         return cls(y[:n], y0 + at_rest, at_mean + moved, held)
