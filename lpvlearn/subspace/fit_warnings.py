@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..data.preparation import constant_columns, held_for, stays_put
 from ..exceptions import RankWarning, warn
+from .constancy import change_over
 from .held_out import HeldOut
 from .identification import Settings
 from .linearity import bent_outputs
@@ -282,12 +283,16 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
     choice_is_told = TESTS <= telling.kinds or fitted.residual > USELESS
     if fitted.selection.held_out is not None and not choice_is_told:
         _warn_about_choice(fitted, fitted.selection.held_out, telling)
-    feedback = None if fitted.method == "pbsid" else fitted.feedback
+    feedback = fitted.feedback
     if feedback is None or fitted.stability_loss:
         return
     if not feedback.found and not telling.kinds & _BENDS:
         _warn_of_bends(fitted, telling)
-    if "lack" in telling or not lacks(fitted.evidence, feedback.innovations):
+    if not feedback.found and not telling.kinds & _BENDS:
+        _warn_of_change(fitted, telling)
+    if fitted.method == "pbsid" or "lack" in telling:
+        return
+    if not lacks(fitted.evidence, feedback.innovations):
         return
     rounded = _rounded_output(fitted.evidence)
     if rounded is not None:
@@ -434,6 +439,21 @@ def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
             "motions worse. Use inputs that move less, about one operating point at a "
             "time (`split_levels` cuts a record by a signal's level), or give what "
             "bends it as a scheduling variable.",
+        )
+
+
+def _warn_of_change(fitted: LocalFit, telling: Telling) -> None:
+    """Tell of a system that is not the same all over its record."""
+    change = change_over(fitted.evidence)
+    if change is not None:
+        telling.once(
+            "change",
+            "The system changes over the record, or is not linear: of output "
+            f"{telling.output(change.output)} the model leaves "
+            f"{100.0 * change.together:.2g} %, models of each of {change.n_parts} "
+            f"parts leave {100.0 * change.apart:.2g} %. Its response is one between "
+            "those, with bands too narrow for any of them. Fit the parts apart, or "
+            "give what changes as a scheduling variable.",
         )
 
 

@@ -1,0 +1,104 @@
+"""Does a system stay the same over its record? Models of parts of it tell.
+
+A test of structural change (Chow, *Econometrica* 28, 1960) by what models of each part
+leave of the errors of the one for all. Slow noise, and all that goes on at a time in
+one part only, is followed by initial states and trends of a part as by its model: so
+the errors must be smaller once they are whitened, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # which loads its signal package when that is first used: slowly
+from numpy.typing import NDArray
+
+from ..systems.threads import one_blas_thread
+from .refinement import refine_simulation
+from .residuals import whitening_filters
+from .signals import Record
+from .simulation_fit import simulation_errors, simulation_fit, with_initial_states
+from .statistics import Evidence
+
+Array = NDArray[np.float64]
+
+# Parts of a record, if each has so many values for every parameter, or half of them
+_PARTS, _VALUES_EACH = 8, 20
+
+# Share of an output's size from which what the model leaves is looked into, and of the
+# squared errors, and of the whitened ones, that models of parts leave where the system
+# was not the same in them.
+_ROUGH, _CHANGED, _CHANGED_WHITE = 0.1, 0.25, 0.5
+
+
+class Change(NamedTuple):
+    """An output of which models of parts leave far less than the one for all."""
+
+    output: int
+    n_parts: int
+    together: float  # left by the one for all, relative to the output
+    apart: float
+
+
+@one_blas_thread
+def change_over(evidence: Evidence) -> Change | None:
+    """The output that changes most over a record, beyond chance; None if none does."""
+    model, free = evidence.model, evidence.free
+    if len(evidence.records) != 1 or not np.isfinite(model.loss) or not len(model.A):
+        return None
+    record = evidence.records[0]
+    parts = _parts(record, _VALUES_EACH * (model.C.size + model.B.size + len(model.A)))
+    size = np.sqrt(sum((part.y**2).mean(axis=1) for part in parts) / max(len(parts), 1))
+    if len(parts) < 2 or not size.all():
+        return None
+    with np.errstate(over="ignore", invalid="ignore"):
+        whole = with_initial_states(model, parts, free, evidence.whitening.weight)
+        together = simulation_errors(whole, parts)
+        if not _rms(together).max() > _ROUGH * size.min():
+            return None
+        apart = []
+        for part in parts:
+            start = simulation_fit(model.A, model.C, [part], free)
+            apart += simulation_errors(refine_simulation(start, [part], free), [part])
+    if not all(np.isfinite(e).all() for e in (*together, *apart)):
+        return None
+    left, left_apart = _rms(together) / size, _rms(apart) / size
+    filters = whitening_filters(apart)
+    white, white_apart = (_rms(_filtered(e, filters)) for e in (together, apart))
+    shares = (left_apart / left) ** 2
+    alike = (left < _ROUGH) | ((white_apart / white) ** 2 > _CHANGED_WHITE)
+    shares[alike] = np.inf
+    k = int(shares.argmin())
+    if not shares[k] < _CHANGED:
+        return None
+    return Change(k, len(parts), float(left[k]), float(left_apart[k]))
+
+
+def _parts(record: Record, least: int) -> list[Record]:
+    """Parts of a record of at least so many values, those in which all inputs move."""
+    n_samples = record.u.shape[1]
+    n_parts = min(_PARTS, record.y.size // least)
+    ends = np.linspace(0, n_samples, n_parts + 1 if n_parts > 1 else 1).astype(int)
+    parts = [record.part(slice(a, b)) for a, b in zip(ends, ends[1:], strict=False)]
+    return [part for part in parts if np.ptp(part.u, axis=1).all()]
+
+
+def _filtered(errors: Sequence[Array], filters: Sequence[Array]) -> list[Array]:
+    """Errors of all outputs through a filter of each, but for its first samples."""
+    first = max(map(len, filters)) - 1
+    return [
+        np.column_stack(
+            [
+                scipy.signal.lfilter(a, [1.0], e[:, i])[first:]
+                for i, a in enumerate(filters)
+            ]
+        )
+        for e in errors
+    ]
+
+
+def _rms(errors: Sequence[Array]) -> Array:
+    """Root mean squares of the errors of every output."""
+    return np.sqrt(np.mean(np.vstack(errors) ** 2, axis=0))
