@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -10,8 +11,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from joblib import Memory
 from numpy.typing import NDArray
 from sklearn.base import clone
+from sklearn.utils.validation import has_fit_parameter
 
 from ..data.experiments import (
     NO_TIME,
@@ -20,10 +23,15 @@ from ..data.experiments import (
     naming,
     read_outputs,
 )
-from ..data.operating_points import check_outputs
+from ..data.operating_points import (
+    check_outputs,
+    local_experiments,
+    moving_experiments,
+)
 from ..data.preparation import part_of
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, collected
+from ..lpv.auto import AutoLPV
 from ..lpv.bands import left_out_errors
 from ..lpv.interpolator import Interpolator, grid_over
 from ..lpv.model import LPVStateSpace
@@ -55,10 +63,11 @@ from ..validation import (
 )
 from .bands import output_errors
 from .black_boxes import balanced_entries
-from .local_models import identify_point
+from .local_models import common_delay, identify_point, identify_points
+from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
-from .structured_models import StructuredModels
+from .structured_models import StructuredModels, restructure_points
 from .workers import results_of
 
 Array = NDArray[np.float64]
@@ -76,6 +85,8 @@ _PARTS, _N_STARTS, _FIRST_STEPS = 5, 3, 15
 
 _LOOKED_AT = 4  # experiments of an operating point: more tell the same of the errors
 
+_FEWEST_POINTS = 3  # at which experiments stay, of a model through these
+
 _LEVELS = 5  # of every scheduling variable, where a form begins as a constant
 
 
@@ -91,9 +102,10 @@ class OutputErrorLPV(ScheduledEstimator):
     ----------
     start : LPVStateSpace, GrayBoxStructure or None, default=None
         Where the search begins: an LPV model, or one with constant matrices, identified
-        from the table, or a part of an experiment, as if it were time-invariant: in a
-        structure, or without one (None) balanced, every entry of its matrices free; the
-        one whose first steps come farthest. A pipeline gives its own.
+        from the table, or a part of an experiment, as if it were time-invariant, or one
+        through the operating points at which experiments stay: in a structure, or
+        without one (None) balanced, every entry of its matrices free; the one whose
+        first steps come farthest. A pipeline gives its own.
     rate : {"auto", True, False}, default="auto"
         Whether A follows the rates of change of the scheduling variables too, by terms
         ``N_j(kappa) dkappa_j/dt`` in every row of A that holds parameters, quadratic
@@ -105,8 +117,9 @@ class OutputErrorLPV(ScheduledEstimator):
         parameters (without these, from the local experiments), pulls to the start:
         with its own weight, times a factor, or not at all. Alone there is none.
     interpolator : PolynomialLPV, RationalLPV or SplineLPV, default=None
-        The form of the parameters where `start` is no LPV model. None is
-        ``PolynomialLPV(2)``, without a structure ``PolynomialLPV(1)``.
+        The form of the parameters where `start` is no LPV model. None is the one that
+        `AutoLPV` takes through three or more operating points at which experiments
+        stay, or ``PolynomialLPV(2)``, without a structure ``PolynomialLPV(1)``.
     local : estimator, default=None
         The time-invariant model to start from; None is
         ``SubspaceLTI(stability="enforce")``. ``order="auto"`` becomes the order of the
@@ -448,7 +461,42 @@ class OutputErrorLPV(ScheduledEstimator):
                 except ValueError:  # a part that tells too little
                     if group is experiments:
                         raise
+            with suppress(ValueError):
+                models += self._through_points(experiments, dt, bounds)
         return _promising(models, [_record(e, dt) for e in experiments])
+
+    def _through_points(
+        self, experiments: Sequence[Experiment], dt: float, bounds: Array
+    ) -> list[LPVStateSpace]:
+        """The model through the operating points at which experiments stay, if any."""
+        points = local_experiments(moving_experiments(experiments)[0])
+        if len(points) < _FEWEST_POINTS:
+            return []
+        runner = PointRunner(self.n_jobs, 0, "raise", Memory(None))
+        structure = self.start
+        local, points = identify_points(
+            self._local(),
+            points,
+            runner,
+            structure=structure,
+            sampling_time=dt,
+            combine="pool",
+            discretization="zoh",
+            efficient=True,
+            deviate=structure is not None,
+        )
+        way = "aligned" if structure is None else GrayBoxRestructurer(structure)
+        found = restructure_points(way, local, points, runner)
+        form = AutoLPV() if self.interpolator is None else clone(self.interpolator)
+        known = {}
+        if has_fit_parameter(form, "covariance"):
+            known["covariance"] = found.covariance
+        form = form.fit(found.points.kappa, found.theta, **known)
+        delay = common_delay(found.local, found.points.kappa, dt)
+        return [LPVStateSpace(found.structure, form, bounds, input_delay=delay)]
+
+    def _local(self) -> Any:
+        return SubspaceLTI(stability="enforce") if self.local is None else self.local
 
     def _constant_model(
         self,
@@ -459,7 +507,7 @@ class OutputErrorLPV(ScheduledEstimator):
     ) -> LPVStateSpace:
         """One time-invariant model of some experiments, in the form of an LPV model."""
         structure, names = self.start, as_list(self.scheduling)
-        local = SubspaceLTI(stability="enforce") if self.local is None else self.local
+        local = self._local()
         if structure is not None and local.get_params().get("order") == "auto":
             local = clone(local).set_params(order=structure.order)
         lti = identify_point(

@@ -11,6 +11,7 @@ from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import GridSearchCV, cross_validate
 
 from lpvlearn import (
+    GrayBoxStructure,
     OutputErrorLPV,
     PolynomialLPV,
     RationalLPV,
@@ -160,6 +161,34 @@ def test_from_a_time_invariant_model_of_the_table(form):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_from_the_points_at_which_experiments_stay():
+    """Their parameters tell the form, too: 1 / rope is no polynomial."""
+    rope = GrayBoxStructure.from_template(
+        [[0, 1], ["-w2", "-c"]], [[0], ["-b"]], [[1, 0]]
+    )
+    rng = np.random.default_rng(0)
+    steady = [np.full(500, length) for length in (0.5, 0.9, 1.5, 2.2, 3.0)]
+    t = 0.05 * np.arange(500)
+    moving = [1.75 + 1.2 * np.sin(w * t + w) for w in (0.3, 0.4, 0.35)]
+    tables = []
+    for run, lengths in enumerate([*steady, *moving]):
+        u, x, y = np.repeat(rng.choice([-1.0, 1.0], 125), 4), np.zeros(2), []
+        for force, length in zip(u, lengths, strict=True):
+            y.append(x[0])
+            now = rope.model([1.0 / length, 0.15, 9.81 / length]).to_discrete(0.05)
+            x = now.A @ x + now.B[:, 0] * force
+        y = y + 0.02 * np.std(y) * rng.standard_normal(500)
+        columns = {"force": u, "kappa": lengths, "run": run, "time": t, "angle": y}
+        tables.append(pd.DataFrame(columns))
+    fresh, table = tables.pop(), pd.concat(tables, ignore_index=True)
+    model = OutputErrorLPV(rope, **ROLES).fit(
+        table.drop(columns="angle"), table[["angle"]]
+    )
+    fit = bft_score(fresh[["angle"]], model.predict(fresh.drop(columns="angle")))
+    assert fit > 97.0
+
+
 def test_without_a_structure_matrices_are_affine_in_the_scheduling():
     truth = spring_lpv()
     X, _ = sweeps()
