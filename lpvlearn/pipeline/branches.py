@@ -16,6 +16,7 @@ ones of every length kept; their evidences also tell how certain the choice is.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ Choices = NDArray[np.intp]
 # _TINY of the largest by that of it).
 _EQUAL, _EXACT, _OTHER, _TINY = 1.02, 1e-9, 1e-2, 1e-6
 _OPTIMA = 6  # of a point at most, apart from interchanges
+_FEW = 8  # parameters of which any two may be exchanged
 _SWEEPS = 4  # over the points: optima travel that far
 
 # Prior of a parameter over the scheduling range, in units of its spread: the level, the
@@ -48,6 +50,7 @@ _UNKNOWN = 1e6  # variance, in squares of the spread, from which a value says no
 _KEPT = 200  # families of every length
 _WEIGHED = 24  # of them whose evidence is computed, for each prior of the search
 _CERTAIN = 0.95  # probability of the choice from which no more is said
+_WHOLE = 1e-3  # and of other parameters at all points, which may be as smooth by nature
 _TELLS = 0.05  # difference of two choices, in the spread of a parameter, that matters
 _DEVIATIONS = 3.0  # and in its standard deviations
 
@@ -65,6 +68,7 @@ class Doubt(NamedTuple):
     point: int
     params: Choices  # which would change
     probability: float  # of the choice
+    other: Array  # (n_params,): what they would be
 
 
 class Family(NamedTuple):
@@ -110,7 +114,8 @@ def tied_branches(
         if structure.is_bounded
         else len(optima[int(spanning_tree(kappa, outward=False)[0][0])])
     )
-    chosen, doubts = smoothest_family(kappa, candidates, variances, n_first)
+    guess = _guess(structure, getattr(fitted[0], "init", None))
+    chosen, doubts = smoothest_family(kappa, candidates, variances, n_first, guess)
     family = np.array([c[i] for c, i in zip(candidates, chosen, strict=True)])
     own = np.array([found[0] for found in optima])
     number = places[_numbering(structure, family[:, places].swapaxes(0, 1), own)]
@@ -123,7 +128,10 @@ def tied_branches(
         else:
             branches.append(Branch(None, None if (pi == places[0]).all() else pi))
     back = np.argsort(number)
-    return branches, [d._replace(params=np.sort(back[d.params])) for d in doubts]
+    return branches, [
+        d._replace(params=np.sort(back[d.params]), other=d.other[number])
+        for d in doubts
+    ]
 
 
 def _equal_optima(
@@ -149,6 +157,10 @@ def _equal_optima(
     edges = sorted([*edges, *((j, i) for i, j in edges)])
     beside = [[j for i, j in edges if i == k] for k in range(len(kappa))]
     waiting = [(i, starts[j]) for i, j in edges]
+    if len(places) == 1:
+        root = int(order[0])
+        for pi in _exchanges(problems[root], starts[root], _EQUAL * least[root]):
+            waiting += [(k, start[pi]) for k, start in enumerate(starts)]
     for _ in range(_SWEEPS):
         new = []
         for i, start in waiting:
@@ -162,14 +174,55 @@ def _equal_optima(
                 optima[i], known[i] = [fit.x], [fit.x[places]]
                 new += [(k, fit.x) for k in beside[i]]
                 continue
-            size = np.maximum(np.abs(fit.x), _TINY * np.abs(fit.x).max())
-            gaps = np.abs(np.vstack(known[i]) - fit.x) / np.where(size > 0, size, 1.0)
-            if (gaps.max(1) > _OTHER).all():
+            if _is_other(fit.x, np.vstack(known[i])):
                 optima[i].append(fit.x)
                 known[i].append(fit.x[places])
                 new += [(k, fit.x) for k in beside[i]]
         waiting = new
     return optima, lower
+
+
+def _is_other(theta: Array, known: Array) -> bool:
+    """Whether parameters are none of the rows that are known."""
+    size = np.maximum(np.abs(theta), _TINY * np.abs(theta).max())
+    gaps = np.abs(known - theta) / np.where(size > 0, size, 1.0)
+    return bool((gaps.max(1) > _OTHER).all())
+
+
+def _exchanges(
+    problem: RestructuringProblem, theta: Array, most: float
+) -> list[list[int]]:
+    """Which two parameters, exchanged, lead to other optima of at most that error.
+
+    Of parts of like kind, lags in series, say, another value of each gives the same
+    response. Of many parameters that is not looked for.
+    """
+    n, found = len(theta), theta[None]
+    kept: list[list[int]] = []
+    for i, j in combinations(range(n if n <= _FEW else 0), 2):
+        pi = [{i: j, j: i}.get(k, k) for k in range(n)]
+        fit = problem.fit(theta[pi])
+        equal = fit is not None and fit.relative_error <= most
+        if fit is not None and equal and _is_other(fit.x, found):
+            found = np.vstack([found, fit.x])
+            kept.append(pi)
+    return kept
+
+
+def _guess(structure: GrayBoxStructure, init: Any) -> Array:
+    """What is known of the parameters before, NaN of the others."""
+    if init is not None and not isinstance(init, str):
+        return np.asarray(init, dtype=float)
+    ranged = ~np.isnan(structure.ranges[0])
+    known = ranged | (structure.initial is not None)
+    guess = np.where(ranged, structure.ranges.mean(0), structure.reference)
+    return np.where(known, guess, np.nan)
+
+
+def _distance(images: Array, guess: Array) -> Array:
+    """How far families (..., n_points, n_params) are from a guess, relative to it."""
+    size = np.where(guess != 0, np.abs(guess), 1.0)
+    return np.asarray(np.nansum(np.abs(images - guess) / size, axis=(-2, -1)))
 
 
 def _numbering(structure: GrayBoxStructure, images: Array, own: Array) -> int:
@@ -179,12 +232,9 @@ def _numbering(structure: GrayBoxStructure, images: Array, own: Array) -> int:
     """
     inside = ((images >= structure.lower) & (images <= structure.upper)).all((1, 2))
     merit = (images == own).all(2).sum(1)
-    ranged = ~np.isnan(structure.ranges[0])
-    known = ranged | (structure.initial is not None)
-    if known.any():
-        guess = np.where(ranged, structure.ranges.mean(0), structure.reference)[known]
-        size = np.where(guess != 0, np.abs(guess), 1.0)
-        merit = -(np.abs(images[..., known] - guess) / size).sum((1, 2))
+    guess = _guess(structure, None)
+    if not np.isnan(guess).all():
+        merit = -_distance(images, guess)
     return int(np.argmax(np.where(inside, merit, -np.inf)))
 
 
@@ -193,13 +243,15 @@ def smoothest_family(
     candidates: Sequence[Array],
     variances: Sequence[Array],
     n_first: int | None = None,
+    guess: Array | None = None,
 ) -> Family:
     """The most plausible choice of one candidate at every point.
 
     `candidates` hold parameters (n_candidates, n_params) for every row of `kappa`,
     `variances` those of their errors (zero where not known). At the first point of the
     tree only the first `n_first` are taken, where the others would but number the parts
-    of the whole family anew.
+    of the whole family anew. Of two that differ at all points the nearer to a `guess`
+    (n_params,), NaN of what is not known, is taken, if there is one.
     """
     x = _scaled(kappa)
     order = spanning_tree(kappa, outward=False)[0].astype(np.intp)
@@ -219,17 +271,35 @@ def smoothest_family(
     chosen = families[int(np.argmax(evidence))]
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
+    changes = _changes(Y, V, families, chosen)
+    other = np.array([differs.any(1) for differs in changes])  # (n_points, n_families)
+    whole = other.all(0) & (weight > _WHOLE)
+    if whole.any() and guess is not None and not np.isnan(guess).all():
+        rows = zip(candidates, families.T, strict=True)
+        images = np.stack([np.asarray(c)[i] for c, i in rows], axis=1)
+        apart = np.where(whole | (weight == weight.max()), 0.0, np.inf)
+        return Family(families[int(np.argmin(apart + _distance(images, guess)))], [])
     doubts = []
-    for k in range(len(kappa)):
-        own = Y[k][chosen[k]]
-        gap = np.abs(Y[k][families[:, k]] - own)
-        noise = np.sqrt(V[k][families[:, k]] + V[k][chosen[k]])
-        differs = gap > np.maximum(_TELLS, _DEVIATIONS * noise)
-        certain = 1.0 - float(weight[differs.any(1)].sum())
-        if certain < _CERTAIN:
-            rival = int(np.argmax(np.where(differs.any(1), weight, -1.0)))
-            doubts.append(Doubt(k, columns[differs[rival]], certain))
+    for k, differs in enumerate(changes):
+        certain = 1.0 - float(weight[other[k]].sum())
+        if whole.any() or certain < _CERTAIN:
+            rivals = whole if whole.any() else other[k]
+            rival = int(np.argmax(np.where(rivals, weight, -1.0)))
+            values = np.asarray(candidates[k])[families[rival, k]]
+            doubts.append(Doubt(k, columns[differs[rival]], certain, values))
     return Family(chosen, doubts)
+
+
+def _changes(
+    Y: Sequence[Array], V: Sequence[Array], families: Choices, chosen: Choices
+) -> list[NDArray[np.bool_]]:
+    """Where families differ from one, (n_families, q) of every point."""
+    changes = []
+    for k, c in enumerate(chosen):
+        gap = np.abs(Y[k][families[:, k]] - Y[k][c])
+        noise = np.sqrt(V[k][families[:, k]] + V[k][c])
+        changes.append(gap > np.maximum(_TELLS, _DEVIATIONS * noise))
+    return changes
 
 
 def _scaled(kappa: Array) -> Array:

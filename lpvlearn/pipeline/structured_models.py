@@ -34,7 +34,7 @@ from .black_boxes import (
     channel_sizes,
     tell_of_forced,
 )
-from .branches import tied_branches
+from .branches import Doubt, tied_branches
 from .local_models import LocalModel, motions
 from .runner import Done, PointRunner, place_of, tell_skipped
 
@@ -350,6 +350,9 @@ def _tie_branches(
                 tied[k] = Done(fitted_there, told)
             elif branch.places is not None:
                 tied[k] = Done(fitted[k].interchanged(branch.places), told)
+    if len(doubts) == len(kappa):
+        _warn_of_another_family(structure, doubts[0], place_of(0, kappa))
+        return tied
     for doubt in doubts:
         names = ", ".join(structure.parameter_names[j] for j in doubt.params)
         warn(
@@ -362,6 +365,21 @@ def _tie_branches(
             "OutputErrorLPV(structure)."
         )
     return tied
+
+
+def _warn_of_another_family(
+    structure: GrayBoxStructure, doubt: Doubt, place: str
+) -> None:
+    """Tell of other parameters of all points that are as good, and as smooth."""
+    names = structure.parameter_names
+    values = ", ".join(f"{names[j]} = {doubt.other[j]:.4g}" for j in doubt.params)
+    warn(
+        f"the parameters {', '.join(names[j] for j in doubt.params)} have other values "
+        f"that give the same responses at all operating points ({place}: {values}), "
+        "and change as smoothly: the data do not tell which part is which. Say it by "
+        "structure.with_bounds(), structure.with_ranges(), or a first guess, "
+        "GrayBoxRestructurer(structure, init=...)."
+    )
 
 
 def covariance_of_parameters(

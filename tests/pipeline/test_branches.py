@@ -209,3 +209,48 @@ def test_choices_are_kept_in_a_memory(tmp_path):
     first = modes_pipeline(memory=tmp_path).fit(X, y).parameters_
     again = modes_pipeline(memory=tmp_path).fit(X, y).parameters_
     np.testing.assert_array_equal(first, again)
+
+
+LAGS = GrayBoxStructure.from_template([["-a", 0], ["a", "-b"]], [["g"], [0]], [[0, 1]])
+
+
+def lags(structure, *, n_points=8, init="similarity"):
+    """Two tanks in series, one of which is 1.5 times as slow at all points."""
+    rng = np.random.default_rng(3)
+    kappa, outputs, inputs = np.linspace(0.5, 3.0, n_points), [], []
+    for level in kappa:
+        rate = 1.0 / np.sqrt(level)
+        u = np.repeat(rng.choice([-1.0, 1.0], 60), 15)[:, None]
+        plant = LAGS.model([rate / 60.0, rate / 90.0, 0.02])
+        y = plant.simulate(u, sampling_time=2.0)
+        outputs.append(y + 0.01 * y.std() * rng.standard_normal(y.shape))
+        inputs.append(np.column_stack([u, np.full(len(u), level)]))
+    pipeline = LocalLPVPipeline(
+        restructurer=GrayBoxRestructurer(structure, init=init),
+        scheduling=1,
+        experiment=1,
+        sampling_time=2.0,
+    )
+    return pipeline.fit(np.vstack(inputs), np.vstack(outputs))
+
+
+def test_parameters_with_other_values_at_all_points_are_told():
+    """Either family is as smooth: the slow lag may be either, with another gain."""
+    told = r"a, b, g have other values .* \(scheduling 0.5\): a = .*with_ranges"
+    with pytest.warns(UserWarning, match=told) as caught:
+        lags(LAGS)
+    assert len(caught) == 1
+
+
+@pytest.mark.parametrize("g", [0.02, 0.03])
+@pytest.mark.parametrize("known", ["range", "bound", "guess"])
+def test_what_is_known_of_them_tells_which_is_which(known, g):
+    interval, structure, init = {"g": (0.8 * g, 1.2 * g)}, LAGS, "similarity"
+    if known == "range":
+        structure = LAGS.with_ranges(interval)
+    elif known == "bound":
+        structure = LAGS.with_bounds(interval)
+    else:
+        init = [0.02, 0.01, 0.02] if g == 0.02 else [0.01, 0.02, 0.03]
+    found = lags(structure, n_points=4, init=init)
+    np.testing.assert_allclose(found.parameters_["g"], g, rtol=0.05)
