@@ -339,10 +339,16 @@ def has_one_axis(value: Any) -> bool:
         return False
 
 
-def names_of(argument: str, names: Any, n: int | None = None) -> list[Any]:
-    """`names` as a list of different ones, `n` of them or any number above zero."""
+def names_of(
+    argument: str, names: Any, n: int | None = None, *, of_columns: bool = False
+) -> list[Any]:
+    """`names` as a list of different ones, `n` of them or any number above zero.
+
+    One of columns may be a tuple, as those of a MultiIndex are.
+    """
     listed: list[Any] = []
-    if has_one_axis(names) and not isinstance(names, Mapping):
+    several = of_columns and isinstance(names, list | tuple)
+    if several or (has_one_axis(names) and not isinstance(names, Mapping)):
         listed = list(names)
     try:
         distinct = len({*listed}) == len(listed)

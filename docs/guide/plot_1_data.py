@@ -19,8 +19,8 @@ role                         the column holds
                              grouped by their mean scheduling value
 ============================ ==========================================================
 
-A role is given by a column's name, by the name of a level of the index, or by a
-position (for arrays).
+A role is given by a column's name (a tuple, where the columns are a MultiIndex), by the
+name of a level of the index, or by a position (for arrays).
 """
 
 # %%

@@ -8,8 +8,8 @@ else by a level of the index, else by its position.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from numbers import Integral
@@ -149,17 +149,26 @@ def _listed(names: Sequence[Any]) -> str:
     return ", ".join(map(repr, names[:_N_SHOWN])) + ", ..." * (len(names) > _N_SHOWN)
 
 
-def _keys(role: str, value: Any) -> list[Any]:
+def _keys(role: str, value: Any, names: Collection[Hashable]) -> list[Any]:
     """The columns with a role, which only some roles may share."""
-    return as_list(value) if role in _SEVERAL or value is None else [value]
+    return as_list(value, names) if role in _SEVERAL or value is None else [value]
 
 
-def as_list(keys: Any) -> list[Any]:
-    """The columns with a role, as a list; empty for None."""
+def as_list(keys: Any, names: Collection[Hashable] = ()) -> list[Any]:
+    """The columns with a role, as a list; empty for None.
+
+    A tuple that is one of the `names` is one, as those of a MultiIndex are.
+
+    >>> as_list(("force", "N")), as_list(("force", "N"), [("force", "N"), "time"])
+    (['force', 'N'], [('force', 'N')])
+    """
     if keys is None:
         return []
     if isinstance(keys, (np.ndarray, pd.Index, pd.Series, pd.DataFrame)):
         return np.ravel(keys).tolist()
+    if isinstance(keys, tuple):
+        with suppress(TypeError):  # of an array in it, which is no name
+            keys = [keys] if keys in {*names} else keys
     return list(keys) if isinstance(keys, (list, tuple)) else [keys]
 
 
@@ -271,7 +280,8 @@ class Table:
         """The columns that share a role; none for `keys=None`."""
         if keys is None:
             return []
-        found = [self._find(key, role) for key in as_list(keys)]
+        known = [*self.names, *self.levels]
+        found = [self._find(key, role) for key in as_list(keys, known)]
         names = [column.name for column in found]
         if not found or len(set(names)) < len(names):
             raise ValueError(
@@ -292,6 +302,7 @@ class Experiment:
     operating_point: Hashable = None  # label of the column with that role
     sampling_time: float | None = None  # seconds, of the time column; None without
     input_names: tuple[Hashable, ...] = ()  # of the columns, or their positions
+    scheduling_names: tuple[Hashable, ...] = ()  # likewise
     breaks: tuple[int, ...] = ()  # samples before which time says that some are missing
     jitter: float = 0.0  # largest deviation from even time, relative to the step
     # (n_samples, n_outputs): outputs that were missing, and are estimates; None: none
@@ -413,6 +424,7 @@ def read_experiments(
             operating_point=operating_point_of(by_point, rows, label),
             sampling_time=clock.step,
             input_names=tuple(names),
+            scheduling_names=tuple(c.name for c in kappa),
             breaks=tuple(clock.breaks.tolist()),
             jitter=clock.jitter,
         )
@@ -458,14 +470,15 @@ def fitted_roles(
         return dict(roles)
     seen, found = list(estimator.feature_names_in_), dict.fromkeys(ROLES)
     there, lacking = {*table.names, *table.levels}, []
+    known = {*seen, *there}
 
     def name_of(key: Any) -> Any:
         is_position = isinstance(key, Integral) and key not in seen
         return seen[key] if is_position and -len(seen) <= key < len(seen) else key
 
-    others = {name_of(k) for r in ROLES[1:] for k in _keys(r, roles[r])}
+    others = {name_of(k) for r in ROLES[1:] for k in _keys(r, roles[r], known)}
     for role in ROLES:
-        names = [name_of(key) for key in _keys(role, roles[role])]
+        names = [name_of(key) for key in _keys(role, roles[role], known)]
         if role == "inputs":
             names = names or [name for name in seen if name not in others]
         absent = [name for name in names if name not in there]

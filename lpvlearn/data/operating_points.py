@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from numbers import Integral
 
 import numpy as np
 import pandas as pd
@@ -274,7 +275,7 @@ def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) ->
     for name in set(own) & set(names):
         k, j = own.index(name), list(names).index(name)
         inputs = np.concatenate([e.inputs[:, k] for e in experiments])
-        if isinstance(name, str) and np.array_equal(inputs, outputs[:, j]):
+        if not isinstance(name, Integral) and np.array_equal(inputs, outputs[:, j]):
             raise ValueError(
                 f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
                 "drop it from X, or list the inputs in `inputs`."

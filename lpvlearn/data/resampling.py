@@ -159,7 +159,8 @@ def resample(
             if _looks_held(c, records)
         ]
     else:
-        held = [c.name for c in table.several(as_list(hold) or None, "hold")]
+        keys = as_list(hold, table.names)
+        held = [c.name for c in table.several(keys or None, "hold")]
     even = _on_grids(frame.drop(columns=stamps.name), grids, held)
     place = list(frame).index(stamps.name)
     even.insert(place, stamps.name, _even_stamps(stamps, grids))

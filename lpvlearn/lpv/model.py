@@ -205,13 +205,13 @@ class LPVStateSpace(VersionedPickle):
         object.__setattr__(self, "n_scheduling", bounds.shape[1])
         names = self.scheduling_names
         if names is not None:
-            names_of("scheduling_names", names, bounds.shape[1])
+            names_of("scheduling_names", names, bounds.shape[1], of_columns=True)
         for name in ("order", "n_inputs", "n_outputs"):
             object.__setattr__(self, name, getattr(self.structure, name))
         for signal in ("input", "output"):
             names, n = getattr(self, f"{signal}_names"), getattr(self, f"n_{signal}s")
             if names is not None:
-                names_of(f"{signal}_names", names, n)
+                names_of(f"{signal}_names", names, n, of_columns=True)
         object.__setattr__(self, "units", units_by_name(self.units))
         steady = flag("steady_start", self.steady_start)
         object.__setattr__(self, "steady_start", steady)

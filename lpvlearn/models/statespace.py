@@ -175,7 +175,9 @@ class StateSpace(VersionedPickle):
             ("input_names", input_names, self.n_inputs),
             ("output_names", output_names, self.n_outputs),
         ):
-            listed = None if given is None else names_of(name, given, n)
+            listed = given
+            if given is not None:
+                listed = names_of(name, given, n, of_columns=True)
             object.__setattr__(self, name, listed)
         object.__setattr__(self, "units", units_by_name(units))
 

@@ -20,7 +20,7 @@ def output_errors(
     names: Sequence[Hashable], errors: Sequence[Array], left_out: Sequence[Array] = ()
 ) -> pd.DataFrame:
     """Columns model_error and noise, a row per output, as `levels_of` has them."""
-    index = pd.Index(list(names), name="output")
+    index = pd.Index(list(names), name="output", tupleize_cols=False)
     return pd.DataFrame(levels_of(errors, left_out)._asdict(), index)
 
 

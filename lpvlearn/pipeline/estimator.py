@@ -559,7 +559,7 @@ list, default=None
                 self.interpolator_, covariance, models = together
             span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
             self.scheduling_range_ = found.points.identified_range
-            self.scheduling_names_ = as_list(self.scheduling)
+            self.scheduling_names_ = list(experiments[0].scheduling_names)
             tell_of_joint_scheduling(kappa, self.scheduling_names_)
             self.lpv_ = LPVStateSpace(
                 found.structure,

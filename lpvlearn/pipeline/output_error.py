@@ -19,7 +19,6 @@ from sklearn.utils.validation import has_fit_parameter
 from ..data.experiments import (
     NO_TIME,
     Experiment,
-    as_list,
     naming,
     read_outputs,
 )
@@ -304,11 +303,11 @@ class OutputErrorLPV(ScheduledEstimator):
         self._single_output = np.asarray(y).ndim == 1
         self.output_names_, self.n_outputs_ = names, len(names)
         dt = self._sampling_time(experiments)
-        start = self._start(experiments, dt)
+        start, first = self._start(experiments, dt), experiments[0]
         start = replace(
             start,
-            scheduling_names=start.scheduling_names or as_list(self.scheduling) or None,
-            input_names=start.input_names or experiments[0].input_names,
+            scheduling_names=start.scheduling_names or first.scheduling_names or None,
+            input_names=start.input_names or first.input_names,
             output_names=start.output_names or names,
             units={**(start.units or {}), **(self.units or {})} or None,
         )
@@ -390,7 +389,7 @@ class OutputErrorLPV(ScheduledEstimator):
             covariance=self.coefficients_covariance_,
         )
         self.scheduling_range_, self.sampling_time_ = identified, sampling_time
-        names = as_list(self.scheduling) or as_list(start.scheduling_names)
+        names = list(experiments[0].scheduling_names or start.scheduling_names or ())
         self.scheduling_names_ = names or [*range(1, start.n_scheduling + 1)]
         self.rate_ = self.lpv_.rate_terms is not None
         self.deviation_, self.n_iter_ = found.deviation, found.n_iter
@@ -430,7 +429,7 @@ class OutputErrorLPV(ScheduledEstimator):
 
     def _start(self, experiments: Sequence[Experiment], dt: float) -> LPVStateSpace:
         """The model given, or a time-invariant one in the form of an LPV model."""
-        names = as_list(self.scheduling)
+        names = experiments[0].scheduling_names
         if isinstance(self.start, LPVStateSpace):
             model = self.start
             sizes = (
@@ -506,7 +505,7 @@ class OutputErrorLPV(ScheduledEstimator):
         bounds: Array,
     ) -> LPVStateSpace:
         """One time-invariant model of some experiments, in the form of an LPV model."""
-        structure, names = self.start, as_list(self.scheduling)
+        structure, names = self.start, experiments[0].scheduling_names
         local = self._local()
         if structure is not None and local.get_params().get("order") == "auto":
             local = clone(local).set_params(order=structure.order)

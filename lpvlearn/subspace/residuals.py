@@ -31,6 +31,7 @@ Neyman), and p-values are right again.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -247,7 +248,8 @@ def model_residuals(
 def input_labels(names: Sequence[Hashable]) -> list[str]:
     """Names of columns; positions become u1, u2, ..."""
     return [
-        name if isinstance(name, str) else f"u{j + 1}" for j, name in enumerate(names)
+        f"u{j + 1}" if isinstance(name, Integral) else str(name)
+        for j, name in enumerate(names)
     ]
 
 

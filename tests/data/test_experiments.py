@@ -388,3 +388,16 @@ def test_bad_trajectories_raise(trajectories, words):
 def test_names_of_columns_in_any_container_are_a_list(names):
     assert as_list(names) == ["a", "b"]
     assert as_list("ab") == ["ab"] and as_list(None) == [] and as_list(0) == [0]
+
+
+def test_a_tuple_that_is_a_column_is_one_column():
+    X = pd.DataFrame({("sig", "u"): [1.0, 2.0], ("sig", "kap"): [3.0, 3.0]})
+    y = pd.Series([0.0, 1.0], name=("out", "y"))
+    for inputs in (("sig", "u"), [("sig", "u")], 0):
+        (run,) = read(X, y, inputs=inputs, scheduling=("sig", "kap"))
+        assert run.input_names == (("sig", "u"),)
+        assert run.scheduling_names == (("sig", "kap"),)
+        np.testing.assert_array_equal(run.scheduling, [[3.0], [3.0]])
+    assert read_outputs(y)[1] == [("out", "y")]
+    (run,) = read(X, y, inputs=(("sig", "u"), ("sig", "kap")))
+    assert run.input_names == (("sig", "u"), ("sig", "kap"))

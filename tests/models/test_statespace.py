@@ -604,6 +604,7 @@ def test_names_and_units_go_along(changed):
 def test_names_and_units_must_be_those_of_the_signals():
     with pytest.raises(ValueError, match="`input_names` must be a list of 1 distinct"):
         StateSpace(-1, 1, 1, input_names=["a", "b"])
+    assert StateSpace(-1, 1, 1).with_names([("a", "b")]).input_names == [("a", "b")]
     with pytest.raises(ValueError, match="`units` must be a dict from names to units"):
         StateSpace(-1, 1, 1, units={"a": 1})
 

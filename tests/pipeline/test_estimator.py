@@ -466,6 +466,28 @@ def test_names_of_columns_are_kept_and_checked(fitted, spring):
         fitted.predict(X.rename(columns={"force": "u"}))
 
 
+def test_columns_of_a_multiindex_take_roles(fitted, spring, memory):
+    X, y, X_sweep, y_sweep = spring
+    names = {"force": ("in", "force"), "kappa": ("set", "kappa")}
+    names |= {"run": ("row", "run"), "time": ("row", "time")}
+
+    def renamed(X):
+        return X.set_axis(pd.MultiIndex.from_tuples(map(names.get, X)), axis=1)
+
+    outputs = pd.MultiIndex.from_tuples([("out", "position")])
+    roles = {role: names[column] for role, column in ROLES.items()}
+    model = spring_pipeline(memory=memory).set_params(**roles)
+    model.fit(renamed(X), y.set_axis(outputs, axis=1)).set_output(transform="pandas")
+    found = model.predict(renamed(X_sweep))
+    np.testing.assert_array_equal(found, fitted.predict(X_sweep))
+    assert found.columns.equals(outputs)
+    assert model.scheduling_names_ == [("set", "kappa")]
+    assert model.lpv_.at(0.5).input_names == [("in", "force")]
+    assert len(fit_report(model, renamed(X_sweep), y_sweep)) == 1
+    with pytest.warns(ExtrapolationWarning, match="'set', 'kappa'"):
+        model.predict(renamed(X_sweep.assign(kappa=9.0)))
+
+
 def test_html_shows_the_steps_before_and_after_fitting(fitted):
     nested = spring_pipeline(local=SubspaceLTI(), interpolator=PolynomialLPV())
     for pipeline, state in ((nested, "Not fitted"), (fitted, "Fitted")):

@@ -9,6 +9,7 @@ import textwrap
 import tracemalloc
 import warnings
 import zipfile
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -406,6 +407,12 @@ def test_names_of_scheduling_variables_do_no_harm(tmp_path):
     table = pd.DataFrame({"kappa": [0.0, 1.5]})
     named = PolynomialLPV(1).fit(table, [[30, 1.2, 40], [30, 1.2, 100]])
     model = LPVStateSpace(spring_structure(), named, [[0.0], [1.5]])
+    assert_same(model, there_and_back(model, tmp_path / "model.zip"))
+
+
+def test_names_may_be_tuples(tmp_path):
+    names = {"input_names": [("in", "force")], "output_names": [("out", 1)]}
+    model = replace(spring_lpv(), scheduling_names=[("set", "kappa")], **names)
     assert_same(model, there_and_back(model, tmp_path / "model.zip"))
 
 

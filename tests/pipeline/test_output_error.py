@@ -297,6 +297,15 @@ def test_names_and_units_of_the_table_travel():
     assert (*found.input_names, *found.scheduling_names) == ("F", "load")
 
 
+def test_columns_of_a_multiindex_are_named_by_tuples():
+    X, y = sweeps(n=1, n_samples=200)
+    X.columns = pd.MultiIndex.from_tuples([("t", name) for name in X])
+    roles = {role: ("t", column) for role, column in ROLES.items()}
+    model = OutputErrorLPV(spring_lpv(), rate=False, max_iter=1, **roles).fit(X, y)
+    assert model.scheduling_names_ == [("t", "kappa")]
+    assert model.lpv_.input_names == (("t", "force"),)
+
+
 def test_leaving_the_range_is_told(alone):
     X, _ = spring_sweep(100)
     with pytest.warns(ExtrapolationWarning, match="'kappa'.*farthest at 2"):
