@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -73,6 +72,7 @@ from .reports import Summary, Tables, summarise, tables
 from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
+from .steps import STEPS, WITHOUT, check_step
 from .structured_models import (
     StructuredModels,
     begins_held,
@@ -80,6 +80,7 @@ from .structured_models import (
     restructure_points,
 )
 from .together import through_black_boxes
+from .workers import check_jobs
 
 Array = NDArray[np.float64]
 
@@ -88,17 +89,6 @@ _DEFAULTS = {
     "restructurer": GrayBoxRestructurer,
     "interpolator": AutoLPV,
 }
-
-_WITHOUT = ("aligned", "passthrough")  # what restructures without a structure
-
-# Methods that the steps need, an example, and what else is allowed.
-_STEPS = {
-    "local": (("fit",), "SubspaceLTI()", ()),
-    "restructurer": (("fit_model",), "GrayBoxRestructurer(structure)", _WITHOUT),
-    "interpolator": (("fit", "predict"), "AutoLPV() or PolynomialLPV()", ()),
-    "refiner": (("refine",), "OutputErrorLPV()", ()),
-}
-
 
 _PATIENCE = 2.0  # seconds after which one asks oneself what is going on
 
@@ -762,7 +752,7 @@ list, default=None
 
     def _restructurer(self) -> Any:
         """The restructurer to clone, or the way without one."""
-        return _WITHOUT[0] if self.restructurer is None else self.restructurer
+        return WITHOUT[0] if self.restructurer is None else self.restructurer
 
     def _interpolator(self, n_points: int) -> Any:
         if n_points == 1:
@@ -802,15 +792,9 @@ list, default=None
         if self.max_time is not None:
             positive_time("max_time", self.max_time)
         verbosity(self.verbose)
-        if self.n_jobs is not None and (
-            not isinstance(self.n_jobs, Integral) or self.n_jobs == 0
-        ):
-            raise ValueError(
-                "`n_jobs` must be None or an integer, -1 for all processors, not 0. "
-                f"Got {self.n_jobs!r}."
-            )
-        for name in _STEPS:
-            _check_step(name, getattr(self, name))
+        check_jobs(self.n_jobs)
+        for name in STEPS:
+            check_step(name, getattr(self, name))
 
 
 def _told_apart(
@@ -865,24 +849,5 @@ def _check_channels(
 
 def _name_of_step(step: Any, name: str) -> str:
     if name == "restructurer" and (step is None or isinstance(step, str)):
-        return step or _WITHOUT[0]
+        return step or WITHOUT[0]
     return (_DEFAULTS[name] if step is None else type(step)).__name__
-
-
-def _check_step(name: str, step: Any) -> None:
-    """Refuse what cannot be a step of the method, and say what can."""
-    methods, example, other = _STEPS[name]
-    if step is None or (isinstance(step, str) and step in other):
-        return
-    got = f"{step!r}" if isinstance(step, str) else type(step).__name__
-    if isinstance(step, type):
-        got = f"the class {step.__name__}, not an instance"
-    elif all(hasattr(step, method) for method in (*methods, "get_params")):
-        if name != "local" or not hasattr(step, "fit_model"):
-            return
-        got += ", which is a `restructurer`"
-    choice = ", ".join(["an estimator", *map(repr, other)]) + " or None"
-    raise ValueError(
-        f"`{name}` must be {choice}. Got {got}. Give an instance with the "
-        f"method(s) {', '.join(methods)}, such as {example}."
-    )

@@ -66,8 +66,9 @@ from .local_models import common_delay, identify_point, identify_points
 from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
+from .steps import check_step
 from .structured_models import StructuredModels, restructure_points
-from .workers import results_of
+from .workers import check_jobs, results_of
 
 Array = NDArray[np.float64]
 
@@ -537,6 +538,13 @@ class OutputErrorLPV(ScheduledEstimator):
         units_by_name(self.units)
         verbosity(self.verbose)
         whole_number("max_iter", self.max_iter, 1)
+        check_jobs(self.n_jobs)
+        check_step("local", self.local)
+        check_step("interpolator", self.interpolator)
+        form = self.interpolator
+        if not (form is None or isinstance(form, Interpolator)):
+            got = type(form).__name__
+            raise ValueError(_NO_COEFFICIENTS.format("interpolator", got))
         if not (self.prior is None or isinstance(self.prior, str)):
             number(
                 "prior", self.prior, "'local', a factor of 0 or more, or None", low=0

@@ -11,13 +11,15 @@ from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
 from importlib import import_module
+from numbers import Integral
 from typing import Any
 
-from joblib import Parallel, delayed, effective_n_jobs
+from joblib import Parallel, cpu_count, delayed, effective_n_jobs
 from joblib.externals.loky import reusable_executor
 from joblib.parallel import get_active_backend
 
 from ..systems.worker import WATCH, end_with_parent
+from ..validation import shown
 
 # A call as `joblib.delayed` writes it down: function, arguments, keywords.
 Task = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
@@ -35,13 +37,28 @@ _UNREADABLE = (
 )
 
 
+def check_jobs(n_jobs: Any) -> int | None:
+    """The argument `n_jobs` as joblib takes it, or a ValueError."""
+    if n_jobs is None or (isinstance(n_jobs, Integral) and n_jobs != 0):
+        return None if n_jobs is None else int(n_jobs)
+    raise ValueError(
+        "`n_jobs` must be None or an integer, -1 for all processors, not 0. Got "
+        f"{shown(n_jobs)}."
+    )
+
+
 def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
     """Results of tasks in their order, as they come, from `n_jobs` processes.
+
+    No more than there are tasks, or processors.
 
     All at once where the backend of joblib cannot send them one by one, as Ray's.
     These are at work from now on. Raises a RuntimeError where one of them is killed
     from outside.
     """
+    tasks, n_jobs = list(tasks), check_jobs(n_jobs)
+    if n_jobs is not None:  # more of them would wait, or be too many to begin
+        n_jobs = min(n_jobs, max(len(tasks), cpu_count()))
     backend, _ = get_active_backend()
     as_they_come = "generator" if backend.supports_return_generator else "list"
     parallel = Parallel(n_jobs=n_jobs, return_as=as_they_come)
@@ -71,7 +88,10 @@ def started(n_jobs: int | None) -> Callable[[], None]:
 
     What is returned waits for them.
     """
-    ready = results_of([delayed(_ready)()] * effective_n_jobs(n_jobs), n_jobs)
+    n_jobs = check_jobs(n_jobs)
+    most = max(effective_n_jobs(-1), cpu_count())
+    n_workers = min(effective_n_jobs(n_jobs), most)
+    ready = results_of([delayed(_ready)()] * n_workers, n_jobs)
 
     def wait() -> None:
         for _ in ready:

@@ -324,6 +324,10 @@ def test_leaving_the_range_is_told(alone):
         ({"offset": "auto"}, "`offset` must be"),
         ({"missing": "drop"}, "`missing` must be"),
         ({"max_iter": 0}, "`max_iter` must be"),
+        ({"interpolator": "auto"}, "`interpolator` must be an estimator or None. Got"),
+        ({"interpolator": LinearRegression()}, "`interpolator` needs an interpolator"),
+        ({"local": 3}, "`local` must be an estimator or None. Got int"),
+        ({"n_jobs": 0}, "`n_jobs` must be None or an integer, -1 for all"),
     ],
 )
 def test_wrong_options_are_refused(options, message):

@@ -1,0 +1,19 @@
+"""Work shared between processes: how many of them."""
+
+import pytest
+from joblib import delayed, parallel_config
+
+from lpvlearn.pipeline.workers import check_jobs, results_of
+
+
+def test_no_more_jobs_than_tasks_or_processors_are_begun():
+    with parallel_config("threading"):
+        found = results_of([delayed(abs)(-k) for k in range(3)], 10**9)
+        assert list(found) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("n_jobs", ["auto", 0, [], 1.5])
+def test_what_is_no_number_of_jobs_is_refused(n_jobs):
+    with pytest.raises(ValueError, match="`n_jobs` must be None or an integer, -1"):
+        check_jobs(n_jobs)
+    assert check_jobs(None) is None and check_jobs(-1) == -1
