@@ -335,11 +335,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             ``norm="covariance"`` has no estimates.
         """
         self._check_options()
-        if self.norm == "covariance" and not len(estimates):
-            raise ValueError(
-                "`norm='covariance'` needs `estimates`: an identified model with its "
-                "uncertainty, as LocalLPVPipeline gives it. Got none."
-            )
+        estimates = () if estimates is None else estimates
         lists = {"starts": starts, "realizations": realizations, "estimates": estimates}
         for name, value in lists.items():
             listed = isinstance(value, Sequence) and not isinstance(value, str)
@@ -348,6 +344,11 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                     f"`{name}` must be a list. Got {type(value).__name__}; put a "
                     "single one in brackets."
                 )
+        if self.norm == "covariance" and not len(estimates):
+            raise ValueError(
+                "`norm='covariance'` needs `estimates`: an identified model with its "
+                "uncertainty, as LocalLPVPipeline gives it. Got none."
+            )
         for estimate in estimates:
             pair = isinstance(estimate, tuple | list) and len(estimate) == 2
             if not pair or not isinstance(estimate[0], StateSpace):

@@ -466,6 +466,14 @@ ERRORS = [
         "needs `estimates`",
     ),
     (
+        lambda: GrayBoxRestructurer(norm="covariance").fit_model(GOOD, estimates=None),
+        "needs `estimates`.*Got none",
+    ),
+    (
+        lambda: GrayBoxRestructurer(norm="covariance").fit_model(GOOD, estimates=3),
+        "`estimates` must be a list. Got int",
+    ),
+    (
         lambda: GrayBoxRestructurer(
             norm="covariance", frequency_weight=(None, 1.0)
         ).fit_model(GOOD, estimates=[(GOOD, [])]),
