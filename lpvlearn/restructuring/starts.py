@@ -21,6 +21,7 @@ from ..structures.map import AffineMap
 from ..structures.mechanical import ImplicitMap
 from ..structures.structure import GrayBoxStructure, drawn_around
 from ..systems.balancing import balancing_transformation
+from ..validation import shown
 from .continuation import continued_fits
 from .coordinates import CanonicalForm
 from .deadline import time_is_up
@@ -125,12 +126,33 @@ def search(
             f"{', '.join(silent)}, which change nothing: an input or an output may be "
             "missing in B, C or D."
         )
+    begun = given if only_given else [guess]
+    worst = None if begun[0] is None else _worst_pole(problem, begun[0])
+    if worst is not None:
+        name, others = "init", "init='similarity'"
+        if only_given:
+            name, others = "starts", "search=True"
+        raise ValueError(
+            f"`{name}` must be parameters of a stable model. Got {shown(begun[0])}, "
+            f"with a pole at {worst:.4g}. Correct it (its signs, the order of the "
+            f"parameters), or leave it out: {others} looks for others."
+            + DISCRETE_BOX
+            * (problem.system.dt is not None)
+        )
     raise ValueError(
         "no stable starting point was found for `structure`. Give `init`, a vector of "
         f"parameters of a stable model, or raise `n_starts` (got {n_starts})."
         + DISCRETE_BOX
         * (problem.system.dt is not None)
     )
+
+
+def _worst_pole(problem: RestructuringProblem, theta: Array) -> complex | None:
+    """The pole that makes the model of parameters unstable, if any does."""
+    poles = problem.system.poles(theta)
+    rates = growth(poles, problem.system.dt)
+    grows = np.isfinite(poles).all() and rates.max(initial=-np.inf) >= 0
+    return complex(poles[np.argmax(rates)]) if grows else None
 
 
 def _without_effect(

@@ -77,6 +77,15 @@ def test_what_keeps_a_search_from_starting_is_told():
         GrayBoxRestructurer(unstable).fit_model(StateSpace(0.5, 3, 1, None, 1.0))
 
 
+def test_an_unstable_first_guess_is_named_with_its_pole():
+    box, wrong = spring_structure().model([30, 1.2, 40]), [-1.0, -1.0, -1.0]
+    with pytest.raises(ValueError, match=r"`init` must.* pole at 1.618\+0j"):
+        GrayBoxRestructurer(spring_structure(), init=wrong).fit_model(box)
+    with pytest.raises(ValueError, match="`starts` must.*search=True looks"):
+        only = {"starts": [wrong], "search": False}
+        GrayBoxRestructurer(spring_structure()).fit_model(box, **only)
+
+
 @pytest.fixture
 def rooms():
     """Five nodes of known capacities, heat in at two; and the truth."""
