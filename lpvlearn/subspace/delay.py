@@ -112,6 +112,14 @@ def with_late_inputs(
     """
     if not delay.any():
         return split_at_gaps(experiments) if gaps else list(experiments)
+    longest = max(len(e.rows) for e in experiments)
+    if longest < delay.max() + 2 and (gaps or not rest):
+        raise ValueError(
+            f"`input_delay` of {delay.max()} samples needs an experiment of at least "
+            f"{delay.max() + 2} samples: what arrives before is not known. Got "
+            f"{longest}. initial_state='rest' takes it as zero."
+        )
+    delay = np.minimum(delay, longest)  # nothing arrives later than at the end
     late = []
     for e in experiments:
         first, *others = unbroken_runs(e)
@@ -119,16 +127,7 @@ def with_late_inputs(
         before = mean if rest and at_mean else None
         late.append(late_inputs(first, delay, rest=rest, before=before)[0])
         late += [late_inputs(run, delay, rest=False)[0] for run in others]
-    if rest and not gaps:
-        return late
-    longest = max(len(e.rows) for e in experiments)
-    if longest < delay.max() + 2:
-        raise ValueError(
-            f"`input_delay` of {delay.max()} samples needs an experiment of at least "
-            f"{delay.max() + 2} samples: what arrives before is not known. Got "
-            f"{longest}. initial_state='rest' takes it as zero."
-        )
-    return split_at_gaps(late)
+    return late if rest and not gaps else split_at_gaps(late)
 
 
 def find_delays(

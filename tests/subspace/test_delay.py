@@ -423,6 +423,10 @@ def test_experiments_shorter_than_the_delay_are_refused():
     _, u, y = late_record()
     with pytest.raises(ValueError, match="experiment of at least 302 samples"):
         estimator(input_delay=300).fit(u, y)
+    with pytest.raises(ValueError, match="experiment of at least 1000000002 samples"):
+        estimator(input_delay=10**9).fit(u, y)  # at once
+    with pytest.raises(ValueError, match="Every input must vary"):
+        estimator(input_delay=10**9, initial_state="rest").fit(u, y)
 
 
 def test_a_stream_cannot_look_for_its_delay():
