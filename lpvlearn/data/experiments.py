@@ -35,6 +35,7 @@ from ..validation import (
 )
 from .alignment import align_outputs
 from .forgotten_roles import warn_of_disorder, warn_of_forgotten_roles
+from .text_numbers import reading_of
 from .timestamps import (
     TIME_TOL,
     UNTIMED,
@@ -122,9 +123,10 @@ class Column:
                 "Give a column of labels or times its role, or list the numeric "
                 "columns in `inputs`."
             )
+        got = series.iloc[first]
         raise ValueError(
-            f"Column {self.name!r} of {argument} must hold numbers. Got "
-            f"{shown(series.iloc[first])} at row {first}. {remedy}"
+            f"Column {self.name!r} of {argument} must hold numbers. Got {shown(got)} "
+            f"at row {first}. {reading_of(got) or remedy}"
         )
 
     def labels(self, rows: Sequence[int]) -> list[Hashable]:
@@ -544,10 +546,11 @@ def _checked(argument: str, values: Any, **options: Any) -> NDArray[Any]:
             at = zip(
                 ("row", "column"), np.unravel_index(k, entries.shape), strict=False
             )
-            cause = "" if isinstance(flat[k], str) else f": {error}"
+            cause = "." if isinstance(flat[k], str) else f": {error}."
+            cause = f"{cause} {reading_of(flat[k])}".rstrip()
             raise kind(
                 f"`{argument}` must hold numbers. Got {shown(as_scalar(flat[k]))} at "
-                f"{', '.join(f'{axis} {i}' for axis, i in at)}{cause}."
+                f"{', '.join(f'{axis} {i}' for axis, i in at)}{cause}"
             ) from error
         if entries.ndim in _RESHAPED:
             raise ValueError(

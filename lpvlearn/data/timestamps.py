@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from contextlib import suppress
-from numbers import Real
+from datetime import date
+from numbers import Complex, Real
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..exceptions import warn
 from ..validation import first_not_a_number, shown
+from .text_numbers import reading_of
 
 Indices = NDArray[np.intp]
 
@@ -91,7 +93,9 @@ def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
         if kind == "O":
             text = np.array([isinstance(value, str | bytes) for value in series])
             if text.any():  # which NumPy reads, and nothing else adds to
-                _raise_bad_time(column, int(np.argmax(text)), series)
+                row = first_not_a_number(series.astype(object).where(text, 0.0))
+                row = int(np.argmax(text)) if row is None else row
+                _raise_bad_time(column, row, series)
         try:
             seconds = series.to_numpy(dtype=np.float64, na_value=np.nan)
         except (TypeError, ValueError, ArithmeticError):
@@ -308,11 +312,27 @@ def _decimal_unit(seconds: NDArray[np.float64]) -> float:
 
 def _raise_bad_time(column: Hashable, row: int, series: pd.Series) -> NoReturn:
     value = series.iloc[row]
-    if pd.isna(value):
-        remedy = "drop such rows: with missing='split' they are a gap"
-    else:
-        remedy = "convert text with pandas.to_datetime"
+    missing = pd.api.types.is_scalar(value) and pd.isna(value)
     raise ValueError(
         f"Time column {column!r} must hold finite numbers (seconds) or datetimes. Got "
-        f"{'no time' if pd.isna(value) else shown(value)} at row {row}; {remedy}."
+        f"{'no time' if missing else shown(value)} at row {row}. {_remedy(value)}"
+    )
+
+
+def _remedy(value: Any) -> str:
+    """What to do about what is no time."""
+    if isinstance(value, str | bytes):
+        return reading_of(value) or (
+            "Convert text of dates with pandas.to_datetime, of numbers with "
+            "pandas.to_numeric."
+        )
+    if isinstance(value, pd.Period):
+        return "Convert periods with their to_timestamp()."
+    if isinstance(value, date) and value is not pd.NaT:
+        return "Convert dates with pandas.to_datetime."
+    if isinstance(value, Complex) and not isinstance(value, Real):
+        return "Give seconds as real numbers."
+    return (
+        f"Drop rows without a time below {_LATEST:g} s: with missing='split' they are "
+        "a gap."
     )

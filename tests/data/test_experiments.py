@@ -289,6 +289,8 @@ BAD_CALLS = [
     (lambda: _with("u2", 12, pd.NA), {}, ["NaN", "'u2'", "'run 2'", "row 12"]),
     (lambda: _with("kappa", 3, np.inf), {}, ["infinity", "'kappa'", "row 3"]),
     (lambda: _with("u1", 4, "1,5"), {}, ["'u1'", "numbers", "'1,5'", "row 4"]),
+    (lambda: _with("kappa", 4, "1,5"), {}, ["decimal comma", "read_csv(decimal=',')"]),
+    (lambda: _with("u1", 4, "1,500.00"), {}, ["read_csv(thousands=',')"]),
     (lambda: _with("u1", 4, 1j), {}, ["'u1'", "numbers", "row 4"]),
     (lambda: _with("run", 4, None), {}, ["`experiment`", "'run'", "row 4"]),
     (lambda: _with("t", 4, np.nan), {}, ["'t'", "finite", "row 4"]),

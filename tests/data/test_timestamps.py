@@ -1,6 +1,7 @@
 """Time stamps: even however they are stored, or refused."""
 
 import re
+from datetime import date
 
 import numpy as np
 import pandas as pd
@@ -150,3 +151,23 @@ def test_parts_of_seconds_since_1970_are_told(unit, parts):
     with pytest.warns(UserWarning, match=rf"X\['t'\], unit='{unit}'"):
         time_in_seconds(parts * seconds, "t")
     assert time_in_seconds(seconds, "t")[0] > 1e9  # seconds since 1970 are fine
+
+
+@pytest.mark.parametrize(
+    ("stamps", "remedy"),
+    [
+        (["0,0", "0,1"], r"read_csv\(decimal=','\)"),
+        (["0.00", "1,500.00"], r"'1,500.00' at row 1.*read_csv\(thousands=','\)"),
+        (pd.Categorical([0.5, "0,5"]), r"'0,5' at row 1.*read_csv\(decimal"),
+        (["0.0 s", "0.1 s"], "dates with pandas.to_datetime, of numbers with"),
+        (pd.period_range("2026-01-01", periods=2, freq="s"), r"to_timestamp\(\)"),
+        ([date(2026, 1, 1), date(2026, 1, 2)], "Convert dates with pandas.to_datetime"),
+        ([0.0, np.inf], r"inf\)? at row 1. Drop rows without a time below 1e\+30 s"),
+        ([0.0, 1e308], r"1e\+308\)? at row 1. Drop rows without a time below"),
+        ([0.0, pd.NaT], "no time at row 1. Drop rows without a time"),
+        ([0.0, 1j], "Give seconds as real numbers"),
+    ],
+)
+def test_what_is_no_time_is_told_its_own_remedy(stamps, remedy):
+    with pytest.raises(ValueError, match=f"^Time column 't' must hold.*{remedy}"):
+        time_in_seconds(stamps, "t")

@@ -411,7 +411,7 @@ def test_infinity_is_not_resampled(name):
 
 def test_times_of_text_are_refused_by_all():
     call, X = calls()["resample"], world().X.astype({"time": str})
-    with pytest.raises(ValueError, match="convert text"):
+    with pytest.raises(ValueError, match="Convert text"):
         call.function(**{**call.arguments, "X": X})
 
 
@@ -426,7 +426,7 @@ def test_times_beyond_floats_are_refused_at_their_row(digits):
 def test_times_of_text_are_refused_where_they_are_categories():
     X = world().X.iloc[:1].astype({"time": str}).astype({"time": "category"})
     call = calls()["SubspaceLTI.predict"]
-    with pytest.raises(ValueError, match="convert text"):
+    with pytest.raises(ValueError, match="Convert text"):
         call.function(**{**call.arguments, "X": X})
 
 
