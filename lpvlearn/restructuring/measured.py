@@ -39,7 +39,12 @@ _BESIDE = 1e-3
 
 _MOST_AVERAGES = 10**9  # of a response: no record has more
 
-_SMALLEST = 1e-100  # largest entry of a response, in units that make sense
+# Gains in units that make sense. The searches take fourth powers of smaller ones, and
+# begin with parameters about one, from where they do not come to larger ones: those of
+# a mass on a spring they miss from 1e28 on.
+SMALLEST, LARGEST = 1e-60, 1e20
+
+_LEAST = 1e-100  # deviation or coherence, which are squared
 
 # A coherence is estimated from few averages: never nearer to one than that
 _LEAST_INCOHERENCE = 1e-6
@@ -169,10 +174,10 @@ def read_frequency_data(
             "then. Got zeros only."
         )
     largest = float(np.abs(G).max(initial=0.0))
-    if not _SMALLEST < largest < 1.0 / _SMALLEST:
+    if not SMALLEST < largest < LARGEST:
         raise ValueError(
-            f"`frf` must be of a size from {_SMALLEST:g} to {1.0 / _SMALLEST:g}, of "
-            f"which the squares are numbers. Got {largest:.3g}; take another unit."
+            f"`frf` must be of a size from {SMALLEST:g} to {LARGEST:g}. Got "
+            f"{largest:.3g}; take another unit."
         )
     return grid, G.reshape(len(grid), n_outputs, n_inputs).astype(complex)
 
@@ -198,7 +203,7 @@ def read_noise(
         values = values[:, None, None]
     k, p, m = G.shape
     known = values.ndim == 3 and values.shape in ((k, 1, 1), G.shape)
-    least, most = _SMALLEST, 1 / _SMALLEST if coherence is None else 1.0
+    least, most = _LEAST, 1.0 / _LEAST if coherence is None else 1.0
     if not known or not ((values > least) & (values <= most)).all():
         rule = f"above {least:g}, and {most:g} at most"
         raise ValueError(

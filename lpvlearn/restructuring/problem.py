@@ -31,6 +31,8 @@ from .least_squares import (
 )
 from .limits import Limits, growth, keeps_margin, natural_margin
 from .measured import (
+    LARGEST,
+    SMALLEST,
     MeasuredErrorSystem,
     read_frequency_data,
     read_noise,
@@ -58,8 +60,9 @@ _SAME_COST = 1e-4  # relative difference of the costs of fits in one basin: it i
 # a rate that no response down to the lowest frequency could show.
 _LEAST_DECAY = 1e-4
 
-_LEAST_NORM = 1e-150  # of a black box: squares of smaller ones leave the numbers
 _SAME = 1e-6  # relative difference of delays that is rounding
+
+_MOST_WEIGHTED = 1e60  # size of a weighted response: fourth powers of it are numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,12 +369,17 @@ def problem_from_models(
 
 
 def _check_size(norm: float) -> None:
-    if not norm > _LEAST_NORM:
+    if not norm > SMALLEST:
         raise ValueError(
             "`model` must have a response that is not zero where it is compared: "
             f"nothing tells the parameters then. Got one of the norm {norm:.3g}. Name "
             "inputs that move the outputs, give the structure a feedthrough if the "
             "model is a gain, or choose other units if it is only small."
+        )
+    if not norm < LARGEST:
+        raise ValueError(
+            f"`model` must have a gain (behind a weight) below {LARGEST:g}. Got "
+            f"{norm:.3g}: units are out of range. Take others for inputs or outputs."
         )
 
 
@@ -484,13 +492,20 @@ def problem_from_response(
         W = W / np.sqrt(np.mean(std**2, axis=2))[:, None, :]
         std = std[np.argsort(grid)]
     system = MeasuredErrorSystem(structure, grid, G, W)
+    reference = float(np.linalg.norm(system.W @ system.G, 2, axis=(1, 2)).max())
+    if not 1.0 / _MOST_WEIGHTED < reference < _MOST_WEIGHTED:
+        raise ValueError(
+            f"`frf` must be of a size from {1.0 / _MOST_WEIGHTED:g} to "
+            f"{_MOST_WEIGHTED:g} behind its weights, or in deviations of its noise. "
+            f"Got {reference:.3g}; take weights nearer to 1."
+        )
     return RestructuringProblem(
         structure,
         system,
         stable_realization(system.omega, system.G, structure.order),
         system.omega,
         _LEAST_DECAY * float(system.omega[system.omega > 0][0]),
-        float(np.linalg.norm(system.W @ system.G, 2, axis=(1, 2)).max()),
+        reference,
         np.zeros(G.shape[1:]),
         0.0,
         np.zeros(structure.n_inputs),

@@ -182,6 +182,26 @@ def test_a_black_box_of_no_response_is_refused(b, c):
         GrayBoxRestructurer(spring_structure()).fit_model(box)
 
 
+def test_units_out_of_range_are_told():
+    """No warning of NumPy comes before: they are errors here."""
+    box, gray_box = spring_structure().model([30, 1.2, 40]), spring_structure()
+    omega = np.geomspace(0.5, 50.0, 20)
+    frf = box.frequency_response(omega)
+    large = StateSpace(box.A, 1e100 * box.B, 1e100 * box.C)
+    with pytest.raises(ValueError, match=r"gain .* below 1e\+20. Got .*e\+2"):
+        GrayBoxRestructurer(gray_box).fit_model(large)
+    with pytest.raises(ValueError, match=r"from 1e-60 to 1e\+20. Got .*e\+80"):
+        GrayBoxRestructurer(gray_box).fit(omega, 1e80 * frf)
+    with pytest.raises(ValueError, match="behind its weights.*e-100"):
+        GrayBoxRestructurer(gray_box).fit(omega, frf, np.full(20, 1e-100))
+    for gain in (1e-58, 1e18):
+        restructurer = GrayBoxRestructurer(gray_box)
+        restructurer.fit_model(StateSpace(box.A, gain * box.B, box.C))
+        np.testing.assert_allclose(
+            restructurer.params_, [30 * gain, 1.2, 40], rtol=1e-6
+        )
+
+
 @pytest.mark.filterwarnings("ignore::lpvlearn.exceptions.RankWarning")
 def test_a_form_of_many_states_ends_where_its_coefficients_do():
     """What is left is rounding, though far above that of a response."""
