@@ -62,6 +62,11 @@ class OperatingPoints:
         )
 
     @property
+    def n_longest(self) -> int:
+        """Samples of the longest experiment."""
+        return max(len(run.rows) for group in self.experiments for run in group)
+
+    @property
     def span(self) -> Array:
         """Smallest and largest scheduling values of the points, (2, n_scheduling)."""
         return np.array([self.kappa.min(axis=0), self.kappa.max(axis=0)])

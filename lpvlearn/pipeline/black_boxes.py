@@ -20,7 +20,7 @@ from ..lpv.spline import SplineLPV
 from ..models.statespace import StateSpace, with_signs_of
 from ..structures.structure import GrayBoxStructure
 from ..validation import listed
-from .left_out import errors_left_out, largest_difference
+from .left_out import errors_left_out, forgetting, forgotten, largest_difference
 from .local_models import LocalModel, motions
 from .runner import place_of
 
@@ -43,30 +43,38 @@ _FORCED, _NAMED = 0.5, 3
 
 
 def aligned_black_boxes(
-    local: Sequence[LocalModel], kappa: Array, u: Array, y: Array
+    local: Sequence[LocalModel], kappa: Array, u: Array, y: Array, longest: float
 ) -> tuple[GrayBoxStructure, Array]:
     """Entries of the models of all points in the states that are foreseen best.
 
     With what the other points foresee where the record of one does not tell its states.
     Warns of points whose own records speak for another order. Inputs and outputs count
-    by how far they move, `u` and `y`, whatever their units.
+    by how far they move, `u` and `y`, whatever their units. What decays in about the
+    `longest` record (seconds) or later is `forgotten` while states are compared.
     """
-    models = [_scaled(balanced(model), u, y).balance() for model in local]
+    models = [_scaled(balanced(model), u, y) for model in local]
+    rate = forgotten(models, longest)
+    models = [forgetting(model, rate).balance() for model in models]
     fewer = [
         k
         for k, model in enumerate(local)
         if model.own is not None and model.own.order < model.order
     ]
     own = [
-        model if one.own is None or k not in fewer else _scaled(balanced(one.own), u, y)
+        model
+        if one.own is None or k not in fewer
+        else forgetting(_scaled(balanced(one.own), u, y), rate)
         for k, (one, model) in enumerate(zip(local, models, strict=True))
     ]
     theta, mended = _foretold(models, own, fewer, kappa)
-    tell_of_forced(local, kappa, mended)
+    tell_of_forced(local, kappa, rate, mended)
     direct = _has_feedthrough(models)
     first = next(model for k, model in enumerate(models) if k not in mended)
     structure = _full(first, direct)
-    rows = [_scaled(structure.model(row), 1.0 / u, 1.0 / y) for row in theta]
+    rows = [
+        _scaled(forgetting(structure.model(row), -rate), 1.0 / u, 1.0 / y)
+        for row in theta
+    ]
     whole = _full(first, direct, local[0].integrating)
     return whole, _entries(rows, direct)
 
@@ -244,18 +252,21 @@ def _suspects(whole: _Foreseeable | None, kappa: Array) -> list[Sequence[int]]:
 
 
 def tell_of_forced(
-    local: Sequence[LocalModel], kappa: Array, mended: Sequence[int] = ()
+    local: Sequence[LocalModel],
+    kappa: Array,
+    rate: float,
+    mended: Sequence[int] = (),
 ) -> None:
     """Warn of models of the common order that are not those of their own records.
 
-    But for points that are `mended`.
+    Of states `forgotten` at a rate. But for points that are `mended`.
     """
     forced = [
         f"{place_of(k, kappa)}: {100.0 * change:.0f} %"
         for k, model in enumerate(local)
         if model.own is not None
         and k not in mended
-        and (change := largest_difference(model.lti, model.own.lti)) > _FORCED
+        and (change := _change(model, model.own, rate)) > _FORCED
     ]
     if forced:
         warn(
@@ -266,6 +277,11 @@ def tell_of_forced(
             "to the next points. Record for longer there, leave the point out, or give "
             "a lower order: local=SubspaceLTI(order=...)."
         )
+
+
+def _change(model: LocalModel, own: LocalModel, rate: float) -> float:
+    both = (forgetting(one.lti, rate) for one in (model, own))
+    return largest_difference(*both)
 
 
 def _of_one_order(models: Sequence[StateSpace]) -> Sequence[StateSpace]:

@@ -533,7 +533,9 @@ list, default=None
 
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
-            found = restructure_points(restructurer, local, points, runner, limit)
+            found = restructure_points(
+                restructurer, local, points, runner, self.sampling_time_, limit
+            )
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
@@ -585,7 +587,8 @@ list, default=None
                 if self.refiner_ is None
                 else self.refiner_.output_errors_
             )
-            growth = growth_rates(self.lpv_, kappa)
+            longest = self.sampling_time_ * found.points.n_longest
+            growth = growth_rates(self.lpv_, kappa, longest)
             if getattr(self.interpolator_, "form_", "") == INTERPOLATION:
                 tell_unforeseen(
                     self.lpv_,
@@ -593,6 +596,7 @@ list, default=None
                     self.interpolator_.best_estimator_,
                     kappa,
                     found.theta,
+                    longest,
                 )
             report = tables(found, self.lpv_, self.sampling_time_, growth)
             self.parameters_, self.parameters_std_ = (

@@ -28,6 +28,8 @@ _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 # median of several from which models between the points are seldom good to a tenth.
 _ELSEWHERE, _WORSE, _MEDIAN, _MANY = 1.0, 1.5, 0.3, 4
 
+_HARDLY = 3.0  # time constants in the longest record of what hardly decays
+
 _NAMED = 3  # operating points that a message lists
 
 
@@ -63,17 +65,21 @@ def errors_left_out(
     form: Any,
     kappa: Array,
     theta: Array,
+    rate: float = 0.0,
 ) -> dict[int, float]:
     """By points within the range of the others, the errors of what these make of them.
 
-    Of the response, in the largest gain of the point's model.
+    Of the response, in the largest gain of the point's model; of states forgotten at
+    a `rate`.
     """
     errors = {}
     for out in inner_places(kappa):
         k = int(out.argmax())
         values = interpolated_without(k, form, kappa, theta, kappa[[k]])
         if values is not None:
-            errors[k] = largest_difference(structure.model(values[0]), models[k])
+            found = structure.model(values[0])
+            both = (forgetting(model, rate) for model in (found, models[k]))
+            errors[k] = largest_difference(*both)
     return errors
 
 
@@ -83,6 +89,7 @@ def tell_unforeseen(
     form: Any,
     kappa: Array,
     theta: Array,
+    longest: float,
 ) -> None:
     """Tell of points within the range of the others of which these know nothing.
 
@@ -91,7 +98,8 @@ def tell_unforeseen(
     """
     if not models[0].is_continuous:
         return
-    errors = errors_left_out(lpv.structure, models, form, kappa, theta)
+    rate = forgotten(models, longest)
+    errors = errors_left_out(lpv.structure, models, form, kappa, theta, rate)
     worst = sorted(((error, k) for k, error in errors.items()), reverse=True)
     high = [(error, k) for error, k in worst if error > _ELSEWHERE]
     often = high and (high[0][0] > _WORSE or 2 * len(high) >= len(errors))
@@ -109,6 +117,26 @@ def tell_unforeseen(
             "`parameters_` for a point that is unlike the others, give a structure "
             "where there is none, or measure in between (`suggest_operating_point`)."
         )
+
+
+def forgotten(models: Sequence[StateSpace], longest: float) -> float:
+    """The rate, 1/s, at which states are forgotten where models are compared.
+
+    What decays in about the `longest` record (seconds) or later, as integrators, has
+    Gramians and gains of any size, which say nothing of it. 0 where all decay sooner.
+    """
+    rate = _HARDLY / longest
+    slowest = max(model.poles().real.max(initial=-np.inf) for model in models)
+    return rate if slowest > -rate else 0.0
+
+
+def forgetting(model: StateSpace, rate: float) -> StateSpace:
+    """The model ``A - rate I``, in any basis: its response at ``j omega + rate``."""
+    if not rate:
+        return model
+    A = model.A - rate * np.eye(model.order)
+    matrices = A, model.B, model.C, model.D
+    return StateSpace(*matrices, model.sampling_time, input_delay=model.input_delay)
 
 
 def largest_difference(one: StateSpace, other: StateSpace) -> float:

@@ -313,7 +313,9 @@ class OutputErrorLPV(ScheduledEstimator):
             units={**(start.units or {}), **(self.units or {})} or None,
         )
         self.refine(start, experiments, dt)
-        growth_rates(self.lpv_, grid_over(self.lpv_.scheduling_range, 3), _UNSEEN)
+        levels = grid_over(self.lpv_.scheduling_range, 3)
+        longest = dt * max(len(e.rows) for e in experiments)
+        growth_rates(self.lpv_, levels, longest, _UNSEEN)
         return self
 
     def refine(
@@ -486,7 +488,7 @@ class OutputErrorLPV(ScheduledEstimator):
             deviate=structure is not None,
         )
         way = "aligned" if structure is None else GrayBoxRestructurer(structure)
-        found = restructure_points(way, local, points, runner)
+        found = restructure_points(way, local, points, runner, dt)
         form = AutoLPV() if self.interpolator is None else clone(self.interpolator)
         known = {}
         if has_fit_parameter(form, "covariance"):

@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 
 _STEPS = 20  # into which the way from a point to its neighbour is cut
 
+_GROWN = 0.01  # share by which what counts as growing does so over a record, at least
+
 _ROUNDING = 1e-8  # of the largest pole: an integrator's may lie so far to the right
 
 
@@ -22,19 +24,23 @@ _OVERSHOT = (
 )
 
 
-def growth_rates(lpv: LPVStateSpace, kappa: Array, cause: str = _OVERSHOT) -> Array:
+def growth_rates(
+    lpv: LPVStateSpace, kappa: Array, longest: float, cause: str = _OVERSHOT
+) -> Array:
     """Largest real part (1/s) of the frozen poles about each operating point.
 
-    Half-way to its neighbours. What grows is told: the range, and the `cause`.
+    Half-way to its neighbours. What grows is told: the range, and the `cause`; what
+    does so by next to nothing over the `longest` record (seconds) counts as zero.
     """
     model, ends = lpv.silenced(), neighbours(kappa)
-    rates = _rates(model, kappa)
+    least = _GROWN / longest
+    rates = _rates(model, kappa, least)
     share = np.linspace(0.0, 1.0, _STEPS + 1)[1:-1, None]
     worst, where = rates.max(initial=-np.inf), kappa[rates.argmax()]
     unstable = [kappa[k] for k in np.flatnonzero(rates > 0)]
     for first, last in ends:
         between = kappa[first] + share * (kappa[last] - kappa[first])
-        found = _rates(model, between)
+        found = _rates(model, between, least)
         unstable += list(between[found > 0])
         if found.max() > worst:
             worst, where = found.max(), between[found.argmax()]
@@ -57,9 +63,10 @@ def growth_rates(lpv: LPVStateSpace, kappa: Array, cause: str = _OVERSHOT) -> Ar
     return rates
 
 
-def _rates(model: LPVStateSpace, kappa: Array) -> Array:
-    """Largest real part of the poles at every value; rounding counts as zero."""
+def _rates(model: LPVStateSpace, kappa: Array, least: float) -> Array:
+    """Largest real part of the poles at every value; 0 up to `least`, and rounding."""
     poles = model.frozen_poles(kappa)
     rates = poles.real.max(axis=1, initial=-np.inf)
     size = np.abs(poles).max(axis=1, initial=0.0)
-    return np.where(np.abs(rates) <= _ROUNDING * size, 0.0, rates)
+    is_zero = (np.abs(rates) <= _ROUNDING * size) | ((rates > 0) & (rates <= least))
+    return np.where(is_zero, 0.0, rates)

@@ -35,6 +35,7 @@ from .black_boxes import (
     tell_of_forced,
 )
 from .branches import Doubt, tied_branches
+from .left_out import forgotten
 from .local_models import LocalModel, motions
 from .runner import Done, PointRunner, place_of, tell_skipped
 
@@ -68,6 +69,7 @@ def restructure_points(
     local: list[LocalModel],
     points: OperatingPoints,
     runner: PointRunner,
+    sampling_time: float,
     max_time: float | None = None,
 ) -> StructuredModels:
     """Bring the local models of all operating points into one structure.
@@ -78,11 +80,13 @@ def restructure_points(
     """
     began = perf_counter()
     if isinstance(restructurer, str):
+        longest = sampling_time * points.n_longest
         if restructurer == "aligned":
             sizes = channel_sizes(points.experiments)
-            structure, theta = aligned_black_boxes(local, points.kappa, *sizes)
+            structure, theta = aligned_black_boxes(local, points.kappa, *sizes, longest)
         else:
-            tell_of_forced(local, points.kappa)
+            rate = forgotten([model.lti for model in local], longest)
+            tell_of_forced(local, points.kappa, rate)
             models = [balanced(model) for model in local]
             structure, theta = balanced_entries(models, local[0].integrating)
         models = [

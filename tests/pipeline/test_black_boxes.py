@@ -4,6 +4,7 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from lpvlearn import (
@@ -22,7 +23,7 @@ from lpvlearn.pipeline.black_boxes import (
 )
 from lpvlearn.pipeline.local_models import LocalModel
 
-from ..conftest import modes
+from ..conftest import ROLES, modes
 
 STEP = 0.1
 
@@ -42,7 +43,7 @@ def local(lti, own=None):
 
 def aligned(points, kappa, outputs=(1.0,)):
     """Of one input in units of one, and outputs in those given."""
-    return aligned_black_boxes(points, kappa, np.ones(1), np.array(outputs))
+    return aligned_black_boxes(points, kappa, np.ones(1), np.array(outputs), 1e9)
 
 
 def errors_between(structure, theta, kappa, truth):
@@ -182,12 +183,12 @@ def test_points_of_which_more_states_make_another_model_are_named():
     with pytest.warns(
         UserWarning, match=r"order 3.*\(operating point 2 \(sch.*: 5\d\d %"
     ):
-        tell_of_forced(points, kappa)
+        tell_of_forced(points, kappa, 0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        tell_of_forced(points[:2], kappa[:2])
-        tell_of_forced([replace(points[2], own=None)], kappa[2:])
-        tell_of_forced(points, kappa, mended=[2])
+        tell_of_forced(points[:2], kappa[:2], 0.0)
+        tell_of_forced([replace(points[2], own=None)], kappa[2:], 0.0)
+        tell_of_forced(points, kappa, 0.0, mended=[2])
 
 
 @pytest.mark.parametrize("vanishes", [0, 1, 2])
@@ -208,3 +209,28 @@ def test_a_mode_that_exact_records_do_not_have_at_a_point_is_foreseen(vanishes):
     for z in np.linspace(places[0], places[-1], 5):
         true = plant(z)
         assert (lpv.at(z) - true).hinf_norm() < 0.03 * true.hinf_norm()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_integrators_have_gains_of_any_size_and_states_of_one(seed):
+    """A position that a servo drives: its pole is anywhere near zero."""
+    rng, tables = np.random.default_rng(seed), []
+
+    def servo(kappa):
+        w = 12.0 / np.sqrt(kappa)
+        A = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -(w**2), -0.2 * w]]
+        return StateSpace(A, [[0.0], [0.0], [0.3 * w**2]], [[1.0, 0.0, 0.0]])
+
+    for run, kappa in enumerate([0.5, 1.0, 1.5, 2.0]):
+        u = np.repeat(rng.choice([-1.0, 1.0], 300), 5)[:, None]
+        y = servo(kappa).simulate(u, sampling_time=0.02)[:, 0]
+        y = y + 0.02 * y.std() * rng.standard_normal(len(y))
+        columns = {"u": u[:, 0], "kappa": kappa, "run": run, "y": y}
+        tables.append(pd.DataFrame(columns).assign(time=0.02 * np.arange(len(u))))
+    table = pd.concat(tables, ignore_index=True)
+    model = LocalLPVPipeline(**ROLES).fit(table.drop(columns="y"), table[["y"]])
+    omega = np.geomspace(0.2, 80.0, 40)
+    for kappa in (0.75, 1.25, 1.75):
+        true = servo(kappa).frequency_response(omega)
+        found = model.lpv_.at(kappa).frequency_response(omega)
+        assert np.abs(found - true).max() < 0.03 * np.abs(true).max()

@@ -22,7 +22,7 @@ def damped(c, interpolator, kappa=KAPPA):
 def test_a_cubic_between_stable_points_may_be_unstable():
     lpv = damped([20.0, 0.2, 0.2, 20.0], PolynomialLPV(3))
     with pytest.warns(UserWarning, match=r"unstable.*1 from 1.0\d to 1.9\d.*at 1\.5"):
-        rates = growth_rates(lpv, KAPPA)
+        rates = growth_rates(lpv, KAPPA, 1e3)
     assert rates[0] < 0 < rates[1] == pytest.approx(rates[2], rel=1e-9)
     poles = lpv.frozen_poles([1.5])
     assert rates[1] == pytest.approx(poles.real.max())
@@ -30,7 +30,7 @@ def test_a_cubic_between_stable_points_may_be_unstable():
 
 def test_a_spline_does_not_overshoot():
     lpv = damped([20.0, 0.2, 0.2, 20.0], SplineLPV())
-    rates = growth_rates(lpv, KAPPA)  # a warning would be an error
+    rates = growth_rates(lpv, KAPPA, 1e3)  # a warning would be an error
     np.testing.assert_allclose(rates[1:3], lpv.frozen_poles([1.0, 2.0]).real.max(1))
 
 
@@ -49,7 +49,7 @@ def test_between_points_of_two_variables():
         structure, Hollow(), [kappa[0], kappa[3]], scheduling_names=["mass", "speed"]
     )
     with pytest.warns(UserWarning, match=r"'mass' from 0.4.* 'speed' from 0.4"):
-        rates = growth_rates(lpv, kappa)
+        rates = growth_rates(lpv, kappa, 1e3)
     np.testing.assert_array_equal(rates > 0, [True, False, False, False, True])
 
 
@@ -57,7 +57,7 @@ def test_integrators_are_no_growth():
     structure = spring_structure().fix({"k": 0.0, "b": 1.0})
     form = PolynomialLPV(1).fit(KAPPA, [[1.0], [2.0], [3.0], [4.0]])
     lpv = LPVStateSpace(structure, form, [KAPPA[0], KAPPA[-1]])
-    np.testing.assert_array_equal(growth_rates(lpv, KAPPA), 0.0)
+    np.testing.assert_array_equal(growth_rates(lpv, KAPPA, 1e3), 0.0)
 
 
 def test_the_report_shows_the_growth_rate():

@@ -327,7 +327,7 @@ def test_one_canonical_form_needs_one_order():
         for n in (1, 2)
     ]
     with pytest.raises(ValueError, match=r"one order. Got orders \[1, 2\]"):
-        restructure_points(GrayBoxRestructurer(), models, None, None)
+        restructure_points(GrayBoxRestructurer(), models, None, None, 1.0)
 
 
 SENSORS = GrayBoxStructure.from_template(
