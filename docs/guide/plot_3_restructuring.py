@@ -110,8 +110,11 @@ restructurer.starts_
 # are (and further optima from the neighbours' parameters), and takes of all families
 # the one of the highest evidence as smooth functions of the scheduling variable:
 # branches that cross keep their slopes. Where another family is nearly as plausible, it
-# warns with the names of the parameters. ``with_ranges``, ``with_bounds`` or a first
-# guess decide which part has which number.
+# warns with the names of the parameters. Other values may give the same responses at
+# all points without any parts of like names: of two tanks in series either may be the
+# slow one, with another gain at the inlet. Any two parameters are exchanged to find
+# such values, which are told. ``with_ranges``, ``with_bounds`` or a first guess decide
+# which part has which number, and which family is taken.
 #
 # Two parts that noise has merged at a point have no places at all: the parameters there
 # are any, with infinite covariance, and no smooth function goes through them. Then the

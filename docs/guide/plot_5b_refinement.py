@@ -120,7 +120,9 @@ pipeline.refiner_.rate_, pipeline.lpv_
 # -------------------------
 # Alone, the estimator begins with one time-invariant model of the table: in a
 # structure, or without one as a balanced model with matrices affine in the scheduling
-# variables. What it needs then is data that tell all coefficients:
+# variables; or, where experiments of the table stay at three operating points or more,
+# with the model through these, as a pipeline makes it. What it needs then is data that
+# tell all coefficients:
 #
 # .. code-block:: python
 #

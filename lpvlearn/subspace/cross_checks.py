@@ -178,9 +178,10 @@ def tell_of_delay(
     telling.once(
         "delay",
         f"Input {telling.input(delay.argmax())} shows in the outputs only after {cut} "
-        "samples, for certain. With a delay in their place a model of order "
-        f"{other[0]} {what}. Give it as `input_delay`, {cut} at most, and compare on "
-        "another record; input_delay='auto' takes only what is a delay beyond doubt.",
+        "samples, beyond noise; it may arrive a few sooner. With a delay in place of "
+        f"them a model of order {other[0]} {what}. Give it as `input_delay`, {cut} or "
+        "less, and compare on another record; input_delay='auto' takes only what is a "
+        "delay beyond doubt.",
     )
 
 

@@ -99,8 +99,10 @@ def tell_of_held_outputs(outputs: Sequence[Array], telling: Telling) -> None:
             "held",
             f"Output {telling.output(held.index(slowest))} keeps its values for "
             f"{slowest} samples: it was sampled more slowly than the table, and held "
-            "in between as the response of no linear system is. Take one row of every "
-            f"{slowest} (the first of each value), or `resample`.",
+            "in between as the response of no linear system is. Where no input moves "
+            f"while it is held, take one row of every {slowest} (the first of each "
+            "value), or `resample`; where one does, put NaN in place of values that "
+            "are held, and use missing='estimate' with a given `order`.",
         )
 
 
@@ -306,7 +308,9 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
             "finer sensor.",
         )
     else:
-        remedy = "a higher `order`" if chose_order else "order='auto'"
+        remedy = "a higher `order`"
+        if not chose_order:
+            remedy += " (order='auto' finds it; beside a structure it is that of this)"
         # Without figures, so that a search over orders says it once of each.
         telling.once(
             "lack",
