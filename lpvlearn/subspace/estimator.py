@@ -493,10 +493,17 @@ class SubspaceLTI(
         self.__dict__.pop("rates_", None)  # of an earlier fit
         if self.integrating is not None:
             return self._fit_rates(X, y)
+        return self._fit_table(X, y)
+
+    def _fit_table(self, X: Any, y: Any, *, rates: bool = False) -> Self:
+        """As `fit`, or of `rates`, most of which may be noise that was differenced."""
         choices = check_options(self.get_params(deep=False))
+        choices = choices._replace(differences=rates)
         experiments = self._read(X, y, reset=True, cut=False)
         self._single_output = np.asarray(y).ndim == 1
         telling = Telling(*_labels_of(X, experiments, y))
+        if rates:
+            telling = telling.aside("noisy output")
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
             if self.detrend is not None:
                 raise ValueError(
@@ -728,7 +735,7 @@ class SubspaceLTI(
             scheduling=None,
             operating_point=None,
         )
-        self.rates_ = inner = rate_model.fit(table, rates)
+        self.rates_ = inner = rate_model._fit_table(table, rates, rates=True)
         best = inner
         if flags.all() and inner.method_ != "pbsid":
             best = self._of_sums(experiments, inner)

@@ -391,7 +391,7 @@ def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
     poor = [telling.output(k) for k in np.flatnonzero(left > USELESS**2)]
     if poor and len(poor) < np.count_nonzero(~np.isnan(left)):
         telling.once(
-            "useless",
+            "noisy output",
             f"The model explains next to nothing of output(s) {', '.join(poor)}: what "
             "moves these is mostly noise, or noise as slow as what the inputs do. Try "
             "refine='simulation' or a higher `order`, identify them apart from the "

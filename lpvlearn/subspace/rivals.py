@@ -174,7 +174,7 @@ def may_share_noise(fitted: LocalFit, choices: Choices) -> bool:
         and sum(record.u.shape[1] for record in records) <= _PLENTY
         and choices.refine in ("auto", "prediction")
         and fitted.selection.order
-        and not choices.estimated
+        and not (choices.estimated or choices.differences)
         and not (feedback is not None and feedback.found)
         and fitted.residual > _AUDIBLE
         and len(fitted.evidence.noise.A) >= _LAGS * len(fitted.model.C)

@@ -197,3 +197,21 @@ def test_the_rates_of_a_loop_keep_what_acts_at_once():
     np.testing.assert_allclose(rates.lti_.D.item(), at_once, rtol=0.2)
     static = rates.lti_.frequency_response([0.0]).real.item()
     np.testing.assert_allclose(static, ratio, rtol=0.3)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_differenced_noise_of_a_sensor_moves_no_plant(seed):
+    """It would be taken for states, or for what a loop answers."""
+    rng = np.random.default_rng(seed)
+    w = 17.0
+    A = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -(w**2), -0.2 * w]]
+    servo = StateSpace(A, [[0.0], [0.0], [0.3 * w**2]], [[1.0, 0.0, 0.0]])
+    u = np.repeat(rng.choice([-1.0, 1.0], 500), 5)[:, None]
+    y = servo.simulate(u, sampling_time=0.02)
+    y = y + 0.02 * y.std() * rng.standard_normal(y.shape)
+    model = SubspaceLTI(integrating=True, sampling_time=0.02).fit(u, y)
+    assert (model.order_, model.method_) == (3, "po-moesp")
+    omega = np.geomspace(0.2, 80.0, 40)
+    true = servo.frequency_response(omega)
+    found = model.lti_.to_continuous().frequency_response(omega)
+    assert np.abs(found - true).max() < 0.01 * np.abs(true).max()
