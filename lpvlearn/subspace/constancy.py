@@ -50,7 +50,7 @@ def change_over(evidence: Evidence) -> Change | None:
         return None
     record = evidence.records[0]
     parts = _parts(record, _VALUES_EACH * (model.C.size + model.B.size + len(model.A)))
-    size = np.sqrt(sum((part.y**2).mean(axis=1) for part in parts) / max(len(parts), 1))
+    size = record.y.std(axis=1)
     if len(parts) < 2 or not size.all():
         return None
     with np.errstate(over="ignore", invalid="ignore"):
@@ -67,9 +67,8 @@ def change_over(evidence: Evidence) -> Change | None:
     left, left_apart = _rms(together) / size, _rms(apart) / size
     filters = whitening_filters(apart)
     white, white_apart = (_rms(_filtered(e, filters)) for e in (together, apart))
-    shares = (left_apart / left) ** 2
-    alike = (left < _ROUGH) | ((white_apart / white) ** 2 > _CHANGED_WHITE)
-    shares[alike] = np.inf
+    changed = (left > _ROUGH) & (white_apart**2 < _CHANGED_WHITE * white**2)
+    shares = np.where(changed, left_apart / np.maximum(left, _ROUGH), np.inf) ** 2
     k = int(shares.argmin())
     if not shares[k] < _CHANGED:
         return None
