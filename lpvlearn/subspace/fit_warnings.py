@@ -355,11 +355,12 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> Non
             "input, or use `predict_ahead`.",
         )
     elif residual > USELESS:
+        other = "an `order` of your own" if chose_order else "order='auto'"
         telling.once(
             "useless",
             "The model explains next to nothing of the outputs: its simulation "
             f"error is {100.0 * residual:.0f} % of their size. Try a longer "
-            "`horizon` or order='auto', and check that inputs and outputs belong "
+            f"`horizon` or {other}, and check that inputs and outputs belong "
             "together and in the order of time.",
         )
     elif follows_means_alone(fitted.evidence) or _confirms_means_alone(fitted):
