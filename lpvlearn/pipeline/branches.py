@@ -212,7 +212,7 @@ def _exchanges(
 def _guess(structure: GrayBoxStructure, init: Any) -> Array:
     """What is known of the parameters before, NaN of the others."""
     if init is not None and not isinstance(init, str):
-        return np.asarray(init, dtype=float)
+        return structure.check_params(init)
     ranged = ~np.isnan(structure.ranges[0])
     known = ranged | (structure.initial is not None)
     guess = np.where(ranged, structure.ranges.mean(0), structure.reference)

@@ -251,6 +251,8 @@ def test_what_is_known_of_them_tells_which_is_which(known, g):
     elif known == "bound":
         structure = LAGS.with_bounds(interval)
     else:
-        init = [0.02, 0.01, 0.02] if g == 0.02 else [0.01, 0.02, 0.03]
+        init = [0.02, 0.01, 0.02]
+        if g == 0.03:
+            init = {"a": 0.01, "b": 0.02, "g": 0.03}
     found = lags(structure, n_points=4, init=init)
     np.testing.assert_allclose(found.parameters_["g"], g, rtol=0.05)
