@@ -290,7 +290,7 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
         return
     if not feedback.found and not telling.kinds & _BENDS:
         _warn_of_bends(fitted, telling)
-    if not feedback.found and not telling.kinds & _BENDS:
+    if not feedback.found and not telling.kinds & (_BENDS | {"useless"}):
         _warn_of_change(fitted, telling)
     if fitted.method == "pbsid" or "lack" in telling:
         return
