@@ -19,7 +19,13 @@ from ..systems.threads import one_blas_thread
 from .refinement import refine_simulation
 from .residuals import whitening_filters
 from .signals import Record
-from .simulation_fit import simulation_errors, simulation_fit, with_initial_states
+from .simulation_fit import (
+    Freedom,
+    Realization,
+    simulation_errors,
+    simulation_fit,
+    with_initial_states,
+)
 from .statistics import Evidence
 
 Array = NDArray[np.float64]
@@ -54,14 +60,12 @@ def change_over(evidence: Evidence) -> Change | None:
     if len(parts) < 2 or not size.all():
         return None
     with np.errstate(over="ignore", invalid="ignore"):
-        whole = with_initial_states(model, parts, free, evidence.whitening.weight)
-        together = simulation_errors(whole, parts)
-        if not _rms(together).max() > _ROUGH * size.min():
+        if not (_rms(_together(model, parts, free)) > _ROUGH * size).any():
             return None
-        apart = []
+        model = _refined(model, record, free)  # as the parts are, whatever it was
+        together, apart = _together(model, parts, free), []
         for part in parts:
-            start = simulation_fit(model.A, model.C, [part], free)
-            apart += simulation_errors(refine_simulation(start, [part], free), [part])
+            apart += simulation_errors(_refined(model, part, free), [part])
     if not all(np.isfinite(e).all() for e in (*together, *apart)):
         return None
     left, left_apart = _rms(together) / size, _rms(apart) / size
@@ -73,6 +77,17 @@ def change_over(evidence: Evidence) -> Change | None:
     if not shares[k] < _CHANGED:
         return None
     return Change(k, len(parts), float(left[k]), float(left_apart[k]))
+
+
+def _together(model: Realization, parts: list[Record], free: Freedom) -> list[Array]:
+    """Errors of one model for all parts, of initial states and trends of each."""
+    return simulation_errors(with_initial_states(model, parts, free), parts)
+
+
+def _refined(model: Realization, record: Record, free: Freedom) -> Realization:
+    """The nearest minimum of the simulation error of a record."""
+    start = simulation_fit(model.A, model.C, [record], free)
+    return refine_simulation(start, [record], free)
 
 
 def _parts(record: Record, least: int) -> list[Record]:

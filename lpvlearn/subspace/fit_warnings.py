@@ -454,7 +454,7 @@ def _warn_of_change(fitted: LocalFit, telling: Telling) -> None:
         telling.once(
             "change",
             "The system changes over the record, or is not linear: of output "
-            f"{telling.output(change.output)} the model leaves "
+            f"{telling.output(change.output)} one model leaves "
             f"{100.0 * change.together:.2g} %, models of each of {change.n_parts} "
             f"parts leave {100.0 * change.apart:.2g} %. Its response is one between "
             "those, with bands too narrow for any of them. Fit the parts apart, or "
