@@ -30,7 +30,7 @@ from .statistics import Evidence
 
 Array = NDArray[np.float64]
 
-# Parts of a record, if each has so many values for every parameter, or half of them
+# Parts of a record: at most so many, each of so many values for every parameter.
 _PARTS, _VALUES_EACH = 8, 20
 
 # Share of an output's size from which what the model leaves is looked into, and of the
@@ -63,9 +63,26 @@ def change_over(evidence: Evidence) -> Change | None:
         if not (_rms(_together(model, parts, free)) > _ROUGH * size).any():
             return None
         model = _refined(model, record, free)  # as the parts are, whatever it was
-        together, apart = _together(model, parts, free), []
-        for part in parts:
-            apart += simulation_errors(_refined(model, part, free), [part])
+        models = [_refined(model, part, free) for part in parts]
+        apart = [
+            simulation_errors(of_part, [part])[0]
+            for of_part, part in zip(models, parts, strict=True)
+        ]
+        change = _change(_together(model, parts, free), apart, size)
+        # What is left by a poor minimum says nothing of the system: parts found others.
+        if change is not None:
+            fits = [simulation_fit(m.A, m.C, [record], free) for m in models]
+            best = min(fits, key=lambda fit: fit.loss)
+            if np.isfinite(best.loss):
+                best = refine_simulation(best, [record], free)
+                return _change(_together(best, parts, free), apart, size)
+        return change
+
+
+def _change(
+    together: Sequence[Array], apart: Sequence[Array], size: Array
+) -> Change | None:
+    """What the errors of one model and of models of parts tell, if they do."""
     if not all(np.isfinite(e).all() for e in (*together, *apart)):
         return None
     left, left_apart = _rms(together) / size, _rms(apart) / size
@@ -76,7 +93,7 @@ def change_over(evidence: Evidence) -> Change | None:
     k = int(shares.argmin())
     if not shares[k] < _CHANGED:
         return None
-    return Change(k, len(parts), float(left[k]), float(left_apart[k]))
+    return Change(k, len(apart), float(left[k]), float(left_apart[k]))
 
 
 def _together(model: Realization, parts: list[Record], free: Freedom) -> list[Array]:
