@@ -25,7 +25,7 @@ from scipy.spatial.distance import cdist
 
 from ..lpv.alignment import spanning_tree
 from ..restructuring.problem import RestructuringProblem
-from ..structures.interchanges import interchanges
+from ..structures.interchanges import distance, interchanges, known_before
 from ..structures.structure import GrayBoxStructure
 
 Array = NDArray[np.float64]
@@ -114,8 +114,10 @@ def tied_branches(
         if structure.is_bounded
         else len(optima[int(spanning_tree(kappa, outward=False)[0][0])])
     )
-    guess = _guess(structure, getattr(fitted[0], "init", None))
-    chosen, doubts = smoothest_family(kappa, candidates, variances, n_first, guess)
+    guess = known_before(structure, getattr(fitted[0], "init", None))
+    chosen, doubts = smoothest_family(
+        kappa, candidates, variances, n_first, guess, places
+    )
     family = np.array([c[i] for c, i in zip(candidates, chosen, strict=True)])
     own = np.array([found[0] for found in optima])
     number = places[_numbering(structure, family[:, places].swapaxes(0, 1), own)]
@@ -209,22 +211,6 @@ def _exchanges(
     return kept
 
 
-def _guess(structure: GrayBoxStructure, init: Any) -> Array:
-    """What is known of the parameters before, NaN of the others."""
-    if init is not None and not isinstance(init, str):
-        return structure.check_params(init)
-    ranged = ~np.isnan(structure.ranges[0])
-    known = ranged | (structure.initial is not None)
-    guess = np.where(ranged, structure.ranges.mean(0), structure.reference)
-    return np.where(known, guess, np.nan)
-
-
-def _distance(images: Array, guess: Array) -> Array:
-    """How far families (..., n_points, n_params) are from a guess, relative to it."""
-    size = np.where(guess != 0, np.abs(guess), 1.0)
-    return np.asarray(np.nansum(np.abs(images - guess) / size, axis=(-2, -1)))
-
-
 def _numbering(structure: GrayBoxStructure, images: Array, own: Array) -> int:
     """Which image of the whole family to keep: nearest to what is known of the parts.
 
@@ -232,9 +218,9 @@ def _numbering(structure: GrayBoxStructure, images: Array, own: Array) -> int:
     """
     inside = ((images >= structure.lower) & (images <= structure.upper)).all((1, 2))
     merit = (images == own).all(2).sum(1)
-    guess = _guess(structure, None)
+    guess = known_before(structure, None)
     if not np.isnan(guess).all():
-        merit = -_distance(images, guess)
+        merit = -distance(images, guess)
     return int(np.argmax(np.where(inside, merit, -np.inf)))
 
 
@@ -244,14 +230,16 @@ def smoothest_family(
     variances: Sequence[Array],
     n_first: int | None = None,
     guess: Array | None = None,
+    places: Choices | None = None,
 ) -> Family:
     """The most plausible choice of one candidate at every point.
 
     `candidates` hold parameters (n_candidates, n_params) for every row of `kappa`,
-    `variances` those of their errors (zero where not known). At the first point of the
-    tree only the first `n_first` are taken, where the others would but number the parts
-    of the whole family anew. Of two that differ at all points the nearer to a `guess`
-    (n_params,), NaN of what is not known, is taken, if there is one.
+    `variances` those of their errors (zero where not known). Families that but number
+    their parts in another of `places` (n_numberings, n_params) are one: at the first
+    point of the tree only the first `n_first` are taken, where the others would do
+    that. Of two that differ at all points the nearer to a `guess` (n_params,), NaN of
+    what is not known, is taken, if there is one.
     """
     x = _scaled(kappa)
     order = spanning_tree(kappa, outward=False)[0].astype(np.intp)
@@ -259,7 +247,7 @@ def smoothest_family(
         np.any([np.ptp(rows, axis=0) > 0 for rows in candidates], axis=0)
     )
     chosen = np.zeros(len(kappa), dtype=np.intp)
-    if columns.size == 0 or len(kappa) < 2:
+    if columns.size == 0:
         return Family(chosen, [])
     center, unit = _units(candidates, columns)
     Y = [(rows[:, columns] - center) / unit for rows in candidates]
@@ -267,6 +255,10 @@ def smoothest_family(
     families = np.unique(
         np.vstack([_search(x, Y, V, order, prior, n_first) for prior in _QUICK]), axis=0
     )
+    places = np.arange(candidates[0].shape[1])[None] if places is None else places
+    rows = zip(candidates, families.T, strict=True)
+    values = np.stack([np.asarray(c)[i] for c, i in rows], axis=1)
+    families, images = _apart(families, values[..., places].swapaxes(1, 2))
     evidence = _evidence(x, Y, V, families)
     chosen = families[int(np.argmax(evidence))]
     weight = np.exp(evidence - evidence.max())
@@ -275,10 +267,9 @@ def smoothest_family(
     other = np.array([differs.any(1) for differs in changes])  # (n_points, n_families)
     whole = other.all(0) & (weight > _WHOLE)
     if whole.any() and guess is not None and not np.isnan(guess).all():
-        rows = zip(candidates, families.T, strict=True)
-        images = np.stack([np.asarray(c)[i] for c, i in rows], axis=1)
-        apart = np.where(whole | (weight == weight.max()), 0.0, np.inf)
-        return Family(families[int(np.argmin(apart + _distance(images, guess)))], [])
+        away = np.where(whole | (weight == weight.max()), 0.0, np.inf)
+        away += distance(images, guess).min(1)
+        return Family(families[int(np.argmin(away))], [])
     doubts = []
     for k, differs in enumerate(changes):
         certain = 1.0 - float(weight[other[k]].sum())
@@ -288,6 +279,18 @@ def smoothest_family(
             values = np.asarray(candidates[k])[families[rival, k]]
             doubts.append(Doubt(k, columns[differs[rival]], certain, values))
     return Family(chosen, doubts)
+
+
+def _apart(families: Choices, images: Array) -> tuple[Choices, Array]:
+    """The families that are no other numbering of one before, and theirs.
+
+    `images` are all of these, (n_families, n_numberings, n_points, n_params).
+    """
+    kept: list[int] = []
+    for f, image in enumerate(images):
+        if not (images[kept, 0] == image[:, None]).all((2, 3)).any():
+            kept.append(f)
+    return families[kept], images[kept]
 
 
 def _changes(

@@ -25,6 +25,7 @@ from sklearn.utils.validation import check_is_fitted
 from ..exceptions import RankWarning, VersionedPickle, all_or_nothing, warn
 from ..minimax.problem import ACTIVE_PEAK, MinimaxResult
 from ..models.statespace import StateSpace
+from ..structures.interchanges import exchangeable, known_before
 from ..structures.structure import GrayBoxStructure
 from ..systems.threads import one_blas_thread
 from ..validation import (
@@ -249,6 +250,10 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
     and certificates are then those of the weighted error; `lti_` has the pole. A pole
     of the black box that is nearer to p than c / 20 is an estimate of it, and moved
     there; one that is farther off is weighted alike, not divided.
+
+    Parts that may change places, two lags in series, give one response with either's
+    values. Which are whose is told by bounds, ranges, or `init`; where nothing tells
+    it, and names that differ by more than digits show that it matters, a warning does.
 
     Examples
     --------
@@ -922,6 +927,17 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             )
         if self.identifiability_.rank < self.structure_.n_params:
             warn(str(self.identifiability_), RankWarning)
+            return
+        known = known_before(self.structure_, self.init)
+        names = exchangeable(self.structure_, self.params_, known)
+        if names:
+            warn(
+                f"the values of {listed([repr(name) for name in names], _NAMED)} may "
+                "be those of one another: no response tells these parts of the "
+                "structure apart. Say which is which by structure.with_bounds(), "
+                "structure.with_ranges(), or a first guess, `init`; or number their "
+                "names, as 'lag_1' and 'lag_2', where it does not matter."
+            )
 
     # -- use -----------------------------------------------------------------------
 

@@ -14,7 +14,8 @@ random parameters tell.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,8 @@ _COLOUR = 1e-5  # relative difference of equal second derivatives: their truncat
 _SAME = 1e-8  # relative difference of equal responses: rounding
 _MOST = 720  # permutations that are found at most: those of six parts
 _STEPS = 50_000  # of the search, after which the rest is left out
-_AWAY = np.array([0.7 + 0.4j, 1.9 - 1.1j, 0.3 + 2.3j])  # where, times the rate of A
+_AWAY = np.array([0.7 + 0.4j, 1.9 - 1.1j, 0.3 + 2.3j])  # where, times a rate of A
+_RATES = 1e-12  # those of A relative to its size that are not zero
 
 
 def interchanges(structure: GrayBoxStructure) -> Places:
@@ -52,9 +54,49 @@ def interchanges(structure: GrayBoxStructure) -> Places:
     array([[0, 1, 2],
            [1, 0, 2]])
     """
+    return _interchanges(structure, np.ones((structure.n_params,) * 2, dtype=bool))
+
+
+def exchangeable(structure: GrayBoxStructure, theta: Array, guess: Array) -> list[str]:
+    """Names of parameters whose values could be those of one another.
+
+    No response, bound or `guess` (n_params,; NaN where nothing is known) tells them
+    apart. Names that differ in their digits alone are but numbered.
+    """
+    kinds = np.array([re.sub(r"\d+", "", name) for name in structure.parameter_names])
+    images = theta[_interchanges(structure, kinds[:, None] != kinds)]
+    inside = ((images >= structure.lower) & (images <= structure.upper)).all(1)
+    far = distance(images[:, None], guess)
+    moved = (images != theta) & (inside & np.isclose(far, far[0]))[:, None]
+    return [structure.parameter_names[j] for j in np.flatnonzero(moved.any(0))]
+
+
+def known_before(structure: GrayBoxStructure, init: Any) -> Array:
+    """What is known of the parameters before a fit, NaN of the others.
+
+    `init` is that of `GrayBoxRestructurer`: parameters, or how to find some.
+    """
+    if init is not None and not isinstance(init, str):
+        return structure.check_params(init)
+    ranged = ~np.isnan(structure.ranges[0])
+    known = ranged | (structure.initial is not None)
+    guess = np.where(ranged, structure.ranges.mean(0), structure.reference)
+    return np.where(known, guess, np.nan)
+
+
+def distance(images: Array, guess: Array) -> Array:
+    """How far families (..., n_points, n_params) are from a guess, relative to it."""
+    size = np.where(guess != 0, np.abs(guess), 1.0)
+    return np.asarray(np.nansum(np.abs(images - guess) / size, axis=(-2, -1)))
+
+
+def _interchanges(
+    structure: GrayBoxStructure, of_interest: NDArray[np.bool_]
+) -> Places:
+    """All, if two parameters `of_interest` (n_params, n_params) look exchangeable."""
     q = structure.n_params
     nothing = np.arange(q)[None]
-    found = _automorphisms(structure)
+    found = _automorphisms(structure, of_interest)
     if len(found) < 2:
         return nothing
     rng = np.random.default_rng(0)
@@ -63,7 +105,7 @@ def interchanges(structure: GrayBoxStructure) -> Places:
         here = _response(structure, theta)
         if not np.isfinite(here).all():
             continue
-        most = _SAME * np.abs(here).max()
+        most = _SAME * np.abs(here).max(axis=(1, 2), keepdims=True)
         found = [
             pi
             for pi in found
@@ -82,13 +124,16 @@ def _response(structure: GrayBoxStructure, theta: Array) -> Complex:
     """G at complex frequencies that depend on what no permutation changes."""
     n, (rows, columns) = structure.order, structure.map.shape
     S = structure.system_matrix(theta)
-    nothing = np.full((len(_AWAY), rows - n, columns - n), np.nan + 0j)
+    nothing = np.full((1, rows - n, columns - n), np.nan + 0j)
     if not np.isfinite(S).all():
         return nothing
     level = structure.system_matrix(np.full(len(theta), float(np.mean(theta))))
     if not np.isfinite(level).all():
         return nothing
     s = _frequencies(level, n)
+    rates = np.abs(np.linalg.eigvals(level[:n, :n]))
+    slow = rates[rates > _RATES * np.abs(s).max()]  # where what is slow is seen, too
+    s = np.concatenate([s, *np.multiply.outer(slow, _AWAY)])
     M = s[:, None, None] * np.eye(n) - S[:n, :n]
     G = S[n:, :n] @ np.linalg.solve(M, S[:n, n:] + 0j) + S[n:, n:]
     return np.asarray(G)
@@ -106,10 +151,13 @@ def _slopes(structure: GrayBoxStructure, theta: Array, s: Complex) -> Complex:
     return np.asarray(dG.swapaxes(0, 1).reshape(q, -1))
 
 
-def _automorphisms(structure: GrayBoxStructure) -> list[Places]:
+def _automorphisms(
+    structure: GrayBoxStructure, of_interest: NDArray[np.bool_]
+) -> list[Places]:
     """Permutations that keep both derivatives where all parameters are equal.
 
-    The identity is the first; nothing where no such point gives a model.
+    The identity is the first; nothing where no such point gives a model, or where no
+    two parameters `of_interest` (n_params, n_params) have the same first ones.
     """
     q = structure.n_params
     for value in _EQUALS:
@@ -122,8 +170,8 @@ def _automorphisms(structure: GrayBoxStructure) -> list[Places]:
     s = _frequencies(S, structure.order)
     first = _slopes(structure, theta, s)
     alike = _equal(first[:, None], first[None])
-    if not alike.sum() > q:  # every parameter has a colour of its own
-        return []
+    if not (alike & of_interest)[~np.eye(q, dtype=bool)].any():
+        return []  # each of them has a colour of its own
     second = np.array(
         [
             _slopes(structure, theta + d, s) - _slopes(structure, theta - d, s)

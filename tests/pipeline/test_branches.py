@@ -234,12 +234,20 @@ def lags(structure, *, n_points=8, init="similarity"):
     return pipeline.fit(np.vstack(inputs), np.vstack(outputs))
 
 
-def test_parameters_with_other_values_at_all_points_are_told():
+@pytest.mark.filterwarnings("ignore:All experiments are at one operating point")
+@pytest.mark.parametrize("n_points", [1, 8])
+def test_parameters_with_other_values_at_all_points_are_told(n_points):
     """Either family is as smooth: the slow lag may be either, with another gain."""
     told = r"a, b, g have other values .* \(scheduling 0.5\): a = .*with_ranges"
     with pytest.warns(UserWarning, match=told) as caught:
-        lags(LAGS)
-    assert len(caught) == 1
+        lags(LAGS, n_points=n_points)
+    assert sum("have other values" in str(w.message) for w in caught) == 1
+
+
+def test_bounds_for_all_parts_leave_one_family():
+    """Whose parts exchanged at all points it is still: a warning would be an error."""
+    bounds = dict.fromkeys(MODES.parameter_names, (-99.0, 99.0))
+    modes_pipeline(MODES.with_bounds(bounds)).fit(*modes_tables(range(4)))
 
 
 @pytest.mark.parametrize("g", [0.02, 0.03])

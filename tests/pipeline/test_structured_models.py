@@ -188,7 +188,9 @@ TWO_LAGS = GrayBoxStructure.from_template(
 )
 
 
-@pytest.mark.filterwarnings("ignore:the (structure|search for|parameters|intervals)")
+@pytest.mark.filterwarnings(
+    "ignore:the (structure|search for|parameters|intervals|values of)"
+)
 @pytest.mark.parametrize(
     "restructurer",
     [None, GrayBoxRestructurer(), "passthrough", GrayBoxRestructurer(TWO_LAGS)],

@@ -601,6 +601,7 @@ def test_a_gain_at_its_turning_point_is_no_floor(interval):
     assert fitted.lower_bound_ == fitted.structural_floor_ == 0
 
 
+@pytest.mark.filterwarnings("ignore:the values of")
 def test_the_peaks_below_a_floor_are_equally_high(rough):
     """What is left below the floor is minimised, and told, without any weight."""
     unit = GrayBoxStructure.from_template(

@@ -59,6 +59,7 @@ def two_lags():
     )
 
 
+@pytest.mark.filterwarnings("ignore:the values of")
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 def test_restructurer_minimises_the_h2_norm():
     box = StateSpace(
@@ -93,6 +94,7 @@ def test_infinite_h2_norm_is_refused():
         GrayBoxRestructurer(structure, norm="h2").fit_model(box)
 
 
+@pytest.mark.filterwarnings("ignore:the values of")
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 @pytest.mark.filterwarnings("ignore:the response determines")
 @pytest.mark.parametrize("bounded", [False, True])

@@ -75,6 +75,7 @@ def test_intervals_of_parts_that_are_nearly_alike_are_told():
     assert ParameterUncertainty(held, theta).not_linear(alike) == []
 
 
+@pytest.mark.filterwarnings("ignore:the values of")
 def test_fits_tell_of_intervals_that_are_not_linear():
     problem, theta = two_lags(1.0, 1.02)
     box = problem.model(theta).balance()

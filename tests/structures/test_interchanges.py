@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from lpvlearn import GrayBoxStructure
-from lpvlearn.structures.interchanges import interchanges
+from lpvlearn.structures.interchanges import (
+    exchangeable,
+    interchanges,
+    known_before,
+)
 
 LAGS = GrayBoxStructure.from_template(
     [["-a", 0, 0], ["b", "-b", 0], [0, "c", "-c"]], [["a"], [0], [0]], [[0, 0, 1]]
@@ -70,3 +74,41 @@ def test_a_structure_that_exists_nowhere_in_the_middle_has_none_to_tell():
 
     structure = GrayBoxStructure.from_function(pole, [1.0, 2.0])
     assert interchanges(structure).tolist() == [[0, 1]]
+
+
+def servo(actuator="actuator", sensor="sensor"):
+    return GrayBoxStructure.from_template(
+        A=[[f"-{actuator}", 0], [1, f"-{sensor}"]], B=[["gain"], [0]], C=[[0, 1]]
+    )
+
+
+def told(structure, theta, init=None):
+    known = known_before(structure, init)
+    return exchangeable(structure, structure.check_params(theta), known)
+
+
+def test_parts_of_which_nothing_tells_the_one_from_the_other_are_named():
+    theta = {"actuator": 6.0, "sensor": 2.0, "gain": 1.0}
+    assert told(servo(), theta) == ["actuator", "sensor"]
+    assert told(servo(), theta | {"sensor": 6.0}) == []  # one value for both
+    # bounds, ranges and guesses tell, if they are not those of both
+    actuator, both = {"actuator": (4.0, 9.0)}, dict.fromkeys(theta, (1.0, 9.0))
+    assert told(servo().with_bounds(actuator), theta) == []
+    assert told(servo().with_ranges(actuator), theta) == []
+    assert told(servo(), theta, [1.0, 5.0, 2.0]) == []
+    assert told(servo().with_bounds(both), theta) == ["actuator", "sensor"]
+    assert told(servo().with_ranges(both), theta) == ["actuator", "sensor"]
+
+
+def test_parts_that_are_but_numbered_may_have_any_number():
+    assert (
+        told(servo("lag_1", "lag_2"), {"lag_1": 6.0, "lag_2": 2.0, "gain": 1.0}) == []
+    )
+
+
+def test_slow_parameters_beside_fast_poles_are_told_apart():
+    """As a product alone of two is seen at the rate of the fast one."""
+    fast = GrayBoxStructure.from_template(
+        [[0, 1, 0], [0, "-a", "a"], [0, 0, -1e8]], [[0], [0], ["b"]], [[1, 0, 0]]
+    )
+    assert len(interchanges(fast)) == 1
