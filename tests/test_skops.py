@@ -81,6 +81,7 @@ def chain(tables):
         PolynomialLPV(2),
         RationalLPV(1),
         *(SplineLPV(kind) for kind in ("pchip", "cubic", "linear")),
+        SplineLPV(scale="log"),
         AutoLPV(),
     ],
     ids=str,

@@ -108,7 +108,9 @@ pipeline.interpolator_.selection_.round(1)
 # No polynomial comes near: the arm's parameters are entries of
 # :math:`M(\kappa)^{-1} K`, and so rational functions. The pipeline says which form it
 # took; where no form can be true, or the covariances are not known, the interpolation
-# goes through the points and keeps their shape (:class:`~lpvlearn.SplineLPV`).
+# goes through the points and keeps their shape (:class:`~lpvlearn.SplineLPV`), or
+# follows smooth laws by cubic pieces, over the logarithm of a length or a mass too,
+# where points left out show that this is nearer.
 
 pipeline.interpolator_.form_
 

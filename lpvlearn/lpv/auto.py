@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import Any
 
@@ -41,7 +41,11 @@ _SUPPORT = 10.0
 _FREE = 0.5
 _NOISE = 10.0  # standard deviations over which a parameter moves by more than noise
 
-INTERPOLATION = "pchip"  # where no form is true
+# Where no form is true: the first, or one of the others that meets points left out, so
+# many at least, with less than this share of its squared errors of most parameters.
+_CURVES = (("pchip", "linear"), ("cubic", "linear"), ("pchip", "log"), ("cubic", "log"))
+_SMOOTHER, _LEFT_OUT = 0.1, 3
+_FORESEEN = 0.02  # mean squared error, in the spread, of what must not be met worse
 
 
 class AutoLPV(Interpolator):
@@ -53,7 +57,9 @@ class AutoLPV(Interpolator):
     criterion is within 10 of the lowest, a polynomial of degree 2 at most, and then the
     one with fewest coefficients, is taken.
     Where none is left, or the covariances are not known, the interpolation follows the
-    points and keeps their shape (`SplineLPV`).
+    points (`SplineLPV`): it keeps their shape, unless a cubic spline, or a curve over
+    the logarithms of the scheduling variables, meets points that are left out, three at
+    least, at a third of the errors of most parameters.
 
     Parameters
     ----------
@@ -153,9 +159,9 @@ class AutoLPV(Interpolator):
             free = bent[chosen] and n - dof[chosen] > _FREE * n
             believed = not free or _foresees(found[chosen][1], kappa, points)
         if not believed:
-            spline = SplineLPV(INTERPOLATION).fit(kappa, points.theta)
+            name, spline = _interpolation(kappa, points)
             chosen = len(found)
-            found.append((INTERPOLATION, spline))
+            found.append((name, spline.fit(kappa, points.theta)))
             chi2, dof, cost = np.r_[chi2, np.nan], np.r_[dof, 0], np.r_[cost, np.nan]
         self.form_, self.best_estimator_ = found[chosen]
         self.selection_ = pd.DataFrame(
@@ -198,30 +204,60 @@ class AutoLPV(Interpolator):
 
 
 def _foresees(form: Any, kappa: Array, points: WeightedPoints) -> bool:
-    """Whether points left out are met as well as by interpolation of the others.
+    """Whether points left out are met as well as by interpolation of the others."""
+    curve = _interpolation(kappa, points)[1]
+    own, other = _errors_left_out([form, curve], kappa, points).sum(axis=(1, 2))
+    return bool(own <= other)
 
-    Those within the range of the others, in the spread of every parameter that moves
-    by more than its noise. And on a grid all points of a level, next to which others
-    of the same level tell what only they do not.
+
+def _interpolation(kappa: Array, points: WeightedPoints) -> tuple[str, SplineLPV]:
+    """Name and kind of the curve through all points, not fitted."""
+    names, curves = [], []
+    for kind, scale in _CURVES:
+        if scale == "linear" or (kappa > 0.0).all():
+            names.append(kind if scale == "linear" else f"{scale} {kind}")
+            curves.append(SplineLPV(kind, scale=scale))
+    errors = _errors_left_out(curves, kappa, points)
+    if errors.shape[1] < _LEFT_OUT or not errors[0].any():
+        return names[0], curves[0]
+    # of every parameter, relative to the first: noise of some hides no law of others
+    each = errors.sum(axis=1)
+    shares = np.median(each[:, each[0] > 0.0] / each[0, each[0] > 0.0], axis=1)
+    seen = each[0] < _FORESEEN * errors.shape[1]
+    worse = (each[:, seen] > _FORESEEN * errors.shape[1]).any(axis=1)
+    best = int(np.argmin(np.where(worse, np.inf, shares)))
+    if not shares[best] < _SMOOTHER:
+        best = 0
+    return names[best], curves[best]
+
+
+def _errors_left_out(
+    forms: Sequence[Any], kappa: Array, points: WeightedPoints
+) -> Array:
+    """Squared errors at points left out, (n_forms, n_left_out, n_moving).
+
+    Those within the range of the others, in the spread of every parameter that moves,
+    and by more than its noise where that is known. And on a grid all points of a level,
+    next to which others of the same level tell what only they do not.
     """
-    theta, covariance = points.theta, points.covariance
-    assert covariance is not None  # the forms were judged by it
-    variance = np.mean(np.diagonal(covariance, axis1=1, axis2=2), axis=0)
-    spread = np.ptp(theta, axis=0)
-    moves = spread > _NOISE * np.sqrt(variance)
-    squares = np.zeros(2)
+    theta, spread = points.theta, np.ptp(points.theta, axis=0)
+    covariance = points.covariance if points.whitening is not None else None
+    moves = spread > 0.0
+    if covariance is not None:
+        variance = np.mean(np.diagonal(covariance, axis1=1, axis2=2), axis=0)
+        moves = spread > _NOISE * np.sqrt(variance)
+    squares: list[Array] = []
     for out in (*inner_places(kappa), *inner_levels(kappa)):
-        rest = kappa[~out]
+        rest, known = kappa[~out], None if covariance is None else covariance[~out]
         try:
             with collected():  # what few points do not determine
-                other = copy(form).fit(rest, theta[~out], covariance=covariance[~out])
-                spline = SplineLPV(INTERPOLATION).fit(rest, theta[~out])
+                fitted = [copy(form).fit(rest, theta[~out], known) for form in forms]
         except ValueError:  # the others are too few
             continue
-        for k, one in enumerate((other, spline)):
-            errors = (one.predict(kappa[out]) - theta[out])[:, moves] / spread[moves]
-            squares[k] += float(np.sum(errors**2))
-    return bool(squares[0] <= squares[1])
+        errors = np.array([form.predict(kappa[out]) - theta[out] for form in fitted])
+        squares.append(np.sum((errors[..., moves] / spread[moves]) ** 2, axis=1))
+    shape = len(squares), len(forms), int(np.count_nonzero(moves))
+    return np.reshape(squares, shape).swapaxes(0, 1)
 
 
 def _forms(kappa: Array) -> Iterator[tuple[str, PolynomialLPV | RationalLPV]]:

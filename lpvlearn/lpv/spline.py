@@ -21,6 +21,7 @@ from .weighting import WeightedPoints
 Array = NDArray[np.float64]
 
 _KINDS = ("pchip", "cubic", "linear")
+_SCALES = ("linear", "log")
 
 
 class SplineLPV(Interpolator):
@@ -37,6 +38,10 @@ class SplineLPV(Interpolator):
         smooth precise parameters, but it may swing), or straight lines. With several,
         on scattered points: radial basis functions, of the distance ("linear") or its
         cube (the others), with every variable mapped to [-1, 1].
+    scale : {"linear", "log"}, default="linear"
+        What the curve is laid over: the scheduling variables, or their logarithms,
+        where all are above zero: lengths, masses, speeds that range over a factor of
+        two and more, of which powers are near to straight there.
     extrapolation : {"ignore", "warn", "clip", "error"}, default="ignore"
         What `predict` does outside of `scheduling_range_`: go on (with one variable,
         along the tangent at the border) without or with an `ExtrapolationWarning`, hold
@@ -66,8 +71,15 @@ class SplineLPV(Interpolator):
     array([0. , 0.5, 1. ])
     """
 
-    def __init__(self, kind: str = "pchip", *, extrapolation: str = "ignore") -> None:
+    def __init__(
+        self,
+        kind: str = "pchip",
+        *,
+        scale: str = "linear",
+        extrapolation: str = "ignore",
+    ) -> None:
         self.kind = kind
+        self.scale = scale
         self.extrapolation = extrapolation
 
     def __getstate__(self) -> dict[str, Any]:
@@ -80,9 +92,12 @@ class SplineLPV(Interpolator):
             self._draw(self._theta)
 
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
-        x, place = np.unique(
-            to_unit(kappa, self.scheduling_range_), axis=0, return_inverse=True
-        )
+        if self.scale == "log" and not (kappa > 0.0).all():
+            raise ValueError(
+                "`scale` must be 'linear' where a scheduling variable is not above "
+                f"zero. Got 'log', and {kappa.min():.4g}."
+            )
+        x, place = np.unique(self._unit(kappa), axis=0, return_inverse=True)
         weight = np.zeros((len(x), len(kappa)))
         weight[place.ravel(), np.arange(len(kappa))] = points.root**2
         theta = weight @ points.theta / weight.sum(axis=1, keepdims=True)
@@ -109,7 +124,15 @@ class SplineLPV(Interpolator):
         return curves[self.kind](x[:, 0], theta)
 
     def _evaluate(self, kappa: Array) -> Array:
-        return _along(self._curve, to_unit(kappa, self.scheduling_range_))
+        return _along(self._curve, self._unit(kappa))
+
+    def _unit(self, kappa: Array) -> Array:
+        """Where scheduling values lie from -1 to 1; beyond, along the tangent there."""
+        if self.scale == "linear":
+            return to_unit(kappa, self.scheduling_range_)
+        inside = np.clip(kappa, *self.scheduling_range_)
+        beyond = (kappa - inside) / inside
+        return to_unit(np.log(inside) + beyond, np.log(self.scheduling_range_))
 
     def _coefficients(self) -> Array:
         return self._theta.ravel()
@@ -118,7 +141,7 @@ class SplineLPV(Interpolator):
         self._draw(coefficients.reshape(self._theta.shape))
 
     def _carried(self, outer: Array, kappa: Array) -> Array:
-        x, (n, q) = to_unit(kappa, self.scheduling_range_), self._theta.shape
+        x, (n, q) = self._unit(kappa), self._theta.shape
         if isinstance(self._curve, PchipInterpolator):  # its slopes follow the values
             nodes, units = self._nodes[:, 0], np.eye(n)[:, :, None].repeat(q, axis=2)
             changes = _pchip_slope_changes(nodes, self._theta)
@@ -130,6 +153,7 @@ class SplineLPV(Interpolator):
     def _check_options(self) -> None:
         super()._check_options()
         one_of("kind", self.kind, _KINDS)
+        one_of("scale", self.scale, _SCALES)
 
 
 def _along(curve: Any, x: Array) -> Array:

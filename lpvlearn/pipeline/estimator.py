@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import clone
-from sklearn.utils.validation import check_is_fitted, has_fit_parameter
+from sklearn.utils.validation import check_is_fitted
 
 from ..data.dataset import kept_on_disk, open_dataset, tables_by_experiment
 from ..data.experiments import (
@@ -37,7 +37,7 @@ from ..data.operating_points import (
 from ..data.preparation import has_gaps, split_at_gaps
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, retold, warn
-from ..lpv.auto import INTERPOLATION, AutoLPV
+from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import interpolated
 from ..lpv.extrapolation import warn_outside_hull
 from ..lpv.model import LPVStateSpace
@@ -77,6 +77,7 @@ from .structured_models import (
     StructuredModels,
     begins_held,
     offsets_of_points,
+    over_points,
     restructure_points,
 )
 from .together import through_black_boxes
@@ -540,10 +541,7 @@ list, default=None
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
             kappa = self.operating_points_ = found.points.kappa
-            interpolator, known = self._interpolator(len(kappa)), {}
-            if has_fit_parameter(interpolator, "covariance"):
-                known["covariance"] = found.covariance
-            self.interpolator_ = interpolator.fit(kappa, found.theta, **known)
+            self.interpolator_ = over_points(self._interpolator(len(kappa)), found)
             covariance = local_covariance(self.interpolator_, found)
             models = found  # those whose points of work are the LPV model's
             together = through_black_boxes(self.interpolator_, found)
@@ -589,11 +587,12 @@ list, default=None
             )
             longest = self.sampling_time_ * found.points.n_longest
             growth = growth_rates(self.lpv_, kappa, longest)
-            if getattr(self.interpolator_, "form_", "") == INTERPOLATION:
+            form = getattr(self.interpolator_, "best_estimator_", None)
+            if isinstance(form, SplineLPV):
                 tell_unforeseen(
                     self.lpv_,
                     self.structured_models_,
-                    self.interpolator_.best_estimator_,
+                    form,
                     kappa,
                     found.theta,
                     longest,

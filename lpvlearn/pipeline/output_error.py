@@ -14,7 +14,6 @@ import pandas as pd
 from joblib import Memory
 from numpy.typing import NDArray
 from sklearn.base import clone
-from sklearn.utils.validation import has_fit_parameter
 
 from ..data.experiments import (
     NO_TIME,
@@ -67,7 +66,7 @@ from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
 from .steps import check_step
-from .structured_models import StructuredModels, restructure_points
+from .structured_models import StructuredModels, over_points, restructure_points
 from .workers import check_jobs, results_of
 
 Array = NDArray[np.float64]
@@ -490,10 +489,7 @@ class OutputErrorLPV(ScheduledEstimator):
         way = "aligned" if structure is None else GrayBoxRestructurer(structure)
         found = restructure_points(way, local, points, runner, dt)
         form = AutoLPV() if self.interpolator is None else clone(self.interpolator)
-        known = {}
-        if has_fit_parameter(form, "covariance"):
-            known["covariance"] = found.covariance
-        form = form.fit(found.points.kappa, found.theta, **known)
+        form = over_points(form, found)
         delay = common_delay(found.local, found.points.kappa, dt)
         return [LPVStateSpace(found.structure, form, bounds, input_delay=delay)]
 

@@ -15,6 +15,7 @@ import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import NDArray
 from sklearn.base import clone
+from sklearn.utils.validation import has_fit_parameter
 
 from ..data.operating_points import OperatingPoints
 from ..exceptions import collected, warn
@@ -158,6 +159,14 @@ def restructure_points(
     return StructuredModels(
         points, local, helped[0].structure_, theta, covariance, models, helped
     )
+
+
+def over_points(interpolator: Any, found: StructuredModels) -> Any:
+    """The interpolator, fitted to parameters, and by their covariances if it may."""
+    known = {}
+    if has_fit_parameter(interpolator, "covariance"):
+        known["covariance"] = found.covariance
+    return interpolator.fit(found.points.kappa, found.theta, **known)
 
 
 def offsets_of_points(found: StructuredModels) -> tuple[Array, Array] | None:

@@ -609,15 +609,13 @@ def whitening_filters(errors: Sequence[Array]) -> list[Array]:
 
 def f_test(added: Array, target: Array, dof: int) -> ResidualTest:
     """What added columns explain of a target of so many degrees of freedom."""
-    P = _basis(added)
-    explained = P.T @ target
-    left = target - P @ explained
-    q = P.shape[1]
+    left, q = without(added, target)
     error = dof - q
     if q == 0 or error < 1 or not target.any():
         return ResidualTest(0.0, q, 1.0)
     loss = max(float(left @ left), np.finfo(float).tiny)
-    statistic = float(explained @ explained) / loss * error
+    explained = float(np.sum((target - left) ** 2))
+    statistic = explained / loss * error
     return ResidualTest(statistic, q, float(special.fdtrc(q, error, statistic / q)))
 
 
@@ -634,13 +632,12 @@ def without(known: Array, columns: Array) -> tuple[Array, int]:
 
 
 def _basis(columns: Array) -> Array:
-    """Orthonormal basis of the directions in which columns of size one are not small.
+    """Basis of the directions in which columns of size one are not small.
 
-    By singular values: which columns a pivoted factorisation leaves out turns on
-    rounding where some are combinations of others, and so would what it spans.
+    Orthonormal up to rounding by the square of what is small. By singular values: which
+    columns a pivoted factorisation leaves out turns on rounding where some are
+    combinations of others, and so would what it spans.
     """
-    Q, R = linalg.qr(columns, mode="economic", check_finite=False)
-    U, sizes, _ = linalg.svd(  # by the driver that always converges
-        R, full_matrices=False, check_finite=False, lapack_driver="gesvd"
-    )
-    return Q @ U[:, sizes > DEPENDENT]
+    squares, V = np.linalg.eigh(columns.T @ columns)
+    large = squares > DEPENDENT**2
+    return columns @ (V[:, large] / np.sqrt(squares[large]))

@@ -73,6 +73,33 @@ def test_without_covariances_the_points_are_followed():
     np.testing.assert_array_equal(model.predict(FINE), expected)
 
 
+WIDE = np.array([0.5, 0.8, 1.2, 2.0, 3.0])[:, None]
+
+
+@pytest.mark.parametrize("power", [-0.5, 0.3, -1.0])
+def test_powers_of_a_positive_variable_are_followed_over_its_logarithm(power):
+    """Beside noise of what hardly moves, whose size is not known."""
+    noise = 1e-3 * np.random.default_rng(0).normal(size=(5, 1))
+    theta = np.column_stack([WIDE**power, -3.0 * WIDE ** (power / 2), noise])
+    model = AutoLPV().fit(WIDE, theta)
+    assert model.form_.startswith("log ")
+    between = np.array([[0.65], [1.0], [1.6], [2.5]])
+    errors = model.predict(between)[:, :1] / between**power - 1.0
+    shape_kept = SplineLPV().fit(WIDE, theta).predict(between)[:, :1]
+    kept = shape_kept / between**power - 1.0
+    assert np.abs(errors).max() < 0.15 * np.abs(kept).max()
+
+
+def test_what_is_smooth_over_any_variable_is_followed_by_a_cubic_spline():
+    kappa = np.linspace(-1.0, 1.0, 7)[:, None]
+    theta = np.column_stack([kappa**2, np.exp(kappa)])
+    assert AutoLPV().fit(kappa, theta).form_ == "cubic"
+    steps = np.where(kappa > 0.1, 1.0, 0.0)  # of which it would swing
+    assert AutoLPV().fit(kappa, steps).form_ == "pchip"
+    few = AutoLPV().fit(kappa[:4], theta[:4])  # two left out tell too little
+    assert few.form_ == "pchip"
+
+
 @pytest.mark.parametrize(("n_points", "form"), [(1, 0), (2, 1), (3, 2)])
 def test_few_points_carry_a_constant_a_line_or_a_parabola(n_points, form):
     theta = np.exp(KAPPA[:n_points])

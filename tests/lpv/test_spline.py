@@ -78,3 +78,37 @@ def test_points_on_one_line_and_single_points_serve():
 def test_kinds_that_are_not_known_are_refused():
     with pytest.raises(ValueError, match="`kind` must be 'pchip', 'cubic' or 'linear'"):
         SplineLPV("quintic").fit(KAPPA, THETA)
+
+
+# -- over logarithms -------------------------------------------------------------------
+
+WIDE = np.array([[0.5], [0.8], [1.2], [2.0], [3.0]])
+BETWEEN = np.array([[0.65], [1.6], [2.5]])
+
+
+@pytest.mark.parametrize("kind", ["pchip", "cubic", "linear"])
+def test_over_logarithms_what_is_linear_in_them_is_met(kind):
+    model = SplineLPV(kind, scale="log").fit(WIDE, 3.0 - 2.0 * np.log(WIDE))
+    expected = 3.0 - 2.0 * np.log(BETWEEN)
+    np.testing.assert_allclose(model.predict(BETWEEN), expected, rtol=1e-12)
+
+
+def test_over_logarithms_it_goes_straight_on_in_the_variable_too():
+    """Along the tangents at the ends, to zero and below."""
+    model = SplineLPV("cubic", scale="log").fit(WIDE, np.log(WIDE[:, 0]))
+    beyond = np.array([-2.0, 0.0, 0.25, 0.5, 3.0, 6.0])
+    line = np.r_[np.log(0.5) + 2.0 * (beyond[:4] - 0.5), np.log(3) + beyond[4:] / 3 - 1]
+    np.testing.assert_allclose(model.predict(beyond[:, None]), line, rtol=1e-12)
+
+
+def test_logarithms_need_values_above_zero():
+    with pytest.raises(ValueError, match="`scale` must be 'linear'.*above zero. Got"):
+        SplineLPV(scale="log").fit(KAPPA, THETA)
+    with pytest.raises(ValueError, match="`scale` must be 'linear' or 'log'"):
+        SplineLPV(scale="lin").fit(WIDE, WIDE)
+
+
+def test_one_value_of_a_variable_has_a_logarithm():
+    kappa = np.column_stack([WIDE[:, 0], np.full(5, 0.01)])
+    model = SplineLPV(scale="log").fit(kappa, WIDE[:, 0])
+    np.testing.assert_allclose(model.predict(kappa), WIDE[:, 0])

@@ -199,6 +199,7 @@ def interpolators():
         yield AutoLPV("bic", extrapolation="clip").fit(kappa, theta)
         for kind in ("pchip", "cubic", "linear"):
             yield SplineLPV(kind).fit(kappa, theta)
+    yield SplineLPV("cubic", scale="log").fit([[1.0], [2.0], [4.0]], [1.0, 3.0, 2.0])
     yield SplineLPV().fit([[1.0]], [[2.0, 3.0]])
     yield PolynomialLPV(3)
 
