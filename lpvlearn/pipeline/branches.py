@@ -15,7 +15,8 @@ ones of every length kept; their evidences also tell how certain the choice is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from ..structures.structure import GrayBoxStructure
 
 Array = NDArray[np.float64]
 Choices = NDArray[np.intp]
+Distance = Callable[[Array], Array]  # of families (..., n_points, n_params)
 
 # A fit is another optimum where its error exceeds that of the point's own by no more
 # than a part, or rounding, and a parameter differs by more than a part (those below
@@ -114,13 +116,14 @@ def tied_branches(
         if structure.is_bounded
         else len(optima[int(spanning_tree(kappa, outward=False)[0][0])])
     )
-    guess = known_before(structure, getattr(fitted[0], "init", None))
+    known = known_before(structure, getattr(fitted[0], "init", None))
+    far = None if np.isnan(known).all() else partial(distance, structure, guess=known)
     chosen, doubts = smoothest_family(
-        kappa, candidates, variances, n_first, guess, places
+        kappa, candidates, variances, n_first, far, places
     )
     family = np.array([c[i] for c, i in zip(candidates, chosen, strict=True)])
     own = np.array([found[0] for found in optima])
-    number = places[_numbering(structure, family[:, places].swapaxes(0, 1), own)]
+    number = places[_numbering(structure, family[:, places].swapaxes(0, 1), own, far)]
     branches = []
     for found, origin, i, lower in zip(optima, origins, chosen, lower_fit, strict=True):
         optimum, pi = origin[i]
@@ -211,16 +214,15 @@ def _exchanges(
     return kept
 
 
-def _numbering(structure: GrayBoxStructure, images: Array, own: Array) -> int:
-    """Which image of the whole family to keep: nearest to what is known of the parts.
+def _numbering(
+    structure: GrayBoxStructure, images: Array, own: Array, far: Distance | None
+) -> int:
+    """Which image of the whole family to keep: the least `far` from what is known.
 
     Else the one that leaves most points as they are.
     """
     inside = ((images >= structure.lower) & (images <= structure.upper)).all((1, 2))
-    merit = (images == own).all(2).sum(1)
-    guess = known_before(structure, None)
-    if not np.isnan(guess).all():
-        merit = -distance(images, guess)
+    merit = (images == own).all(2).sum(1) if far is None else -far(images)
     return int(np.argmax(np.where(inside, merit, -np.inf)))
 
 
@@ -229,7 +231,7 @@ def smoothest_family(
     candidates: Sequence[Array],
     variances: Sequence[Array],
     n_first: int | None = None,
-    guess: Array | None = None,
+    far: Distance | None = None,
     places: Choices | None = None,
 ) -> Family:
     """The most plausible choice of one candidate at every point.
@@ -238,8 +240,8 @@ def smoothest_family(
     `variances` those of their errors (zero where not known). Families that but number
     their parts in another of `places` (n_numberings, n_params) are one: at the first
     point of the tree only the first `n_first` are taken, where the others would do
-    that. Of two that differ at all points the nearer to a `guess` (n_params,), NaN of
-    what is not known, is taken, if there is one.
+    that. Of two that differ at all points the less `far` from what is known is taken,
+    if something is.
     """
     x = _scaled(kappa)
     order = spanning_tree(kappa, outward=False)[0].astype(np.intp)
@@ -266,9 +268,9 @@ def smoothest_family(
     changes = _changes(Y, V, families, chosen)
     other = np.array([differs.any(1) for differs in changes])  # (n_points, n_families)
     whole = other.all(0) & (weight > _WHOLE)
-    if whole.any() and guess is not None and not np.isnan(guess).all():
+    if whole.any() and far is not None:
         away = np.where(whole | (weight == weight.max()), 0.0, np.inf)
-        away += distance(images, guess).min(1)
+        away += far(images).min(1)
         return Family(families[int(np.argmin(away))], [])
     doubts = []
     for k, differs in enumerate(changes):

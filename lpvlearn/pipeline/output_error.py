@@ -61,6 +61,7 @@ from ..validation import (
 )
 from .bands import output_errors
 from .black_boxes import balanced_entries
+from .error_warnings import tell_of_errors
 from .local_models import common_delay, identify_point, identify_points
 from .runner import PointRunner
 from .scheduled import ScheduledEstimator
@@ -76,7 +77,7 @@ _NO_COEFFICIENTS = (
     "RationalLPV or SplineLPV. Got {}."
 )
 
-_UNSEEN = "No experiment that stays there was fitted."
+_UNSEEN = "Where no experiment stays, nothing tells what the model does in the end."
 
 # Parts of an experiment, each nearer to an operating point than the whole, of which
 # time-invariant models are made, too; how many of these are tried, by so many steps.
@@ -294,7 +295,9 @@ class OutputErrorLPV(ScheduledEstimator):
         Warns
         -----
         UserWarning
-            If the model is unstable at values within its range.
+            If the model is unstable at values within its range; if its errors are more
+            than a tenth of an output and constants would halve their squares, or that
+            much of them follows from the inputs and scheduling variables.
         """
         self._check_options()
         experiments = self._read(X, y, reset=True)
@@ -407,6 +410,7 @@ class OutputErrorLPV(ScheduledEstimator):
             for e, record in zip(experiments, records, strict=True)
         ]
         self.report_ = _report(labels, records, before, after)
+        tell_of_errors(self.lpv_, records, after, own, start)
         self.output_errors_ = output_errors(
             start.output_names or range(1, start.n_outputs + 1),
             after,
@@ -464,7 +468,8 @@ class OutputErrorLPV(ScheduledEstimator):
                         raise
             with suppress(ValueError):
                 models += self._through_points(experiments, dt, bounds)
-        return _promising(models, [_record(e, dt) for e in experiments])
+        own = Own(self.initial_state == "estimate", self.offset == "constant")
+        return _promising(models, [_record(e, dt) for e in experiments], own)
 
     def _through_points(
         self, experiments: Sequence[Experiment], dt: float, bounds: Array
@@ -592,14 +597,14 @@ def known_coefficients(
 def _parts_of(e: Experiment) -> list[Experiment]:
     """Parts of an experiment, along which the scheduling variables move less."""
     ends = np.linspace(0, len(e.rows), _PARTS + 1).astype(int)
-    return [part_of(e, slice(*pair)) for pair in pairwise(ends)]
+    return [part_of(e, slice(a, b)) for a, b in pairwise(ends) if b > a + 1]
 
 
 def _promising(
-    models: Sequence[LPVStateSpace], records: Sequence[Record]
+    models: Sequence[LPVStateSpace], records: Sequence[Record], own: Own
 ) -> LPVStateSpace:
     """The start of a search whose first steps come farthest."""
-    own, one = Own(True, False), np.ones(models[0].n_outputs)
+    one = np.ones(models[0].n_outputs)
 
     def loss(model: LPVStateSpace) -> float:
         return sum(squares(model, record, own, one) for record in records)

@@ -34,6 +34,7 @@ _SAME = 1e-8  # relative difference of equal responses: rounding
 _MOST = 720  # permutations that are found at most: those of six parts
 _STEPS = 50_000  # of the search, after which the rest is left out
 _AWAY = np.array([0.7 + 0.4j, 1.9 - 1.1j, 0.3 + 2.3j])  # where, times a rate of A
+_OUTSIDE = 1e3  # weight of what lies outside of a range
 _RATES = 1e-12  # those of A relative to its size that are not zero
 
 
@@ -66,7 +67,7 @@ def exchangeable(structure: GrayBoxStructure, theta: Array, guess: Array) -> lis
     kinds = np.array([re.sub(r"\d+", "", name) for name in structure.parameter_names])
     images = theta[_interchanges(structure, kinds[:, None] != kinds)]
     inside = ((images >= structure.lower) & (images <= structure.upper)).all(1)
-    far = distance(images[:, None], guess)
+    far = distance(structure, images[:, None], guess)
     moved = (images != theta) & (inside & np.isclose(far, far[0]))[:, None]
     return [structure.parameter_names[j] for j in np.flatnonzero(moved.any(0))]
 
@@ -84,10 +85,16 @@ def known_before(structure: GrayBoxStructure, init: Any) -> Array:
     return np.where(known, guess, np.nan)
 
 
-def distance(images: Array, guess: Array) -> Array:
-    """How far families (..., n_points, n_params) are from a guess, relative to it."""
+def distance(structure: GrayBoxStructure, images: Array, guess: Array) -> Array:
+    """How far families (..., n_points, n_params) are from a guess, relative to it.
+
+    What is outside of the ranges of the structure is farther than anything within.
+    """
     size = np.where(guess != 0, np.abs(guess), 1.0)
-    return np.asarray(np.nansum(np.abs(images - guess) / size, axis=(-2, -1)))
+    low, high = structure.ranges
+    outside = np.fmax(low - images, images - high)  # NaN where there is no range
+    away = np.abs(images - guess) + _OUTSIDE * np.where(outside > 0.0, outside, 0.0)
+    return np.asarray(np.nansum(away / size, axis=(-2, -1)))
 
 
 def _interchanges(

@@ -55,27 +55,28 @@ def change_over(evidence: Evidence) -> Change | None:
     if len(evidence.records) != 1 or not np.isfinite(model.loss) or not len(model.A):
         return None
     record = evidence.records[0]
+    each = free._replace(initial_states=True)  # of parts: they begin in mid-motion
     parts = _parts(record, _VALUES_EACH * (model.C.size + model.B.size + len(model.A)))
     size = record.y.std(axis=1)
     if len(parts) < 2 or not size.all():
         return None
     with np.errstate(over="ignore", invalid="ignore"):
-        if not (_rms(_together(model, parts, free)) > _ROUGH * size).any():
+        if not (_rms(_together(model, parts, each)) > _ROUGH * size).any():
             return None
         model = _refined(model, record, free)  # as the parts are, whatever it was
-        models = [_refined(model, part, free) for part in parts]
+        models = [_refined(model, part, each) for part in parts]
         apart = [
             simulation_errors(of_part, [part])[0]
             for of_part, part in zip(models, parts, strict=True)
         ]
-        change = _change(_together(model, parts, free), apart, size)
+        change = _change(_together(model, parts, each), apart, size)
         # What is left by a poor minimum says nothing of the system: parts found others.
         if change is not None:
             fits = [simulation_fit(m.A, m.C, [record], free) for m in models]
             best = min(fits, key=lambda fit: fit.loss)
             if np.isfinite(best.loss):
                 best = refine_simulation(best, [record], free)
-                return _change(_together(best, parts, free), apart, size)
+                return _change(_together(best, parts, each), apart, size)
         return change
 
 

@@ -79,12 +79,15 @@ from .missing_outputs import (
     by_prediction,
     by_simulation,
     first_guess,
+    further,
+    is_sparse,
     movement,
     runs_to_complete,
     warn_of_few,
     warn_of_many_pieces,
 )
-from .offsets import N_TRENDS, level_matters, of_rates
+from .offsets import N_TRENDS, USELESS, level_matters, of_rates
+from .one_fit import TooFewSamples
 from .options import Choices, check_options
 from .residuals import (
     Residuals,
@@ -93,7 +96,7 @@ from .residuals import (
     model_residuals,
     residual_tests,
 )
-from .selection import selection_text
+from .selection import MAX_ORDER, cost_of_known, selection_text
 from .stream import SampleStream, fit_as_stream
 from .telling import Telling
 
@@ -127,7 +130,9 @@ _TAKEN = (
 # Missing outputs are estimated in so many rounds at most, until they move by less than
 # this many standard deviations of an innovation.
 _MOST_ROUNDS, _SETTLED = 20, 0.01
+_ASTRAY = 4  # rounds that move them more than one before, after which no more is done
 _FREE_ROUNDS = 3  # after so many no other order is looked for
+_BEYOND = 2  # orders tried beyond the best one, where few outputs are there
 
 _FAINT = 1e-3  # weight of an estimate beside an output that is known
 
@@ -503,7 +508,7 @@ class SubspaceLTI(
         self._single_output = np.asarray(y).ndim == 1
         telling = Telling(*_labels_of(X, experiments, y))
         if rates:
-            telling = telling.aside("noisy output")
+            telling = telling.aside("noisy output", "useless")
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
             if self.detrend is not None:
                 raise ValueError(
@@ -511,7 +516,7 @@ class SubspaceLTI(
                     f"that are not there are not known. Got {self.detrend!r}. Use "
                     f"offset={self.detrend!r}."
                 )
-            experiments = self._completed(experiments, choices, telling)
+            experiments, choices = self._completed(experiments, choices, telling)
         elif self.missing == "split":
             warn_of_many_pieces(experiments)
         delay = self._delay_of(experiments, choices)
@@ -521,32 +526,65 @@ class SubspaceLTI(
 
     def _completed(
         self, experiments: list[Experiment], choices: Choices, telling: Telling
-    ) -> list[Experiment]:
+    ) -> tuple[list[Experiment], Choices]:
         """Experiments with missing outputs as the model of the completed ones expects.
 
-        Cut where inputs are missing, or time has a hole.
+        Cut where inputs are missing, or time has a hole. And the choices that remain:
+        where little is there, the order is chosen by that, from below.
         """
         runs = runs_to_complete(experiments, at_rest=not choices.initial_states)
         if not any(map(has_gaps, runs)):
-            return runs
+            return runs, choices
         warn_of_few(runs, telling)
         completed = first_guess(runs)
         delay = self._delay_of(completed, choices)
+        sparse = is_sparse(runs)
+        if sparse and choices.method == "auto":
+            choices = choices._replace(method="po-moesp")
+        if not sparse or choices.order is not None:
+            return self._settled(runs, completed, choices, delay)[0], choices
+        guess, best, least, beyond = completed, (completed, choices), np.inf, 0
+        for order in choices.orders or range(1, MAX_ORDER + 1):
+            some = choices._replace(order=order, orders=())
+            try:
+                completed, fitted = self._settled(runs, guess, some, delay)
+            except TooFewSamples:
+                break
+            cost, beyond = cost_of_known(fitted.evidence), beyond + 1
+            if cost < least:
+                best, least, beyond = (completed, some), cost, 0
+            elif beyond == _BEYOND:
+                break
+        return best
+
+    def _settled(
+        self,
+        runs: Sequence[Experiment],
+        completed: list[Experiment],
+        choices: Choices,
+        delay: Delay,
+    ) -> tuple[list[Experiment], LocalFit]:
+        """Experiments, `completed` in some way, as their own model expects them."""
         chosen: tuple[int, str] | None = None
         known: LocalFit | None = None
-        moved = np.inf
+        least, astray, last = np.inf, 0, [completed]
         for k in range(_MOST_ROUNDS):
             with collected():  # said of the completed samples
                 fitted = self._identify(completed, choices, delay, Telling(), known)
             before, completed = completed, self._expected(runs, completed)
-            noise = self.predictor_.covariance
-            last, moved = moved, movement(runs, before, completed, noise)
-            if not moved > _SETTLED or (known is not None and moved > last):
+            moved = movement(runs, before, completed, self.predictor_.covariance)
+            astray = 0 if known is None or moved < least else astray + 1
+            if not moved > _SETTLED or astray == _ASTRAY:
                 break
+            least = min(least, moved)
+            last = [*last, completed] if known is not None else [completed]
+            if len(last) == 3:
+                completed = further(runs, last)
+                last = [completed]
             if chosen == (fitted.selection.order, fitted.method) or k >= _FREE_ROUNDS:
                 known = fitted
             chosen = fitted.selection.order, fitted.method
-        return completed
+        return completed, fitted
 
     def _expected(
         self, runs: Sequence[Experiment], completed: Sequence[Experiment]
@@ -568,23 +606,25 @@ class SubspaceLTI(
         found = list(zip(runs, own, strict=True))
         try:
             if predictor.gain is not None:
-                return [
+                expected = [
                     by_prediction(e, predictor, e.inputs - u0, x0, level)
                     for e, (x0, level) in found
                 ]
-            return by_simulation(
-                runs,
-                [
+            else:
+                simulated = [
                     level + self.lti_.simulate(e.inputs - u0, initial_state=x0)
                     for e, (x0, level) in found
-                ],
-            )
+                ]
+                expected = by_simulation(runs, simulated)
+            if all(np.isfinite(e.measured).all() for e in expected):
+                return expected
         except DivergenceError:
-            raise ValueError(
-                "missing='estimate' needs a model that can be simulated. That of "
-                f"order {self.order_} grows beyond numbers: use missing='split', "
-                "another `order`, or stability='enforce'."
-            ) from None
+            pass
+        raise ValueError(
+            "missing='estimate' needs a model that can be simulated. That of order "
+            f"{self.order_} grows beyond numbers: use missing='split', another "
+            "`order`, or stability='enforce'."
+        )
 
     def fit_each(self, X: Any, y: Any) -> list[Self]:
         """Fit one model to every experiment, as the first one chooses.
@@ -739,6 +779,14 @@ class SubspaceLTI(
         best = inner
         if flags.all() and inner.method_ != "pbsid":
             best = self._of_sums(experiments, inner)
+        if best.residual_ > USELESS:
+            what = "the rates of the outputs" if best is inner else "the outputs"
+            warn(
+                f"The model explains next to nothing of {what}: its simulation error "
+                f"is {100.0 * best.residual_:.0f} % of their size. Check that the "
+                "outputs integrate, that inputs and outputs belong together, and that "
+                "rows are in the order of time; or leave `integrating` out."
+            )
         self.lti_: StateSpace = integrated(best.lti_, flags)
         self._name(*_names_of(experiments, y))
         self._evidence: Any = RateEvidence(best.deviated_models(), flags, m)

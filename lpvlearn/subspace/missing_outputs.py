@@ -42,10 +42,14 @@ _MANY, _SHORT = 5, 50
 
 _DRAWN = 15  # times that missing errors are drawn, for the model of the noise
 
-_FEW = 1.0 / 3.0  # share of an output that is there, below which that is told
+# Share of an output that is there, below which that is told, and below which the order
+# is looked for by what is there alone
+_FEW, _SPARSE = 1.0 / 3.0, 0.6
 
 # Of conjugate gradients: standard deviations of an innovation, and steps
 _TOL, _STEPS = 1e-3, 200
+
+_FURTHEST = 20.0  # steps that several rounds may be taken further
 
 _ROUNDING = 1e-9  # size of an error, relative to those that there are, that is not one
 
@@ -119,6 +123,15 @@ def warn_of_few(runs: Sequence[Experiment], telling: Telling) -> None:
         )
 
 
+def is_sparse(runs: Sequence[Experiment]) -> bool:
+    """Whether about as many samples of an output are missing as are there.
+
+    What is estimated then decides about an order, and looks like a loop.
+    """
+    known = np.mean(np.vstack([np.isfinite(run.measured) for run in runs]), axis=0)
+    return bool(known.min() < _SPARSE)
+
+
 def with_estimates(run: Experiment, outputs: Array) -> Experiment:
     """A run with values of outputs that are missing in it."""
     return replace(run, outputs=outputs, estimated=np.isnan(run.measured))
@@ -143,6 +156,26 @@ def movement(
     ]
     squares = np.concatenate(moved)
     return float(np.sqrt(np.mean(squares))) if len(squares) else 0.0
+
+
+def further(
+    runs: Sequence[Experiment], rounds: Sequence[Sequence[Experiment]]
+) -> list[Experiment]:
+    """Estimates where three rounds of one model lead, as far as they go one way.
+
+    Of a map that shortens the way by one factor that is its end (R. Varadhan and C.
+    Roland, Scandinavian Journal of Statistics 35, 2008): the more is missing, the
+    slower are the rounds.
+    """
+    first, second, third = ([e.measured for e in one] for one in rounds)
+    step = [b - a for a, b in zip(first, second, strict=True)]
+    bend = [c - b - s for b, c, s in zip(second, third, step, strict=True)]
+    sizes = [np.sqrt(sum(float(np.sum(e**2)) for e in x)) for x in (step, bend)]
+    length = min(max(sizes[0] / sizes[1], 1.0), _FURTHEST) if sizes[1] > 0.0 else 1.0
+    return [
+        with_estimates(run, a + 2.0 * length * s + length**2 * b)
+        for run, a, s, b in zip(runs, first, step, bend, strict=True)
+    ]
 
 
 def first_guess(runs: Sequence[Experiment]) -> list[Experiment]:

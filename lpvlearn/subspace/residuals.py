@@ -472,6 +472,34 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
     )
 
 
+def explained_by_inputs(errors: Sequence[Array], inputs: Sequence[Array]) -> Array:
+    """Share of the squared errors of every output that past inputs explain.
+
+    Of the whitened errors, by the input that explains most; 0 where that may be chance,
+    or the samples are too few to tell.
+    """
+    names = list(range(errors[0].shape[1])), list(range(inputs[0].shape[1]))
+    try:
+        found, n_lags = with_windows(
+            Residuals(list(errors), list(inputs), *names), None
+        )
+    except ValueError:
+        return np.zeros(errors[0].shape[1])
+    n = sum(map(len, found.errors))
+    tests = input_tests(found.errors, found.inputs, n_lags).past
+    return np.array(
+        [
+            max(
+                (test.statistic - test.dof) / (test.statistic + n)
+                if test.p_value < CERTAIN
+                else 0.0
+                for test in of_output
+            )
+            for of_output in tests
+        ]
+    )
+
+
 class Spikes(NamedTuple):
     """Errors of one output that stand out of the others."""
 

@@ -793,3 +793,19 @@ def _error_structure(
     by_inputs = (np.abs(lags[:, :m, m:]) / np.sqrt(variance)).max()
     size = np.where(of_v[0] > 0.0, of_v[0], np.inf)
     return float(by_inputs), float((of_v[min(1, len(own) - 1)] / size).max())
+
+
+def cost_of_known(evidence: Evidence) -> float:
+    """Schwarz's criterion of the simulation errors of outputs that are there."""
+    model, records, free = evidence.model, evidence.records, evidence.free
+    if not np.isfinite(model.loss):
+        return np.inf
+    known = np.vstack([record.known for record in records])
+    squares = np.where(known, np.vstack(simulation_errors(model, records)), 0.0) ** 2
+    n_known, order = known.sum(axis=0), len(model.A)
+    power = np.where(known, np.hstack([r.y for r in records]).T, 0.0) ** 2
+    floor = np.maximum(EXACT * power.sum(axis=0), np.finfo(float).tiny)
+    left = np.log(np.maximum(squares.sum(axis=0), floor) / n_known)
+    n_unknown = model.B.size + model.C.size + int(free.direct.sum())
+    n_unknown += len(records) * free.n_own(order)
+    return float(n_known @ left + np.log(n_known.sum()) * n_unknown)

@@ -345,3 +345,36 @@ def test_the_progress_bar_tells_the_cost(capsys):
     X, y = sweeps(n_samples=100)
     OutputErrorLPV(spring_lpv(), rate=False, verbose=1, **ROLES).fit(X, y)
     assert "cost=" in capsys.readouterr().err
+
+
+# -- what the errors tell --------------------------------------------------------------
+
+
+def test_a_run_of_a_few_samples_is_fitted_with_the_others():
+    X, y = sweeps()
+    few = X["run"] == "sweep 1"
+    keep = ~few | (np.cumsum(few) <= 4)
+    roles = ROLES | {"experiment": "run"}
+    found = OutputErrorLPV(spring_structure(), **roles).fit(X[keep], y[keep])
+    assert found.report_.loc["sweep 0", "BFT"] > 90.0
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`lpv_` is unstable")  # as it is without them
+def test_constants_that_are_missing_are_told():
+    X, y = sweeps()
+    roles = ROLES | {"experiment": "run"}
+    off = y + y.std()
+    with pytest.warns(UserWarning, match="Use offset='constant'"):
+        OutputErrorLPV(spring_structure(), **roles).fit(X, off)
+    found = OutputErrorLPV(spring_structure(), offset="constant", **roles).fit(X, off)
+    assert found.report_["BFT"].min() > 90.0
+
+
+@pytest.mark.slow
+def test_a_delay_that_is_missing_is_told():
+    X, y = sweeps()
+    roles = ROLES | {"experiment": "run"}
+    late = y.groupby(X["run"]).shift(4).fillna(0.0)
+    with pytest.warns(UserWarning, match="'position' follow from the inputs.*delay"):
+        OutputErrorLPV(spring_structure(), **roles).fit(X, late)

@@ -7,6 +7,7 @@ import pytest
 
 from lpvlearn import GrayBoxStructure
 from lpvlearn.structures.interchanges import (
+    distance,
     exchangeable,
     interchanges,
     known_before,
@@ -98,6 +99,19 @@ def test_parts_of_which_nothing_tells_the_one_from_the_other_are_named():
     assert told(servo(), theta, [1.0, 5.0, 2.0]) == []
     assert told(servo().with_bounds(both), theta) == ["actuator", "sensor"]
     assert told(servo().with_ranges(both), theta) == ["actuator", "sensor"]
+
+
+def test_what_is_outside_of_a_range_is_far():
+    """However near it is to the middle."""
+    ranges = {"actuator": (0.4, 2.6), "sensor": (0.8, 2.6)}
+    structure = servo().with_ranges(ranges)
+    known = known_before(structure, None)
+    images = np.array([[[2.5, 1.0, 0.5]], [[0.5, 1.0, 2.5]]])  # actuator, gain, sensor
+    assert structure.parameter_names == ("actuator", "gain", "sensor")
+    far = distance(structure, images, known)
+    assert far[0] > 100.0 * far[1]
+    theta = dict(zip(structure.parameter_names, images[1, 0], strict=True))
+    assert told(structure, theta) == []
 
 
 def test_parts_that_are_but_numbered_may_have_any_number():

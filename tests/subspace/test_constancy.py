@@ -70,3 +70,15 @@ def test_an_input_that_bends_is_no_noise_that_moves_the_plant(bend):
     y = y + 0.02 * y.std() * rng.standard_normal(y.shape)
     with pytest.warns(UserWarning, match="follow squares or cubes"):
         SubspaceLTI(sampling_time=STEP).fit(u, y)
+
+
+@pytest.mark.parametrize("initial_state", ["estimate", "rest"])
+def test_parts_begin_in_mid_motion_whatever_the_record_does(initial_state):
+    """Slow poles: what moves from before is most of a part."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.choice([-1.0, 1.0], 80), 15)[:, None]
+    gain = np.where(np.arange(len(u)) < 600, 1.0, 2.5)[:, None]
+    y = lfilter([0.0, 0.02], [1.0, -0.98], gain * u, axis=0)
+    y = y + 0.05 * y.std() * rng.standard_normal(y.shape)
+    with pytest.warns(UserWarning, match="changes over the record"):
+        SubspaceLTI(initial_state=initial_state).fit(u, y)

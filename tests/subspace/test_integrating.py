@@ -215,3 +215,15 @@ def test_differenced_noise_of_a_sensor_moves_no_plant(seed):
     true = servo.frequency_response(omega)
     found = model.lti_.to_continuous().frequency_response(omega)
     assert np.abs(found - true).max() < 0.01 * np.abs(true).max()
+
+
+def test_rates_that_are_mostly_noise_explain_their_sums():
+    """The simulation error told of is that of the outputs."""
+    u, y = record(noise=0.03)
+    angle = y[["angle"]]  # a warning would be an error
+    model = SubspaceLTI(sampling_time=STEP, integrating=True).fit(u, angle)
+    assert model.rates_.residual_ > 0.5
+    assert model.score(u, angle) > 0.9
+    with pytest.warns(UserWarning, match="next to nothing of the.*outputs integrate"):
+        noise = np.random.default_rng(0).normal(size=angle.shape)
+        SubspaceLTI(1, sampling_time=STEP, integrating=True).fit(u, noise)

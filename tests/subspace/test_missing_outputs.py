@@ -1,6 +1,7 @@
 """Missing outputs, estimated by the model that they are missing for."""
 
 import copy
+import warnings
 from contextlib import nullcontext
 
 import numpy as np
@@ -14,8 +15,14 @@ from lpvlearn import (
     StateSpace,
     SubspaceLTI,
 )
+from lpvlearn.data.experiments import Experiment
 from lpvlearn.models.innovation import NoiseModel
-from lpvlearn.subspace.missing_outputs import expected_change, noise_of
+from lpvlearn.subspace.missing_outputs import (
+    expected_change,
+    further,
+    noise_of,
+    with_estimates,
+)
 from lpvlearn.subspace.noise import spectral_density
 from tests.conftest import ROLES, spring_structure, spring_tables
 
@@ -356,3 +363,34 @@ def test_nothing_is_left_after_a_delay():
     rare = pytest.warns(UserWarning, match="is missing in 94 %")
     with pytest.raises(ValueError, match="come with their delay"), rare:
         SubspaceLTI(1, horizon=3, missing="estimate", input_delay=6).fit(u, y)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "every"), [(1, 2), (1, 3), (2, 4)])
+def test_the_order_of_outputs_that_come_seldom_is_that_of_what_is_there(seed, every):
+    """Completed samples ask for states of their own, and look like a loop."""
+    rng = np.random.default_rng(seed)
+    A = 0.97 * np.array([[0.9, 0.3], [-0.3, 0.9]])
+    plant = StateSpace(A, rng.normal(size=(2, 1)), rng.normal(size=(1, 2)))
+    plant = StateSpace(plant.A, plant.B, plant.C, sampling_time=0.1)
+    u = np.repeat(rng.choice([-1.0, 1.0], 200), 6)[:, None]
+    y = plant.simulate(u)
+    y = y + 0.03 * y.std() * rng.normal(size=y.shape)
+    y[np.arange(len(y)) % every > 0] = np.nan
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*is missing in")
+        found = SubspaceLTI(missing="estimate", sampling_time=0.1).fit(u, y)
+    assert found.order_ == 2
+    assert (found.lti_ - plant).hinf_norm() < 0.01 * plant.hinf_norm()
+
+
+def test_rounds_that_go_one_way_are_taken_to_their_end():
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=(30, 2))
+    run = Experiment("a", np.arange(30), y, np.where(y > 0.5, np.nan, y))
+    away = np.where(y > 0.5, rng.normal(size=y.shape), 0.0)
+    rounds = [[with_estimates(run, y + 0.9**k * away)] for k in range(3)]
+    (end,) = further([run], rounds)
+    np.testing.assert_allclose(end.outputs, y, atol=1e-12)
+    (still,) = further([run], [rounds[0]] * 3)
+    np.testing.assert_array_equal(still.outputs, rounds[0][0].outputs)
