@@ -29,6 +29,8 @@ ESTIMATORS = [
 @pytest.mark.filterwarnings("ignore:The model simulates parts of the record")
 @pytest.mark.filterwarnings("ignore:the structure comes no nearer")
 @pytest.mark.filterwarnings("ignore:`lpv_` is unstable at values within its range")
+@pytest.mark.filterwarnings("ignore:with a constant of every experiment")
+@pytest.mark.filterwarnings("ignore:the errors of output .* follow from the inputs")
 @parametrize_with_checks(
     [
         LocalLPVPipeline(),

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 # Errors that are told: constants, of a search of so many steps, leave less than this
 # share of their squares, or the inputs explain more than this share of the output.
-_CONSTANT, _STEPS, _OF_OUTPUT = 0.5, 15, 0.1
+_CONSTANT, _STEPS, _OF_OUTPUT = 0.25, 15, 0.1
 
 
 def tell_of_errors(
@@ -26,12 +26,14 @@ def tell_of_errors(
     errors: Sequence[Array],
     own: Own,
     start: LPVStateSpace,
+    max_iter: int,
 ) -> None:
     """Tell of large errors that constants would take, or that follow the inputs.
 
-    By some steps from the `start` with constants; and by regression on the inputs
-    alone, times the scheduling variables, as a gain that varies, and on these, as what
-    an offset does to such a gain, over all records and the one of the largest errors.
+    By some steps from the `start`, `max_iter` at most, with constants; and by
+    regression on the inputs alone, times the scheduling variables, as a gain that
+    varies, and on these, as what an offset does to such a gain, over all records and
+    the one of the largest errors.
     """
     each = np.array([_shares(*pair) for pair in zip(records, errors, strict=True)])
     worst = int(each.max(axis=1).argmax())
@@ -40,7 +42,8 @@ def tell_of_errors(
     if not own.constant:
         with suppress(ValueError):  # it diverges
             other = own._replace(constant=True)
-            found = refine(start, records, other, max_iter=_STEPS).model
+            steps = min(max_iter, _STEPS)
+            found = refine(start, records, other, max_iter=steps).model
             weight = np.ones(model.n_outputs)
             squared = sum(squares(found, record, other, weight) for record in records)
             share = squared / np.sum(np.vstack(errors) ** 2)

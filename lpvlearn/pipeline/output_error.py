@@ -296,7 +296,7 @@ class OutputErrorLPV(ScheduledEstimator):
         -----
         UserWarning
             If the model is unstable at values within its range; if its errors are more
-            than a tenth of an output and constants would halve their squares, or that
+            than a tenth of an output and constants would halve them, or that
             much of them follows from the inputs and scheduling variables.
         """
         self._check_options()
@@ -410,7 +410,7 @@ class OutputErrorLPV(ScheduledEstimator):
             for e, record in zip(experiments, records, strict=True)
         ]
         self.report_ = _report(labels, records, before, after)
-        tell_of_errors(self.lpv_, records, after, own, start)
+        tell_of_errors(self.lpv_, records, after, own, start, self.max_iter)
         self.output_errors_ = output_errors(
             start.output_names or range(1, start.n_outputs + 1),
             after,

@@ -239,7 +239,9 @@ class SubspaceLTI(
         "estimate" does so where inputs are missing; outputs are estimated by the model
         and its noise, and the model by what is known of them, in turn (algorithm of
         expectation and maximisation): take it where many are, each for a short time,
-        or one of several. Levels that shift are not looked for beside them.
+        or one of several, or where outputs come slower than inputs. Levels that shift
+        are not looked for beside them; nor, where an output is there at less than six
+        of ten samples, is feedback.
     integrating : True, str, int or list of them, default=None
         Outputs with an integrator, as the position of a motor: by the columns of y or
         their positions, True for all. Their rates ``(y[k+1] - y[k]) / dt`` are

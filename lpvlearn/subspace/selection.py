@@ -802,10 +802,9 @@ def cost_of_known(evidence: Evidence) -> float:
         return np.inf
     known = np.vstack([record.known for record in records])
     squares = np.where(known, np.vstack(simulation_errors(model, records)), 0.0) ** 2
-    n_known, order = known.sum(axis=0), len(model.A)
+    n_known = known.sum(axis=0)
     power = np.where(known, np.hstack([r.y for r in records]).T, 0.0) ** 2
     floor = np.maximum(EXACT * power.sum(axis=0), np.finfo(float).tiny)
     left = np.log(np.maximum(squares.sum(axis=0), floor) / n_known)
-    n_unknown = model.B.size + model.C.size + int(free.direct.sum())
-    n_unknown += len(records) * free.n_own(order)
+    n_unknown = n_parameters(len(model.A), records, free)
     return float(n_known @ left + np.log(n_known.sum()) * n_unknown)
