@@ -145,7 +145,7 @@ class AutoLPV(Interpolator):
         excess = 1.0
         if not any(map(is_chance, chi2, dof)) and good.any():
             excess = np.min(chi2[good] / dof[good])
-        n, chosen, believed = points.theta.size, 0, False
+        n, chosen, proven = points.theta.size, 0, False
         price = 2.0 if self.criterion == "aic" else math.log(n)
         cost = chi2 / excess + price * (n - dof)
         if good.any():
@@ -157,11 +157,14 @@ class AutoLPV(Interpolator):
             ]
             chosen = int(min(supported, key=lambda k: (bent[k], -dof[k], cost[k])))
             free = bent[chosen] and n - dof[chosen] > _FREE * n
-            believed = not free or _foresees(found[chosen][1], kappa, points)
-        if not believed:
-            name, spline = _interpolation(kappa, points)
+            proven = not free
+        if not proven:
+            name, curve = _interpolation(kappa, points)
+            if good.any():
+                proven = _foresees(found[chosen][1], curve, kappa, points)
+        if not proven:
             chosen = len(found)
-            found.append((name, spline.fit(kappa, points.theta)))
+            found.append((name, curve.fit(kappa, points.theta)))
             chi2, dof, cost = np.r_[chi2, np.nan], np.r_[dof, 0], np.r_[cost, np.nan]
         self.form_, self.best_estimator_ = found[chosen]
         self.selection_ = pd.DataFrame(
@@ -203,9 +206,10 @@ class AutoLPV(Interpolator):
         one_of("criterion", self.criterion, _CRITERIA)
 
 
-def _foresees(form: Any, kappa: Array, points: WeightedPoints) -> bool:
-    """Whether points left out are met as well as by interpolation of the others."""
-    curve = _interpolation(kappa, points)[1]
+def _foresees(
+    form: Any, curve: SplineLPV, kappa: Array, points: WeightedPoints
+) -> bool:
+    """Whether points left out are met as well as by a curve through the others."""
     own, other = _errors_left_out([form, curve], kappa, points).sum(axis=(1, 2))
     return bool(own <= other)
 

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 
 from ..systems.threads import one_blas_thread
 from .refinement import refine_simulation
-from .residuals import whitening_filters
+from .residuals import filtered, whitening_filters
 from .signals import Record
 from .simulation_fit import (
     Freedom,
@@ -88,7 +87,7 @@ def _change(
         return None
     left, left_apart = _rms(together) / size, _rms(apart) / size
     filters = whitening_filters(apart)
-    white, white_apart = (_rms(_filtered(e, filters)) for e in (together, apart))
+    white, white_apart = (_rms(filtered(e, filters)) for e in (together, apart))
     changed = (left > _ROUGH) & (white_apart**2 < _CHANGED_WHITE * white**2)
     shares = np.where(changed, left_apart / np.maximum(left, _ROUGH), np.inf) ** 2
     k = int(shares.argmin())
@@ -115,20 +114,6 @@ def _parts(record: Record, least: int) -> list[Record]:
     ends = np.linspace(0, n_samples, n_parts + 1 if n_parts > 1 else 1).astype(int)
     parts = [record.part(slice(a, b)) for a, b in zip(ends, ends[1:], strict=False)]
     return [part for part in parts if np.ptp(part.u, axis=1).all()]
-
-
-def _filtered(errors: Sequence[Array], filters: Sequence[Array]) -> list[Array]:
-    """Errors of all outputs through a filter of each, but for its first samples."""
-    first = max(map(len, filters)) - 1
-    return [
-        np.column_stack(
-            [
-                scipy.signal.lfilter(a, [1.0], e[:, i])[first:]
-                for i, a in enumerate(filters)
-            ]
-        )
-        for e in errors
-    ]
 
 
 def _rms(errors: Sequence[Array]) -> Array:

@@ -538,14 +538,14 @@ class SubspaceLTI(
         if not any(map(has_gaps, runs)):
             return runs, choices
         warn_of_few(runs, telling)
-        completed = first_guess(runs)
-        delay = self._delay_of(completed, choices)
+        guess = first_guess(runs)
+        delay = self._delay_of(guess, choices)
         sparse = is_sparse(runs)
         if sparse and choices.method == "auto":
             choices = choices._replace(method="po-moesp")
         if not sparse or choices.order is not None:
-            return self._settled(runs, completed, choices, delay)[0], choices
-        guess, best, least, beyond = completed, (completed, choices), np.inf, 0
+            return self._settled(runs, guess, choices, delay)[0], choices
+        best, least, beyond = (guess, choices), np.inf, 0
         for order in choices.orders or range(1, MAX_ORDER + 1):
             some = choices._replace(order=order, orders=())
             try:

@@ -111,7 +111,7 @@ def warn_of_many_pieces(experiments: Sequence[Experiment]) -> None:
 
 def warn_of_few(runs: Sequence[Experiment], telling: Telling) -> None:
     """Tell of an output that is hardly there."""
-    known = np.mean(np.vstack([np.isfinite(run.measured) for run in runs]), axis=0)
+    known = _shares_known(runs)
     rarest = int(np.argmin(known))
     if known[rarest] < _FEW:
         warn(
@@ -128,8 +128,13 @@ def is_sparse(runs: Sequence[Experiment]) -> bool:
 
     What is estimated then decides about an order, and looks like a loop.
     """
-    known = np.mean(np.vstack([np.isfinite(run.measured) for run in runs]), axis=0)
-    return bool(known.min() < _SPARSE)
+    return bool(_shares_known(runs).min() < _SPARSE)
+
+
+def _shares_known(runs: Sequence[Experiment]) -> Array:
+    """Share of every output that is there."""
+    there = np.vstack([np.isfinite(run.measured) for run in runs])
+    return np.asarray(np.mean(there, axis=0))
 
 
 def with_estimates(run: Experiment, outputs: Array) -> Experiment:

@@ -354,13 +354,9 @@ def cross_correlations(
     """
     ny = errors[0].shape[1]
     filters = whitening_filters(errors) + whitening_filters(inputs)
-    start, n_samples = max(map(len, filters)) - 1, 0
-    sums = np.zeros((n_lags + 1, len(filters), len(filters)))
-    for pair in zip(errors, inputs, strict=True):
-        signals = zip(filters, np.hstack(pair).T, strict=True)
-        z = np.column_stack(
-            [scipy.signal.lfilter(a, [1.0], x)[start:] for a, x in signals]
-        )
+    n_samples, sums = 0, np.zeros((n_lags + 1, len(filters), len(filters)))
+    signals = [np.hstack(pair) for pair in zip(errors, inputs, strict=True)]
+    for z in filtered(signals, filters):
         known = min(len(z), n_lags + 1)
         if known:
             n_samples += len(z)
@@ -455,24 +451,13 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
         return False
     poles = np.linalg.eigvals(model.A).astype(complex)
     fitted = Fitted(poles, evidence.free.direct, np.eye(len(size))[None])
-    names = list(range(len(size))), list(range(inputs[0].shape[1]))
-    try:
-        residuals, n_lags = with_windows(
-            Residuals(errors, inputs, *names, fitted), None
-        )
-    except ValueError:  # too few samples
-        return False
-    tests = input_tests(residuals.errors, residuals.inputs, n_lags, fitted).past
-    n = sum(map(len, residuals.errors))
-    return any(
-        test.p_value < CERTAIN
-        and test.statistic - test.dof > _MUCH * (test.statistic + n)
-        for i in suspects
-        for test in tests[i]
-    )
+    share = explained_by_inputs(errors, inputs, fitted)
+    return bool((share[suspects] > _MUCH).any())
 
 
-def explained_by_inputs(errors: Sequence[Array], inputs: Sequence[Array]) -> Array:
+def explained_by_inputs(
+    errors: Sequence[Array], inputs: Sequence[Array], fitted: Fitted | None = None
+) -> Array:
     """Share of the squared errors of every output that past inputs explain.
 
     Of the whitened errors, by the input that explains most; 0 where that may be chance,
@@ -481,12 +466,12 @@ def explained_by_inputs(errors: Sequence[Array], inputs: Sequence[Array]) -> Arr
     names = list(range(errors[0].shape[1])), list(range(inputs[0].shape[1]))
     try:
         found, n_lags = with_windows(
-            Residuals(list(errors), list(inputs), *names), None
+            Residuals(list(errors), list(inputs), *names, fitted), None
         )
     except ValueError:
         return np.zeros(errors[0].shape[1])
     n = sum(map(len, found.errors))
-    tests = input_tests(found.errors, found.inputs, n_lags).past
+    tests = input_tests(found.errors, found.inputs, n_lags, fitted).past
     return np.array(
         [
             max(
@@ -633,6 +618,20 @@ def whitening_filters(errors: Sequence[Array]) -> list[Array]:
         autoregression([e[:, [i]] for e in errors]) for i in range(errors[0].shape[1])
     ]
     return [np.concatenate([[1.0], -model.C[0]]) for model in models]
+
+
+def filtered(signals: Sequence[Array], filters: Sequence[Array]) -> list[Array]:
+    """Signals through a filter of every column, but for the first samples of all."""
+    start = max(map(len, filters)) - 1
+    return [
+        np.column_stack(
+            [
+                scipy.signal.lfilter(a, [1.0], x)[start:]
+                for a, x in zip(filters, signal.T, strict=True)
+            ]
+        )
+        for signal in signals
+    ]
 
 
 def f_test(added: Array, target: Array, dof: int) -> ResidualTest:
