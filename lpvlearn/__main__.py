@@ -109,7 +109,7 @@ def _add_paper(parser: argparse.ArgumentParser) -> None:
 
 
 def _paper(options: argparse.Namespace) -> None:
-    n_jobs = options.jobs or min(_MAX_JOBS, joblib.cpu_count())
+    n_jobs = min(options.jobs or joblib.cpu_count(), _MAX_JOBS)
     with (
         whole_folder(options.output, overwrite=True) as folder,
         _points_done(options.output, options.resume) as memory,

@@ -268,9 +268,14 @@ def refine(
 
             def jacobian(kept: NDArray[np.intp]) -> Array:
                 nonlocal told
+                try:
+                    G = gram(trial[0], errors, weight)
+                except ValueError:  # states too fast for its samples
+                    if not costs:
+                        raise
+                    return np.full((1, 1 + q, q), np.inf)
                 costs.append((n_round, cost))
                 tell(cost)
-                G = gram(trial[0], errors, weight)
                 told = G[1:, 1:]
                 return _rotated(G, r[0, 0])[None]
 

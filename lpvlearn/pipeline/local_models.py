@@ -18,7 +18,7 @@ from sklearn.base import clone
 from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
 from ..data.preparation import DETRENDS
-from ..exceptions import collected, warn
+from ..exceptions import collected, retold, warn
 from ..models.statespace import (
     ModelPair,
     StateSpace,
@@ -117,6 +117,7 @@ def identify_points(
         if _integrates(local):  # the model of the rates has not the integrators
             rest -= integrators(structure)
         local = clone(local).set_params(order=rest)
+        options["most"] = isinstance(local, SubspaceLTI)
     # Where a record stood in the table does not matter: splits share their results.
     groups = [[_bare(e) for e in group] for group in points.experiments]
 
@@ -223,6 +224,7 @@ def identify_point(
     discretization: str,
     efficient: bool = False,
     deviate: bool = True,
+    most: bool = False,
 ) -> LocalModel:
     """Identify the local model of one operating point by a clone of `local`.
 
@@ -230,7 +232,9 @@ def identify_point(
     all experiments, or "average": one model each, balanced, signs aligned, and the
     matrices averaged (the paper's Monte Carlo). Refuses outputs that do not vary, and
     an unstable model, which cannot be balanced. `efficient` gives `estimates`,
-    `deviate` the `pairs` of a pooled one, which these need.
+    `deviate` the `pairs` of a pooled one, which these need. The order may be the `most`
+    that there can be: a pooled model then leaves out states that the samples do not ask
+    for, where they alternate.
     """
     if _integrates(local) and combine == "average":
         raise ValueError(
@@ -240,7 +244,8 @@ def identify_point(
     advice = _look_at_outputs(experiments, local)
     labels = list(dict.fromkeys(e.label for e in experiments))
     if combine == "pool" or len(labels) == 1:
-        fitted = _fit_local(local, experiments, sampling_time)
+        fit = _fit_at_most if most else _fit_local
+        fitted = fit(local, experiments, sampling_time)
         pairs = _deviated(fitted) if deviate else []
         if _from_closed_loop(fitted):
             advice = _HELD + advice
@@ -467,6 +472,36 @@ def _fit_local(
             f"attribute `lti_`, as SubspaceLTI does. Got {type(local).__name__}."
         )
     return fitted
+
+
+def _fit_at_most(
+    local: Any, experiments: Sequence[Experiment], sampling_time: float
+) -> Any:
+    """The same with fewer states where some of them alternate, and are not asked for.
+
+    No system in continuous time has a pole on the negative real axis: a state more than
+    the samples show follows their noise there.
+    """
+    with retold() as told:
+        fitted = _fit_local(local, experiments, sampling_time)
+        n_alternating = _n_alternating(fitted.lti_)
+        if not n_alternating:
+            return fitted
+        highest = local.get_params()["order"]
+        fewer = range(max(1, highest - n_alternating), highest + 1)
+        with collected() as other, suppress(ValueError):
+            again = clone(local).set_params(order=fewer)
+            again = _fit_local(again, experiments, sampling_time)
+            if again.order_ < fitted.order_ and not _n_alternating(again.lti_):
+                told[:] = other
+                return again
+        return fitted
+
+
+def _n_alternating(model: StateSpace) -> int:
+    """Poles on the negative real axis, of a model in discrete time."""
+    poles = model.poles()
+    return int(np.count_nonzero((poles.real < 0.0) & (poles.imag == 0.0)))
 
 
 def _fit_table(

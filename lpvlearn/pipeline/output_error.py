@@ -510,15 +510,17 @@ class OutputErrorLPV(ScheduledEstimator):
     ) -> LPVStateSpace:
         """One time-invariant model of some experiments, in the form of an LPV model."""
         structure, names = self.start, experiments[0].scheduling_names
-        local = self._local()
+        local, most = self._local(), False
         if structure is not None and local.get_params().get("order") == "auto":
             local = clone(local).set_params(order=structure.order)
+            most = isinstance(local, SubspaceLTI)
         lti = identify_point(
             local,
             identified,
             sampling_time=dt,
             combine="pool",
             discretization="zoh",
+            most=most,
         ).lti
         if structure is None:
             structure, (theta,) = balanced_entries([lti])
@@ -612,7 +614,7 @@ def _promising(
     def soon(model: LPVStateSpace) -> float:
         try:
             return loss(refine(model, records, own, max_iter=_FIRST_STEPS).model)
-        except ValueError:  # it diverges
+        except ValueError:  # it diverges, or has states too fast for its samples
             return np.inf
 
     best = sorted(models, key=loss)[:_N_STARTS]

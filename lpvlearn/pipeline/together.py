@@ -128,7 +128,7 @@ def fitted_together(
         likely = found.cost < _FAR * (n_values - n) and found.cost + 2.0 * n < least
         if likely and _holds(structure, found.form):
             misfit, least = found.cost / (n_values - n), found.cost + 2.0 * n
-            covariance = max(misfit, 1.0) * pinvh(found.information)
+            covariance = max(misfit, 1.0) * pinvh(found.slopes.T @ found.slopes)
             best = Together(found.form, covariance, misfit)
     return best
 
@@ -180,7 +180,7 @@ def _along_the_points(
 class _Found(NamedTuple):
     form: PolynomialLPV
     cost: float  # chi-square
-    information: Array  # of its coefficients
+    slopes: Array  # of what its squares add up to, by its coefficients
 
 
 def _fitted(
@@ -190,7 +190,7 @@ def _fitted(
     form = PolynomialLPV(degree).fit(kappa, theta)
     S = form.sensitivities(kappa)
     c, cost, J = common_coefficients(boxes, S, form.coefficients())
-    return _Found(form.with_coefficients(c), cost, J.T @ J)
+    return _Found(form.with_coefficients(c), cost, J)
 
 
 def _holds(structure: GrayBoxStructure, form: PolynomialLPV) -> bool:

@@ -340,7 +340,9 @@ def common_coefficients(
     reached, costs = levenberg_marquardt(
         residuals, start[None], max_iter=_MANY, tol=_ROUGH, stop=time_is_up
     )
-    return reached[0], float(costs[0]), coordinates(reached[0])[1]
+    with np.errstate(all="ignore"):  # of a start too far, which stays
+        slopes = coordinates(reached[0])[1]
+    return reached[0], float(costs[0]), slopes
 
 
 def _linear_analysis(J: Array) -> tuple[Array, Array, Array]:

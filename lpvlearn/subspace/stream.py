@@ -277,6 +277,11 @@ class SampleStream:
         self._label: Hashable = None  # of the sample that came last
         self._open = False  # whether nothing of that experiment is missing since
         self.delay = input_delays(options["input_delay"], n_inputs, samples=True)
+        if (self.delay >= BUFFER).any():
+            raise ValueError(
+                f"`input_delay` must be below {BUFFER} samples in partial_fit, which "
+                f"keeps no more of a stream. Got {self.delay.max()}."
+            )
         self._rest = not choices.initial_states
         self._in_transit: Array | None = None  # inputs of that experiment
         unknown = bool(self.delay.any()) and not self._rest

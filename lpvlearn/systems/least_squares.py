@@ -149,12 +149,13 @@ def levenberg_marquardt(
             if not better.any():
                 return better
             J = jacobian(np.flatnonzero(better))
-        finite = np.isfinite(J).all((1, 2))
+            squares = J.swapaxes(1, 2) @ J
+            slopes = (J.swapaxes(1, 2) @ r[better, :, None])[:, :, 0]
+        finite = np.isfinite(squares).all((1, 2)) & np.isfinite(slopes).all(1)
         better[better] = finite
         own, J = rows[better], J[finite]
         x[own], cost[own] = trial[better], new[better]
-        transposed = J.swapaxes(1, 2)
-        H[own], g[own] = transposed @ J, (transposed @ r[better, :, None])[:, :, 0]
+        H[own], g[own] = squares[finite], slopes[finite]
         S[own] = np.maximum(S[own], np.sqrt(H[own][:, diagonal, diagonal]))
         held = ((x[own] <= lower) & (g[own] > 0)) | ((x[own] >= upper) & (g[own] < 0))
         unit[own] = np.where(held, 0.0, 1.0 / np.where(S[own] > 0, S[own], 1.0))

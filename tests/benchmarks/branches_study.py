@@ -154,7 +154,6 @@ def identified(
         runs.append((u, k, y + noise))
     return LocalLPVPipeline(
         SubspaceLTI(
-            structure.order,
             feedthrough=False,
             horizon="auto" if horizon is None else horizon * structure.order,
         ),

@@ -231,6 +231,26 @@ def test_a_start_that_diverges_is_told():
         refine(bad, [record(truth, 3000)], REST)
 
 
+@pytest.mark.parametrize("refused", [1, 3])
+def test_steps_whose_derivatives_would_not_end_are_rejected(monkeypatch, refused):
+    truth, calls, whole = spring_lpv(), [], refinement._gram
+
+    def sometimes(*args):
+        calls.append(args)
+        if len(calls) == refused:
+            raise ValueError("states too fast")
+        return whole(*args)
+
+    monkeypatch.setattr(refinement, "_gram", sometimes)
+    start, records = perturbed(truth), [record(truth)]
+    if refused == 1:  # the start itself
+        with pytest.raises(ValueError, match="too fast"):
+            refine(start, records, REST)
+        return
+    found = coefficients_of(refine(start, records, REST).model)
+    np.testing.assert_allclose(found, coefficients_of(truth), atol=1e-5)
+
+
 def test_residuals_in_few_coordinates_keep_all_that_steps_need():
     rng = np.random.default_rng(0)
     J, r = rng.normal(size=(50, 4)), rng.normal(size=50)

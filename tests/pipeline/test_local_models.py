@@ -56,6 +56,36 @@ def test_a_plant_in_a_loop_keeps_what_its_own_method_found(combine):
         assert 0.01 < std < 0.5 and abs(error) < 3.0 * std
 
 
+def test_a_state_that_alternates_with_the_noise_is_left_out():
+    # the fast one of four lags hardly shows: a fourth state follows the noise
+    rates = np.array([0.5, 0.7, 1.0, 6.0])
+    A = np.diag(rates[1:], -1) - np.diag(rates)
+    truth = StateSpace(A, rates[0] * np.eye(4, 1), [[0, 0, 0, 1]], [[0]])
+    rng = np.random.default_rng(18)
+    u = rng.choice([-1.0, 1.0], (150, 1)).repeat(4, axis=0)
+    y = truth.simulate(u, sampling_time=STEP)
+    y += 0.01 * y.std() * rng.standard_normal(y.shape)
+    chain = GrayBoxStructure.from_template(
+        A=[["-a", 0, 0, 0], ["b", "-b", 0, 0], [0, "c", "-c", 0], [0, 0, "d", "-d"]],
+        B=[["a"], [0], [0], [0]],
+        C=[[0, 0, 0, 1]],
+    )
+    X, y = from_trajectories([(u, 0.0, y)], sampling_time=STEP)
+    errors = {}
+    for order in ("auto", 4):
+        pipeline = LocalLPVPipeline(
+            SubspaceLTI(order, feedthrough=False), GrayBoxRestructurer(chain), **ROLES
+        )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            pipeline.fit(X.rename(columns={"experiment": "run"}), y)
+        texts = [str(w.message) for w in caught]
+        assert any("negative real axis" in text for text in texts) == (order == 4)
+        (box,) = pipeline.local_models_
+        errors[box.order] = (box - truth).hinf_norm() / truth.hinf_norm()
+    assert errors[3] < 0.002 and errors[5] > 0.1  # a pole on that axis counts as two
+
+
 def test_a_plant_that_only_its_loop_holds_is_refused_with_the_remedy():
     options = {"sampling_time": STEP, "combine": "pool", "discretization": "zoh"}
     local = SubspaceLTI(1, method="pbsid", feedthrough=False)

@@ -268,6 +268,12 @@ def test_trends_cannot_be_removed_from_a_stream(system):
         SubspaceLTI(detrend="constant").partial_fit(u, y)
 
 
+def test_a_stream_waits_for_no_input_longer_than_it_keeps_samples(system):
+    model = SubspaceLTI(3, horizon=10, input_delay=10**9)
+    with pytest.raises(ValueError, match="below 131072 samples.*Got 1000000000"):
+        model.partial_fit(*record(system, 100))
+
+
 def test_memory_does_not_grow_with_the_stream(system, short_stream):
     model, sizes = SubspaceLTI(5, horizon=8), []
     for seed in range(6):

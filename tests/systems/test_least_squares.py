@@ -89,3 +89,12 @@ def test_a_search_that_is_stopped_keeps_its_best():
     start = np.array([[-1.2, 1.0]])
     x, cost = levenberg_marquardt(rosenbrock, start, stop=lambda: next(looks))
     assert 0.0 < cost[0] < np.sum(rosenbrock(start, None)[0] ** 2)
+
+
+def test_a_point_whose_squared_derivatives_overflow_is_none():
+    def residuals(x, rows):
+        jacobian = np.full((len(x), 1, 1), 1e200)
+        return x.copy(), lambda better: jacobian[better]
+
+    reached, cost = levenberg_marquardt(residuals, np.array([[2.0]]))
+    assert reached.item() == 2.0 and cost.item() == np.inf
