@@ -136,8 +136,9 @@ class LocalLPVPipeline(ScheduledEstimator):
     local : estimator, default=None
         Step 3, a black-box model per operating point; None is ``SubspaceLTI()``. Its
         column roles are set by the pipeline. ``order="auto"`` becomes the order of the
-        restructurer's structure where it has one, else one order for all points: that
-        of most evidence, all their records together.
+        restructurer's structure where it has one, less where a state would but follow
+        the noise, with a pole on the negative real axis; else one order for all points:
+        that of most evidence, all their records together.
     restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
         Step 4. Without a structure, "aligned" (None) interpolates the entries of
         the local models, each turned to its neighbour by the rotation that brings their

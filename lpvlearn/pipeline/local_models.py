@@ -105,9 +105,10 @@ def identify_points(
 ) -> tuple[list[LocalModel], OperatingPoints]:
     """Local models of the operating points, and which of these did not fail.
 
-    The order of the structure replaces ``order="auto"`` of the local estimator; without
-    one, "auto", or several orders, become an order that a point takes: the one with the
-    most evidence of all points. Options as in `identify_point`.
+    The order of the structure replaces ``order="auto"`` of the local estimator, as the
+    `most` there can be; without one, "auto", or several orders, become an order that a
+    point takes: the one with the most evidence of all points. Options as in
+    `identify_point`.
     """
     given = local.get_params(deep=False).get("order")
     free = isinstance(given, str) and given == "auto"

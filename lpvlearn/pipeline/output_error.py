@@ -123,7 +123,7 @@ class OutputErrorLPV(ScheduledEstimator):
     local : estimator, default=None
         The time-invariant model to start from; None is
         ``SubspaceLTI(stability="enforce")``. ``order="auto"`` becomes the order of the
-        structure.
+        structure, as in `LocalLPVPipeline`.
     initial_state : {"estimate", "rest"}, default="estimate"
         Whether the initial state of every experiment is unknown.
     offset : {None, "constant"}, default=None
