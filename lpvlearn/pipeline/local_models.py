@@ -113,12 +113,7 @@ def identify_points(
     given = local.get_params(deep=False).get("order")
     free = isinstance(given, str) and given == "auto"
     chooses = free or isinstance(given, range | list | tuple | np.ndarray)
-    if free and isinstance(structure, GrayBoxStructure):
-        rest = structure.order
-        if _integrates(local):  # the model of the rates has not the integrators
-            rest -= integrators(structure)
-        local = clone(local).set_params(order=rest)
-        options["most"] = isinstance(local, SubspaceLTI)
+    local, options["most"] = of_structure(local, structure)
     # Where a record stood in the table does not matter: splits share their results.
     groups = [[_bare(e) for e in group] for group in points.experiments]
 
@@ -160,6 +155,21 @@ def identify_points(
     tell_skipped(found, points.kappa)
     kept = [k for k, done in enumerate(found) if done is not None]
     return [done.result for done in found if done is not None], points.keep(kept)
+
+
+def of_structure(local: Any, structure: Any) -> tuple[Any, bool]:
+    """The estimator with the order of a structure, if that is left to it ("auto").
+
+    And whether a model may have fewer states, as `identify_point` asks.
+    """
+    given = local.get_params(deep=False).get("order")
+    free = isinstance(given, str) and given == "auto"
+    if not (free and isinstance(structure, GrayBoxStructure)):
+        return local, False
+    order = structure.order
+    if _integrates(local):  # the model of the rates has not the integrators
+        order -= integrators(structure)
+    return clone(local).set_params(order=order), isinstance(local, SubspaceLTI)
 
 
 def _of_own_orders(
@@ -485,7 +495,7 @@ def _fit_at_most(
     """
     with retold() as told:
         fitted = _fit_local(local, experiments, sampling_time)
-        n_alternating = _n_alternating(fitted.lti_)
+        n_alternating = len(_alternating(fitted.lti_))
         if not n_alternating:
             return fitted
         highest = local.get_params()["order"]
@@ -493,16 +503,16 @@ def _fit_at_most(
         with collected() as other, suppress(ValueError):
             again = clone(local).set_params(order=fewer)
             again = _fit_local(again, experiments, sampling_time)
-            if again.order_ < fitted.order_ and not _n_alternating(again.lti_):
+            if again.order_ < fitted.order_ and not len(_alternating(again.lti_)):
                 told[:] = other
                 return again
         return fitted
 
 
-def _n_alternating(model: StateSpace) -> int:
+def _alternating(model: StateSpace) -> Array:
     """Poles on the negative real axis, of a model in discrete time."""
     poles = model.poles()
-    return int(np.count_nonzero((poles.real < 0.0) & (poles.imag == 0.0)))
+    return np.asarray(poles.real[(poles.real < 0.0) & (poles.imag == 0.0)])
 
 
 def _fit_table(
@@ -604,8 +614,7 @@ def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpa
             "leave the point out by on_error='skip'."
         )
     if lti.order > model.order:
-        poles = model.poles()
-        poles = poles[(poles.real < 0) & (poles.imag == 0)].real
+        poles = _alternating(model)
         warn(
             f"the identified model of order {model.order} has "
             f"{lti.order - model.order} pole(s) on the negative real axis "

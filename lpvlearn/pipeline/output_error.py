@@ -62,7 +62,12 @@ from ..validation import (
 from .bands import output_errors
 from .black_boxes import balanced_entries
 from .error_warnings import tell_of_errors
-from .local_models import common_delay, identify_point, identify_points
+from .local_models import (
+    common_delay,
+    identify_point,
+    identify_points,
+    of_structure,
+)
 from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
@@ -510,10 +515,7 @@ class OutputErrorLPV(ScheduledEstimator):
     ) -> LPVStateSpace:
         """One time-invariant model of some experiments, in the form of an LPV model."""
         structure, names = self.start, experiments[0].scheduling_names
-        local, most = self._local(), False
-        if structure is not None and local.get_params().get("order") == "auto":
-            local = clone(local).set_params(order=structure.order)
-            most = isinstance(local, SubspaceLTI)
+        local, most = of_structure(self._local(), structure)
         lti = identify_point(
             local,
             identified,
