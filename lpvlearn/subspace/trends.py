@@ -98,11 +98,15 @@ def _may_drift_off(
     # Errors that are rounding go with the inputs, slowly.
     if rounded_outputs(tested.model, tested.records).repeated.any():
         return False
-    most = criterion_in_units(tested) + CERTAIN
-    return is_worth_a_choice(
-        lambda near: criterion_in_units(near.evidence) < most,
-        *(pairs, choices, telling, fitted, 2),
-    )
+    least, order = criterion_in_units(tested), len(tested.model.A)
+
+    def may_drift(near: LocalFit) -> bool:
+        # Drifts instead of a mode may need other states yet; beside all modes they are
+        # there, or are not.
+        doubt = CERTAIN if len(near.model.A) < order else 0.0
+        return criterion_in_units(near.evidence) < least + doubt
+
+    return is_worth_a_choice(may_drift, pairs, choices, telling, fitted, 2)
 
 
 def _with_drifts(
