@@ -15,6 +15,7 @@ from lpvlearn import (
     AutoLPV,
     GrayBoxRestructurer,
     GrayBoxStructure,
+    PolynomialLPV,
     StateSpace,
     SubspaceLTI,
     gap,
@@ -76,7 +77,8 @@ def interpolation():
 
 
 def chain():
-    spring_pipeline().fit(*spring_tables(n_samples=100, kappas=(0.0, 1.0)))
+    pipeline = spring_pipeline(interpolator=PolynomialLPV(1))
+    pipeline.fit(*spring_tables(n_samples=100, kappas=(0.0, 1.0)))
 
 
 @pytest.mark.parametrize(
@@ -123,5 +125,7 @@ def test_no_code_that_a_fit_runs_changes_the_filters(monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr(warnings, "catch_warnings", refuse)
-        spring_pipeline(restructurer=GrayBoxRestructurer(structure)).fit(X, y)
+        spring_pipeline(
+            restructurer=GrayBoxRestructurer(structure), interpolator=PolynomialLPV(1)
+        ).fit(X, y)
         jordan.to_continuous()

@@ -59,7 +59,7 @@ from ..validation import (
     verbosity,
 )
 from .html_report import html_report
-from .left_out import tell_unforeseen
+from .left_out import tell_of_two_points, tell_unforeseen
 from .local_models import common_delay, estimates_outputs, identify_points
 from .memory import checked_memory
 from .output_error import (
@@ -413,8 +413,9 @@ list, default=None
         UserWarning
             If the delays of the inputs (``local=SubspaceLTI(input_delay=...)``) differ
             between operating points: `lpv_` has their median, the models of the points
-            their own. If `lpv_` is unstable at values between the points. If there is a
-            `refiner`, and no experiment moves. The warnings of the steps name the
+            their own. If `lpv_` is unstable at values between the points. If there are
+            two of these, with different models. If there is a `refiner`, and no
+            experiment moves. The warnings of the steps name the
             point. They come when the fit ends, and stay in `warnings_`.
         """
         with retold() as told:
@@ -589,6 +590,8 @@ list, default=None
             longest = self.sampling_time_ * found.points.n_longest
             growth = growth_rates(self.lpv_, kappa, longest)
             form = getattr(self.interpolator_, "best_estimator_", None)
+            if form is not None:
+                tell_of_two_points(self.structured_models_, kappa, longest)
             if isinstance(form, SplineLPV):
                 tell_unforeseen(
                     self.lpv_,

@@ -119,6 +119,26 @@ def tell_unforeseen(
         )
 
 
+def tell_of_two_points(
+    models: Sequence[StateSpace], kappa: Array, longest: float
+) -> None:
+    """Tell that straight lines between two points, whose models differ, are a guess."""
+    if len(np.unique(kappa, axis=0)) != 2 or not models[0].is_continuous:
+        return
+    k = int((kappa != kappa[0]).any(axis=1).argmax())
+    rate = forgotten(models, longest)
+    ends = [forgetting(models[i], rate) for i in (0, k)]
+    change = min(largest_difference(*ends), largest_difference(*ends[::-1]))
+    if change > _MEDIAN:
+        warn(
+            "with two operating points nothing tells of what is between them: the "
+            "parameters run along straight lines, between models that differ by "
+            f"{100.0 * change:.0f} % of the largest gain. Measure a point in between; "
+            "where the lines are known to be straight, use "
+            "interpolator=PolynomialLPV(1)."
+        )
+
+
 def forgotten(models: Sequence[StateSpace], longest: float) -> float:
     """The rate, 1/s, at which states are forgotten where models are compared.
 

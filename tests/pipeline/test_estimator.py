@@ -418,8 +418,12 @@ def test_one_sweep_is_no_operating_point(spring):
 def test_two_points_carry_a_line_by_default(spring, memory):
     X, y, _, _ = spring
     two = X["kappa"].isin([0.0, 0.5])
-    pipeline = spring_pipeline(memory=memory).fit(X[two], y[two])
+    pipeline = spring_pipeline(memory=memory)
+    with pytest.warns(UserWarning, match="nothing tells of what is between"):
+        pipeline.fit(X[two], y[two])
     assert pipeline.interpolator_.form_ == "polynomial 1"
+    pipeline.set_params(interpolator=PolynomialLPV(1)).fit(X[two], y[two])
+    assert pipeline.warnings_ == []
 
 
 # -------------------------------------------------------------------- tables and arrays
@@ -714,7 +718,9 @@ def test_constants_that_differ_at_one_point_are_told():
     level = X["run"].astype("category").cat.codes.to_numpy() % 3 - 1.0
     for combine in ("pool", "average"):
         with pytest.warns(UserWarning, match="have different constants.*At all oper"):
-            fitted = spring_pipeline(combine=combine).fit(X, y + 0.2 * level[:, None])
+            fitted = spring_pipeline(
+                combine=combine, interpolator=PolynomialLPV(1)
+            ).fit(X, y + 0.2 * level[:, None])
         truth = spring_truth(KAPPA[:2])
         np.testing.assert_allclose(fitted.parameters_, truth, rtol=0.05)
         assert fitted.report_["local_BFT"].min() > 95.0

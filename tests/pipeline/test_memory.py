@@ -13,13 +13,15 @@ import pandas as pd
 import pytest
 from joblib import Memory
 
-from lpvlearn import GrayBoxRestructurer, GrayBoxStructure
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, PolynomialLPV
 from lpvlearn.pipeline.memory import fingerprint
 from lpvlearn.pipeline.runner import PointRunner
 
 from ..conftest import spring_pipeline, spring_structure, spring_tables
 
 CALLS = []
+
+line_pipeline = partial(spring_pipeline, interpolator=PolynomialLPV(1))
 
 
 def square(x, note=None):
@@ -97,19 +99,19 @@ def test_slow_writing_of_the_memory_is_not_told_to_the_user(tmp_path, monkeypatc
     monkeypatch.setattr(joblib.memory, "time", slow)  # every look takes a second
     X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
     for _ in range(2):  # a warning would be an error
-        spring_pipeline(memory=tmp_path).fit(X, y)
+        line_pipeline(memory=tmp_path).fit(X, y)
 
 
 def test_memory_is_a_folder_a_path_or_a_joblib_memory(tmp_path):
     X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0))
-    expected = spring_pipeline().fit(X, y)
+    expected = line_pipeline().fit(X, y)
     for memory in (
         str(tmp_path / "a"),
         tmp_path / "b",
         Memory(tmp_path / "c", verbose=0),
     ):
         for _ in range(2):
-            pipeline = spring_pipeline(memory=memory).fit(X, y)
+            pipeline = line_pipeline(memory=memory).fit(X, y)
             pd.testing.assert_frame_equal(pipeline.parameters_, expected.parameters_)
             pd.testing.assert_frame_equal(pipeline.report_, expected.report_)
 
@@ -119,12 +121,12 @@ def test_memory_teaches_what_it_cannot_be(tmp_path):
     with pytest.raises(
         ValueError, match="`memory` must be None, a folder, or a joblib"
     ):
-        spring_pipeline(memory=3).fit(X, y)
+        line_pipeline(memory=3).fit(X, y)
     file = tmp_path / "file"
     file.touch()
     for place in (file, file / "below"):
         with pytest.raises(NotADirectoryError, match="`memory` must be a folder. Got"):
-            spring_pipeline(memory=place).fit(X, y)
+            line_pipeline(memory=place).fit(X, y)
 
 
 def test_steps_that_cannot_be_pickled_are_not_kept_and_said(tmp_path):
@@ -133,7 +135,7 @@ def test_steps_that_cannot_be_pickled_are_not_kept_and_said(tmp_path):
     structure = GrayBoxStructure.from_function(
         lambda theta: truth.matrices(theta), [30.0, 1.2, 50.0]
     )
-    pipeline = spring_pipeline(restructurer=GrayBoxRestructurer(structure))
+    pipeline = line_pipeline(restructurer=GrayBoxRestructurer(structure))
     expected = pipeline.fit(X, y).parameters_
     with pytest.warns(UserWarning, match="keeps nothing .* `restructurer`") as told:
         pipeline.set_params(memory=tmp_path).fit(X, y)
@@ -264,7 +266,7 @@ def matrices(theta):
         importlib.invalidate_caches()
         function = importlib.import_module("users_plant").matrices
         structure = GrayBoxStructure.from_function(function, [30.0, 1.2, 50.0])
-        pipeline = spring_pipeline(
+        pipeline = line_pipeline(
             restructurer=GrayBoxRestructurer(structure), memory=tmp_path / "kept"
         )
         found.append(pipeline.fit(X, y).parameters_.to_numpy())

@@ -436,7 +436,9 @@ def test_without_a_covariance_the_hinf_optimum_is_kept():
 
 def test_max_time_is_shared_by_the_points_and_told():
     X, y = spring_tables(noise=0.02, n_samples=300, kappas=KAPPA[::3])
-    pipeline = spring_pipeline(max_time=1e-6, efficient=False)
+    pipeline = spring_pipeline(
+        max_time=1e-6, efficient=False, interpolator=PolynomialLPV(1)
+    )
     with pytest.warns(ConvergenceWarning, match="max_time") as told:
         pipeline.fit(X, y)
     assert len(told) >= 2
