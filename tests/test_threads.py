@@ -47,6 +47,7 @@ def blas_threads():
     return [pool.num_threads for pool in POOLS]
 
 
+@pytest.mark.slow
 def test_threads_agree_with_a_serial_fit_and_put_back_the_threads_of_blas():
     X, y = spring_tables(n_samples=100, kappas=(0.0, 1.0, 2.0))
     structure = GrayBoxStructure.from_function(matrices, [30.0, 1.2, 50.0])

@@ -662,6 +662,7 @@ def test_offsets_are_left_out_where_there_are_none(spring, about_zero):
     )
 
 
+@pytest.mark.slow
 def test_a_model_without_offsets_says_what_it_misses(spring):
     X, y, _, _ = spring
     X, y = X[X["kappa"] < 1], y[X["kappa"] < 1]

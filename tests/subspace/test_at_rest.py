@@ -20,6 +20,7 @@ def step_test(seed, first=0.0, level=20.0, n=240, at=25, noise=0.01, decay=0.0):
     return u, y + noise * 30.0 * gain * rng.standard_normal(y.shape), gain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["auto", 2])
 @pytest.mark.parametrize("first", [0.0, 30.0])
 def test_step_tests_tell_the_static_gain(first, order):
@@ -113,12 +114,14 @@ def gains(heaters=HEATERS, **options):
     return np.array(found) / [gain for *_, gain in heaters]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"order": 2}, {"order": 3}])
 def test_states_of_a_dead_time_take_nothing_of_the_gain(options):
     """Free ones stand for a level of any size, with and without a constant."""
     np.testing.assert_allclose(gains(**options), 1.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_rest_that_is_said_is_at_the_first_inputs():
     """Where that is likelier than at rest at zero with a step of 36 before."""
     options = {"initial_state": "rest", "feedthrough": False}

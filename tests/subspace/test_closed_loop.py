@@ -59,6 +59,7 @@ def test_it_is_exact_without_noise(system, order):
     assert model.singular_values_.shape == (2 * model.horizon_,)
 
 
+@pytest.mark.slow
 def test_the_error_falls_under_feedback_where_that_of_others_stays():
     errors = {"po-moesp": [], "pbsid": []}
     for n_samples in (1000, 9000):
@@ -200,6 +201,7 @@ def test_constants_change_nothing_but_themselves():
     assert tests[0][:2].min() > 1e-3  # whiteness and past inputs, not the future
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [2, "auto"])
 def test_constants_are_taken_where_they_are(order):
     assert loops_fit(*two_loops(np.zeros((2, 2))), order).offset_ is None
@@ -298,6 +300,7 @@ def test_streams_are_refused():
 # -- auto ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_auto_takes_it_where_there_is_feedback():
     u, y = closed_loop(np.random.default_rng(3), 2000)
     with pytest.warns(UserWarning, match="closed loop.*'pbsid' was taken.*D = 0"):

@@ -126,6 +126,7 @@ def test_complete_records_are_fitted_as_ever():
     assert np.array_equal(plain.lti_.A, other.lti_.A)
 
 
+@pytest.mark.slow
 def test_without_noise_the_system_is_found():
     true, u, y = record(1, 600, noise=0.0)
     model = SubspaceLTI(4, horizon=8, missing="estimate").fit(u, without(y, 0.2))

@@ -138,6 +138,7 @@ def _ladder(n_stages):
     return StateSpace(A, B, C).to_discrete(0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_resonances_that_noise_could_be_do_not_end_the_search(seed):
     # A long autoregression imitates those that an order lacks, so that the criterion

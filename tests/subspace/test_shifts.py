@@ -88,6 +88,7 @@ def test_what_is_no_shift_is_none(rng):
     assert find_shifts([Record.of(u, y)], None) == [[]]
 
 
+@pytest.mark.slow
 def test_a_record_is_cut_as_by_hand():
     """The model is that of a table with experiments that end at the shifts."""
     rng = np.random.default_rng(3)
