@@ -34,7 +34,11 @@ from ..validation import (
     squarable,
 )
 from .alignment import align_outputs
-from .forgotten_roles import warn_of_disorder, warn_of_forgotten_roles
+from .forgotten_roles import (
+    refuse_outputs_among_inputs,
+    warn_of_disorder,
+    warn_of_forgotten_roles,
+)
 from .text_numbers import reading_of
 from .timestamps import (
     TIME_TOL,
@@ -416,6 +420,8 @@ def read_experiments(
         warn_of_disorder(X, groups)
     if reset and roles["inputs"] is None:
         warn_of_forgotten_roles(U, names, groups, roles)
+    if reset and table.named and Y is not None:
+        refuse_outputs_among_inputs(U, names, Y)
     return [
         Experiment(
             label=label,

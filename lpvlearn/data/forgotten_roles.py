@@ -80,6 +80,24 @@ def warn_of_forgotten_roles(
             )
 
 
+def refuse_outputs_among_inputs(
+    inputs: Array, names: Sequence[Hashable], outputs: Array
+) -> None:
+    """Refuse inputs of a table (n_samples, n_inputs) that are outputs, to the bit.
+
+    A single one may be all there is, of a gain of 1.
+    """
+    if len(names) < 2:
+        return
+    for column, name in zip(inputs.T, names, strict=True):
+        same = (outputs == column[:, None]).all(axis=0)
+        if same.any() and (column != column[0]).any():
+            raise ValueError(
+                f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
+                "drop it from X, or list the inputs in `inputs`."
+            )
+
+
 def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:
     """Warn of rows not in the order of their numbers or dates, the index, or torn.
 

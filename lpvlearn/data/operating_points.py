@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from numbers import Integral
 
 import numpy as np
 import pandas as pd
@@ -202,8 +201,9 @@ def group_operating_points(
 
     Experiments with an operating-point label are grouped by it; the others by the mean
     of their scheduling variable: means of one point are within `tol` of a neighbour, by
-    default the larger of 1 % of their range and the median spread of the variable
-    within an experiment. A ValueError where they form a longer chain.
+    default the larger of 1 % of their range and the spread of the variable within one
+    of the two, or the median spread where that is less. A ValueError where they form a
+    longer chain.
 
     The values (n_points, n_scheduling) are the means over a point's experiments, in
     lexicographic order; without scheduling columns `n_scheduling` is 0, and points are
@@ -223,7 +223,7 @@ def group_operating_points(
     elif means is None:
         group = np.zeros(len(experiments), dtype=np.intp)
     else:
-        group = _cluster(means, _tolerance(signals, means, tol))
+        group = _cluster(means, *_tolerance(signals, means, tol))
     n_points = int(group.max()) + 1
     if means is None:
         return group, np.empty((n_points, 0))
@@ -232,24 +232,30 @@ def group_operating_points(
     return np.argsort(order)[group], kappa[order]
 
 
-def _tolerance(signals: Sequence[Array], means: Array, tol: ArrayLike | None) -> Array:
+def _tolerance(
+    signals: Sequence[Array], means: Array, tol: ArrayLike | None
+) -> tuple[Array, Array]:
+    """Of every pair of experiments (n, n, n_scheduling), and the largest."""
     if tol is None:
-        spreads = [np.ptp(signal, axis=0) for signal in signals]
-        return np.maximum(_CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0))
+        spreads = np.array([np.ptp(signal, axis=0) for signal in signals])
+        close, usual = _CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0)
+        wider = np.maximum(spreads[:, None, :], spreads[None, :, :])
+        return np.maximum(close, np.minimum(wider, usual)), np.maximum(close, usual)
     given = as_numbers("scheduling_tol", tol)
     if given.shape not in ((1,), (means.shape[1],)) or not (given >= 0).all():
         raise ValueError(
             "`scheduling_tol` must be a non-negative number, or one per scheduling "
             f"variable ({means.shape[1]}). Got {shown(tol)}."
         )
-    return np.broadcast_to(given, means.shape[1:])
+    largest = np.broadcast_to(given, means.shape[1:])
+    return largest, largest
 
 
-def _cluster(means: Array, tol: Array) -> NDArray[np.intp]:
-    """Group means that are within `tol`, whatever their order."""
+def _cluster(means: Array, near: Array, tol: Array) -> NDArray[np.intp]:
+    """Group means that are as `near`, `tol` at most, whatever their order."""
     distance = np.abs(means[:, None, :] - means[None, :, :])
-    near = (distance <= tol).all(axis=2)
-    _, group = connected_components(csr_array(near), directed=False)
+    joined = csr_array((distance <= near).all(axis=2))
+    _, group = connected_components(joined, directed=False)
     for k in range(group.max() + 1):
         extent = np.ptp(means[group == k], axis=0)
         if (extent > _CHAIN * tol).any():
@@ -265,7 +271,7 @@ def _cluster(means: Array, tol: Array) -> NDArray[np.intp]:
 
 
 def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:
-    """Refuse outputs (of these names) that are constant, or stand among the inputs."""
+    """Refuse outputs (of these names) that are constant."""
     outputs = np.vstack([e.measured for e in experiments])
     lowest, highest = np.fmin.reduce(outputs), np.fmax.reduce(outputs)  # without NaN
     constant = lowest == highest
@@ -276,15 +282,6 @@ def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) ->
             "no dynamics can be identified from it. Leave it out of `y`, or check the "
             "sensor and its column."
         )
-    own = experiments[0].input_names
-    for name in set(own) & set(names):
-        k, j = own.index(name), list(names).index(name)
-        inputs = np.concatenate([e.inputs[:, k] for e in experiments])
-        if not isinstance(name, Integral) and np.array_equal(inputs, outputs[:, j]):
-            raise ValueError(
-                f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
-                "drop it from X, or list the inputs in `inputs`."
-            )
 
 
 def neighbours(kappa: Array) -> NDArray[np.intp]:

@@ -67,7 +67,7 @@ def aligned_black_boxes(
         for k, (one, model) in enumerate(zip(local, models, strict=True))
     ]
     theta, mended = _foretold(models, own, fewer, kappa)
-    tell_of_forced(local, kappa, rate, mended)
+    tell_of_forced(local, kappa, longest, mended)
     direct = _has_feedthrough(models)
     first = next(model for k, model in enumerate(models) if k not in mended)
     structure = _full(first, direct)
@@ -254,19 +254,22 @@ def _suspects(whole: _Foreseeable | None, kappa: Array) -> list[Sequence[int]]:
 def tell_of_forced(
     local: Sequence[LocalModel],
     kappa: Array,
-    rate: float,
+    longest: float,
     mended: Sequence[int] = (),
 ) -> None:
     """Warn of models of the common order that are not those of their own records.
 
-    Of states `forgotten` at a rate. But for points that are `mended`.
+    What hardly decays in the `longest` record (seconds) does not count, as nothing is
+    known of it, nor do models that have no equivalent of their order in continuous
+    time. But for points that are `mended`.
     """
     forced = [
         f"{place_of(k, kappa)}: {100.0 * change:.0f} %"
         for k, model in enumerate(local)
         if model.own is not None
+        and model.own.lti.order == model.own.order  # or it alternates with the noise
         and k not in mended
-        and (change := _change(model, model.own, rate)) > _FORCED
+        and (change := _change(model, model.own, longest)) > _FORCED
     ]
     if forced:
         warn(
@@ -279,9 +282,10 @@ def tell_of_forced(
         )
 
 
-def _change(model: LocalModel, own: LocalModel, rate: float) -> float:
-    both = (forgetting(one.lti, rate) for one in (model, own))
-    return largest_difference(*both)
+def _change(model: LocalModel, own: LocalModel, longest: float) -> float:
+    both = model.lti, own.lti
+    rate = forgotten(both, longest)
+    return largest_difference(*(forgetting(one, rate) for one in both))
 
 
 def _of_one_order(models: Sequence[StateSpace]) -> Sequence[StateSpace]:

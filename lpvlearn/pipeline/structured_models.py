@@ -36,7 +36,6 @@ from .black_boxes import (
     tell_of_forced,
 )
 from .branches import Doubt, tied_branches
-from .left_out import forgotten
 from .local_models import LocalModel, motions
 from .runner import Done, PointRunner, place_of, tell_skipped
 
@@ -86,8 +85,7 @@ def restructure_points(
             sizes = channel_sizes(points.experiments)
             structure, theta = aligned_black_boxes(local, points.kappa, *sizes, longest)
         else:
-            rate = forgotten([model.lti for model in local], longest)
-            tell_of_forced(local, points.kappa, rate)
+            tell_of_forced(local, points.kappa, longest)
             models = [balanced(model) for model in local]
             structure, theta = balanced_entries(models, local[0].integrating)
         models = [

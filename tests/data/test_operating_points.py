@@ -33,6 +33,15 @@ def test_realizations_of_a_point_are_grouped_whatever_their_order():
     np.testing.assert_allclose(kappa.ravel(), values.reshape(3, 10).mean(axis=1))
 
 
+def test_points_are_as_far_apart_as_their_own_records_move():
+    """Of a level that moves by a part of itself: the lowest points are the nearest."""
+    levels = np.array([1.0, 2.5, 4.0, 6.0, 8.5, 11.0, 13.5, 16.0])
+    runs = [_runs([level], spread=0.15 * level)[0] for level in [*levels, 16.2]]
+    index, kappa = group_operating_points(runs)
+    np.testing.assert_array_equal(index, [*range(8), 7])
+    np.testing.assert_allclose(kappa.ravel(), [*levels[:-1], 16.1])
+
+
 def test_points_of_two_scheduling_variables_need_both_to_agree():
     values = [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, 1.0]]
     index, kappa = group_operating_points(_runs(values))

@@ -183,12 +183,26 @@ def test_points_of_which_more_states_make_another_model_are_named():
     with pytest.warns(
         UserWarning, match=r"order 3.*\(operating point 2 \(sch.*: 5\d\d %"
     ):
-        tell_of_forced(points, kappa, 0.0)
+        tell_of_forced(points, kappa, np.inf)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        tell_of_forced(points[:2], kappa[:2], 0.0)
-        tell_of_forced([replace(points[2], own=None)], kappa[2:], 0.0)
-        tell_of_forced(points, kappa, 0.0, mended=[2])
+        tell_of_forced(points[:2], kappa[:2], np.inf)
+        tell_of_forced([replace(points[2], own=None)], kappa[2:], np.inf)
+        tell_of_forced(points, kappa, np.inf, mended=[2])
+
+
+def test_states_of_a_record_that_hardly_decay_within_it_are_not_told():
+    lag = StateSpace([[-0.05]], [[0.5]], [[1.0]])
+    A = modes(-1e-6 + 0.011j, -0.05)
+    more = StateSpace(A, [[0.0], [1e-2], [0.5]], [[1e-2, 0.0, 1.0]])
+    point = local(lag, local(more))
+    with pytest.warns(UserWarning, match="does not tell so many states"):
+        tell_of_forced([point], np.zeros((1, 1)), np.inf)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tell_of_forced([point], np.zeros((1, 1)), 900.0)
+        grown = replace(point, own=replace(local(more), order=2))
+        tell_of_forced([grown], np.zeros((1, 1)), np.inf)
 
 
 @pytest.mark.parametrize("vanishes", [0, 1, 2])
