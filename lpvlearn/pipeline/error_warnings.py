@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
-from ..lpv.refinement import Own, Record, refine, squares
+from ..lpv.refinement import Own, Prior, Record, refine, squares
 from ..subspace.residuals import explained_by_inputs
 
 Array = NDArray[np.float64]
@@ -26,24 +26,40 @@ def tell_of_errors(
     errors: Sequence[Array],
     own: Own,
     start: LPVStateSpace,
+    prior: Prior | None,
     max_iter: int,
 ) -> None:
     """Tell of large errors that constants would take, or that follow the inputs.
 
-    By some steps from the `start`, `max_iter` at most, with constants; and by
-    regression on the inputs alone, times the scheduling variables, as a gain that
-    varies, and on these, as what an offset does to such a gain, over all records and
-    the one of the largest errors.
+    First of outputs in other units, or of the other sign, than those of the local
+    experiments, of which the `prior` is, by what the `start` simulates. By some steps
+    from there, `max_iter` at most, with constants. And by regression on the
+    inputs alone, times the scheduling variables, as a gain that varies, and on these,
+    as what an offset does to such a gain, over all records and the one of the largest
+    errors.
     """
     each = np.array([_shares(*pair) for pair in zip(records, errors, strict=True)])
     worst = int(each.max(axis=1).argmax())
     if not each[worst].max() > _OF_OUTPUT:
         return
+    names = model.output_names or range(1, model.n_outputs + 1)
+    if prior is not None:
+        gain, left = _gains(start, records)
+        i = int(np.argmin(np.where(np.abs(gain - 1.0) > _OF_OUTPUT, left, np.inf)))
+        if abs(gain[i] - 1.0) > _OF_OUTPUT and left[i] < _CONSTANT:
+            warn(
+                f"output {names[i]!r} is {gain[i]:.3g} times what the model of the "
+                "local experiments simulates, but for "
+                f"{100.0 * np.sqrt(left[i]):.2g} % of the errors: the sensor has "
+                "another sign or unit in the experiments that move. Give all of them "
+                "the same."
+            )
+            return
     if not own.constant:
         with suppress(ValueError):  # it diverges
             other = own._replace(constant=True)
             steps = min(max_iter, _STEPS)
-            found = refine(start, records, other, max_iter=steps).model
+            found = refine(start, records, other, prior, max_iter=steps).model
             weight = np.ones(model.n_outputs)
             squared = sum(squares(found, record, other, weight) for record in records)
             share = squared / np.sum(np.vstack(errors) ** 2)
@@ -68,7 +84,6 @@ def tell_of_errors(
         part = np.maximum(part, np.sqrt(explained) * size)
     i = int(np.argmax(part))
     if part[i] > _OF_OUTPUT:
-        names = model.output_names or range(1, model.n_outputs + 1)
         warn(
             f"the errors of output {names[i]!r} follow from the inputs and scheduling "
             f"variables, at {100.0 * part[i]:.0f} % of its size and beyond chance: the "
@@ -77,6 +92,19 @@ def tell_of_errors(
             "offset (subtract it), or the search ended in a poor minimum (`report_`): "
             "give a `start` that is nearer."
         )
+
+
+def _gains(model: LPVStateSpace, records: Sequence[Record]) -> tuple[Array, Array]:
+    """Of outputs by what is simulated from rest, and the share of errors left."""
+    found = [model.simulate(r.u, r.kappa, r.dt) for r in records]
+    y, y_model = (
+        np.vstack([one - one.mean(axis=0) for one in some])
+        for some in ([record.y for record in records], found)
+    )
+    size, squared = (np.sum(x**2, axis=0) for x in (y_model, y - y_model))
+    gain = np.sum(y_model * y, axis=0) / np.where(size > 0.0, size, np.inf)
+    left = np.sum((y - gain * y_model) ** 2, axis=0)
+    return gain, left / np.where(squared > 0.0, squared, np.inf)
 
 
 def _shares(record: Record, errors: Array) -> Array:

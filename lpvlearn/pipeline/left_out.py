@@ -25,8 +25,12 @@ _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 
 # Error of what the others make of a model, in its largest gain: that of a resonance
 # that is elsewhere, as may be at a point of many; what is worse than that; and the
-# median of several from which models between the points are seldom good to a tenth.
-_ELSEWHERE, _WORSE, _MEDIAN, _MANY = 1.0, 1.5, 0.3, 4
+# median of one, two or more from which models between the points are seldom good to a
+# tenth: of few points, each that is left out leaves the largest gap.
+_ELSEWHERE, _WORSE, _MEDIANS = 1.0, 1.5, (0.8, 0.45, 0.3)
+
+# Difference of two models, in the largest gain, between which a line is a guess.
+_APART = 0.3
 
 _HARDLY = 3.0  # time constants in the longest record of what hardly decays
 
@@ -103,7 +107,8 @@ def tell_unforeseen(
     worst = sorted(((error, k) for k, error in errors.items()), reverse=True)
     high = [(error, k) for error, k in worst if error > _ELSEWHERE]
     often = high and (high[0][0] > _WORSE or 2 * len(high) >= len(errors))
-    most = len(errors) >= _MANY and np.median([*errors.values()]) > _MEDIAN
+    limit = _MEDIANS[min(len(errors), len(_MEDIANS)) - 1]
+    most = errors and np.median([*errors.values()]) > limit
     if often or most:
         named = [
             f"{k} (scheduling {', '.join(f'{v:.4g}' for v in kappa[k])}: "
@@ -129,7 +134,7 @@ def tell_of_two_points(
     rate = forgotten(models, longest)
     ends = [forgetting(models[i], rate) for i in (0, k)]
     change = min(largest_difference(*ends), largest_difference(*ends[::-1]))
-    if change > _MEDIAN:
+    if change > _APART:
         warn(
             "with two operating points nothing tells of what is between them: the "
             "parameters run along straight lines, between models that differ by "

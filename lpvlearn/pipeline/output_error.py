@@ -415,7 +415,7 @@ class OutputErrorLPV(ScheduledEstimator):
             for e, record in zip(experiments, records, strict=True)
         ]
         self.report_ = _report(labels, records, before, after)
-        tell_of_errors(self.lpv_, records, after, own, start, self.max_iter)
+        tell_of_errors(self.lpv_, records, after, own, start, prior, self.max_iter)
         self.output_errors_ = output_errors(
             start.output_names or range(1, start.n_outputs + 1),
             after,

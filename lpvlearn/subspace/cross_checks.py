@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ..data.preparation import DETRENDS, Pairs, Rounded, far_out
 from ..exceptions import RankWarning
 from ..systems.simulation import delayed, lti_response
+from ..validation import listed
 from .delay import first_samples, longest_delays
 from .held_out import DOUBT, HeldOut
 from .local_fit import LocalFit
@@ -17,12 +21,19 @@ from .simulation_fit import simulation_errors, with_initial_states
 from .telling import Telling
 from .trends import with_trends
 
+Array = NDArray[np.float64]
+
+_NAMED = 5  # experiments that a message lists
+
 _ROUGH = 0.1  # share of the outputs' size, left by a model, that is looked into
 
 # Experiments contradict one another where models of each leave less than this share of
 # the squared errors of the one for all. That is looked into for the longest ones, of so
 # many samples a parameter.
 _CONTRADICTED, _MOST_ALONE, _VALUES_EACH = 0.25, 6, 10
+
+# Share of an experiment's squared outputs, left by a model, that it has no part in.
+_FOREIGN = 0.5
 
 # Share of the error that is left without samples of inputs that are not answered.
 _ANSWERED = 0.6
@@ -58,6 +69,8 @@ def tell_of_contradiction(
         if lengths[k] >= least and np.ptp(pairs[k][0], axis=0).all()  # inputs move
     ]
     found = simulation_errors(with_initial_states(model, records, free), records)
+    if _tell_of_foreign(pairs, choices, telling, whole, found):
+        return
     energies = []
     for k in some:
         try:
@@ -84,6 +97,46 @@ def tell_of_contradiction(
             "sensor), or it is not linear. Check them, give what differs as a "
             "scheduling variable, or leave out those that do not belong here.",
         )
+
+
+def _tell_of_foreign(
+    pairs: Pairs,
+    choices: Choices,
+    telling: Telling,
+    whole: LocalFit,
+    found: Sequence[Array],
+) -> bool:
+    """Tell of experiments without which a model of the others explains these."""
+    records = whole.scaled.records
+    left = np.array([np.sum(e**2) for e in found])
+    size = np.array([np.sum(record.y**2) for record in records])
+    foreign = left > _FOREIGN * size
+    rest = np.flatnonzero(~foreign)
+    if not (foreign.any() and len(rest)):
+        return False
+    same, n_trend = whole.chosen(choices), whole.evidence.free.n_trend
+    try:
+        other = choose_and_identify(
+            [pairs[k] for k in rest], same, telling.aside("collinear"), n_trend
+        )
+    except TooFewSamples:
+        return False
+    scale = other.evidence.output_scale / whole.evidence.output_scale
+    errors = simulation_errors(other.evidence.model, other.scaled.records)
+    alone = sum(np.sum((e * scale) ** 2) for e in errors)
+    if not alone < _CONTRADICTED * left[rest].sum():
+        return False
+    names = [str(k) for k in np.flatnonzero(foreign)]
+    shares = 100.0 * np.sqrt([alone, left[rest].sum()] / size[rest].sum())
+    telling.once(
+        "contradiction",
+        f"Experiment(s) {listed(names, _NAMED)}, counted "
+        "from 0, do not belong to the others: of the outputs of these a model leaves "
+        f"{shares[0]:.2g} % without them, {shares[1]:.2g} % with them. Check them for "
+        "channels that were exchanged, unplugged or of another sign, or leave them "
+        "out.",
+    )
+    return True
 
 
 def tell_of_input_spikes(

@@ -36,6 +36,13 @@ def test_a_point_that_is_unlike_the_others_is_told(tables):
     assert "do not foresee point(s)" in words and "2 (scheduling 1:" in words
 
 
+def test_a_wrong_value_of_few_points_is_told():
+    X, y = spring_tables(noise=1e-2, n_samples=300, kappas=[0.0, 0.5, 1.0, 1.5, 2.0])
+    assert said(spring_pipeline(), X, y) == ""
+    X = X.assign(kappa=X["kappa"].replace(1.0, 1.75))
+    assert "do not foresee point(s)" in said(spring_pipeline(), X, y)
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_scheduling_variables_that_move_together_are_told(tables, together):
     X, y = tables

@@ -371,6 +371,17 @@ def test_constants_that_are_missing_are_told():
     assert found.report_["BFT"].min() > 90.0
 
 
+@pytest.mark.parametrize("gain", [-1.0, 1000.0])
+def test_a_sensor_of_another_sign_or_unit_is_told(both, memory, gain):
+    """Constants do not stand for it: local experiments hold the model."""
+    X, y = both[1]
+    moves = X.groupby("run")["kappa"].transform(np.ptp) > 0.0
+    other = y.mul(np.where(moves, gain, 1.0), axis=0)
+    with pytest.warns(UserWarning, match="'position' is .* times what") as w:
+        spring_pipeline(memory=memory, refiner=OutputErrorLPV()).fit(X, other)
+    assert len(w) == 1
+
+
 @pytest.mark.slow
 def test_a_delay_that_is_missing_is_told():
     X, y = sweeps()

@@ -527,6 +527,23 @@ def test_experiments_that_contradict_one_another_are_told(gains):
     assert n_told >= 8 if gains[0] != gains[1] else n_told == 0
 
 
+def test_experiments_of_another_system_are_named():
+    """Of two the outputs were exchanged; where none were, as noisy, all is silent."""
+    system = StateSpace([[0.6, 0.5], [-0.5, 0.6]], [[1], [0]], [[1, 0]], None, 1.0)
+    rng = np.random.default_rng(5)
+    u = rng.standard_normal((5, 300, 1))
+    y = np.array([system.simulate(one) for one in u])
+    y += 0.1 * y.std() * rng.standard_normal(y.shape)
+    exchanged = y[[0, 3, 2, 1, 4]]
+    with pytest.warns(
+        UserWarning, match=r"Experiment\(s\) 1, 3, counted from 0, do not"
+    ):
+        fit_pairs(list(zip(u, exchanged, strict=True)), Choices(order=2), Telling())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit_pairs(list(zip(u, y, strict=True)), Choices(order=2), Telling())
+
+
 def test_experiments_whose_inputs_rest_contradict_none(rng):
     """Alone they tell nothing of a model."""
     u = np.repeat(rng.standard_normal((3, 60)), 5, axis=1)
