@@ -34,8 +34,8 @@ from ..data.preparation import (
     unbroken_runs,
 )
 from ..systems.simulation import delayed
-from .identification import Settings, identify
-from .noise import autoregression
+from .identification import Settings, fit_once
+from .noise import Whitening, autoregression
 from .selection import select
 from .signals import Record
 from .simulation_fit import simulation_errors
@@ -67,6 +67,10 @@ _WORSE, _BY_CHANCE, _CLEARLY = 6.0, 0.05, 1.05
 _STATES = range(-2, 3)  # about the order chosen at the longest delay, that are tried
 
 _GIVEN_UP = 2  # delays in turn without any good model: shorter ones have none either
+
+# Long delays that smooth inputs leave possible are looked at in so many steps first,
+# then one by one about the best of these.
+_COARSE = 10
 
 _SHORTEST_HORIZON = 8  # of the models compared, which the refinement makes equal
 
@@ -319,7 +323,10 @@ class _Trial:
         horizon = min(horizon, self.settings.max_horizon(cuts))
         if self.settings.max_order(horizon) < order:
             return [np.full_like(r.y.T, np.inf) for r in records]
-        model = identify(heads, order, horizon, settings).model
+        # Along the valleys of smooth inputs, steps without an end tell no delays apart.
+        none = Whitening.none(len(heads[0].y))
+        found = fit_once(heads, order, horizon, settings, none, patient=False)
+        model = found.candidate.model
         if part == 1.0:
             cuts = [0] * len(cuts)
         errors = simulation_errors(model, records)
@@ -379,19 +386,31 @@ class _Trial:
         def price(size: _Size) -> float:  # Schwarz's criterion
             return float(np.log(self.n_values)) * n_parameters(size)
 
-        least, best, tried_in_vain = np.inf, (families[0][0], 0), 0
-        for d in range(longest[j], -1, -1):
-            tried_in_vain += 1
-            for sizes in families:
-                for size in sizes:
-                    misfit = self.n_values * np.log(self.loss(at(d), size, j))
-                    if misfit + price(size) < least:
-                        least, best = misfit + price(size), (size, d)
-                    if misfit + price(sizes[-1]) > least:
-                        break  # smaller models fit no better
-                    tried_in_vain = 0
-            if tried_in_vain == _GIVEN_UP:
-                break
+        least, best = np.inf, (families[0][0], 0)
+
+        def look_at(delays: range) -> None:
+            nonlocal least, best
+            tried_in_vain = 0
+            for d in delays:
+                tried_in_vain += 1
+                for sizes in families:
+                    for size in sizes:
+                        misfit = self.n_values * np.log(self.loss(at(d), size, j))
+                        if misfit + price(size) < least:
+                            least, best = misfit + price(size), (size, d)
+                        if misfit + price(sizes[-1]) > least:
+                            break  # smaller models fit no better
+                        tried_in_vain = 0
+                if tried_in_vain == _GIVEN_UP:
+                    break
+
+        most = int(longest[j])
+        step = max(1, most // _COARSE)
+        look_at(range(most, -1, -step))
+        if step > 1:
+            near = best[1]
+            look_at(range(min(near + step - 1, most), near, -1))
+            look_at(range(near - 1, max(near - step, -1), -1))
         size, d = best
         if d == 0:
             return 0

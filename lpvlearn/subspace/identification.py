@@ -289,8 +289,13 @@ def fit_once(
     settings: Settings,
     whitening: Whitening,
     start: Realization | None = None,
+    *,
+    patient: bool = True,
 ) -> Fitted:
-    """Model of whitened records, from their subspace or another model of them."""
+    """Model of whitened records, from their subspace or another model of them.
+
+    `patient` is as in `refine_simulation`.
+    """
     white = whitening.records(records, settings.free)
     width = {horizon: order + settings.n_noise_states}
     subspace = subspaces_of(white, width, settings.method)[horizon]
@@ -300,7 +305,7 @@ def fit_once(
             other = restarted(start, whitening, white, settings.free)
             if other.loss < model.loss and not settings.enforce_stability:
                 model = other
-        model = refine_simulation(model, white, settings.free, patient=True)
+        model = refine_simulation(model, white, settings.free, patient=patient)
     model = of_records(model, records, whitening, settings.free)
     candidate = Candidate(model, horizon, whitening, settings.refine)
     return Fitted(candidate, subspace.singular_values)
@@ -319,8 +324,7 @@ def refit(
 ) -> Fitted:
     """As `fit_once`, from a model that is near: the subspace is not asked.
 
-    `signals` are those of the `start` and other records, `patient` is as in
-    `refine_simulation`.
+    `signals` are those of the `start` and other records.
     """
     white, free = whitening.records(records, settings.free), settings.free
     one_each = len(white) == len(start.initial_states) == 1 and not free.n_trend
