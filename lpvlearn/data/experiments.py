@@ -421,7 +421,7 @@ def read_experiments(
     if reset and roles["inputs"] is None:
         warn_of_forgotten_roles(U, names, groups, roles)
     if reset and table.named and Y is not None:
-        refuse_outputs_among_inputs(U, names, Y)
+        refuse_outputs_among_inputs(U, names, Y, y_names)
     return [
         Experiment(
             label=label,

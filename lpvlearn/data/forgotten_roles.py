@@ -81,7 +81,10 @@ def warn_of_forgotten_roles(
 
 
 def refuse_outputs_among_inputs(
-    inputs: Array, names: Sequence[Hashable], outputs: Array
+    inputs: Array,
+    names: Sequence[Hashable],
+    outputs: Array,
+    output_names: Sequence[Hashable],
 ) -> None:
     """Refuse inputs of a table (n_samples, n_inputs) that are outputs, to the bit.
 
@@ -89,9 +92,9 @@ def refuse_outputs_among_inputs(
     """
     if len(names) < 2:
         return
-    for column, name in zip(inputs.T, names, strict=True):
-        same = (outputs == column[:, None]).all(axis=0)
-        if same.any() and (column != column[0]).any():
+    for name in set(names) & set(output_names):
+        column = inputs[:, list(names).index(name)]
+        if (column == outputs[:, list(output_names).index(name)]).all():
             raise ValueError(
                 f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
                 "drop it from X, or list the inputs in `inputs`."

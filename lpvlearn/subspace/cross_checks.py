@@ -133,8 +133,8 @@ def _tell_of_foreign(
         f"Experiment(s) {listed(names, _NAMED)}, counted "
         "from 0, do not belong to the others: of the outputs of these a model leaves "
         f"{shares[0]:.2g} % without them, {shares[1]:.2g} % with them. Check them for "
-        "channels that were exchanged, unplugged or of another sign, or leave them "
-        "out.",
+        "channels that were exchanged, unplugged or of another sign, or for another "
+        "setting of the system, and leave them out.",
     )
     return True
 

@@ -79,6 +79,7 @@ def test_tables_of_one_axis_are_told_by_splitters_and_scorers(of):
             scorer(w.subspace, x, w.y)
 
 
+@pytest.mark.filterwarnings("ignore:Experiment.s. 2")  # at another operating point
 def test_a_stream_asks_for_the_outputs_of_every_batch():
     w = world()
     model = lp.SubspaceLTI(**QUICK, **TABLE_ROLES).partial_fit(w.X, w.y)
