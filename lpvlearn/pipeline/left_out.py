@@ -25,9 +25,9 @@ _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 
 # Error of what the others make of a model, in its largest gain: that of a resonance
 # that is elsewhere, as may be at a point of many; what is worse than that; and the
-# median of one, two or more from which models between the points are seldom good to a
-# tenth: of few points, each that is left out leaves the largest gap.
-_ELSEWHERE, _WORSE, _MEDIANS = 1.0, 1.5, (0.8, 0.45, 0.3)
+# median of several, or of few, from which models between the points are seldom good to
+# a tenth: of few points, each that is left out leaves a large gap.
+_ELSEWHERE, _WORSE, _MEDIAN, _MANY, _OF_FEW = 1.0, 1.5, 0.3, 4, 0.8
 
 # Difference of two models, in the largest gain, between which a line is a guess.
 _APART = 0.3
@@ -107,7 +107,7 @@ def tell_unforeseen(
     worst = sorted(((error, k) for k, error in errors.items()), reverse=True)
     high = [(error, k) for error, k in worst if error > _ELSEWHERE]
     often = high and (high[0][0] > _WORSE or 2 * len(high) >= len(errors))
-    limit = _MEDIANS[min(len(errors), len(_MEDIANS)) - 1]
+    limit = _MEDIAN if len(errors) >= _MANY else _OF_FEW
     most = errors and np.median([*errors.values()]) > limit
     if often or most:
         named = [
