@@ -110,7 +110,10 @@ def _tell_of_foreign(
     records = whole.scaled.records
     left = np.array([np.sum(e**2) for e in found])
     size = np.array([np.sum(record.y**2) for record in records])
-    foreign = left > _FOREIGN * size
+    # Levels of their own are none of another system.
+    moved = [np.sum((e - e.mean(axis=0)) ** 2) for e in found]
+    motion = [np.sum((r.y.T - r.y.T.mean(axis=0)) ** 2) for r in records]
+    foreign = np.array(moved) > _FOREIGN * np.array(motion)
     rest = np.flatnonzero(~foreign)
     if not (foreign.any() and len(rest)):
         return False
