@@ -86,12 +86,7 @@ def refuse_outputs_among_inputs(
     outputs: Array,
     output_names: Sequence[Hashable],
 ) -> None:
-    """Refuse inputs of a table (n_samples, n_inputs) that are outputs, to the bit.
-
-    A single one may be all there is, of a gain of 1.
-    """
-    if len(names) < 2:
-        return
+    """Refuse inputs of a table (n_samples, n_inputs) that are outputs, to the bit."""
     for name in set(names) & set(output_names):
         column = inputs[:, list(names).index(name)]
         if (column == outputs[:, list(output_names).index(name)]).all():

@@ -20,7 +20,13 @@ from ..lpv.spline import SplineLPV
 from ..models.statespace import StateSpace, with_signs_of
 from ..structures.structure import GrayBoxStructure
 from ..validation import listed
-from .left_out import errors_left_out, forgetting, forgotten, largest_difference
+from .left_out import (
+    changed,
+    errors_left_out,
+    forgetting,
+    forgotten,
+    largest_difference,
+)
 from .local_models import LocalModel, motions
 from .runner import place_of
 
@@ -269,7 +275,7 @@ def tell_of_forced(
         if model.own is not None
         and model.own.lti.order == model.own.order  # or it alternates with the noise
         and k not in mended
-        and (change := _change(model, model.own, longest)) > _FORCED
+        and (change := changed(model.lti, model.own.lti, longest)) > _FORCED
     ]
     if forced:
         warn(
@@ -280,12 +286,6 @@ def tell_of_forced(
             "to the next points. Record for longer there, leave the point out, or give "
             "a lower order: local=SubspaceLTI(order=...)."
         )
-
-
-def _change(model: LocalModel, own: LocalModel, longest: float) -> float:
-    both = model.lti, own.lti
-    rate = forgotten(both, longest)
-    return largest_difference(*(forgetting(one, rate) for one in both))
 
 
 def _of_one_order(models: Sequence[StateSpace]) -> Sequence[StateSpace]:

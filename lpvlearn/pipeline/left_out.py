@@ -131,9 +131,8 @@ def tell_of_two_points(
     if len(np.unique(kappa, axis=0)) != 2 or not models[0].is_continuous:
         return
     k = int((kappa != kappa[0]).any(axis=1).argmax())
-    rate = forgotten(models, longest)
-    ends = [forgetting(models[i], rate) for i in (0, k)]
-    change = min(largest_difference(*ends), largest_difference(*ends[::-1]))
+    one, other = models[0], models[k]
+    change = min(changed(one, other, longest), changed(other, one, longest))
     if change > _APART:
         warn(
             "with two operating points nothing tells of what is between them: the "
@@ -162,6 +161,12 @@ def forgetting(model: StateSpace, rate: float) -> StateSpace:
     A = model.A - rate * np.eye(model.order)
     matrices = A, model.B, model.C, model.D
     return StateSpace(*matrices, model.sampling_time, input_delay=model.input_delay)
+
+
+def changed(one: StateSpace, other: StateSpace, longest: float) -> float:
+    """`largest_difference` of what decays within the `longest` record (seconds)."""
+    rate = forgotten((one, other), longest)
+    return largest_difference(forgetting(one, rate), forgetting(other, rate))
 
 
 def largest_difference(one: StateSpace, other: StateSpace) -> float:

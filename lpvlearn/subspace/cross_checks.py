@@ -79,11 +79,8 @@ def tell_of_contradiction(
             )
         except TooFewSamples:
             continue
-        own = other.scaled.records
-        scale = other.evidence.output_scale / whole.evidence.output_scale
-        errors = simulation_errors(other.evidence.model, own)[0] * scale
         size = np.sum(records[k].y ** 2)
-        energies.append([np.sum(found[k] ** 2), np.sum(errors**2), size])
+        energies.append([np.sum(found[k] ** 2), _left_by(other, whole), size])
     if len(energies) < 2:
         return
     together, apart, size = np.sum(energies, axis=0)
@@ -124,9 +121,7 @@ def _tell_of_foreign(
         )
     except TooFewSamples:
         return False
-    scale = other.evidence.output_scale / whole.evidence.output_scale
-    errors = simulation_errors(other.evidence.model, other.scaled.records)
-    alone = sum(np.sum((e * scale) ** 2) for e in errors)
+    alone = _left_by(other, whole)
     if not alone < _CONTRADICTED * left[rest].sum():
         return False
     names = [str(k) for k in np.flatnonzero(foreign)]
@@ -140,6 +135,13 @@ def _tell_of_foreign(
         "setting of the system, and leave them out.",
     )
     return True
+
+
+def _left_by(other: LocalFit, whole: LocalFit) -> float:
+    """Squared errors of another model on its own records, in the units of the whole."""
+    scale = other.evidence.output_scale / whole.evidence.output_scale
+    errors = simulation_errors(other.evidence.model, other.scaled.records)
+    return float(sum(np.sum((e * scale) ** 2) for e in errors))
 
 
 def tell_of_input_spikes(

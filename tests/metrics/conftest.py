@@ -60,6 +60,8 @@ def data():
     X = pd.DataFrame({"u": rng.normal(size=120)})
     X["run"] = np.repeat(["a", "b", "c"], 40)
     X["kappa"] = np.repeat([0.25, 0.5, 0.75], 40)
-    model = GainFromRest(experiment="run", scheduling="kappa").fit(X, X["u"])
+    model = GainFromRest(experiment="run", scheduling="kappa").fit(
+        X, X["u"].rename("y")
+    )
     true = model.predict_with_initial_state(X, None)
     return model, X, pd.DataFrame(true, columns=["vx", "vy"])

@@ -255,6 +255,8 @@ def test_missing_samples_are_counted_and_left_out(data):
 
 def test_a_simulation_that_is_not_finite_is_no_missing_sample(data):
     model, X, y = data
-    broken = GainFromRest(np.nan, experiment="run", scheduling="kappa").fit(X, X["u"])
+    broken = GainFromRest(np.nan, experiment="run", scheduling="kappa").fit(
+        X, X["u"].rename("y")
+    )
     with pytest.raises(ValueError, match="`y_pred` must be finite. Got nan at row 0"):
         fit_report(broken, X, y)
