@@ -197,7 +197,7 @@ pd.Series(test.mean(axis=1).round(2), pd.Index(sizes, name="rows"), name="BFT (%
 # -------
 # **permutation_importance by roles**: roles may be levels of the index, too. Then only
 # inputs are columns, and only they are shuffled. (An input more needs a structure that
-# has one more, or none: black boxes that are aligned, the default.)
+# has one more, or none: black boxes, the default.)
 
 from sklearn.inspection import permutation_importance
 

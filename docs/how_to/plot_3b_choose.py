@@ -94,8 +94,9 @@ pd.DataFrame(restructured).assign(truth=lambda t: 40 + 20 * t.index**2).round(3)
 #   and few points do.
 # * **Momenta, fluxes or heat** as states, not rates, where masses, inductances or
 #   capacities follow the scheduling variable while it moves (:ref:`guide_state_basis`).
-# * **None**: ``restructurer="aligned"``, the default without a structure, turns
-#   balanced models to one another. It takes more points than a structure does.
+# * **None**: the default without a structure takes the observable canonical form where
+#   a simple law carries it, and else ``"aligned"``, which turns balanced models to one
+#   another. It takes more points than a structure does.
 # * Never ``"passthrough"``: balanced models as they are, the paper's baseline.
 
 structured = {"restructurer": GrayBoxRestructurer(spring.structure)}

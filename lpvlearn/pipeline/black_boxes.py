@@ -58,7 +58,7 @@ def aligned_black_boxes(
     by how far they move, `u` and `y`, whatever their units. What decays in about the
     `longest` record (seconds) or later is `forgotten` while states are compared.
     """
-    models = [_scaled(balanced(model), u, y) for model in local]
+    models = [scaled(balanced(model), u, y) for model in local]
     rate = forgotten(models, longest)
     models = [forgetting(model, rate).balance() for model in models]
     fewer = [
@@ -69,7 +69,7 @@ def aligned_black_boxes(
     own = [
         model
         if one.own is None or k not in fewer
-        else forgetting(_scaled(balanced(one.own), u, y), rate)
+        else forgetting(scaled(balanced(one.own), u, y), rate)
         for k, (one, model) in enumerate(zip(local, models, strict=True))
     ]
     theta, mended = _foretold(models, own, fewer, kappa)
@@ -78,7 +78,7 @@ def aligned_black_boxes(
     first = next(model for k, model in enumerate(models) if k not in mended)
     structure = _full(first, direct)
     rows = [
-        _scaled(forgetting(structure.model(row), -rate), 1.0 / u, 1.0 / y)
+        scaled(forgetting(structure.model(row), -rate), 1.0 / u, 1.0 / y)
         for row in theta
     ]
     whole = _full(first, direct, local[0].integrating)
@@ -92,7 +92,7 @@ def channel_sizes(groups: Sequence[Sequence[Experiment]]) -> tuple[Array, Array]
     return u, y
 
 
-def _scaled(model: StateSpace, u: Array, y: Array) -> StateSpace:
+def scaled(model: StateSpace, u: Array, y: Array) -> StateSpace:
     """The model of inputs in units of `u` and outputs in units of `y`."""
     C, D, dt = model.C / y[:, None], model.D * u / y[:, None], model.sampling_time
     return StateSpace(model.A, model.B * u, C, D, dt, input_delay=model.input_delay)

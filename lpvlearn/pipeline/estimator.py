@@ -140,12 +140,15 @@ class LocalLPVPipeline(ScheduledEstimator):
         the noise, with a pole on the negative real axis; else one order for all points:
         that of most evidence, all their records together.
     restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
-        Step 4. Without a structure, "aligned" (None) interpolates the entries of
+        Step 4. Without a structure, "aligned" interpolates the entries of
         the local models, each turned to its neighbour by the rotation that brings their
         matrices nearest: of balanced ones, or, where points left out are clearly better
         foreseen, of such whose inputs move all states alike, or whose outputs show them
         alike. "passthrough": of balanced ones whose signs alone agree, the paper's
-        baseline. ``GrayBoxRestructurer()`` is the observable canonical form.
+        baseline. ``GrayBoxRestructurer()`` is the observable canonical form. None is
+        that form where `AutoLPV` finds its parameters on a polynomial of degree 2 at
+        most, or a fraction of degrees 3 together, which foresees points left out
+        clearly better than "aligned" does; else that.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
         (n_points, n_params); None is ``AutoLPV()``, which chooses by the covariances
@@ -224,7 +227,7 @@ list, default=None
     structured_models_ : list of StateSpace
         Gray-box models (without a structure, the balanced ones).
     restructurers_ : list
-        The fitted restructurers, empty without a structure.
+        The fitted restructurers, empty where black boxes are interpolated.
     parameters_ : DataFrame of shape (n_points, n_params)
         Gray-box parameters, one row per operating point: the efficient ones, where
         `efficient` applies.
@@ -501,7 +504,7 @@ list, default=None
             steps |= {"interpolator": self.interpolator, "refiner": self.refiner}
         memory = checked_memory(self.memory, steps)
         runner = PointRunner(self.n_jobs, self.verbose, self.on_error, memory)
-        restructurer, watch = self._restructurer(), Stopwatch(verbose=self.verbose)
+        restructurer, watch = self.restructurer, Stopwatch(verbose=self.verbose)
         efficient = getattr(restructurer, "norm", None) == "covariance"
 
         with watch.step("reading of the table"):  # steps 1 and 2, and their groups
@@ -531,13 +534,19 @@ list, default=None
                 combine=self.combine,
                 discretization=self.discretization,
                 efficient=self.efficient or efficient,
-                deviate=not isinstance(restructurer, str),
+                deviate=self._needs_deviations(),
             )
 
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
             found = restructure_points(
-                restructurer, local, points, runner, self.sampling_time_, limit
+                restructurer,
+                local,
+                points,
+                runner,
+                self.sampling_time_,
+                limit,
+                self._interpolator(len(points)),
             )
             self.restructurers_ = found.restructurers
 
@@ -694,7 +703,7 @@ list, default=None
             jitter=self.time_jitter_,
             scheduling=self.scheduling_names_,
             local=_name_of_step(self.local, "local"),
-            restructurer=_name_of_step(self.restructurer, "restructurer"),
+            restructurer=self._way(),
         )
         if self.refiner_ is None:
             return found
@@ -706,6 +715,14 @@ list, default=None
         )
 
     # -- helpers -------------------------------------------------------------------
+
+    def _way(self) -> str:
+        """How the points came to one structure, or one basis."""
+        if isinstance(self.restructurer, str):
+            return self.restructurer
+        if self.restructurer is None and not self.restructurers_:
+            return WITHOUT[0]
+        return _name_of_step(self.restructurer, "restructurer")
 
     @property
     def _splits(self) -> bool:
@@ -757,9 +774,11 @@ list, default=None
         places = np.flatnonzero(flags).tolist()
         return clone(local).set_params(integrating=places)
 
-    def _restructurer(self) -> Any:
-        """The restructurer to clone, or the way without one."""
-        return WITHOUT[0] if self.restructurer is None else self.restructurer
+    def _needs_deviations(self) -> bool:
+        """Whether covariances of parameters are asked for, or choose the states."""
+        if self.restructurer is None:
+            return self.interpolator is None or isinstance(self.interpolator, AutoLPV)
+        return not isinstance(self.restructurer, str)
 
     def _interpolator(self, n_points: int) -> Any:
         if n_points == 1:
@@ -855,6 +874,4 @@ def _check_channels(
 
 
 def _name_of_step(step: Any, name: str) -> str:
-    if name == "restructurer" and (step is None or isinstance(step, str)):
-        return step or WITHOUT[0]
     return (_DEFAULTS[name] if step is None else type(step)).__name__

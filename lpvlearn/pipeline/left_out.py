@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -70,20 +70,24 @@ def errors_left_out(
     kappa: Array,
     theta: Array,
     rate: float = 0.0,
+    *,
+    covariance: Array | None = None,
+    seen: Callable[[StateSpace], StateSpace] | None = None,
 ) -> dict[int, float]:
     """By points within the range of the others, the errors of what these make of them.
 
     Of the response, in the largest gain of the point's model; of states forgotten at
-    a `rate`.
+    a `rate`. Models are `seen` as they are, or otherwise.
     """
     errors = {}
     for out in inner_places(kappa):
         k = int(out.argmax())
-        values = interpolated_without(k, form, kappa, theta, kappa[[k]])
+        values = interpolated_without(k, form, kappa, theta, kappa[[k]], covariance)
         if values is not None:
-            found = structure.model(values[0])
-            both = (forgetting(model, rate) for model in (found, models[k]))
-            errors[k] = largest_difference(*both)
+            both = [structure.model(values[0]), models[k]]
+            if seen is not None:
+                both = [seen(model) for model in both]
+            errors[k] = largest_difference(*(forgetting(m, rate) for m in both))
     return errors
 
 

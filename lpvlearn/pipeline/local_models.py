@@ -353,10 +353,11 @@ def _equilibrium(
 ) -> tuple[Array, Array] | None:
     """Inputs and outputs at which the model rests, nearest to the experiments' means.
 
-    In units of how far they move within the experiments; where the experiments begin
-    nearest to rest if a mode does not decay over them, which rests nearly anywhere, but
-    for one that stands for constants and would have that far from all outputs.
-    None where the estimator has not looked for constants, or does not tell.
+    Where these have drifts: as they begin, from which what drifts goes away. In units
+    of how far they move within the experiments; where the experiments begin nearest to
+    rest if a mode does not decay over them, which rests nearly anywhere, but for one
+    that stands for constants and would have that far from all outputs. None where the
+    estimator has not looked for constants, or does not tell.
     """
     first = fitted[0]
     looked = getattr(first, "offset", None) or getattr(first, "detrend", None)
@@ -364,7 +365,7 @@ def _equilibrium(
         return None
     if _integrates(first) and first.offset_ is None:
         return None
-    known = [own.resting_point() for own in fitted]
+    known = [own.resting_point(begun=True) for own in fitted]
     u0, y0 = (np.mean(values, axis=0) for values in zip(*known, strict=True))
     longest = max(len(e.inputs) for e in experiments)
     (u, u_scale), (y, y_scale) = motions(experiments)

@@ -494,11 +494,10 @@ class OutputErrorLPV(ScheduledEstimator):
             combine="pool",
             discretization="zoh",
             efficient=True,
-            deviate=structure is not None,
         )
-        way = "aligned" if structure is None else GrayBoxRestructurer(structure)
-        found = restructure_points(way, local, points, runner, dt)
         form = AutoLPV() if self.interpolator is None else clone(self.interpolator)
+        way = None if structure is None else GrayBoxRestructurer(structure)
+        found = restructure_points(way, local, points, runner, dt, interpolator=form)
         form = over_points(form, found)
         delay = common_delay(found.local, found.points.kappa, dt)
         return [LPVStateSpace(found.structure, form, bounds, input_delay=delay)]

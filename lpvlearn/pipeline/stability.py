@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from ..data.operating_points import neighbours
 from ..exceptions import warn
+from ..lpv.interpolator import Interpolator, grid_over
 from ..lpv.model import LPVStateSpace
+from ..structures.structure import GrayBoxStructure
 
 Array = NDArray[np.float64]
 
@@ -17,6 +19,7 @@ _GROWN = 0.01  # share by which what counts as growing does so over a record, at
 
 _ROUNDING = 1e-8  # of the largest pole: an integrator's may lie so far to the right
 
+_LEVELS = 41  # of each scheduling variable, at which a form is looked at
 
 _OVERSHOT = (
     "The local models are stable; the interpolation between them overshoots, which "
@@ -70,3 +73,11 @@ def _rates(model: LPVStateSpace, kappa: Array, least: float) -> Array:
     size = np.abs(poles).max(axis=1, initial=0.0)
     is_zero = (np.abs(rates) <= _ROUNDING * size) | ((rates > 0) & (rates <= least))
     return np.where(is_zero, 0.0, rates)
+
+
+def holds_within_range(structure: GrayBoxStructure, form: Interpolator) -> bool:
+    """Whether the model is stable and within its bounds over the range of a form."""
+    values = form.predict(grid_over(form.scheduling_range_, _LEVELS))
+    within = (values >= structure.lower) & (values <= structure.upper)
+    poles = np.linalg.eigvals(structure.matrices(values)[0])
+    return bool(within.all() and (poles.real < 0).all())

@@ -18,11 +18,12 @@ from sklearn.base import clone
 from sklearn.utils.validation import has_fit_parameter
 
 from ..data.operating_points import OperatingPoints
-from ..exceptions import collected, warn
+from ..exceptions import collected, retold, warn
 from ..lpv.equilibria import points_of_work
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..restructuring.deadline import bounded, time_is_up
+from ..restructuring.estimator import GrayBoxRestructurer
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..restructuring.uncertainty import ParameterUncertainty
@@ -36,6 +37,7 @@ from .black_boxes import (
     tell_of_forced,
 )
 from .branches import Doubt, tied_branches
+from .canonical import better_in_canonical_form
 from .local_models import LocalModel, motions
 from .runner import Done, PointRunner, place_of, tell_skipped
 
@@ -71,13 +73,18 @@ def restructure_points(
     runner: PointRunner,
     sampling_time: float,
     max_time: float | None = None,
+    interpolator: Any = None,
 ) -> StructuredModels:
     """Bring the local models of all operating points into one structure.
 
-    "aligned" or "passthrough": the entries of the balanced models are parameters.
+    "aligned" or "passthrough": the entries of the balanced models are parameters. None:
+    "aligned", but where the canonical form is better for the `interpolator`.
     `max_time` bounds the seconds of all points: equal shares, known in advance, and
     what is left of it for the help of neighbours.
     """
+    if restructurer is None:
+        arguments = local, points, runner, sampling_time, max_time
+        return _without_structure(interpolator, *arguments)
     began = perf_counter()
     if isinstance(restructurer, str):
         longest = sampling_time * points.n_longest
@@ -157,6 +164,33 @@ def restructure_points(
     return StructuredModels(
         points, local, helped[0].structure_, theta, covariance, models, helped
     )
+
+
+def _without_structure(
+    interpolator: Any,
+    local: list[LocalModel],
+    points: OperatingPoints,
+    runner: PointRunner,
+    sampling_time: float,
+    max_time: float | None,
+) -> StructuredModels:
+    """Aligned models, or canonical ones where that is better and nothing is told."""
+    with retold() as told:
+        aligned = restructure_points("aligned", local, points, runner, sampling_time)
+    if told or not better_in_canonical_form(
+        local,
+        points.kappa,
+        (aligned.structure, aligned.theta),
+        channel_sizes(points.experiments),
+        sampling_time * points.n_longest,
+        interpolator,
+    ):
+        return aligned
+    with collected() as told:
+        canonical = restructure_points(
+            GrayBoxRestructurer(), local, points, runner, sampling_time, max_time
+        )
+    return aligned if told else canonical
 
 
 def over_points(interpolator: Any, found: StructuredModels) -> Any:

@@ -27,11 +27,11 @@ from scipy.linalg import pinvh
 from ..exceptions import warn
 from ..lpv.alignment import spanning_tree
 from ..lpv.auto import AutoLPV
-from ..lpv.interpolator import grid_over
 from ..lpv.polynomial import PolynomialLPV, resolvable_powers
 from ..restructuring.deadline import time_is_up
 from ..restructuring.minimise_covariance import UncertainBoxes, common_coefficients
 from ..structures.structure import GrayBoxStructure
+from .stability import holds_within_range
 from .structured_models import StructuredModels
 
 Array = NDArray[np.float64]
@@ -43,7 +43,6 @@ _STARTS, _KEPT = 5, 2  # points whose parameters are tried throughout, and gone 
 # Chi-squares per degree of freedom: of parameters, from which a form is far from them;
 # of black boxes, from which they refute it
 _NEAR, _FAR = 100.0, 4.0
-_LEVELS = 41  # of each scheduling variable: where the model must be stable
 
 
 class Together(NamedTuple):
@@ -126,7 +125,7 @@ def fitted_together(
     for found in _candidates(known, places, theta):
         n = found.form.coefficients().size
         likely = found.cost < _FAR * (n_values - n) and found.cost + 2.0 * n < least
-        if likely and _holds(structure, found.form):
+        if likely and holds_within_range(structure, found.form):
             misfit, least = found.cost / (n_values - n), found.cost + 2.0 * n
             covariance = max(misfit, 1.0) * pinvh(found.slopes.T @ found.slopes)
             best = Together(found.form, covariance, misfit)
@@ -191,11 +190,3 @@ def _fitted(
     S = form.sensitivities(kappa)
     c, cost, J = common_coefficients(boxes, S, form.coefficients())
     return _Found(form.with_coefficients(c), cost, J)
-
-
-def _holds(structure: GrayBoxStructure, form: PolynomialLPV) -> bool:
-    """Whether the model is stable and within its bounds over the range."""
-    values = form.predict(grid_over(form.scheduling_range_, _LEVELS))
-    within = (values >= structure.lower) & (values <= structure.upper)
-    poles = np.linalg.eigvals(structure.matrices(values)[0])
-    return bool(within.all() and (poles.real < 0).all())

@@ -1490,8 +1490,14 @@ class SubspaceLTI(
             raise ValueError(f"`omega` must be finite. Got {found.max()} per sample.")
         return found
 
-    def resting_point(self) -> tuple[Array, Array]:
+    def resting_point(self, *, begun: bool = False) -> tuple[Array, Array]:
         """Inputs and outputs at rest: `input_offset_` and `output_offset_` pooled.
+
+        Parameters
+        ----------
+        begun : bool, default=False
+            Outputs are those where a drift (`output_drift_`) begins with the
+            experiments, not in the middle of it.
 
         Returns
         -------
@@ -1500,7 +1506,8 @@ class SubspaceLTI(
         y0 : ndarray of shape (n_outputs,)
         """
         check_is_fitted(self, "lti_")
-        pooled = self._offsets.pooled()
+        offsets = self._offsets.begun() if begun else self._offsets
+        pooled = offsets.pooled()
         return pooled.inputs[0], pooled.outputs[0]
 
     def selection_text(self) -> str:

@@ -107,6 +107,11 @@ class Offsets(NamedTuple):
         inputs, outputs = self.inputs + inputs, self.outputs + outputs
         return self._replace(inputs=inputs, outputs=outputs)
 
+    def begun(self) -> Offsets:
+        """With the outputs where the drifts of the experiments begin."""
+        gone = self.drifts * (self.n_samples - 1)[:, None] / 2.0
+        return self._replace(outputs=self.outputs - gone)
+
     def pooled(self) -> Offsets:
         """As of one experiment: the means over all samples."""
         total = self.n_samples.sum(keepdims=True)
@@ -413,6 +418,11 @@ def may_have_drift(evidence: Evidence) -> bool:
     if (mode_rates(evidence.model.A) * evidence.longest < 1.0).any():
         return True
     return chance_of_trend(evidence, 2) < _SUSPICIOUS
+
+
+def drifts_off(evidence: Evidence) -> bool:
+    """Whether errors have a drift beyond chance."""
+    return chance_of_trend(evidence, 2) < _SIGNIFICANT
 
 
 def _lasts(evidence: Evidence) -> bool:

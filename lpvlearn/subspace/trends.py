@@ -14,6 +14,7 @@ from .offsets import (
     N_TRENDS,
     constants_matter,
     criterion_in_units,
+    drifts_off,
     leaves_rounding,
     may_be_better,
     may_have_constants,
@@ -74,7 +75,9 @@ def with_trends(
     # The states of a given order that are to follow a drift are missing elsewhere.
     given = choices.order is not None and choices.initial_states and n_trend < 2
     given &= fitted.method != "pbsid" and not choices.enforce_stability
-    lost = given and (outlasts(fitted) or fitted.residual > _HARDLY)
+    lost = given and (
+        outlasts(fitted) or fitted.residual > _HARDLY or drifts_off(tested)
+    )
     shown = choices.order is None and not hides and not rough
     if choices.offset == "auto" and (
         lost or (shown and _may_drift_off(pairs, judged, telling, fitted))

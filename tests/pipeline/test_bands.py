@@ -108,7 +108,8 @@ def test_what_is_not_known_is_refused_with_the_remedy(memory):
     X, y = spring_tables(noise=0.05, n_samples=N_SAMPLES)
     new, _ = spring_sweep(50)
     for model in (
-        LocalLPVPipeline(**ROLES),  # parameters without covariances
+        # parameters without covariances
+        LocalLPVPipeline(restructurer="aligned", **ROLES),
         spring_pipeline(memory=memory, interpolator=LinearRegression()),
     ):
         model.fit(X, y)

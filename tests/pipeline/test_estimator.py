@@ -105,9 +105,11 @@ def test_baseline_without_structure_is_worse(fitted, spring, memory):
     assert score < bft_score(y_sweep, fitted.predict(X_sweep)) - 1
 
 
-def test_without_a_structure_black_boxes_are_aligned(fitted, spring):
+def test_black_boxes_are_aligned_where_that_is_asked_for(fitted, spring):
     X, y, X_sweep, y_sweep = spring
-    pipeline = LocalLPVPipeline(SubspaceLTI(2, feedthrough=False), **ROLES).fit(X, y)
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(2, feedthrough=False), "aligned", **ROLES
+    ).fit(X, y)
     assert pipeline.restructurers_ == []
     assert pipeline.parameters_.shape == (4, 4 + 2 + 2)  # no feedthrough
     for turned, true in zip(

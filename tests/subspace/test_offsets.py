@@ -107,6 +107,22 @@ def test_drifts_are_exact_and_told_per_second(rng):
     np.testing.assert_allclose(model.predict_with_initial_state(X, y), y, atol=1e-8)
 
 
+def test_the_resting_point_may_be_where_drifts_begin(rng):
+    X, y = table(rng, levels=(3.0, 3.0), drift=4.0)
+    model = SubspaceLTI(3, horizon=6, offset="linear", **options()).fit(X, y)
+    (_, middle), (_, begun) = model.resting_point(), model.resting_point(begun=True)
+    np.testing.assert_allclose(middle - begun, 4.0 * np.array([1.0, -2.0]))
+
+
+@pytest.mark.parametrize("size", [0.1, 0.3, 1.0])
+def test_a_given_order_does_not_hide_a_drift(rng, size):
+    """It has no state left to follow it."""
+    X, y = table(rng, levels=(0.0,), n=600, noise=0.1, drift=size * 3.0)
+    free, given = (SubspaceLTI(order, **options()).fit(X, y) for order in ("auto", 3))
+    assert free.offset_ == given.offset_ == "linear"
+    assert error_of(given) < 0.05
+
+
 @pytest.mark.parametrize("offset, degree", [("constant", 0), ("linear", 1)])
 def test_what_is_estimated_may_be_added_to_the_outputs(rng, offset, degree):
     """Also with noise: the model is the same to rounding."""

@@ -1,0 +1,137 @@
+"""Whether black boxes had better be interpolated in the observable canonical form.
+
+No structure, no common states: those that are aligned follow any models, but by no law.
+Outputs and their derivatives are states of any system, and where its equations are
+polynomials in the scheduling variables, or fractions of such, so is the canonical form:
+of a low degree, if a system is simple. That points follow such a form within their
+covariances, and foresee one another by it, happens by no chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import clone
+
+from ..exceptions import collected
+from ..lpv.auto import AutoLPV
+from ..lpv.polynomial import PolynomialLPV
+from ..lpv.rational import RationalLPV
+from ..lpv.spline import SplineLPV
+from ..models.statespace import DEVIATION, StateSpace
+from ..restructuring.coordinates import CanonicalForm
+from ..structures.structure import GrayBoxStructure
+from .black_boxes import scaled
+from .left_out import errors_left_out, forgotten
+from .local_models import LocalModel
+from .stability import holds_within_range
+
+Array = NDArray[np.float64]
+
+_LOW = 2, 3  # the degree of a polynomial, and both degrees of a fraction, at most
+
+# An error of a point left out, in its largest gain, as bad as any; and the share of the
+# errors of aligned models that must be left: with as much, there is nothing to gain
+_UNLIKE, _CLEARLY = 2.0, 0.8
+
+
+class _Canonical(NamedTuple):
+    """Models of all points in the form, and the covariances of their parameters."""
+
+    structure: GrayBoxStructure
+    theta: Array
+    covariance: Array
+
+
+def better_in_canonical_form(
+    local: Sequence[LocalModel],
+    kappa: Array,
+    aligned: tuple[GrayBoxStructure, Array],
+    sizes: tuple[Array, Array],
+    longest: float,
+    interpolator: Any,
+) -> bool:
+    """Whether a low form carries canonical parameters, and foresees points better.
+
+    Points that are left out, better than what is interpolated of `aligned` models,
+    inputs and outputs in units of their `sizes`, what does not decay in the `longest`
+    record (seconds) forgotten. Judged by an `interpolator` that chooses.
+    """
+    if not isinstance(interpolator, AutoLPV) or local[0].integrating:
+        return False
+    found = _canonical(local)
+    if found is None:
+        return False
+    with collected():
+        auto = clone(interpolator).fit(kappa, found.theta, covariance=found.covariance)
+    form = auto.best_estimator_
+    if not _is_low(form) or not holds_within_range(found.structure, form):
+        return False
+    models = [model.lti for model in local]
+    rate = forgotten(models, longest)
+    ways = (
+        (*aligned, SplineLPV(), None),
+        (found.structure, found.theta, form, found.covariance),
+    )
+    other, own = (
+        errors_left_out(
+            structure,
+            models,
+            curve,
+            kappa,
+            theta,
+            rate,
+            covariance=P,
+            seen=lambda model: scaled(model, *sizes),
+        )
+        for structure, theta, curve, P in ways
+    )
+    both = [k for k in own if k in other]
+    by_form, by_curve = (
+        sum(min(errors[k], _UNLIKE) for k in both) for errors in (own, other)
+    )
+    return bool(both) and by_form <= by_curve
+
+
+def _canonical(local: Sequence[LocalModel]) -> _Canonical | None:
+    """None where a model has no such form, or its covariance is not known."""
+    if len({model.lti.order for model in local}) > 1 or not local[0].lti.order:
+        return None
+    structure = GrayBoxStructure.observable_canonical(
+        local[0].lti.order,
+        local[0].lti.n_inputs,
+        local[0].lti.n_outputs,
+        any(bool(model.lti.D.any()) for model in local),
+    )
+    form = CanonicalForm(structure, None)
+    theta, covariance = [], []
+    for model in local:
+        pairs = model.deviated()
+        rows = [form.parameters(_matrix(m)) for pair in pairs for m in pair]
+        own = form.parameters(_matrix(model.lti))
+        known = [row for row in rows if row is not None]
+        if own is None or not rows or len(known) < len(rows):
+            return None
+        changes = np.array(known[::2]) - np.array(known[1::2])
+        theta.append(own)
+        covariance.append(changes.T @ changes / (2.0 * DEVIATION) ** 2)
+    return _Canonical(structure, np.array(theta), np.array(covariance))
+
+
+def _matrix(model: StateSpace) -> Array:
+    return np.block([[model.A, model.B], [model.C, model.D]])
+
+
+def _is_low(form: Any) -> bool:
+    """Whether a form is simple, and the points are more than it needs."""
+    plain, fraction = _LOW
+    if isinstance(form, PolynomialLPV):
+        low = form.degree <= plain
+    elif isinstance(form, RationalLPV):
+        low = form.degree + form.denominator <= fraction
+    else:
+        return False
+    return low and form.degrees_of_freedom_ > 0

@@ -1,0 +1,108 @@
+"""Black boxes without a structure: in canonical form where a low one carries it."""
+
+import numpy as np
+import pytest
+
+from lpvlearn import (
+    LocalLPVPipeline,
+    OutputErrorLPV,
+    SplineLPV,
+    StateSpace,
+    bft_score,
+    from_trajectories,
+)
+from lpvlearn.datasets import prbs
+
+from ..conftest import ROLES, modes, spring_sweep, spring_tables
+
+STEP = 0.06
+
+
+def pendulum(kappa):
+    """Of a length that grows: its equation has fractions of degrees 1 and 2."""
+    length = 0.5 * (1.0 + 1.5 * kappa)
+    inertia = (1.0 + 1.5 * kappa) ** 2
+    A = [[0.0, 1.0], [-9.81 / length, -0.5 / inertia]]
+    return StateSpace(A, [[0.0], [10.0 / inertia]], [[1.0, 0.0]])
+
+
+def two_modes(kappa):
+    """Of frequencies that change in their own ways, in one output."""
+    A = modes((-0.1 + 1j) * (3.0 + 2.0 * kappa), (-0.05 + 1j) * (9.0 - 3.0 * kappa))
+    return StateSpace(A, [[0.0], [2.0], [0.0], [6.0]], [[1.0, 0.0, 1.0, 0.0]])
+
+
+def tables(system, n_points, noise=0.01, units=1.0):
+    rng, trajectories = np.random.default_rng(0), []
+    for k, kappa in enumerate(np.linspace(0.0, 1.0, n_points)):
+        u = prbs(600, clock=4, random_state=k)
+        y = system(kappa).simulate(u, sampling_time=STEP)
+        y = units * (y + noise * y.std() * rng.standard_normal(y.shape))
+        trajectories.append((u, kappa, y))
+    return from_trajectories(trajectories, sampling_time=STEP)
+
+
+def moving(system, n_samples=800):
+    """Inputs, scheduling and outputs while kappa moves fast, in the system's states."""
+    u = prbs(n_samples, clock=4, random_state=77)
+    kappa = 0.5 - 0.5 * np.cos(np.linspace(0.0, 12.0 * np.pi, n_samples))
+    x, y = np.zeros(system(0.0).order), []
+    for v, value in zip(u, kappa, strict=True):
+        frozen = system(value).to_discrete(STEP)
+        y.append(frozen.C @ x)
+        x = frozen.A @ x + frozen.B @ v
+    return u, kappa, np.array(y)
+
+
+def pipeline(restructurer=None, **options):
+    roles = ROLES | {"experiment": "experiment"}
+    return LocalLPVPipeline(restructurer=restructurer, **options, **roles)
+
+
+def test_a_low_form_that_foresees_the_points_is_taken():
+    X, y = tables(pendulum, 5)
+    model, other = pipeline().fit(X, y), pipeline("aligned").fit(X, y)
+    assert model.interpolator_.form_ == "rational 1/2"
+    assert list(model.parameters_) == ["a2_1", "a2_2", "b1_1", "b2_1", "d1_1"]
+    assert len(model.restructurers_) == 5
+    assert "Restructuring: GrayBoxRestructurer" in model.summary()
+    assert "each turned to its neighbour" in other.summary()
+    u, kappa, truth = moving(pendulum)
+    ours, theirs = (
+        bft_score(truth, m.lpv_.simulate(u, kappa, STEP)) for m in (model, other)
+    )
+    assert ours > 99.0 > 90.0 > theirs
+
+
+@pytest.mark.parametrize("units", [1e-6, 1e5])
+def test_units_do_not_choose(units):
+    model = pipeline().fit(*tables(pendulum, 5, units=units))
+    assert model.interpolator_.form_ == "rational 1/2"
+
+
+def slight_pendulum(kappa):
+    return pendulum(0.3 * kappa)
+
+
+@pytest.mark.parametrize("system, n_points", [(slight_pendulum, 3), (two_modes, 5)])
+def test_where_no_low_form_is_told_black_boxes_are_aligned(system, n_points):
+    """Of three points any parabola goes through, and tells nothing."""
+    X, y = tables(system, n_points)
+    model, other = pipeline().fit(X, y), pipeline("aligned").fit(X, y)
+    assert model.restructurers_ == []
+    np.testing.assert_array_equal(model.parameters_, other.parameters_)
+
+
+def test_a_curve_through_the_points_is_one_through_aligned_models():
+    model = pipeline(interpolator=SplineLPV()).fit(*tables(pendulum, 5))
+    assert model.restructurers_ == []
+
+
+@pytest.mark.slow
+def test_a_refined_model_keeps_the_states():
+    X, y = spring_tables(noise=0.01)
+    X_sweep, y_sweep = spring_sweep()
+    model = OutputErrorLPV(**ROLES)
+    model.fit(X, y)
+    assert model.lpv_.structure.parameter_names[0] == "a2_1"
+    assert bft_score(y_sweep, model.predict(X_sweep)) > 99.0
