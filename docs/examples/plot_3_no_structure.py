@@ -6,9 +6,10 @@ Nobody wrote down the physics. What can be done with black-box models alone?
 
 1. Interpolate *balanced* models (``restructurer="passthrough"``). Balanced coordinates
    are unique up to signs, but the states may change places between operating points.
-2. *Align* them (``restructurer="aligned"``): each is turned to its neighbour by the rotation that brings their matrices nearest. Where the
-   gain of a mode goes through zero, states that inputs move alike, or outputs show
-   alike, are interpolated instead of balanced ones, if these foresee points better.
+2. *Align* them (``restructurer="aligned"``): each is turned to its neighbour by the
+   rotation that brings their matrices nearest. Where the gain of a mode goes through
+   zero, states that inputs move alike, or outputs show alike, are interpolated instead
+   of balanced ones, if these foresee points better.
 3. Bring every model into the *observable canonical form*
    (``restructurer=GrayBoxRestructurer()``): a structure that fits every model of one
    order, so that all share a basis whose states are the outputs and their derivatives.

@@ -161,6 +161,8 @@ round(bft_score(data.y_large, y), 1)
 #   :math:`w`, for inputs of which the outputs tell nothing are what they are.
 #
 # Between the points :math:`u_0`, :math:`y_0` and :math:`x_0` are splines. Where the
+# system schedules itself, the gains tell their slopes too, and the splines have these,
+# unless points that are left out speak against it. Where the
 # equilibria bend more than the equations do (currents of a drive are rational in its
 # speed, the back-EMF is linear), the constants of :math:`\dot x = A x + B u + c` are
 # splines instead, if these tell points that are left out clearly better: of one

@@ -20,19 +20,25 @@ random would bend the interpolation.
 
 Models that integrate are at rest at any output, and their inputs are constants then.
 
-Between the points the equilibria follow from what is interpolated of them. Where they
-bend more than the models do (a drive, whose currents at rest are rational in a speed
-that its equations have as it is), that had better be the constants in ``dx/dt = A x + B
-u + c``, ``y = C x + D u + d``: of those that tell left-out points better.
+Between the points the equilibria follow from what is interpolated of them. Where that
+tells left-out points clearly better, it is not themselves:
+
+- Where they bend more than the models do (a drive, whose currents at rest are rational
+  in a speed that its equations have as it is), the constants in ``dx/dt = A x + B u +
+  c``, ``y = C x + D u + d``.
+- Where they are those of one system that schedules itself (levels of a tank), a curve
+  with the slopes that the models' gains tell: ``du0 = P dy0``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.linalg import null_space
 
 from ..models.statespace import StateSpace
@@ -40,6 +46,14 @@ from .alignment import spanning_tree
 from .weighting import inner_places
 
 Array = NDArray[np.float64]
+
+# What is at rest at scheduling values, of the frozen model there; and how that comes
+# from points (kappa, values, models) of which some are kept.
+_Kept: TypeAlias = NDArray[np.bool_]
+_AtRest: TypeAlias = "Callable[[Array, StateSpace], _Work]"
+_Way: TypeAlias = (
+    "Callable[[Array, Array, Sequence[StateSpace], NDArray[np.bool_]], _AtRest]"
+)
 
 # Static gain, from motions of the inputs to those of the outputs, that is nothing.
 _STATIC = 0.01
@@ -90,12 +104,8 @@ def points_of_work(
         found = zip(models, inputs, outputs, strict=True)
         x0 = np.array([_state_at_rest(*point, scales) for point in found])
         return np.hstack([inputs, outputs, x0])
-    gains = np.array([model.dc_gain() for model in models])
-    inverse = _inverse(gains * u_scale / y_scale[:, None])
-    inverse *= u_scale[:, None] / y_scale
-    moved_states = -np.array([np.linalg.solve(m.A, m.B) for m in models])
-    states, seen = moved_states @ inverse, inverse @ gains
-    unseen = moved_states @ (np.eye(len(u_scale)) - seen)
+    statics = _Statics.of(models, scales)
+    gains, inverse, states, unseen = statics
     if np.sum(np.var(inputs / u_scale, axis=0)) <= _STANDING:
         common = np.broadcast_to(inputs.mean(axis=0), inputs.shape)
         change = _times(gains, common - inputs)
@@ -103,13 +113,10 @@ def points_of_work(
         far = np.any(np.abs(change) > _FAR * y_scale, axis=1)
         outputs = outputs + np.where(far[:, None], 0.0, change)
         inputs = common
-    order, parents = spanning_tree(kappa)
-    child, parent = order[1:], parents[order[1:]]
-    du, dy = inputs[child] - inputs[parent], outputs[child] - outputs[parent]
-    asked = _times(0.5 * (seen[child] + seen[parent]), du) / u_scale
-    answer = _times(0.5 * (inverse[child] + inverse[parent]), dy) / u_scale
-    moved = np.sum(asked**2) + np.sum(answer**2)
-    if asked.any() and np.sum((asked - answer) ** 2) <= _UNEXPLAINED * moved:
+    if _are_one_family(statics, kappa, inputs, outputs, u_scale):
+        order, parents = spanning_tree(kappa)
+        child, parent = order[1:], parents[order[1:]]
+        du, dy = inputs[child] - inputs[parent], outputs[child] - outputs[parent]
         x0 = _times(states, outputs) + _times(unseen, inputs)
         for k, j, step, of_input in zip(child, parent, dy, du, strict=True):
             x0[k] = x0[j] + 0.5 * (states[k] + states[j]) @ step
@@ -118,6 +125,20 @@ def points_of_work(
     bias = _constants_of_sensors(inputs, outputs, gains, inverse, u_scale)
     x0 = _times(states, outputs - bias) + _times(unseen, inputs)
     return np.hstack([inputs, outputs, x0])
+
+
+def _are_one_family(
+    statics: _Statics, kappa: Array, inputs: Array, outputs: Array, u_scale: Array
+) -> bool:
+    """Whether points follow one another by their models' own gain, du0 = P dy0."""
+    order, parents = spanning_tree(kappa)
+    child, parent = order[1:], parents[order[1:]]
+    du, dy = inputs[child] - inputs[parent], outputs[child] - outputs[parent]
+    inverse, seen = statics.inverse, statics.inverse @ statics.gains
+    asked = _times(0.5 * (seen[child] + seen[parent]), du) / u_scale
+    answer = _times(0.5 * (inverse[child] + inverse[parent]), dy) / u_scale
+    moved = np.sum(asked**2) + np.sum(answer**2)
+    return bool(asked.any() and np.sum((asked - answer) ** 2) <= _UNEXPLAINED * moved)
 
 
 def _any_integrates(models: Sequence[StateSpace]) -> bool:
@@ -129,48 +150,152 @@ def interpolated(
     kappa: Array,
     values: Array,
     model_at: Callable[[Array], StateSpace],
-    y_scale: Array,
+    scales: tuple[Array, Array],
 ) -> Any:
-    """The `values` of points of work over `kappa`, by themselves or their constants.
+    """The `values` of points of work over `kappa`: as they are, or by their models.
 
     As the regressors that `spline` makes; `model_at` gives the frozen model at
-    scheduling values (n_scheduling,), `y_scale` is the size of the motion of outputs.
+    scheduling values (n_scheduling,), `scales` are the sizes of the motions of inputs
+    and outputs.
     """
     by_themselves = spline().fit(kappa, values)
-    if kappa.shape[1] > 1 or len(kappa) < _FEWEST:
+    if kappa.shape[1] > 1:
         return by_themselves
     models = [model_at(k) for k in kappa]
     if _any_integrates(models):
         return by_themselves
-    work = [_Work.of(*one) for one in zip(models, values, strict=True)]
-    constants = np.array(
-        [point.constants(m) for point, m in zip(work, models, strict=True)]
-    )
-    errors = []  # of outputs at rest at points that the others foresee
-    for out in inner_places(kappa):
-        k = int(out.argmax())
-        kept = [spline().fit(kappa[~out], v[~out]) for v in (values, constants)]
-        point, rest = (one.predict(kappa[[k]])[0] for one in kept)
-        there = _Work.of(models[k], point)
-        moved = there.y + models[k].dc_gain() @ (work[k].u - there.u)
-        both = moved, _Work.resting(models[k], work[k].u, rest).y
-        errors.append([(y - work[k].y) / y_scale for y in both])
-    own, by_constants = np.mean(np.square(errors), axis=(0, 2))
-    if not (own > _BENT and by_constants < _BETTER * own):
+    # and the share of the errors of those before them that they may leave
+    ways: list[tuple[_Way, float]] = [(partial(_by_themselves, spline), np.inf)]
+    statics = _Statics.of(models, scales)
+    u, y = np.split(values[:, : sum(map(len, scales))], [len(scales[0])], axis=1)
+    distinct = len(np.unique(kappa)) == len(kappa)
+    if distinct and _are_one_family(statics, kappa, u, y, scales[0]):
+        straight = _bend(kappa, y / scales[1]) <= _bend(kappa, u / scales[0])
+        slopes = partial(_by_slopes, statics=statics, of_outputs=straight)
+        ways.append((slopes, 1.0))
+    if len(kappa) >= _FEWEST:
+        ways.append((partial(_by_constants, spline), _BETTER))
+    best, least = ways[0][0], np.inf
+    for way, share in ways if len(ways) > 1 else ():
+        error = _error_at_rest(way, kappa, values, models, scales[1])
+        if least > _BENT and error < share * least:
+            best, least = way, error
+    if best is ways[0][0]:
         return by_themselves
+    found = best(kappa, values, models, np.ones(len(kappa), dtype=bool))
     places = np.sort(kappa[:, 0])
     fine = np.interp(
         np.arange(_BETWEEN * (len(places) - 1) + 1) / _BETWEEN,
         np.arange(len(places)),
         places,
     )[:, None]
-    c = spline().fit(kappa, constants).predict(fine)
-    u = by_themselves.predict(fine)[:, : models[0].n_inputs]
-    found = [
-        np.concatenate(_Work.resting(model_at(k), *known))
-        for k, *known in zip(fine, u, c, strict=True)
-    ]
-    return spline().fit(fine, np.array(found))
+    rest = [np.concatenate(found(k, model_at(k))) for k in fine]
+    return spline().fit(fine, np.array(rest))
+
+
+def _error_at_rest(
+    way: _Way,
+    kappa: Array,
+    values: Array,
+    models: Sequence[StateSpace],
+    y_scale: Array,
+) -> float:
+    """Mean squared error of outputs at rest at points left out; 0 without any."""
+    errors = []
+    for out in inner_places(kappa):
+        k = int(out.argmax())
+        known = _Work.of(models[k], values[k])
+        there = way(kappa, values, models, ~out)(kappa[k], models[k])
+        moved = there.y + models[k].dc_gain() @ (known.u - there.u)
+        errors.append((moved - known.y) / y_scale)
+    return float(np.mean(np.square(errors))) if errors else 0.0
+
+
+def _by_themselves(
+    spline: Callable[[], Any],
+    kappa: Array,
+    values: Array,
+    models: Sequence[StateSpace],
+    kept: _Kept,
+) -> _AtRest:
+    """A curve through the points that are kept."""
+    curve = spline().fit(kappa[kept], values[kept])
+    return lambda place, model: _Work.of(model, curve.predict([place])[0])
+
+
+def _by_constants(
+    spline: Callable[[], Any],
+    kappa: Array,
+    values: Array,
+    models: Sequence[StateSpace],
+    kept: _Kept,
+) -> _AtRest:
+    """A curve through the constants with which the models rest there."""
+    points = zip(models, values, strict=True)
+    constants = np.array([_Work.of(*one).constants(one[0]) for one in points])
+    inputs, own = (spline().fit(kappa[kept], v[kept]) for v in (values, constants))
+
+    def at_rest(place: Array, model: StateSpace) -> _Work:
+        u = inputs.predict([place])[0, : model.n_inputs]
+        return _Work.resting(model, u, own.predict([place])[0])
+
+    return at_rest
+
+
+def _by_slopes(
+    kappa: Array,
+    values: Array,
+    models: Sequence[StateSpace],
+    kept: _Kept,
+    *,
+    statics: _Statics,
+    of_outputs: bool,
+) -> _AtRest:
+    """A curve whose slopes are those of equilibria of one system, by its models.
+
+    Those of the outputs, or of the inputs, are those of a curve through them; the
+    others follow: ``du0 = P dy0``, ``dy0 = G du0``, ``A dx0 + B du0 = 0``.
+    """
+    rows = np.flatnonzero(kept)[np.argsort(kappa[kept, 0])]
+    x, v = kappa[rows, 0], values[rows]
+    m, p = models[0].n_inputs, models[0].n_outputs
+    gains, inverse, states, unseen = (M[rows] for M in statics)
+    u, y = np.split(CubicSpline(x, v[:, : m + p])(x, 1), [m], axis=1)
+    if of_outputs:
+        u = u + _times(inverse, y - _times(gains, u))
+    else:
+        y = y + _times(gains, u - _times(inverse, y))
+    slopes = np.hstack([u, y, _times(states, y) + _times(unseen, u)])
+    curve = CubicHermiteSpline(x, v, slopes)
+    return lambda place, model: _Work.of(model, curve(place[0]))
+
+
+def _bend(kappa: Array, values: Array) -> float:
+    """Part of the variance of values that no straight line over `kappa` explains."""
+    line = np.column_stack([np.ones(len(kappa)), kappa])
+    moved = values - values.mean(axis=0)
+    left = moved - line @ np.linalg.lstsq(line, moved)[0]
+    size = np.sum(moved**2)
+    return float(np.sum(left**2) / size) if size else np.inf
+
+
+class _Statics(NamedTuple):
+    """Models at rest: gains G (n_points, n_outputs, n_inputs), and what follows."""
+
+    gains: Array
+    inverse: Array  # P, from outputs to the inputs that they show
+    states: Array  # S, from outputs to states
+    unseen: Array  # from inputs to the states by what the outputs do not show of them
+
+    @classmethod
+    def of(cls, models: Sequence[StateSpace], scales: tuple[Array, Array]) -> _Statics:
+        u_scale, y_scale = scales
+        gains = np.array([model.dc_gain() for model in models])
+        inverse = _inverse(gains * u_scale / y_scale[:, None])
+        inverse *= u_scale[:, None] / y_scale
+        moved = -np.array([np.linalg.solve(m.A, m.B) for m in models])
+        rest = np.eye(len(u_scale)) - inverse @ gains
+        return cls(gains, inverse, moved @ inverse, moved @ rest)
 
 
 class _Work(NamedTuple):

@@ -184,7 +184,8 @@ list, default=None
     offsets : {"auto", None}, default="auto"
         Experiments stand about points of work, inputs u0 and outputs y0: where the
         local models have constants (`SubspaceLTI.offset_`, `detrend`), the LPV model
-        follows these, interpolated by a cubic spline through the points (see Notes).
+        follows these, interpolated by a cubic spline through the points (see Notes),
+        with the slopes that the models' gains tell where they are of one system.
         None: its outputs are zero at rest at input zero, with a warning where the
         experiments speak against it.
     efficient : bool, default=True
@@ -793,9 +794,9 @@ list, default=None
         held = getattr(self.interpolator_, "extrapolation", None) == "clip"
         beyond = "clip" if held else "ignore"
         spline = partial(SplineLPV, "cubic", extrapolation=beyond)
-        values, y_scale = known
+        values, scales = known
         frozen = self.lpv_.silenced().at
-        return interpolated(spline, found.points.kappa, values, frozen, y_scale)
+        return interpolated(spline, found.points.kappa, values, frozen, scales)
 
     def _check_options(self) -> None:
         one_of("combine", self.combine, ("pool", "average"))

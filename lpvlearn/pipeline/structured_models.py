@@ -201,10 +201,12 @@ def over_points(interpolator: Any, found: StructuredModels) -> Any:
     return interpolator.fit(found.points.kappa, found.theta, **known)
 
 
-def offsets_of_points(found: StructuredModels) -> tuple[Array, Array] | None:
+def offsets_of_points(
+    found: StructuredModels,
+) -> tuple[Array, tuple[Array, Array]] | None:
     """``[u0, y0, x0]`` of every point, as `LPVStateSpace` has them; None for none.
 
-    And the size of the motion of the outputs.
+    And the sizes of the motions of inputs and outputs.
     """
     if not any(model.n_trend and model.rest for model in found.local):
         return None
@@ -214,7 +216,7 @@ def offsets_of_points(found: StructuredModels) -> tuple[Array, Array] | None:
     inputs, outputs = (np.array(values) for values in zip(*rest, strict=True))
     scales = (u_scale, y_scale)
     kappa = found.points.kappa
-    return points_of_work(found.models, kappa, inputs, outputs, scales), y_scale
+    return points_of_work(found.models, kappa, inputs, outputs, scales), scales
 
 
 def begins_held(model: LPVStateSpace, points: OperatingPoints, dt: float) -> bool:

@@ -9,6 +9,7 @@ from lpvlearn.lpv.equilibria import interpolated, points_of_work
 from lpvlearn.lpv.spline import SplineLPV
 
 ONE = (np.ones(1), np.ones(1))
+SMALL = (0.1 * np.ones(1), np.ones(1))  # motions of the inputs about their levels
 KAPPA = np.linspace(-1.2, 1.2, 13)[:, None]
 
 
@@ -188,7 +189,7 @@ def test_equilibria_that_bend_follow_from_constants_that_do_not(n_points, error)
         return SplineLPV("cubic")
 
     kappa = speeds[:, None]
-    found = interpolated(spline, kappa, values, motor, np.ones(2))
+    found = interpolated(spline, kappa, values, motor, (np.ones(2), np.ones(2)))
     assert_allclose(found.predict(kappa), values, atol=1e-6 if n_points > 4 else 1e-9)
     between = 0.5 * (speeds[1:] + speeds[:-1])
     far, near = 0.0, 0.0
@@ -214,5 +215,39 @@ def test_equilibria_that_do_not_bend_are_interpolated_as_they_are():
     kappa = np.linspace(0.0, 2.0, 6)[:, None]
     y = 0.3 + kappa
     values = np.hstack([(1.0 + kappa) * y, y, y, 0.0 * y])
-    found = interpolated(lambda: SplineLPV("cubic"), kappa, values, spring, np.ones(1))
+    found = interpolated(lambda: SplineLPV("cubic"), kappa, values, spring, ONE)
     assert found.n_points_ == 6
+
+
+def tank(level):
+    """``h' = u - sqrt(h)``, of which the level is measured."""
+    return StateSpace([[-0.5 / np.sqrt(level[0])]], [[1.0]], [[1.0]])
+
+
+def valve(opening):
+    """``h' = u - log(h)``, of which the input is known."""
+    return StateSpace([[-np.exp(-opening[0])]], [[1.0]], [[1.0]])
+
+
+@pytest.mark.parametrize(
+    "system, kappa, inputs, outputs",
+    [
+        (tank, [1.0, 4.0, 9.0, 16.0], np.sqrt, np.asarray),
+        (valve, [0.0, 1.0, 2.0, 3.0], np.asarray, np.exp),
+    ],
+)
+def test_equilibria_of_one_system_have_the_slopes_of_its_gains(
+    system, kappa, inputs, outputs
+):
+    kappa = np.array(kappa)[:, None]
+    models = [system(k) for k in kappa]
+    values = points_of_work(models, kappa, inputs(kappa), outputs(kappa), SMALL)
+    found = interpolated(lambda: SplineLPV("cubic"), kappa, values, system, ONE)
+    alone = SplineLPV("cubic").fit(kappa, values)
+    assert_allclose(found.predict(kappa), values, atol=1e-9)
+    between = 0.5 * (kappa[1:] + kappa[:-1])
+    truth = np.hstack([inputs(between), outputs(between)])
+    ours, theirs = (
+        np.abs(one.predict(between)[:, :2] - truth).max() for one in (found, alone)
+    )
+    assert ours < 0.5 * theirs
