@@ -52,16 +52,14 @@ def better_in_canonical_form(
     aligned: tuple[GrayBoxStructure, Array],
     sizes: tuple[Array, Array],
     longest: float,
-    interpolator: Any,
+    interpolator: AutoLPV,
 ) -> bool:
     """Whether a low form carries canonical parameters, and foresees points better.
 
     Points that are left out, better than what is interpolated of `aligned` models,
     inputs and outputs in units of their `sizes`, what does not decay in the `longest`
-    record (seconds) forgotten. Judged by an `interpolator` that chooses.
+    record (seconds) forgotten. Judged by what the `interpolator` chooses.
     """
-    if not isinstance(interpolator, AutoLPV) or local[0].integrating:
-        return False
     found = _canonical(local)
     if found is None:
         return False

@@ -63,6 +63,7 @@ from .left_out import tell_of_two_points, tell_unforeseen
 from .local_models import common_delay, estimates_outputs, identify_points
 from .memory import checked_memory
 from .output_error import (
+    best_along,
     known_coefficients,
     local_covariance,
     local_output_errors,
@@ -79,6 +80,7 @@ from .structured_models import (
     offsets_of_points,
     over_points,
     restructure_points,
+    without_structure,
 )
 from .together import through_black_boxes
 from .workers import check_jobs
@@ -148,7 +150,8 @@ class LocalLPVPipeline(ScheduledEstimator):
         baseline. ``GrayBoxRestructurer()`` is the observable canonical form. None is
         that form where `AutoLPV` finds its parameters on a polynomial of degree 2 at
         most, or a fraction of degrees 3 together, which foresees points left out
-        clearly better than "aligned" does; else that.
+        clearly better than "aligned" does; else that. With a `refiner` it is what
+        follows the experiments that move better.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
         (n_points, n_params); None is ``AutoLPV()``, which chooses by the covariances
@@ -540,15 +543,13 @@ list, default=None
 
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
-            found = restructure_points(
-                restructurer,
-                local,
-                points,
-                runner,
-                self.sampling_time_,
-                limit,
-                self._interpolator(len(points)),
-            )
+            known = local, points, runner, self.sampling_time_, limit
+            if restructurer is None:
+                form = self._interpolator(len(points))
+                ways = without_structure(*known, form, every=bool(moving))
+                found = best_along(ways, form, moving, self.sampling_time_)
+            else:
+                found = restructure_points(restructurer, *known)
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa

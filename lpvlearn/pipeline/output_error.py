@@ -72,7 +72,12 @@ from .runner import PointRunner
 from .scheduled import ScheduledEstimator
 from .stability import growth_rates
 from .steps import check_step
-from .structured_models import StructuredModels, over_points, restructure_points
+from .structured_models import (
+    StructuredModels,
+    over_points,
+    restructure_points,
+    without_structure,
+)
 from .workers import check_jobs, results_of
 
 Array = NDArray[np.float64]
@@ -496,11 +501,13 @@ class OutputErrorLPV(ScheduledEstimator):
             efficient=True,
         )
         form = AutoLPV() if self.interpolator is None else clone(self.interpolator)
-        way = None if structure is None else GrayBoxRestructurer(structure)
-        found = restructure_points(way, local, points, runner, dt, interpolator=form)
-        form = over_points(form, found)
-        delay = common_delay(found.local, found.points.kappa, dt)
-        return [LPVStateSpace(found.structure, form, bounds, input_delay=delay)]
+        known = local, points, runner, dt, None
+        if structure is None:
+            ways = without_structure(*known, form, every=True)
+        else:
+            ways = [restructure_points(GrayBoxRestructurer(structure), *known)]
+        found = [_through(form, way, dt) for way in ways]
+        return [replace(model, scheduling_range=bounds) for model in found]
 
     def _local(self) -> Any:
         return SubspaceLTI(stability="enforce") if self.local is None else self.local
@@ -620,6 +627,39 @@ def _promising(
 
     best = sorted(models, key=loss)[:_N_STARTS]
     return min(best, key=soon) if len(best) > 1 else best[0]
+
+
+def _through(form: Any, found: StructuredModels, dt: float) -> LPVStateSpace:
+    """The LPV model through operating points, by a clone of a form."""
+    kappa = found.points.kappa
+    span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
+    delay = common_delay(found.local, kappa, dt)
+    form = over_points(clone(form), found)
+    return LPVStateSpace(found.structure, form, span, input_delay=delay)
+
+
+def best_along(
+    ways: Sequence[StructuredModels],
+    form: Any,
+    experiments: Sequence[Experiment],
+    sampling_time: float,
+) -> StructuredModels:
+    """The structured models through which a form simulates experiments best.
+
+    Of those that move, whatever their levels: what tells how states should be chosen.
+    """
+    if len(ways) == 1:
+        return ways[0]
+    records = [_record(e, sampling_time) for e in experiments]
+    weight = 1.0 / np.sqrt(np.mean([r.y.var(axis=0) for r in records], axis=0))
+    own = Own(initial_state=True, constant=True)
+
+    def loss(found: StructuredModels) -> float:
+        with collected():  # is told of what is taken
+            model = _through(form, found, sampling_time)
+        return sum(squares(model, record, own, weight) for record in records)
+
+    return min(ways, key=loss)
 
 
 def local_covariance(form: Any, found: StructuredModels) -> Array | None:

@@ -19,6 +19,7 @@ from sklearn.utils.validation import has_fit_parameter
 
 from ..data.operating_points import OperatingPoints
 from ..exceptions import collected, retold, warn
+from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import points_of_work
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
@@ -73,18 +74,13 @@ def restructure_points(
     runner: PointRunner,
     sampling_time: float,
     max_time: float | None = None,
-    interpolator: Any = None,
 ) -> StructuredModels:
     """Bring the local models of all operating points into one structure.
 
-    "aligned" or "passthrough": the entries of the balanced models are parameters. None:
-    "aligned", but where the canonical form is better for the `interpolator`.
+    "aligned" or "passthrough": the entries of the balanced models are parameters.
     `max_time` bounds the seconds of all points: equal shares, known in advance, and
     what is left of it for the help of neighbours.
     """
-    if restructurer is None:
-        arguments = local, points, runner, sampling_time, max_time
-        return _without_structure(interpolator, *arguments)
     began = perf_counter()
     if isinstance(restructurer, str):
         longest = sampling_time * points.n_longest
@@ -166,31 +162,44 @@ def restructure_points(
     )
 
 
-def _without_structure(
-    interpolator: Any,
+def without_structure(
     local: list[LocalModel],
     points: OperatingPoints,
     runner: PointRunner,
     sampling_time: float,
     max_time: float | None,
-) -> StructuredModels:
-    """Aligned models, or canonical ones where that is better and nothing is told."""
+    interpolator: Any,
+    *,
+    every: bool = False,
+) -> list[StructuredModels]:
+    """Aligned models and canonical ones, the better first for the `interpolator`.
+
+    The better alone, unless `every` one is asked for, or the other has been told of.
+    """
     with retold() as told:
         aligned = restructure_points("aligned", local, points, runner, sampling_time)
-    if told or not better_in_canonical_form(
-        local,
-        points.kappa,
-        (aligned.structure, aligned.theta),
-        channel_sizes(points.experiments),
-        sampling_time * points.n_longest,
-        interpolator,
-    ):
-        return aligned
+    integrates = bool(local[0].integrating)
+    if told or integrates or not isinstance(interpolator, AutoLPV):
+        return [aligned]
+    longest = sampling_time * points.n_longest
+    sizes = channel_sizes(points.experiments)
+    known = aligned.structure, aligned.theta
+    better = better_in_canonical_form(
+        local, points.kappa, known, sizes, longest, interpolator
+    )
+    if not (better or every):
+        return [aligned]
     with collected() as told:
-        canonical = restructure_points(
-            GrayBoxRestructurer(), local, points, runner, sampling_time, max_time
-        )
-    return aligned if told else canonical
+        try:
+            canonical = restructure_points(
+                GrayBoxRestructurer(), local, points, runner, sampling_time, max_time
+            )
+        except ValueError:
+            return [aligned]
+    if told:
+        return [aligned]
+    ways = [canonical, aligned] if better else [aligned, canonical]
+    return ways if every else ways[:1]
 
 
 def over_points(interpolator: Any, found: StructuredModels) -> Any:

@@ -1,6 +1,7 @@
 """Black boxes without a structure: in canonical form where a low one carries it."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from lpvlearn import (
@@ -98,11 +99,15 @@ def test_a_curve_through_the_points_is_one_through_aligned_models():
     assert model.restructurers_ == []
 
 
-@pytest.mark.slow
-def test_a_refined_model_keeps_the_states():
-    X, y = spring_tables(noise=0.01)
+def test_experiments_that_move_choose_the_states():
+    """Three points tell of no form; what moves tells which states follow it."""
+    X, y = spring_tables(noise=0.01, kappas=(0.0, 0.75, 1.5))
+    X_moving, y_moving = spring_sweep(1000, seed=3)
     X_sweep, y_sweep = spring_sweep()
-    model = OutputErrorLPV(**ROLES)
-    model.fit(X, y)
-    assert model.lpv_.structure.parameter_names[0] == "a2_1"
-    assert bft_score(y_sweep, model.predict(X_sweep)) > 99.0
+    alone = LocalLPVPipeline(**ROLES).fit(X, y)
+    assert alone.restructurers_ == []
+    model = LocalLPVPipeline(refiner=OutputErrorLPV(), **ROLES)
+    model.fit(pd.concat([X, X_moving]), pd.concat([y, y_moving]))
+    assert len(model.restructurers_) == 3
+    assert bft_score(y_sweep, model.predict(X_sweep)) > 99.5
+    assert bft_score(y_sweep, alone.predict(X_sweep)) < 99.0
