@@ -43,6 +43,11 @@ _HELD, _ENOUGH_CHANGES, _LONGEST_HELD = 0.95, 20, 1000
 # in this share of its samples does not stay anywhere by itself.
 _STAYS, _LONGER, _OTHERS, _CHANGES = 10, 3, 0.1, 0.5
 
+# It drops out where it jumps to a value and back by so many times what this share of
+# its steps are, and comes back as near as this share of the jump; and does so in less
+# than this share of its samples. Not if so many of the jumps are moves of the inputs.
+_APART, _MOST, _BACK, _SELDOM, _FOLLOWED = 4.0, 0.95, 0.5, 0.1, 0.7
+
 # A sample stands out that is this many times as far from the median as this share of
 # others are, of so many at least.
 _FAR, _USUAL, _FAR_OF = 5.0, 0.95, 50
@@ -397,3 +402,51 @@ def stays_put(signals: Sequence[Array]) -> list[list[tuple[int, int]]]:
         start, stop = k[:-1][long].tolist(), k[1:][long].tolist()
         parts.append(list(zip(start, stop, strict=True)))
     return parts
+
+
+class DroppedOut(NamedTuple):
+    """Where a signal falls to one value, and is back where it was."""
+
+    value: float
+    runs: list[tuple[int, int, int]]  # experiment, start and stop
+
+
+def drops_out(
+    signals: Sequence[Array], inputs: Sequence[Array] | None = None
+) -> DroppedOut | None:
+    """Runs in which a sensor of many digits reads one value, far from its neighbours.
+
+    Of signals (n_samples,), by experiment; None where there are no two such samples, or
+    they follow `inputs` (n_samples, n_inputs) that seldom move.
+
+    >>> y = 5.0 + np.sin(np.linspace(0.0, 20.0, 200))
+    >>> y[50:53] = y[120:121] = 0.0
+    >>> drops_out([y])
+    DroppedOut(value=0.0, runs=[(0, 50, 53), (0, 120, 121)])
+    """
+    known = [y[np.isfinite(y)] for y in signals]
+    steps = np.abs(np.concatenate([np.diff(y) for y in known]))
+    if not np.count_nonzero(steps) > _CHANGES * len(steps):
+        return None
+    least = _APART * np.quantile(steps, _MOST)
+    found: dict[float, list[tuple[int, int, int]]] = {}
+    for e, y in enumerate(signals):
+        k = np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [len(y)]])
+        start, stop = k[1:-2], k[2:-1]  # but for the first run and the last
+        value, before, after = y[start], y[start - 1], y[stop]
+        jump = np.minimum(np.abs(value - before), np.abs(value - after))
+        falls = (jump > least) & (np.abs(after - before) < _BACK * jump)
+        for v, *run in zip(
+            *(column[falls].tolist() for column in (value, start, stop)), strict=True
+        ):
+            found.setdefault(v, []).append((e, *run))
+    if not found:
+        return None
+    value, runs = max(found.items(), key=lambda item: len(item[1]))
+    n = sum(stop - start for _, start, stop in runs)
+    few = n < _SELDOM * sum(map(len, signals))
+    if inputs is not None:
+        moves = [np.any(np.diff(u, axis=0, prepend=u[:1]) != 0, axis=1) for u in inputs]
+        followed = np.mean([moves[e][start] for e, start, _ in runs])
+        few &= not followed > _FOLLOWED or np.mean(np.concatenate(moves)) > followed / 2
+    return DroppedOut(value, runs) if few and n > 1 else None

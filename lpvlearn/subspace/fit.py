@@ -15,6 +15,7 @@ from .cross_checks import tell_of_contradiction, tell_of_input_spikes, without_r
 from .drift import of_drifting_noise
 from .fit_warnings import (
     tell_of_answers,
+    tell_of_dropouts,
     tell_of_feedback,
     tell_of_held_outputs,
     tell_of_limits,
@@ -50,6 +51,7 @@ def fit_pairs(
         raise TooFewSamples(str(error)) from None
     outputs = [y for _, y in pairs]
     tell_of_still_outputs(outputs, telling)
+    tell_of_dropouts(pairs, telling)
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     fitted = with_trends(pairs, choices, telling, known)
     pairs, fitted = without_rounding(pairs, choices, telling, fitted, known)

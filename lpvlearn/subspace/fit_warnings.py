@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import constant_columns, held_for, stays_put
+from ..data.preparation import Pairs, constant_columns, drops_out, held_for, stays_put
 from ..exceptions import RankWarning, warn
 from .constancy import change_over
 from .held_out import HeldOut
@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 TESTS = {"held out", "orders", "static gain", "response", "decay", "bent", "lack"}
 
 # What was told of that bends a response as well
-_BENDS = {"bent", "limit", "held", "input spikes"}
+_BENDS = {"bent", "limit", "held", "dropouts", "input spikes"}
 
 # Share of its motion by which a model moves where an output stays, and of the samples
 _MOVES_ON, _AT_LIMITS = 0.05, 0.01
@@ -104,6 +104,25 @@ def tell_of_held_outputs(outputs: Sequence[Array], telling: Telling) -> None:
             "value), or `resample`; where one does, put NaN in place of values that "
             "are held, and use missing='estimate' with a given `order`.",
         )
+
+
+def tell_of_dropouts(pairs: Pairs, telling: Telling) -> None:
+    """Tell of outputs whose sensor reads one value in between."""
+    inputs, outputs = zip(*pairs, strict=True)
+    for k in range(outputs[0].shape[1]) if "dropouts" not in telling else ():
+        found = drops_out([y[:, k] for y in outputs], inputs)
+        if found is not None:
+            n = sum(stop - start for _, start, stop in found.runs)
+            first, start, _ = found.runs[0]
+            where = f" of experiment {first}" if len(outputs) > 1 else ""
+            telling.once(
+                "dropouts",
+                f"Output {telling.output(k)} falls to {found.value:.6g} in {n} "
+                f"sample(s), {len(found.runs)} time(s), far from what is before and "
+                f"after; the first is sample {start}{where}, counted from 0. Its "
+                "sensor, or what logs it, drops out: put NaN in place of these "
+                "samples and use missing='estimate'.",
+            )
 
 
 def tell_of_limits(
@@ -354,7 +373,7 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> Non
             "outputs move, not where they stand. Record what makes them drift as an "
             "input, or use `predict_ahead`.",
         )
-    elif residual > USELESS:
+    elif residual > USELESS and "dropouts" not in telling:
         other = "an `order` of your own" if chose_order else "order='auto'"
         telling.once(
             "useless",
@@ -402,7 +421,8 @@ def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
 
 def _warn_of_spikes(fitted: LocalFit, telling: Telling) -> None:
     """Tell of samples that a sensor may have got wrong: the model follows them."""
-    spikes = None if "spikes" in telling else find_spikes(fitted.evidence)
+    told = "spikes" in telling or "dropouts" in telling
+    spikes = None if told else find_spikes(fitted.evidence)
     if spikes is None:
         return
     rounded = rounded_outputs(fitted.evidence.model, fitted.evidence.records)

@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter, tf2ss
 
 from lpvlearn import StateSpace, SubspaceLTI, bft_score
-from lpvlearn.data.preparation import remove_trends, stays_put
+from lpvlearn.data.preparation import drops_out, remove_trends, stays_put
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace.fit import fit_pairs
 from lpvlearn.subspace.fit_warnings import warn_about
@@ -414,6 +414,40 @@ def test_a_sensor_that_hangs_is_told():
         SubspaceLTI(1, offset=None).fit(X, named)
     y[100:130] = y[300:330] = np.nan
     SubspaceLTI(1, missing="estimate").fit(u, y)
+
+
+@pytest.mark.parametrize("fallen, length", [(0.0, 3), (-999.0, 1)])
+def test_a_sensor_that_drops_out_is_told(fallen, length):
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.choice([-1.0, 1.0], (100, 1)), 6, axis=0)
+    y = 5.0 + lfilter([0.0, 0.1], [1.0, -0.9], u, axis=0)
+    y += 0.01 * rng.standard_normal(y.shape)
+    SubspaceLTI().fit(u, y)
+    at = [slice(k, k + length) for k in (77, 180, 333, 501)]
+    for part in at:
+        y[part] = fallen
+    n = 4 * length
+    told = rf"'level' falls to {fallen:.6g} in {n} sample\(s\), 4 time.*sample 77,"
+    named = pd.Series(y[:, 0], name="level")
+    with pytest.warns(UserWarning, match=told) as warned:
+        SubspaceLTI().fit(pd.DataFrame(u, columns=["pump"]), named)
+    assert len(warned) == 1
+    for part in at:
+        y[part] = np.nan
+    model = SubspaceLTI(missing="estimate").fit(u, y)
+    assert abs(model.lti_.poles() - 0.9).max() < 0.01
+
+
+@pytest.mark.parametrize("rest", [0.0, 0.01])
+def test_pulses_are_no_dropouts(rest):
+    """Of an output that answers its input at once, at rest in between or with noise."""
+    rng = np.random.default_rng(0)
+    pulses = np.zeros(600)
+    pulses[np.arange(20, 600, 40)] = 5.0
+    y = pulses + lfilter([0.0, 0.1], [1.0, -0.9], pulses)
+    y += rest * rng.standard_normal(600)
+    assert drops_out([y], [pulses[:, None]]) is None
+    assert drops_out([np.sign(np.sin(np.arange(600.0)))]) is None
 
 
 def test_an_output_at_rest_is_at_no_limit():
