@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import median_filter
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import Delaunay, QhullError
 from scipy.spatial.distance import cdist
 
 from ..exceptions import warn
-from ..validation import shown, squarable
+from ..validation import listed, shown, squarable
 from .experiments import Experiment, as_numbers
 
 Array = NDArray[np.float64]
@@ -36,6 +37,11 @@ _JOINT = 0.1
 # A variable that is constant but for so many steps, of more than this share of its
 # range over the points and with so many samples for each, is at several points.
 _FEW_STEPS, _STEP, _STILL = 3, 0.05, 10
+
+# A spike is this many times as far from the median of so many samples about it as this
+# share of all steps are, and farther than a step that counts.
+_SPIKE, _ABOUT, _MOST = 4.0, 7, 0.95
+_NAMED = 3  # experiments that a message lists
 
 _ROUNDING = 1e-6  # of scheduling values, relative to the range they are compared with
 _CLOSE = 0.01  # share of the range within which means are one point, if not more
@@ -109,6 +115,39 @@ def local_experiments(
             "follows the scheduling variable, or leave `scheduling` out."
         )
     return OperatingPoints(kappa, groups)
+
+
+def without_spikes(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Experiments with the medians of their neighbours for samples that stand far out.
+
+    Of scheduling variables, of which a sensor that drops out makes others. Told.
+    """
+    runs, found = list(experiments), {}
+    signals = [run.scheduling for run in runs if run.scheduling is not None]
+    known = (signal.size and np.isfinite(signal).all() for signal in signals)
+    if len(signals) < len(runs) or not all(known):
+        return runs
+    middle = np.array([np.median(signal, axis=0) for signal in signals])
+    extent = np.ptp(middle, axis=0)
+    scale = np.where(extent > 0, extent, np.abs(middle).max(axis=0))
+    for k, signal in enumerate(signals):
+        if len(signal) <= _ABOUT or not np.ptp(signal, axis=0).any():
+            continue
+        about = median_filter(signal, size=(_ABOUT, 1), mode="nearest")
+        usual = np.quantile(np.abs(np.diff(signal, axis=0)), _MOST, axis=0)
+        far = np.abs(signal - about) > np.maximum(_SPIKE * usual, _STEP * scale)
+        if far.any():
+            first, j = np.argwhere(far)[0]
+            found[k] = f"{runs[k].label!r}: {signal[first, j]:.4g} at sample {first}"
+            runs[k] = replace(runs[k], scheduling=np.where(far, about, signal))
+    if found:
+        warn(
+            "the scheduling variables fall to other values for single samples, as of a "
+            f"sensor that drops out (experiment {listed([*found.values()], _NAMED)}). "
+            "The model takes the median of their neighbours there. Replace them in the "
+            "table that you give to `predict`, too."
+        )
+    return runs
 
 
 def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:

@@ -33,6 +33,7 @@ from ..data.operating_points import (
     local_experiments,
     moving_experiments,
     tell_of_joint_scheduling,
+    without_spikes,
 )
 from ..data.preparation import has_gaps, split_at_gaps
 from ..data.timestamps import TIME_TOL
@@ -512,7 +513,7 @@ list, default=None
         efficient = getattr(restructurer, "norm", None) == "covariance"
 
         with watch.step("reading of the table"):  # steps 1 and 2, and their groups
-            experiments = read()
+            experiments = without_spikes(read())
             self.n_outputs_ = len(self.output_names_)
             check_outputs(experiments, self.output_names_)
             self.time_jitter_ = max(e.jitter for e in experiments)

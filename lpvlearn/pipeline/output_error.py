@@ -25,6 +25,7 @@ from ..data.operating_points import (
     check_outputs,
     local_experiments,
     moving_experiments,
+    without_spikes,
 )
 from ..data.preparation import part_of
 from ..data.timestamps import TIME_TOL
@@ -310,7 +311,7 @@ class OutputErrorLPV(ScheduledEstimator):
             much of them follows from the inputs and scheduling variables.
         """
         self._check_options()
-        experiments = self._read(X, y, reset=True)
+        experiments = without_spikes(self._read(X, y, reset=True))
         names = read_outputs(y)[1]
         check_outputs(experiments, names)
         self._single_output = np.asarray(y).ndim == 1

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.data.operating_points import _check_local, group_operating_points
+from lpvlearn.data.operating_points import (
+    _check_local,
+    group_operating_points,
+    without_spikes,
+)
 
 
 def _runs(values, spread=0.0, points=None):
@@ -114,3 +118,39 @@ def test_a_single_sweep_is_not_local():
     (run,) = runs = _runs([1.0], spread=1.0)
     with pytest.raises(ValueError, match="must be local"):
         _check_local(runs, run.scheduling.mean(axis=0, keepdims=True))
+
+
+def _record(signal, label=0):
+    signal = np.asarray(signal, float)[:, None]
+    rows = np.arange(len(signal))
+    return Experiment(label, rows, np.ones((len(rows), 1)), scheduling=signal)
+
+
+def test_spikes_of_scheduling_variables_are_replaced_and_told():
+    rng = np.random.default_rng(0)
+    clean = [k + 0.01 * rng.standard_normal(300) for k in (0.0, 0.5, 1.0)]
+    spiky = [signal.copy() for signal in clean]
+    spiky[1][77], spiky[2][100:103] = 0.0, -999.0
+    with pytest.warns(
+        UserWarning, match=r"experiment 1: 0 at sample 77, 2: -999 at sam"
+    ):
+        found = without_spikes([_record(x, k) for k, x in enumerate(spiky)])
+    for run, signal in zip(found, clean, strict=True):
+        np.testing.assert_allclose(run.scheduling[:, 0], signal, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        np.sign(np.sin(0.1 * np.arange(300.0))),
+        np.sin(np.arange(300.0)),
+        np.repeat([0.0, 1.0, 0.5, 2.0, 0.0], 60),
+        np.linspace(0.0, 1.0, 300),
+        np.full(300, 3.0),
+        np.random.default_rng(0).standard_normal(300),
+        np.r_[[0.0] * 5, 1.0],
+    ],
+)
+def test_what_moves_has_no_spikes(signal):
+    run = _record(signal)
+    assert without_spikes([run])[0] is run
