@@ -38,18 +38,44 @@ _LOW = 2, 3  # the degree of a polynomial, and both degrees of a fraction, at mo
 _UNLIKE, _CLEARLY = 2.0, 0.8
 
 
-class _Canonical(NamedTuple):
+class CanonicalModels(NamedTuple):
     """Models of all points in the form, and the covariances of their parameters."""
 
     structure: GrayBoxStructure
-    theta: Array
-    covariance: Array
+    theta: Array  # (n_points, n_params)
+    covariance: Array  # (n_points, n_params, n_params)
 
 
-def better_in_canonical_form(
+def canonical_black_boxes(local: Sequence[LocalModel]) -> CanonicalModels | None:
+    """None where a model has no such form, or its covariance is not known."""
+    first = local[0].lti
+    if len({model.lti.order for model in local}) > 1 or not first.order:
+        return None
+    structure = GrayBoxStructure.observable_canonical(
+        first.order,
+        first.n_inputs,
+        first.n_outputs,
+        any(bool(model.lti.D.any()) for model in local),
+    )
+    form = CanonicalForm(structure, None)
+    theta, covariance = [], []
+    for model in local:
+        around = [m for pair in model.deviated() for m in pair]
+        rows = [form.parameters(_matrix(m)) for m in (model.lti, *around)]
+        known = [row for row in rows if row is not None]
+        if not around or len(known) < len(rows):
+            return None
+        changes = np.array(known[1::2]) - np.array(known[2::2])
+        theta.append(known[0])
+        covariance.append(changes.T @ changes / (2.0 * DEVIATION) ** 2)
+    return CanonicalModels(structure, np.array(theta), np.array(covariance))
+
+
+def is_better_form(
+    canonical: CanonicalModels,
+    aligned: tuple[GrayBoxStructure, Array],
     local: Sequence[LocalModel],
     kappa: Array,
-    aligned: tuple[GrayBoxStructure, Array],
     sizes: tuple[Array, Array],
     longest: float,
     interpolator: AutoLPV,
@@ -60,63 +86,33 @@ def better_in_canonical_form(
     inputs and outputs in units of their `sizes`, what does not decay in the `longest`
     record (seconds) forgotten. Judged by what the `interpolator` chooses.
     """
-    found = _canonical(local)
-    if found is None:
-        return False
+    structure, theta, covariance = canonical
     with collected():
-        auto = clone(interpolator).fit(kappa, found.theta, covariance=found.covariance)
+        auto = clone(interpolator).fit(kappa, theta, covariance=covariance)
     form = auto.best_estimator_
-    if not _is_low(form) or not holds_within_range(found.structure, form):
+    if not _is_low(form) or not holds_within_range(structure, form):
         return False
     models = [model.lti for model in local]
     rate = forgotten(models, longest)
-    ways = (
-        (*aligned, SplineLPV(), None),
-        (found.structure, found.theta, form, found.covariance),
-    )
+    ways = (*aligned, SplineLPV(), None), (structure, theta, form, covariance)
     other, own = (
         errors_left_out(
-            structure,
+            of,
             models,
             curve,
             kappa,
-            theta,
+            values,
             rate,
             covariance=P,
             seen=lambda model: scaled(model, *sizes),
         )
-        for structure, theta, curve, P in ways
+        for of, values, curve, P in ways
     )
     both = [k for k in own if k in other]
     by_form, by_curve = (
         sum(min(errors[k], _UNLIKE) for k in both) for errors in (own, other)
     )
-    return bool(both) and by_form <= by_curve
-
-
-def _canonical(local: Sequence[LocalModel]) -> _Canonical | None:
-    """None where a model has no such form, or its covariance is not known."""
-    if len({model.lti.order for model in local}) > 1 or not local[0].lti.order:
-        return None
-    structure = GrayBoxStructure.observable_canonical(
-        local[0].lti.order,
-        local[0].lti.n_inputs,
-        local[0].lti.n_outputs,
-        any(bool(model.lti.D.any()) for model in local),
-    )
-    form = CanonicalForm(structure, None)
-    theta, covariance = [], []
-    for model in local:
-        pairs = model.deviated()
-        rows = [form.parameters(_matrix(m)) for pair in pairs for m in pair]
-        own = form.parameters(_matrix(model.lti))
-        known = [row for row in rows if row is not None]
-        if own is None or not rows or len(known) < len(rows):
-            return None
-        changes = np.array(known[::2]) - np.array(known[1::2])
-        theta.append(own)
-        covariance.append(changes.T @ changes / (2.0 * DEVIATION) ** 2)
-    return _Canonical(structure, np.array(theta), np.array(covariance))
+    return bool(both) and by_form < _CLEARLY * by_curve
 
 
 def _matrix(model: StateSpace) -> Array:

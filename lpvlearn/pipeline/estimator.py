@@ -232,7 +232,7 @@ list, default=None
     structured_models_ : list of StateSpace
         Gray-box models (without a structure, the balanced ones).
     restructurers_ : list
-        The fitted restructurers, empty where black boxes are interpolated.
+        The fitted restructurers, empty without one.
     parameters_ : DataFrame of shape (n_points, n_params)
         Gray-box parameters, one row per operating point: the efficient ones, where
         `efficient` applies.
@@ -245,7 +245,7 @@ list, default=None
         black box, or with ``combine="average"`` and ``efficient=False`` from the spread
         of the realizations. NaN where that is not known: a local model that does not
         minimise the simulation error (``refine=False``, a stability that had to be
-        enforced), collinear inputs, or no structure.
+        enforced), collinear inputs, or aligned black boxes.
     interpolator_ : fitted regressor
         Of `lpv_`: with a `refiner`, that with the refined coefficients.
     refiner_ : fitted refiner or None
@@ -544,13 +544,13 @@ list, default=None
 
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
-            known = local, points, runner, self.sampling_time_, limit
+            known = local, points, runner, self.sampling_time_
             if restructurer is None:
                 form = self._interpolator(len(points))
                 ways = without_structure(*known, form, every=bool(moving))
                 found = best_along(ways, form, moving, self.sampling_time_)
             else:
-                found = restructure_points(restructurer, *known)
+                found = restructure_points(restructurer, *known, limit)
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa
@@ -705,7 +705,7 @@ list, default=None
             sampling_time=self.sampling_time_,
             jitter=self.time_jitter_,
             scheduling=self.scheduling_names_,
-            local=_name_of_step(self.local, "local"),
+            local=type(self._local()).__name__,
             restructurer=self._way(),
         )
         if self.refiner_ is None:
@@ -723,9 +723,10 @@ list, default=None
         """How the points came to one structure, or one basis."""
         if isinstance(self.restructurer, str):
             return self.restructurer
-        if self.restructurer is None and not self.restructurers_:
-            return WITHOUT[0]
-        return _name_of_step(self.restructurer, "restructurer")
+        if self.restructurer is None:
+            known = np.isfinite(self.parameters_covariance_).any()
+            return "canonical" if known else WITHOUT[0]
+        return type(self.restructurer).__name__
 
     @property
     def _splits(self) -> bool:
@@ -874,7 +875,3 @@ def _check_channels(
             f"{has}inputs; `y` has {len(outputs)} column(s), {found}. They must agree: "
             "give the outputs of the structure alone, in its order."
         )
-
-
-def _name_of_step(step: Any, name: str) -> str:
-    return (_DEFAULTS[name] if step is None else type(step)).__name__

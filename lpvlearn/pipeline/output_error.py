@@ -502,7 +502,7 @@ class OutputErrorLPV(ScheduledEstimator):
             efficient=True,
         )
         form = AutoLPV() if self.interpolator is None else clone(self.interpolator)
-        known = local, points, runner, dt, None
+        known = local, points, runner, dt
         if structure is None:
             ways = without_structure(*known, form, every=True)
         else:

@@ -270,7 +270,7 @@ def summarise(
 
     `jitter` is by how much of a step time stamps are off, at most; `scheduling` names
     the variables (none: a time-invariant model), `local` and `restructurer` the classes
-    of steps 3 and 4.
+    of steps 3 and 4, or the states of black boxes.
     """
     report = found.points
     kappa = np.array([np.atleast_1d(label) for label in report.index], dtype=float)
@@ -345,11 +345,10 @@ def summarise(
                 "point(s): see `parameters_std_`"
             )
     else:
-        basis = (
-            "each turned to its neighbour"
-            if restructurer == "aligned"
-            else "which have no common state basis"
-        )
+        basis = {
+            "aligned": "each turned to its neighbour",
+            "canonical": "in the observable canonical form",
+        }.get(restructurer, "which have no common state basis")
         lines.append(
             "Restructuring: none; the entries of black boxes are interpolated, " + basis
         )

@@ -24,7 +24,6 @@ from ..lpv.equilibria import points_of_work
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..restructuring.deadline import bounded, time_is_up
-from ..restructuring.estimator import GrayBoxRestructurer
 from ..restructuring.minimise_covariance import Estimate
 from ..restructuring.problem import GOOD_FIT, problem_from_models
 from ..restructuring.uncertainty import ParameterUncertainty
@@ -38,7 +37,7 @@ from .black_boxes import (
     tell_of_forced,
 )
 from .branches import Doubt, tied_branches
-from .canonical import better_in_canonical_form
+from .canonical import canonical_black_boxes, is_better_form
 from .local_models import LocalModel, motions
 from .runner import Done, PointRunner, place_of, tell_skipped
 
@@ -91,10 +90,7 @@ def restructure_points(
             tell_of_forced(local, points.kappa, longest)
             models = [balanced(model) for model in local]
             structure, theta = balanced_entries(models, local[0].integrating)
-        models = [
-            structure.model(row).with_input_delay(model.lti.input_delay)
-            for row, model in zip(theta, local, strict=True)
-        ]
+        models = _delayed(structure, theta, local)
         unknown = _unknown_covariance(theta)
         return StructuredModels(points, local, structure, theta, unknown, models, [])
     restructurer = _with_structure(restructurer, local)
@@ -167,39 +163,46 @@ def without_structure(
     points: OperatingPoints,
     runner: PointRunner,
     sampling_time: float,
-    max_time: float | None,
     interpolator: Any,
     *,
     every: bool = False,
 ) -> list[StructuredModels]:
     """Aligned models and canonical ones, the better first for the `interpolator`.
 
-    The better alone, unless `every` one is asked for, or the other has been told of.
+    The better alone, unless `every` one is asked for, or aligned ones where these are
+    told of.
     """
     with retold() as told:
         aligned = restructure_points("aligned", local, points, runner, sampling_time)
     integrates = bool(local[0].integrating)
     if told or integrates or not isinstance(interpolator, AutoLPV):
         return [aligned]
-    longest = sampling_time * points.n_longest
-    sizes = channel_sizes(points.experiments)
-    known = aligned.structure, aligned.theta
-    better = better_in_canonical_form(
-        local, points.kappa, known, sizes, longest, interpolator
+    found = canonical_black_boxes(local)
+    if found is None:
+        return [aligned]
+    better = is_better_form(
+        found,
+        (aligned.structure, aligned.theta),
+        local,
+        points.kappa,
+        channel_sizes(points.experiments),
+        sampling_time * points.n_longest,
+        interpolator,
     )
-    if not (better or every):
-        return [aligned]
-    with collected() as told:
-        try:
-            canonical = restructure_points(
-                GrayBoxRestructurer(), local, points, runner, sampling_time, max_time
-            )
-        except ValueError:
-            return [aligned]
-    if told:
-        return [aligned]
+    models = _delayed(found.structure, found.theta, local)
+    canonical = StructuredModels(points, local, *found, models, [])
     ways = [canonical, aligned] if better else [aligned, canonical]
     return ways if every else ways[:1]
+
+
+def _delayed(
+    structure: GrayBoxStructure, theta: Array, local: Sequence[LocalModel]
+) -> list[StateSpace]:
+    """Models of a structure with the delays of the local ones."""
+    return [
+        structure.model(row).with_input_delay(model.lti.input_delay)
+        for row, model in zip(theta, local, strict=True)
+    ]
 
 
 def over_points(interpolator: Any, found: StructuredModels) -> Any:
