@@ -16,7 +16,7 @@ Nobody wrote down the physics. What can be done with black-box models alone?
 
 The default, ``restructurer=None``, takes the third way where a polynomial or a fraction
 of low degrees carries the parameters within their covariances, and foresees points that
-are left out clearly better than the second does; else the second.
+are left out as well as the second does; else the second.
 """
 
 # %%

@@ -33,9 +33,7 @@ Array = NDArray[np.float64]
 
 _LOW = 2, 3  # the degree of a polynomial, and both degrees of a fraction, at most
 
-# An error of a point left out, in its largest gain, as bad as any; and the share of the
-# errors of aligned models that must be left: with as much, there is nothing to gain
-_UNLIKE, _CLEARLY = 2.0, 0.8
+_UNLIKE = 2.0  # an error of a point left out, in its largest gain, as bad as any
 
 
 class CanonicalModels(NamedTuple):
@@ -80,9 +78,9 @@ def is_better_form(
     longest: float,
     interpolator: AutoLPV,
 ) -> bool:
-    """Whether a low form carries canonical parameters, and foresees points better.
+    """Whether a low form carries canonical parameters, and foresees points no worse.
 
-    Points that are left out, better than what is interpolated of `aligned` models,
+    Points that are left out, no worse than what is interpolated of `aligned` models,
     inputs and outputs in units of their `sizes`, what does not decay in the `longest`
     record (seconds) forgotten. Judged by what the `interpolator` chooses.
     """
@@ -112,7 +110,7 @@ def is_better_form(
     by_form, by_curve = (
         sum(min(errors[k], _UNLIKE) for k in both) for errors in (own, other)
     )
-    return bool(both) and by_form < _CLEARLY * by_curve
+    return bool(both) and by_form <= by_curve
 
 
 def _matrix(model: StateSpace) -> Array:

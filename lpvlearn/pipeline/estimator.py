@@ -151,7 +151,7 @@ class LocalLPVPipeline(ScheduledEstimator):
         baseline. ``GrayBoxRestructurer()`` is the observable canonical form. None is
         that form where `AutoLPV` finds its parameters on a polynomial of degree 2 at
         most, or a fraction of degrees 3 together, which foresees points left out
-        clearly better than "aligned" does; else that. With a `refiner` it is what
+        as well as "aligned" does; else that. With a `refiner` it is what
         follows the experiments that move better.
     interpolator : regressor, default=None
         Step 5, from scheduling values (n_points, n_scheduling) to parameters
