@@ -368,7 +368,7 @@ def _equilibrium(
     known = [own.resting_point(begun=True) for own in fitted]
     u0, y0 = (np.mean(values, axis=0) for values in zip(*known, strict=True))
     longest = max(len(e.inputs) for e in experiments)
-    (u, u_scale), (y, y_scale) = motions(experiments)
+    (u, u_scale), (y, y_scale) = motions(_without_drifts(fitted, experiments))
     gain = lti.dc_gain()
     if (mode_rates(first.lti_.A) * longest < 1.0).any():
         far = np.abs(y0 - y) > _FAR * y_scale
@@ -380,6 +380,20 @@ def _equilibrium(
         np.concatenate([(u - u0) / u_scale, (y - y0) / y_scale]),
     )
     return u0 + step, y0 + gain @ step
+
+
+def _without_drifts(
+    fitted: Sequence[Any], experiments: Sequence[Experiment]
+) -> Sequence[Experiment]:
+    """The experiments without what their outputs drift from the beginning on."""
+    drifts = np.vstack([own.output_drift_ for own in fitted])  # per second
+    if not drifts.any() or len(drifts) != len(experiments):
+        return experiments
+    per_sample = drifts * fitted[0].lti_.sampling_time
+    return [
+        replace(e, outputs=e.measured - np.arange(len(e.inputs))[:, None] * drift)
+        for e, drift in zip(experiments, per_sample, strict=True)
+    ]
 
 
 def _tell_different_constants(

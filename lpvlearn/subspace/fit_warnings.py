@@ -409,13 +409,17 @@ def _warn_of_outputs(fitted: LocalFit, telling: Telling) -> None:
         return
     left = motions_left(fitted.evidence)
     poor = [telling.output(k) for k in np.flatnonzero(left > USELESS**2)]
+    about_one = np.abs(np.linalg.eigvals(model.A) - 1.0) < _ABOUT_ONE
+    remedy = "Try"
+    if about_one.any():
+        remedy = "Where it integrates, name it in `integrating`. Else try"
     if poor and len(poor) < np.count_nonzero(~np.isnan(left)):
         telling.once(
             "noisy output",
             f"The model explains next to nothing of output(s) {', '.join(poor)}: what "
-            "moves these is mostly noise, or noise as slow as what the inputs do. Try "
-            "refine='simulation' or a higher `order`, identify them apart from the "
-            "others, or leave them out.",
+            "moves these is mostly noise, or noise as slow as what the inputs do. "
+            f"{remedy} refine='simulation' or a higher `order`, identify them apart "
+            "from the others, or leave them out.",
         )
 
 
@@ -593,16 +597,16 @@ def warn_about_pole(A: Array, telling: Telling, method: str = "po-moesp") -> Non
             "Use stability='enforce' for a stable one, another `order`, or a longer "
             "`horizon`."
         )
-        if (np.abs(poles[moduli > 1.0] - 1.0) < _ABOUT_ONE).all():
-            remedy = (
-                "Name outputs that integrate, as a position does, in `integrating`. "
-                f"Else: {remedy}"
-            )
         if method == "pbsid":
             remedy = (
                 "Such a plant can be predicted (`predict_ahead`), but not simulated "
                 "for long nor brought into a structure: for that, identify the closed "
                 "loop, with the controller's reference as input."
+            )
+        if (np.abs(poles[moduli > 1.0] - 1.0) < _ABOUT_ONE).all():
+            remedy = (
+                "Name outputs that integrate, as a position does, in `integrating`. "
+                f"Where they drift, use offset='linear'. Else: {remedy}"
             )
         telling.once(
             "pole",

@@ -412,9 +412,11 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
 def may_have_drift(evidence: Evidence) -> bool:
     """Whether a model without drifts should be tried with them.
 
-    They show in its errors; or a mode does not decay, which stands for them, or for the
-    offset of an input that is integrated.
+    They show in its errors; or a mode grows, or does not decay, which stands for them,
+    or for the offset of an input that is integrated.
     """
+    if spectral_radius(evidence.model.A) > 1.0:
+        return True
     if (mode_rates(evidence.model.A) * evidence.longest < 1.0).any():
         return True
     return chance_of_trend(evidence, 2) < _SUSPICIOUS
@@ -430,12 +432,17 @@ def _lasts(evidence: Evidence) -> bool:
     return bool((mode_rates(evidence.model.A) * evidence.longest < _LASTING).any())
 
 
-def unmoved_errors(evidence: Evidence) -> float:
+def unmoved_errors(evidence: Evidence, *, beside_drifts: bool = False) -> float:
     """Times the squared errors, without what inputs do to modes that do not decay.
 
-    Next to one of modes that follow a drift; infinite where there are none.
+    Next to one of modes that follow a drift; infinite where there are none. Of an
+    integrator the level of an input makes a drift: what it does `beside_drifts` tells
+    whether inputs move it.
     """
-    model, free = evidence.model, evidence.free
+    model, free, records = evidence.model, evidence.free, evidence.records
+    if beside_drifts:
+        free = free._replace(n_trend=2)
+        records = [r._replace(trend=trend_signals(r.u.shape[1], 2)) for r in records]
     poles, V = np.linalg.eig(model.A)
     # By column of `V`.
     slow = np.abs(1.0 - poles) * evidence.longest < HARDLY_DECAYS
@@ -450,7 +457,7 @@ def unmoved_errors(evidence: Evidence) -> float:
     for B in (model.B - part @ model.B, model.B):
         moved = model._replace(B=B, blocks=None)
         with np.errstate(over="ignore", invalid="ignore"):
-            found = with_initial_states(moved, evidence.records, free, weight)
+            found = with_initial_states(moved, records, free, weight)
         losses.append(found.loss)
     return losses[0] / losses[1] if 0.0 < losses[1] < np.inf else np.inf
 

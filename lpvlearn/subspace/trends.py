@@ -76,7 +76,9 @@ def with_trends(
     given = choices.order is not None and choices.initial_states and n_trend < 2
     given &= fitted.method != "pbsid" and not choices.enforce_stability
     lost = given and (
-        outlasts(fitted) or fitted.residual > _HARDLY or drifts_off(tested)
+        outlasts(fitted)
+        or fitted.residual > _HARDLY
+        or _drifts_off(pairs, judged, telling, fitted, tested)
     )
     shown = choices.order is None and not hides and not rough
     if choices.offset == "auto" and (
@@ -89,6 +91,26 @@ def with_trends(
         if rough
         else fitted
     )
+
+
+def _drifts_off(
+    pairs: Pairs,
+    choices: Choices,
+    telling: Telling,
+    fitted: LocalFit,
+    tested: Evidence,
+) -> bool:
+    """Whether errors of a given order drift, and by no state that inputs move."""
+    own = fitted.evidence.one_step
+    if not (drifts_off(tested) or drifts_off(own) or wanders(own)):
+        return False
+    order, n_trend = len(fitted.model.A) + 1, fitted.evidence.free.n_trend
+    try:
+        more, worse = of_order(pairs, choices, telling, order, fitted, n_trend)
+    except TooFewSamples:
+        return True
+    moved = unmoved_errors(more.evidence.one_step, beside_drifts=True) > HARDLY_MOVED
+    return not (worse < -CERTAIN and moved)
 
 
 def _may_drift_off(
@@ -141,7 +163,7 @@ def _with_drifts(
         least = CERTAIN
     elif not drifting:
         least = -ALIKE if spared else ALIKE
-    elif (unmoved := unmoved_errors(tested)) < _NOT_MOVED:
+    elif (unmoved := unmoved_errors(tested, beside_drifts=True)) < _NOT_MOVED:
         least = -ALIKE
     else:
         least = ALIKE if unmoved < HARDLY_MOVED else CERTAIN
