@@ -94,6 +94,16 @@ def refuse_outputs_among_inputs(
                 f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
                 "drop it from X, or list the inputs in `inputs`."
             )
+    if len(names) < 2:
+        return  # who gives one column as both may mean it
+    for k, name in enumerate(names):
+        same = (inputs[:, [k]] == outputs).all(axis=0)
+        if same.any() and np.ptp(inputs[:, k]) > 0.0:
+            raise ValueError(
+                f"`inputs` must not hold an output. Got column {name!r} of X with the "
+                f"values of output {output_names[int(same.argmax())]!r}: drop it from "
+                "X, or list the inputs in `inputs`."
+            )
 
 
 def warn_of_disorder(X: Any, groups: Sequence[Indices]) -> None:

@@ -66,6 +66,7 @@ _UNITS_SINCE_1970 = (
 # Share of the steps up to which a table does not look shuffled: those that go back in
 # time, where experiments follow each other, or leave rows out, as a logger does.
 _FEW = 0.05
+_OFTEN = 0.2  # share of equal stamps from which rounding makes them
 
 
 def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
@@ -173,7 +174,13 @@ def read_clock(
     if steps.min() <= 0:
         k = int(np.argmin(steps > 0))
         remedy = _USE_INSTEAD
-        if steps[k] == 0:
+        if steps.min() == 0 and np.mean(steps == 0) > _OFTEN:
+            remedy = (
+                "Many stamps stand twice: they are rounded more coarsely than samples "
+                "come. Leave `time` out and give the step, `sampling_time`. If it is "
+                "the rows that stand twice, drop these (drop_duplicates of pandas)."
+            )
+        elif steps[k] == 0:
             remedy = "Drop rows that stand twice (drop_duplicates of pandas). " + remedy
         elif np.sum(steps <= 0) <= _FEW * len(t):
             remedy = _RESTARTS + remedy

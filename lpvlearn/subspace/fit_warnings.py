@@ -11,7 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import Pairs, constant_columns, drops_out, held_for, stays_put
+from ..data.preparation import (
+    Pairs,
+    constant_columns,
+    drops_out,
+    far_out,
+    held_for,
+    stays_put,
+)
 from ..exceptions import RankWarning, warn
 from .constancy import change_over
 from .held_out import HeldOut
@@ -373,7 +380,9 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> Non
             "outputs move, not where they stand. Record what makes them drift as an "
             "input, or use `predict_ahead`.",
         )
-    elif residual > USELESS and "dropouts" not in telling:
+    elif residual > USELESS and _tells_of_glitches(fitted, telling):
+        pass  # they hide whatever else there is
+    elif residual > USELESS:
         other = "an `order` of your own" if chose_order else "order='auto'"
         telling.once(
             "useless",
@@ -392,6 +401,26 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> Non
         )
     elif chose_order and len(fitted.model.A) and not whitening.of_differences:
         _warn_of_outputs(fitted, telling)
+
+
+def _tells_of_glitches(fitted: LocalFit, telling: Telling) -> bool:
+    """Tell of single outputs far from all others, if there are some; or were told."""
+    if "dropouts" in telling:
+        return True
+    far = [far_out(record.y.T) for record in fitted.scaled.records]
+    found = [(k, *at) for k, one in enumerate(far) for at in np.argwhere(one)]
+    if not found:
+        return False
+    first, sample, output = found[0]
+    where = f" of experiment {first}" if len(far) > 1 else ""
+    telling.once(
+        "dropouts",
+        f"{len(found)} sample(s) of the outputs stand far from all others and hide "
+        f"what the inputs do; the first is sample {sample}{where} of output "
+        f"{telling.output(output)}, counted from 0. If a sensor got them wrong, "
+        "replace them by NaN and use missing='estimate'.",
+    )
+    return True
 
 
 def _confirms_means_alone(fitted: LocalFit) -> bool:

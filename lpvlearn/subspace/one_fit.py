@@ -290,6 +290,12 @@ def _with_independent_inputs(pairs: Pairs, telling: Telling) -> tuple[Pairs, Arr
     basis = independent_inputs([u for u, _ in pairs])
     if basis is None:
         return pairs, np.eye(n_inputs)
+    if not basis.shape[1]:
+        raise ValueError(
+            "An input must move within an experiment: what it does by its levels alone "
+            "cannot be told from constants of the experiments. Give records in which "
+            "it moves, make one experiment of them, or use offset=None."
+        )
     telling.once(
         "collinear",
         f"The {n_inputs} inputs are collinear (rank {basis.shape[1]}): their separate "

@@ -62,7 +62,8 @@ def with_trends(
         )
 
     refused = np.inf
-    if choices.offset == "auto" and may_matter():
+    moves = any(np.ptp(u, axis=0).any() for u, _ in pairs)
+    if choices.offset == "auto" and moves and may_matter():
         other = choose_and_identify(pairs, judged, telling, 1, fitted)
         order = len(fitted.model.A)
         if stands and len(other.model.A) > order:
@@ -81,8 +82,10 @@ def with_trends(
         or _drifts_off(pairs, judged, telling, fitted, tested)
     )
     shown = choices.order is None and not hides and not rough
-    if choices.offset == "auto" and (
-        lost or (shown and _may_drift_off(pairs, judged, telling, fitted))
+    if (
+        choices.offset == "auto"
+        and moves
+        and (lost or (shown and _may_drift_off(pairs, judged, telling, fitted)))
     ):
         fitted = _with_drifts(pairs, judged, telling, fitted, refused)
         n_trend = fitted.evidence.free.n_trend

@@ -175,3 +175,7 @@ def test_an_output_left_in_the_table_is_refused():
     with pytest.raises(ValueError, match="must not hold an output. Got column 'pos"):
         read_experiments(reader, X, y, inputs=None, experiment="run", **roles)
     read_experiments(reader, X, y, inputs="u", experiment="run", **roles)
+    with pytest.raises(ValueError, match="column 'position' of X with the values of"):
+        read_experiments(
+            reader, X, y.to_numpy(), inputs=None, experiment="run", **roles
+        )

@@ -56,7 +56,7 @@ def test_even_time_passes_however_it_is_stored(stamps):
     [
         ([0, 1, 2, 4], "missing='split'.*resample"),
         ([0.0, 0.1, 0.25, 0.3], "`time_tol`.*resample"),
-        ([0.0, 0.1, 0.1, 0.2], "stand twice"),
+        ([0.0, 0.1, 0.1, 0.2, 0.3, 0.4, 0.5], "Drop rows that stand twice"),
         ([0.3, 0.2, 0.1], "Do not shuffle"),
         (np.r_[np.arange(100) / 10, 9.9 + 0.11 * np.arange(1, 100)], "`time_tol`"),
         (np.round(np.cumsum(np.repeat([1.00, 1.06], 500)), 1), "`time_tol`"),
@@ -67,6 +67,12 @@ def test_uneven_time_raises_and_says_what_to_use(stamps, remedy):
     with pytest.raises(ValueError, match="GroupKFold.*TimeSeriesSplit") as raised:
         read_clock(np.asarray(stamps, float), column="t", experiment=0)
     assert re.search(remedy, str(raised.value))
+
+
+def test_stamps_that_are_rounded_too_coarsely_are_no_rows_that_stand_twice():
+    stamps = np.round(0.05 * np.arange(100), 1)
+    with pytest.raises(ValueError, match="rounded more coarsely.*`sampling_time`"):
+        read_clock(stamps, column="t", experiment=0)
 
 
 def test_a_few_lost_rows_do_not_look_shuffled():

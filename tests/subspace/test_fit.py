@@ -438,6 +438,29 @@ def test_a_sensor_that_drops_out_is_told(fallen, length):
     assert abs(model.lti_.poles() - 0.9).max() < 0.01
 
 
+@pytest.mark.parametrize("size", [20.0, 1e3])
+def test_a_sample_far_from_all_others_is_told(size):
+    """However far: a model that it hides must not be blamed."""
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((500, 1))
+    y = lfilter([0.0, 0.2], [1.0, -0.8], u, axis=0) + 0.01 * rng.standard_normal(
+        u.shape
+    )
+    y[200] = size
+    with pytest.warns(UserWarning, match="1 sample.* stand far .*sample 200") as warned:
+        SubspaceLTI().fit(u, y)
+    assert len(warned) == 1
+
+
+def test_inputs_that_stand_still_tell_no_constants():
+    rng = np.random.default_rng(0)
+    level = np.repeat([1.0, 2.0, 3.0], 200)
+    X, y = np.column_stack([level, level]), rng.standard_normal(600).cumsum()
+    with pytest.raises(ValueError, match="An input must move within an experiment"):
+        SubspaceLTI(offset="constant", experiment=1).fit(X, y)
+    assert SubspaceLTI(experiment=1).fit(X, y).offset_ is None
+
+
 @pytest.mark.parametrize("rest", [0.0, 0.01])
 def test_pulses_are_no_dropouts(rest):
     """Of an output that answers its input at once, at rest in between or with noise."""
