@@ -829,3 +829,22 @@ def test_a_restructurer_in_the_first_place_is_named():
     wrong = LocalLPVPipeline(GrayBoxRestructurer(spring_structure()), **ROLES)
     with pytest.raises(ValueError, match="which is a `restructurer`"):
         wrong.fit(X, y)
+
+
+@pytest.mark.parametrize("structured", [True, False])
+def test_points_of_work_are_where_drifts_begin(structured):
+    """Of outputs that drift by as much as they move, about a level."""
+    X, y = spring_tables(noise=0.01)
+    runs = X["run"].astype("category").cat.codes.to_numpy()
+    drift = np.array([0.8, -1.0, 0.6, -0.4])[runs] * X["time"] / X["time"].max()
+    X["force"] += 2.0 * X["kappa"]
+    y = y["position"] + drift + 5.0
+    restructurer = GrayBoxRestructurer(spring_structure()) if structured else None
+    model = LocalLPVPipeline(restructurer=restructurer, **ROLES).fit(X, y)
+    kappa = model.operating_points_
+    moved = model.lpv_.input_offset(kappa) - 2.0 * kappa
+    rest = model.lpv_.output_offset(kappa) - moved * [
+        [lti.dc_gain().item()] for lti in model.structured_models_
+    ]
+    np.testing.assert_allclose(rest, 5.0, atol=0.02)
+    assert (model.report_["local_BFT"] > 98.0).all()

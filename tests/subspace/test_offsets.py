@@ -123,6 +123,14 @@ def test_a_given_order_does_not_hide_a_drift(rng, size):
     assert error_of(given) < 0.05
 
 
+@pytest.mark.parametrize("order", ["auto", 3])
+def test_a_drift_is_no_integrator_that_the_level_of_an_input_moves(rng, order):
+    X, y = table(rng, levels=(5.0,), n=600, noise=0.1, drift=3.0, u0=4.0)
+    model = SubspaceLTI(order, **options()).fit(X, y)
+    assert (model.offset_, model.order_) == ("linear", 3)
+    assert error_of(model) < 0.05
+
+
 @pytest.mark.parametrize("offset, degree", [("constant", 0), ("linear", 1)])
 def test_what_is_estimated_may_be_added_to_the_outputs(rng, offset, degree):
     """Also with noise: the model is the same to rounding."""
