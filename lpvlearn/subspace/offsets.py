@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import linalg, special
 
 from ..data.preparation import Pairs
-from ..systems.beginnings import standing
+from ..systems.beginnings import moves_of, standing
 from ..systems.least_squares import column_scale
 from ..systems.simulation import free_responses, lti_response, trend_signals
 from .criterion import criterion_of
@@ -76,6 +76,7 @@ _ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
 _BEYOND = 100.0  # times the largest output: a constant that is none
 _SETTLED = 10.0  # time constants per experiment of a mode that forgets its beginning
 _RELUCTANTLY = 1e-4  # taken: initial states where offsets do as well
+_FEW_MOVES = 10  # of inputs, whose answers may be straight lines
 _UNSEEN, _NEARLY = 0.1, 0.01  # of errors, and of a drift: what inputs need not explain
 _LASTING = 0.1  # decay of a mode over a record, of one that may be a constant
 _FAR = 3.0  # standard deviations between the mean of a channel and zero
@@ -437,10 +438,10 @@ def unmoved_errors(evidence: Evidence, *, beside_drifts: bool = False) -> float:
 
     Next to one of modes that follow a drift; infinite where there are none. Of an
     integrator the level of an input makes a drift: what it does `beside_drifts` tells
-    whether inputs move it.
+    whether inputs move it, of ones that move often.
     """
     model, free, records = evidence.model, evidence.free, evidence.records
-    if beside_drifts:
+    if beside_drifts and sum(len(moves_of(r.u.T)) for r in records) > _FEW_MOVES:
         free = free._replace(n_trend=2)
         records = [r._replace(trend=trend_signals(r.u.shape[1], 2)) for r in records]
     poles, V = np.linalg.eig(model.A)
