@@ -47,13 +47,9 @@ from .weighting import inner_places
 
 Array = NDArray[np.float64]
 
-# What is at rest at scheduling values, of the frozen model there; and how that comes
-# from points (kappa, values, models) of which some are kept.
-_Kept: TypeAlias = NDArray[np.bool_]
+# What is at rest at scheduling values, of the frozen model there; how points tell it
 _AtRest: TypeAlias = "Callable[[Array, StateSpace], _Work]"
-_Way: TypeAlias = (
-    "Callable[[Array, Array, Sequence[StateSpace], NDArray[np.bool_]], _AtRest]"
-)
+_Way: TypeAlias = "Callable[[_Points], _AtRest]"
 
 # Static gain, from motions of the inputs to those of the outputs, that is nothing.
 _STATIC = 0.01
@@ -164,25 +160,25 @@ def interpolated(
     models = [model_at(k) for k in kappa]
     if _any_integrates(models):
         return by_themselves
+    points = _Points(kappa, values, models)
     # and the share of the errors of those before them that they may leave
     ways: list[tuple[_Way, float]] = [(partial(_by_themselves, spline), np.inf)]
-    statics = _Statics.of(models, scales)
-    u, y = np.split(values[:, : sum(map(len, scales))], [len(scales[0])], axis=1)
+    u, y = points.equilibria()
     distinct = len(np.unique(kappa)) == len(kappa)
+    statics = _Statics.of(models, scales)
     if distinct and _are_one_family(statics, kappa, u, y, scales[0]):
         straight = _bend(kappa, y / scales[1]) <= _bend(kappa, u / scales[0])
-        slopes = partial(_by_slopes, statics=statics, of_outputs=straight)
-        ways.append((slopes, 1.0))
+        ways.append((partial(_by_slopes, scales, straight), 1.0))
     if len(kappa) >= _FEWEST:
         ways.append((partial(_by_constants, spline), _BETTER))
     best, least = ways[0][0], np.inf
     for way, share in ways if len(ways) > 1 else ():
-        error = _error_at_rest(way, kappa, values, models, scales[1])
+        error = _error_at_rest(way, points, scales[1])
         if least > _BENT and error < share * least:
             best, least = way, error
     if best is ways[0][0]:
         return by_themselves
-    found = best(kappa, values, models, np.ones(len(kappa), dtype=bool))
+    found = best(points)
     places = np.sort(kappa[:, 0])
     fine = np.interp(
         np.arange(_BETWEEN * (len(places) - 1) + 1) / _BETWEEN,
@@ -193,47 +189,48 @@ def interpolated(
     return spline().fit(fine, np.array(rest))
 
 
-def _error_at_rest(
-    way: _Way,
-    kappa: Array,
-    values: Array,
-    models: Sequence[StateSpace],
-    y_scale: Array,
-) -> float:
+class _Points(NamedTuple):
+    """Points of work, and their models."""
+
+    kappa: Array  # (n_points, 1)
+    values: Array  # [u0, y0, x0]
+    models: Sequence[StateSpace]
+
+    def kept(self, rows: NDArray[np.intp]) -> _Points:
+        """Those of some rows, in this order."""
+        models = [self.models[k] for k in rows]
+        return _Points(self.kappa[rows], self.values[rows], models)
+
+    def equilibria(self) -> tuple[Array, Array]:
+        """Inputs and outputs."""
+        m, p = self.models[0].n_inputs, self.models[0].n_outputs
+        return self.values[:, :m], self.values[:, m : m + p]
+
+
+def _error_at_rest(way: _Way, points: _Points, y_scale: Array) -> float:
     """Mean squared error of outputs at rest at points left out; 0 without any."""
     errors = []
-    for out in inner_places(kappa):
+    for out in inner_places(points.kappa):
         k = int(out.argmax())
-        known = _Work.of(models[k], values[k])
-        there = way(kappa, values, models, ~out)(kappa[k], models[k])
-        moved = there.y + models[k].dc_gain() @ (known.u - there.u)
+        model = points.models[k]
+        known = _Work.of(model, points.values[k])
+        there = way(points.kept(np.flatnonzero(~out)))(points.kappa[k], model)
+        moved = there.y + model.dc_gain() @ (known.u - there.u)
         errors.append((moved - known.y) / y_scale)
     return float(np.mean(np.square(errors))) if errors else 0.0
 
 
-def _by_themselves(
-    spline: Callable[[], Any],
-    kappa: Array,
-    values: Array,
-    models: Sequence[StateSpace],
-    kept: _Kept,
-) -> _AtRest:
-    """A curve through the points that are kept."""
-    curve = spline().fit(kappa[kept], values[kept])
+def _by_themselves(spline: Callable[[], Any], points: _Points) -> _AtRest:
+    """A curve through the points."""
+    curve = spline().fit(points.kappa, points.values)
     return lambda place, model: _Work.of(model, curve.predict([place])[0])
 
 
-def _by_constants(
-    spline: Callable[[], Any],
-    kappa: Array,
-    values: Array,
-    models: Sequence[StateSpace],
-    kept: _Kept,
-) -> _AtRest:
+def _by_constants(spline: Callable[[], Any], points: _Points) -> _AtRest:
     """A curve through the constants with which the models rest there."""
-    points = zip(models, values, strict=True)
-    constants = np.array([_Work.of(*one).constants(one[0]) for one in points])
-    inputs, own = (spline().fit(kappa[kept], v[kept]) for v in (values, constants))
+    pairs = zip(points.models, points.values, strict=True)
+    constants = np.array([_Work.of(*pair).constants(pair[0]) for pair in pairs])
+    inputs, own = (spline().fit(points.kappa, v) for v in (points.values, constants))
 
     def at_rest(place: Array, model: StateSpace) -> _Work:
         u = inputs.predict([place])[0, : model.n_inputs]
@@ -243,30 +240,23 @@ def _by_constants(
 
 
 def _by_slopes(
-    kappa: Array,
-    values: Array,
-    models: Sequence[StateSpace],
-    kept: _Kept,
-    *,
-    statics: _Statics,
-    of_outputs: bool,
+    scales: tuple[Array, Array], of_outputs: bool, points: _Points
 ) -> _AtRest:
     """A curve whose slopes are those of equilibria of one system, by its models.
 
     Those of the outputs, or of the inputs, are those of a curve through them; the
     others follow: ``du0 = P dy0``, ``dy0 = G du0``, ``A dx0 + B du0 = 0``.
     """
-    rows = np.flatnonzero(kept)[np.argsort(kappa[kept, 0])]
-    x, v = kappa[rows, 0], values[rows]
-    m, p = models[0].n_inputs, models[0].n_outputs
-    gains, inverse, states, unseen = (M[rows] for M in statics)
-    u, y = np.split(CubicSpline(x, v[:, : m + p])(x, 1), [m], axis=1)
+    points = points.kept(np.argsort(points.kappa[:, 0]))
+    x = points.kappa[:, 0]
+    gains, inverse, states, unseen = _Statics.of(points.models, scales)
+    u, y = (CubicSpline(x, values)(x, 1) for values in points.equilibria())
     if of_outputs:
         u = u + _times(inverse, y - _times(gains, u))
     else:
         y = y + _times(gains, u - _times(inverse, y))
     slopes = np.hstack([u, y, _times(states, y) + _times(unseen, u)])
-    curve = CubicHermiteSpline(x, v, slopes)
+    curve = CubicHermiteSpline(x, points.values, slopes)
     return lambda place, model: _Work.of(model, curve(place[0]))
 
 
