@@ -160,9 +160,9 @@ plt.show()
 # What is known, and when
 # -----------------------
 # ``lpv_.covariance`` is None, and the bands are refused, where the covariances of the
-# local parameters are not known (without a structure, or from a black box that does not
-# minimise the simulation error), or the interpolation has no coefficients (a regressor
-# of another library). A refinement knows it always. Where no form of the interpolation
+# local parameters are not known (aligned black boxes, or one that does not minimise the
+# simulation error), or the interpolation has no coefficients (a regressor of another
+# library). A refinement knows it always. Where no form of the interpolation
 # meets the points as well as their covariances allow, what is left of them is the
 # form's own error: the covariance is then multiplied by chi-square per degree of
 # freedom. Offsets of points of work, delays and the state at the start count as known.
