@@ -30,6 +30,8 @@ _FEWEST = 10  # steps below which a few even ones are chance
 # and of those of an index that may do the latter.
 _RESTARTS, _TORN = 0.05, 0.05
 
+_ALIKE = 100  # samples from which columns that agree to the bit are one
+
 _ORDERED = ("integer", "datetime64", "timedelta64")  # index types that tell an order
 
 _HOLDS = 10.0  # samples that a number of an experiment stands for, at least, on average
@@ -94,8 +96,8 @@ def refuse_outputs_among_inputs(
                 f"`inputs` must not hold an output. Got column {name!r} in X and in y: "
                 "drop it from X, or list the inputs in `inputs`."
             )
-    if len(names) < 2:
-        return  # who gives one column as both may mean it
+    if len(names) < 2 or len(inputs) < _ALIKE:
+        return  # who gives one column as both may mean it, and coarse ones may agree
     for k, name in enumerate(names):
         same = (inputs[:, [k]] == outputs).all(axis=0)
         if same.any() and np.ptp(inputs[:, k]) > 0.0:

@@ -18,6 +18,7 @@ from sklearn.base import clone
 
 from ..exceptions import collected
 from ..lpv.auto import AutoLPV
+from ..lpv.extrapolation import distance_from_hull
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.rational import RationalLPV
 from ..lpv.spline import SplineLPV
@@ -32,6 +33,9 @@ from .stability import holds_within_range
 Array = NDArray[np.float64]
 
 _LOW = 2, 3  # the degree of a polynomial, and both degrees of a fraction, at most
+
+# Times the chi-square of a form, that of constants: noise moves no point so far
+_EXPLAINED = 1e4
 
 _UNLIKE = 2.0  # an error of a point left out, in its largest gain, as bad as any
 
@@ -90,6 +94,10 @@ def is_better_form(
     form = auto.best_estimator_
     if not _is_low(form) or not holds_within_range(structure, form):
         return False
+    if form.degrees_of_freedom_ < 2 * structure.n_params:  # less than with a point less
+        constant = auto.selection_["chi2"].iloc[0]
+        if constant > _EXPLAINED * max(form.chi2_, form.degrees_of_freedom_):
+            return True
     models = [model.lti for model in local]
     rate = forgotten(models, longest)
     ways = (*aligned, SplineLPV(), None), (structure, theta, form, covariance)
@@ -107,10 +115,18 @@ def is_better_form(
         for of, values, curve, P in ways
     )
     both = [k for k in own if k in other]
+    # what the others do not surround is extrapolated, by any form
+    both = [k for k in both if not _is_corner(k, kappa)] or both
     by_form, by_curve = (
         sum(min(errors[k], _UNLIKE) for k in both) for errors in (own, other)
     )
     return bool(both) and by_form <= by_curve
+
+
+def _is_corner(k: int, kappa: Array) -> bool:
+    """Whether a point is outside the hull of the others."""
+    others = np.delete(kappa, k, axis=0)
+    return bool(distance_from_hull(kappa[[k]], others)[0] > 0.0)
 
 
 def _matrix(model: StateSpace) -> Array:

@@ -94,6 +94,29 @@ def test_where_no_low_form_is_told_black_boxes_are_aligned(system, n_points):
     np.testing.assert_array_equal(model.parameters_, other.parameters_)
 
 
+def test_corners_of_two_scheduling_variables_speak_against_no_form():
+    """What the others do not surround, no form foresees: the centre is what tells."""
+    rng, trajectories = np.random.default_rng(0), []
+    corners = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)]
+    for k, (a, b) in enumerate(corners):
+        mass = 1.0 + a + 0.5 * b
+        A = [[0.0, 1.0], [-20.0 / mass, -0.8 / mass]]
+        system = StateSpace(A, [[0.0], [20.0 / mass]], [[1.0, 0.0]])
+        u = prbs(600, clock=4, random_state=k)
+        y = system.simulate(u, sampling_time=STEP)
+        noise = 0.01 * y.std() * rng.standard_normal(y.shape)
+        trajectories.append((u, np.array([[a, b]]), y + noise))
+    X, y = from_trajectories(trajectories, sampling_time=STEP)
+    names = ["kappa1", "kappa2"]
+    model = LocalLPVPipeline(
+        scheduling=names, experiment="experiment", time="time"
+    ).fit(X, y)
+    assert model.interpolator_.form_ == "rational 1/1"
+    middle = model.lpv_.at([0.5, 0.0])
+    assert middle.dc_gain().item() == pytest.approx(1.0, abs=0.01)
+    assert np.abs(middle.poles()[0]) == pytest.approx(np.sqrt(20.0 / 1.5), rel=0.01)
+
+
 def test_parameters_are_those_of_the_canonical_restructurer():
     X, y = tables(pendulum, 5)
     model, other = pipeline().fit(X, y), pipeline(GrayBoxRestructurer()).fit(X, y)
