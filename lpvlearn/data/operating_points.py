@@ -122,17 +122,32 @@ def without_spikes(experiments: Sequence[Experiment]) -> list[Experiment]:
 
     Of scheduling variables, of which a sensor that drops out makes others. Told.
     """
-    runs, found = list(experiments), {}
+    runs = list(experiments)
     signals = [run.scheduling for run in runs if run.scheduling is not None]
     known = (signal.size and np.isfinite(signal).all() for signal in signals)
     if len(signals) < len(runs) or not all(known):
         return runs
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _without_spikes(runs, signals)
+
+
+def _without_spikes(
+    runs: list[Experiment], signals: Sequence[Array]
+) -> list[Experiment]:
+    """As `without_spikes`, of scheduling `signals` that are known."""
+    moving = [
+        k
+        for k, signal in enumerate(signals)
+        if len(signal) > _ABOUT and np.ptp(signal, axis=0).any()
+    ]
+    if not moving:
+        return runs
+    found = {}
     middle = np.array([np.median(signal, axis=0) for signal in signals])
     extent = np.ptp(middle, axis=0)
     scale = np.where(extent > 0, extent, np.abs(middle).max(axis=0))
-    for k, signal in enumerate(signals):
-        if len(signal) <= _ABOUT or not np.ptp(signal, axis=0).any():
-            continue
+    for k in moving:
+        signal = signals[k]
         about = median_filter(signal, size=(_ABOUT, 1), mode="nearest")
         usual = np.quantile(np.abs(np.diff(signal, axis=0)), _MOST, axis=0)
         far = np.abs(signal - about) > np.maximum(_SPIKE * usual, _STEP * scale)

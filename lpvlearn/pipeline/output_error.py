@@ -652,7 +652,8 @@ def best_along(
     if len(ways) == 1:
         return ways[0]
     records = [_record(e, sampling_time) for e in experiments]
-    weight = 1.0 / np.sqrt(np.mean([r.y.var(axis=0) for r in records], axis=0))
+    power = np.mean([r.y.var(axis=0) for r in records], axis=0)
+    weight = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
     own = Own(initial_state=True, constant=True)
 
     def loss(found: StructuredModels) -> float:
