@@ -604,14 +604,17 @@ list, default=None
             form = getattr(self.interpolator_, "best_estimator_", None)
             if form is not None:
                 tell_of_two_points(self.structured_models_, kappa, longest)
-            if isinstance(form, SplineLPV):
+            unknown = getattr(restructurer, "structure", None) is None and not moving
+            saturated = unknown and getattr(form, "degrees_of_freedom_", 1) <= 0
+            if isinstance(form, SplineLPV) or (saturated and len(kappa) > 2):
                 tell_unforeseen(
                     self.lpv_,
                     self.structured_models_,
-                    form,
+                    SplineLPV() if saturated else form,
                     kappa,
                     found.theta,
                     longest,
+                    saturated=saturated,
                 )
             report = tables(found, self.lpv_, self.sampling_time_, growth)
             self.parameters_, self.parameters_std_ = (

@@ -98,11 +98,14 @@ def tell_unforeseen(
     kappa: Array,
     theta: Array,
     longest: float,
+    *,
+    saturated: bool = False,
 ) -> None:
     """Tell of points within the range of the others of which these know nothing.
 
     Where no form is true the interpolation follows the points: one that the others do
-    not foresee is another system, or there are too few of them.
+    not foresee is another system, or there are too few of them; as where a form is
+    `saturated`.
     """
     if not models[0].is_continuous:
         return
@@ -119,12 +122,17 @@ def tell_unforeseen(
             f"{100.0 * error:.0f} %)"
             for error, k in high or worst
         ]
+        known = (
+            f"any {len(kappa)} points lie on a form of as many coefficients"
+            if saturated
+            else "no form fits the parameters over the operating points"
+        )
         warn(
-            "no form fits the parameters over the operating points, and the others do "
-            f"not foresee point(s) {listed(named, _NAMED)}, by the error in the "
-            "largest gain: between points the LPV model may be as wrong. Look at "
-            "`parameters_` for a point that is unlike the others, give a structure "
-            "where there is none, or measure in between (`suggest_operating_point`)."
+            f"{known}, and the others do not foresee point(s) "
+            f"{listed(named, _NAMED)}, by the error in the largest gain: between "
+            "points the LPV model may be as wrong. Look at `parameters_` for a point "
+            "that is unlike the others, give a structure where there is none, or "
+            "measure in between (`suggest_operating_point`)."
         )
 
 

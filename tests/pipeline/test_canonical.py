@@ -124,6 +124,15 @@ def test_parameters_are_those_of_the_canonical_restructurer():
     np.testing.assert_allclose(model.parameters_std_, other.parameters_std_, rtol=1e-2)
 
 
+def test_a_parabola_through_any_three_points_is_told():
+    """Of the canonical form, of which nothing else is known."""
+    X, y = tables(pendulum, 3)
+    with pytest.warns(UserWarning, match="any 3 points lie on a form .* not foresee"):
+        pipeline(GrayBoxRestructurer()).fit(X, y)
+    X, y = tables(slight_pendulum, 3)
+    assert pipeline(GrayBoxRestructurer()).fit(X, y).interpolator_.form_
+
+
 def test_a_curve_through_the_points_is_one_through_aligned_models():
     model = pipeline(interpolator=SplineLPV()).fit(*tables(pendulum, 5))
     assert list(model.parameters_)[0] == "a1_1"
