@@ -174,8 +174,9 @@ def without_structure(
     """
     with retold() as told:
         aligned = restructure_points("aligned", local, points, runner, sampling_time)
-    integrates = bool(local[0].integrating)
-    if told or integrates or not isinstance(interpolator, AutoLPV):
+    # two points lie on a line, whatever states they have
+    tells = isinstance(interpolator, AutoLPV) and (every or len(points) > 2)
+    if told or local[0].integrating or not tells:
         return [aligned]
     found = canonical_black_boxes(local)
     if found is None:

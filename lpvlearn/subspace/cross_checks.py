@@ -18,7 +18,7 @@ from .offsets import CERTAIN, criterion_in_units
 from .one_fit import TooFewSamples, choose_and_identify, errors_held_out
 from .options import Choices
 from .simulation_fit import simulation_errors, with_initial_states
-from .telling import Telling
+from .telling import Telling, in_experiment
 from .trends import with_trends
 
 Array = NDArray[np.float64]
@@ -169,7 +169,7 @@ def tell_of_input_spikes(
         return
     if other.residual < _ANSWERED * whole.residual:
         j, k, i = found[0]
-        where = f"sample {i}{f' of experiment {k}' if len(pairs) > 1 else ''}"
+        where = f"sample {in_experiment(i, k, len(pairs))}"
         telling.once(
             "input spikes",
             f"{len(found)} sample(s) of the inputs stand far out, and the outputs do "

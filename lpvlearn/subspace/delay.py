@@ -267,6 +267,14 @@ class _Size(NamedTuple):
     direct: bool  # whether the input whose delay is looked for acts at once
 
 
+class _Best(NamedTuple):
+    """The lowest criterion so far, of which model and delay."""
+
+    cost: float
+    size: _Size
+    delay: int
+
+
 @dataclass(frozen=True)
 class _Trial:
     """Samples to try delays on; from row `longest` on all inputs are known."""
@@ -386,32 +394,36 @@ class _Trial:
         def price(size: _Size) -> float:  # Schwarz's criterion
             return float(np.log(self.n_values)) * n_parameters(size)
 
-        least, best = np.inf, (families[0][0], 0)
+        def with_delay(d: int, best: _Best) -> tuple[_Best, bool]:
+            """The best so far, and whether a model of that delay is good."""
+            good = False
+            for sizes in families:
+                for size in sizes:
+                    misfit = self.n_values * np.log(self.loss(at(d), size, j))
+                    if misfit + price(size) < best.cost:
+                        best = _Best(misfit + price(size), size, d)
+                    if misfit + price(sizes[-1]) > best.cost:
+                        break  # smaller models fit no better
+                    good = True
+            return best, good
 
-        def look_at(delays: range) -> None:
-            nonlocal least, best
-            tried_in_vain = 0
+        def best_of(delays: range, best: _Best) -> _Best:
+            in_vain = 0
             for d in delays:
-                tried_in_vain += 1
-                for sizes in families:
-                    for size in sizes:
-                        misfit = self.n_values * np.log(self.loss(at(d), size, j))
-                        if misfit + price(size) < least:
-                            least, best = misfit + price(size), (size, d)
-                        if misfit + price(sizes[-1]) > least:
-                            break  # smaller models fit no better
-                        tried_in_vain = 0
-                if tried_in_vain == _GIVEN_UP:
+                best, good = with_delay(d, best)
+                in_vain = 0 if good else in_vain + 1
+                if in_vain == _GIVEN_UP:
                     break
+            return best
 
         most = int(longest[j])
         step = max(1, most // _COARSE)
-        look_at(range(most, -1, -step))
+        best = best_of(range(most, -1, -step), _Best(np.inf, families[0][0], 0))
         if step > 1:
-            near = best[1]
-            look_at(range(min(near + step - 1, most), near, -1))
-            look_at(range(near - 1, max(near - step, -1), -1))
-        size, d = best
+            near = best.delay
+            best = best_of(range(min(near + step - 1, most), near, -1), best)
+            best = best_of(range(near - 1, max(near - step, -1), -1), best)
+        _, size, d = best
         if d == 0:
             return 0
         loss = self.loss(at(d), size, j)

@@ -38,7 +38,7 @@ from .rounding import rounded_outputs
 from .selection import MAX_ORDER, better_horizon
 from .signals import thinned
 from .statistics import OPEN, Evidence
-from .telling import Telling
+from .telling import Telling, in_experiment
 from .varx import Feedback
 
 Array = NDArray[np.float64]
@@ -121,12 +121,12 @@ def tell_of_dropouts(pairs: Pairs, telling: Telling) -> None:
         if found is not None:
             n = sum(stop - start for _, start, stop in found.runs)
             first, start, _ = found.runs[0]
-            where = f" of experiment {first}" if len(outputs) > 1 else ""
+            where = in_experiment(start, first, len(outputs))
             telling.once(
                 "dropouts",
                 f"Output {telling.output(k)} falls to {found.value:.6g} in {n} "
                 f"sample(s), {len(found.runs)} time(s), far from what is before and "
-                f"after; the first is sample {start}{where}, counted from 0. Its "
+                f"after; the first is sample {where}, counted from 0. Its "
                 "sensor, or what logs it, drops out: put NaN in place of these "
                 "samples and use missing='estimate'.",
             )
@@ -380,17 +380,16 @@ def _warn_of_error(fitted: LocalFit, chose_order: bool, telling: Telling) -> Non
             "outputs move, not where they stand. Record what makes them drift as an "
             "input, or use `predict_ahead`.",
         )
-    elif residual > USELESS and _tells_of_glitches(fitted, telling):
-        pass  # they hide whatever else there is
     elif residual > USELESS:
         other = "an `order` of your own" if chose_order else "order='auto'"
-        telling.once(
-            "useless",
-            "The model explains next to nothing of the outputs: its simulation "
-            f"error is {100.0 * residual:.0f} % of their size. Try a longer "
-            f"`horizon` or {other}, and check that inputs and outputs belong "
-            "together and in the order of time.",
-        )
+        if not _tells_of_glitches(fitted, telling):  # which hide whatever else there is
+            telling.once(
+                "useless",
+                "The model explains next to nothing of the outputs: its simulation "
+                f"error is {100.0 * residual:.0f} % of their size. Try a longer "
+                f"`horizon` or {other}, and check that inputs and outputs belong "
+                "together and in the order of time.",
+            )
     elif follows_means_alone(fitted.evidence) or _confirms_means_alone(fitted):
         higher = "" if chose_order else ", order='auto'"
         telling.once(
@@ -412,11 +411,11 @@ def _tells_of_glitches(fitted: LocalFit, telling: Telling) -> bool:
     if not found:
         return False
     first, sample, output = found[0]
-    where = f" of experiment {first}" if len(far) > 1 else ""
+    where = in_experiment(sample, first, len(far))
     telling.once(
         "dropouts",
         f"{len(found)} sample(s) of the outputs stand far from all others and hide "
-        f"what the inputs do; the first is sample {sample}{where} of output "
+        f"what the inputs do; the first is sample {where} of output "
         f"{telling.output(output)}, counted from 0. If a sensor got them wrong, "
         "replace them by NaN and use missing='estimate'.",
     )
@@ -461,12 +460,13 @@ def _warn_of_spikes(fitted: LocalFit, telling: Telling) -> None:
     rounded = rounded_outputs(fitted.evidence.model, fitted.evidence.records)
     if rounded.variances[spikes.output]:
         return  # some errors of that are larger than others
-    several, n = len(fitted.evidence.records) > 1, spikes.n_found
+    n_records = len(fitted.evidence.records)
+    where = in_experiment(spikes.sample, spikes.experiment, n_records)
     stands_out = (
-        f"{n} sample(s) of output {telling.output(spikes.output)} stand far out of the "
-        f"errors of the model and make {100.0 * spikes.share:.0f} % of their squares; "
-        f"the farthest is sample {spikes.sample}"
-        f"{f' of experiment {spikes.experiment}' if several else ''}, counted from 0. "
+        f"{spikes.n_found} sample(s) of output {telling.output(spikes.output)} stand "
+        "far out of the errors of the model and make "
+        f"{100.0 * spikes.share:.0f} % of their squares; "
+        f"the farthest is sample {where}, counted from 0. "
     )
     if spikes.follow:
         stands_out += (

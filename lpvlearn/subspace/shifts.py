@@ -40,7 +40,7 @@ from .one_fit import (
 )
 from .options import Choices
 from .signals import Record
-from .telling import Telling
+from .telling import Telling, in_experiment
 from .varx import Regression, regression_of, samples_of
 
 Array = NDArray[np.float64]
@@ -235,7 +235,7 @@ def without_shifts(
         if errors_held_out(fitted, choices).bft < errors_held_out(whole, choices).bft:
             return pairs, whole
     samples = "; ".join(
-        f"{', '.join(map(str, cuts))}{f' of experiment {k}' if len(pairs) > 1 else ''}"
+        in_experiment(", ".join(map(str, cuts)), k, len(pairs))
         for k, cuts in enumerate(shifts)
         if cuts
     )

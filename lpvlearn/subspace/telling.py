@@ -48,5 +48,14 @@ class Telling:
         return _called(self.outputs, k)
 
 
+def in_experiment(sample: object, experiment: int, n_experiments: int) -> str:
+    """How a message calls a sample, or several: of which experiment, if of some.
+
+    >>> in_experiment(7, 0, 1), in_experiment("7, 9", 2, 3)
+    ('7', '7, 9 of experiment 2')
+    """
+    return f"{sample} of experiment {experiment}" if n_experiments > 1 else f"{sample}"
+
+
 def _called(names: Sequence[Hashable] | None, k: SupportsIndex) -> str:
     return str(index(k) + 1) if names is None else repr(names[index(k)])

@@ -76,17 +76,15 @@ def with_trends(
     # The states of a given order that are to follow a drift are missing elsewhere.
     given = choices.order is not None and choices.initial_states and n_trend < 2
     given &= fitted.method != "pbsid" and not choices.enforce_stability
-    lost = given and (
-        outlasts(fitted)
-        or fitted.residual > _HARDLY
-        or _drifts_off(pairs, judged, telling, fitted, tested)
-    )
-    shown = choices.order is None and not hides and not rough
-    if (
-        choices.offset == "auto"
-        and moves
-        and (lost or (shown and _may_drift_off(pairs, judged, telling, fitted)))
-    ):
+
+    def may_drift() -> bool:
+        if given:
+            lost = outlasts(fitted) or fitted.residual > _HARDLY
+            return lost or _drifts_off(pairs, judged, telling, fitted, tested)
+        shown = choices.order is None and not hides and not rough
+        return shown and _may_drift_off(pairs, judged, telling, fitted)
+
+    if choices.offset == "auto" and moves and may_drift():
         fitted = _with_drifts(pairs, judged, telling, fitted, refused)
         n_trend = fitted.evidence.free.n_trend
     return (
@@ -105,7 +103,8 @@ def _drifts_off(
 ) -> bool:
     """Whether errors of a given order drift, and by no state that inputs move."""
     own = fitted.evidence.one_step
-    if not (drifts_off(tested) or drifts_off(own) or wanders(own)):
+    shown = drifts_off(tested) or (own is not tested and drifts_off(own))
+    if not (shown or wanders(own)):
         return False
     order, n_trend = len(fitted.model.A) + 1, fitted.evidence.free.n_trend
     try:
