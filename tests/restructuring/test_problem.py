@@ -219,5 +219,5 @@ def test_a_form_of_many_states_ends_where_its_coefficients_do():
     structure = GrayBoxStructure.observable_canonical(24, 3, 3)
     fitted = GrayBoxRestructurer(structure).fit_model(box)
     problem = problem_from_models(structure, [box], None)
-    assert 1e-10 < fitted.relative_error_ <= problem.rounding(fitted.params_)
+    assert 1e-12 < fitted.relative_error_ <= problem.rounding(fitted.params_)
     assert fitted.n_iter_ == 0
