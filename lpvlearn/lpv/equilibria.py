@@ -26,6 +26,8 @@ tells left-out points clearly better, it is not themselves:
 - Where they bend more than the models do (a drive, whose currents at rest are rational
   in a speed that its equations have as it is), the constants in ``dx/dt = A x + B u +
   c``, ``y = C x + D u + d``.
+- Where they bend less over the logarithm of the scheduling variable, or over one over
+  it (a flow, a speed), these.
 - Where they are those of one system that schedules itself (levels of a tank), a curve
   with the slopes that the models' gains tell: ``du0 = P dy0``.
 """
@@ -171,6 +173,8 @@ def interpolated(
         ways.append((partial(_by_slopes, scales, straight), 1.0))
     if len(kappa) >= _FEWEST:
         ways.append((partial(_by_constants, spline), _BETTER))
+        if (kappa > 0.0).all():
+            ways += [(partial(_over, f, spline), _BETTER) for f in (np.log, _inverted)]
     best, least = ways[0][0], np.inf
     for way, share in ways if len(ways) > 1 else ():
         error = _error_at_rest(way, points, scales[1])
@@ -224,6 +228,23 @@ def _by_themselves(spline: Callable[[], Any], points: _Points) -> _AtRest:
     """A curve through the points."""
     curve = spline().fit(points.kappa, points.values)
     return lambda place, model: _Work.of(model, curve.predict([place])[0])
+
+
+def _over(
+    function: Callable[[Array], Array], spline: Callable[[], Any], points: _Points
+) -> _AtRest:
+    """A curve through the points over a function of the scheduling variable."""
+    curve = spline().fit(function(points.kappa), points.values)
+
+    def at_rest(place: Array, model: StateSpace) -> _Work:
+        return _Work.of(model, curve.predict([function(place)])[0])
+
+    return at_rest
+
+
+def _inverted(kappa: Array) -> Array:
+    """One over a scheduling variable, as what stays in a flow is held for so long."""
+    return np.asarray(1.0 / kappa)
 
 
 def _by_constants(spline: Callable[[], Any], points: _Points) -> _AtRest:

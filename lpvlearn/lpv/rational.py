@@ -26,8 +26,9 @@ Array = NDArray[np.float64]
 _TERMS = ("total", "tensor")
 
 # The denominator has no zero within the range widened by this share of it on either
-# side: a sweep overshoots the outermost of the points.
-_MARGIN = 0.1
+# side: a sweep overshoots the outermost of the points. The second where with the first
+# no function is plausible: the pole of a length, or a mass, is where that is zero.
+_MARGINS = 0.1, 0.02
 
 _LEAST = 0.02  # of the denominator's largest value there: smaller is as good as a zero
 
@@ -93,8 +94,8 @@ class RationalLPV(Interpolator):
     this error itself.
 
     The denominator is positive, 0.02 of its largest value at least, within the range
-    of the points and a margin of 10 % of its width on either side. Beyond there may be
-    a pole.
+    of the points and a margin of 10 % of its width on either side, or of 2 % where no
+    such function is plausible by the covariances. Beyond there may be a pole.
 
     References
     ----------
@@ -139,14 +140,15 @@ class RationalLPV(Interpolator):
                 break
         phi = self._terms(kappa, self.powers_)
         psi = self._terms(kappa, self.denominator_powers_)[:, 1:]
-        places = self._terms(
-            _places(self.scheduling_range_, kappa), self.denominator_powers_
-        )[:, 1:]
-        found = fit_rational(phi, psi, places, points)
-        values = phi @ found.numerator / (1.0 + psi @ found.denominator)[:, None]
-        self._judge(points, values, found.rank * q + psi.shape[1])
-        if points.whitening is not None and not self.weighted_:
-            found = fit_rational(phi, psi, places, points.unweighted())
+        wide, narrow = (self._away_from_poles(kappa, margin) for margin in _MARGINS)
+        for places in (wide, narrow):
+            found = fit_rational(phi, psi, places, points)
+            values = phi @ found.numerator / (1.0 + psi @ found.denominator)[:, None]
+            self._judge(points, values, found.rank * q + psi.shape[1])
+            if points.whitening is None or self.weighted_:
+                break
+        else:
+            found = fit_rational(phi, psi, wide, points.unweighted())
         self.numerator_, self.rank_ = found.numerator, found.rank
         self.denominator_ = np.concatenate([[1.0], found.denominator])
 
@@ -160,8 +162,7 @@ class RationalLPV(Interpolator):
 
     def _set(self, coefficients: Array) -> None:
         numerator, d = np.split(coefficients, [self.numerator_.size])
-        ends = self.scheduling_range_
-        places = self._terms(_places(ends, ends), self.denominator_powers_)[:, 1:]
+        places = self._away_from_poles(self.scheduling_range_, _MARGINS[1])
         if not _is_allowed(places, d):
             raise ValueError(
                 "`coefficients` must keep the denominator positive within the range "
@@ -170,6 +171,11 @@ class RationalLPV(Interpolator):
             )
         self.numerator_ = numerator.reshape(self.numerator_.shape)
         self.denominator_ = np.concatenate([[1.0], d])
+
+    def _away_from_poles(self, kappa: Array, margin: float) -> Array:
+        """Terms of the denominator but for its constant where that must not vanish."""
+        places = _places(self.scheduling_range_, kappa, margin)
+        return self._terms(places, self.denominator_powers_)[:, 1:]
 
     def _carried(self, outer: Array, kappa: Array) -> Array:
         psi = self._terms(kappa, self.denominator_powers_)
@@ -298,13 +304,13 @@ def _is_allowed(places: Array, d: Array) -> bool:
     return bool(below.min() >= _LEAST * below.max())  # False of NaN
 
 
-def _places(scheduling_range: Array, kappa: Array) -> Array:
+def _places(scheduling_range: Array, kappa: Array, margin: float) -> Array:
     """Where the denominator must not vanish: the range and its margin, as a grid."""
     n = kappa.shape[1]
     levels = int(_PLACES ** (1 / n) + 1e-9)
     if levels < 2:
         return kappa
     low, high = scheduling_range
-    margin = _MARGIN * (high - low)
-    axes = np.linspace(low - margin, high + margin, levels).T
+    beyond = margin * (high - low)
+    axes = np.linspace(low - beyond, high + beyond, levels).T
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, n)

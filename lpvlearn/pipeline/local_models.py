@@ -125,12 +125,12 @@ def identify_points(
             "local models", identify_point, arguments, points.kappa, known, **options
         )
 
-    def scouted() -> list[Done | None]:
+    def tried(estimator: Any, some: Sequence[int]) -> list[Done | None]:
+        """Of some points alone; what fails is not told."""
         found: list[Done | None] = [None] * len(groups)
-        some = np.linspace(0, len(groups) - 1, _SCOUTS).round().astype(int)
-        arguments = [(local, groups[k]) for k in some]
+        arguments = [(estimator, groups[k]) for k in some]
         quiet = replace(runner, on_error="skip", verbose=0)
-        with collected(), suppress(ValueError):  # what fails is tried, and told, again
+        with collected(), suppress(ValueError):
             known = quiet.run(
                 "local models", identify_point, arguments, points.kappa[some], **options
             )
@@ -142,7 +142,10 @@ def identify_points(
         found = identify(local)
     else:
         search = free and len(groups) > _SCOUTS and type(local) is SubspaceLTI
-        found = _of_own_orders(local, identify, scouted() if search else [])
+        some = np.linspace(0, len(groups) - 1, _SCOUTS).round().astype(int).tolist()
+        scouts = tried(local, some) if search else []
+        found = _of_own_orders(local, identify, scouts)
+        found = _drifting_alike(local, tried, found)
         models = [done.result for done in found if done is not None]
         if len({model.order for model in models}) > 1:
             order = _common_order(models)
@@ -196,6 +199,38 @@ def _of_own_orders(
         return found
     pairs = zip(found, unsure, strict=True)
     return identify(local, [None if again else done for done, again in pairs])
+
+
+def _drifting_alike(
+    local: Any,
+    tried: Callable[[Any, Sequence[int]], list[Done | None]],
+    found: list[Done | None],
+) -> list[Done | None]:
+    """With drifts wherever fewer states do beside them, if outputs drift at a point.
+
+    What drifts in one experiment mostly does in all of them. Where it is not beyond
+    doubt, states that the plant does not have stand for it.
+    """
+    drifting = [
+        _own_order(done.result)
+        for done in found
+        if done is not None and done.result.n_trend > 1
+    ]
+    if local.get_params(deep=False).get("offset") != "auto" or not drifting:
+        return found
+    most = max(drifting)
+    some = [
+        k
+        for k, done in enumerate(found)
+        if done is None or (done.result.n_trend < 2 and _own_order(done.result) > most)
+    ]
+    if not some:
+        return found
+    others = tried(clone(local).set_params(offset="linear"), some)
+    return [
+        other if other is not None and _own_order(other.result) <= most else done
+        for done, other in zip(found, others, strict=True)
+    ]
 
 
 def _beside(found: Done | None, own: Done | None) -> Done | None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
-from ..systems.beginnings import stands
+from ..systems.beginnings import Stands, first_inputs, stands
 from .criterion import PRICE
 from .identification import spectral_radius
 from .local_fit import LocalFit
@@ -56,6 +56,8 @@ def from_rest(
     if not asked or free.method == "pbsid" or not len(free.model.A):
         return None
     stand, evidence = stands(pairs), free.evidence
+    if stand is None and said:  # where it is not to be seen
+        stand = Stands(np.array([first_inputs(u) for u, _ in pairs]), False)
     if stand is None:
         return None
     first, seen = stand
@@ -115,7 +117,7 @@ def _is_as_likely(own: Evidence, other: Evidence, seen: bool) -> bool:
         return False
     left, plainly = _plain_errors(own, other)
     if not other.free.initial_states:
-        return worse < 0.0 and left <= 1.0
+        return worse < 0.0 and plainly <= -worse
     if other.whitening.of_differences and left >= 1.0:
         return False  # it is meant to leave more
     gain = other.static_gain()

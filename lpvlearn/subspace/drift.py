@@ -63,10 +63,16 @@ def differences(pairs: Pairs) -> Pairs:
     return [(np.diff(u, axis=0), np.diff(y, axis=0)) for u, y in pairs]
 
 
+def n_lasting(fitted: LocalFit) -> int:
+    """Number of modes that do not decay over the longest experiment, or grow."""
+    poles = np.linalg.eigvals(fitted.model.A)
+    slow = np.abs(1.0 - poles) * fitted.evidence.longest < HARDLY_DECAYS
+    return int((slow | (np.abs(poles) > 1.0)).sum())
+
+
 def outlasts(fitted: LocalFit) -> bool:
-    """Whether a mode does not decay over the longest experiment, or grows."""
-    slow = (mode_rates(fitted.model.A) * fitted.evidence.longest < HARDLY_DECAYS).any()
-    return bool(slow) or fitted.grows()
+    """Whether there are such modes."""
+    return n_lasting(fitted) > 0
 
 
 def may_drift(fitted: LocalFit) -> bool:

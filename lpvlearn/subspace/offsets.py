@@ -366,10 +366,11 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
 
     Signals that are far from zero all the time hardly rest there. Without constants the
     static gain or a slow mode follows their means, which the criterion hardly minds and
-    little excitation does not refute. They are left out where their test takes them for
-    zero, or the criterion says that the model with them is a poor one: the other is one
-    with zeros. They are kept where they halve the squared errors of as few states:
-    these follow the means else, and leave to the noise how outputs move.
+    little excitation does not refute, and simulations begin at zero. They are left out
+    where the criterion says, beyond chance, that the model with them is a poor one: the
+    other is one with zeros. They are kept where they halve the squared errors of as few
+    states: these follow the means else, and leave to the noise how outputs move. Beside
+    a mode that grows their test has the word.
 
     Of a given order one state may stand for the constants of all experiments, by its
     initial values: it does not decay. The criterion does not mind that, until some
@@ -394,7 +395,9 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     far = stays_far(without.records)
     few = len(other.model.A) <= min(len(without.model.A), _FEW_STATES)
     decays = spectral_radius(other.model.A) <= 1.0
-    if far and few and decays:
+    if far and decays and better > -CERTAIN:
+        return True
+    if far and decays and few:
         if motion_left(other) < _MOSTLY * motion_left(without):
             return True
     replaced = _lasts(without) and not _lasts(other)
@@ -464,10 +467,21 @@ def unmoved_errors(evidence: Evidence, *, beside_drifts: bool = False) -> float:
 
 
 def _is_beyond(evidence: Evidence) -> bool:
-    """Whether constants are far beyond anything that the outputs reach."""
-    trends = evidence.model.trends
-    reached = np.max([np.abs(r.y).max(axis=1) for r in evidence.records], axis=0)
-    return bool((np.abs(trends) > _BEYOND * reached).any())
+    """Whether constants are far beyond anything that the outputs reach.
+
+    About the means of inputs that stay far from zero: there these are at home.
+    """
+    records, model = evidence.records, evidence.model
+    constants = model.trends
+    if spectral_radius(model.A) < 1.0:
+        means = np.array([r.u.mean(axis=1) for r in records])
+        motion = np.array([r.u.std(axis=1) for r in records])
+        levels = np.where(np.abs(means) > _FAR * motion, means, 0.0)
+        x = np.linalg.solve(np.eye(len(model.A)) - model.A, model.B)
+        constants = constants.copy()
+        constants[:, 0] += levels @ (model.C @ x + model.D).T
+    reached = np.max([np.abs(r.y).max(axis=1) for r in records], axis=0)
+    return bool((np.abs(constants) > _BEYOND * reached).any())
 
 
 def shifts_matter(whole: Evidence, parts: Evidence) -> bool:

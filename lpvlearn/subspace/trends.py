@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..data.preparation import Pairs
-from .drift import outlasts, wanders
+from ..systems.beginnings import moves_of
+from .drift import n_lasting, outlasts, wanders
 from .local_fit import LocalFit
 from .offsets import (
     ALIKE,
@@ -161,7 +162,11 @@ def _with_drifts(
     spared = len(fitted.model.A) - len(other.model.A)
     drifting = other.offsets.drifts.any()
     simpler = not outlasts(other) if drifting else spared >= 0
-    if choices.order is not None:
+    fewer_last = n_lasting(other) < n_lasting(fitted) and not other.grows()
+    spurious = fewer_last and (spared > 0 or fitted.grows())
+    if spurious and _are_lines(other):
+        simpler, least = True, 0.0  # a mode that the plant does not have stood for them
+    elif choices.order is not None:
         least = CERTAIN
     elif not drifting:
         least = -ALIKE if spared else ALIKE
@@ -180,6 +185,16 @@ def _with_drifts(
         if not worse > least:
             return level
     return other
+
+
+def _are_lines(fitted: LocalFit) -> bool:
+    """Whether outputs drift along lines, about which they do not wander.
+
+    Of one move of the inputs an integrator makes a line.
+    """
+    kinks = any(len(moves_of(r.u.T)) > 1 for r in fitted.evidence.records)
+    drifts = fitted.offsets.drifts.any() and not wanders(fitted.evidence)
+    return bool(kinks and drifts)
 
 
 def _takes_a_gain(without: Evidence, other: Evidence) -> bool:

@@ -224,7 +224,8 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
             of_calm = _of_calm(windows, noisy, calm)
             found = of_calm if of_calm.share > _MUCH else found
     if found.p_value < _LEVEL:  # an input that noise reaches at once may tell of it
-        first = 1 if within.p_value < _INSTANTANEOUS else 0
+        # Kicks of an input hide whether it answers within the sample.
+        first = 1 if within.p_value < _INSTANTANEOUS or calm is not None else 0
         of_most, curved = _of_most(windows, m, noisy, first, calm)
         found = max(found, of_most)
     innovations = np.sum(y**2, axis=1) / max(dof, 1)

@@ -204,6 +204,21 @@ def test_equilibria_that_bend_follow_from_constants_that_do_not(n_points, error)
     assert near <= min(error, far)
 
 
+@pytest.mark.parametrize("level", [lambda flow: 30.0 / flow, np.log])
+def test_equilibria_are_followed_over_what_they_bend_less(level):
+    """The temperature of what is heated while it flows by."""
+    flows = np.array([[0.5], [1.0], [1.5], [2.0], [3.0]])
+
+    def exchanger(flow):
+        return StateSpace(-1.0, 1.0, 1.0)
+
+    y = 20.0 + level(flows)
+    values = np.hstack([60.0 + 0.0 * flows, y, y])
+    found = interpolated(lambda: SplineLPV("cubic"), flows, values, exchanger, ONE)
+    between = np.array([[0.6], [0.75], [1.25], [2.5]])
+    assert_allclose(found.predict(between)[:, 1:2], 20.0 + level(between), atol=0.02)
+
+
 def test_equilibria_that_do_not_bend_are_interpolated_as_they_are():
     """A spring: its point of work is linear in kappa, its constants are not."""
 

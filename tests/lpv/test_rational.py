@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from lpvlearn import PolynomialLPV, RationalLPV
+from lpvlearn import AutoLPV, PolynomialLPV, RationalLPV
 from lpvlearn.datasets import FlexibleArm
 
 KAPPA = np.linspace(-0.9, 0.9, 7)[:, None]
@@ -60,6 +60,21 @@ def test_a_denominator_of_degree_zero_is_a_polynomial():
             model.predict(KAPPA), polynomial.predict(KAPPA), atol=1e-9
         )
         assert model.denominator_.tolist() == [1.0]
+
+
+def test_a_pole_near_the_range_is_found_where_nothing_else_is_plausible():
+    """Of a rope from 0.6 to 12 m: its pendulum's stiffness is one over its length."""
+    lengths = np.array([[0.6], [2.0], [4.0], [7.0], [12.0]])
+    rng, std = np.random.default_rng(0), 1e-3
+    truth = np.hstack([9.81 / lengths, 0.1 + 0.0 * lengths, 1.0 / lengths])
+    covariance = np.tile(np.diag(std**2 * np.ones(3)), (5, 1, 1))
+    theta = truth + std * rng.normal(size=truth.shape)
+    for model in (RationalLPV(1, 1), AutoLPV()):
+        model.fit(lengths, theta, covariance=covariance)
+        np.testing.assert_allclose(
+            model.predict([[1.0]])[0], [9.81, 0.1, 1.0], atol=5e-3
+        )
+    assert model.form_ == "rational 1/1"
 
 
 def test_polynomials_need_no_denominator():

@@ -260,3 +260,26 @@ def test_a_mode_that_stands_for_constants_does_not_tell_where_outputs_rest():
     assert y0 == pytest.approx(lti.dc_gain().item() * u0)
     low = Experiment(0, np.arange(300), u, y - 3.5, sampling_time=1.0)
     assert local_models._equilibrium(lti, [fitted], [low]) == (0.0, 0.0)
+
+
+def test_what_drifts_at_some_points_is_looked_for_at_all():
+    """Where it is not beyond doubt, a third mode would stand for it."""
+    rng, X, Y = np.random.default_rng(0), [], []
+
+    def plant(z):
+        lag = 60.0 * (1.0 + 0.4 * z)
+        A = [[-1.0 / lag, 0.0], [0.125, -0.125]]
+        return StateSpace(A, [[1.0 / lag], [0.0]], [[0.0, 2.0 + z]])
+
+    for run, z in enumerate([0.0, 0.5, 1.0, 1.5]):
+        u = np.repeat(rng.choice([-1.0, 1.0], 30), 20)[:, None]
+        y = plant(z).simulate(u, sampling_time=0.5)[:, 0]
+        line = y.std() * rng.choice([-1.0, 1.0]) * np.linspace(0.0, 0.8, 600)
+        Y.append(y + line + 0.01 * y.std() * rng.standard_normal(600))
+        columns = {"u": u[:, 0], "kappa": z, "run": run, "time": 0.5 * np.arange(600)}
+        X.append(pd.DataFrame(columns))
+    model = LocalLPVPipeline(**ROLES).fit(pd.concat(X), np.concatenate(Y))
+    for z in (0.25, 0.75, 1.25):
+        true, found = plant(z), model.lpv_.at(z)
+        assert found.order == 2
+        assert (found - true).hinf_norm() < 0.05 * true.hinf_norm()

@@ -40,6 +40,24 @@ def test_step_tests_tell_the_static_gain(first, order):
     assert np.median(np.abs(errors)) < 0.02 and np.max(np.abs(errors)) < 0.1
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of states that noise has
+@pytest.mark.parametrize("seed", range(3))
+def test_rest_that_is_said_may_be_where_inputs_go_on_slowly(seed):
+    """A zone that is heated, and the temperature outdoors."""
+    rng = np.random.default_rng(seed)
+    heat = np.repeat(rng.choice([20.0, 60.0], 20), 20)
+    heat[:20] = 60.0
+    outdoors = 20.0 + 5.0 * np.sin(2 * np.pi * np.arange(400) / 400)
+    u = np.column_stack([heat, outdoors])
+    y = 21.0 + lfilter([0.0, 0.003], [1.0, -0.97], heat - heat[0])
+    y += lfilter([0.0, 0.01], [1.0, -0.98], outdoors - outdoors[0])
+    noisy = y + 0.03 * rng.standard_normal(400)
+    model = SubspaceLTI(initial_state="rest").fit(u, noisy)
+    np.testing.assert_array_equal(model.input_offset_, [[60.0, 20.0]])
+    left = model.predict(u) - y
+    assert np.linalg.norm(left) < 0.05 * np.linalg.norm(y - y.mean())
+
+
 def test_a_level_of_zero_is_no_constant():
     u, y, gain = step_test(1, level=0.0)
     model = SubspaceLTI().fit(u, y)

@@ -504,6 +504,28 @@ def test_auto_keeps_a_plant_that_only_the_loop_holds():
         assert_allclose(np.abs(model.lti_.poles()).max(), 1.1, atol=0.03)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_kicks_of_a_derivative_do_not_hide_the_loop(seed):
+    """Steps of a reference through a PD controller of a magnet that falls by itself."""
+    rng = np.random.default_rng(seed)
+    levitated = StateSpace([[0.0, 1.0], [1800.0, 0.0]], [[0.0], [-24.0]], [[1.0, 0.0]])
+    A, B = (getattr(levitated.to_discrete(0.002), M) for M in "AB")
+    r = 1e-3 * np.repeat(rng.choice([-1.0, 1.0], 34), 60)[:2000]
+    noise = 1e-5 * rng.standard_normal(2000)
+    x, before, u, y = np.zeros(2), 0.0, np.zeros(2000), np.zeros(2000)
+    for t in range(2000):
+        y[t] = x[0] + noise[t]
+        error = r[t] - y[t]
+        u[t] = -300.0 * error - 2500.0 * (error - before)
+        x, before = A @ x + B[:, 0] * u[t], error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of the loop, of its pole
+        model = SubspaceLTI(sampling_time=0.002).fit(u[:, None] + 0.8, y + 0.012)
+    assert model.method_ == "pbsid"
+    poles = np.sort(np.abs(model.lti_.poles()))
+    assert poles[-1] == pytest.approx(np.exp(0.002 * np.sqrt(1800.0)), abs=5e-3)
+
+
 def test_auto_is_po_moesp_in_open_loop(system):
     u, y = record(system, 500)
     model = SubspaceLTI(5).fit(u, y)

@@ -220,3 +220,29 @@ def test_noise_that_shakes_slow_modes_may_be_more_than_drift(seed):
     target = plant.simulate(fresh)
     error = model.lti_.simulate(fresh) - target
     assert np.linalg.norm(error) < 0.25 * np.linalg.norm(target)
+
+
+def _thermal(seed, slowest, drift, samples=600):
+    """Two lags, one of up to half the record, and an output that drifts along a line.
+
+    Units of the time are samples; the drift is by the output's standard deviation.
+    """
+    rng = np.random.default_rng(seed)
+    A = [[-1.0 / slowest, 0.0], [1.0 / 16.0, -1.0 / 16.0]]
+    plant = StateSpace(A, [[1.0 / slowest], [0.0]], [[0.0, 2.5]])
+    u = np.repeat(rng.choice([-1.0, 1.0], samples // 20), 20)[:, None]
+    y = plant.simulate(u, sampling_time=1.0)[:, 0]
+    line = drift * y.std() * np.linspace(0.0, 1.0, samples)
+    return plant, u, y + line + 0.01 * y.std() * rng.standard_normal(samples)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("slowest", [120.0, 300.0])
+@pytest.mark.parametrize("drift", [0.3, 1.0])
+def test_no_slow_mode_stands_for_a_line_beside_slow_ones(slowest, drift, seed):
+    plant, u, y = _thermal(seed, slowest, drift)
+    model = SubspaceLTI(sampling_time=1.0).fit(u, y)
+    assert (model.order_, model.offset_) == (2, "linear")
+    fresh = _thermal(seed + 50, slowest, 0.0)[1]
+    truth = plant.simulate(fresh, sampling_time=1.0)
+    assert bft_score(truth, model.lti_.simulate(fresh)) > 98.0

@@ -496,6 +496,43 @@ def test_short_step_responses_are_not_spoilt():
         )
 
 
+@pytest.mark.parametrize("seed", [5, 9, 40])
+def test_a_step_test_about_a_level_has_a_constant(seed):
+    """Slow lags, of which the record does not tell whether their line meets zero."""
+    rng = np.random.default_rng(5000 + seed)
+    n = int(rng.choice([200, 300, 500]))
+    slow = n / float(rng.choice([1, 2, 4, 8])) * rng.uniform(0.3, 0.7)
+    gain, at, level = rng.uniform(1, 20), rng.uniform(1, 60), rng.uniform(10, 400)
+    fast, step = n - slow, at * rng.uniform(0.05, 0.15)
+    A = [[-1 / slow, 0.0], [1 / fast, -1 / fast]]
+    plant = StateSpace(A, [[gain / slow], [0.0]], [[0.0, 1.0]])
+
+    def record(first, second):
+        moved = step * (np.arange(n) >= 20) * first
+        moved[n // 2 :] = step * second
+        return plant.simulate(moved[:, None], sampling_time=1.0), at + moved[:, None]
+
+    y, u = record(1.0, -0.7)
+    noisy = y + level + 0.01 * np.ptp(y) * rng.standard_normal(y.shape)
+    model = SubspaceLTI(sampling_time=1.0).fit(u, noisy)
+    fresh, inputs = record(0.6, -0.4)
+    assert model.offset_ == "constant"
+    assert fit_of(model, inputs, fresh + level) > 0.9
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_simulations_of_far_signals_begin_there(seed):
+    """Whether or not the line of rest meets zero, as it does here."""
+    rng = np.random.default_rng(seed)
+    plant = StateSpace([[0.98]], [[0.3]], [[1.0]], None, 1.0)
+    u = 30.0 + rng.standard_normal((2, 400, 1))
+    y = [plant.simulate(one - 30.0) + 450.0 for one in u]
+    noisy = y[0] + 0.02 * y[0].std() * rng.standard_normal(y[0].shape)
+    model = SubspaceLTI().fit(u[0], noisy)
+    assert model.offset_ == "constant"
+    assert fit_of(model, u[1], y[1]) > 0.7  # it begins at the mean of the inputs
+
+
 # -- use -------------------------------------------------------------------------------
 
 
