@@ -510,7 +510,7 @@ class SubspaceLTI(
         self._single_output = np.asarray(y).ndim == 1
         telling = Telling(*_labels_of(X, experiments, y))
         if rates:
-            telling = telling.aside("noisy output", "useless")
+            telling = telling.aside("noisy output", "useless", "dropouts")
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
             if self.detrend is not None:
                 raise ValueError(

@@ -1,6 +1,7 @@
 """Outputs with an integrator: identified from their rates."""
 
 import pickle
+import warnings
 
 import numpy as np
 import pandas as pd
@@ -227,3 +228,15 @@ def test_rates_that_are_mostly_noise_explain_their_sums():
     with pytest.warns(UserWarning, match="next to nothing of the.*outputs integrate"):
         noise = np.random.default_rng(0).normal(size=angle.shape)
         SubspaceLTI(1, sampling_time=STEP, integrating=True).fit(u, noise)
+
+
+def test_rates_of_an_output_that_answers_at_once_do_not_drop_out():
+    """A battery's voltage: its resistance makes one value at every step of a current."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.choice([-4.0, -2.0, 0.0, 2.0], 50), 40)[:, None]
+    y = 7e-5 * np.cumsum(np.vstack([[[0.0]], u[:-1]]), axis=0) + 0.012 * u
+    y = np.round(y + 5e-4 * rng.standard_normal(u.shape), 3)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        SubspaceLTI(integrating=True).fit(u, y)
+    assert not any("drops out" in str(one.message) for one in caught)
