@@ -233,13 +233,17 @@ def tell_of_delay(
         what = f"does as well on parts held out as this one of order {order}"
     else:
         what = f"simulates {fits[0]:.3g} % of parts held out, this one {fits[1]:.3g} %"
+    late = [
+        f"input {telling.input(j)} only after {delay[j]} samples"
+        for j in np.flatnonzero(delay >= _LATE)
+    ]
     telling.once(
         "delay",
-        f"Input {telling.input(delay.argmax())} shows in the outputs only after {cut} "
-        "samples, beyond noise; it may arrive a few sooner. With a delay in place of "
-        f"them a model of order {other[0]} {what}. Give it as `input_delay`, {cut} or "
-        "less, and compare on another record; input_delay='auto' takes only what is a "
-        "delay beyond doubt.",
+        f"Beyond noise, the outputs show {', '.join(late)}; it may arrive a few "
+        f"sooner. With a delay in place of them a model of order {other[0]} {what}. "
+        "Try input_delay='auto', which takes what is a delay beyond doubt, or give as "
+        f"many samples or fewer (input_delay={delay.tolist()}), and compare on another "
+        "record.",
     )
 
 

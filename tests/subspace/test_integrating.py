@@ -231,7 +231,7 @@ def test_rates_that_are_mostly_noise_explain_their_sums():
 
 
 def test_rates_of_an_output_that_answers_at_once_do_not_drop_out():
-    """A battery's voltage: its resistance makes one value at every step of a current."""
+    """A battery, whose resistance makes one value at every step of a current."""
     rng = np.random.default_rng(1)
     u = np.repeat(rng.choice([-4.0, -2.0, 0.0, 2.0], 50), 40)[:, None]
     y = 7e-5 * np.cumsum(np.vstack([[[0.0]], u[:-1]]), axis=0) + 0.012 * u
