@@ -32,8 +32,14 @@ def align_outputs(
     y = in_columns(y, getattr(estimator, "_output_names", None))
     first, second = names  # in messages
     positions = f"{second}.to_numpy() if the rows belong together as they stand"
-    with naming_argument(second, f"have as many rows as {first}", y):
-        check_consistent_length(X, y)
+    rule = f"have as many rows as {first}"
+    with naming_argument(second, rule, y):
+        try:
+            check_consistent_length(X, y)
+        except ValueError as error:
+            raise ValueError(
+                f"`{second}` must {rule}: select the same rows of both. {error}."
+            ) from error
     own, given = getattr(X, "index", None), getattr(y, "index", None)
     if not isinstance(own, pd.Index) or not isinstance(given, pd.Index):
         return y

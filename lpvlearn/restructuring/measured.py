@@ -52,6 +52,12 @@ _LEAST_INCOHERENCE = 1e-6
 # Least decay of a realised pole, relative to its size and to the highest frequency
 _LEAST_DAMPING, _LEAST_RATE = 1e-4, 1e-9
 
+# What is not frequencies may be samples
+_OF_SAMPLES = (
+    " These are to be frequencies, in rad/s. Of samples of inputs and outputs identify "
+    "a model first: fit_model(SubspaceLTI().fit(X, y).lti_), or use `LocalLPVPipeline`."
+)
+
 
 class MeasuredErrorSystem(ErrorSystem):
     """The error of a structure against a measured frequency response.
@@ -139,12 +145,12 @@ def read_frequency_data(
     if grid.ndim != 1 or len(grid) == 0:
         raise ValueError(
             "`omega` must have shape (n_freq,) or (n_freq, 1) with n_freq >= 1. "
-            f"Got {grid.shape}."
+            f"Got {grid.shape}." + _OF_SAMPLES
         )
     if not np.isfinite(grid).all() or (grid < 0).any() or not (grid > 0).any():
         raise ValueError(
             "`omega` must be finite, not negative, and not only zero. Got "
-            f"{shown(omega)}."
+            f"{grid.min():.4g} to {grid.max():.4g}." + _OF_SAMPLES
         )
     if len(np.unique(grid)) != len(grid):
         raise ValueError(f"`omega` must hold every frequency once. Got {shown(omega)}.")

@@ -233,13 +233,13 @@ def tell_of_delay(
         what = f"does as well on parts held out as this one of order {order}"
     else:
         what = f"simulates {fits[0]:.3g} % of parts held out, this one {fits[1]:.3g} %"
-    late = [
+    shown = [
         f"input {telling.input(j)} only after {delay[j]} samples"
         for j in np.flatnonzero(delay >= _LATE)
     ]
     telling.once(
         "delay",
-        f"Beyond noise, the outputs show {', '.join(late)}; it may arrive a few "
+        f"Beyond noise, the outputs show {', '.join(shown)}; it may arrive a few "
         f"sooner. With a delay in place of them a model of order {other[0]} {what}. "
         "Try input_delay='auto', which takes what is a delay beyond doubt, or give as "
         f"many samples or fewer (input_delay={delay.tolist()}), and compare on another "

@@ -17,6 +17,7 @@ from ..data.preparation import (
     drops_out,
     far_out,
     held_for,
+    independent_inputs,
     stays_put,
 )
 from ..exceptions import RankWarning, warn
@@ -298,11 +299,17 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
     model = fitted.model
     chose_order = len({row.order for row in fitted.selection.rows}) > 1
     if model.rank_deficit:
+        remedy = "Excite the inputs more richly, or lower `order`."
+        inputs = [r.u.T - r.u.mean(axis=1) for r in fitted.scaled.records]
+        if inputs and independent_inputs(inputs) is not None:
+            remedy = (
+                "Inputs are the same but for constants and factors, and nothing tells "
+                "what each of them does: leave out all but one of these."
+            )
         telling.once(
             "rank",
             f"The data leave {model.rank_deficit} directions of B and D "
-            "undetermined; the smallest solution was taken. Excite the inputs "
-            "more richly, or lower `order`.",
+            f"undetermined; the smallest solution was taken. {remedy}",
             RankWarning,
         )
     warn_about_pole(model.A, telling, fitted.method)

@@ -730,3 +730,12 @@ def test_a_count_that_is_excitation_is_not_rounding(gains):
     y = lfilter([0.0, 0.3], [1.0, -0.7], u @ gains) + 0.05 * rng.standard_normal(600)
     model = SubspaceLTI(1).fit(u, y)
     assert model.lti_.dc_gain()[0] == pytest.approx(gains, abs=0.05)
+
+
+def test_inputs_that_are_alike_but_for_a_constant_are_told():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((300, 1))
+    y = lfilter([0.0, 0.1], [1.0, -0.9], u, axis=0)
+    y += 0.01 * rng.standard_normal((300, 1))
+    with pytest.warns(RankWarning, match="the same but for constants and factors"):
+        SubspaceLTI().fit(np.hstack([u, 2.0 * u + 1.0]), y)
