@@ -228,11 +228,11 @@ class SubspaceLTI(
         better for them and they are significant, or save states, and where signals that
         stay three standard deviations or more from zero do not refute them; else (and
         with `detrend`, which has dealt with them) none. It takes drifts that stand for
-        a mode which does not decay and inputs do not move, or that are beyond doubt; of
-        a given order, where its model is poor or does not decay without. Where levels
-        shift within an experiment, by a load or a sensor that moved, "auto" ends it
-        there and begins another, with a warning, if the criterion is clearly better for
-        that.
+        a mode which does not decay and inputs do not move, that spare such a mode
+        beside slow ones, or that are beyond doubt; of a given order, where its model is
+        poor or does not decay without. Where levels shift within an experiment, by a
+        load or a sensor that moved, "auto" ends it there and begins another, with a
+        warning, if the criterion is clearly better for that.
     missing : {"raise", "split", "estimate"}, default="raise"
         "split" ends an experiment before a sample with NaN, or a row that the `time`
         column misses, and starts another after it, with an initial state of its own.
