@@ -159,32 +159,42 @@ def _with_drifts(
         return fitted
     before = min(criterion_in_units(tested), refused)
     better = before - criterion_in_units(other.evidence.one_step)
-    spared = len(fitted.model.A) - len(other.model.A)
-    drifting = other.offsets.drifts.any()
-    simpler = not outlasts(other) if drifting else spared >= 0
-    fewer_last = n_lasting(other) < n_lasting(fitted) and not other.grows()
-    spurious = fewer_last and (spared > 0 or fitted.grows())
-    if spurious and _are_lines(other):
-        simpler, least = True, 0.0  # a mode that the plant does not have stood for them
-    elif choices.order is not None:
-        least = CERTAIN
-    elif not drifting:
-        least = -ALIKE if spared else ALIKE
-    elif (unmoved := unmoved_errors(tested, beside_drifts=True)) < _NOT_MOVED:
-        least = -ALIKE
-    else:
-        least = ALIKE if unmoved < HARDLY_MOVED else CERTAIN
-    if not (simpler and better > least):
+    asked = _gain_asked(fitted, other, given=choices.order is not None)
+    if not better > asked:
         return fitted
-    if drifting and _takes_a_gain(fitted.evidence, other.evidence):
+    if other.offsets.drifts.any() and _takes_a_gain(fitted.evidence, other.evidence):
         return fitted
-    if spared < 0 and choices.order is None:
+    order = len(other.model.A)
+    if order > len(fitted.model.A) and choices.order is None:
         # What more states gain is no drift.
-        order, n_trend = len(other.model.A), fitted.evidence.free.n_trend
+        n_trend = fitted.evidence.free.n_trend
         level, worse = of_order(pairs, choices, telling, order, other, n_trend)
-        if not worse > least:
+        if not worse > asked:
             return level
     return other
+
+
+def _gain_asked(fitted: LocalFit, other: LocalFit, *, given: bool) -> float:
+    """By how much the criterion is to be better for the `other` model, with drifts.
+
+    Of a `given` order, say. Infinite where that needs a mode which does not decay: but
+    for one beside slow ones that the drift spares, or keeps from growing.
+    """
+    spared = len(fitted.model.A) - len(other.model.A)
+    drifting = bool(other.offsets.drifts.any())
+    fewer_last = n_lasting(other) < n_lasting(fitted) and not other.grows()
+    if fewer_last and (spared > 0 or fitted.grows()) and _are_lines(other):
+        return 0.0
+    if outlasts(other) if drifting else spared < 0:
+        return np.inf
+    if given:
+        return CERTAIN
+    if not drifting:
+        return -ALIKE if spared else ALIKE
+    unmoved = unmoved_errors(fitted.evidence.one_step, beside_drifts=True)
+    if unmoved < _NOT_MOVED:
+        return -ALIKE
+    return ALIKE if unmoved < HARDLY_MOVED else CERTAIN
 
 
 def _are_lines(fitted: LocalFit) -> bool:
