@@ -26,6 +26,8 @@ tells left-out points clearly better, it is not themselves:
 - Where they bend more than the models do (a drive, whose currents at rest are rational
   in a speed that its equations have as it is), the constants in ``dx/dt = A x + B u +
   c``, ``y = C x + D u + d``.
+- Where the sensors have one constant at all points, what the models answer to the
+  inputs at rest.
 - Where they bend less over the logarithm of the scheduling variable, or over one over
   it (a flow, a speed), these.
 - Where they are those of one system that schedules itself (levels of a tank), a curve
@@ -67,6 +69,9 @@ _CLEAR = 10.0
 # the fewest points for that, and places between points that equilibria are taken at
 _BETTER, _FEWEST, _BETWEEN = 0.25, 5, 8
 _BENT = 1e-4  # mean square of such an error, by the motion, that is worth it
+
+# Range of constants of sensors over the points that are one, by that of the outputs
+_SAME_CONSTANT = 0.05
 
 # Variance of the levels of inputs over the points, in that of their motion: none. And
 # how far, in that of the outputs, a gain that is known takes them to a common one.
@@ -171,6 +176,8 @@ def interpolated(
     if distinct and _are_one_family(statics, kappa, u, y, scales[0]):
         straight = _bend(kappa, y / scales[1]) <= _bend(kappa, u / scales[0])
         ways.append((partial(_by_slopes, scales, straight), 1.0))
+    if len(kappa) > 2 and points.have_one_constant(scales[1]):
+        ways.append((partial(_by_one_constant, spline), _BETTER))
     if len(kappa) >= _FEWEST:
         ways.append((partial(_by_constants, spline), _BETTER))
         if (kappa > 0.0).all():
@@ -210,6 +217,18 @@ class _Points(NamedTuple):
         m, p = self.models[0].n_inputs, self.models[0].n_outputs
         return self.values[:, :m], self.values[:, m : m + p]
 
+    def constants_of_sensors(self) -> Array:
+        """Outputs less what the models answer to the inputs, (n_points, n_outputs)."""
+        u, y = self.equilibria()
+        return y - _times(np.array([model.dc_gain() for model in self.models]), u)
+
+    def have_one_constant(self, y_scale: Array) -> bool:
+        """Whether these are the same at all points, beside how outputs differ."""
+        c, y = (
+            x / y_scale for x in (self.constants_of_sensors(), self.equilibria()[1])
+        )
+        return bool(np.ptp(c, axis=0).max() < _SAME_CONSTANT * np.ptp(y, axis=0).max())
+
 
 def _error_at_rest(way: _Way, points: _Points, y_scale: Array) -> float:
     """Mean squared error of outputs at rest at points left out; 0 without any."""
@@ -228,6 +247,18 @@ def _by_themselves(spline: Callable[[], Any], points: _Points) -> _AtRest:
     """A curve through the points."""
     curve = spline().fit(points.kappa, points.values)
     return lambda place, model: _Work.of(model, curve.predict([place])[0])
+
+
+def _by_one_constant(spline: Callable[[], Any], points: _Points) -> _AtRest:
+    """What the models answer to the inputs, beside the constants of the sensors."""
+    inputs = spline().fit(points.kappa, points.values)
+    bias = points.constants_of_sensors().mean(axis=0)
+
+    def at_rest(place: Array, model: StateSpace) -> _Work:
+        u = inputs.predict([place])[0, : model.n_inputs]
+        return _Work.resting(model, u, np.concatenate([np.zeros(model.order), bias]))
+
+    return at_rest
 
 
 def _over(

@@ -24,7 +24,14 @@ from .fit_warnings import (
 from .local_fit import LocalFit
 from .one_fit import TooFewSamples
 from .options import Choices
-from .rivals import believable, may_share_noise, tell_of_lead, with_shared_noise
+from .rivals import (
+    believable,
+    held_by_a_loop,
+    may_be_held,
+    may_share_noise,
+    tell_of_lead,
+    with_shared_noise,
+)
 from .shifts import without_shifts
 from .telling import Telling
 from .trends import with_trends
@@ -73,6 +80,8 @@ def fit_pairs(
         # Of inputs without anything new a rival makes of many states what it likes.
         if not foreseen:
             fitted, doubt = believable(pairs, choices, telling, fitted)
+    elif may_be_held(fitted, choices):
+        fitted = held_by_a_loop(pairs, choices, telling, fitted)
     elif may_share_noise(fitted, choices):
         fitted = with_shared_noise(pairs, choices, telling, fitted)
     feedback = fitted.feedback

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy import linalg, special
 
 from ..data.preparation import Pairs
+from ..exceptions import DivergenceError
 from ..systems.beginnings import moves_of, standing
 from ..systems.least_squares import column_scale
 from ..systems.simulation import free_responses, lti_response, trend_signals
@@ -206,7 +207,7 @@ def _as_they_begin(
     With the answer S to steps of the inputs, ``trends + free x0 = y0 - S u0 + free x``:
     behind an integrator u0 is a straight line. Least squares, with as little as may be
     of x. Shapes (n_experiments, n_inputs) and (n_experiments, n_outputs); None where
-    drifts are left.
+    drifts are left, or the model grows beyond all numbers.
     """
     model, n_values = evidence.model, sum(r.n_values for r in evidence.records)
     lti, scale = evidence.state_space(model, 1.0), evidence.output_scale
@@ -215,7 +216,10 @@ def _as_they_begin(
     for n, x0, trend in zip(lengths, model.initial_states, trends, strict=True):
         free = free_responses(lti.A, lti.C, n)
         target = (free @ x0 + trend_signals(n, len(trend)).T @ trend) / scale
-        steps = [-lti.simulate(np.tile(row, (n, 1))) for row in np.eye(m)]
+        try:
+            steps = [-lti.simulate(np.tile(row, (n, 1))) for row in np.eye(m)]
+        except DivergenceError:
+            return None
         constants = np.broadcast_to(np.eye(ny), (n, ny, ny))
         columns = np.concatenate([np.stack(steps, axis=2), constants, free], axis=2)
         columns = (columns / scale[:, None]).reshape(n * ny, -1)
@@ -381,10 +385,13 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     alone decides.
 
     A constant far beyond the outputs stands for a drift, together with the initial
-    state of a mode that does not decay over the record. Rounding tells nothing.
+    state of a mode that does not decay over the record; or for an offset of the inputs,
+    where these move that mode. Rounding tells nothing.
     """
     if _is_beyond(other):
-        return False
+        moved = unmoved_errors(other, beside_drifts=True)
+        if not HARDLY_MOVED < moved < np.inf:
+            return False
     better = criterion_in_units(without) - criterion_in_units(other)
     if better > 0.0 and len(other.model.A) < len(without.model.A):
         return True
@@ -421,7 +428,7 @@ def may_have_drift(evidence: Evidence) -> bool:
     """
     if spectral_radius(evidence.model.A) > 1.0:
         return True
-    if (mode_rates(evidence.model.A) * evidence.longest < 1.0).any():
+    if (mode_rates(evidence.model.A) * evidence.longest < HARDLY_DECAYS).any():
         return True
     return chance_of_trend(evidence, 2) < _SUSPICIOUS
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..data.preparation import DETRENDS, Pairs
 from .closed_loop import ClosedLoopEvidence
@@ -14,12 +15,15 @@ from .fit_warnings import Doubt
 from .held_out import DOUBT, HeldOut
 from .identification import spectral_radius
 from .local_fit import LocalFit
-from .offsets import CERTAIN, follows_means_alone
+from .offsets import CERTAIN, HARDLY_DECAYS, follows_means_alone
 from .one_fit import TooFewSamples, choose_and_identify, errors_held_out
 from .options import Choices
 from .rounding import rounded_outputs
 from .telling import Telling
 from .trends import with_trends
+from .varx import Regression
+
+Array = NDArray[np.float64]
 
 # Share of the squared errors that later inputs leave where the outputs lead them; time
 # constants per experiment of a mode that may be a line of a reference
@@ -31,6 +35,9 @@ _OF_NOISE, _CERTAIN = 0.5, 3.0
 
 # The same of one with D free, where nothing but answers within the sample shows a loop.
 _OF_ANSWERS = 0.25
+
+# Growth within a sample of a plant that no controller holds.
+_FASTEST = 2.0
 
 # Lags of a noise that may be more than that of a sensor; samples of which more tell the
 # plant without it; share of the outputs' size below which either model is as good.
@@ -100,6 +107,8 @@ def believable(
         better = not said and of_blind.total < _OF_NOISE * error.total
         # growing modes simulate bounded signals by what is to come of the inputs
         better &= not blind.grows(_CERTAIN)
+        # and are predicted: what they have of noise, simulations amplify
+        better &= not best.grows(_CERTAIN) or _deviance(blind) < _deviance(best)
         unsure = makeshift or (best.grows() and not best.grows(_CERTAIN))
         if not said and not best.grows() and of_that.total < _LED * error.total:
             unsure |= find_lead(pairs)[0] > 0  # inputs were made of later outputs, too
@@ -164,6 +173,70 @@ def tell_of_lead(
             "move it by as much. Or a controller makes it of the outputs and leaves "
             "little to its reference: that must move more for a plant to be found.",
         )
+
+
+def may_be_held(fitted: LocalFit, choices: Choices) -> bool:
+    """Whether outputs grow by their own past, more than they do in any record.
+
+    As those of a plant that only a loop holds, be its noise too small to be known to
+    the inputs. Inputs that follow from the outputs hide it.
+    """
+    feedback = fitted.feedback
+    asked = choices.method == "auto" and choices.refine in ("auto", "prediction")
+    asked &= choices.initial_states and not choices.enforce_stability
+    if (
+        not asked
+        or choices.estimated
+        or choices.differences
+        or fitted.method == "pbsid"
+    ):
+        return False
+    if feedback is None or feedback.regression is None:
+        return False
+    growth = spectral_radius(_own_past(feedback.regression))
+    return feedback.foreseen or bool(
+        np.log(max(growth, 1.0)) * fitted.evidence.longest > HARDLY_DECAYS
+    )
+
+
+def _own_past(regression: Regression) -> Array:
+    """The state matrix of a regression on past outputs."""
+    own = -regression[1:, :, regression.shape[2] - regression.shape[1] :]
+    past, ny, _ = own.shape
+    A = np.eye(past * ny, k=-ny)
+    A[:ny] = np.hstack(list(own))
+    return A
+
+
+def held_by_a_loop(
+    pairs: Pairs, choices: Choices, telling: Telling, first: LocalFit
+) -> LocalFit:
+    """The model of a plant that grows for certain, if that is far likelier.
+
+    In open loop its outputs would have grown: there is a loop, however little of it
+    the noise shows.
+    """
+    n_trend, feedback = first.evidence.free.n_trend, first.feedback
+    chosen = choices._replace(method="pbsid", offset=DETRENDS[n_trend])
+    if choices.feedthrough is True and feedback is not None and feedback.instantaneous:
+        chosen = chosen._replace(feedthrough=False)
+    try:
+        other = choose_and_identify(pairs, chosen, telling, n_trend, first)
+        likelier = _deviance(other) < _deviance(first) - CERTAIN
+        held = spectral_radius(other.model.A) < _FASTEST
+        if not (likelier and held and other.grows(_CERTAIN)):
+            return first
+        telling.once(
+            "feedback",
+            "The outputs follow from their own past as those of a plant that grows by "
+            "itself, though they have not grown: a controller holds it. method='pbsid' "
+            "was taken, which that does not bias. In open loop give method='po-moesp'.",
+        )
+        if choices.offset == "auto":  # constants are judged anew
+            return with_trends(pairs, chosen._replace(offset="auto"), telling, other)
+    except TooFewSamples:
+        return first
+    return other
 
 
 def may_share_noise(fitted: LocalFit, choices: Choices) -> bool:

@@ -215,7 +215,11 @@ def without_shifts(
     asked = choices.offset == "auto" and choices.initial_states and choices.refine
     if not asked or choices.estimated or feedback is None:
         return pairs, whole
-    shifts = find_shifts(whole.scaled.records, feedback.regression)
+    records, regression = whole.scaled.records, feedback.regression
+    channels = len(records[0].u) + len(records[0].y)
+    if regression is not None and regression.shape[2] != channels:
+        regression = regression_of(records)  # levels were no input beside constants
+    shifts = find_shifts(records, regression)
     if not any(shifts):
         return pairs, whole
     parts = cut_at(pairs, shifts)

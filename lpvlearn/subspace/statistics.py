@@ -308,7 +308,9 @@ class Evidence:
         std = self.frequency_response_std(np.zeros(1))[0].real
         moved = self._input_sizes()
         power = np.mean(np.abs(response * moved) ** 2, axis=0)
-        size = np.sqrt(power.sum(axis=1, keepdims=True)) / moved
+        all_inputs = np.sqrt(power.sum(axis=1, keepdims=True))
+        never = np.full(power.shape, np.inf)  # of an input that does not move
+        size = np.divide(all_inputs, moved, out=never, where=moved > 0.0)
         return StaticGain(response[0].real, std, size)
 
     def _input_sizes(self) -> Array:

@@ -219,6 +219,25 @@ def test_equilibria_are_followed_over_what_they_bend_less(level):
     assert_allclose(found.predict(between)[:, 1:2], 20.0 + level(between), atol=0.02)
 
 
+@pytest.mark.parametrize("n_points", [3, 4, 6])
+def test_outputs_at_rest_are_what_the_models_answer_beside_one_constant(n_points):
+    """Few points tell that, though their gains and inputs bend as they like."""
+    rng = np.random.default_rng(n_points)
+    kappa = np.linspace(0.5, 3.0, n_points)[:, None]
+
+    def heated(flow):
+        return StateSpace(-float(flow[0]), 1.0, 1.0)
+
+    u = 40.0 + 5.0 * rng.normal(size=kappa.shape)
+    x = u / kappa
+    values = np.hstack([u, 20.0 + x, x])
+    found = interpolated(lambda: SplineLPV(), kappa, values, heated, ONE)
+    between = np.linspace(0.6, 2.9, 9)[:, None]
+    u0, y0, x0 = found.predict(between).T
+    assert_allclose(y0 - x0, 20.0, rtol=1e-9)
+    assert_allclose(x0, u0 / between[:, 0], rtol=0.02)
+
+
 def test_equilibria_that_do_not_bend_are_interpolated_as_they_are():
     """A spring: its point of work is linear in kappa, its constants are not."""
 

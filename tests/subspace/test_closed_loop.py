@@ -526,6 +526,29 @@ def test_kicks_of_a_derivative_do_not_hide_the_loop(seed):
     assert poles[-1] == pytest.approx(np.exp(0.002 * np.sqrt(1800.0)), abs=5e-3)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plant_that_grows_is_held_though_noise_is_too_small_to_show_it(seed):
+    """Its inputs are nearly all reference and answers to that."""
+    rng = np.random.default_rng(seed)
+    plant = StateSpace([[0.0, 1.0], [0.6, -1.7]], [[0.0], [1.0]], [[1.0, 0.0]])
+    A, B = (getattr(plant.to_discrete(0.25), M) for M in "AB")
+    r = rng.standard_normal(1200)
+    x, before, u, y = np.zeros(2), 0.0, np.zeros(1200), np.zeros(1200)
+    for t in range(1200):
+        y[t] = x[0] + 0.01 * rng.standard_normal()
+        error = r[t] - y[t]
+        u[t] = 4.0 * error + 2.0 * (error - before)
+        x, before = A @ x + B[:, 0] * u[t], error
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = SubspaceLTI(sampling_time=0.25).fit(u[:, None], y)
+    told = "".join(str(one.message) for one in caught)
+    assert "a controller holds it" in told or "The inputs know the noise" in told
+    assert model.method_ == "pbsid"
+    poles = np.linalg.eigvals(A).real
+    assert np.abs(model.lti_.poles()).max() == pytest.approx(poles.max(), abs=3e-3)
+
+
 def test_auto_is_po_moesp_in_open_loop(system):
     u, y = record(system, 500)
     model = SubspaceLTI(5).fit(u, y)

@@ -520,6 +520,27 @@ def test_a_step_test_about_a_level_has_a_constant(seed):
     assert fit_of(model, inputs, fresh + level) > 0.9
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_level_of_an_integrators_input_is_no_second_integrator(seed):
+    """Beside a pole next to one its constant is far beyond all outputs."""
+    rng = np.random.default_rng(seed)
+    plant = StateSpace(
+        [[1.0, 0.1], [0.0, 0.96]], [[0.0], [0.4]], [[1.0, 0.0]], None, 1.0
+    )
+    X, y = [], []
+    for run in range(4):
+        u = rng.standard_normal((420, 1))
+        X.append(np.hstack([u + 30.0, np.full((420, 1), run)]))
+        y.append(plant.simulate(u))
+    y = np.vstack(y)
+    noisy = np.round(y + 0.02 * y.std() * rng.standard_normal(y.shape), 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it may be on the border
+        model = SubspaceLTI(experiment=1).fit(np.vstack(X), noisy)
+    assert (model.order_, model.offset_) == (2, "constant")
+    assert fit_of(model, np.vstack(X), y) > 0.9
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_simulations_of_far_signals_begin_there(seed):
     """Whether or not the line of rest meets zero, as it does here."""

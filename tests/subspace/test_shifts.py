@@ -175,3 +175,18 @@ def test_cuts_that_make_a_stable_model_grow_are_not_made(monkeypatch):
         found = SubspaceLTI(2).fit(u, y)
     assert len(found.initial_states_) == 1
     assert np.abs(found.lti_.poles()).max() < 1.0
+
+
+def test_a_level_that_is_no_input_beside_constants_is_left_alone():
+    """A scheduling variable without its role: it stands still in every experiment."""
+    rng, X, Y = np.random.default_rng(0), [], []
+    for run, level in enumerate([0.0, 0.5, 1.0]):
+        u = np.repeat(rng.choice([-1.0, 1.0], 30), 10)[:, None]
+        y = lfilter([0.0, 0.1], [1.0, level / 5.0 - 0.9], u, axis=0)
+        Y.append(20.0 + 30.0 / (1.0 + level) + y)
+        X.append(np.hstack([u, np.full((300, 1), level), np.full((300, 1), run)]))
+    y = np.vstack(Y) + 0.004 * rng.standard_normal((900, 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        model = SubspaceLTI(experiment=2).fit(np.vstack(X), y)
+    assert model.offset_ == "constant"
