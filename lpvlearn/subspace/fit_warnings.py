@@ -82,11 +82,11 @@ _GROWN = 1.1
 
 
 def tell_of_still_outputs(outputs: Sequence[Array], telling: Telling) -> None:
-    """Tell of outputs that never change beside others that do."""
+    """Tell of outputs that never change."""
     if "still" in telling:
         return
     still = constant_columns(outputs)
-    if 0 < len(still) < outputs[0].shape[1]:
+    if len(still):
         k = int(still[0])
         telling.once(
             "still",

@@ -193,6 +193,8 @@ def may_be_held(fitted: LocalFit, choices: Choices) -> bool:
         return False
     if feedback is None or feedback.regression is None:
         return False
+    if not fitted.residual > _AUDIBLE or fitted.grows(_CERTAIN):
+        return False  # it may have grown
     growth = spectral_radius(_own_past(feedback.regression))
     return feedback.foreseen or bool(
         np.log(max(growth, 1.0)) * fitted.evidence.longest > HARDLY_DECAYS

@@ -291,6 +291,7 @@ def test_what_surveys_found_is_told(name, spoiled, told):
         call.function(**{**call.arguments, **spoiled})
 
 
+@pytest.mark.filterwarnings("ignore:Output 1 is .* in all samples")
 def test_what_surveys_found_is_right():
     structure, theta = world().structure, np.array([30.0, 1.2, 40.0])
     masked = structure.system_matrix(np.ma.masked_less(theta, 0.0))
@@ -431,6 +432,7 @@ def test_times_of_text_are_refused_where_they_are_categories():
         call.function(**{**call.arguments, "X": X})
 
 
+@pytest.mark.filterwarnings("ignore:Output 1 is .* in all samples")
 def test_a_constant_of_any_size_is_found():
     u = np.random.default_rng(0).standard_normal((180, 1))
     model = lp.SubspaceLTI().fit(u, np.full((180, 1), 1e16))
