@@ -70,6 +70,9 @@ _CLEAR = 10.0
 _BETTER, _FEWEST, _BETWEEN = 0.25, 5, 8
 _BENT = 1e-4  # mean square of such an error, by the motion, that is worth it
 
+# Scheduling values of which there are logarithms and inverses
+_POSITIVE = 1e-100
+
 # Range of constants of sensors over the points that are one, by that of the outputs
 _SAME_CONSTANT = 0.05
 
@@ -180,7 +183,7 @@ def interpolated(
         ways.append((partial(_by_one_constant, spline), _BETTER))
     if len(kappa) >= _FEWEST:
         ways.append((partial(_by_constants, spline), _BETTER))
-        if (kappa > 0.0).all():
+        if (kappa > _POSITIVE).all():
             ways += [(partial(_over, f, spline), _BETTER) for f in (np.log, _inverted)]
     best, least = ways[0][0], np.inf
     for way, share in ways if len(ways) > 1 else ():
@@ -224,10 +227,9 @@ class _Points(NamedTuple):
 
     def have_one_constant(self, y_scale: Array) -> bool:
         """Whether these are the same at all points, beside how outputs differ."""
-        c, y = (
-            x / y_scale for x in (self.constants_of_sensors(), self.equilibria()[1])
-        )
-        return bool(np.ptp(c, axis=0).max() < _SAME_CONSTANT * np.ptp(y, axis=0).max())
+        both = self.constants_of_sensors(), self.equilibria()[1]
+        c, y = (float(np.max(np.ptp(x, axis=0) / y_scale)) for x in both)
+        return c < _SAME_CONSTANT * y
 
 
 def _error_at_rest(way: _Way, points: _Points, y_scale: Array) -> float:

@@ -184,21 +184,15 @@ def may_be_held(fitted: LocalFit, choices: Choices) -> bool:
     feedback = fitted.feedback
     asked = choices.method == "auto" and choices.refine in ("auto", "prediction")
     asked &= choices.initial_states and not choices.enforce_stability
-    if (
-        not asked
-        or choices.estimated
-        or choices.differences
-        or fitted.method == "pbsid"
-    ):
+    if not asked or fitted.method == "pbsid" or choices.estimated:
         return False
-    if feedback is None or feedback.regression is None:
+    if choices.differences or feedback is None or feedback.regression is None:
         return False
     if not fitted.residual > _AUDIBLE or fitted.grows(_CERTAIN):
         return False  # it may have grown
-    growth = spectral_radius(_own_past(feedback.regression))
-    return feedback.foreseen or bool(
-        np.log(max(growth, 1.0)) * fitted.evidence.longest > HARDLY_DECAYS
-    )
+    growth = max(spectral_radius(_own_past(feedback.regression)), 1.0)
+    grows = np.log(growth) * fitted.evidence.longest > HARDLY_DECAYS
+    return bool(grows) or feedback.foreseen
 
 
 def _own_past(regression: Regression) -> Array:
@@ -228,16 +222,17 @@ def held_by_a_loop(
         held = spectral_radius(other.model.A) < _FASTEST
         if not (likelier and held and other.grows(_CERTAIN)):
             return first
-        telling.once(
-            "feedback",
-            "The outputs follow from their own past as those of a plant that grows by "
-            "itself, though they have not grown: a controller holds it. method='pbsid' "
-            "was taken, which that does not bias. In open loop give method='po-moesp'.",
-        )
         if choices.offset == "auto":  # constants are judged anew
-            return with_trends(pairs, chosen._replace(offset="auto"), telling, other)
+            chosen = chosen._replace(offset="auto")
+            other = with_trends(pairs, chosen, telling, other)
     except TooFewSamples:
         return first
+    telling.once(
+        "feedback",
+        "The outputs follow from their own past as those of a plant that grows by "
+        "itself, though they have not grown: a controller holds it. method='pbsid' was "
+        "taken, which that does not bias. In open loop give method='po-moesp'.",
+    )
     return other
 
 
