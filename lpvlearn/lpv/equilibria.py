@@ -179,12 +179,12 @@ def interpolated(
     if distinct and _are_one_family(statics, kappa, u, y, scales[0]):
         straight = _bend(kappa, y / scales[1]) <= _bend(kappa, u / scales[0])
         ways.append((partial(_by_slopes, scales, straight), 1.0))
-    if len(kappa) > 2 and points.have_one_constant(scales[1]):
+    if points.have_one_constant(scales[1]):
         ways.append((partial(_by_one_constant, spline), _BETTER))
     if len(kappa) >= _FEWEST:
         ways.append((partial(_by_constants, spline), _BETTER))
-        if (kappa > _POSITIVE).all():
-            ways += [(partial(_over, f, spline), _BETTER) for f in (np.log, _inverted)]
+    if (kappa > _POSITIVE).all():
+        ways += [(partial(_over, f, spline), _BETTER) for f in (np.log, _inverted)]
     best, least = ways[0][0], np.inf
     for way, share in ways if len(ways) > 1 else ():
         error = _error_at_rest(way, points, scales[1])

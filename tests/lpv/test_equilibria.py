@@ -204,10 +204,11 @@ def test_equilibria_that_bend_follow_from_constants_that_do_not(n_points, error)
     assert near <= min(error, far)
 
 
+@pytest.mark.parametrize("n_points", [3, 5])
 @pytest.mark.parametrize("level", [lambda flow: 30.0 / flow, np.log])
-def test_equilibria_are_followed_over_what_they_bend_less(level):
+def test_equilibria_are_followed_over_what_they_bend_less(level, n_points):
     """The temperature of what is heated while it flows by."""
-    flows = np.array([[0.5], [1.0], [1.5], [2.0], [3.0]])
+    flows = np.linspace(0.5, 3.0, n_points)[:, None]
 
     def exchanger(flow):
         return StateSpace(-1.0, 1.0, 1.0)
@@ -216,7 +217,8 @@ def test_equilibria_are_followed_over_what_they_bend_less(level):
     values = np.hstack([60.0 + 0.0 * flows, y, y])
     found = interpolated(lambda: SplineLPV("cubic"), flows, values, exchanger, ONE)
     between = np.array([[0.6], [0.75], [1.25], [2.5]])
-    assert_allclose(found.predict(between)[:, 1:2], 20.0 + level(between), atol=0.02)
+    # of levels from 10 to 60
+    assert_allclose(found.predict(between)[:, 1:2], 20.0 + level(between), atol=0.1)
 
 
 @pytest.mark.parametrize("n_points", [3, 4, 6])
