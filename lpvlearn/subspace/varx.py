@@ -436,7 +436,8 @@ def _chosen_past(
         left = scaled[acting, past * c :]
         spread = left @ left.T + _EXACT * np.eye(len(left))
         volume = np.linalg.slogdet(spread)[1]
-        volume -= np.linalg.slogdet(spread[:n_direct, :n_direct])[1]
+        with np.errstate(invalid="ignore"):  # inf - inf of inputs that are dependent
+            volume -= np.linalg.slogdet(spread[:n_direct, :n_direct])[1]
         n_regressors = n_direct + past * c
         n_parameters = ny * n_regressors + ny * (ny + 1) / 2
         penalty = 2.0 * n_parameters * n / max(n - n_regressors - ny - 1, 1)
