@@ -201,8 +201,10 @@ for delay in (0, "auto"):
 # does. ``offset="constant"`` estimates it together with :math:`\mathfrak{B},
 # \mathfrak{D}` and :math:`x_0`, in every step of the refinement too, and projects a row
 # of ones out of the subspace step. The default, ``"auto"``, does so where the constants
-# are significant, given the colour of the noise, and is the model without them
-# elsewhere. Two experiments with different offsets:
+# are significant, given the colour of the noise, and where signals stay three standard
+# deviations or more from zero unless that refutes them: the samples then hardly tell
+# whether rest at zero is rest, and predictions are to begin where the signals are. It
+# is the model without constants elsewhere. Two experiments with different offsets:
 
 two = X.iloc[:2000].copy()
 two["experiment"] = np.repeat(["morning", "evening"], 1000)
@@ -304,6 +306,8 @@ display = BodeDisplay.from_models(
 #   Standard deviations and ``predict_ahead`` are right under feedback, and the plant
 #   may be unstable: the model is then good for prediction, not for long simulations.
 #   Constants and drifts of the experiments (``offset``) are estimated there as well.
+#   A plant that grows by itself though its outputs have not is taken for one in a loop,
+#   be its noise too small to be known to the inputs.
 # * Say ``feedthrough=False`` unless the controller needs a sample to answer: a
 #   feedthrough and a controller that answers within the sample can be told apart where
 #   the reference moves by steps, as "auto" does, but not where signals are Gaussian.

@@ -45,7 +45,9 @@ found = pipeline.report_[["u0_voltage", "y0_angle"]]
 found.assign(holds=data.holding_voltages).round(3)
 
 # %%
-# Between the points they are interpolated by a cubic spline. ``lpv_`` has them at any
+# Between the points they are interpolated by a cubic spline: as they are, or what the
+# models tell of them, or over the logarithm or the inverse of the scheduling variable,
+# whichever foresees points that are left out clearly better. ``lpv_`` has them at any
 # angle:
 
 lpv = pipeline.lpv_
