@@ -124,7 +124,8 @@ def _may_drift_off(
     if not (may_have_drift(tested) or wanders(tested)):
         return False
     # Errors that are rounding go with the inputs, slowly.
-    if rounded_outputs(tested.model, tested.records).repeated.any():
+    rounded = rounded_outputs(tested.model, tested.records).repeated.any()
+    if rounded and not outlasts(fitted):
         return False
     least, order = criterion_in_units(tested), len(tested.model.A)
 

@@ -238,11 +238,14 @@ def _thermal(seed, slowest, drift, samples=600):
 
 @pytest.mark.parametrize("seed", [0, 2])
 @pytest.mark.parametrize("slowest", [120.0, 300.0])
-@pytest.mark.parametrize("drift", [0.3, 1.0])
-def test_no_slow_mode_stands_for_a_line_beside_slow_ones(slowest, drift, seed):
+@pytest.mark.parametrize(("drift", "part"), [(0.3, None), (1.0, None), (1.0, 0.05)])
+def test_no_slow_mode_stands_for_a_line_beside_slow_ones(slowest, drift, part, seed):
+    """Nor where outputs are rounded, to a part of their standard deviation."""
     plant, u, y = _thermal(seed, slowest, drift)
+    if part is not None:
+        y = part * y.std() * np.round(y / (part * y.std()))
     model = SubspaceLTI(sampling_time=1.0).fit(u, y)
     assert (model.order_, model.offset_) == (2, "linear")
     fresh = _thermal(seed + 50, slowest, 0.0)[1]
     truth = plant.simulate(fresh, sampling_time=1.0)
-    assert bft_score(truth, model.lti_.simulate(fresh)) > 98.0
+    assert bft_score(truth, model.lti_.simulate(fresh)) > (95.0 if part else 98.0)
