@@ -28,9 +28,9 @@ from .noise import Whitening
 from .offsets import (
     ALIKE,
     CERTAIN,
-    HARDLY_DECAYS,
     attributed,
     criterion_in_units,
+    lasting,
     motion_left,
     with_levels,
 )
@@ -66,8 +66,7 @@ def differences(pairs: Pairs) -> Pairs:
 def n_lasting(fitted: LocalFit) -> int:
     """Number of modes that do not decay over the longest experiment, or grow."""
     poles = np.linalg.eigvals(fitted.model.A)
-    slow = np.abs(1.0 - poles) * fitted.evidence.longest < HARDLY_DECAYS
-    return int((slow | (np.abs(poles) > 1.0)).sum())
+    return int(lasting(poles, fitted.evidence.longest).sum())
 
 
 def outlasts(fitted: LocalFit) -> bool:

@@ -38,6 +38,7 @@ from .identification import Centres, mode_rates, spectral_radius
 from .noise import autoregression, spectral_density
 from .signals import Record, signal_factor
 from .simulation_fit import (
+    Realization,
     in_sections,
     jacobian_regression,
     project_out,
@@ -257,8 +258,7 @@ def stands_by_chance(evidence: Evidence, times: float = _AT_REST) -> bool:
     model, poles = evidence.model, np.linalg.eigvals(evidence.model.A)
     if np.abs(1.0 - poles).min(initial=1.0) < _RCOND or evidence.free.n_trend:
         return False
-    eye = np.eye(len(model.A))
-    gain = model.C @ np.linalg.solve(eye - model.A, model.B) + model.D
+    gain = _static_gain(model)
     for record in evidence.records:
         n = standing(record.u.T)
         if not n:
@@ -273,6 +273,12 @@ def stands_by_chance(evidence: Evidence, times: float = _AT_REST) -> bool:
         if (off * moved > times * motion).any():
             return True
     return False
+
+
+def _static_gain(model: Realization) -> Array:
+    """Outputs at rest by inputs of one, of scaled records."""
+    x = np.linalg.solve(np.eye(len(model.A)) - model.A, model.B)
+    return np.asarray(model.C @ x + model.D)
 
 
 def without_slow_modes(evidence: Evidence) -> list[tuple[Array, Array]] | None:
@@ -402,10 +408,10 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     far = stays_far(without.records)
     few = len(other.model.A) <= min(len(without.model.A), _FEW_STATES)
     decays = spectral_radius(other.model.A) <= 1.0
-    if far and decays and better > -CERTAIN:
-        return True
-    if far and decays and few:
-        if motion_left(other) < _MOSTLY * motion_left(without):
+    if far and decays:
+        if better > -CERTAIN:
+            return True
+        if few and motion_left(other) < _MOSTLY * motion_left(without):
             return True
     replaced = _lasts(without) and not _lasts(other)
     if not better > -(0.0, CERTAIN, _BEYOND_DOUBT)[far + replaced]:
@@ -420,15 +426,19 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > CERTAIN))
 
 
+def lasting(poles: NDArray, longest: int) -> NDArray[np.bool_]:
+    """Which modes do not decay over the longest experiment, or grow."""
+    return (np.abs(1.0 - poles) * longest < HARDLY_DECAYS) | (np.abs(poles) > 1.0)
+
+
 def may_have_drift(evidence: Evidence) -> bool:
     """Whether a model without drifts should be tried with them.
 
     They show in its errors; or a mode grows, or does not decay, which stands for them,
     or for the offset of an input that is integrated.
     """
-    if spectral_radius(evidence.model.A) > 1.0:
-        return True
-    if (mode_rates(evidence.model.A) * evidence.longest < HARDLY_DECAYS).any():
+    poles = np.linalg.eigvals(evidence.model.A)
+    if lasting(poles, evidence.longest).any():
         return True
     return chance_of_trend(evidence, 2) < _SUSPICIOUS
 
@@ -456,8 +466,7 @@ def unmoved_errors(evidence: Evidence, *, beside_drifts: bool = False) -> float:
         records = [r._replace(trend=trend_signals(r.u.shape[1], 2)) for r in records]
     poles, V = np.linalg.eig(model.A)
     # By column of `V`.
-    slow = np.abs(1.0 - poles) * evidence.longest < HARDLY_DECAYS
-    slow |= np.abs(poles) > 1.0
+    slow = lasting(poles, evidence.longest)
     if not slow.any() or not free.initial_states:
         return np.inf
     try:
@@ -484,9 +493,8 @@ def _is_beyond(evidence: Evidence) -> bool:
         means = np.array([r.u.mean(axis=1) for r in records])
         motion = np.array([r.u.std(axis=1) for r in records])
         levels = np.where(np.abs(means) > _FAR * motion, means, 0.0)
-        x = np.linalg.solve(np.eye(len(model.A)) - model.A, model.B)
         constants = constants.copy()
-        constants[:, 0] += levels @ (model.C @ x + model.D).T
+        constants[:, 0] += levels @ _static_gain(model).T
     reached = np.max([np.abs(r.y).max(axis=1) for r in records], axis=0)
     return bool((np.abs(constants) > _BEYOND * reached).any())
 
