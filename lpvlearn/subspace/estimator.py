@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import replace
-from itertools import compress, starmap
 from numbers import Integral
 from typing import Any, Self, cast
 
@@ -36,7 +35,6 @@ from ..data.preparation import (
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL
 from ..exceptions import (
-    DivergenceError,
     VersionedPickle,
     all_or_nothing,
     collected,
@@ -44,23 +42,9 @@ from ..exceptions import (
 )
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
-from ..systems.beginnings import (
-    Beginning,
-    begin_held,
-    first_inputs,
-    held_state,
-    standing,
-    waiting,
-)
-from ..systems.simulation import (
-    estimate_initial_state,
-    free_responses,
-    spread_of,
-    trend_signals,
-    with_transit,
-)
 from ..systems.threads import one_blas_thread
 from ..validation import frequencies, input_delays, naming_argument, one_of
+from .completion import completed, completed_by
 from .cross_checks import tell_of_delay
 from .delay import Delay, find_delays, with_late_inputs
 from .fit import fit_pairs
@@ -76,18 +60,9 @@ from .integrating import (
 )
 from .local_fit import LocalFit
 from .missing_outputs import (
-    by_prediction,
-    by_simulation,
-    first_guess,
-    further,
-    is_sparse,
-    movement,
-    runs_to_complete,
-    warn_of_few,
     warn_of_many_pieces,
 )
-from .offsets import N_TRENDS, USELESS, level_matters, of_rates
-from .one_fit import TooFewSamples
+from .offsets import N_TRENDS, USELESS, of_rates
 from .options import Choices, check_options
 from .residuals import (
     Residuals,
@@ -96,7 +71,8 @@ from .residuals import (
     model_residuals,
     residual_tests,
 )
-from .selection import MAX_ORDER, cost_of_known, selection_text
+from .selection import selection_text
+from .simulator import Simulator
 from .stream import SampleStream, fit_as_stream
 from .telling import Telling
 
@@ -125,18 +101,6 @@ _TAKEN = (
     "offsets_differ_",
     "steady_start_",
 )
-
-
-# Missing outputs are estimated in so many rounds at most, until they move by less than
-# this many standard deviations of an innovation.
-_MOST_ROUNDS, _SETTLED = 20, 0.01
-_ASTRAY = 4  # rounds that move them more than one before, after which no more is done
-_FREE_ROUNDS = 3  # after so many no other order is looked for
-_BEYOND = 2  # orders tried beyond the best one, where few outputs are there
-
-_FAINT = 1e-3  # weight of an estimate beside an output that is known
-
-_AGAIN = 3  # rounds in which a model that is known estimates them
 
 
 class SubspaceLTI(
@@ -518,7 +482,9 @@ class SubspaceLTI(
                     f"that are not there are not known. Got {self.detrend!r}. Use "
                     f"offset={self.detrend!r}."
                 )
-            experiments, choices = self._completed(experiments, choices, telling)
+            experiments, choices = completed(
+                experiments, choices, telling, self._delay_of, self._learn
+            )
         elif self.missing == "split":
             warn_of_many_pieces(experiments)
         delay = self._delay_of(experiments, choices)
@@ -526,107 +492,17 @@ class SubspaceLTI(
         self._name(*_names_of(experiments, y))
         return self
 
-    def _completed(
-        self, experiments: list[Experiment], choices: Choices, telling: Telling
-    ) -> tuple[list[Experiment], Choices]:
-        """Experiments with missing outputs as the model of the completed ones expects.
-
-        Cut where inputs are missing, or time has a hole. And the choices that remain:
-        where little is there, the order is chosen by that, from below.
-        """
-        runs = runs_to_complete(experiments, at_rest=not choices.initial_states)
-        if not any(map(has_gaps, runs)):
-            return runs, choices
-        warn_of_few(runs, telling)
-        guess = first_guess(runs)
-        delay = self._delay_of(guess, choices)
-        sparse = is_sparse(runs)
-        if sparse and choices.method == "auto":
-            choices = choices._replace(method="po-moesp")
-        if not sparse or choices.order is not None:
-            return self._settled(runs, guess, choices, delay)[0], choices
-        best, least, beyond = (guess, choices), np.inf, 0
-        for order in choices.orders or range(1, MAX_ORDER + 1):
-            some = choices._replace(order=order, orders=())
-            try:
-                completed, fitted = self._settled(runs, guess, some, delay)
-            except TooFewSamples:
-                break
-            cost, beyond = cost_of_known(fitted.evidence), beyond + 1
-            if cost < least:
-                best, least, beyond = (completed, some), cost, 0
-            elif beyond == _BEYOND:
-                break
-        return best
-
-    def _settled(
+    def _learn(
         self,
-        runs: Sequence[Experiment],
-        completed: list[Experiment],
+        experiments: list[Experiment],
         choices: Choices,
         delay: Delay,
-    ) -> tuple[list[Experiment], LocalFit]:
-        """Experiments, `completed` in some way, as their own model expects them."""
-        chosen: tuple[int, str] | None = None
-        known: LocalFit | None = None
-        least, astray, last = np.inf, 0, [completed]
-        for k in range(_MOST_ROUNDS):
-            with collected():  # said of the completed samples
-                fitted = self._identify(completed, choices, delay, Telling(), known)
-            before, completed = completed, self._expected(runs, completed)
-            moved = movement(runs, before, completed, self.predictor_.covariance)
-            astray = 0 if known is None or moved < least else astray + 1
-            if not moved > _SETTLED or astray == _ASTRAY:
-                break
-            least = min(least, moved)
-            last = [*last, completed] if known is not None else [completed]
-            if len(last) == 3:
-                completed = further(runs, last)
-                last = [completed]
-            if chosen == (fitted.selection.order, fitted.method) or k >= _FREE_ROUNDS:
-                known = fitted
-            chosen = fitted.selection.order, fitted.method
-        return completed, fitted
-
-    def _expected(
-        self, runs: Sequence[Experiment], completed: Sequence[Experiment]
-    ) -> list[Experiment]:
-        """Runs of known inputs with the outputs that are expected of missing ones.
-
-        Their initial states, and trends, are those of runs that were `completed`
-        before: of the known outputs alone they might be anything.
-        """
-        predictor = self._evidence.predictor(self.lti_, None)
-        u0, y0 = self.resting_point()
-        rest = self.initial_state == "rest"
-        own = [
-            (self._beginning(e), y0)
-            if rest
-            else self._own_part(e, predictor, of_fit=True)
-            for e in completed
-        ]
-        found = list(zip(runs, own, strict=True))
-        try:
-            if predictor.gain is not None:
-                expected = [
-                    by_prediction(e, predictor, e.inputs - u0, x0, level)
-                    for e, (x0, level) in found
-                ]
-            else:
-                simulated = [
-                    level + self.lti_.simulate(e.inputs - u0, initial_state=x0)
-                    for e, (x0, level) in found
-                ]
-                expected = by_simulation(runs, simulated)
-            if all(np.isfinite(e.measured).all() for e in expected):
-                return expected
-        except DivergenceError:
-            pass
-        raise ValueError(
-            "missing='estimate' needs a model that can be simulated. That of order "
-            f"{self.order_} grows beyond numbers: use missing='split', another "
-            "`order`, or stability='enforce'."
-        )
+        known: LocalFit | None,
+    ) -> tuple[LocalFit, Simulator]:
+        """The model of samples some of which are estimates: nothing is told of it."""
+        with collected():
+            fitted = self._identify(experiments, choices, delay, Telling(), known)
+        return fitted, self._simulator()
 
     def fit_each(self, X: Any, y: Any) -> list[Self]:
         """Fit one model to every experiment, as the first one chooses.
@@ -734,7 +610,7 @@ class SubspaceLTI(
             )
         self._take(fitted, self._step_of(experiments), delay)
         asked = choices.initial_states or bool(fitted.offsets.inputs.any())
-        self.steady_start_ = asked and self._begin_held(experiments)
+        self.steady_start_ = asked and self._simulator().begin_held(experiments)
         warn_about(fitted, telling)
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
@@ -1160,7 +1036,7 @@ class SubspaceLTI(
                 "are known, predict_with_initial_state(X, y) and "
                 "initial_state='estimate' of scores estimate those of every experiment."
             )
-        return self._in_table(self._read(X, None), X, self._simulated)
+        return self._in_table(self._read(X, None), X, self._simulator().simulated)
 
     @one_blas_thread
     def predict_with_initial_state(self, X: Any, y: Any) -> Array:
@@ -1184,13 +1060,8 @@ class SubspaceLTI(
             simulation begins anew after that.
         """
         check_is_fitted(self, "lti_")
-
-        def simulated(e: Experiment) -> Array:
-            x0, level = self._own_part(e)
-            u0, _ = self.resting_point()
-            return level + self.lti_.simulate(e.inputs - u0, initial_state=x0)
-
-        return self._in_table(self._read(X, y, outputs=False), X, simulated)
+        experiments = self._read(X, y, outputs=False)
+        return self._in_table(experiments, X, self._simulator().fitted_to_own)
 
     def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
         """Coefficient of determination of the simulation from rest.
@@ -1241,14 +1112,15 @@ class SubspaceLTI(
         check_is_fitted(self, "lti_")
         one_of("initial_state", initial_state, ("estimate", "rest"))
         experiments, predictor = self._read(X, y, outputs=False), self.predictor_
+        model = self._simulator()
 
         def predicted(e: Experiment) -> Array:
-            u0, level = self.resting_point()
+            u0, level = model.resting_point()
             x0 = None
             if initial_state == "estimate":
-                x0, level = self._own_part(e, predictor)
+                x0, level = model.own_part(e, predictor)
             elif predictor.gain is None:
-                x0 = self._beginning(e)
+                x0 = model.beginning(e)
             u, y = e.inputs - u0, e.measured - level
             return level + predictor.predict(u, y, steps=steps, initial_state=x0)
 
@@ -1372,10 +1244,7 @@ class SubspaceLTI(
         n_missing = sum(part.sum(axis=0) for part in lost)
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
             at_rest = self.initial_state == "rest"
-            runs = runs_to_complete(experiments, at_rest=at_rest)
-            experiments = first_guess(runs)
-            for _ in range(_AGAIN):
-                experiments = self._expected(runs, experiments)
+            experiments = completed_by(self._simulator(), experiments, at_rest=at_rest)
         experiments = self._with_late_inputs(experiments, self.input_delay_, True)
         undelayed = self.lti_.with_input_delay(0)
         found = model_residuals(
@@ -1554,122 +1423,11 @@ class SubspaceLTI(
             **options,
         )
 
-    def _begin_held(self, experiments: Sequence[Experiment]) -> bool:
-        """Whether experiments begin where their first inputs hold the model.
-
-        And not at rest about zero, or, where there are levels, about their means.
-        """
-        lti = self.lti_
-        wait = [waiting(e.inputs) > 0 for e in experiments]
-        if not (lti.is_stable and any(wait)):
-            return False
-        gain = lti.dc_gain()
-        known = self.input_offset_, self.output_offset_, self._offsets.drifts
-        k = len(experiments)  # fewer than levels, where a record is cut at shifts
-        levels = (
-            np.broadcast_to(v if len(v) == k else v[:1], (k, v.shape[1])) for v in known
-        )
-
-        def beginning(e: Experiment, u0: Array, y0: Array, drift: Array) -> Beginning:
-            n = len(e.inputs)
-            y = e.measured - np.outer(np.arange(n) - (n - 1) / 2.0, drift)
-            return Beginning.of(
-                (e.inputs, y),
-                (u0, y0),
-                gain,
-                lti.simulate,
-                about_mean=self.offset_ is not None,
-            )
-
-        return begin_held(
-            starmap(beginning, compress(zip(experiments, *levels, strict=True), wait))
-        )
-
-    def _simulated(self, experiment: Experiment) -> Array:
-        """Outputs from the beginning that the experiments of `fit` let expect."""
-        return self._from(self._beginning(experiment), experiment)
-
-    def _beginning(self, experiment: Experiment) -> Array | None:
-        """State and inputs in transit where the first inputs hold it; None for rest."""
-        u, lti = experiment.inputs, self.lti_
-        if not (getattr(self, "steady_start_", False) and standing(u)):
-            return None
-        first = first_inputs(u) - self.resting_point()[0]
-        x0 = held_state(lti.A, lti.B, first, discrete=True)
-        return None if x0 is None else np.append(x0, np.repeat(first, lti.input_delay))
-
-    def _from(self, x0: Array | None, experiment: Experiment) -> Array:
-        """Outputs about the mean offsets from a state there; None is rest."""
-        u0, y0 = self.resting_point()
-        return y0 + self.lti_.simulate(experiment.inputs - u0, initial_state=x0)
-
-    def _own_part(
-        self,
-        experiment: Experiment,
-        predictor: InnovationModel | None = None,
-        *,
-        of_fit: bool = False,
-    ) -> tuple[Array, Array]:
-        """Initial state, inputs in transit; and the outputs their answers add to.
-
-        Behind the errors of simulation, or of a predictor that has a gain, for which
-        inputs in transit are those at rest: what they miss dies out. A level that did
-        not show in the samples `of_fit` may show in others.
-        """
-        (u0, y0), y = self.resting_point(), experiment.measured
-        n_trend, own = self._evidence.free.n_trend, None
-        if not n_trend and self.offset is not None and not of_fit:
-            n_trend, own = self._as_it_stands(experiment)
-        trend = trend_signals(len(y), n_trend)
-        if predictor is not None and predictor.gain is not None:
-            u = experiment.inputs - u0
-            own = predictor.estimate_initial_state(u, y - y0, trend)
-        elif own is None:
-            responses, error = self._unexplained(experiment, trend)
-            own = estimate_initial_state(responses, error, spread_of(y))
-        x0, trends = np.split(own, [len(own) - n_trend * len(y0)])
-        return x0, y0 + trend.T @ trends.reshape(n_trend, len(y0))
-
-    def _unexplained(self, experiment: Experiment, trend: Array) -> tuple[Array, Array]:
-        """Responses to own unknowns, and the errors of simulation they are to explain.
-
-        Shapes (n_samples, n_outputs, n_unknowns), those of trends last, and (n_samples,
-        n_outputs).
-        """
-        lti, y = self.lti_, experiment.measured
-        responses = free_responses(lti.A, lti.C, len(y), trend)
-        responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
-        error = y - self._from(None, experiment)
-        if experiment.estimated is not None:  # lest known ones leave states open
-            faint = np.where(experiment.estimated, _FAINT, 1.0)
-            responses, error = responses * faint[:, :, None], error * faint
-        return responses, error
-
-    def _as_it_stands(self, experiment: Experiment) -> tuple[int, Array | None]:
-        """1 where an experiment has a level that those of the fit did not have, or 0.
-
-        And its own unknowns, by simulation; None where that diverges.
-        """
-        y = experiment.measured
-        try:
-            with np.errstate(over="ignore", invalid="ignore"):
-                responses, error = self._unexplained(
-                    experiment, trend_signals(len(y), 1)
-                )
-        except DivergenceError:
-            return 0, None
-        unknown = np.isnan(y)
-        if experiment.estimated is not None:
-            unknown |= experiment.estimated
-        if not (np.isfinite(responses).all() and np.isfinite(error[~unknown]).all()):
-            return 0, None
-        size, found, left = spread_of(y), [], []
-        for free in (responses[:, :, : -len(size)], responses):
-            own = estimate_initial_state(free, error, size)
-            found.append(own)
-            left.append(np.where(unknown, np.nan, (error - free @ own) / size))
-        level = int(level_matters(left[0], left[1], len(found[1])))
-        return level, found[level]
+    def _simulator(self) -> Simulator:
+        """The model with what is known of its experiments."""
+        held = getattr(self, "steady_start_", False)
+        constants = self.offset is not None
+        return Simulator(self.lti_, self._evidence, self._offsets, constants, held)
 
     def _in_table(
         self,

@@ -503,7 +503,8 @@ def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
             "model, which stands in for it there, simulates larger, smaller or other "
             "motions worse. Use inputs that move less, about one operating point at a "
             "time (`split_levels` cuts a record by a signal's level), or give what "
-            "bends it as a scheduling variable.",
+            "bends it as a scheduling variable. Where inputs were measured with noise, "
+            "which looks the same, give what was commanded.",
         )
 
 

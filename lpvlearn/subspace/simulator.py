@@ -1,0 +1,188 @@
+"""A fitted model in the experiments that it meets: where they begin, and stand.
+
+What it answers to inputs about its resting point adds to a level, from a state that
+the experiment begins in. Both are those of the fit, or what the measured outputs of an
+experiment tell of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import compress, starmap
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..data.experiments import Experiment
+from ..exceptions import DivergenceError
+from ..models.innovation import InnovationModel
+from ..models.statespace import StateSpace
+from ..systems.beginnings import (
+    Beginning,
+    begin_held,
+    first_inputs,
+    held_state,
+    standing,
+    waiting,
+)
+from ..systems.simulation import (
+    estimate_initial_state,
+    free_responses,
+    spread_of,
+    trend_signals,
+    with_transit,
+)
+from .integrating import RateEvidence
+from .offsets import Offsets, level_matters
+from .statistics import Evidence
+
+Array = NDArray[np.float64]
+
+_FAINT = 1e-3  # weight of an estimate beside an output that is known
+
+
+class Simulator(NamedTuple):
+    """A model with the constants of its fit.
+
+    `offset` is whether experiments may have constants at all, `begins_held` whether
+    those begin where their inputs hold the model whose inputs stand still at first.
+    """
+
+    lti: StateSpace
+    evidence: Evidence | RateEvidence
+    offsets: Offsets
+    offset: bool
+    begins_held: bool = False
+
+    def resting_point(self) -> tuple[Array, Array]:
+        """Inputs and outputs at rest, the mean over all experiments of the fit."""
+        pooled = self.offsets.pooled()
+        return pooled.inputs[0], pooled.outputs[0]
+
+    def predictor(self) -> InnovationModel:
+        """The innovation model, with all states of the noise."""
+        return self.evidence.predictor(self.lti, None)
+
+    def begin_held(self, experiments: Sequence[Experiment]) -> bool:
+        """Whether experiments of the fit begin where their first inputs hold the model.
+
+        And not at rest about zero, or, where there are levels, about their means.
+        """
+        lti = self.lti
+        wait = [waiting(e.inputs) > 0 for e in experiments]
+        if not (lti.is_stable and any(wait)):
+            return False
+        gain = lti.dc_gain()
+        known = self.offsets.inputs, self.offsets.outputs, self.offsets.drifts
+        k = len(experiments)  # fewer than levels, where a record is cut at shifts
+        levels = (
+            np.broadcast_to(v if len(v) == k else v[:1], (k, v.shape[1])) for v in known
+        )
+
+        def beginning(e: Experiment, u0: Array, y0: Array, drift: Array) -> Beginning:
+            n = len(e.inputs)
+            y = e.measured - np.outer(np.arange(n) - (n - 1) / 2.0, drift)
+            return Beginning.of(
+                (e.inputs, y),
+                (u0, y0),
+                gain,
+                lti.simulate,
+                about_mean=self.evidence.free.n_trend > 0,
+            )
+
+        return begin_held(
+            starmap(beginning, compress(zip(experiments, *levels, strict=True), wait))
+        )
+
+    def simulated(self, experiment: Experiment) -> Array:
+        """Outputs from the beginning that the experiments of the fit let expect."""
+        return self._from(self.beginning(experiment), experiment)
+
+    def fitted_to_own(self, experiment: Experiment) -> Array:
+        """Outputs from the initial state, and about the level, of its measured ones."""
+        x0, level = self.own_part(experiment)
+        u0, _ = self.resting_point()
+        return level + self.lti.simulate(experiment.inputs - u0, initial_state=x0)
+
+    def beginning(self, experiment: Experiment) -> Array | None:
+        """State and inputs in transit where the first inputs hold it; None for rest."""
+        u, lti = experiment.inputs, self.lti
+        if not (self.begins_held and standing(u)):
+            return None
+        first = first_inputs(u) - self.resting_point()[0]
+        x0 = held_state(lti.A, lti.B, first, discrete=True)
+        return None if x0 is None else np.append(x0, np.repeat(first, lti.input_delay))
+
+    def own_part(
+        self,
+        experiment: Experiment,
+        predictor: InnovationModel | None = None,
+        *,
+        of_fit: bool = False,
+    ) -> tuple[Array, Array]:
+        """Initial state, inputs in transit; and the outputs their answers add to.
+
+        Behind the errors of simulation, or of a predictor that has a gain, for which
+        inputs in transit are those at rest: what they miss dies out. A level that did
+        not show in the samples `of_fit` may show in others.
+        """
+        (u0, y0), y = self.resting_point(), experiment.measured
+        n_trend, own = self.evidence.free.n_trend, None
+        if not n_trend and self.offset and not of_fit:
+            n_trend, own = self._as_it_stands(experiment)
+        trend = trend_signals(len(y), n_trend)
+        if predictor is not None and predictor.gain is not None:
+            u = experiment.inputs - u0
+            own = predictor.estimate_initial_state(u, y - y0, trend)
+        elif own is None:
+            responses, error = self._unexplained(experiment, trend)
+            own = estimate_initial_state(responses, error, spread_of(y))
+        x0, trends = np.split(own, [len(own) - n_trend * len(y0)])
+        return x0, y0 + trend.T @ trends.reshape(n_trend, len(y0))
+
+    def _from(self, x0: Array | None, experiment: Experiment) -> Array:
+        """Outputs about the mean offsets from a state there; None is rest."""
+        u0, y0 = self.resting_point()
+        return y0 + self.lti.simulate(experiment.inputs - u0, initial_state=x0)
+
+    def _unexplained(self, experiment: Experiment, trend: Array) -> tuple[Array, Array]:
+        """Responses to own unknowns, and the errors of simulation they are to explain.
+
+        Shapes (n_samples, n_outputs, n_unknowns), those of trends last, and (n_samples,
+        n_outputs).
+        """
+        lti, y = self.lti, experiment.measured
+        responses = free_responses(lti.A, lti.C, len(y), trend)
+        responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
+        error = y - self._from(None, experiment)
+        if experiment.estimated is not None:  # lest known ones leave states open
+            faint = np.where(experiment.estimated, _FAINT, 1.0)
+            responses, error = responses * faint[:, :, None], error * faint
+        return responses, error
+
+    def _as_it_stands(self, experiment: Experiment) -> tuple[int, Array | None]:
+        """1 where an experiment has a level that those of the fit did not have, or 0.
+
+        And its own unknowns, by simulation; None where that diverges.
+        """
+        y = experiment.measured
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                responses, error = self._unexplained(
+                    experiment, trend_signals(len(y), 1)
+                )
+        except DivergenceError:
+            return 0, None
+        unknown = np.isnan(y)
+        if experiment.estimated is not None:
+            unknown |= experiment.estimated
+        if not (np.isfinite(responses).all() and np.isfinite(error[~unknown]).all()):
+            return 0, None
+        size, found, left = spread_of(y), [], []
+        for free in (responses[:, :, : -len(size)], responses):
+            own = estimate_initial_state(free, error, size)
+            found.append(own)
+            left.append(np.where(unknown, np.nan, (error - free @ own) / size))
+        level = int(level_matters(left[0], left[1], len(found[1])))
+        return level, found[level]
