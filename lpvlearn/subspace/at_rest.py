@@ -7,17 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import Pairs
 from ..systems.beginnings import Stands, first_inputs, stands
 from .criterion import PRICE
 from .identification import spectral_radius
 from .local_fit import LocalFit
-from .offsets import ALIKE, CERTAIN, HARDLY_DECAYS, criterion_in_units, stands_by_chance
-from .one_fit import TooFewSamples, of_order
-from .options import Choices
+from .offsets import ALIKE, CERTAIN, HARDLY_DECAYS, stands_by_chance
+from .one_fit import Samples, TooFewSamples
 from .simulation_fit import simulation_errors
 from .statistics import Evidence
-from .telling import Telling
 from .trends import with_trends
 
 Array = NDArray[np.float64]
@@ -32,27 +29,21 @@ _MAY_BE = 2.0  # times that states must balance each other, of what may be by ch
 class AtRest(NamedTuple):
     """A model of experiments that begin at rest, and what it is one of."""
 
-    pairs: Pairs  # inputs less those that the experiments begin with
-    choices: Choices
+    samples: Samples  # inputs less those that the experiments begin with
     fitted: LocalFit
     first: Array  # (n_experiments, n_inputs): those inputs
 
 
-def from_rest(
-    pairs: Pairs,
-    choices: Choices,
-    telling: Telling,
-    free: LocalFit,
-    known: LocalFit | None,
-) -> AtRest | None:
+def from_rest(samples: Samples, free: LocalFit, like: LocalFit | None) -> AtRest | None:
     """The model of experiments that begin at a stand, if as likely as the `free` one.
 
     Or likelier than that of experiments which are said to begin at rest, at inputs of
-    zero. Else others that are `known` tell how these begin.
+    zero. Else others `like` them tell how these begin.
     """
+    pairs, choices, _ = samples
     asked, said = choices.offset in ("auto", "constant"), not choices.initial_states
-    if known is not None and not said:
-        asked = not known.evidence.free.initial_states
+    if like is not None and not said:
+        asked = not like.evidence.free.initial_states
     if not asked or free.method == "pbsid" or not len(free.model.A):
         return None
     stand, evidence = stands(pairs), free.evidence
@@ -61,23 +52,22 @@ def from_rest(
     if stand is None:
         return None
     first, seen = stand
-    at_rest = choices._replace(initial_states=False)
+    at_rest = samples.having(initial_states=False)
     if first.any():  # a level is that of the answer to these
         sure = said or choices.offset == "constant" or bool(evidence.free.n_trend)
         if not sure and not stands_by_chance(evidence.one_step, _MAY_BE):
             return None  # without a constant it is that to zero
         seen &= sure or stands_by_chance(evidence.one_step)
-        at_rest = at_rest._replace(offset="constant")
+        at_rest = at_rest.having(offset="constant")
     elif said:
         return None
     moved = [(u - level, y) for (u, y), level in zip(pairs, first, strict=True)]
-    fitted = _as_likely(moved, at_rest, telling, free, seen)
-    return None if fitted is None else AtRest(moved, at_rest, fitted, first)
+    at_rest = at_rest._replace(pairs=moved)
+    fitted = _as_likely(at_rest, free, seen)
+    return None if fitted is None else AtRest(at_rest, fitted, first)
 
 
-def _as_likely(
-    pairs: Pairs, choices: Choices, telling: Telling, free: LocalFit, seen: bool
-) -> LocalFit | None:
+def _as_likely(samples: Samples, free: LocalFit, seen: bool) -> LocalFit | None:
     """The model from rest, unless that is less likely than `free` initial states.
 
     These and a constant may balance each other for as long as inputs stand still, and
@@ -87,7 +77,7 @@ def _as_likely(
     so the errors themselves must hardly be larger.
     """
     try:
-        fitted = with_trends(pairs, choices, telling, free)
+        fitted = with_trends(samples, free)
     except TooFewSamples:
         return None
     own, other = fitted.evidence, free.evidence
@@ -98,7 +88,7 @@ def _as_likely(
     if len(own.model.A) in (0, order):
         return None
     # states may be missing, or follow a drift
-    as_many, _ = of_order(pairs, choices, telling, order, fitted, own.free.n_trend)
+    as_many, _ = samples.of_order(order, fitted, own.free.n_trend)
     return as_many if _is_as_likely(as_many.evidence, other, seen) else None
 
 
@@ -109,7 +99,7 @@ def _is_as_likely(own: Evidence, other: Evidence, seen: bool) -> bool:
     likelier beyond chance: it is they that take the gain. Rest elsewhere, at inputs of
     zero, has as many unknowns.
     """
-    worse = criterion_in_units(own.one_step) - criterion_in_units(other.one_step)
+    worse = own.one_step.criterion - other.one_step.criterion
     by_chance, drifts_off = stands_by_chance(other.one_step), other.free.n_trend > 1
     rate = 1.0 - spectral_radius(own.model.A)
     settles = rate * own.longest > (HARDLY_DECAYS if drifts_off else 1.0)

@@ -7,18 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import DETRENDS, Pairs, Rounded, far_out
+from ..data.preparation import DETRENDS, Rounded, far_out
 from ..exceptions import RankWarning
 from ..systems.simulation import delayed, lti_response
 from ..validation import listed
 from .delay import first_samples, longest_delays
 from .held_out import DOUBT, HeldOut
 from .local_fit import LocalFit
-from .offsets import CERTAIN, criterion_in_units
-from .one_fit import TooFewSamples, choose_and_identify, errors_held_out
-from .options import Choices
+from .offsets import CERTAIN
+from .one_fit import Samples, TooFewSamples
 from .simulation_fit import simulation_errors, with_initial_states
-from .telling import Telling, in_experiment
+from .telling import in_experiment
 from .trends import with_trends
 
 Array = NDArray[np.float64]
@@ -50,11 +49,11 @@ _RISEN, _WHOLE, _EARLY = 4, 20, 0.25
 _WILD, _LOOKED_AT, _PART = 10.0, np.geomspace(1e-2, 3.0, 8), 0.05
 
 
-def tell_of_contradiction(
-    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
-) -> None:
+def tell_of_contradiction(samples: Samples, whole: LocalFit) -> None:
     """Tell of experiments that one model cannot explain, and models of each do."""
-    free, same = whole.evidence.free, whole.chosen(choices)
+    pairs, choices, telling = samples
+    same = samples._replace(choices=whole.chosen(choices)).aside("collinear")
+    free = whole.evidence.free
     records, model = whole.scaled.records, whole.evidence.model
     if len(pairs) < 2 or not whole.residual > _ROUGH or "contradiction" in telling:
         return
@@ -69,15 +68,12 @@ def tell_of_contradiction(
         if lengths[k] >= least and np.ptp(pairs[k][0], axis=0).all()  # inputs move
     ]
     found = simulation_errors(with_initial_states(model, records, free), records)
-    if _tell_of_foreign(pairs, choices, telling, whole, found):
+    if _tell_of_foreign(samples, same, whole, found):
         return
     energies = []
     for k in some:
-        try:
-            other = choose_and_identify(
-                [pairs[k]], same, telling.aside("collinear"), free.n_trend, whole
-            )
-        except TooFewSamples:
+        other = same._replace(pairs=[pairs[k]]).tried(free.n_trend, whole)
+        if other is None:
             continue
         size = np.sum(records[k].y ** 2)
         energies.append([np.sum(found[k] ** 2), _left_by(other, whole), size])
@@ -97,13 +93,12 @@ def tell_of_contradiction(
 
 
 def _tell_of_foreign(
-    pairs: Pairs,
-    choices: Choices,
-    telling: Telling,
-    whole: LocalFit,
-    found: Sequence[Array],
+    samples: Samples, same: Samples, whole: LocalFit, found: Sequence[Array]
 ) -> bool:
-    """Tell of experiments without which a model of the others explains these."""
+    """Tell of experiments without which a model of the others explains these.
+
+    The `same` samples, by the choices of the whole; `found` are the errors of that.
+    """
     records = whole.scaled.records
     left = np.array([np.sum(e**2) for e in found])
     size = np.array([np.sum(record.y**2) for record in records])
@@ -114,19 +109,16 @@ def _tell_of_foreign(
     rest = np.flatnonzero(~foreign)
     if not (foreign.any() and len(rest)):
         return False
-    same, n_trend = whole.chosen(choices), whole.evidence.free.n_trend
-    try:
-        other = choose_and_identify(
-            [pairs[k] for k in rest], same, telling.aside("collinear"), n_trend
-        )
-    except TooFewSamples:
+    others = same._replace(pairs=[samples.pairs[k] for k in rest])
+    other = others.tried(whole.evidence.free.n_trend)
+    if other is None:
         return False
     alone = _left_by(other, whole)
     if not alone < _CONTRADICTED * left[rest].sum():
         return False
     names = [str(k) for k in np.flatnonzero(foreign)]
     shares = 100.0 * np.sqrt([alone, left[rest].sum()] / size[rest].sum())
-    telling.once(
+    samples.telling.once(
         "contradiction",
         f"Experiment(s) {listed(names, _NAMED)}, counted "
         "from 0, do not belong to the others: of the outputs of these a model leaves "
@@ -144,10 +136,9 @@ def _left_by(other: LocalFit, whole: LocalFit) -> float:
     return float(sum(np.sum((e * scale) ** 2) for e in errors))
 
 
-def tell_of_input_spikes(
-    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
-) -> None:
+def tell_of_input_spikes(samples: Samples, whole: LocalFit) -> None:
     """Tell of single samples of an input that the outputs do not answer."""
+    pairs, choices, telling = samples
     if not whole.residual > _ROUGH or "input spikes" in telling:
         return
     without, found = [], []
@@ -160,14 +151,9 @@ def tell_of_input_spikes(
         without.append((u, y))
     if not found:
         return
-    n_trend = whole.evidence.free.n_trend
-    try:
-        other = choose_and_identify(
-            without, whole.chosen(choices), telling.aside(), n_trend
-        )
-    except TooFewSamples:
-        return
-    if other.residual < _ANSWERED * whole.residual:
+    same = Samples(without, whole.chosen(choices), telling.aside())
+    other = same.tried(whole.evidence.free.n_trend)
+    if other is not None and other.residual < _ANSWERED * whole.residual:
         j, k, i = found[0]
         where = f"sample {in_experiment(i, k, len(pairs))}"
         telling.once(
@@ -181,15 +167,14 @@ def tell_of_input_spikes(
         )
 
 
-def tell_of_delay(
-    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
-) -> None:
+def tell_of_delay(samples: Samples, whole: LocalFit) -> None:
     """Tell of inputs that arrive late, where no delay was asked for.
 
     Each sample of a delay takes a state, or blurs the response. The first answer that
     is certain may come later than the input arrives: with that much delay a model must
     simulate parts held out clearly better, or no worse with fewer states.
     """
+    pairs, choices, telling = samples
     if whole.method == "pbsid" or choices.estimated or "delay" in telling:
         return
     pairs = first_samples(pairs)
@@ -201,29 +186,29 @@ def tell_of_delay(
     if cut < _LATE or not ("lack" in telling or _answers_late(whole, cut)):
         return
     n_trend = whole.evidence.free.n_trend
-    given = choices._replace(method=whole.method, offset=DETRENDS[n_trend])
+    aside = samples.aside()
+    given = aside.having(method=whole.method, offset=DETRENDS[n_trend])
     known = slice(cut if choices.initial_states else 0, None)  # from rest, all are
     pairs = [(u, y) for u, y in pairs if len(u) > cut + 1]
     late = [(delayed(u, delay)[known], y[known]) for u, y in pairs]
     early = [(u[known], y[known]) for u, y in pairs]
-    same, order = whole.chosen(choices), whole.selection.order
+    same = aside._replace(choices=whole.chosen(choices))
+    order = whole.selection.order
 
-    def with_errors(
-        pairs: Pairs, choices: Choices, known: LocalFit | None = None
-    ) -> tuple[int, HeldOut]:
+    def with_errors(some: Samples, like: LocalFit | None = None) -> tuple[int, HeldOut]:
         """Order, and errors on parts held out."""
-        aside = telling.aside()
-        other = choose_and_identify(pairs, choices, aside, n_trend, known)
-        return other.selection.order, errors_held_out(other, given)
+        other = some.fit(n_trend, like)
+        return other.selection.order, given.errors_held_out(other)
 
     try:
-        own = with_errors(early, same, whole)
+        own = with_errors(same._replace(pairs=early), whole)
         # a choice among all orders takes many times as long as one of these
         fewer = order - _FEWER if choices.order is None else 0
-        some = (same._replace(order=n) for n in (order, fewer) if n > 0)
-        if not any(_gain(own, with_errors(late, one)) for one in some):
+        same = same._replace(pairs=late)
+        some = (same.having(order=n) for n in (order, fewer) if n > 0)
+        if not any(_gain(own, with_errors(one)) for one in some):
             return
-        other = with_errors(late, given)
+        other = with_errors(given._replace(pairs=late))
     except TooFewSamples:
         return
     gained, fits = _gain(own, other), (other[1].bft, own[1].bft)
@@ -280,25 +265,20 @@ def _answers_late(fitted: LocalFit, delay: int) -> bool:
 
 
 def without_rounding(
-    pairs: Pairs,
-    choices: Choices,
-    telling: Telling,
-    whole: LocalFit,
-    known: LocalFit | None,
-) -> tuple[Pairs, LocalFit]:
+    samples: Samples, whole: LocalFit, like: LocalFit | None
+) -> tuple[Samples, LocalFit]:
     """Take out a ripple of inputs that only the rounding of their numbers makes.
 
     A model makes of it what it likes, unless the ripple is what drives outputs.
     """
+    pairs, telling = samples.pairs, samples.telling
     rounded = Rounded.of([u for u, _ in pairs])
     if rounded is None or not _is_wild(whole, rounded):
-        return pairs, whole
+        return samples, whole
     exact = list(zip(rounded.exact, (y for _, y in pairs), strict=True))
-    fitted = with_trends(exact, choices, telling.aside("collinear"), known)
-    worse = criterion_in_units(fitted.evidence.one_step)
-    worse -= criterion_in_units(whole.evidence.one_step)
-    if not worse < CERTAIN:
-        return pairs, whole
+    fitted = with_trends(samples._replace(pairs=exact).aside("collinear"), like)
+    if not fitted.worse_than(whole) < CERTAIN:
+        return samples, whole
     ripple = np.abs(np.vstack([u for u, _ in pairs]) - np.vstack(rounded.exact)).max(
         axis=0
     )
@@ -311,7 +291,7 @@ def without_rounding(
         "solution was taken. Excite them independently, or leave one out.",
         RankWarning,
     )
-    return exact, fitted
+    return samples._replace(pairs=exact), fitted
 
 
 def _is_wild(fitted: LocalFit, rounded: Rounded) -> bool:

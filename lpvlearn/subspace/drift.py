@@ -29,18 +29,15 @@ from .offsets import (
     ALIKE,
     CERTAIN,
     attributed,
-    criterion_in_units,
     lasting,
     motion_left,
     with_levels,
 )
-from .one_fit import TooFewSamples, choose_and_identify, is_worth_a_choice, of_order
-from .options import Choices
+from .one_fit import Samples
 from .residuals import lacks
 from .signals import output_energy, shorten
 from .simulation_fit import with_initial_states
 from .statistics import Evidence
-from .telling import Telling
 from .varx import find_feedback
 
 Array = NDArray[np.float64]
@@ -140,8 +137,7 @@ def drifts(whole: LocalFit, other: LocalFit, doubt: float = 0.0) -> bool:
     is taken which does not say that it knows where the outputs stand. Else it must be
     better beyond chance.
     """
-    better = doubt + criterion_in_units(whole.evidence)
-    better -= criterion_in_units(other.evidence)
+    better = doubt + whole.evidence.criterion - other.evidence.criterion
     if not wanders(other.evidence):
         return better > CERTAIN
     n_samples = whole.evidence.longest
@@ -152,14 +148,13 @@ def drifts(whole: LocalFit, other: LocalFit, doubt: float = 0.0) -> bool:
     return better > -PRICE - CERTAIN * n_followed
 
 
-def of_drifting_noise(
-    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
-) -> LocalFit | None:
+def of_drifting_noise(samples: Samples, whole: LocalFit) -> LocalFit | None:
     """The model by differences of all samples; None where their noise does not drift.
 
     Or that of samples with as many states, where its noise does not. Where a
     controller answers the outputs, its inputs follow the drift as well.
     """
+    choices = samples.choices
     weighed = choices.refine in ("auto", "prediction") and not choices.estimated
     if whole.method == "pbsid" or not weighed or not choices.initial_states:
         return None
@@ -168,27 +163,25 @@ def of_drifting_noise(
     if not may_drift(whole):
         return None
     innovations = whole.feedback.innovations
-    same = choices._replace(method=whole.method, differences=True)
     n_trend = whole.evidence.free.n_trend
-    moved, n_left = differences(pairs), max(n_trend - 1, 0)
+    n_left = max(n_trend - 1, 0)
+    moved = samples.having(method=whole.method, differences=True)
+    moved = moved._replace(pairs=differences(samples.pairs))
     if choices.offset == "auto":  # where drift begins is anywhere
         n_trend = max(n_trend, 1)
 
     def may_be_better_so(near: LocalFit) -> bool:
-        return drifts(whole, _of_samples(pairs, choices, near, n_trend), CERTAIN)
+        return drifts(whole, _of_samples(samples, near, n_trend), CERTAIN)
 
     # From a model whose noise is slow, steps on differences may lead astray.
-    if not wanders(whole.evidence) and not is_worth_a_choice(
-        may_be_better_so, moved, same, telling, whole, n_left
+    if not wanders(whole.evidence) and not moved.is_worth_a_choice(
+        may_be_better_so, whole, n_left
     ):
         return None
-    try:
-        found = choose_and_identify(moved, same, telling.aside(), n_left)
-    except TooFewSamples:
+    found = moved.aside().tried(n_left)
+    if found is None or found.stability_loss:
         return None
-    if found.stability_loss:
-        return None
-    other = _of_samples(pairs, choices, found, n_trend)
+    other = _of_samples(samples, found, n_trend)
     feedback = find_feedback(other.scaled.records)
     if feedback is None or feedback.found:
         return None
@@ -200,7 +193,7 @@ def of_drifting_noise(
     ):
         return None  # errors that inputs explain are no drift
     order = len(other.model.A)
-    level, worse = of_order(pairs, choices, telling, order, other, n_trend)
+    level, worse = samples.of_order(order, other, n_trend)
     if worse < ALIKE and settles(level, other):
         return level
     held_out = found.selection.held_out
@@ -212,11 +205,10 @@ def of_drifting_noise(
     return other
 
 
-def _of_samples(
-    pairs: Pairs, choices: Choices, found: LocalFit, n_trend: int
-) -> LocalFit:
+def _of_samples(samples: Samples, found: LocalFit, n_trend: int) -> LocalFit:
     """The model that was `found` of the differences of samples as one of these."""
-    moved, centres = centred(pairs, n_trend, choices.initial_states)
+    pairs = samples.pairs
+    moved, centres = centred(pairs, n_trend, samples.choices.initial_states)
     moved = [(u @ found.evidence.basis, y) for u, y in moved]
     scaled = scale_records(moved, n_trend)
     evidence = of_levels(found.evidence, scaled, n_trend)
@@ -227,6 +219,5 @@ def _of_samples(
         residual=float(np.sqrt(evidence.model.loss / energy)),
         evidence=evidence,
         offsets=offsets,
-        first_model=evidence.model,
         scaled=scaled,
     )

@@ -47,7 +47,7 @@ from ..validation import frequencies, input_delays, naming_argument, one_of
 from .completion import completed, completed_by
 from .cross_checks import tell_of_delay
 from .delay import Delay, find_delays, with_late_inputs
-from .fit import fit_pairs
+from .fit import fit_samples
 from .fit_warnings import TESTS, warn_about, warn_about_horizon
 from .integrating import (
     RateEvidence,
@@ -63,6 +63,7 @@ from .missing_outputs import (
     warn_of_many_pieces,
 )
 from .offsets import N_TRENDS, USELESS, of_rates
+from .one_fit import Samples
 from .options import Choices, check_options
 from .residuals import (
     Residuals,
@@ -599,15 +600,10 @@ class SubspaceLTI(
         gaps |= bool(delay.any()) and choices.initial_states
         if known is not None:
             choices = known.chosen(choices)
-        fitted = fit_as_stream(pairs, choices, telling, detrend=self.detrend, gaps=gaps)
+        samples = Samples(pairs, choices, telling)
+        fitted = fit_as_stream(samples, detrend=self.detrend, gaps=gaps)
         if fitted is None:
-            fitted = fit_pairs(
-                pairs,
-                choices,
-                telling,
-                detrend=self.detrend,
-                known=known,
-            )
+            fitted = fit_samples(samples, detrend=self.detrend, like=known)
         self._take(fitted, self._step_of(experiments), delay)
         asked = choices.initial_states or bool(fitted.offsets.inputs.any())
         self.steady_start_ = asked and self._simulator().begin_held(experiments)
@@ -615,9 +611,8 @@ class SubspaceLTI(
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
         if known is None and not isinstance(self.input_delay, str) and not delay.any():
-            tell_of_delay(
-                remove_trends(pairs, self.detrend)[0], choices, telling, fitted
-            )
+            pairs = remove_trends(pairs, self.detrend)[0]
+            tell_of_delay(samples._replace(pairs=pairs), fitted)
         return fitted
 
     def _fit_rates(self, X: Any, y: Any) -> Self:

@@ -1,7 +1,7 @@
 """From experiments to everything that `SubspaceLTI` keeps of a fit.
 
 The records are made regular, order and horizon chosen, the model identified
-(`fit_pairs`), with what the samples turn out to need: constants of the experiments,
+(`fit_samples`), with what the samples turn out to need: constants of the experiments,
 drifts, shifts, rest at their beginning, a model of the closed loop.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..data.preparation import Pairs, check_excitation, remove_trends
+from ..data.preparation import check_excitation, remove_trends
 from .at_rest import from_rest, moved_back
 from .cross_checks import tell_of_contradiction, tell_of_input_spikes, without_rounding
 from .drift import of_drifting_noise
@@ -22,8 +22,7 @@ from .fit_warnings import (
     tell_of_still_outputs,
 )
 from .local_fit import LocalFit
-from .one_fit import TooFewSamples
-from .options import Choices
+from .one_fit import Samples, TooFewSamples
 from .rivals import (
     believable,
     held_by_a_loop,
@@ -33,23 +32,18 @@ from .rivals import (
     with_shared_noise,
 )
 from .shifts import without_shifts
-from .telling import Telling
 from .trends import with_trends
 
 
-def fit_pairs(
-    pairs: Pairs,
-    choices: Choices,
-    telling: Telling,
-    *,
-    detrend: str | None = None,
-    known: LocalFit | None = None,
+def fit_samples(
+    samples: Samples, *, detrend: str | None = None, like: LocalFit | None = None
 ) -> LocalFit:
     """Check, detrend, choose and identify.
 
-    Of samples like those of a `known` fit feedback is not looked for again.
+    Of samples `like` those of another fit feedback is not looked for again.
     `TooFewSamples` where an input is constant or the samples are too few.
     """
+    pairs, choices, telling = samples
     # By channel in memory, as tables are read: sums take a tenth of the time.
     pairs = [(np.asfortranarray(u), np.asfortranarray(y)) for u, y in pairs]
     try:
@@ -60,38 +54,40 @@ def fit_pairs(
     tell_of_still_outputs(outputs, telling)
     tell_of_dropouts(pairs, telling)
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
-    fitted = with_trends(pairs, choices, telling, known)
-    pairs, fitted = without_rounding(pairs, choices, telling, fitted, known)
-    fitted = of_drifting_noise(pairs, choices, telling, fitted) or fitted
+    samples = samples._replace(pairs=pairs)
+    fitted = with_trends(samples, like)
+    samples, fitted = without_rounding(samples, fitted, like)
+    fitted = of_drifting_noise(samples, fitted) or fitted
     if fitted.selection.order:
         tell_of_held_outputs(outputs, telling)
         tell_of_limits(outputs, fitted, telling)
-    tell_of_contradiction(pairs, choices, telling, fitted)
-    tell_of_input_spikes(pairs, choices, telling, fitted)
-    whole, rest, differ = pairs, None, fitted.offsets.differ
-    pairs, fitted = without_shifts(pairs, choices, telling, fitted)
-    if pairs is whole:
-        rest = from_rest(pairs, choices, telling, fitted, known)
+    tell_of_contradiction(samples, fitted)
+    tell_of_input_spikes(samples, fitted)
+    whole, rest, differ = samples, None, fitted.offsets.differ
+    samples, fitted = without_shifts(samples, fitted)
+    if samples is whole:
+        rest = from_rest(samples, fitted, like)
     if rest is not None:
-        pairs, choices, fitted, first = rest
+        samples, fitted, first = rest
+        choices = samples.choices
     doubt = None
     foreseen = fitted.feedback is not None and fitted.feedback.foreseen
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
         # Of inputs without anything new a rival makes of many states what it likes.
         if not foreseen:
-            fitted, doubt = believable(pairs, choices, telling, fitted)
+            fitted, doubt = believable(samples, fitted)
     elif may_be_held(fitted, choices):
-        fitted = held_by_a_loop(pairs, choices, telling, fitted)
+        fitted = held_by_a_loop(samples, fitted)
     elif may_share_noise(fitted, choices):
-        fitted = with_shared_noise(pairs, choices, telling, fitted)
+        fitted = with_shared_noise(samples, fitted)
     feedback = fitted.feedback
     if feedback is not None and feedback.found and "feedback" not in telling:
         if feedback.shown or not fitted.model.D.any():
             tell_of_feedback(feedback, fitted, choices, doubt, telling)
         else:
             tell_of_answers(feedback, telling)
-        if known is None and not foreseen:
-            tell_of_lead(pairs, choices, telling, fitted)
+        if like is None and not foreseen:
+            tell_of_lead(samples, fitted)
     if rest is not None:
         fitted = moved_back(fitted, first, differ)
     if detrend is None:

@@ -23,7 +23,6 @@ from ..data.preparation import (
 from ..exceptions import RankWarning, warn
 from .constancy import change_over
 from .held_out import HeldOut
-from .identification import Settings
 from .linearity import bent_outputs
 from .local_fit import LocalFit
 from .offsets import (
@@ -270,18 +269,12 @@ def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
     """Tell the user when another horizon fits clearly better than the one given."""
     if fitted.method == "pbsid":
         return
-    settings = Settings(
-        fitted.evidence.free,
-        fitted.method,
-        choices.refine is not False,
-        choices.enforce_stability,
-    )
     better = better_horizon(
-        fitted.first_model,
+        fitted.evidence.model,
         fitted.residual,
         fitted.scaled.records,
         fitted.selection.horizon,
-        settings,
+        fitted.settings(choices),
     )
     if better is not None:
         warn(

@@ -32,9 +32,22 @@ class LocalFit(NamedTuple):
     method: str  # that made the model
     feedback: Feedback | None  # None where the samples are too few for its test
     offsets: Offsets  # of the experiments, what `detrend` subtracted among them
-    first_model: Realization  # of `scaled`, the samples that were fitted as one table:
-    scaled: ScaledRecords  # all of them, or the first ones of a long table or a stream
+    scaled: ScaledRecords  # what was fitted as one table; none of a summary
     signals: SharedSignals  # of this model and samples like these
+
+    def settings(self, choices: Choices) -> Settings:
+        """How models like it are made."""
+        return Settings(
+            self.evidence.free,
+            self.method,
+            choices.refine is not False,
+            choices.enforce_stability,
+            choices.n_noise_states,
+        )
+
+    def worse_than(self, other: LocalFit) -> float:
+        """By how much its criterion is above that of another's, one step ahead."""
+        return self.evidence.one_step.criterion - other.evidence.one_step.criterion
 
     def chosen(self, choices: Choices) -> Choices:
         """What was chosen among these for samples that tell the same."""

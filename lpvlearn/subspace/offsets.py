@@ -33,7 +33,6 @@ from ..exceptions import DivergenceError
 from ..systems.beginnings import moves_of, standing
 from ..systems.least_squares import column_scale
 from ..systems.simulation import free_responses, lti_response, trend_signals
-from .criterion import criterion_of
 from .identification import Centres, mode_rates, spectral_radius
 from .noise import autoregression, spectral_density
 from .signals import Record, signal_factor
@@ -302,7 +301,7 @@ def may_be_better(without: Evidence, other: Evidence) -> bool:
     Of as many states the chance of the constants tells; of fewer ones the criterion,
     which other states with these may make better yet.
     """
-    better = criterion_in_units(without) - criterion_in_units(other)
+    better = without.criterion - other.criterion
     if len(other.model.A) < len(without.model.A):
         return better > -CERTAIN
     return better > 0.0 or chance_of_trend(other) < _SUSPICIOUS
@@ -398,7 +397,7 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
         moved = unmoved_errors(other, beside_drifts=True)
         if not HARDLY_MOVED < moved < np.inf:
             return False
-    better = criterion_in_units(without) - criterion_in_units(other)
+    better = without.criterion - other.criterion
     if better > 0.0 and len(other.model.A) < len(without.model.A):
         return True
     if leaves_rounding(without):
@@ -506,7 +505,7 @@ def shifts_matter(whole: Evidence, parts: Evidence) -> bool:
     glitches with them, which are no shifts.
     """
     n, kept = (sum(r.u.shape[1] for r in e.records) for e in (whole, parts))
-    if not criterion_in_units(whole) - n / kept * criterion_in_units(parts) > CERTAIN:
+    if not whole.criterion - n / kept * parts.criterion > CERTAIN:
         return False
     return chance_of_trend(parts, equal=True) < _SIGNIFICANT
 
@@ -531,16 +530,6 @@ def level_matters(without: Array, other: Array, n_unknowns: int) -> bool:
     after = max(after, np.finfo(float).tiny)
     ratio = (before - after) / ny / (after / n_error)
     return bool(special.fdtrc(ny, n_error, ratio) < _SIGNIFICANT)
-
-
-def criterion_in_units(evidence: Evidence) -> float:
-    """That of the orders, of outputs in their units; minus infinity where one is 0."""
-    records = evidence.records
-    if not np.logical_or.reduce([record.y.any(axis=1) for record in records]).all():
-        return -np.inf  # nothing is left of it, and its scale tells nothing
-    n_samples = sum(record.u.shape[1] for record in records)
-    units = 2.0 * n_samples * float(np.log(evidence.output_scale).sum())
-    return units + criterion_of(evidence.model, records, evidence.free)
 
 
 def _has_slow_mode(evidence: Evidence) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from .identification import (
     validate,
 )
 from .local_fit import LocalFit
-from .offsets import attributed, criterion_in_units, with_levels, without_slow_modes
+from .offsets import attributed, with_levels, without_slow_modes
 from .options import Choices
 from .selection import PlantFit, Row, Selection, select
 from .signals import Record, SharedSignals, share_known, shorten
@@ -46,157 +47,157 @@ class TooFewSamples(ValueError):
     """The samples do not tell enough for a model; more of them may."""
 
 
-def choose_and_identify(
-    pairs: Pairs,
-    choices: Choices,
-    telling: Telling,
-    n_trend: int,
-    known: LocalFit | None = None,
-) -> LocalFit:
-    """Choose and identify, with `n_trend` trends of every output and experiment.
+class Samples(NamedTuple):
+    """Samples, how models of them are to be chosen, and what is told meanwhile."""
 
-    What is `known` of the same samples with other trends, or of others like them, is
-    the feedback, whose test gives every experiment a constant.
-    """
-    n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
-    order, horizon = choices.order, choices.horizon
-    whole, (pairs, centres) = pairs, centred(pairs, n_trend, choices.initial_states)
-    try:
-        pairs, basis = _with_independent_inputs(pairs, telling)
-        settings = choices.settings(n_outputs, n_inputs, basis, n_trend)
-        if settings.method != "pbsid":
-            settings.check_size([len(u) for u, _ in pairs], order, horizon)
-    except ValueError as error:
-        raise TooFewSamples(str(error)) from None
-    scaled = scale_records(pairs, n_trend, choices.estimated)
-    feedback = find_feedback(scaled.records) if known is None else known.feedback
-    settings = _heed(feedback, settings, choices.feedthrough is True)
-    if settings.method == "pbsid":
+    pairs: Pairs
+    choices: Choices
+    telling: Telling
+
+    def having(self, **chosen: Any) -> Samples:
+        """The same with other choices."""
+        return self._replace(choices=self.choices._replace(**chosen))
+
+    def aside(self, *kinds: str) -> Samples:
+        """The same of which nothing is told, or nothing but of other kinds."""
+        return self._replace(telling=self.telling.aside(*kinds))
+
+    def fit(self, n_trend: int, like: LocalFit | None = None) -> LocalFit:
+        """Choose and identify, with `n_trend` trends of every output and experiment.
+
+        What is known of a model of the same samples with other trends, or of others
+        `like` them, is the feedback, whose test gives every experiment a constant.
+        `TooFewSamples` where they do not tell enough.
+        """
+        choices, order, horizon = self.choices, self.choices.order, self.choices.horizon
+        pairs, centres = centred(self.pairs, n_trend, choices.initial_states)
+        n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
         try:
-            plant = identify_closed_loop(scaled, basis, order, horizon, settings)
-            found = plant.selection.order
-            if order is None and found not in (settings.orders or [found]):
-                # a state too few spoils the plant, one too many costs little
-                enough = (n for n in settings.orders if n > found)
-                order = min(enough, default=settings.orders[-1])
-                plant = identify_closed_loop(scaled, basis, order, horizon, settings)
+            pairs, basis = _with_independent_inputs(pairs, self.telling)
+            settings = choices.settings(n_outputs, n_inputs, basis, n_trend)
+            if settings.method != "pbsid":
+                settings.check_size([len(u) for u, _ in pairs], order, horizon)
         except ValueError as error:
             raise TooFewSamples(str(error)) from None
-    else:
-        plant = _identify_open_loop(scaled, basis, order, horizon, settings, known)
-    offsets = attributed(plant.evidence, centres, whole)
-    evidence, offsets = with_levels(plant.evidence, offsets)
-    residual = plant.residual
-    if choices.estimated:
-        residual = _residual_of_known(evidence, settings.method, residual)
-    return LocalFit(
-        evidence.model,
-        plant.singular_values,
-        residual,
-        plant.stability_loss,
-        plant.selection,
-        evidence,
-        settings.method,
-        feedback,
-        offsets,
-        evidence.model,
-        scaled,
-        SharedSignals(),
-    )
-
-
-def of_order(
-    pairs: Pairs,
-    choices: Choices,
-    telling: Telling,
-    order: int,
-    other: LocalFit,
-    n_trend: int,
-) -> tuple[LocalFit, float]:
-    """The model of the samples of that order, with these trends.
-
-    And by how much its criterion is worse than that of the `other`, whose choice of the
-    order it keeps.
-    """
-    found = choose_and_identify(pairs, choices._replace(order=order), telling, n_trend)
-    worse = criterion_in_units(found.evidence.one_step)
-    worse -= criterion_in_units(other.evidence.one_step)
-    return found._replace(selection=found.selection.among(other.selection)), worse
-
-
-def is_worth_a_choice(
-    promising: Callable[[LocalFit], bool],
-    pairs: Pairs,
-    choices: Choices,
-    telling: Telling,
-    fitted: LocalFit,
-    n_trend: int,
-) -> bool:
-    """Whether to choose among all orders again, with other trends or of differences.
-
-    That takes as long as the first choice. Few steps lead from the model found to one
-    of its order, and to those without each one of the modes that may be constants:
-    unless these tell nothing of other orders, one of them must be promising.
-    """
-    evidence, horizon = fitted.evidence, fitted.selection.horizon
-    others = without_slow_modes(evidence)
-    if others is None or not evidence.refined:
-        return True
-    free = evidence.free._replace(n_trend=n_trend)
-    telling = telling.aside("collinear")
-
-    def near(A: Array, C: Array) -> LocalFit:
-        model = evidence.model._replace(A=A, C=C, blocks=None)
-        start = fitted._replace(
-            evidence=replace(evidence, model=model, free=free),
-            selection=Selection(len(A), horizon, []),
-            residual=np.inf,  # whatever comes of it
-        )
-        same = choices._replace(order=len(A), horizon=horizon, refine="prediction")
-        return choose_and_identify(
-            pairs, same._replace(method=fitted.method), telling, n_trend, start
+        scaled = scale_records(pairs, n_trend, choices.estimated)
+        feedback = find_feedback(scaled.records) if like is None else like.feedback
+        settings = _heed(feedback, settings, choices.feedthrough is True)
+        if settings.method == "pbsid":
+            try:
+                plant = identify_closed_loop(scaled, basis, order, horizon, settings)
+                found = plant.selection.order
+                if order is None and found not in (settings.orders or [found]):
+                    # a state too few spoils the plant, one too many costs little
+                    enough = (n for n in settings.orders if n > found)
+                    order = min(enough, default=settings.orders[-1])
+                    plant = identify_closed_loop(
+                        scaled, basis, order, horizon, settings
+                    )
+            except ValueError as error:
+                raise TooFewSamples(str(error)) from None
+        else:
+            plant = _identify_open_loop(scaled, basis, order, horizon, settings, like)
+        offsets = attributed(plant.evidence, centres, self.pairs)
+        evidence, offsets = with_levels(plant.evidence, offsets)
+        residual = plant.residual
+        if choices.estimated:
+            residual = _residual_of_known(evidence, settings.method, residual)
+        return LocalFit(
+            model=evidence.model,
+            singular_values=plant.singular_values,
+            residual=residual,
+            stability_loss=plant.stability_loss,
+            selection=plant.selection,
+            evidence=evidence,
+            method=settings.method,
+            feedback=feedback,
+            offsets=offsets,
+            scaled=scaled,
+            signals=SharedSignals(),
         )
 
-    try:
-        own = evidence.model.A, evidence.model.C
-        return any(promising(near(A, C)) for A, C in [own, *others])
-    except TooFewSamples:  # for that horizon
-        return True
+    def tried(self, n_trend: int, like: LocalFit | None = None) -> LocalFit | None:
+        """As `fit`; None where the samples do not tell enough."""
+        try:
+            return self.fit(n_trend, like)
+        except TooFewSamples:
+            return None
 
+    def of_order(
+        self, order: int, other: LocalFit, n_trend: int
+    ) -> tuple[LocalFit, float]:
+        """The model of that order, with these trends.
 
-def errors_held_out(fitted: LocalFit, choices: Choices) -> HeldOut:
-    """Errors of a fit's like on parts held out."""
-    evidence, scaled = fitted.evidence, fitted.scaled
-    horizon = fitted.selection.horizon
-    free = evidence.free._replace(initial_states=True)  # what is left begins in motion
-    settings = Settings(
-        free,
-        fitted.method,
-        choices.refine is not False,
-        choices.enforce_stability,
-        choices.n_noise_states,
-    )
-    if fitted.method != "pbsid":
-        whitening, refined = evidence.whitening, evidence.refined
-        like = Candidate(evidence.model, horizon, whitening, refined)
-        return validate(like, scaled.records, settings)
+        And by how much its criterion is worse than that of the `other`, whose choice of
+        the order it keeps.
+        """
+        found = self.having(order=order).fit(n_trend)
+        selection = found.selection.among(other.selection)
+        return found._replace(selection=selection), found.worse_than(other)
 
-    refitted: Callable[[list[Record]], Realization]
-    if isinstance(evidence, ClosedLoopEvidence) and evidence.refined:
-        refitted = replace(evidence, free=free).of_others
-    else:
+    def is_worth_a_choice(
+        self, promising: Callable[[LocalFit], bool], fitted: LocalFit, n_trend: int
+    ) -> bool:
+        """Whether to choose among all orders again, with other trends or samples.
 
-        def refitted(train: list[Record]) -> Realization:
-            part = scaled._replace(records=train)
-            basis, order = evidence.basis, choices.order
-            return identify_closed_loop(
-                part, basis, order, choices.horizon, settings
-            ).evidence.model
+        That takes as long as the first choice. Few steps lead from the model `fitted`
+        to one of its order, and to those without each one of the modes that may be
+        constants: unless these tell nothing of other orders, one of them must be
+        promising.
+        """
+        evidence, horizon = fitted.evidence, fitted.selection.horizon
+        others = without_slow_modes(evidence)
+        if others is None or not evidence.refined:
+            return True
+        free = evidence.free._replace(n_trend=n_trend)
+        same = self.aside("collinear").having(horizon=horizon, refine="prediction")
+        same = same.having(method=fitted.method)
 
-    try:
-        return held_out(refitted, scaled.records)
-    except ValueError:  # too few samples are left
-        return HeldOut([], np.nan)
+        def near(A: Array, C: Array) -> LocalFit:
+            model = evidence.model._replace(A=A, C=C, blocks=None)
+            start = fitted._replace(
+                evidence=replace(evidence, model=model, free=free),
+                selection=Selection(len(A), horizon, []),
+                residual=np.inf,  # whatever comes of it
+            )
+            return same.having(order=len(A)).fit(n_trend, start)
+
+        try:
+            own = evidence.model.A, evidence.model.C
+            return any(promising(near(A, C)) for A, C in [own, *others])
+        except TooFewSamples:  # for that horizon
+            return True
+
+    def errors_held_out(self, fitted: LocalFit) -> HeldOut:
+        """Errors of a fit's like on parts held out."""
+        evidence, scaled, choices = fitted.evidence, fitted.scaled, self.choices
+        free = evidence.free._replace(initial_states=True)  # what is left is in motion
+        settings = fitted.settings(choices)._replace(free=free)
+        if fitted.method != "pbsid":
+            like = Candidate(
+                evidence.model,
+                fitted.selection.horizon,
+                evidence.whitening,
+                evidence.refined,
+            )
+            return validate(like, scaled.records, settings)
+
+        refitted: Callable[[list[Record]], Realization]
+        if isinstance(evidence, ClosedLoopEvidence) and evidence.refined:
+            refitted = replace(evidence, free=free).of_others
+        else:
+
+            def refitted(train: list[Record]) -> Realization:
+                part = scaled._replace(records=train)
+                basis, order = evidence.basis, choices.order
+                return identify_closed_loop(
+                    part, basis, order, choices.horizon, settings
+                ).evidence.model
+
+        try:
+            return held_out(refitted, scaled.records)
+        except ValueError:  # too few samples are left
+            return HeldOut([], np.nan)
 
 
 def _identify_open_loop(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import DETRENDS, Pairs
+from ..data.preparation import DETRENDS
 from .closed_loop import ClosedLoopEvidence
 from .criterion import PRICE
 from .delay import find_lead, with_later_inputs
@@ -16,10 +16,9 @@ from .held_out import DOUBT, HeldOut
 from .identification import spectral_radius
 from .local_fit import LocalFit
 from .offsets import CERTAIN, HARDLY_DECAYS, follows_means_alone
-from .one_fit import TooFewSamples, choose_and_identify, errors_held_out
+from .one_fit import Samples, TooFewSamples
 from .options import Choices
 from .rounding import rounded_outputs
-from .telling import Telling
 from .trends import with_trends
 from .varx import Regression
 
@@ -48,9 +47,7 @@ _LAGS, _PLENTY, _AUDIBLE = 2, 20_000, 0.01
 _FAR_BETTER = 0.5
 
 
-def believable(
-    pairs: Pairs, choices: Choices, telling: Telling, first: LocalFit
-) -> tuple[LocalFit, Doubt | None]:
+def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | None]:
     """The first model of a closed loop, or one that refutes it on parts held out.
 
     Its like of the order that "po-moesp" takes is one: prediction, by which the order
@@ -63,21 +60,22 @@ def believable(
     answers at once; or the plant is unstable, by no more than chance, and the other is
     not; or D was left free for a stable plant, but fits these parts no better.
     """
-    n_trend = first.evidence.free.n_trend
+    choices, n_trend = samples.choices, first.evidence.free.n_trend
     without_d = not first.evidence.free.direct.any()
     feedback, as_said = first.feedback, choices.feedthrough
     answered = feedback is not None and feedback.answered
     shown = feedback is not None and feedback.shown
     if answered and without_d:
-        choices = choices._replace(feedthrough=False)
-    same = choices._replace(offset=DETRENDS[n_trend])
+        samples = samples.having(feedthrough=False)
+        choices = samples.choices
+    same = samples.having(offset=DETRENDS[n_trend])
 
     def rival(**chosen: Any) -> tuple[LocalFit, HeldOut]:
-        chosen_so = same._replace(**chosen)
-        other = choose_and_identify(pairs, chosen_so, telling, n_trend, first)
-        return other, errors_held_out(other, chosen_so)
+        chosen_so = same.having(**chosen)
+        other = chosen_so.fit(n_trend, first)
+        return other, chosen_so.errors_held_out(other)
 
-    best, error = first, errors_held_out(first, choices)
+    best, error = first, samples.errors_held_out(first)
     before, makeshift = error, False
     try:
         if not error.parts:
@@ -111,7 +109,8 @@ def believable(
         better &= not best.grows(_CERTAIN) or _deviance(blind) < _deviance(best)
         unsure = makeshift or (best.grows() and not best.grows(_CERTAIN))
         if not said and not best.grows() and of_that.total < _LED * error.total:
-            unsure |= find_lead(pairs)[0] > 0  # inputs were made of later outputs, too
+            # inputs were made of later outputs, too
+            unsure |= find_lead(samples.pairs)[0] > 0
         if unsure and not open_loop.grows() and not better:
             blind, of_blind = open_loop, of_that
             better = of_that.clearly_better_than(error, DOUBT)
@@ -128,42 +127,40 @@ def believable(
         return first, None
     doubt = Doubt(before.bft, error.bft, first.grows())
     if n_trend and choices.offset == "auto":  # constants are judged anew
-        chosen = choices._replace(method=best.method)
-        best = with_trends(pairs, chosen, telling, best)
+        best = with_trends(samples.having(method=best.method), best)
     return best, doubt
 
 
-def tell_of_lead(
-    pairs: Pairs, choices: Choices, telling: Telling, fitted: LocalFit
-) -> None:
+def tell_of_lead(samples: Samples, fitted: LocalFit) -> None:
     """Tell of outputs that lead the inputs, where these seem to know the noise.
 
     Beside later inputs a model simulates parts held out far better, and there is no
     feedback. So does the inverse of a controller that leaves little to its reference.
     """
+    (pairs, choices, telling), n_trend = samples, fitted.evidence.free.n_trend
     lead, latest = find_lead(pairs)
     if not lead:
         return
-    n_trend = fitted.evidence.free.n_trend
-    offset = DETRENDS[n_trend]
-    plain = choices._replace(method="auto", offset=offset, estimated=())
-    pairs, error = with_later_inputs(pairs, lead), errors_held_out(fitted, choices)
+    later = samples.having(method="auto", offset=DETRENDS[n_trend], estimated=())
+    later = later._replace(pairs=with_later_inputs(pairs, lead)).aside()
+    error = samples.errors_held_out(fitted)
     led = _OF_NOISE if fitted.grows() else _LED
     # One order tells whether it is worth while to look for the best.
     first = choices.order or max(1, fitted.selection.order)
     for order, share in {first: _OF_NOISE, choices.order: led}.items():
-        plain = plain._replace(order=order)
+        later = later.having(order=order)
         try:
-            other = choose_and_identify(pairs, plain, telling.aside(), n_trend)
+            other = later.fit(n_trend)
         except TooFewSamples:
             return
         if other.feedback is None or other.feedback.found:
             return
-        found = errors_held_out(other, plain)
+        found = later.errors_held_out(other)
         if not found.total < share * error.total:
             return
     # A reference of a few lines is the free motion of modes that do not decay.
-    if 1.0 - spectral_radius(other.model.A) >= _LINE / max(len(u) for u, _ in pairs):
+    longest = max(len(u) for u, _ in later.pairs)
+    if 1.0 - spectral_radius(other.model.A) >= _LINE / longest:
         telling.once(
             "lead",
             f"The outputs seem to know input {telling.input(latest)} at least {lead} "
@@ -204,30 +201,28 @@ def _own_past(regression: Regression) -> Array:
     return A
 
 
-def held_by_a_loop(
-    pairs: Pairs, choices: Choices, telling: Telling, first: LocalFit
-) -> LocalFit:
+def held_by_a_loop(samples: Samples, first: LocalFit) -> LocalFit:
     """The model of a plant that grows for certain, if that is far likelier.
 
     In open loop its outputs would have grown: there is a loop, however little of it
     the noise shows.
     """
     n_trend, feedback = first.evidence.free.n_trend, first.feedback
-    chosen = choices._replace(method="pbsid", offset=DETRENDS[n_trend])
+    choices = samples.choices
+    chosen = samples.having(method="pbsid", offset=DETRENDS[n_trend])
     if choices.feedthrough is True and feedback is not None and feedback.instantaneous:
-        chosen = chosen._replace(feedthrough=False)
+        chosen = chosen.having(feedthrough=False)
     try:
-        other = choose_and_identify(pairs, chosen, telling, n_trend, first)
+        other = chosen.fit(n_trend, first)
         likelier = _deviance(other) < _deviance(first) - CERTAIN
         held = spectral_radius(other.model.A) < _FASTEST
         if not (likelier and held and other.grows(_CERTAIN)):
             return first
         if choices.offset == "auto":  # constants are judged anew
-            chosen = chosen._replace(offset="auto")
-            other = with_trends(pairs, chosen, telling, other)
+            other = with_trends(chosen.having(offset="auto"), other)
     except TooFewSamples:
         return first
-    telling.once(
+    samples.telling.once(
         "feedback",
         "The outputs follow from their own past as those of a plant that grows by "
         "itself, though they have not grown: a controller holds it. method='pbsid' was "
@@ -252,9 +247,7 @@ def may_share_noise(fitted: LocalFit, choices: Choices) -> bool:
     )
 
 
-def with_shared_noise(
-    pairs: Pairs, choices: Choices, telling: Telling, first: LocalFit
-) -> LocalFit:
+def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
     """The model of which noise moves the states of the plant, if that is likelier.
 
     Such noise tells of the poles what inputs do not. A model of the simulation error
@@ -266,19 +259,18 @@ def with_shared_noise(
     that drifts makes some models likelier by chance than a chi-square tells.
     """
     n_trend = first.evidence.free.n_trend
-    several, own = pairs[0][1].shape[1] > 1, first.selection.order
-    tried = [choices._replace(method="pbsid", offset=DETRENDS[n_trend])]
-    if choices.order is None:  # as many states at least, of which the inputs reach all
-        tried += [tried[0]._replace(n_noise_states=n) for n in (own, own + 1)]
+    several, own = len(first.model.C) > 1, first.selection.order
+    tried = [samples.having(method="pbsid", offset=DETRENDS[n_trend])]
+    if samples.choices.order is None:  # as many at least, of which inputs reach all
+        tried += [tried[0].having(n_noise_states=n) for n in (own, own + 1)]
     least = _deviance(first)
     least -= CERTAIN if first.evidence.whitening.of_differences else 0.0
     best, error, n_joint = first, None, -1
     for chosen in tried:
-        if chosen.n_noise_states <= n_joint:
+        if chosen.choices.n_noise_states <= n_joint:
             continue  # as many states were chosen before
-        try:
-            other = choose_and_identify(pairs, chosen, telling, n_trend, first)
-        except TooFewSamples:
+        other = chosen.tried(n_trend, first)
+        if other is None:
             continue
         evidence = other.evidence
         if not isinstance(evidence, ClosedLoopEvidence):
@@ -290,8 +282,8 @@ def with_shared_noise(
             continue
         if follows_means_alone(evidence):
             continue  # what moves it is all called noise
-        error = error or errors_held_out(first, choices)
-        its = errors_held_out(other, chosen)
+        error = error or samples.errors_held_out(first)
+        its = chosen.errors_held_out(other)
         more = several and other.selection.order > own
         if more and not its.total < _FAR_BETTER * error.total:
             continue

@@ -33,14 +33,9 @@ from numpy.typing import NDArray
 from ..data.preparation import Pairs
 from .local_fit import LocalFit
 from .offsets import shifts_matter
-from .one_fit import (
-    TooFewSamples,
-    choose_and_identify,
-    errors_held_out,
-)
-from .options import Choices
+from .one_fit import Samples
 from .signals import Record
-from .telling import Telling, in_experiment
+from .telling import in_experiment
 from .varx import Regression, regression_of, samples_of
 
 Array = NDArray[np.float64]
@@ -200,9 +195,7 @@ def cut_at(pairs: Pairs, shifts: Sequence[Sequence[int]]) -> Pairs:
     ]
 
 
-def without_shifts(
-    pairs: Pairs, choices: Choices, telling: Telling, whole: LocalFit
-) -> tuple[Pairs, LocalFit]:
+def without_shifts(samples: Samples, whole: LocalFit) -> tuple[Samples, LocalFit]:
     """Cut the experiments where levels shift, if that explains them clearly better.
 
     One step ahead, where noise alone explains all that moves slowly: parts that leave
@@ -210,45 +203,46 @@ def without_shifts(
     of states, must simulate as much of what is held out as the whole.
     Short ones hide in their initial states that a mode would grow.
     """
-    feedback = whole.feedback
+    (pairs, choices, telling), feedback = samples, whole.feedback
     # The errors of a rough model are not the noise that shifts must stand out of.
     asked = choices.offset == "auto" and choices.initial_states and choices.refine
     if not asked or choices.estimated or feedback is None:
-        return pairs, whole
+        return samples, whole
     records, regression = whole.scaled.records, feedback.regression
     channels = len(records[0].u) + len(records[0].y)
     if regression is not None and regression.shape[2] != channels:
         regression = regression_of(records)  # levels were no input beside constants
     shifts = find_shifts(records, regression)
     if not any(shifts):
-        return pairs, whole
+        return samples, whole
     parts = cut_at(pairs, shifts)
     rests = np.all([np.ptp(u, axis=0) == 0.0 for u, _ in parts], axis=0)
     if rests.any():  # an input tells nothing of any part: its step made the shift
-        return pairs, whole
-    try:
-        fitted = choose_and_identify(parts, choices, telling, 1, whole)
-    except TooFewSamples:
-        return pairs, whole
+        return samples, whole
+    cut = samples._replace(pairs=parts)
+    fitted = cut.tried(1, whole)
+    if fitted is None:
+        return samples, whole
     if not shifts_matter(whole.evidence.one_step, fitted.evidence.one_step):
-        return pairs, whole
+        return samples, whole
     if fitted.grows() and not whole.grows():
-        return pairs, whole
+        return samples, whole
     given = choices.order is not None
     if whole.selection.order and (given or not fitted.selection.order):
-        if errors_held_out(fitted, choices).bft < errors_held_out(whole, choices).bft:
-            return pairs, whole
-    samples = "; ".join(
+        held_out = cut.errors_held_out(fitted), samples.errors_held_out(whole)
+        if held_out[0].bft < held_out[1].bft:
+            return samples, whole
+    where = "; ".join(
         in_experiment(", ".join(map(str, cuts)), k, len(pairs))
         for k, cuts in enumerate(shifts)
         if cuts
     )
     telling.once(
         "shifts",
-        f"The outputs shift at sample(s) {samples}, counted from 0, by what the inputs "
+        f"The outputs shift at sample(s) {where}, counted from 0, by what the inputs "
         "do not explain: a load came or went, a sensor moved, or the system is not "
         "linear. What lies between was fitted as experiments of their own, each with "
         "its constant (`output_offset_`). Give a load that you know as an input; "
         "offset='constant' or None fits the whole.",
     )
-    return parts, fitted
+    return cut, fitted

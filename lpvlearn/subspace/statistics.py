@@ -30,6 +30,7 @@ from scipy import fft
 from ..models.innovation import InnovationModel, NoiseModel
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..systems.response import resolvent
+from .criterion import criterion_of
 from .missing_outputs import noise_of
 from .noise import Whitening, reduced_noise_model, spectral_density
 from .signals import Record, block_slices, signal_pieces
@@ -211,6 +212,16 @@ class Evidence:
         if self.told is not None:
             return self.model
         return in_sections(self.whitening.model(self.model))
+
+    @cached_property
+    def criterion(self) -> float:
+        """That of the orders, of outputs in their units; -inf where one is 0."""
+        records = self.records
+        if not np.logical_or.reduce([r.y.any(axis=1) for r in records]).all():
+            return -np.inf  # nothing is left of it, and its scale tells nothing
+        n_samples = sum(record.u.shape[1] for record in records)
+        units = 2.0 * n_samples * float(np.log(self.output_scale).sum())
+        return units + criterion_of(self.model, records, self.free)
 
     @property
     def longest(self) -> int:

@@ -36,10 +36,10 @@ from ..data.timestamps import TIME_TOL, Clock, read_clock, time_in_seconds
 from ..systems.threads import one_blas_thread
 from ..validation import SQUARED, input_delays
 from .delay import late_inputs
-from .fit import fit_pairs
+from .fit import fit_samples
 from .fit_warnings import warn_about, warn_about_drift, warn_about_pole
 from .local_fit import LocalFit
-from .one_fit import TooFewSamples
+from .one_fit import Samples, TooFewSamples
 from .options import Choices
 from .stream_summary import Piece, StreamSummary
 from .telling import Telling
@@ -472,7 +472,7 @@ class SampleStream:
         while True:
             full = bool(left) or buffer.n_samples >= BUFFER
             try:
-                fitted = fit_pairs(buffer.pairs, choices, self._telling)
+                fitted = fit_samples(Samples(buffer.pairs, choices, self._telling))
                 break
             except TooFewSamples as error:
                 if not full:
@@ -520,13 +520,14 @@ def _same(first: Any, other: Any) -> bool:
 
 
 def fit_as_stream(
-    pairs: Pairs, choices: Choices, telling: Telling, *, detrend: str | None, gaps: bool
+    samples: Samples, *, detrend: str | None, gaps: bool
 ) -> LocalFit | None:
     """Fit a long table as a stream of its samples; `gaps` as in `SampleBuffer`.
 
     None where that would not do: few samples, first ones that say too little, or a
     closed loop.
     """
+    pairs, choices, _ = samples
     if sum(len(u) for u, _ in pairs) <= BUFFER or choices.method == "pbsid":
         return None
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
@@ -536,7 +537,7 @@ def fit_as_stream(
     if not _as_independent(first, pairs):
         return None
     try:
-        begun = fit_pairs(first, choices, telling)
+        begun = fit_samples(samples._replace(pairs=first))
         if begun.method == "pbsid":
             return None
         choices = choices._replace(method=begun.method)

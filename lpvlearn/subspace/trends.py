@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..data.preparation import Pairs
 from ..systems.beginnings import moves_of
 from .drift import n_lasting, outlasts, wanders
 from .local_fit import LocalFit
@@ -14,7 +13,6 @@ from .offsets import (
     HARDLY_MOVED,
     N_TRENDS,
     constants_matter,
-    criterion_in_units,
     drifts_off,
     leaves_rounding,
     may_be_better,
@@ -23,11 +21,9 @@ from .offsets import (
     stands_by_chance,
     unmoved_errors,
 )
-from .one_fit import TooFewSamples, choose_and_identify, is_worth_a_choice, of_order
-from .options import Choices
+from .one_fit import Samples, TooFewSamples
 from .rounding import rounded_outputs
 from .statistics import Evidence
-from .telling import Telling
 
 # Share of the outputs' size left unexplained that constants may be the reason of
 _HARDLY = 0.4
@@ -37,15 +33,14 @@ _HARDLY = 0.4
 _NOT_MOVED = 1.1
 
 
-def with_trends(
-    pairs: Pairs, choices: Choices, telling: Telling, known: LocalFit | None
-) -> LocalFit:
+def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
     """Choose and identify, with constants of the experiments where these matter."""
+    choices = samples.choices
     n_trend = N_TRENDS[choices.offset]
     # The errors of a rough model are not the noise that constants must stand out of.
     rough = choices.offset == "auto" and choices.refine is False
-    judged = choices._replace(refine="simulation") if rough else choices
-    fitted = choose_and_identify(pairs, judged, telling, n_trend, known)
+    judged = samples.having(refine="simulation") if rough else samples
+    fitted = judged.fit(n_trend, like)
     # A slow mode of the noise, which outputs drive, stands for constants only too well;
     # so does one of a model that has to start at rest. In the errors of a poor model of
     # a given order nothing stands out.
@@ -57,23 +52,22 @@ def with_trends(
     def may_matter() -> bool:
         if hides or stands:
             return True
-        return may_have_constants(tested) and is_worth_a_choice(
-            lambda near: may_be_better(tested, near.evidence),
-            *(pairs, judged, telling, fitted, 1),
+        return may_have_constants(tested) and judged.is_worth_a_choice(
+            lambda near: may_be_better(tested, near.evidence), fitted, 1
         )
 
     refused = np.inf
-    moves = any(np.ptp(u, axis=0).any() for u, _ in pairs)
+    moves = any(np.ptp(u, axis=0).any() for u, _ in samples.pairs)
     if choices.offset == "auto" and moves and may_matter():
-        other = choose_and_identify(pairs, judged, telling, 1, fitted)
+        other = judged.fit(1, fitted)
         order = len(fitted.model.A)
         if stands and len(other.model.A) > order:
-            as_many, worse = of_order(pairs, judged, telling, order, other, 1)
+            as_many, worse = judged.of_order(order, other, 1)
             other = as_many if worse < 0.0 else other
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
         elif choices.order is not None:  # a poor model shows many things
-            refused = criterion_in_units(other.evidence.one_step)
+            refused = other.evidence.one_step.criterion
     # The states of a given order that are to follow a drift are missing elsewhere.
     given = choices.order is not None and choices.initial_states and n_trend < 2
     given &= fitted.method != "pbsid" and not choices.enforce_stability
@@ -81,27 +75,17 @@ def with_trends(
     def may_drift() -> bool:
         if given:
             lost = outlasts(fitted) or fitted.residual > _HARDLY
-            return lost or _drifts_off(pairs, judged, telling, fitted, tested)
+            return lost or _drifts_off(judged, fitted, tested)
         shown = choices.order is None and not hides and not rough
-        return shown and _may_drift_off(pairs, judged, telling, fitted)
+        return shown and _may_drift_off(judged, fitted)
 
     if choices.offset == "auto" and moves and may_drift():
-        fitted = _with_drifts(pairs, judged, telling, fitted, refused)
+        fitted = _with_drifts(judged, fitted, refused)
         n_trend = fitted.evidence.free.n_trend
-    return (
-        choose_and_identify(pairs, choices, telling, n_trend, fitted)
-        if rough
-        else fitted
-    )
+    return samples.fit(n_trend, fitted) if rough else fitted
 
 
-def _drifts_off(
-    pairs: Pairs,
-    choices: Choices,
-    telling: Telling,
-    fitted: LocalFit,
-    tested: Evidence,
-) -> bool:
+def _drifts_off(samples: Samples, fitted: LocalFit, tested: Evidence) -> bool:
     """Whether errors of a given order drift, and by no state that inputs move."""
     own = fitted.evidence.one_step
     shown = drifts_off(tested) or (own is not tested and drifts_off(own))
@@ -109,16 +93,14 @@ def _drifts_off(
         return False
     order, n_trend = len(fitted.model.A) + 1, fitted.evidence.free.n_trend
     try:
-        more, worse = of_order(pairs, choices, telling, order, fitted, n_trend)
+        more, worse = samples.of_order(order, fitted, n_trend)
     except TooFewSamples:
         return True
     moved = unmoved_errors(more.evidence.one_step, beside_drifts=True) > HARDLY_MOVED
     return not (worse < -CERTAIN and moved)
 
 
-def _may_drift_off(
-    pairs: Pairs, choices: Choices, telling: Telling, fitted: LocalFit
-) -> bool:
+def _may_drift_off(samples: Samples, fitted: LocalFit) -> bool:
     """Whether to try drifts, of a model whose errors or modes may hide them."""
     tested = fitted.evidence.one_step
     if not (may_have_drift(tested) or wanders(tested)):
@@ -127,24 +109,17 @@ def _may_drift_off(
     rounded = rounded_outputs(tested.model, tested.records).repeated.any()
     if rounded and not outlasts(fitted):
         return False
-    least, order = criterion_in_units(tested), len(tested.model.A)
 
     def may_drift(near: LocalFit) -> bool:
         # Drifts instead of a mode may need other states yet; beside all modes they are
         # there, or are not.
-        doubt = CERTAIN if len(near.model.A) < order else 0.0
-        return criterion_in_units(near.evidence) < least + doubt
+        doubt = CERTAIN if len(near.model.A) < len(tested.model.A) else 0.0
+        return near.evidence.criterion < tested.criterion + doubt
 
-    return is_worth_a_choice(may_drift, pairs, choices, telling, fitted, 2)
+    return samples.is_worth_a_choice(may_drift, fitted, 2)
 
 
-def _with_drifts(
-    pairs: Pairs,
-    choices: Choices,
-    telling: Telling,
-    fitted: LocalFit,
-    refused: float = np.inf,
-) -> LocalFit:
+def _with_drifts(samples: Samples, fitted: LocalFit, refused: float) -> LocalFit:
     """The model with drifts, or offsets of inputs that are integrated, if that is it.
 
     Of equals the model is taken which needs no mode that inputs do not move: it stands
@@ -154,22 +129,20 @@ def _with_drifts(
     tested = fitted.evidence.one_step
     if leaves_rounding(tested):
         return fitted
-    try:
-        other = choose_and_identify(pairs, choices, telling, 2, fitted)
-    except TooFewSamples:
+    other, given = samples.tried(2, fitted), samples.choices.order is not None
+    if other is None:
         return fitted
-    before = min(criterion_in_units(tested), refused)
-    better = before - criterion_in_units(other.evidence.one_step)
-    asked = _gain_asked(fitted, other, given=choices.order is not None)
+    better = min(tested.criterion, refused) - other.evidence.one_step.criterion
+    asked = _gain_asked(fitted, other, given=given)
     if not better > asked:
         return fitted
     if other.offsets.drifts.any() and _takes_a_gain(fitted.evidence, other.evidence):
         return fitted
     order = len(other.model.A)
-    if order > len(fitted.model.A) and choices.order is None:
+    if order > len(fitted.model.A) and not given:
         # What more states gain is no drift.
         n_trend = fitted.evidence.free.n_trend
-        level, worse = of_order(pairs, choices, telling, order, other, n_trend)
+        level, worse = samples.of_order(order, other, n_trend)
         if not worse > asked:
             return level
     return other

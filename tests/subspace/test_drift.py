@@ -10,7 +10,7 @@ from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.metrics import bft_score
 from lpvlearn.subspace import drift, trends
 from lpvlearn.subspace.drift import differences, of_levels
-from lpvlearn.subspace.one_fit import choose_and_identify
+from lpvlearn.subspace.one_fit import Samples
 from lpvlearn.subspace.options import Choices
 from lpvlearn.subspace.statistics import StaticGain
 from lpvlearn.subspace.telling import Telling
@@ -55,8 +55,8 @@ class TestOfLevels:
         y = plant.simulate(u, initial_state=[0.3, -1.0]) + 2.0 * (offset is not None)
         choices = Choices(order=2, horizon=8, offset=offset)
         n_trend = int(offset is not None)
-        whole = choose_and_identify([(u, y)], choices, Telling(), n_trend)
-        found = choose_and_identify(differences([(u, y)]), choices, Telling(), 0)
+        whole = Samples([(u, y)], choices, Telling()).fit(n_trend)
+        found = Samples(differences([(u, y)]), choices, Telling()).fit(0)
         evidence = of_levels(found.evidence, whole.scaled, n_trend)
         omega = np.linspace(1e-3, np.pi, 20)
         response = evidence.state_space(evidence.model, 1.0)
@@ -75,8 +75,8 @@ class TestOfLevels:
         u = np.cumsum(rng.standard_normal((400, 2)), axis=0) * [1e-3, 1e2]
         y = plant.simulate(u)
         choices = Choices(order=3, horizon=8)
-        whole = choose_and_identify([(u, y)], choices, Telling(), 0)
-        found = choose_and_identify(differences([(u, y)]), choices, Telling(), 0)
+        whole = Samples([(u, y)], choices, Telling()).fit(0)
+        found = Samples(differences([(u, y)]), choices, Telling()).fit(0)
         evidence = of_levels(found.evidence, whole.scaled, 0)
         assert_allclose(
             evidence.state_space(evidence.model, 1.0).dc_gain(),

@@ -12,8 +12,9 @@ from scipy.signal import lfilter, tf2ss
 from lpvlearn import StateSpace, SubspaceLTI, bft_score
 from lpvlearn.data.preparation import drops_out, remove_trends, stays_put
 from lpvlearn.exceptions import RankWarning
-from lpvlearn.subspace.fit import fit_pairs
+from lpvlearn.subspace.fit import fit_samples
 from lpvlearn.subspace.fit_warnings import warn_about
+from lpvlearn.subspace.one_fit import Samples
 from lpvlearn.subspace.options import Choices, check_options
 from lpvlearn.subspace.telling import Telling
 from lpvlearn.systems.simulation import lti_response
@@ -504,7 +505,7 @@ def test_a_fit_that_parts_held_out_do_not_confirm_is_told(rng):
     u, y = record(rng, 300)
     y = y + 0.1 * rng.standard_normal(y.shape)
     choices = check_options(SubspaceLTI().get_params())
-    fitted = fit_pairs([(u, y)], choices, Telling())
+    fitted = fit_samples(Samples([(u, y)], choices, Telling()))
     for residual, expected in ((0.05, 0), (0.4, 0), (0.6, 1)):
         held_out = fitted.selection.held_out._replace(residual=residual)
         poor = fitted._replace(selection=replace(fitted.selection, held_out=held_out))
@@ -538,7 +539,9 @@ def test_an_order_that_the_likelihood_disputes_is_told(rng):
     """By more than 30: of a chance of 1e-7."""
     u, e = rng.standard_normal((2, 300, 1))
     y = lfilter([0.0, 1.0], [1.0, -0.7], u, axis=0) + 0.1 * e
-    fitted = fit_pairs([(u, y)], check_options(SubspaceLTI().get_params()), Telling())
+    fitted = fit_samples(
+        Samples([(u, y)], check_options(SubspaceLTI().get_params()), Telling())
+    )
     chosen = fitted.selection.order, fitted.selection.horizon
     for excess in (29.0, 31.0):
         rows = [
@@ -577,7 +580,7 @@ def test_experiments_that_contradict_one_another_are_told(gains):
         told = Telling()
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            fit_pairs(pairs, Choices(order=2), told)
+            fit_samples(Samples(pairs, Choices(order=2), told))
         n_told += "contradiction" in told
         assert any("contradict" in str(w.message) for w in said) == (
             "contradiction" in told
@@ -596,10 +599,13 @@ def test_experiments_of_another_system_are_named():
     with pytest.warns(
         UserWarning, match=r"Experiment\(s\) 1, 3, counted from 0, do not"
     ):
-        fit_pairs(list(zip(u, exchanged, strict=True)), Choices(order=2), Telling())
+        fit_samples(
+            Samples(list(zip(u, exchanged, strict=True)), Choices(order=2), Telling())
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fit_pairs(list(zip(u, y, strict=True)), Choices(order=2), Telling())
+        pairs = list(zip(u, y, strict=True))
+        fit_samples(Samples(pairs, Choices(order=2), Telling()))
 
 
 def test_experiments_whose_inputs_rest_contradict_none(rng):
@@ -684,7 +690,7 @@ def test_parts_that_only_means_explain_are_told(bft, told, rng):
     u = np.repeat(rng.standard_normal((30, 1)), 10, axis=0)
     y = 20.0 + StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0).simulate(u)
     y = y + 0.01 * rng.standard_normal(y.shape)
-    fitted = fit_pairs([(u + 10.0, y)], Choices(), Telling())
+    fitted = fit_samples(Samples([(u + 10.0, y)], Choices(), Telling()))
     held_out = fitted.selection.held_out._replace(bft=bft)
     selection = replace(fitted.selection, held_out=held_out)
     with warnings.catch_warnings(record=True) as caught:

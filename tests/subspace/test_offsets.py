@@ -473,8 +473,7 @@ def test_where_slow_modes_hide_constants_the_criterion_decides(
         for offset in (None, "constant")
     )
     monkeypatch.setattr(offsets, "chance_of_trend", lambda *_, **__: 1.0)
-    worth = {id(without): better, id(other): 0.0}
-    monkeypatch.setattr(offsets, "criterion_in_units", lambda e: worth[id(e)])
+    without.__dict__["criterion"], other.__dict__["criterion"] = better, 0.0
     assert offsets.constants_matter(without, other) == taken
 
 

@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI
 from lpvlearn.subspace import shifts
+from lpvlearn.subspace.one_fit import Samples
 from lpvlearn.subspace.shifts import _statistics, cut_at, find_shifts
 from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.varx import find_feedback, longest_past, regression_of
@@ -120,14 +121,14 @@ def test_cuts_for_a_given_order_must_simulate_as_much_held_out(better, monkeypat
     u, y = slow_record(rng, 900)
     y = y + np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
     order = SubspaceLTI(offset="constant").fit(u, y).order_
-    told = shifts.errors_held_out
+    told = Samples.errors_held_out
 
-    def held_out(fitted, choices):
-        found = told(fitted, choices)
+    def held_out(samples, fitted):
+        found = told(samples, fitted)
         cut = len(fitted.scaled.records) > 1
         return found._replace(bft=found.bft if better or not cut else -1e3)
 
-    monkeypatch.setattr(shifts, "errors_held_out", held_out)
+    monkeypatch.setattr(Samples, "errors_held_out", held_out)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found = SubspaceLTI(order).fit(u, y)
@@ -141,11 +142,11 @@ def test_cuts_that_leave_inputs_nothing_to_explain_are_not_made(monkeypatch):
     u, y = slow_record(rng, 900)
     y = y + 0.1 * np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
 
-    def fitted(pairs, choices, *args, like=shifts.choose_and_identify):
-        order = 0 if len(pairs) > 1 else choices.order
-        return like(pairs, choices._replace(order=order), *args)
+    def fitted(samples, *args, fit=Samples.fit):
+        order = 0 if len(samples.pairs) > 1 else samples.choices.order
+        return fit(samples.having(order=order), *args)
 
-    monkeypatch.setattr(shifts, "choose_and_identify", fitted)
+    monkeypatch.setattr(Samples, "fit", fitted)
     monkeypatch.setattr(shifts, "shifts_matter", lambda whole, parts: True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the shifts do
@@ -159,16 +160,16 @@ def test_cuts_that_make_a_stable_model_grow_are_not_made(monkeypatch):
     u, y = slow_record(rng, 900)
     y = y + 0.1 * np.searchsorted([400, 640], np.arange(900), side="right")[:, None]
 
-    def fitted(pairs, *args, like=shifts.choose_and_identify):
-        found = like(pairs, *args)
-        if len(pairs) == 1:
+    def fitted(samples, *args, fit=Samples.fit):
+        found = fit(samples, *args)
+        if len(samples.pairs) == 1:
             return found
         evidence = found.evidence
         grown = evidence.model._replace(A=1.5 * evidence.model.A)
         evidence = replace(evidence, model=grown)
         return found._replace(evidence=evidence, model=grown)
 
-    monkeypatch.setattr(shifts, "choose_and_identify", fitted)
+    monkeypatch.setattr(Samples, "fit", fitted)
     monkeypatch.setattr(shifts, "shifts_matter", lambda whole, parts: True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of what the shifts do

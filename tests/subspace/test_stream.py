@@ -596,9 +596,9 @@ def test_dropped_rows_and_jitter_of_a_stream_are_those_of_its_table(timed, dates
 
 
 def test_small_batches_make_few_models_and_the_same(system, monkeypatch):
-    made, fit = [], stream_module.fit_pairs
+    made, fit = [], stream_module.fit_samples
     monkeypatch.setattr(
-        stream_module, "fit_pairs", lambda *a, **k: made.append(1) or fit(*a, **k)
+        stream_module, "fit_samples", lambda *a, **k: made.append(1) or fit(*a, **k)
     )
     u, y = record(system, 900)
     model = fed(SubspaceLTI(5, horizon=8), u, y, [5] * 180)
