@@ -31,6 +31,7 @@ from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.identification import mode_rates
 from ..subspace.integrating import integrating_flags
+from ..subspace.offsets import lasting
 from .runner import Done, PointRunner, label_of, tell_skipped
 
 Array = NDArray[np.float64]
@@ -76,6 +77,8 @@ class LocalModel:
     discretization: str = "zoh"
     integrating: list[int] = field(default_factory=list)  # outputs, by place
     n_trend: int = 0  # 1: a constant of every output and experiment, 2: and a drift
+    lasts: bool = False  # whether a mode does not decay over the longest experiment
+    criterion: float = np.nan  # as `SubspaceLTI.criterion`, where that is told
     # inputs and outputs at rest, near the experiments; None: not looked for
     rest: tuple[Array, Array] | None = None
     # that of the order that its record takes, where it is not the one of all points
@@ -138,14 +141,32 @@ def identify_points(
                 found[k] = done
         return found
 
+    def attempted(
+        estimator: Any, known: Sequence[Done | None] = ()
+    ) -> list[Done | None]:
+        """Of all points; what fails is left open, and not told yet."""
+        lenient = replace(runner, on_error="skip")
+        arguments = [(estimator, group) for group in groups]
+        with collected(), suppress(ValueError):
+            return lenient.run(
+                "local models",
+                *(identify_point, arguments, points.kappa, known),
+                **options,
+            )
+        return [None] * len(groups)
+
     if not chooses or structure is not None:
         found = identify(local)
     else:
         search = free and len(groups) > _SCOUTS and type(local) is SubspaceLTI
         some = np.linspace(0, len(groups) - 1, _SCOUTS).round().astype(int).tolist()
         scouts = tried(local, some) if search else []
-        found = _of_own_orders(local, identify, scouts)
-        found = _drifting_alike(local, tried, found)
+        if local.get_params(deep=False).get("offset") == "auto":
+            found = _of_own_orders(local, attempted, scouts)
+            found = _drifting_alike(local, tried, found)
+            found = identify(local, found) if None in found else found
+        else:
+            found = _of_own_orders(local, identify, scouts)
         models = [done.result for done in found if done is not None]
         if len({model.order for model in models}) > 1:
             order = _common_order(models)
@@ -206,31 +227,52 @@ def _drifting_alike(
     tried: Callable[[Any, Sequence[int]], list[Done | None]],
     found: list[Done | None],
 ) -> list[Done | None]:
-    """With drifts wherever fewer states do beside them, if outputs drift at a point.
+    """With drifts at all points, if these together are likelier so.
 
     What drifts in one experiment mostly does in all of them. Where it is not beyond
-    doubt, states that the plant does not have stand for it.
+    doubt, states that the plant does not have stand for it: ones that other points do
+    not need, that do not decay, or grow. Their records are independent, and criteria
+    add up: those with drifts, of no more states than the others take together, must
+    have the lesser sum.
     """
-    drifting = [
-        _own_order(done.result)
-        for done in found
-        if done is not None and done.result.n_trend > 1
-    ]
-    if local.get_params(deep=False).get("offset") != "auto" or not drifting:
+    models = [done.result for done in found if done is not None]
+    sound = [model for model in models if model.n_trend > 1 and not model.lasts]
+    most = _common_order(sound) if sound else np.inf
+    doubtful = [m.lasts or (m.n_trend < 2 and _own_order(m) > most) for m in models]
+    if not any(doubtful) and len(models) == len(found):
         return found
-    most = max(drifting)
-    some = [
-        k
-        for k, done in enumerate(found)
-        if done is None or (done.result.n_trend < 2 and _own_order(done.result) > most)
-    ]
-    if not some:
+    drifting = clone(local).set_params(offset="linear")
+
+    def drifts(known: list[Done | None], highest: float) -> list[Done | None]:
+        """All points with drifts; anew where they are not, or have more states."""
+        again = [
+            k
+            for k, done in enumerate(known)
+            if done is None
+            or done.result.n_trend < 2
+            or _own_order(done.result) > highest
+        ]
+        new = tried(drifting, again) if again else known
+        return [new[k] if k in again else done for k, done in enumerate(known)]
+
+    others = drifts(found, np.inf)
+    with_them = [done.result for done in others if done is not None]
+    if not with_them:
         return found
-    others = tried(clone(local).set_params(offset="linear"), some)
-    return [
-        other if other is not None and _own_order(other.result) <= most else done
-        for done, other in zip(found, others, strict=True)
-    ]
+    highest, given = _common_order(with_them), local.get_params(deep=False)["order"]
+    given = range(highest + 1) if isinstance(given, str) else given
+    drifting.set_params(order=[n for n in given if n <= highest])
+    others = drifts(others, highest)
+    with_them = [done.result for done in others if done is not None]
+    if len(with_them) < len(found) or any(model.lasts for model in with_them):
+        return found
+    if not models:
+        return others
+    order = _common_order(models)
+    better = sum(_cost(m, order) - _cost(m, _own_order(m)) for m in models)
+    for one, other in zip(found, with_them, strict=True):
+        better += one.result.criterion - other.criterion if one is not None else 0.0
+    return others if better > 0.0 and highest <= order else found
 
 
 def _beside(found: Done | None, own: Done | None) -> Done | None:
@@ -255,10 +297,15 @@ def _common_order(models: Sequence[LocalModel]) -> int:
     if not all(model.costs for model in models):
         return orders[-1]
     total = dict.fromkeys(orders, 0.0)
-    for costs in (model.costs for model in models):
-        for order in orders:  # beyond those tried, more states bring nothing
-            total[order] += costs.get(min(order, max(costs)), np.inf)
+    for model in models:
+        for order in orders:
+            total[order] += _cost(model, order)
     return min(orders, key=lambda order: total[order])
+
+
+def _cost(model: LocalModel, order: int) -> float:
+    """What an order costs; beyond those tried, more states bring nothing."""
+    return model.costs.get(min(order, max(model.costs)), np.inf)
 
 
 def identify_point(
@@ -310,6 +357,8 @@ def identify_point(
             discretization=discretization,
             integrating=_integrating(fitted),
             n_trend=_n_trend(fitted),
+            lasts=_lasts(fitted, experiments),
+            criterion=_criterion(fitted),
             rest=_equilibrium(lti, [fitted], experiments),
         )
         if efficient and pairs:
@@ -381,6 +430,20 @@ def _n_trend(fitted: Any) -> int:
     """Trends of every output and experiment in a model, as `LocalModel` has them."""
     trends = {getattr(fitted, name, None) for name in ("offset_", "detrend")}
     return max(n for n, trend in enumerate(DETRENDS) if trend in trends or n == 0)
+
+
+def _lasts(fitted: Any, experiments: Sequence[Experiment]) -> bool:
+    """Whether a mode does not decay over the longest experiment; integrators apart."""
+    rates = getattr(fitted, "rates_", None)
+    lti = fitted.lti_ if rates is None else rates.lti_
+    longest = max(len(e.inputs) for e in experiments)
+    return bool(lasting(lti.poles(), longest).any())
+
+
+def _criterion(fitted: Any) -> float:
+    """That of the model of an estimator that tells it, else NaN."""
+    told = getattr(fitted, "criterion", None)
+    return np.nan if told is None else told()
 
 
 def _equilibrium(

@@ -1354,6 +1354,25 @@ class SubspaceLTI(
             raise ValueError(f"`omega` must be finite. Got {found.max()} per sample.")
         return found
 
+    def criterion(self) -> float:
+        """How likely the model makes its samples, and what its parameters cost.
+
+        Of models of the same samples the one with the least value is to be preferred,
+        as by Akaike's criterion; each of them has its own noise.
+
+        Returns
+        -------
+        float
+            Minus twice the logarithm of the likelihood but for a constant, and four
+            for every parameter and every unknown of the experiments. Minus infinity
+            where nothing is left of an output; NaN with `integrating`, where the errors
+            are those of the rates.
+        """
+        check_is_fitted(self, "lti_")
+        if isinstance(self._evidence, RateEvidence):
+            return np.nan
+        return self._evidence.one_step.criterion
+
     def resting_point(self, *, begun: bool = False) -> tuple[Array, Array]:
         """Inputs and outputs at rest: `input_offset_` and `output_offset_` pooled.
 

@@ -283,3 +283,29 @@ def test_what_drifts_at_some_points_is_looked_for_at_all():
         true, found = plant(z), model.lpv_.at(z)
         assert found.order == 2
         assert (found - true).hinf_norm() < 0.05 * true.hinf_norm()
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_points_together_tell_that_outputs_drift(seed):
+    """Two tanks, not linear: each point alone has slow states for it, or grows."""
+    rng, X, Y = np.random.default_rng(seed), [], []
+    for run, level in enumerate([1.5, 3.0, 5.0, 8.0]):
+        u = 0.45 * np.sqrt(level) + 0.06 * np.repeat(rng.choice([-1.0, 1.0], 20), 20)
+        levels, y = np.full(2, level), np.empty(400)
+        for k in range(400):
+            y[k] = levels[1]
+            for _ in range(4):  # half a second each
+                out = 0.45 * np.sqrt(levels)
+                levels = levels + 0.125 * np.array([u[k] - out[0], out[0] - out[1]])
+        size, drift = y.std(), rng.uniform(-1.5, 1.5)
+        y += size * (drift * np.linspace(0, 1, 400) + 0.03 * rng.standard_normal(400))
+        columns = {"u": u, "kappa": level, "run": run, "time": 2.0 * np.arange(400)}
+        X.append(pd.DataFrame(columns))
+        Y.append(y)
+    model = LocalLPVPipeline(**ROLES).fit(pd.concat(X), np.concatenate(Y))
+    for level in (2.2, 4.0, 6.5):
+        found = model.lpv_.at(level)
+        assert found.order == 2
+        assert found.dc_gain().item() == pytest.approx(
+            2.0 * np.sqrt(level) / 0.45, rel=0.1
+        )
