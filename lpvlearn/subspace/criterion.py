@@ -9,7 +9,7 @@ import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 
 from ..systems.simulation import estimate_initial_state, free_responses
-from .noise import autoregression, taper
+from .noise import autoregression, taper, whitening_filter
 from .signals import Record
 from .simulation_fit import Freedom, Realization, simulation_errors
 
@@ -91,7 +91,7 @@ def _innovations(
     for i in range(len(model.C)):
         parts = [error[:, [i]] for error in errors]
         noise = autoregression(parts, highest=int(highest[i]))
-        filters.append(np.append(1.0, -noise.C[0]))
+        filters.append(whitening_filter(noise))
         sizes.append(np.sqrt(noise.covariance[0, 0]) or 1.0)
     lost, squares = max(map(len, filters)) - 1, np.zeros(len(sizes))
     n_samples = np.zeros(len(sizes))

@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import special
 
@@ -35,7 +34,7 @@ from ..data.preparation import (
 )
 from ..systems.simulation import delayed
 from .identification import Settings, fit_once
-from .noise import Whitening, autoregression
+from .noise import Whitening, autoregression, through_filter, whitening_filter
 from .selection import select
 from .signals import Record
 from .simulation_fit import simulation_errors
@@ -359,16 +358,10 @@ class _Trial:
         if not np.isfinite(size).all():
             return self
         size[size == 0.0] = 1.0
-        model = autoregression(
-            [e[:, [i]] / size[i] for e in errors for i in range(len(size))]
-        )
-        a = np.concatenate([[1.0], -model.C[0]])
-
-        def white(signal: Array) -> Array:
-            return scipy.signal.lfilter(a, [1.0], signal, axis=0)[len(a) - 1 :]
-
-        filtered = [(white(u), white(y)) for u, y in self.pairs]
-        return self.of(filtered, self.settings, self.longest, self.horizon, size)
+        channels = [e[:, [i]] / size[i] for e in errors for i in range(len(size))]
+        a = whitening_filter(autoregression(channels))
+        white = [(through_filter(a, u), through_filter(a, y)) for u, y in self.pairs]
+        return self.of(white, self.settings, self.longest, self.horizon, size)
 
     def delay_of(
         self, j: int, longest: Delay, orders: Sequence[int], *, given: bool

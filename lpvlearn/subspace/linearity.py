@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 
 from ..systems.least_squares import scaled_lstsq
@@ -26,6 +25,7 @@ from ..systems.simulation import (
     trend_signals,
 )
 from ..systems.threads import one_blas_thread
+from .noise import through_filter
 from .residuals import (
     CERTAIN,
     DEPENDENT,
@@ -138,7 +138,7 @@ def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:
     """Filtered signals of all records, of each less what the first `n_own` explain."""
     rows = []
     for part in signals:
-        white = scipy.signal.lfilter(a, [1.0], part, axis=0)[len(a) - 1 :]
+        white = through_filter(a, part)
         own = of_size_one(white[:, :n_own])
         rows.append(without(own, white[:, n_own:])[0])
     return np.vstack(rows)

@@ -97,8 +97,8 @@ class Whitening(NamedTuple):
         if filtered:
             channels = [e[:, [i]] / size[i] for e in errors for i in noisy]
             middle = int(np.median([len(e) for e in errors]))
-            model = autoregression(channels, highest=middle // _LEAST_LEFT)
-            coefficients = np.concatenate([coefficients, -model.C[0]])
+            highest = middle // _LEAST_LEFT
+            coefficients = whitening_filter(autoregression(channels, highest=highest))
         whitened = cls(coefficients, np.eye(len(size)))._filtered(errors)
         return cls(coefficients, _weight(np.vstack(whitened), free))
 
@@ -123,11 +123,7 @@ class Whitening(NamedTuple):
     def _filtered(self, samples: Sequence[Array]) -> list[Array]:
         """Samples without those to which the filter would need others before them."""
         lost = len(self.filter) - 1
-        return [
-            scipy.signal.lfilter(self.filter, [1.0], z, axis=0)[lost:]
-            for z in samples
-            if len(z) > 2 * lost
-        ]
+        return [through_filter(self.filter, z) for z in samples if len(z) > 2 * lost]
 
     def records(self, records: Sequence[Record], free: Freedom) -> list[Record]:
         """Samples filtered and weighted.
@@ -142,11 +138,10 @@ class Whitening(NamedTuple):
         for u, y, trend, missing in records:
             if u.shape[1] > 2 * lost:
                 if lost:
-                    u = scipy.signal.lfilter(self.filter, [1.0], u, axis=1)[:, first:]
-                    y = scipy.signal.lfilter(self.filter, [1.0], y, axis=1)[:, first:]
-                    if len(trend):
-                        trend = scipy.signal.lfilter(self.filter, [1.0], trend, axis=1)
-                        trend = trend[:, first:]
+                    u, y, trend = (
+                        through_filter(self.filter, z.T, first).T if len(z) else z
+                        for z in (u, y, trend)
+                    )
                 if not _is_identity(self.weight):
                     y = self.weight @ y
                 u, y, trend = (np.ascontiguousarray(z) for z in (u, y, trend))
@@ -168,6 +163,29 @@ class Whitening(NamedTuple):
         """The model of the samples before, by one of whitened samples."""
         C, D = (linalg.solve(self.weight, M) for M in (model.C, model.D))
         return model._replace(C=C, D=D)
+
+
+def whitening_filter(noise: NoiseModel) -> Array:
+    """Coefficients ``[1, a_1, ..., a_p]`` that whiten an `autoregression` of a channel.
+
+    >>> e = np.random.default_rng(0).standard_normal((5000, 1))
+    >>> v = scipy.signal.lfilter([1.0], [1.0, -0.9], e, axis=0)
+    >>> whitening_filter(autoregression([v])).round(2)
+    array([ 1. , -0.9])
+    """
+    return np.append(1.0, -noise.C[0])
+
+
+def through_filter(a: Array, signals: Array, first: int | None = None) -> Array:
+    """Signals, a row per sample, through ``a(q)``: from the `first` sample on.
+
+    None leaves out the first ones, to which the filter would need others before them.
+
+    >>> through_filter(np.array([1.0, -1.0]), np.array([1.0, 3.0, 6.0]))
+    array([2., 3.])
+    """
+    through: Array = scipy.signal.lfilter(a, [1.0], signals, axis=0)
+    return through[len(a) - 1 if first is None else first :]
 
 
 def _is_identity(weight: Array) -> bool:

@@ -55,7 +55,7 @@ from ..systems.threads import one_blas_thread
 from ..validation import one_of, share, whole_number
 from .hankel import cholesky_factor, correlation_sequence, stack_factors
 from .identification import centred
-from .noise import autoregression
+from .noise import autoregression, through_filter, whitening_filter
 from .signals import thinned
 from .simulation_fit import simulation_errors, with_initial_states
 from .statistics import Evidence
@@ -407,9 +407,8 @@ def input_tests(
             if len(e) < start + n_rows:
                 continue
             own = [] if fitted is None else _sensitivities(fitted, i, u)
-            present = np.column_stack([*own, e[:, i]])
-            white = scipy.signal.lfilter(a, [1.0], present, axis=0)
-            parts.append((white[start + n_lags : len(e) - n_lags].T, u[start:]))
+            white = through_filter(a, np.column_stack([*own, e[:, i]]))
+            parts.append((white[n_lags : len(white) - n_lags].T, u[start:]))
         n = sum(white.shape[1] for white, _ in parts)
         columns = of_size_one(_factor(parts, n_rows))
         n_own = columns.shape[1] - 1 - n_rows * m
@@ -614,10 +613,10 @@ def _factor(parts: Sequence[tuple[Array, Array]], n_rows: int) -> Array:
 
 def whitening_filters(errors: Sequence[Array]) -> list[Array]:
     """Coefficients ``[1, a_1, ..., a_p]`` that whiten the errors of every output."""
-    models = [
-        autoregression([e[:, [i]] for e in errors]) for i in range(errors[0].shape[1])
+    return [
+        whitening_filter(autoregression([e[:, [i]] for e in errors]))
+        for i in range(errors[0].shape[1])
     ]
-    return [np.concatenate([[1.0], -model.C[0]]) for model in models]
 
 
 def filtered(signals: Sequence[Array], filters: Sequence[Array]) -> list[Array]:
@@ -626,7 +625,7 @@ def filtered(signals: Sequence[Array], filters: Sequence[Array]) -> list[Array]:
     return [
         np.column_stack(
             [
-                scipy.signal.lfilter(a, [1.0], x)[start:]
+                through_filter(a, x, start)
                 for a, x in zip(filters, signal.T, strict=True)
             ]
         )
