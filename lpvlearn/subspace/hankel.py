@@ -21,7 +21,7 @@ batch by batch: its `HankelSum` grows by the columns that each batch completes.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -379,6 +379,23 @@ def stack_factors(factors: Sequence[Array]) -> Array:
     lower[:, : upper.shape[0]] = upper.T
     signs = np.where(np.diagonal(lower) < 0.0, -1.0, 1.0)
     return lower * signs
+
+
+def factor_of_pieces(gram: Array, pieces: Iterable[Array]) -> Array:
+    """Triangular factor of columns in pieces, whose Gram matrix is known.
+
+    By the pieces, which are not looked at before, where squaring would lose accuracy.
+
+    >>> piece = np.array([[3.0, 4.0]])
+    >>> factor_of_pieces(2 * piece @ piece.T, [piece, piece]) ** 2
+    array([[50.]])
+    """
+    lower = cholesky_factor(gram)
+    if lower is None:
+        lower = np.zeros((len(gram), 0))
+        for piece in pieces:
+            lower = stack_factors([lower, piece])
+    return lower
 
 
 def _hankel_matrix(z: Array, n_rows: int) -> Array:

@@ -53,7 +53,7 @@ from ..systems.simulation import (
 )
 from ..systems.threads import one_blas_thread
 from ..validation import one_of, share, whole_number
-from .hankel import cholesky_factor, correlation_sequence, stack_factors
+from .hankel import correlation_sequence, factor_of_pieces
 from .identification import centred
 from .noise import autoregression, through_filter, whitening_filter
 from .signals import thinned
@@ -603,12 +603,7 @@ def _factor(parts: Sequence[tuple[Array, Array]], n_rows: int) -> Array:
                 yield np.vstack([white[:-1, piece], lagged, white[-1:, piece]])
 
     gram = np.asarray(sum(piece @ piece.T for piece in pieces()))
-    lower = cholesky_factor(gram)
-    if lower is None:
-        lower = np.zeros((len(gram), 0))
-        for piece in pieces():
-            lower = stack_factors([lower, piece])
-    return lower.T
+    return factor_of_pieces(gram, pieces()).T
 
 
 def whitening_filters(errors: Sequence[Array]) -> list[Array]:

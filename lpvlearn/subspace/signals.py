@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.simulation import trend_signals
-from .hankel import cholesky_factor, stack_factors
+from .hankel import factor_of_pieces
 
 Array = NDArray[np.float64]
 
@@ -252,12 +252,7 @@ def signal_factor(
         gram = np.asarray(gram)
         if not gram.diagonal().max(initial=0.0) < _LARGEST:
             return None
-        lower = cholesky_factor(gram)
-    if lower is None:
-        lower = np.zeros((len(gram), 0))
-        for X in signal_pieces(blocks, record, driven):
-            lower = stack_factors([lower, X])
-    return lower.T
+    return factor_of_pieces(gram, signal_pieces(blocks, record, driven)).T
 
 
 def signal_factors(
@@ -385,8 +380,7 @@ class SharedSignals:
         gram[:, first : first + ny] = products.T
         if not gram.diagonal().max() < _LARGEST:
             return None
-        lower = cholesky_factor(gram)
-        return (stack_factors([X]) if lower is None else lower).T
+        return factor_of_pieces(gram, [X]).T
 
 
 class _SectionBank:
