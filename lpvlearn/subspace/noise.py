@@ -27,6 +27,7 @@ from scipy import linalg
 
 from ..models.innovation import NoiseModel
 from ..systems.balancing import balancing_transformation
+from ..systems.innovations import innovations
 from ..systems.response import resolvent
 from .hankel import correlation_sequence
 from .signals import Record
@@ -364,9 +365,7 @@ def reduced_noise_model(model: NoiseModel, order: int) -> NoiseModel:
     left, right = left[:order], right[:, :order]
     A, C, K = left @ model.A @ right, model.C @ right, left @ model.K
     Q, S = K @ model.covariance @ K.T, K @ model.covariance
-    P = linalg.solve_discrete_are(A.T, C.T, Q, model.covariance, s=S)
-    covariance = C @ P @ C.T + model.covariance
-    gain = linalg.solve(covariance, (A @ P @ C.T + S).T, assume_a="pos").T
+    gain, covariance = innovations(A, C, Q, S, model.covariance)
     return NoiseModel(A, C, gain, 0.5 * (covariance + covariance.T))
 
 
