@@ -41,6 +41,16 @@ class NoiseModel(NamedTuple):
     K: Array  # (n_states, n_outputs), innovation gain; A - K C is stable
     covariance: Array  # (n_outputs, n_outputs), of the innovations e
 
+    @classmethod
+    def white(cls, covariance: Array) -> NoiseModel:
+        """The one without states.
+
+        >>> NoiseModel.white(np.eye(2)).C.shape
+        (2, 0)
+        """
+        ny = len(covariance)
+        return cls(np.zeros((0, 0)), np.zeros((ny, 0)), np.zeros((0, ny)), covariance)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class InnovationModel(VersionedPickle):

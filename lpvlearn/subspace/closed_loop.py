@@ -205,7 +205,7 @@ class _Predictor(NamedTuple):
         """Of the parameters of the predictor, whose errors are white."""
         half = linalg.solve_triangular(self.root, covariance, lower=True)
         white = linalg.solve_triangular(self.root, half.T, lower=True)
-        noise = NoiseModel(*_no_states(len(white)), white)
+        noise = NoiseModel.white(white)
         known = parameter_covariance(self.model, self.records, self.free, noise)
         return known * self.share
 
@@ -760,7 +760,3 @@ def _riccati_gain(A: Array, C: Array, W: Array, E: Array, n_columns: int) -> Arr
     Q, S, R = (M / n_columns for M in (W @ W.T, W @ E.T, E @ E.T))
     Q = Q + _RICCATI_FLOOR * np.trace(Q) / len(Q) * np.eye(len(Q))
     return innovations(A, C, Q, S, R).gain
-
-
-def _no_states(ny: int) -> tuple[Array, Array, Array]:
-    return np.zeros((0, 0)), np.zeros((ny, 0)), np.zeros((0, ny))

@@ -269,9 +269,7 @@ def noise_of(errors: Sequence[Array]) -> NoiseModel:
     white = [rng.standard_normal(v.shape) for v in errors]
     n_known = np.maximum(np.count_nonzero(~missing, axis=0), 1)
     power = np.nansum(np.vstack(errors) ** 2, axis=0) / n_known
-    ny = len(power)
-    none = np.zeros((0, 0)), np.zeros((ny, 0)), np.zeros((0, ny))
-    noise = NoiseModel(*none, np.diag(power))
+    noise = NoiseModel.white(np.diag(power))
     for _ in range(_DRAWN):
         size = np.sqrt(np.maximum(np.diagonal(noise.covariance), 0.0))
         unit = np.where(size > 0.0, size, 1.0)

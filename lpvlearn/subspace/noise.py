@@ -349,15 +349,12 @@ def reduced_noise_model(model: NoiseModel, order: int) -> NoiseModel:
     """
     if len(model.A) <= order:
         return model
-    ny = len(model.C)
     if order == 0:
         P = linalg.solve_discrete_lyapunov(
             model.A, model.K @ model.covariance @ model.K.T
         )
         spread = model.C @ P @ model.C.T + model.covariance
-        return NoiseModel(
-            np.zeros((0, 0)), np.zeros((ny, 0)), np.zeros((0, ny)), spread
-        )
+        return NoiseModel.white(spread)
     root = linalg.cholesky(model.covariance, lower=True)
     _, left, right = balancing_transformation(
         model.A, model.K @ root, model.C, discrete=True

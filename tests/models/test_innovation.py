@@ -90,7 +90,7 @@ def test_missing_outputs_correct_nothing(joint):
 def test_a_missing_output_is_expected_from_the_other():
     rng = np.random.default_rng(0)
     lti = stable_model(rng, 3, 1, 2, sampling_time=1.0)
-    noise = NoiseModel(*_no_states(), np.array([[1.0, 2.0], [2.0, 4.0]]))
+    noise = NoiseModel.white(np.array([[1.0, 2.0], [2.0, 4.0]]))
     model = InnovationModel(lti, noise, 0.1 * rng.standard_normal((3, 2)))
     u, e = rng.standard_normal((2, 60, 1))
     e, x, y = e * [1.0, 2.0], np.zeros(3), np.zeros((60, 2))
@@ -100,10 +100,6 @@ def test_a_missing_output_is_expected_from_the_other():
     lost = y.copy()
     lost[10:40, 1] = np.nan
     assert_allclose(y - model.predict(u, lost), e, atol=1e-9)
-
-
-def _no_states():
-    return np.zeros((0, 0)), np.zeros((2, 0)), np.zeros((0, 2))
 
 
 def test_trends_are_found_beside_the_initial_state(joint):

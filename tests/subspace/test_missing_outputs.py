@@ -99,7 +99,7 @@ def test_expected_outputs_make_the_least_of_the_innovations():
 
 
 def test_white_errors_of_missing_outputs_are_zero():
-    noise = NoiseModel(np.zeros((0, 0)), np.zeros((1, 0)), np.zeros((0, 1)), np.eye(1))
+    noise = NoiseModel.white(np.eye(1))
     errors = np.random.default_rng(0).standard_normal((30, 1))
     missing = np.arange(30)[:, None] % 4 == 0
     left = errors + expected_change(noise, errors, missing)
