@@ -25,6 +25,7 @@ from ..data.experiments import Experiment
 from ..data.preparation import complete_runs, part_of
 from ..exceptions import warn
 from ..models.innovation import InnovationModel, NoiseModel
+from ..systems.innovations import covariance_root
 from ..systems.simulation import lti_response, state_trajectory
 from .noise import autoregression
 from .telling import Telling
@@ -271,10 +272,7 @@ def noise_of(errors: Sequence[Array]) -> NoiseModel:
     power = np.nansum(np.vstack(errors) ** 2, axis=0) / n_known
     noise = NoiseModel.white(np.diag(power))
     for _ in range(_DRAWN):
-        size = np.sqrt(np.maximum(np.diagonal(noise.covariance), 0.0))
-        unit = np.where(size > 0.0, size, 1.0)
-        values, vectors = np.linalg.eigh(noise.covariance / np.outer(unit, unit))
-        root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        root = covariance_root(noise.covariance)
         signals = [
             lti_response(noise.A, noise.K @ root, noise.C, root, z) for z in white
         ]

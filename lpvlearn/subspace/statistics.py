@@ -29,6 +29,7 @@ from scipy import fft
 
 from ..models.innovation import InnovationModel, NoiseModel
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
+from ..systems.innovations import covariance_root
 from ..systems.response import resolvent
 from .criterion import criterion_of
 from .missing_outputs import noise_of
@@ -277,7 +278,8 @@ class Evidence:
             moved = moved_model(self.sections, change, self.free)
             return self.state_space(self.whitening.undone(moved), lti.sampling_time)
 
-        changes = DEVIATION * _square_root(self.covariance).T
+        root = covariance_root(self.covariance, _NEGLIGIBLE)
+        changes = DEVIATION * root[:, root.any(axis=0)].T
         return [(deviated(change), deviated(-change)) for change in changes]
 
     def poles_std(self) -> NDArray[np.complex128]:
@@ -366,15 +368,6 @@ def _deviations(J: NDArray[np.complex128], covariance: Array) -> NDArray[np.comp
     ]
     real, imag = (np.sqrt(np.maximum(variance, 0.0)) for variance in variances)
     return real + 1j * imag
-
-
-def _square_root(covariance: Array) -> Array:
-    """L with ``L L.T`` the covariance, of full column rank."""
-    scale = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    unit = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(covariance / unit[:, None] / unit)
-    kept = values > _NEGLIGIBLE * values.max(initial=0.0)
-    return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
 
 
 def parameter_covariance(

@@ -32,3 +32,22 @@ def innovations(A: Array, C: Array, Q: Array, S: Array, R: Array) -> Innovations
     covariance = C @ P @ C.T + R
     gain = linalg.solve(covariance, (A @ P @ C.T + S).T, assume_a="pos").T
     return Innovations(gain, covariance)
+
+
+def covariance_root(covariance: Array, negligible: float = 0.0) -> Array:
+    """Square L with ``L L.T`` the covariance.
+
+    A column stands for a direction of the channels, these scaled to variance one. It is
+    zero where the variance along it is no more than a `negligible` share of the
+    largest.
+
+    >>> L = covariance_root(np.array([[4.0, 6.0], [6.0, 9.0]]), 1e-12)
+    >>> (L @ L.T).round(3), L.any(axis=0)
+    (array([[4., 6.],
+           [6., 9.]]), array([False,  True]))
+    """
+    size = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    unit = np.where(size > 0.0, size, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    kept = values > negligible * values.max(initial=0.0)
+    return size[:, None] * vectors * np.sqrt(np.where(kept, values, 0.0))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lpvlearn.systems.innovations import innovations
+from lpvlearn.systems.innovations import covariance_root, innovations
 
 
 def test_the_filter_of_an_innovation_form_has_its_gain_and_covariance():
@@ -24,3 +24,12 @@ def test_a_filter_of_sensor_noise_predicts_with_the_least_variance():
     found = innovations(a * one, one, q * one, 0.0 * one, r * one)
     np.testing.assert_allclose(found.covariance, p + r)
     np.testing.assert_allclose(found.gain, a * p / (p + r))
+
+
+def test_the_root_of_a_covariance_is_one_whatever_the_units():
+    factor = np.random.default_rng(0).standard_normal((3, 2))
+    units = np.array([1e-90, 1.0, 1e90])
+    covariance = factor @ factor.T * units[:, None] * units
+    root = covariance_root(covariance, 1e-12)
+    np.testing.assert_allclose(root @ root.T / covariance, 1.0, rtol=1e-12)
+    assert root.any(axis=0).sum() == 2
