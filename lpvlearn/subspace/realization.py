@@ -173,6 +173,18 @@ def shift_invariant_pair(
     return np.ascontiguousarray(A), leading[:n_outputs].copy()
 
 
+def observability_matrix(A: Array, C: Array, length: int) -> Array:
+    """Extended observability matrix ``[C; C A; C A^2; ...]`` of `length` block rows.
+
+    >>> observability_matrix(np.array([[0.5]]), np.array([[2.0]]), 3).ravel()
+    array([2. , 1. , 0.5])
+    """
+    rows = [C]
+    for _ in range(length - 1):
+        rows.append(rows[-1] @ A)
+    return np.vstack(rows)
+
+
 def reflect_unstable(A: Array, limit: float = 1.0) -> Array:
     """Reflect the poles outside a circle around the origin into it.
 
@@ -212,13 +224,9 @@ def _dominant_pair(
     >>> _dominant_pair(A, B, C, 1, 8)[0].round(6)
     array([[0.9]])
     """
-    seen, reached = [C], [B]
-    for _ in range(length - 1):
-        seen.append(seen[-1] @ A)
-        reached.append(A @ reached[-1])
-    left, s, _ = linalg.svd(
-        np.vstack(seen) @ np.hstack(reached), full_matrices=False, check_finite=False
-    )
+    seen = observability_matrix(A, C, length)
+    reached = observability_matrix(A.T, B.T, length).T
+    left, s, _ = linalg.svd(seen @ reached, full_matrices=False, check_finite=False)
     return shift_invariant_pair(left * np.sqrt(s), len(C), order)
 
 
@@ -234,10 +242,7 @@ def factor_input_matrices(
     `simulation_fit`, which needs the samples. `factor` is that of ``[U_f; ...; Y_f]``.
     """
     (ny, n), m = C.shape, free.direct.shape[1]
-    powers = [C]
-    for _ in range(horizon - 1):
-        powers.append(powers[-1] @ A)
-    observability = np.vstack(powers)
+    observability = observability_matrix(A, C, horizon)
     Q = linalg.qr(observability, check_finite=False)[0][:, n:]
     L11 = factor[: horizon * m, : horizon * m].reshape(horizon, m, horizon * m)
     L31 = Q.T @ factor[-horizon * ny :, : horizon * m]

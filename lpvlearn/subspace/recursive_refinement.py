@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.least_squares import column_scale, scaled_lstsq
+from .realization import observability_matrix
 from .signals import Record, block_slices, signal_factor
 from .simulation_fit import (
     Freedom,
@@ -172,7 +173,8 @@ def _aligned_pair(
         return (), C
     parts = block_slices(pilot.blocks)
     coupled = linalg.block_diag(*map(np.ones_like, pilot.blocks)) == 0.0
-    T = linalg.lstsq(_observability(A, C), _observability(pilot.A, pilot.C))[0]
+    seen = observability_matrix(A, C, 2 * n)
+    T = linalg.lstsq(seen, observability_matrix(pilot.A, pilot.C, 2 * n))[0]
     try:
         A, C = linalg.solve(T, A @ T), C @ T
         for _ in range(_MAX_ALIGN):
@@ -188,14 +190,6 @@ def _aligned_pair(
     except (linalg.LinAlgError, ValueError):
         return None
     return None
-
-
-def _observability(A: Array, C: Array) -> Array:
-    """Extended observability matrix, of twice the order."""
-    rows = [C]
-    for _ in range(2 * len(A) - 1):
-        rows.append(rows[-1] @ A)
-    return np.vstack(rows)
 
 
 def extend_recursion(
