@@ -194,19 +194,14 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
     Canonical correlations of the innovations with future inputs, given present and past
     ones and past outputs, by Bartlett's approximation of Wilks' criterion.
     """
-    records = _some(records)
-    m, ny = len(records[0].u), len(records[0].y)
-    c = m + ny
-    longest = longest_past(records, _MAX_ROWS - _N_FUTURE * m, _N_FUTURE)
-    if longest == 0:
+    whole = _Past.of(records, _N_FUTURE)
+    if whole is None:
         return None
-    factor = _newest_first(records, longest, _N_FUTURE)
-    n = n_windows(records, longest + _N_FUTURE)
-    rows = factor[longest * c :]
-    past = _chosen_past(rows[:c], n, 1, longest, np.ones(m, dtype=bool))
-    cut_off = past == longest and longest * c < _MAX_ROWS - _N_FUTURE * m
+    m, ny = len(whole.records[0].u), len(whole.records[0].y)
+    c, past, rows = m + ny, whole.needed, whole.present
+    cut_off = past == whole.longest and past * c < _MAX_ROWS - _N_FUTURE * m
     u, y, future = np.split(rows[:, past * c :], [m, c])
-    dof = n - past * c
+    dof = whole.n_windows - past * c
     within = _wilks(y, _basis(u, rows[:m], _FORESEEN), dof)
     seen = _basis(y, rows[m:c], _DEPENDENT)
     foreseen = not _basis(u - (u @ seen) @ seen.T, rows[:m], _FORESEEN).size
@@ -215,9 +210,9 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
     noisy = np.linalg.norm(y, axis=1) > _NOISE_FREE * np.linalg.norm(rows[m:c], axis=1)
     dof -= m
     found, curved = _wilks(y[noisy], _basis(future, rows[c:], _FORESEEN), dof), 0.0
-    windows, calm = _windows_of(records, past), None
+    windows, calm = _windows_of(whole.records, past), None
     if found.p_value >= _LEVEL:
-        known = np.vstack([rows[:m], factor[: past * c]])
+        known = np.vstack([rows[:m], whole.before])
         steps = scaled_lstsq(known.T, rows[c : c + m].T, _DEPENDENT)[0]
         calm = _calm(windows, steps)
         if calm is not None:
@@ -227,39 +222,64 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
         # Kicks of an input hide whether it answers within the sample.
         first = 1 if within.p_value < _INSTANTANEOUS or calm is not None else 0
         of_most, curved = _of_most(windows, m, noisy, first, calm)
-        found = max(found, of_most)
-    innovations = np.sum(y**2, axis=1) / max(dof, 1)
-    regression = _coefficients(factor, past, longest, m, ny)
-    acting, lines = within.p_value, (1.0, 1.0)
-    if acting < _INSTANTANEOUS and noisy.any() and m == 1:
-        before = scaled_lstsq(factor[: past * c].T, rows[:c].T, _DEPENDENT)[0]
-        lines = _straight_lines(windows, before, m, noisy)
-    told = *found, acting, curved, innovations, cut_off, regression, foreseen
-    return Feedback(*told, *lines)
+        found = max(found, of_most, key=lambda test: (test.p_value, test.share))
+    p_direct = p_answer = 1.0
+    if within.p_value < _INSTANTANEOUS and noisy.any() and m == 1:
+        before = scaled_lstsq(whole.before.T, rows[:c].T, _DEPENDENT)[0]
+        p_direct, p_answer = _straight_lines(windows, before, m, noisy)
+    return Feedback(
+        p_value=found.p_value,
+        share=found.share,
+        p_instantaneous=within.p_value,
+        curved=curved,
+        innovations=np.sum(y**2, axis=1) / max(dof, 1),
+        cut_off=cut_off,
+        regression=_coefficients(whole),
+        foreseen=foreseen,
+        p_direct=p_direct,
+        p_answer=p_answer,
+    )
 
 
 def regression_of(records: Sequence[Record]) -> Regression | None:
     """The VARX of samples, of as long a past as they need; None for too few."""
-    records = _some(records)
-    m, ny = len(records[0].u), len(records[0].y)
-    longest = longest_past(records, _MAX_ROWS - _N_FUTURE * m, _N_FUTURE)
-    if longest == 0:
-        return None
-    factor, direct = _newest_first(records, longest, 0), np.ones(m, dtype=bool)
-    n = n_windows(records, longest)
-    past = _chosen_past(factor[longest * (m + ny) :], n, 1, longest, direct)
-    return _coefficients(factor, past, longest, m, ny)
+    whole = _Past.of(records, 0)
+    return None if whole is None else _coefficients(whole)
 
 
-def _coefficients(factor: Array, past: int, longest: int, m: int, ny: int) -> Array:
-    """P of the innovations, from a factor of the newest of `longest` samples first."""
-    c = m + ny
-    u, y = np.split(factor[longest * c : (longest + 1) * c], [m])
-    known = np.vstack([u, factor[: past * c]])
+class _Past(NamedTuple):
+    """Rows of a factor of samples with as long a past as they need."""
+
+    records: list[Record]
+    before: Array  # of so many samples as are `needed` of the past, newest first
+    present: Array  # of the samples themselves, and of future inputs
+    needed: int
+    longest: int  # past that was tried
+    n_windows: int
+
+    @classmethod
+    def of(cls, records: Sequence[Record], ahead: int) -> _Past | None:
+        """That of records, and of so many future inputs; None for too few samples."""
+        records = _some(records)
+        m, c = len(records[0].u), len(records[0].u) + len(records[0].y)
+        longest = longest_past(records, _MAX_ROWS - _N_FUTURE * m, _N_FUTURE)
+        if longest == 0:
+            return None
+        factor = _newest_first(records, longest, ahead)
+        present, n = factor[longest * c :], n_windows(records, longest + ahead)
+        needed = _chosen_past(present[:c], n, 1, longest, np.ones(m, dtype=bool))
+        return cls(records, factor[: needed * c], present, needed, longest, n)
+
+
+def _coefficients(past: _Past) -> Regression:
+    """P of the innovations."""
+    m, ny = len(past.records[0].u), len(past.records[0].y)
+    u, y = np.split(past.present[: m + ny], [m])
+    known = np.vstack([u, past.before])
     direct, before = np.split(scaled_lstsq(known.T, y.T, _DEPENDENT)[0], [m])
-    P = np.zeros((past + 1, ny, c))
+    P = np.zeros((past.needed + 1, ny, m + ny))
     P[0] = np.hstack([-direct.T, np.eye(ny)])
-    P[1:] = -before.reshape(past, c, ny).swapaxes(1, 2)
+    P[1:] = -before.reshape(past.needed, m + ny, ny).swapaxes(1, 2)
     return P
 
 
