@@ -63,7 +63,7 @@ from ..models.innovation import (
     NoiseModel,
     prediction_responses,
 )
-from ..systems.innovations import innovations
+from ..systems.innovations import kalman_filter
 from ..systems.least_squares import scaled_lstsq
 from ..systems.simulation import estimate_initial_state, state_trajectory
 from .hankel import hankel_factor
@@ -759,4 +759,4 @@ def _riccati_gain(A: Array, C: Array, W: Array, E: Array, n_columns: int) -> Arr
     """Kalman gain from the residuals of the state and of the output equation."""
     Q, S, R = (M / n_columns for M in (W @ W.T, W @ E.T, E @ E.T))
     Q = Q + _RICCATI_FLOOR * np.trace(Q) / len(Q) * np.eye(len(Q))
-    return innovations(A, C, Q, S, R).gain
+    return kalman_filter(A, C, Q, S, R).gain

@@ -18,16 +18,13 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, linalg
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy import linalg
 
 from ..data.experiments import Experiment
 from ..data.preparation import complete_runs, part_of
 from ..exceptions import warn
-from ..models.innovation import InnovationModel, NoiseModel
-from ..systems.innovations import covariance_root
-from ..systems.simulation import lti_response, state_trajectory
-from .noise import autoregression
+from ..models.innovation import InnovationModel
+from .noise import expected_change, expected_noise, noise_of
 from .telling import Telling
 
 Array = NDArray[np.float64]
@@ -41,14 +38,9 @@ _RCOND = 1e-6  # of its regression: inputs may hardly move
 # Pieces by what gaps of the inputs alone leave, and samples of a piece, to be told
 _MANY, _SHORT = 5, 50
 
-_DRAWN = 15  # times that missing errors are drawn, for the model of the noise
-
 # Share of an output that is there, below which that is told, and below which the order
 # is looked for by what is there alone
 _FEW, _SPARSE = 1.0 / 3.0, 0.6
-
-# Of conjugate gradients: standard deviations of an innovation, and steps
-_TOL, _STEPS = 1e-3, 200
 
 _FURTHEST = 20.0  # steps that several rounds may be taken further
 
@@ -243,53 +235,10 @@ def by_simulation(
     noise = noise_of(errors)
     return [
         with_estimates(
-            run, np.where(np.isnan(v), y + _expected(noise, v), run.measured)
+            run, np.where(np.isnan(v), y + expected_noise(noise, v), run.measured)
         )
         for run, y, v in zip(runs, simulated, errors, strict=True)
     ]
-
-
-def noise_of(errors: Sequence[Array]) -> NoiseModel:
-    """Autoregression of errors of which some are missing (NaN).
-
-    Of what is drawn by the model before from all that the missing ones may be: a signal
-    by the model, and what is expected of the difference. Expected errors alone have not
-    the power that the noise has, and would be more and more of a wave through those
-    that are known (stochastic EM: G. Celeux and J. Diebolt, 1985).
-
-    >>> e = np.random.default_rng(0).standard_normal((5000, 1))
-    >>> v = lti_response(*np.array([[[0.9]], [[1.0]], [[0.9]], [[1.0]]]), e)
-    >>> v[np.random.default_rng(1).random(5000) < 0.4] = np.nan
-    >>> noise_of([v]).C.round(2)
-    array([[0.9]])
-    """
-    missing = np.isnan(np.vstack(errors))
-    if not missing.any():
-        return autoregression(errors)
-    rng = np.random.default_rng(0)  # the same draws from round to round
-    white = [rng.standard_normal(v.shape) for v in errors]
-    n_known = np.maximum(np.count_nonzero(~missing, axis=0), 1)
-    power = np.nansum(np.vstack(errors) ** 2, axis=0) / n_known
-    noise = NoiseModel.white(np.diag(power))
-    for _ in range(_DRAWN):
-        root = covariance_root(noise.covariance)
-        signals = [
-            lti_response(noise.A, noise.K @ root, noise.C, root, z) for z in white
-        ]
-        drawn = [
-            np.where(np.isnan(v), signal + _expected(noise, v - signal), v)
-            for v, signal in zip(errors, signals, strict=True)
-        ]
-        noise = autoregression(drawn)
-    return noise
-
-
-def _expected(noise: NoiseModel, v: Array) -> Array:
-    """What noise is expected to be where it is not known (NaN)."""
-    whitener = noise.A - noise.K @ noise.C, noise.K, -noise.C, np.eye(len(noise.C))
-    missing = np.isnan(v)
-    v = np.where(missing, 0.0, v)
-    return v + expected_change(noise, lti_response(*whitener, v), missing)
 
 
 def by_prediction(
@@ -305,49 +254,6 @@ def by_prediction(
     y = np.where(missing, model.predict(u, y, initial_state=x0), y)
     innovations = y - model.predict(u, y, initial_state=x0)
     return with_estimates(run, level + y + expected_change(model, innovations, missing))
-
-
-def expected_change(
-    noise: NoiseModel | InnovationModel, innovations: Array, missing: NDArray[np.bool_]
-) -> Array:
-    """Change of missing outputs after which the innovations are the smallest.
-
-    Both arrays have shape (n_samples, n_outputs); `innovations` are those of some
-    values of the missing outputs. What comes after an experiment is not asked about.
-    """
-    A, C, K, S = noise.A, noise.C, noise.K, noise.covariance
-    change = np.zeros(missing.shape)
-    if not missing.any():
-        return change
-    scale = np.sqrt(np.maximum(np.diagonal(S), 0.0))
-    scale = np.maximum(scale, _ROUNDING * np.sqrt(np.mean(innovations**2, axis=0)))
-    scale[scale == 0.0] = 1.0
-    weight = np.linalg.pinv(S / scale[:, None] / scale, rcond=_RCOND, hermitian=True)
-    # Answers of the innovations, each in its own size, to impulses of the outputs
-    forcing = np.zeros((len(missing), *K.shape))
-    forcing[0] = K * scale
-    answers = -(C / scale[:, None]) @ state_trajectory(A - K @ C, forcing)
-    answers[0] += np.eye(len(S))
-    n_padded = fft.next_fast_len(2 * len(missing), real=True)
-    spectrum = fft.rfft(answers, n_padded, axis=0)
-
-    def convolved(spectrum: NDArray[np.complex128], v: Array) -> Array:
-        transformed = spectrum @ fft.rfft(v, n_padded, axis=0)[:, :, None]
-        return fft.irfft(transformed[:, :, 0], n_padded, axis=0)[: len(v)]
-
-    transposed = spectrum.conj().transpose(0, 2, 1)
-
-    def normal(x: Array) -> Array:
-        values = np.zeros(missing.shape)
-        values[missing] = x
-        return convolved(transposed, convolved(spectrum, values) @ weight)[missing]
-
-    size = np.count_nonzero(missing)
-    equations = LinearOperator((size, size), matvec=normal)
-    right = -convolved(transposed, (innovations / scale) @ weight)[missing]
-    tolerance = _TOL * np.sqrt(size)  # standard deviations
-    change[missing], _ = cg(equations, right, rtol=0.0, atol=tolerance, maxiter=_STEPS)
-    return change * scale
 
 
 def _lagged(u: Array, n_lags: int) -> Array:

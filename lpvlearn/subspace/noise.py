@@ -10,6 +10,9 @@ a weight W of the outputs,
 under which the dynamics stay the same, ``G_w = W G``, for a filter of all channels
 commutes with them. Colours that differ from output to output are evened out on the
 whole only, the correlation of the innovations completely.
+
+Errors of outputs that are missing are unknown: `expected_noise` is where the
+innovations are the smallest, and `noise_of` describes the others.
 """
 
 from __future__ import annotations
@@ -23,12 +26,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import fft, linalg
+from scipy.sparse.linalg import LinearOperator, cg
 
-from ..models.innovation import NoiseModel
+from ..models.innovation import InnovationModel, NoiseModel
 from ..systems.balancing import balancing_transformation
-from ..systems.innovations import innovations
+from ..systems.innovations import covariance_root, kalman_filter
 from ..systems.response import resolvent
+from ..systems.simulation import lti_response, state_trajectory
 from .hankel import correlation_sequence
 from .signals import Record
 from .simulation_fit import Freedom, Realization
@@ -46,7 +51,8 @@ _PATIENCE = 12  # lags beyond the best number that are looked at
 
 _MAX_CONDITION = 1e8  # of eigenvectors, which would lose half of the spectrum's digits
 
-_ROUNDING = 1e-9  # size of an error, relative to the output, that is not noise
+# Size of an error, relative to the output or to other errors, that is not noise
+_ROUNDING = 1e-9
 
 # Samples of an experiment by those that a filter takes away from it at its start.
 _LEAST_LEFT = 8
@@ -61,6 +67,11 @@ _SAME_FILTER, _SAME_WEIGHT = 0.05, 1.05
 _NOTHING = 1e-9  # of a constant: rounding of a filter that takes differences
 
 _LEAST_VARIANCE = 1e-6  # of a combination of outputs of unit variance, for its weight
+
+_DRAWN = 15  # times that missing errors are drawn, for the model of the noise
+
+# Of conjugate gradients: standard deviations of an innovation, and steps
+_TOLERANCE, _STEPS = 1e-3, 200
 
 
 class Whitening(NamedTuple):
@@ -341,6 +352,94 @@ def _regressions(lags: Array) -> Iterator[tuple[Array, Array]]:
         yield forth, ahead
 
 
+def noise_of(errors: Sequence[Array]) -> NoiseModel:
+    """`autoregression` of errors of which some are missing (NaN).
+
+    Of what is drawn by the model before from all that the missing ones may be: a signal
+    by the model, and what is expected of the difference. Expected errors alone have not
+    the power that the noise has, and would be more and more of a wave through those
+    that are known (stochastic EM: G. Celeux and J. Diebolt, 1985).
+
+    >>> e = np.random.default_rng(0).standard_normal((5000, 1))
+    >>> v = lti_response(*np.array([[[0.9]], [[1.0]], [[0.9]], [[1.0]]]), e)
+    >>> v[np.random.default_rng(1).random(5000) < 0.4] = np.nan
+    >>> noise_of([v]).C.round(2)
+    array([[0.9]])
+    """
+    missing = np.isnan(np.vstack(errors))
+    if not missing.any():
+        return autoregression(errors)
+    rng = np.random.default_rng(0)  # the same draws from round to round
+    white = [rng.standard_normal(v.shape) for v in errors]
+    n_known = np.maximum(np.count_nonzero(~missing, axis=0), 1)
+    power = np.nansum(np.vstack(errors) ** 2, axis=0) / n_known
+    noise = NoiseModel.white(np.diag(power))
+    for _ in range(_DRAWN):
+        root = covariance_root(noise.covariance)
+        signals = [
+            lti_response(noise.A, noise.K @ root, noise.C, root, z) for z in white
+        ]
+        drawn = [
+            np.where(np.isnan(v), signal + expected_noise(noise, v - signal), v)
+            for v, signal in zip(errors, signals, strict=True)
+        ]
+        noise = autoregression(drawn)
+    return noise
+
+
+def expected_noise(noise: NoiseModel, v: Array) -> Array:
+    """What noise is expected to be where it is not known (NaN)."""
+    whitener = noise.A - noise.K @ noise.C, noise.K, -noise.C, np.eye(len(noise.C))
+    missing = np.isnan(v)
+    v = np.where(missing, 0.0, v)
+    return v + expected_change(noise, lti_response(*whitener, v), missing)
+
+
+def expected_change(
+    noise: NoiseModel | InnovationModel, innovations: Array, missing: NDArray[np.bool_]
+) -> Array:
+    """Change of missing outputs after which the innovations are the smallest.
+
+    Both arrays have shape (n_samples, n_outputs); `innovations` are those of some
+    values of the missing outputs. What comes after an experiment is not asked about.
+    """
+    A, C, K, S = noise.A, noise.C, noise.K, noise.covariance
+    change = np.zeros(missing.shape)
+    if not missing.any():
+        return change
+    scale = np.sqrt(np.maximum(np.diagonal(S), 0.0))
+    scale = np.maximum(scale, _ROUNDING * np.sqrt(np.mean(innovations**2, axis=0)))
+    scale[scale == 0.0] = 1.0
+    weight = np.linalg.pinv(
+        S / scale[:, None] / scale, rcond=_LEAST_VARIANCE, hermitian=True
+    )
+    # Answers of the innovations, each in its own size, to impulses of the outputs
+    forcing = np.zeros((len(missing), *K.shape))
+    forcing[0] = K * scale
+    answers = -(C / scale[:, None]) @ state_trajectory(A - K @ C, forcing)
+    answers[0] += np.eye(len(S))
+    n_padded = fft.next_fast_len(2 * len(missing), real=True)
+    spectrum = fft.rfft(answers, n_padded, axis=0)
+
+    def convolved(spectrum: NDArray[np.complex128], v: Array) -> Array:
+        transformed = spectrum @ fft.rfft(v, n_padded, axis=0)[:, :, None]
+        return fft.irfft(transformed[:, :, 0], n_padded, axis=0)[: len(v)]
+
+    transposed = spectrum.conj().transpose(0, 2, 1)
+
+    def normal(x: Array) -> Array:
+        values = np.zeros(missing.shape)
+        values[missing] = x
+        return convolved(transposed, convolved(spectrum, values) @ weight)[missing]
+
+    size = np.count_nonzero(missing)
+    equations = LinearOperator((size, size), matvec=normal)
+    right = -convolved(transposed, (innovations / scale) @ weight)[missing]
+    tolerance = _TOLERANCE * np.sqrt(size)  # standard deviations
+    change[missing], _ = cg(equations, right, rtol=0.0, atol=tolerance, maxiter=_STEPS)
+    return change * scale
+
+
 def reduced_noise_model(model: NoiseModel, order: int) -> NoiseModel:
     """Noise model of fewer states by balanced truncation; itself where it has no more.
 
@@ -362,7 +461,7 @@ def reduced_noise_model(model: NoiseModel, order: int) -> NoiseModel:
     left, right = left[:order], right[:, :order]
     A, C, K = left @ model.A @ right, model.C @ right, left @ model.K
     Q, S = K @ model.covariance @ K.T, K @ model.covariance
-    gain, covariance = innovations(A, C, Q, S, model.covariance)
+    gain, covariance = kalman_filter(A, C, Q, S, model.covariance)
     return NoiseModel(A, C, gain, 0.5 * (covariance + covariance.T))
 
 

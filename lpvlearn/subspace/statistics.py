@@ -32,8 +32,7 @@ from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..systems.innovations import covariance_root
 from ..systems.response import resolvent
 from .criterion import criterion_of
-from .missing_outputs import noise_of
-from .noise import Whitening, reduced_noise_model, spectral_density
+from .noise import Whitening, noise_of, reduced_noise_model, spectral_density
 from .signals import Record, block_slices, signal_pieces
 from .simulation_fit import (
     Freedom,

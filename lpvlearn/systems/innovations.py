@@ -11,27 +11,26 @@ from scipy import linalg
 Array = NDArray[np.float64]
 
 
-class Innovations(NamedTuple):
-    """What a Kalman filter makes of them."""
+class KalmanFilter(NamedTuple):
+    """What predicts the outputs of a system best."""
 
-    gain: Array  # (n, n_outputs): ``A - K C`` is stable
-    covariance: Array  # (n_outputs, n_outputs)
+    gain: Array  # (n, n_outputs), K: ``A - K C`` is stable
+    covariance: Array  # (n_outputs, n_outputs), of the innovations
 
 
-def innovations(A: Array, C: Array, Q: Array, S: Array, R: Array) -> Innovations:
-    """Gain of the Kalman filter, and covariance of the innovations.
+def kalman_filter(A: Array, C: Array, Q: Array, S: Array, R: Array) -> KalmanFilter:
+    """That of ``x[t+1] = A x[t] + w[t]``, ``y[t] = C x[t] + e[t]``.
 
-    Of ``x[t+1] = A x[t] + w[t]``, ``y[t] = C x[t] + e[t]`` with ``E w w.T = Q``,
-    ``E w e.T = S`` and ``E e e.T = R``.
+    The noise has ``E w w.T = Q``, ``E w e.T = S`` and ``E e e.T = R``.
 
     >>> one = np.ones((1, 1))
-    >>> innovations(0.5 * one, one, 0.25 * one, 0.5 * one, one).gain
+    >>> kalman_filter(0.5 * one, one, 0.25 * one, 0.5 * one, one).gain
     array([[0.5]])
     """
     P = linalg.solve_discrete_are(A.T, C.T, Q, R, s=S)
     covariance = C @ P @ C.T + R
     gain = linalg.solve(covariance, (A @ P @ C.T + S).T, assume_a="pos").T
-    return Innovations(gain, covariance)
+    return KalmanFilter(gain, covariance)
 
 
 def covariance_root(covariance: Array, negligible: float = 0.0) -> Array:

@@ -16,14 +16,7 @@ from lpvlearn import (
     SubspaceLTI,
 )
 from lpvlearn.data.experiments import Experiment
-from lpvlearn.models.innovation import NoiseModel
-from lpvlearn.subspace.missing_outputs import (
-    expected_change,
-    further,
-    noise_of,
-    with_estimates,
-)
-from lpvlearn.subspace.noise import spectral_density
+from lpvlearn.subspace.missing_outputs import further, with_estimates
 from tests.conftest import ROLES, spring_structure, spring_tables
 
 OMEGA = np.linspace(0.01, 3.1, 100)
@@ -63,61 +56,6 @@ def without(y, share, seed=0):
 def distance(model, true):
     found, wanted = (m.frequency_response(OMEGA) for m in (model.lti_, true))
     return np.linalg.norm(found - wanted) / np.linalg.norm(wanted)
-
-
-def dense(noise, n_samples):
-    """The map from outputs, sample by sample, to innovations."""
-    A, C, K, _ = noise
-    ny, inner = len(C), A - K @ C
-    L = np.eye(n_samples * ny)
-    answer = K
-    for d in range(1, n_samples):
-        for t in range(n_samples - d):
-            L[(t + d) * ny : (t + d + 1) * ny, t * ny : (t + 1) * ny] = -C @ answer
-        answer = inner @ answer
-    return L
-
-
-def test_expected_outputs_make_the_least_of_the_innovations():
-    rng = np.random.default_rng(0)
-    A = np.diag([0.9, 0.5, -0.3])
-    C, K = rng.standard_normal((2, 3)), 0.3 * rng.standard_normal((3, 2))
-    root = np.array([[2.0, 0.0], [0.01, 0.03]])
-    noise = NoiseModel(A, C, K, root @ root.T)
-    innovations = rng.standard_normal((40, 2)) @ root.T
-    missing = rng.random((40, 2)) < 0.3
-    L = dense(noise, 40)
-    white = np.kron(np.eye(40), np.linalg.inv(root))
-    some = (white @ L)[:, missing.ravel()]
-    wanted = np.linalg.lstsq(some, -white @ innovations.ravel())[0]
-    change = expected_change(noise, innovations, missing)
-    assert not change[~missing].any()
-    size = np.array([2.0, 0.03])
-    np.testing.assert_allclose(
-        (change / size)[missing], wanted / np.tile(size, 40)[missing.ravel()], atol=0.01
-    )
-
-
-def test_white_errors_of_missing_outputs_are_zero():
-    noise = NoiseModel.white(np.eye(1))
-    errors = np.random.default_rng(0).standard_normal((30, 1))
-    missing = np.arange(30)[:, None] % 4 == 0
-    left = errors + expected_change(noise, errors, missing)
-    np.testing.assert_allclose(left[missing], 0.0, atol=1e-12)
-    np.testing.assert_array_equal(left[~missing], errors[~missing])
-
-
-@pytest.mark.parametrize("gaps", ["at random", "in a rhythm"])
-def test_the_noise_of_errors_that_are_partly_known(gaps):
-    e = np.random.default_rng(0).standard_normal((20000, 1))
-    v = lfilter([1.0], [1.0, -0.9], e, axis=0)
-    some = without(v, 0.4)
-    if gaps == "in a rhythm":  # what a wave of that period would explain
-        some = np.where(np.arange(20000)[:, None] % 3 == 0, v, np.nan)
-    model = noise_of([some])
-    density = spectral_density(model, np.array([0.0, 2.0 * np.pi / 3.0])).real.ravel()
-    assert density[0] == pytest.approx(100.0, rel=0.5)
-    assert density[1] < 5.0
 
 
 def test_complete_records_are_fitted_as_ever():

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lpvlearn.systems.innovations import covariance_root, innovations
+from lpvlearn.systems.innovations import covariance_root, kalman_filter
 
 
 def test_the_filter_of_an_innovation_form_has_its_gain_and_covariance():
@@ -10,7 +10,7 @@ def test_the_filter_of_an_innovation_form_has_its_gain_and_covariance():
     C = np.array([[1.0, 2.0], [-1.0, 0.5]])
     K = np.array([[0.3, 0.0], [0.1, 0.2]]) @ np.linalg.inv(C)  # A - K C is stable
     covariance = np.array([[2.0, 0.5], [0.5, 1.0]])
-    found = innovations(A, C, K @ covariance @ K.T, K @ covariance, covariance)
+    found = kalman_filter(A, C, K @ covariance @ K.T, K @ covariance, covariance)
     np.testing.assert_allclose(found.gain, K, atol=1e-9)
     np.testing.assert_allclose(found.covariance, covariance, atol=1e-9)
 
@@ -21,7 +21,7 @@ def test_a_filter_of_sensor_noise_predicts_with_the_least_variance():
     b = r * (1.0 - a**2) - q
     p = (-b + np.sqrt(b**2 + 4.0 * q * r)) / 2.0
     one = np.ones((1, 1))
-    found = innovations(a * one, one, q * one, 0.0 * one, r * one)
+    found = kalman_filter(a * one, one, q * one, 0.0 * one, r * one)
     np.testing.assert_allclose(found.covariance, p + r)
     np.testing.assert_allclose(found.gain, a * p / (p + r))
 
