@@ -65,6 +65,7 @@ from ..models.innovation import (
 )
 from ..systems.innovations import kalman_filter
 from ..systems.least_squares import scaled_lstsq
+from ..systems.modes import spectral_radius
 from ..systems.simulation import estimate_initial_state, state_trajectory
 from .hankel import hankel_factor
 from .identification import REFITS, STABLE_MARGIN, ScaledRecords, Settings
@@ -542,7 +543,7 @@ def _innovation_form(subspace: _Subspace, order: int) -> _Innovation:
     if order:
         parts = scaled_lstsq(np.vstack([X, U, E]).T, ahead.T)[0].T
     A, B, K = np.split(parts, [order, order + m], axis=1)
-    if order and not np.abs(linalg.eigvals(A - K @ C)).max() < 1.0:
+    if not spectral_radius(A - K @ C) < 1.0:
         K = _riccati_gain(A, C, ahead - A @ X - B @ U, E, n)
     return _Innovation(A, B, C, D, K, E @ E.T / n)
 
@@ -698,7 +699,7 @@ def _without_reached_noise(
     A[np.ix_(kept, kept)] += by_A.reshape(n, n)
     C[:, kept] += by_C.reshape(ny, n)
     moved = joint._replace(A=A, B=B, C=C, D=D)
-    stable = np.abs(linalg.eigvals(A - joint.K @ C)).max() < 1.0
+    stable = spectral_radius(A - joint.K @ C) < 1.0
     return moved if stable else joint._replace(B=B)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.least_squares import rank_lstsq, scaled_lstsq
+from ..systems.modes import spectral_radius
 from .simulation_fit import Freedom
 
 Array = NDArray[np.float64]
@@ -195,7 +196,7 @@ def reflect_unstable(A: Array, limit: float = 1.0) -> Array:
     array([[0.5, 0. ],
            [0. , 0.5]])
     """
-    if A.size == 0 or np.abs(np.linalg.eigvals(A)).max() <= limit:
+    if spectral_radius(A) <= limit:
         return A
     # By the real Schur form, because the eigenvectors may be nearly dependent; as
     # 1 / conj(z) = z / |z|**2, a diagonal block is divided by its squared modulus.
@@ -204,7 +205,7 @@ def reflect_unstable(A: Array, limit: float = 1.0) -> Array:
     while start < len(A):
         pair = start + 1 < len(A) and triangular[start + 1, start] != 0.0
         block = slice(start, start + 1 + pair)
-        modulus = np.abs(linalg.eigvals(triangular[block, block])).max()
+        modulus = spectral_radius(triangular[block, block])
         if modulus > limit:
             triangular[block, block] *= (limit / modulus) ** 2
         start = block.stop

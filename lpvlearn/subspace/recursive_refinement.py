@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.least_squares import column_scale, scaled_lstsq
+from ..systems.modes import spectral_radius
 from .realization import observability_matrix
 from .signals import Record, block_slices, signal_factor
 from .simulation_fit import (
@@ -106,7 +107,7 @@ def _ranges(pilot: Realization, directions: Array, free: Freedom) -> Array:
     speed = np.full(directions.shape[1], _SLOWEST)
     for block, part in zip(pilot.blocks, parameter_slices(pilot, free), strict=True):
         change = directions[part]
-        margin = 1.0 - np.abs(np.linalg.eigvals(block)).max()
+        margin = 1.0 - spectral_radius(block)
         size = np.sqrt(np.einsum("ij,ij->j", change, change))
         speed = np.maximum(speed, size / (_RANGE * max(abs(margin), _CLOSEST)))
     return 1.0 / speed

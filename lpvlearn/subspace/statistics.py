@@ -30,6 +30,7 @@ from scipy import fft
 from ..models.innovation import InnovationModel, NoiseModel
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..systems.innovations import covariance_root
+from ..systems.modes import spectral_radius
 from ..systems.response import resolvent
 from .criterion import criterion_of
 from .noise import Whitening, noise_of, reduced_noise_model, spectral_density
@@ -310,10 +311,9 @@ class Evidence:
 
         A mode as slow as the longest record is an integrator to it.
         """
-        radius = float(np.abs(np.linalg.eigvals(self.model.A)).max(initial=0.0))
         known = self.refined and self.sections.blocks is not None
         known &= bool(len(self.model.A)) and self.basis.shape[1] > 0
-        if not known or radius >= 1.0 - 1.0 / self.longest:
+        if not known or spectral_radius(self.model.A) >= 1.0 - 1.0 / self.longest:
             return None
         lti = self.state_space(self.model, 1.0)
         response = lti.frequency_response(np.linspace(0.0, np.pi, _N_FREQUENCIES))
