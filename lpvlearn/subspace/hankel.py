@@ -66,10 +66,20 @@ def data_factors(
     n_trend: int = 0,
     cheap: bool = False,
 ) -> Iterator[Array | None]:
-    """`data_factor` of every horizon; one correlation sequence serves them all.
+    """Lower triangular factor of ``[U_f; U_p; Y_p; Y_f]`` for every horizon.
 
-    With `cheap` None stands for factors of many rows, but for the first, whose Gram
-    matrix is singular to working precision.
+    Of pooled experiments, whose rows are samples ``[u, y]``. `past_outputs` tells
+    whether ``Y_p`` is among the rows of the factor (Verhaegen and Verdult, *Filtering
+    and System Identification*, 2007, Chapter 9). `n_trend` takes a constant (1) or a
+    straight line (2) out of every experiment.
+
+    The factor is that of a Gram matrix, built from correlations that serve all
+    horizons; that of a QR decomposition, which is the same, where squaring would lose
+    accuracy. With `cheap` None stands for those of many rows, but for the first.
+
+    >>> z = np.random.default_rng(0).standard_normal((300, 3))
+    >>> [L.shape for L in data_factors([z], n_inputs=2, horizons=[4, 5])]
+    [(24, 24), (30, 30)]
     """
     records = [without_trend(z, n_trend) for z in records]
     known: dict[int, Array] = {}
@@ -105,41 +115,13 @@ def pooled_correlations(
     return found
 
 
-def data_factor(
-    records: Sequence[Array],
-    n_inputs: int,
-    horizon: int,
-    *,
-    past_outputs: bool = True,
-    engine: str = "cholesky",
-    n_trend: int = 0,
-) -> Array:
-    """Lower triangular factor of ``[U_f; U_p; Y_p; Y_f]`` of pooled experiments.
-
-    A row of a record is a sample ``[u, y]``; `past_outputs` tells whether ``Y_p`` is
-    among the rows of the factor (Verhaegen and Verdult, *Filtering and System
-    Identification*, 2007, Chapter 9). The engine "cholesky" builds the Gram matrix from
-    correlations and falls back to "qr" where that would lose accuracy; both give the
-    same factor. `n_trend` takes a constant (1) or a straight line (2) out of every
-    experiment, whose samples should have none to speak of (`without_trend`).
-
-    >>> z = np.random.default_rng(0).standard_normal((300, 3))
-    >>> L = data_factor([z], n_inputs=2, horizon=4)
-    >>> np.allclose(L, data_factor([z], n_inputs=2, horizon=4, engine="qr"))
-    True
-    """
-    n_outputs = records[0].shape[1] - n_inputs
-    rows = _past_future_rows(n_inputs, n_outputs, horizon, past_outputs)
-    factor = hankel_factor if engine == "cholesky" else _qr_factor
-    return factor(records, 2 * horizon, rows, n_trend)
-
-
 def hankel_factor(
     records: Sequence[Array], n_rows: int, rows: NDArray[np.intp], n_trend: int = 0
 ) -> Array:
     """Lower triangular factor of some `rows` of `n_rows` block rows, in that order.
 
-    `n_trend` as in `data_factor`.
+    `n_trend` as in `data_factors`, of samples that have little of a trend
+    (`without_trend`).
     """
     factor = _squared_factor(records, n_rows, rows, None, n_trend)
     return _qr_factor(records, n_rows, rows, n_trend) if factor is None else factor
@@ -295,7 +277,7 @@ def start_hankel_sum(
     >>> z = np.random.default_rng(0).standard_normal((300, 3))
     >>> parts = start_hankel_sum([z[:100]], n_inputs=2, horizon=4)
     >>> parts = extend_hankel_sum(parts, z[100:], starts=False)
-    >>> np.allclose(parts.triangular(), data_factor([z], n_inputs=2, horizon=4))
+    >>> np.allclose(parts.triangular(), *data_factors([z], n_inputs=2, horizons=[4]))
     True
     """
     c = samples[0].shape[1]

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag, expm
 
 from lpvlearn.subspace import identification
-from lpvlearn.subspace.hankel import _hankel_matrix, data_factor
+from lpvlearn.subspace.hankel import _hankel_matrix, data_factors
 from lpvlearn.subspace.selection import select
 from lpvlearn.subspace.simulation_fit import Freedom
 from lpvlearn.systems.simulation import lti_response
@@ -204,7 +204,7 @@ def accuracy(order: int, n_channels: int, n: int, horizon: int, n_seeds: int) ->
 def compression(n: int, horizon: int) -> None:
     z = np.random.default_rng(0).standard_normal((n, 4))
     start = time.process_time()
-    data_factor([z], 2, horizon)
+    next(data_factors([z], 2, [horizon]))
     fast = time.process_time() - start
     start = time.process_time()
     np.linalg.qr(_hankel_matrix(z, 2 * horizon).T, mode="r")

@@ -12,7 +12,6 @@ from lpvlearn.subspace.hankel import (
     _reordered,
     cholesky_factor,
     correlation_sequence,
-    data_factor,
     data_factors,
     stack_factors,
     triangularize,
@@ -53,16 +52,15 @@ def test_rows_are_ordered_future_inputs_past_inputs_past_outputs_future_outputs(
 @pytest.mark.parametrize("past_outputs", [True, False])
 def test_cholesky_engine_equals_qr_engine(rng, past_outputs):
     records = [rng.standard_normal((n, 4)) for n in (400, 250, 90)]
-    options = {"n_inputs": 2, "horizon": 9, "past_outputs": past_outputs}
-    fast = data_factor(records, **options)
-    slow = data_factor(records, engine="qr", **options)
+    (fast,) = data_factors(records, 2, [9], past_outputs=past_outputs)
+    slow = _qr_factor(records, 18, _past_future_rows(2, 2, 9, past_outputs))
     np.testing.assert_allclose(fast, slow, atol=1e-9 * np.abs(slow).max())
 
 
 def test_pooled_experiments_equal_stacked_factors(rng):
     records = [rng.standard_normal((n, 3)) for n in (300, 120, 80)]
-    pooled = data_factor(records, 2, 5)
-    stacked = stack_factors([data_factor([z], 2, 5) for z in records])
+    (pooled,) = data_factors(records, 2, [5])
+    stacked = stack_factors([next(data_factors([z], 2, [5])) for z in records])
     np.testing.assert_allclose(pooled, stacked, atol=1e-10)
 
 
@@ -99,7 +97,7 @@ def test_singular_data_fall_back_to_qr_and_keep_their_accuracy(rng):
     rows = _past_future_rows(1, 1, 3)
     H = _hankel_matrix(z, 6)[rows]
     assert cholesky_factor(H @ H.T) is None
-    L = data_factor([z], 1, 3)
+    (L,) = data_factors([z], 1, [3])
     np.testing.assert_allclose(L @ L.T, H @ H.T, atol=1e-11 * np.abs(H @ H.T).max())
 
 
@@ -128,7 +126,8 @@ def test_known_correlations_serve_every_horizon(rng):
     records = [rng.standard_normal((n, 3)) for n in (200, 150, 30)]
     factors = data_factors(records, 2, (2, 11, 20))  # the third for the first alone
     for horizon, factor in zip((2, 11, 20), factors, strict=True):
-        np.testing.assert_allclose(factor, data_factor(records, 2, horizon), atol=1e-9)
+        (alone,) = data_factors(records, 2, [horizon])
+        np.testing.assert_allclose(factor, alone, atol=1e-9)
 
 
 @pytest.mark.parametrize("n_trend", [0, 1, 2])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from lpvlearn.subspace.hankel import data_factor
+from lpvlearn.subspace.hankel import data_factors
 from lpvlearn.subspace.realization import (
     observability_subspace,
     reflect_unstable,
@@ -44,7 +44,7 @@ def test_weights_of_outputs_need_no_samples(rng, method):
 
     def space(y):
         z = np.hstack([u, y])
-        factor = data_factor([z], 2, 6, past_outputs=past_outputs)
+        (factor,) = data_factors([z], 2, [6], past_outputs=past_outputs)
         return observability_subspace(factor, 2, 2, 6, 5, method)
 
     found, expected = space(y).weighted(weight), space(y @ weight.T)

@@ -12,7 +12,7 @@ from sklearn.exceptions import NotFittedError
 from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace import stream as stream_module
-from lpvlearn.subspace.hankel import data_factor, extend_hankel_sum, start_hankel_sum
+from lpvlearn.subspace.hankel import data_factors, extend_hankel_sum, start_hankel_sum
 from lpvlearn.subspace.realization import METHODS, factor_input_matrices
 from lpvlearn.systems.simulation import lti_response
 
@@ -225,7 +225,7 @@ def test_hankel_sum_is_the_factor_of_the_pooled_experiments(system, noise):
     state = extend_hankel_sum(state, records[0][100:105], starts=False)
     state = extend_hankel_sum(state, records[0][105:], starts=False)
     state = extend_hankel_sum(state, records[1], starts=True)
-    whole = data_factor(records, 2, 6)
+    (whole,) = data_factors(records, 2, [6])
     assert (state.gram is None) == (noise == 0.0)
     # Factors of singular data agree up to a rotation of their null space.
     np.testing.assert_allclose(
@@ -237,7 +237,7 @@ def test_hankel_sum_is_the_factor_of_the_pooled_experiments(system, noise):
 
 def test_input_matrices_from_the_factor_are_exact_without_noise(system):
     u, y = record(system, 500, noise=0.0)
-    factor = data_factor([np.hstack([u, y])], 2, 6)
+    (factor,) = data_factors([np.hstack([u, y])], 2, [6])
     A, B, C, D = system
     found = factor_input_matrices(factor, A, C, freedom(2, 2), 6)
     np.testing.assert_allclose(found[0], B, atol=1e-7)
