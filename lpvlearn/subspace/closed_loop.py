@@ -82,17 +82,13 @@ from .simulation_fit import (
     with_initial_states,
 )
 from .statistics import Evidence, parameter_covariance
-from .varx import longest_past, n_windows, past_window, samples_of
+from .varx import NO_INNOVATION, longest_past, n_windows, past_window, samples_of
 
 Array = NDArray[np.float64]
 
 _MOST_ROWS = 400  # of the longest past window: its Cholesky factor costs some 10 ms
 
 _MAX_ORDER = 20  # of plant and noise together, where it is chosen
-
-# Part of an output's energy below which innovations are rounding: added to their
-# variance, it makes the criterion stop where nothing but rounding is left to explain.
-_EXACT = 1e-16
 
 # Part of an output's energy added to the innovation covariance before its inverse root
 # weights the outputs, so that data without noise have one.
@@ -457,7 +453,7 @@ def _as_likely(
     be trusted where the likelihood is as quadratic as it takes it for.
     """
     errors = np.vstack(_predicted(model, records, free)[1])
-    floor = _EXACT * np.mean(np.hstack([r.y for r in records]) ** 2, axis=1)
+    floor = NO_INNOVATION * np.mean(np.hstack([r.y for r in records]) ** 2, axis=1)
     spreads = errors.T @ errors / len(errors), whole.covariance
     volumes = [np.linalg.slogdet(S + np.diag(floor))[1] for S in spreads]
     return bool(volumes[0] - volumes[1] < n_fewer * model.B.shape[1] * np.log(n) / n)
@@ -571,9 +567,10 @@ def _criteria(errors: Sequence[Array], subspace: _Subspace) -> Array:
     in the long run.
     """
     n, (ny, m) = subspace.n_columns, subspace.direct.shape
-    floor, each = _EXACT * np.eye(ny), 2.0 * (m + 2 * ny) * np.log(np.log(max(n, 3)))
+    floor = NO_INNOVATION * np.eye(ny)
+    each = 2.0 * (m + 2 * ny) * np.log(np.log(max(n, 3)))
     volumes = [np.linalg.slogdet(E @ E.T + floor)[1] for E in errors]
-    least = ny * np.log(_EXACT)  # but for rounding
+    least = ny * np.log(NO_INNOVATION)  # but for rounding
     return np.maximum(volumes, least) + each / n * np.arange(len(errors))
 
 

@@ -36,7 +36,7 @@ from ..systems.simulation import delayed
 from .identification import Settings, fit_once
 from .noise import Whitening, autoregression, through_filter, whitening_filter
 from .selection import select
-from .signals import Record
+from .signals import FOR_A_CHOICE, Record
 from .simulation_fit import simulation_errors
 
 Array = NDArray[np.float64]
@@ -48,8 +48,6 @@ Delay = NDArray[np.intp]
 LONGEST, _MOST_LAGS = 30, 300
 
 _SHARE = 10  # and no longer than this part of the longest experiment, a tenth
-
-_MAX_SAMPLES = 12_000  # that are looked at: as many as for the choice of an order
 
 # Past outputs and, after the longest delay, inputs in the regression: enough for its
 # error to be nearly white, and for the answers of systems of usual orders.
@@ -185,7 +183,7 @@ def longest_delays(pairs: Pairs, direct: NDArray[np.bool_]) -> Delay:
 
 def first_samples(pairs: Pairs) -> Pairs:
     """The first experiments, some thousand samples of them."""
-    out, left = [], _MAX_SAMPLES
+    out, left = [], FOR_A_CHOICE
     for u, y in pairs:
         if left > 0:
             out.append((u[:left], y[:left]))

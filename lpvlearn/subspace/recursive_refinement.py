@@ -25,6 +25,7 @@ from scipy import linalg
 from ..systems.least_squares import column_scale, scaled_lstsq
 from ..systems.modes import spectral_radius
 from .realization import observability_matrix
+from .refinement import UNDETERMINED
 from .signals import Record, block_slices, signal_factor
 from .simulation_fit import (
     Freedom,
@@ -38,7 +39,6 @@ from .simulation_fit import (
 
 Array = NDArray[np.float64]
 
-_RCOND = 1e-9  # directions of the scaled parameters that the pilot data do not tell
 _HEAD = 4_096  # samples from which the initial state of a stretch is estimated first
 
 # A linearisation holds for changes of a pole of this share of its distance from the
@@ -89,7 +89,7 @@ def start_recursion(
     jacobian = stacked[:, :-1]
     scale = column_scale(jacobian)
     _, s, right = linalg.svd(jacobian / scale, full_matrices=False, check_finite=False)
-    right = right[s > _RCOND * s.max(initial=0.0)]
+    right = right[s > UNDETERMINED * s.max(initial=0.0)]
     directions = right.T / scale[:, None]
     rows = np.column_stack([jacobian @ directions, stacked[:, -1]])
     information = _triangle(rows)

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 _MAX_ITER, _MANY = 20, 100
 
 # Directions of the step that the data do not determine: the choice of basis, mostly.
-_RCOND = 1e-9
+UNDETERMINED = 1e-9
 
 # An excess of this share of the noise that one parameter absorbs is not worth a step.
 _NEGLIGIBLE = 1e-2
@@ -93,7 +93,7 @@ def refine_simulation(
         jacobian, residual = regression[:, :-1], regression[:, -1]
         if not fitted:
             model, fitted = model._replace(loss=float(residual @ residual)), True
-        step, rank = scaled_lstsq(jacobian, residual, _RCOND)
+        step, rank = scaled_lstsq(jacobian, residual, UNDETERMINED)
         left_over = residual - jacobian @ step
         predicted = float(residual @ residual - left_over @ left_over)
         negligible = _NEGLIGIBLE * model.loss * rank / n_values

@@ -36,7 +36,7 @@ _PIECE = 8192  # samples worked on at a time: their signals stay in the cache
 # Averages over the record are known to a percent or so from this many samples.
 _MAX_SAMPLES = 30_000
 
-_FOR_A_CHOICE = 12_000  # samples: it needs fewer than an estimate
+FOR_A_CHOICE = 12_000  # samples: it needs fewer than an estimate
 
 Places = NDArray[np.intp]  # of experiments
 
@@ -103,7 +103,7 @@ def shorten(records: Sequence[Record]) -> tuple[list[Record], float]:
     return parts, sum(record.u.shape[1] for record in parts) / total
 
 
-def thinned(records: Sequence[Record], n_samples: int = _FOR_A_CHOICE) -> list[Record]:
+def thinned(records: Sequence[Record], n_samples: int = FOR_A_CHOICE) -> list[Record]:
     """Evenly spread experiments of about `n_samples` in total, at least one.
 
     Experiments beyond that length are cut to it.

@@ -50,7 +50,7 @@ _SAMPLES_PER_REGRESSOR = 4
 
 # Part of an output's energy below which innovations are rounding: added to their
 # variance, it makes criteria stop where nothing but rounding is left to explain.
-_EXACT = 1e-16
+NO_INNOVATION = 1e-16
 
 # What the feedback is looked for in: so many samples of at most so many rows, and so
 # many future samples of every input, on which controllers answer.
@@ -454,7 +454,7 @@ def _chosen_past(
     best, found = np.inf, longest
     for past in range(shortest, longest + 1):
         left = scaled[acting, past * c :]
-        spread = left @ left.T + _EXACT * np.eye(len(left))
+        spread = left @ left.T + NO_INNOVATION * np.eye(len(left))
         volume = np.linalg.slogdet(spread)[1]
         with np.errstate(invalid="ignore"):  # inf - inf of inputs that are dependent
             volume -= np.linalg.slogdet(spread[:n_direct, :n_direct])[1]
@@ -499,7 +499,7 @@ def _wilks(y: Array, known: Array, dof: int) -> _Correlated:
     if q == 0 or ny == 0 or dof <= ny:
         return _Correlated(1.0, 0.0)
     explained = own @ known
-    left = (1.0 + _EXACT) * np.eye(len(own)) - explained @ explained.T
+    left = (1.0 + NO_INNOVATION) * np.eye(len(own)) - explained @ explained.T
     statistic = -(dof + 0.5 * (q - ny - 1)) * np.linalg.slogdet(left)[1]
     p_value = float(special.chdtrc(ny * q, max(statistic, 0.0)))
     unexplained = 1.0 - np.sum((y @ known) ** 2, axis=1) / np.sum(y**2, axis=1)
