@@ -68,12 +68,12 @@ from ..systems.least_squares import scaled_lstsq
 from ..systems.modes import spectral_radius
 from ..systems.simulation import estimate_initial_state, state_trajectory
 from .hankel import hankel_factor
-from .identification import REFITS, STABLE_MARGIN, ScaledRecords, Settings
+from .identification import REFITS, STABLE_MARGIN, Settings
 from .noise import Whitening
 from .realization import reflect_unstable
+from .records import Record, ScaledRecords, output_energy, share_known, shorten
 from .refinement import refine_simulation
 from .selection import PlantFit, Row, Selection
-from .signals import Record, output_energy, share_known, shorten
 from .simulation_fit import (
     Freedom,
     Realization,
@@ -487,7 +487,7 @@ def _predictor_subspace(
         )
     n_columns = n_windows(records, past)
     if n_columns <= (past + 1) * c:
-        n_samples = sum(record.u.shape[1] for record in records)
+        n_samples = sum(record.n_samples for record in records)
         raise ValueError(
             f"method='pbsid' needs more than {(past + 1) * c} windows of {past} past "
             f"samples ({m} input(s), {ny} output(s)). Got {n_columns} in {n_samples} "
@@ -593,7 +593,7 @@ def _refined(
     if (free.direct != free.direct[0]).any():
         # Mixed outputs would not keep the zeros of D.
         covariance = np.diag(np.diagonal(covariance))
-    n_samples = sum(record.u.shape[1] for record in records)
+    n_samples = sum(record.n_samples for record in records)
     energy = np.array([np.sum(r.y**2, axis=1) for r in records]).sum(axis=0)
     root = _root(covariance, energy / n_samples)
     driven = [

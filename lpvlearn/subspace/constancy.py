@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.threads import one_blas_thread
+from .records import Record
 from .refinement import refine_simulation
 from .residuals import filtered, whitening_filters
-from .signals import Record
 from .simulation_fit import (
     Freedom,
     Realization,
@@ -109,7 +109,7 @@ def _refined(model: Realization, record: Record, free: Freedom) -> Realization:
 
 def _parts(record: Record, least: int) -> list[Record]:
     """Parts of a record of at least so many values, those in which all inputs move."""
-    n_samples = record.u.shape[1]
+    n_samples = record.n_samples
     n_parts = min(_PARTS, record.y.size // least)
     ends = np.linspace(0, n_samples, n_parts + 1 if n_parts > 1 else 1).astype(int)
     parts = [record.part(slice(a, b)) for a, b in zip(ends, ends[1:], strict=False)]

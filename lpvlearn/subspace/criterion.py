@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..systems.simulation import estimate_initial_state, free_responses
 from .noise import autoregression, taper, whitening_filter
-from .signals import Record
+from .records import Record
 from .simulation_fit import Freedom, Realization, simulation_errors
 
 # Of a parameter, in squared standard deviations of its estimate: two of them. Akaike's
@@ -50,7 +50,7 @@ def criterion_of(
         return np.inf
     # Of many lines of a spectrum one stands out by chance: an oscillation may be any of
     # as many as its decay tells apart, and costs what the best of them gains.
-    longest = max(record.u.shape[1] for record in records)
+    longest = max(record.n_samples for record in records)
     poles = np.linalg.eigvals(model.A)
     decay = np.maximum(1.0 - np.abs(poles[poles.imag > 0.0]), 2.0 / longest)
     misfit = -2.0 * float(np.log(decay).sum())

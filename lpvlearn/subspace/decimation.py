@@ -26,7 +26,7 @@ from scipy import linalg
 
 from .identification import Settings, realize, subspaces_of
 from .realization import ObservabilitySubspace
-from .signals import Record
+from .records import Record
 from .simulation_fit import Realization, simulation_fit
 
 Array = NDArray[np.float64]
@@ -97,7 +97,7 @@ class SlowStarts:
         if not records:
             return None
         settings, height = self._settings, 2 * sum(self._settings.free.direct.shape)
-        room = settings.max_horizon([record.u.shape[1] for record in records])
+        room = settings.max_horizon([record.n_samples for record in records])
         horizon = min(_HORIZON, max(2, _MAX_ROWS // height), room)
         highest = min(self._highest, settings.max_order(horizon))
         width = min(highest + settings.n_noise_states, settings.max_order(horizon))
@@ -120,7 +120,7 @@ def decimated(records: Sequence[Record], factor: int) -> list[Record]:
     filter_ = scipy.signal.firwin(n_taps, _EDGE / factor)
     out = []
     for record in records:
-        n_samples = record.u.shape[1]
+        n_samples = record.n_samples
         if n_samples >= n_taps + factor:
             whole = slice(_TAPS, (n_samples - 1) // factor + 1)
             u, y = (

@@ -35,8 +35,8 @@ from ..data.preparation import (
 from ..systems.simulation import delayed
 from .identification import Settings, fit_once
 from .noise import Whitening, autoregression, through_filter, whitening_filter
+from .records import FOR_A_CHOICE, Record
 from .selection import select
-from .signals import FOR_A_CHOICE, Record
 from .simulation_fit import simulation_errors
 
 Array = NDArray[np.float64]
@@ -322,7 +322,7 @@ class _Trial:
             mask[:, j] = False
             settings = settings._replace(free=settings.free._replace(direct=mask))
         records = self.records(delay)
-        cuts = [int(np.ceil(part * r.u.shape[1])) for r in records]
+        cuts = [int(np.ceil(part * r.n_samples)) for r in records]
         heads = [r.head(cut) for r, cut in zip(records, cuts, strict=True)]
         horizon = max(self.horizon, _SHORTEST_HORIZON, 2 * (order + 1))
         horizon = min(horizon, self.settings.max_horizon(cuts))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
 from .criterion import PRICE
-from .identification import ScaledRecords, centred, mode_rates, scale_records
+from .identification import mode_rates
 from .local_fit import LocalFit
 from .noise import Whitening
 from .offsets import (
@@ -34,8 +34,8 @@ from .offsets import (
     with_levels,
 )
 from .one_fit import Samples
+from .records import ScaledRecords, centred, output_energy, scale_records, shorten
 from .residuals import lacks
-from .signals import output_energy, shorten
 from .simulation_fit import with_initial_states
 from .statistics import Evidence
 from .varx import find_feedback
@@ -77,7 +77,7 @@ def may_drift(fitted: LocalFit) -> bool:
     Of what such a mode leaves of drift, white errors are not.
     """
     evidence = fitted.evidence
-    shortest = min(record.u.shape[1] for record in evidence.records)
+    shortest = min(record.n_samples for record in evidence.records)
     if shortest < _FEWEST or motion_left(evidence) < _EXPLAINED**2:
         return False
     rates = mode_rates(evidence.noise.A)

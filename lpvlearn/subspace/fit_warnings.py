@@ -33,10 +33,10 @@ from .offsets import (
     stays_far,
 )
 from .options import Choices
+from .records import thinned
 from .residuals import find_spikes, lacks
 from .rounding import rounded_outputs
 from .selection import MAX_ORDER, better_horizon
-from .signals import thinned
 from .statistics import OPEN, Evidence
 from .telling import Telling, in_experiment
 from .varx import Feedback
@@ -604,7 +604,7 @@ def _may_last(fitted: LocalFit) -> bool:
     Of summaries of records nobody knows how long these were.
     """
     poles = fitted.evidence.state_space(fitted.model, 1.0).poles()
-    lengths = [record.u.shape[1] for record in fitted.scaled.records]
+    lengths = [record.n_samples for record in fitted.scaled.records]
     if not lengths:
         return False
     decay = 1.0 - np.abs(poles)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ..systems.simulation import estimate_initial_state, free_responses, lti_response
-from .signals import Record, thinned
+from .records import Record, thinned
 from .simulation_fit import Realization
 
 Array = NDArray[np.float64]
@@ -118,7 +118,7 @@ def held_out(
             record.part(part)
             for record, (start, stop) in zip(records, cuts, strict=True)
             for part in (slice(0, start), slice(stop, None))
-            if 0 < start == part.stop or record.u.shape[1] - stop >= _TOO_SHORT
+            if 0 < start == part.stop or record.n_samples - stop >= _TOO_SHORT
         ]
         model = refitted(train)
         for record, (start, stop) in zip(records, cuts, strict=True):
@@ -197,7 +197,7 @@ def _cuts(records: Sequence[Record], k: int) -> list[tuple[int, int]]:
     The initial state would take up a piece of a few samples: short experiments beside
     long ones are not cut, and of many short ones the longest half is held out in turn.
     """
-    lengths = np.array([record.u.shape[1] for record in records])
+    lengths = np.array([record.n_samples for record in records])
     if len(records) < 2 * _N_PIECES or np.median(lengths) >= _LONG:
         whole = (lengths < _LONG) & (lengths.max() >= _LONG)
         return [

@@ -11,12 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
-from ..data.preparation import Pairs
 from ..systems.modes import mode_rates as mode_rates  # for the rooms that ask here
 from ..systems.modes import spectral_radius
-from ..systems.simulation import trend_signals
 from .criterion import criterion_of
 from .hankel import data_factors
 from .held_out import DOUBT, HeldOut, held_out
@@ -26,15 +23,9 @@ from .realization import (
     observability_subspace,
     reflect_unstable,
 )
+from .records import Record, output_energy, shorten
 from .refinement import ROUNDING, refine_simulation
-from .signals import (
-    Record,
-    SharedSignals,
-    block_radius,
-    block_sections,
-    output_energy,
-    shorten,
-)
+from .signals import SharedSignals, block_radius, block_sections
 from .simulation_fit import (
     Freedom,
     Realization,
@@ -51,21 +42,9 @@ Array = NDArray[np.float64]
 # many times what the parameters of a model absorb of it.
 STABLE_LOSS, _BY_CHANCE = 1.01, 10.0
 
-# Mean of an input in standard deviations, beyond which it is subtracted to keep digits.
-# Nearer to zero it stays: with an integrator in the model it tells something.
-_FAR = 100.0
-
 # Enforced stability keeps this distance from the unit circle, where rounding could
 # bring a pole back.
 STABLE_MARGIN = 1e-8
-
-
-class ScaledRecords(NamedTuple):
-    """Records with every channel scaled to unit root mean square."""
-
-    records: list[Record]
-    input_scale: Array
-    output_scale: Array
 
 
 class Settings(NamedTuple):
@@ -156,60 +135,6 @@ class Identified(NamedTuple):
     singular_values: Array  # (horizon * n_outputs,): of the subspace
     residual: float  # rms of the simulation errors relative to that of all outputs
     stability_loss: float  # increase of the residual that enforced stability cost
-
-
-def _root_mean_square(parts: Sequence[Array]) -> Array:
-    """RMS of every column over all parts, safe against under- and overflow; 1 for 0."""
-    peak = np.max([np.abs(part).max(axis=0) for part in parts], axis=0)
-    peak[peak == 0.0] = 1.0
-    energy = sum(((part / peak) ** 2).sum(axis=0) for part in parts)
-    rms = peak * np.sqrt(energy / sum(len(part) for part in parts))
-    rms[rms == 0.0] = 1.0
-    return rms
-
-
-def scale_records(
-    experiments: Sequence[tuple[Array, Array]],
-    n_trend: int = 0,
-    estimated: Sequence[NDArray[np.bool_]] = (),
-) -> ScaledRecords:
-    """Scale all experiments (u, y), a row per sample, together.
-
-    Which outputs are `estimated` is known of experiments that go on after these ends.
-    """
-    su = _root_mean_square([u for u, _ in experiments])
-    sy = _root_mean_square([y for _, y in experiments])
-    records = [Record.of(u / su, y / sy, n_trend) for u, y in experiments]
-    for k, missing in enumerate(estimated[: len(records)]):
-        record, n_samples = records[k], records[k].u.shape[1]
-        records[k] = record._replace(missing=missing[:n_samples].T)
-    return ScaledRecords(records, su, sy)
-
-
-class Centres(NamedTuple):
-    """What was subtracted from the samples of the experiments."""
-
-    inputs: Array  # (n_experiments, n_inputs)
-    trends: Array  # (n_experiments, n_trend, n_outputs)
-
-
-def centred(pairs: Pairs, n_trend: int, initial_states: bool) -> tuple[Pairs, Centres]:
-    """Take the trends out of the outputs, and far inputs to zero: digits are kept.
-
-    A model with trends (and initial states, for inputs) of its own is not changed.
-    """
-    n_inputs, n_outputs = pairs[0][0].shape[1], pairs[0][1].shape[1]
-    moved: Pairs = []
-    levels = np.zeros((len(pairs), n_inputs))
-    trends = np.zeros((len(pairs), n_trend, n_outputs))
-    for k, (u, y) in enumerate(pairs if n_trend else []):
-        signals = trend_signals(len(u), n_trend).T
-        trends[k] = linalg.lstsq(signals, y)[0]
-        if initial_states:
-            level = u.mean(axis=0)
-            levels[k] = np.where(np.abs(level) > _FAR * u.std(axis=0), level, 0.0)
-        moved.append((u - levels[k], y - signals @ trends[k]))
-    return moved or pairs, Centres(levels, trends)
 
 
 def subspaces_of(
@@ -373,7 +298,7 @@ def _refitted(
     white = whitening.records(records, free)
     if not white:
         return candidate.model
-    lengths, order = [r.u.shape[1] for r in white], len(candidate.model.A)
+    lengths, order = [r.n_samples for r in white], len(candidate.model.A)
     if candidate.refined or settings.max_horizon(lengths) < candidate.horizon:
         model = restarted(candidate.model, whitening, white, free)
         model = refine_simulation(model, white, free, REFITS)
@@ -473,7 +398,7 @@ def _is_astray(
     chosen: Candidate, plain: Candidate, records: Sequence[Record], settings: Settings
 ) -> bool:
     """Whether a model of whitened errors is one that errors, or likelihood, refute."""
-    longest = max(record.u.shape[1] for record in records)
+    longest = max(record.n_samples for record in records)
     settles = (1.0 - spectral_radius(plain.model.A)) * longest > _SETTLES
     if settles and chosen.model.loss > _FAR_ASTRAY * plain.model.loss:
         return True

@@ -26,6 +26,7 @@ from ..systems.simulation import (
 )
 from ..systems.threads import one_blas_thread
 from .noise import through_filter
+from .records import thinned
 from .residuals import (
     CERTAIN,
     DEPENDENT,
@@ -37,7 +38,6 @@ from .residuals import (
     whitening_filters,
     without,
 )
-from .signals import thinned
 from .simulation_fit import simulation_errors, with_initial_states
 from .statistics import Evidence
 
@@ -70,7 +70,7 @@ def bent_outputs(evidence: Evidence) -> list[int]:
     poles = poles[poles.imag >= 0.0]
     poles = poles[np.argsort(np.abs(1.0 - poles))[:_SLOWEST]]
     records, free = thinned(evidence.records, _BENT_SAMPLES), evidence.free
-    records = [record for record in records if record.u.shape[1] > 2 * N_LAGS]
+    records = [record for record in records if record.n_samples > 2 * N_LAGS]
     if not records:
         return []
     model = with_initial_states(

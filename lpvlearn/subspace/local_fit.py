@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import DETRENDS
-from .identification import Candidate, ScaledRecords, Settings
+from .identification import Candidate, Settings
 from .offsets import Offsets
 from .options import Choices
+from .records import ScaledRecords
 from .selection import Selection
 from .signals import SharedSignals
 from .simulation_fit import Realization

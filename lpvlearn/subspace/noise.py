@@ -35,7 +35,7 @@ from ..systems.innovations import covariance_root, kalman_filter
 from ..systems.response import resolvent
 from ..systems.simulation import lti_response, state_trajectory
 from .hankel import correlation_sequence
-from .signals import Record
+from .records import Record
 from .simulation_fit import Freedom, Realization
 
 Array = NDArray[np.float64]
@@ -164,7 +164,7 @@ class Whitening(NamedTuple):
         """Samples of every one of the `records` that it leaves."""
         lost = len(self.filter) - 1
         first = lost if free.initial_states else 0
-        lengths = [record.u.shape[1] for record in records]
+        lengths = [record.n_samples for record in records]
         return [n - first for n in lengths if n > 2 * lost]
 
     def model(self, model: Realization) -> Realization:

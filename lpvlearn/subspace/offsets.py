@@ -33,9 +33,10 @@ from ..exceptions import DivergenceError
 from ..systems.beginnings import moves_of, standing
 from ..systems.least_squares import column_scale
 from ..systems.simulation import free_responses, lti_response, trend_signals
-from .identification import Centres, mode_rates, spectral_radius
+from .identification import mode_rates, spectral_radius
 from .noise import autoregression, spectral_density
-from .signals import Record, signal_factor
+from .records import Centres, Record
+from .signals import signal_factor
 from .simulation_fit import (
     Realization,
     in_sections,

@@ -17,20 +17,13 @@ from ..data.preparation import Pairs, independent_inputs
 from ..exceptions import RankWarning
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
 from .held_out import HeldOut, held_out
-from .identification import (
-    Candidate,
-    ScaledRecords,
-    Settings,
-    centred,
-    identify,
-    scale_records,
-    validate,
-)
+from .identification import Candidate, Settings, identify, validate
 from .local_fit import LocalFit
 from .offsets import attributed, with_levels, without_slow_modes
 from .options import Choices
+from .records import Record, ScaledRecords, centred, scale_records, share_known, shorten
 from .selection import PlantFit, Row, Selection, select
-from .signals import Record, SharedSignals, share_known, shorten
+from .signals import SharedSignals
 from .simulation_fit import Realization, simulation_errors
 from .statistics import Evidence
 from .telling import Telling

@@ -25,8 +25,9 @@ from scipy import linalg
 from ..systems.least_squares import column_scale, scaled_lstsq
 from ..systems.modes import spectral_radius
 from .realization import observability_matrix
+from .records import Record
 from .refinement import UNDETERMINED
-from .signals import Record, block_slices, signal_factor
+from .signals import block_slices, signal_factor
 from .simulation_fit import (
     Freedom,
     Realization,

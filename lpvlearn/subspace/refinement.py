@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from ..systems.least_squares import column_scale, scaled_lstsq
-from .signals import Record, SharedSignals, block_radius, output_energy
+from .records import Record, output_energy
+from .signals import SharedSignals, block_radius
 from .simulation_fit import Freedom, Realization, block_fit, linearised, moved_model
 
 Array = NDArray[np.float64]

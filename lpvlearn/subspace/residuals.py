@@ -54,9 +54,8 @@ from ..systems.simulation import (
 from ..systems.threads import one_blas_thread
 from ..validation import one_of, share, whole_number
 from .hankel import correlation_sequence, factor_of_pieces
-from .identification import centred
 from .noise import autoregression, through_filter, whitening_filter
-from .signals import thinned
+from .records import centred, thinned
 from .simulation_fit import simulation_errors, with_initial_states
 from .statistics import Evidence
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .signals import Record
+from .records import Record
 from .simulation_fit import Realization, simulation_errors
 
 Array = NDArray[np.float64]

@@ -44,9 +44,9 @@ from .identification import (
 )
 from .noise import Whitening
 from .realization import ObservabilitySubspace
+from .records import Record, output_energy, thinned
 from .refinement import refine_simulation
 from .rounding import rounded_outputs
-from .signals import Record, output_energy, thinned
 from .simulation_fit import (
     Realization,
     simulation_errors,
@@ -227,8 +227,8 @@ def _of_longer_time(
     As many samples of slow motion as a choice needs may take longer than the records
     that it was made of.
     """
-    n_samples = sum(record.u.shape[1] for record in whole)
-    factor = -(-n_samples // sum(record.u.shape[1] for record in thinned(whole)))
+    n_samples = sum(record.n_samples for record in whole)
+    factor = -(-n_samples // sum(record.n_samples for record in thinned(whole)))
     if factor == 1 or chosen.candidate is None:
         return chosen
     n, free = order or max(chosen.order, _PILOT_ORDER), settings.free
@@ -528,7 +528,7 @@ def _highest_horizon(records: Sequence[Record], settings: Settings) -> int:
     """Highest horizon to try: one that the data fill and that costs little."""
     ny, m = settings.free.direct.shape
     height = 2 * m + (1 if settings.method == "pi-moesp" else 2) * ny
-    lengths = [record.u.shape[1] for record in records]
+    lengths = [record.n_samples for record in records]
     return min(settings.max_horizon(lengths), max(2, _MAX_ROWS // height))
 
 
@@ -669,7 +669,7 @@ def _with_more_states(
     if not np.isfinite(model.loss):
         return None
     left = [Record.of(r.u.T, e) for r, e in zip(records, errors, strict=True)]
-    room = settings.max_horizon([r.u.shape[1] for r in records])
+    room = settings.max_horizon([r.n_samples for r in records])
     horizon = min(_SHORT_HORIZON, room)
     if settings.max_order(horizon) < 1:
         return None
@@ -711,7 +711,7 @@ def _is_cut_short(
     wanted: _Range, records: Sequence[Record], settings: Settings
 ) -> bool:
     """Whether horizons that the data could fill are left out for what they cost."""
-    room = settings.max_horizon([record.u.shape[1] for record in records])
+    room = settings.max_horizon([record.n_samples for record in records])
     return _highest_horizon(records, settings) < room or None in wanted.spaces.values()
 
 
@@ -781,7 +781,7 @@ def _error_structure(
     does not depend on them (Bartlett's formula for two autocorrelated signals), and
     the largest of an output's error with that one sample before.
     """
-    n = min(record.u.shape[1], _MAX_SUSPECTED)
+    n = min(record.n_samples, _MAX_SUSPECTED)
     record, m = record.head(n), len(record.u)
     u, error = record.u.T, record.y.T - model.outputs(record, experiment)
     lags = correlation_sequence(np.hstack([u, error]), min(_N_LAGS, n))

@@ -34,7 +34,7 @@ from ..data.preparation import Pairs
 from .local_fit import LocalFit
 from .offsets import shifts_matter
 from .one_fit import Samples
-from .signals import Record
+from .records import Record
 from .telling import in_experiment
 from .varx import Regression, regression_of, samples_of
 

@@ -1,4 +1,4 @@
-"""Records, and the signals that all responses of a model to them are made of.
+"""The signals that all responses of a model to records are made of.
 
 With ``A = T diag(A_1, A_2, ...) inv(T)``, blocks of size one or two, every response of
 the model is a fixed combination of a few filtered signals that do not depend on B, C
@@ -24,8 +24,8 @@ import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ..systems.simulation import trend_signals
 from .hankel import factor_of_pieces
+from .records import Record
 
 Array = NDArray[np.float64]
 
@@ -33,89 +33,12 @@ _MAX_CONDITION = 1e8  # of T, beyond which the sections lose half of the digits
 _PARALLEL = 1.0 - 1e-8  # cosine of eigenvectors that leave their plane inaccurate
 _PIECE = 8192  # samples worked on at a time: their signals stay in the cache
 
-# Averages over the record are known to a percent or so from this many samples.
-_MAX_SAMPLES = 30_000
-
-FOR_A_CHOICE = 12_000  # samples: it needs fewer than an estimate
-
 Places = NDArray[np.intp]  # of experiments
 
 # Samples of an experiment up to which several are worked on together.
 _SHORT = 256
 
 _LARGEST = 1e200  # squares of responses beyond it would overflow
-
-
-class Record(NamedTuple):
-    """Samples of one experiment, one row per channel."""
-
-    u: Array  # (n_inputs, n_samples)
-    y: Array  # (n_outputs, n_samples)
-    trend: Array = np.zeros((0, 0))  # (n_trend, n_samples), free in every output
-    # (n_outputs, n_samples): outputs that were missing, and are estimates; empty: none
-    missing: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
-
-    @classmethod
-    def of(cls, u: Array, y: Array, n_trend: int = 0) -> Record:
-        """The record of samples with one row per time instant, rows contiguous."""
-        trend = trend_signals(len(u), n_trend)
-        return cls(np.ascontiguousarray(u.T), np.ascontiguousarray(y.T), trend)
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """Outputs that were there, (n_samples, n_outputs)."""
-        if self.missing.size:
-            return ~self.missing.T
-        return np.broadcast_to(np.True_, self.y.shape[::-1])
-
-    @property
-    def n_values(self) -> int:
-        """Number of outputs that were there."""
-        return self.y.size - int(np.count_nonzero(self.missing))
-
-    def part(self, samples: slice) -> Record:
-        """Some of the samples, in memory of their own."""
-        u, y, trend = (signals[:, samples].copy() for signals in self[:3])
-        return Record(u, y, trend, self.missing[:, samples])
-
-    def head(self, n_samples: int) -> Record:
-        """The first samples."""
-        return self.part(slice(n_samples))
-
-
-def output_energy(records: Sequence[Record]) -> float:
-    """Sum of squares of all outputs."""
-    return sum(float((record.y**2).sum()) for record in records)
-
-
-def share_known(records: Sequence[Record]) -> float:
-    """Share of the outputs that were there."""
-    return sum(r.n_values for r in records) / sum(r.y.size for r in records)
-
-
-def shorten(records: Sequence[Record]) -> tuple[list[Record], float]:
-    """Heads of the records, some 30,000 samples in total, and their share."""
-    total = sum(record.u.shape[1] for record in records)
-    share = _MAX_SAMPLES / total
-    if share >= 1.0:
-        return list(records), 1.0
-    parts = [r.head(max(2, int(share * r.u.shape[1]))) for r in records]
-    return parts, sum(record.u.shape[1] for record in parts) / total
-
-
-def thinned(records: Sequence[Record], n_samples: int = FOR_A_CHOICE) -> list[Record]:
-    """Evenly spread experiments of about `n_samples` in total, at least one.
-
-    Experiments beyond that length are cut to it.
-
-    >>> runs = [Record(np.zeros((1, n)), np.zeros((1, n))) for n in (50, 40, 60, 70)]
-    >>> [run.u.shape[1] for run in thinned(runs, 120)]
-    [50, 60]
-    """
-    lengths = [record.u.shape[1] for record in records]
-    keep = max(1, min(len(records), int(n_samples * len(records) / sum(lengths))))
-    spread = [i * len(records) // keep for i in range(keep)]
-    return [records[i].head(n_samples) for i in spread]
 
 
 class Sections(NamedTuple):
@@ -265,7 +188,7 @@ def signal_factors(
     Their places, and (n_records, k, n_signals) with the Gramians of the signals; None
     where they overflow. `driven` is (n_records, order, 1 + n_inputs).
     """
-    lengths = np.array([record.u.shape[1] for record in records])
+    lengths = np.array([record.n_samples for record in records])
     groups: list[list[int]] = []
     for i in np.argsort(lengths, kind="stable").tolist():
         n = int(lengths[i])
@@ -291,7 +214,7 @@ def _short_factors(
     """
     (m, _), ny, n_trend = records[0].u.shape, len(records[0].y), len(records[0].trend)
     order, n_records = sum(len(block) for block in blocks), len(records)
-    lengths = [record.u.shape[1] for record in records]
+    lengths = [record.n_samples for record in records]
     longest, base = max(lengths), order * (1 + m)
     second = 0 if driven is None else order
     X = np.zeros((base + m + ny + second + n_trend, n_records, longest))

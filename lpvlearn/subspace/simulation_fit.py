@@ -30,10 +30,10 @@ from ..systems.simulation import (
     lti_response,
 )
 from .hankel import triangularize
+from .records import Record
 from .signals import (
     Pairs,
     Places,
-    Record,
     SharedSignals,
     block_sections,
     block_slices,

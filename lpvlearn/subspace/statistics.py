@@ -34,7 +34,8 @@ from ..systems.modes import spectral_radius
 from ..systems.response import resolvent
 from .criterion import criterion_of
 from .noise import Whitening, noise_of, reduced_noise_model, spectral_density
-from .signals import Record, block_slices, signal_pieces
+from .records import Record
+from .signals import block_slices, signal_pieces
 from .simulation_fit import (
     Freedom,
     Realization,
@@ -220,14 +221,14 @@ class Evidence:
         records = self.records
         if not np.logical_or.reduce([r.y.any(axis=1) for r in records]).all():
             return -np.inf  # nothing is left of it, and its scale tells nothing
-        n_samples = sum(record.u.shape[1] for record in records)
+        n_samples = sum(record.n_samples for record in records)
         units = 2.0 * n_samples * float(np.log(self.output_scale).sum())
         return units + criterion_of(self.model, records, self.free)
 
     @property
     def longest(self) -> int:
         """Samples of the longest record."""
-        return max(record.u.shape[1] for record in self.records)
+        return max(record.n_samples for record in self.records)
 
     @property
     def one_step(self) -> Evidence:

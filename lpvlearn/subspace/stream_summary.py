@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .hankel import HankelSum, extend_hankel_sum, start_hankel_sum
-from .identification import STABLE_LOSS, STABLE_MARGIN, Centres, centred
+from .identification import STABLE_LOSS, STABLE_MARGIN
 from .local_fit import LocalFit
 from .offsets import Offsets, attributed, joined
 from .options import Choices
@@ -30,6 +30,7 @@ from .realization import (
     observability_subspace,
     reflect_unstable,
 )
+from .records import Centres, Record, centred
 from .recursive_refinement import (
     Recursion,
     StretchError,
@@ -39,7 +40,6 @@ from .recursive_refinement import (
     start_recursion,
     stretch_error,
 )
-from .signals import Record
 from .simulation_fit import Realization, in_sections
 
 Array = NDArray[np.float64]
@@ -175,7 +175,7 @@ class StreamSummary:
             if enforce or (not refine and stable.loss <= STABLE_LOSS * best.loss):
                 model = stable
         evidence = self._first.evidence
-        kept = sum(record.u.shape[1] for record in evidence.records)
+        kept = sum(record.n_samples for record in evidence.records)
         return self._first._replace(
             model=model._replace(rank_deficit=self._first.model.rank_deficit),
             offsets=sums.offsets,

@@ -38,7 +38,7 @@ from scipy import linalg, special
 
 from ..systems.least_squares import scaled_lstsq
 from .hankel import hankel_factor, without_trend
-from .signals import Record, thinned
+from .records import Record, thinned
 
 Array = NDArray[np.float64]
 

@@ -20,6 +20,7 @@ from scipy.linalg import block_diag, expm
 
 from lpvlearn.subspace import identification
 from lpvlearn.subspace.hankel import _hankel_matrix, data_factors
+from lpvlearn.subspace.records import scale_records
 from lpvlearn.subspace.selection import select
 from lpvlearn.subspace.simulation_fit import Freedom
 from lpvlearn.systems.simulation import lti_response
@@ -77,7 +78,7 @@ def arm_system() -> System:
 
 def identify(u: Array, y: Array, order: int, horizon: int, **options) -> System:
     """The function core of `SubspaceLTI`."""
-    records, su, sy = identification.scale_records([(u, y)])
+    records, su, sy = scale_records([(u, y)])
     settings = _settings(u, y, **options)
     model = identification.identify(records, order, horizon, settings).model
     return model.A, model.B / su, sy[:, None] * model.C, sy[:, None] * model.D / su
@@ -282,7 +283,7 @@ def monte_carlo(n_fits: int) -> None:
     for method in ("po-moesp", "pi-moesp"):
         y = clean + sigma * rng.standard_normal(clean.shape)
         start = time.process_time()
-        records = identification.scale_records([(u, y)]).records
+        records = scale_records([(u, y)]).records
         settings = _settings(u, y, method=method)
         horizon = select(records, 6, None, settings).horizon
         chosen = time.process_time() - start

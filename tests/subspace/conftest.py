@@ -8,6 +8,7 @@ import pytest
 from lpvlearn.subspace import identification
 from lpvlearn.subspace import stream as stream_module
 from lpvlearn.subspace import stream_summary as summary_module
+from lpvlearn.subspace.records import scale_records
 from lpvlearn.subspace.simulation_fit import Freedom
 from lpvlearn.systems.simulation import lti_response
 
@@ -83,7 +84,7 @@ class Found(NamedTuple):
 
 def identify(pairs, order, horizon, *, feedthrough=True, **options):
     """The function core of `SubspaceLTI`, on samples that are not scaled yet."""
-    records, su, sy = identification.scale_records(pairs)
+    records, su, sy = scale_records(pairs)
     free = Freedom(np.full((len(sy), len(su)), feedthrough))
     settings = identification.Settings(free, **options)
     found = identification.identify(records, order, horizon, settings)

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from lpvlearn.subspace.criterion import criterion_of
-from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.simulation_fit import Realization, with_initial_states
 
 from ..conftest import modes

@@ -7,7 +7,7 @@ from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.metrics import bft_score
 from lpvlearn.subspace.decimation import SlowStarts, decimated, full_rate
 from lpvlearn.subspace.identification import Settings
-from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.simulation_fit import Freedom
 
 STEP = 0.006  # seconds: some five hundred samples in a period of the faster mode

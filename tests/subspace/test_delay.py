@@ -88,7 +88,7 @@ def test_inputs_before_a_gap_of_the_outputs_are_known():
     found = estimator(missing="split").fit(u, y)
     assert found.residual_ < 1e-9
     # 4 samples are lost at the start, none after the gap
-    assert sum(record.u.shape[1] for record in found._evidence.records) == 300 - 4 - 2
+    assert sum(record.n_samples for record in found._evidence.records) == 300 - 4 - 2
     stream = estimator(missing="split")
     for start in range(0, 300, 60):
         stream.partial_fit(u[start : start + 60], y[start : start + 60])
@@ -248,7 +248,7 @@ def test_holes_in_time_end_what_is_known_of_the_inputs():
     found = estimator(**options).fit(table, y[rows])
     assert found.residual_ < 1e-9
     # 4 samples are lost at the start, and after the hole
-    assert sum(record.u.shape[1] for record in found._evidence.records) == 297 - 8
+    assert sum(record.n_samples for record in found._evidence.records) == 297 - 8
     np.testing.assert_allclose(
         found.predict_with_initial_state(table, y[rows]), y[rows], atol=1e-9
     )

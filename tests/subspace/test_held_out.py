@@ -6,7 +6,7 @@ from scipy import linalg
 from scipy.signal import lfilter, place_poles
 
 from lpvlearn.subspace.held_out import HeldOut, Part, held_out
-from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.simulation_fit import Realization
 
 from ..conftest import modes
@@ -20,7 +20,7 @@ def test_errors_are_those_of_the_pieces_alone(rng):
     lengths = []
 
     def refitted(train):
-        lengths.append([record.u.shape[1] for record in train])
+        lengths.append([record.n_samples for record in train])
         return model
 
     error = held_out(refitted, [Record.of(u, y)])
@@ -44,7 +44,7 @@ def test_a_short_experiment_beside_a_long_one_is_not_cut(rng):
     kept = []
 
     def refitted(train):
-        kept.append(train[-1].u.shape[1])
+        kept.append(train[-1].n_samples)
         return model
 
     both = held_out(refitted, [long, short])
@@ -96,7 +96,7 @@ def test_of_short_experiments_whole_ones_are_held_out(rng):
     model, out = Realization(*system, np.zeros((8, 6)), 0.0), []
 
     def refitted(train):
-        out.append(set(lengths) - {record.u.shape[1] for record in train})
+        out.append(set(lengths) - {record.n_samples for record in train})
         return model
 
     assert held_out(refitted, records).residual < 1e-9
@@ -191,7 +191,7 @@ def test_what_moves_in_one_piece_alone_is_not_held_out(rng):
     lengths = []
 
     def refitted(train):
-        lengths.append([record.u.shape[1] for record in train])
+        lengths.append([record.n_samples for record in train])
         return Realization(*system, np.zeros((1, 6)), 0.0)
 
     held_out(refitted, [Record.of(u, y)])

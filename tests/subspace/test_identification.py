@@ -8,7 +8,7 @@ from lpvlearn import SubspaceLTI, bft_score
 from lpvlearn.subspace.identification import Candidate, Settings, _is_astray
 from lpvlearn.subspace.noise import Whitening
 from lpvlearn.subspace.realization import METHODS
-from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.simulation_fit import simulation_fit
 from lpvlearn.systems.simulation import lti_response
 

@@ -15,7 +15,7 @@ from lpvlearn.subspace.noise import (
     reduced_noise_model,
     spectral_density,
 )
-from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.simulation_fit import (
     Freedom,
     Realization,
@@ -176,7 +176,7 @@ def test_a_model_answers_whitened_inputs_with_whitened_outputs(system):
         whitening = Whitening.of([colour * [0.1, 1.0]], free)
         lost = 0 if at_rest else len(whitening.filter) - 1
         white = whitening.records([Record.of(u, y)], free)
-        assert white[0].u.shape[1] == 300 - lost and len(whitening.filter) > 1
+        assert white[0].n_samples == 300 - lost and len(whitening.filter) > 1
         found = identify([(u, y)], 5, 8)
         model = whitening.model(in_form(found))
         model = with_initial_states(model, white, free)

@@ -10,14 +10,13 @@ from scipy.signal import lfilter
 from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
 from lpvlearn.metrics import bft_score
 from lpvlearn.subspace import hankel, offsets
-from lpvlearn.subspace.identification import centred
 from lpvlearn.subspace.offsets import (
     _far_off,
     _tail,
     stands_by_chance,
     without_slow_modes,
 )
-from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.records import Record, centred
 from lpvlearn.subspace.simulation_fit import Freedom, _general_regression, block_fit
 from lpvlearn.systems.simulation import lti_response, trend_signals
 

@@ -5,12 +5,12 @@ import pytest
 from scipy.linalg import block_diag
 
 from lpvlearn import StateSpace
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.recursive_refinement import (
     _aligned_pair,
     input_matrices,
     start_recursion,
 )
-from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import simulation_fit
 
 from .conftest import freedom, record

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.refinement import refine_simulation
-from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.simulation_fit import simulation_fit
 from lpvlearn.systems.simulation import lti_response
 

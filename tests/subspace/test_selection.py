@@ -11,11 +11,11 @@ from lpvlearn.metrics import bft_score
 from lpvlearn.subspace import fit_warnings, selection
 from lpvlearn.subspace.held_out import HeldOut, Part
 from lpvlearn.subspace.identification import Settings
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.selection import (
     _horizon_grid,
     select,
 )
-from lpvlearn.subspace.signals import Record
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes, stable_model

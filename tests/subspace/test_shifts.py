@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 from lpvlearn import SubspaceLTI
 from lpvlearn.subspace import shifts
 from lpvlearn.subspace.one_fit import Samples
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.shifts import _statistics, cut_at, find_shifts
-from lpvlearn.subspace.signals import Record
 from lpvlearn.subspace.varx import find_feedback, longest_past, regression_of
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.signals import (
-    Record,
     SharedSignals,
     block_sections,
     section_states,

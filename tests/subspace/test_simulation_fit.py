@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from lpvlearn.subspace.signals import Record, block_sections, signal_factor
+from lpvlearn.subspace.records import Record
+from lpvlearn.subspace.signals import block_sections, signal_factor
 from lpvlearn.subspace.simulation_fit import (
     _general_regression,
     _solve_regressions,

@@ -7,7 +7,7 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from lpvlearn import SubspaceLTI
-from lpvlearn.subspace.signals import Record
+from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.varx import find_feedback, longest_past, past_window
 
 from ..conftest import stable_model
