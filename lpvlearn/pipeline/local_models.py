@@ -29,9 +29,9 @@ from ..restructuring.known_poles import integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
-from ..subspace.identification import mode_rates
 from ..subspace.integrating import integrating_flags
 from ..subspace.offsets import lasting
+from ..systems.modes import mode_rates
 from .runner import Done, PointRunner, label_of, tell_skipped
 
 Array = NDArray[np.float64]

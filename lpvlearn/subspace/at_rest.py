@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.beginnings import Stands, first_inputs, stands
+from ..systems.modes import spectral_radius
 from .criterion import PRICE
-from .identification import spectral_radius
 from .local_fit import LocalFit
 from .offsets import ALIKE, CERTAIN, HARDLY_DECAYS, stands_by_chance
 from .one_fit import Samples, TooFewSamples

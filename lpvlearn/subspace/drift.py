@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
+from ..systems.modes import mode_rates
 from .criterion import PRICE
-from .identification import mode_rates
 from .local_fit import LocalFit
 from .noise import Whitening
 from .offsets import (

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..systems.modes import mode_rates as mode_rates  # for the rooms that ask here
 from ..systems.modes import spectral_radius
 from .criterion import criterion_of
 from .hankel import data_factors

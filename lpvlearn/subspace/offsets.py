@@ -32,8 +32,8 @@ from ..data.preparation import Pairs
 from ..exceptions import DivergenceError
 from ..systems.beginnings import moves_of, standing
 from ..systems.least_squares import column_scale
+from ..systems.modes import mode_rates, spectral_radius
 from ..systems.simulation import free_responses, lti_response, trend_signals
-from .identification import mode_rates, spectral_radius
 from .noise import autoregression, spectral_density
 from .records import Centres, Record
 from .signals import signal_factor

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import DETRENDS
+from ..systems.modes import spectral_radius
 from .closed_loop import ClosedLoopEvidence
 from .criterion import PRICE
 from .delay import find_lead, with_later_inputs
 from .fit_warnings import Doubt
 from .held_out import DOUBT, HeldOut
-from .identification import spectral_radius
 from .local_fit import LocalFit
 from .offsets import CERTAIN, HARDLY_DECAYS, follows_means_alone
 from .one_fit import Samples, TooFewSamples
