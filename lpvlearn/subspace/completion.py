@@ -9,6 +9,7 @@ import numpy as np
 from ..data.experiments import Experiment
 from ..data.preparation import has_gaps
 from ..exceptions import DivergenceError
+from .criterion import EXACT, n_parameters
 from .delay import Delay
 from .local_fit import LocalFit
 from .missing_outputs import (
@@ -23,8 +24,10 @@ from .missing_outputs import (
 )
 from .one_fit import TooFewSamples
 from .options import Choices
-from .selection import MAX_ORDER, cost_of_known
+from .selection import MAX_ORDER
+from .simulation_fit import simulation_errors
 from .simulator import Simulator
+from .statistics import Evidence
 from .telling import Telling
 
 # Missing outputs are estimated in so many rounds at most, until they move by less than
@@ -72,12 +75,27 @@ def completed(
             found, fitted = _settled(runs, guess, some, delay, learn)
         except TooFewSamples:
             break
-        cost, beyond = cost_of_known(fitted.evidence), beyond + 1
+        cost, beyond = _cost_of_known(fitted.evidence), beyond + 1
         if cost < least:
             best, least, beyond = (found, some), cost, 0
         elif beyond == _BEYOND:
             break
     return best
+
+
+def _cost_of_known(evidence: Evidence) -> float:
+    """Schwarz's criterion of the simulation errors of outputs that are there."""
+    model, records, free = evidence.model, evidence.records, evidence.free
+    if not np.isfinite(model.loss):
+        return np.inf
+    known = np.vstack([record.known for record in records])
+    squares = np.where(known, np.vstack(simulation_errors(model, records)), 0.0) ** 2
+    n_known = known.sum(axis=0)
+    power = np.where(known, np.hstack([r.y for r in records]).T, 0.0) ** 2
+    floor = np.maximum(EXACT * power.sum(axis=0), np.finfo(float).tiny)
+    left = np.log(np.maximum(squares.sum(axis=0), floor) / n_known)
+    n_unknown = n_parameters(len(model.A), records, free)
+    return float(n_known @ left + np.log(n_known.sum()) * n_unknown)
 
 
 def completed_by(

@@ -48,7 +48,8 @@ from .completion import completed, completed_by
 from .cross_checks import tell_of_delay
 from .delay import Delay, find_delays, with_late_inputs
 from .fit import fit_samples
-from .fit_warnings import TESTS, warn_about, warn_about_horizon
+from .fit_warnings import TESTS, warn_about
+from .horizons import warn_about_horizon
 from .integrating import (
     RateEvidence,
     as_table,

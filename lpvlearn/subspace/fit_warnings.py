@@ -20,7 +20,7 @@ from ..data.preparation import (
     independent_inputs,
     stays_put,
 )
-from ..exceptions import RankWarning, warn
+from ..exceptions import RankWarning
 from .constancy import change_over
 from .held_out import HeldOut
 from .linearity import bent_outputs
@@ -36,7 +36,7 @@ from .options import Choices
 from .records import thinned
 from .residuals import find_spikes, lacks
 from .rounding import rounded_outputs
-from .selection import MAX_ORDER, better_horizon
+from .selection import MAX_ORDER
 from .statistics import OPEN, Evidence
 from .telling import Telling, in_experiment
 from .varx import Feedback
@@ -263,25 +263,6 @@ def tell_of_answers(feedback: Feedback, telling: Telling) -> None:
         "is that of the controller: use method='pbsid', feedthrough=False. Else it is "
         "measured with noise, or the system is not linear.",
     )
-
-
-def warn_about_horizon(fitted: LocalFit, choices: Choices) -> None:
-    """Tell the user when another horizon fits clearly better than the one given."""
-    if fitted.method == "pbsid":
-        return
-    better = better_horizon(
-        fitted.evidence.model,
-        fitted.residual,
-        fitted.scaled.records,
-        fitted.selection.horizon,
-        fitted.settings(choices),
-    )
-    if better is not None:
-        warn(
-            f"horizon={choices.horizon} ends in a poor model: its simulation error is "
-            f"{100.0 * fitted.residual:.3g} % of the outputs, that of horizon "
-            f"{better[0]} is {100.0 * better[1]:.3g} %. Use horizon='auto'."
-        )
 
 
 def warn_about(fitted: LocalFit, telling: Telling) -> None:

@@ -12,7 +12,7 @@ The criterion trusts that the system is what the models are. Simulation of parts
 out does not (`held_out`): it may lower the order, and decides among orders which the
 criterion hardly tells apart, as noise that follows the inputs and a further state are.
 
-A horizon that was given is not questioned but by `better_horizon`, after the fit.
+A horizon that was given is questioned after the fit only (`horizons`).
 """
 
 from __future__ import annotations
@@ -29,12 +29,10 @@ from scipy import linalg
 
 from .criterion import EXACT, PRICE, criterion_of, n_parameters
 from .decimation import SlowStarts, decimated, full_rate
-from .hankel import correlation_sequence
 from .held_out import MATTERS, HeldOut
 from .identification import (
     Candidate,
     Settings,
-    fit_once,
     of_records,
     realize,
     refit,
@@ -517,14 +515,14 @@ def _weighted(
 
 def _horizons(records: Sequence[Record], order: int, settings: Settings) -> list[int]:
     """Horizons to try: those that show the order and that the data can fill."""
-    highest = _highest_horizon(records, settings)
+    highest = highest_horizon(records, settings)
     lowest = 2 if highest > 1 else 1
     while lowest < highest and settings.max_order(lowest) < order:
         lowest += 1
     return _horizon_grid(lowest, highest)
 
 
-def _highest_horizon(records: Sequence[Record], settings: Settings) -> int:
+def highest_horizon(records: Sequence[Record], settings: Settings) -> int:
     """Highest horizon to try: one that the data fill and that costs little."""
     ny, m = settings.free.direct.shape
     height = 2 * m + (1 if settings.method == "pi-moesp" else 2) * ny
@@ -712,99 +710,10 @@ def _is_cut_short(
 ) -> bool:
     """Whether horizons that the data could fill are left out for what they cost."""
     room = settings.max_horizon([record.n_samples for record in records])
-    return _highest_horizon(records, settings) < room or None in wanted.spaces.values()
+    return highest_horizon(records, settings) < room or None in wanted.spaces.values()
 
 
 def _best_horizon(starts: Mapping[int, Realization], refine: bool) -> int:
     """Smallest horizon whose loss is near the best."""
     limit = min(model.loss for model in starts.values()) * _LOSS_SLACK[refine]
     return min(h for h, model in starts.items() if model.loss <= limit)
-
-
-# What a model at its minimum under white noise does not show: correlation of the
-# simulation error with past inputs, in standard deviations (the largest of a hundred
-# chance values is near three), or with its predecessor.
-_SUSPICIOUS, _SMOOTH = 6.0, 0.3
-
-# Where that is looked for: past inputs up to this many samples ago, in this many
-# samples of so many experiments.
-_N_LAGS, _MAX_SUSPECTED, _SUSPECTED_RECORDS = 40, 4_096, 4
-
-# Least variance of a correlation, relative to that of white signals: an estimated sum
-# of products over the lags may come out as low as zero.
-_LEAST_VARIANCE = 0.2
-
-_CLEARLY_BETTER = 0.9  # of the present error: that of a clearly better model
-_ROUNDING = 1e-6  # relative errors below it are rounding
-
-
-def better_horizon(
-    model: Realization,
-    residual: float,
-    records: Sequence[Record],
-    horizon: int,
-    settings: Settings,
-) -> tuple[int, float] | None:
-    """Another horizon whose model fits clearly better, and its residual.
-
-    Others are tried only if the simulation error has structure: coloured noise, a model
-    of too low an order, or a poor minimum, which can be told apart by trying.
-    """
-    if not _ROUNDING < residual < np.inf:
-        return None
-    some = enumerate(records[:_SUSPECTED_RECORDS])
-    structure = [_error_structure(model, record, k) for k, record in some]
-    if all(u < _SUSPICIOUS and v < _SMOOTH for u, v in structure):
-        return None
-    order, energy = len(model.A), output_energy(records)
-    highest = _highest_horizon(records, settings)
-    none = Whitening.none(len(records[0].y))
-    # One that minimises other errors is not to blame for those of simulation.
-    own = fit_once(records, order, horizon, settings, none).candidate
-    residual = min(residual, float(np.sqrt(own.model.loss / energy)))
-    for other in (2 * horizon, 4 * horizon, horizon // 2):
-        if not 2 <= other <= highest or settings.max_order(other) < order:
-            continue
-        trial = fit_once(records, order, other, settings, none).candidate
-        error = float(np.sqrt(trial.model.loss / energy))
-        if error < _CLEARLY_BETTER * residual:
-            return other, error
-    return None
-
-
-def _error_structure(
-    model: Realization, record: Record, experiment: int
-) -> tuple[float, float]:
-    """How much the simulation error depends on past inputs and on its own past.
-
-    The largest correlation with past inputs, in standard deviations of an error that
-    does not depend on them (Bartlett's formula for two autocorrelated signals), and
-    the largest of an output's error with that one sample before.
-    """
-    n = min(record.n_samples, _MAX_SUSPECTED)
-    record, m = record.head(n), len(record.u)
-    u, error = record.u.T, record.y.T - model.outputs(record, experiment)
-    lags = correlation_sequence(np.hstack([u, error]), min(_N_LAGS, n))
-    own = np.einsum("dii->di", lags)
-    of_u, of_v = own[:, :m], own[:, m:]
-    white = np.outer(of_u[0], of_v[0])
-    variance = np.maximum(2.0 * of_u.T @ of_v - white, _LEAST_VARIANCE * white) / n
-    variance[variance == 0.0] = np.inf
-    by_inputs = (np.abs(lags[:, :m, m:]) / np.sqrt(variance)).max()
-    size = np.where(of_v[0] > 0.0, of_v[0], np.inf)
-    return float(by_inputs), float((of_v[min(1, len(own) - 1)] / size).max())
-
-
-def cost_of_known(evidence: Evidence) -> float:
-    """Schwarz's criterion of the simulation errors of outputs that are there."""
-    model, records, free = evidence.model, evidence.records, evidence.free
-    if not np.isfinite(model.loss):
-        return np.inf
-    known = np.vstack([record.known for record in records])
-    squares = np.where(known, np.vstack(simulation_errors(model, records)), 0.0) ** 2
-    n_known = known.sum(axis=0)
-    power = np.where(known, np.hstack([r.y for r in records]).T, 0.0) ** 2
-    floor = np.maximum(EXACT * power.sum(axis=0), np.finfo(float).tiny)
-    left = np.log(np.maximum(squares.sum(axis=0), floor) / n_known)
-    n_unknown = n_parameters(len(model.A), records, free)
-    return float(n_known @ left + np.log(n_known.sum()) * n_unknown)
