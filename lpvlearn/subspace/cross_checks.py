@@ -7,18 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import DETRENDS, Rounded, far_out
-from ..exceptions import RankWarning
+from ..data.preparation import DETRENDS, far_out
 from ..systems.simulation import delayed, lti_response
 from ..validation import listed
 from .delay import first_samples, longest_delays
 from .held_out import DOUBT, HeldOut
 from .local_fit import LocalFit
-from .offsets import CERTAIN
 from .one_fit import Samples, TooFewSamples
 from .simulation_fit import simulation_errors, with_initial_states
 from .telling import in_experiment
-from .trends import with_trends
 
 Array = NDArray[np.float64]
 
@@ -42,11 +39,6 @@ _ANSWERED = 0.6
 # so many times of which that is looked for, and is not so high yet half the way there.
 _LATE, _FEWER = 3, 2
 _RISEN, _WHOLE, _EARLY = 4, 20, 0.25
-
-# Of inputs that only rounding tells apart: times the gain of all others, of a model
-# that makes of the ripple what it likes, at these frequencies (rad per sample); and the
-# part of the largest ripple from which an input is one of them.
-_WILD, _LOOKED_AT, _PART = 10.0, np.geomspace(1e-2, 3.0, 8), 0.05
 
 
 def tell_of_contradiction(samples: Samples, whole: LocalFit) -> None:
@@ -262,41 +254,3 @@ def _answers_late(fitted: LocalFit, delay: int) -> bool:
     heights = heights / np.maximum(heights.max(axis=0), np.finfo(float).tiny)
     late = (heights[: delay // 2 + 1] < _EARLY).all(axis=0)
     return bool((late & (heights[: _RISEN * delay] > 0.5).any(axis=0)).any())
-
-
-def without_rounding(
-    samples: Samples, whole: LocalFit, like: LocalFit | None
-) -> tuple[Samples, LocalFit]:
-    """Take out a ripple of inputs that only the rounding of their numbers makes.
-
-    A model makes of it what it likes, unless the ripple is what drives outputs.
-    """
-    pairs, telling = samples.pairs, samples.telling
-    rounded = Rounded.of([u for u, _ in pairs])
-    if rounded is None or not _is_wild(whole, rounded):
-        return samples, whole
-    exact = list(zip(rounded.exact, (y for _, y in pairs), strict=True))
-    fitted = with_trends(samples._replace(pairs=exact).aside("collinear"), like)
-    if not fitted.worse_than(whole) < CERTAIN:
-        return samples, whole
-    ripple = np.abs(np.vstack([u for u, _ in pairs]) - np.vstack(rounded.exact)).max(
-        axis=0
-    )
-    some = np.flatnonzero(ripple > _PART * ripple.max())
-    listed = ", ".join(telling.input(k) for k in some)
-    telling.once(
-        "rounded",
-        f"The inputs {listed} add up, weighted, to a constant but for the rounding of "
-        "their numbers: what each of them does is not identifiable, and the smallest "
-        "solution was taken. Excite them independently, or leave one out.",
-        RankWarning,
-    )
-    return samples._replace(pairs=exact), fitted
-
-
-def _is_wild(fitted: LocalFit, rounded: Rounded) -> bool:
-    """Whether a model makes far more of a ripple than of all that inputs do else."""
-    model = fitted.evidence.state_space(fitted.model, 1.0)
-    G = model.frequency_response(_LOOKED_AT)
-    of_ripple = np.abs(G @ rounded.faint).max()
-    return bool(of_ripple > _WILD * np.abs(G @ rounded.others).max())

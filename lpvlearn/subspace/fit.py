@@ -11,7 +11,7 @@ import numpy as np
 
 from ..data.preparation import check_excitation, remove_trends
 from .at_rest import from_rest, moved_back
-from .cross_checks import tell_of_contradiction, tell_of_input_spikes, without_rounding
+from .cross_checks import tell_of_contradiction, tell_of_input_spikes
 from .drift import of_drifting_noise
 from .fit_warnings import (
     tell_of_answers,
@@ -31,6 +31,7 @@ from .rivals import (
     tell_of_lead,
     with_shared_noise,
 )
+from .rounded_inputs import without_rounding
 from .shifts import without_shifts
 from .trends import with_trends
 

@@ -6,7 +6,6 @@ Of kinds of things that were told already nothing is said again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +34,7 @@ from .offsets import (
 from .options import Choices
 from .records import thinned
 from .residuals import find_spikes, lacks
+from .rivals import Doubt
 from .rounding import rounded_outputs
 from .selection import MAX_ORDER
 from .statistics import OPEN, Evidence
@@ -165,14 +165,6 @@ def tell_of_limits(
                 "the limits, or use NaN for these samples and missing='estimate', and "
                 "compare.",
             )
-
-
-class Doubt(NamedTuple):
-    """Why the first model of a closed loop was given up."""
-
-    bft: float  # on parts held out, percent
-    bft_taken: float  # of the model that was taken instead
-    grew: bool  # whether it was unstable
 
 
 def tell_of_feedback(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from ..systems.modes import spectral_radius
 from .closed_loop import ClosedLoopEvidence
 from .criterion import PRICE
 from .delay import find_lead, with_later_inputs
-from .fit_warnings import Doubt
 from .held_out import DOUBT, HeldOut
 from .local_fit import LocalFit
 from .offsets import CERTAIN, HARDLY_DECAYS, follows_means_alone
@@ -45,6 +44,14 @@ _LAGS, _PLENTY, _AUDIBLE = 2, 20_000, 0.01
 # Share of the squared errors of parts held out that further states leave there where
 # they are the plant's.
 _FAR_BETTER = 0.5
+
+
+class Doubt(NamedTuple):
+    """Why the first model of a closed loop was given up."""
+
+    bft: float  # on parts held out, percent
+    bft_taken: float  # of the model that was taken instead
+    grew: bool  # whether it was unstable
 
 
 def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | None]:
