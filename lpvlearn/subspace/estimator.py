@@ -65,7 +65,14 @@ from .missing_outputs import (
 )
 from .offsets import N_TRENDS, USELESS, of_rates
 from .one_fit import Samples
-from .options import Choices, check_options
+from .options import (
+    Choices,
+    check_for_completion,
+    check_for_rates,
+    check_options,
+    choices_of_each,
+    choices_of_stream,
+)
 from .residuals import (
     Residuals,
     check_kind,
@@ -478,12 +485,7 @@ class SubspaceLTI(
         if rates:
             telling = telling.aside("noisy output", "useless", "dropouts")
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
-            if self.detrend is not None:
-                raise ValueError(
-                    "`detrend` must be None with missing='estimate': means of outputs "
-                    f"that are not there are not known. Got {self.detrend!r}. Use "
-                    f"offset={self.detrend!r}."
-                )
+            check_for_completion(self.detrend)
             experiments, choices = completed(
                 experiments, choices, telling, self._delay_of, self._learn
             )
@@ -550,17 +552,7 @@ class SubspaceLTI(
         >>> print(f"{np.mean(poles):.3f}, {np.std(poles):.4f}")
         0.899, 0.0009
         """
-        if self.missing == "estimate":
-            raise ValueError(
-                "`missing` must be 'raise' or 'split' in fit_each. Got 'estimate'. Use "
-                "`fit` for every experiment."
-            )
-        if self.integrating is not None:
-            raise ValueError(
-                f"`integrating` must be None in fit_each. Got {self.integrating!r}. "
-                "Give it the rates of the outputs, or `fit` every experiment."
-            )
-        choices = check_options(self.get_params(deep=False))
+        choices = choices_of_each(self.get_params(deep=False))
         first = clone(self)
         experiments = first._read(X, y, reset=True, cut=False)
         first._single_output = np.asarray(y).ndim == 1
@@ -618,17 +610,7 @@ class SubspaceLTI(
 
     def _fit_rates(self, X: Any, y: Any) -> Self:
         """Identify the rates of integrating outputs, and integrate their model."""
-        if self.missing == "estimate":
-            raise ValueError(
-                "`missing` must be 'raise' or 'split' with `integrating`: the rates of "
-                "missing outputs are not estimated. Got 'estimate'."
-            )
-        if self.detrend is not None or self.offset == "linear":
-            raise ValueError(
-                "`integrating` needs detrend=None, and another offset than 'linear': "
-                "constants of the rates are straight lines. Got "
-                f"detrend={self.detrend!r}, offset={self.offset!r}."
-            )
+        check_for_rates(self.get_params(deep=False))
         experiments = self._read(X, y, reset=True)
         self.time_jitter_ = max(e.jitter for e in experiments)
         self._stream, self._single_output = None, np.asarray(y).ndim == 1
@@ -774,7 +756,8 @@ class SubspaceLTI(
             if stream is not None:
                 return self._go_on(stream)
             before.check_options(self.__dict__)
-        choices: Any = self._choices_of_stream() if before is None else None
+        options = self.get_params(deep=False)
+        choices: Any = choices_of_stream(options) if before is None else None
         if y is None:
             raise ValueError(
                 "SubspaceLTI requires y to be passed, but the target y is None: `y` "
@@ -791,12 +774,11 @@ class SubspaceLTI(
         jitter = 0.0 if before is None else self.time_jitter_
         self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
         if before is None:
-            step, options = self._step_of(experiments), self.get_params(deep=False)
             stream = SampleStream(
                 choices,
                 options,
                 experiments,
-                step,
+                self._step_of(experiments),
                 _names_of(experiments, y),
                 Telling(*_labels_of(X, experiments, y)),
             )
@@ -807,40 +789,6 @@ class SubspaceLTI(
         if fitted is not None:
             self._take_up(fitted, stream)
         return self._go_on(stream)
-
-    def _choices_of_stream(self) -> Choices:
-        """The options, checked, of which a stream takes not all."""
-        choices = check_options(self.get_params(deep=False))
-        if self.missing == "estimate":
-            raise ValueError(
-                "`missing` must be 'raise' or 'split' in partial_fit, which never sees "
-                "what comes after a gap. Got 'estimate'. Use `fit` for it."
-            )
-        if self.integrating is not None:
-            raise ValueError(
-                "`integrating` must be None in partial_fit. Got "
-                f"{self.integrating!r}. Give it the rates of the outputs, or use `fit`."
-            )
-        if self.detrend is not None:
-            raise ValueError(
-                "`detrend` must be None in partial_fit, which never sees a whole "
-                f"experiment. Got {self.detrend!r}. Use offset={self.detrend!r}."
-            )
-        if isinstance(self.input_delay, str):
-            raise ValueError(
-                "`input_delay` must be a number in partial_fit, which keeps so many "
-                f"samples from batch to batch. Got {self.input_delay!r}. Find it by "
-                "`fit` of a first part of the record, in `input_delay_`."
-            )
-        if choices.method == "pbsid":
-            raise ValueError(
-                "`method` must not be 'pbsid' in partial_fit: of a stream, what it "
-                "needs is not kept. `fit` the table as a whole, or, if the plant "
-                "stands in no feedback loop, leave method='auto'."
-            )
-        if choices.method == "auto":
-            return choices._replace(method="po-moesp")
-        return choices
 
     def _go_on(self, stream: SampleStream) -> Self:
         """Have what a stream does not tell yet wait for someone to ask for it."""

@@ -102,6 +102,80 @@ def check_options(options: Mapping[str, Any]) -> Choices:
     )
 
 
+def check_for_completion(detrend: str | None) -> None:
+    """Refuse what the completion of missing outputs does not take."""
+    if detrend is not None:
+        raise ValueError(
+            "`detrend` must be None with missing='estimate': means of outputs that are "
+            f"not there are not known. Got {detrend!r}. Use offset={detrend!r}."
+        )
+
+
+def check_for_rates(options: Mapping[str, Any]) -> None:
+    """Refuse what the rates of integrating outputs do not take."""
+    detrend, offset = options["detrend"], options["offset"]
+    if options["missing"] == "estimate":
+        raise ValueError(
+            "`missing` must be 'raise' or 'split' with `integrating`: the rates of "
+            "missing outputs are not estimated. Got 'estimate'."
+        )
+    if detrend is not None or offset == "linear":
+        raise ValueError(
+            "`integrating` needs detrend=None, and another offset than 'linear': "
+            f"constants of the rates are straight lines. Got {detrend=}, {offset=}."
+        )
+
+
+def choices_of_each(options: Mapping[str, Any]) -> Choices:
+    """As `check_options`, of which `fit_each` takes not all."""
+    if options["missing"] == "estimate":
+        raise ValueError(
+            "`missing` must be 'raise' or 'split' in fit_each. Got 'estimate'. Use "
+            "`fit` for every experiment."
+        )
+    if options["integrating"] is not None:
+        raise ValueError(
+            f"`integrating` must be None in fit_each. Got {options['integrating']!r}. "
+            "Give it the rates of the outputs, or `fit` every experiment."
+        )
+    return check_options(options)
+
+
+def choices_of_stream(options: Mapping[str, Any]) -> Choices:
+    """As `check_options`, of which `partial_fit` takes not all."""
+    choices = check_options(options)
+    detrend, input_delay = options["detrend"], options["input_delay"]
+    if options["missing"] == "estimate":
+        raise ValueError(
+            "`missing` must be 'raise' or 'split' in partial_fit, which never sees "
+            "what comes after a gap. Got 'estimate'. Use `fit` for it."
+        )
+    if options["integrating"] is not None:
+        raise ValueError(
+            "`integrating` must be None in partial_fit. Got "
+            f"{options['integrating']!r}. Give it the rates of the outputs, or use "
+            "`fit`."
+        )
+    if detrend is not None:
+        raise ValueError(
+            "`detrend` must be None in partial_fit, which never sees a whole "
+            f"experiment. Got {detrend!r}. Use offset={detrend!r}."
+        )
+    if isinstance(input_delay, str):
+        raise ValueError(
+            "`input_delay` must be a number in partial_fit, which keeps so many "
+            f"samples from batch to batch. Got {input_delay!r}. Find it by "
+            "`fit` of a first part of the record, in `input_delay_`."
+        )
+    if choices.method == "pbsid":
+        raise ValueError(
+            "`method` must not be 'pbsid' in partial_fit: of a stream, what it "
+            "needs is not kept. `fit` the table as a whole, or, if the plant "
+            "stands in no feedback loop, leave method='auto'."
+        )
+    return choices._replace(method="po-moesp") if choices.method == "auto" else choices
+
+
 def _order(value: Any) -> tuple[int | None, tuple[int, ...]]:
     """The order, or None and those among which it is to be chosen: () for "auto"."""
     listed = isinstance(value, np.ndarray) and value.ndim == 1
