@@ -55,15 +55,17 @@ from .integrating import (
     as_table,
     integrated,
     integrating_flags,
+    is_poorer,
+    options_of_rates,
     rates_of,
-    simulates_worse,
     sums_of,
+    warn_if_useless,
 )
 from .local_fit import LocalFit
 from .missing_outputs import (
     warn_of_many_pieces,
 )
-from .offsets import N_TRENDS, USELESS, of_rates
+from .offsets import N_TRENDS, Offsets, of_rates
 from .one_fit import Samples
 from .options import (
     Choices,
@@ -617,46 +619,25 @@ class SubspaceLTI(
         flags = integrating_flags(self.integrating, read_outputs(y)[1])
         step = self._step_of(experiments)
         table, rates = as_table(rates_of(experiments, flags, float(step)))
-        m = table.shape[1] - 1
-        # What acts at once follows from how rates are made: a table, which says so.
-        direct = np.broadcast_to(self.feedthrough, (len(flags), m)) | flags[:, None]
-        rate_model = clone(self).set_params(
-            integrating=None,
-            missing="raise",
-            feedthrough=direct,
-            sampling_time=None if step is True else step,
-            inputs=list(table.columns[:-1]),
-            experiment=table.columns[-1],
-            time=None,
-            scheduling=None,
-            operating_point=None,
-        )
+        options = options_of_rates(table, flags, self.feedthrough, step)
+        rate_model = clone(self).set_params(**options)
         self.rates_ = inner = rate_model._fit_table(table, rates, rates=True)
         best = inner
         if flags.all() and inner.method_ != "pbsid":
             best = self._of_sums(experiments, inner)
-        if best.residual_ > USELESS:
-            what = "the rates of the outputs" if best is inner else "the outputs"
-            warn(
-                f"The model explains next to nothing of {what}: its simulation error "
-                f"is {100.0 * best.residual_:.0f} % of their size. Check that the "
-                "outputs integrate, that inputs and outputs belong together, and that "
-                "rows are in the order of time; or leave `integrating` out."
-            )
+        warn_if_useless(best.residual_, of_rates=best is inner)
         self.lti_: StateSpace = integrated(best.lti_, flags)
         self._name(*_names_of(experiments, y))
-        self._evidence: Any = RateEvidence(best.deviated_models(), flags, m)
+        models, n_inputs = best.deviated_models(), self.lti_.n_inputs
+        self._evidence: Any = RateEvidence(models, flags, n_inputs)
         self.input_delay_, self.order_ = self.lti_.input_delay, self.lti_.order
         self.horizon_, self.method_ = inner.horizon_, inner.method_
         self.selection_, self.residual_ = inner.selection_, inner.residual_
         self.singular_values_ = inner.singular_values_
         self.stability_loss_, self.n_outputs_ = inner.stability_loss_, len(flags)
-        self._offsets = of_rates(inner._offsets, inner.lti_.dc_gain(), flags)
-        self.offset_, self.offsets_differ_ = inner.offset_, inner.offsets_differ_
-        self.steady_start_ = False
-        self.input_offset_ = self._offsets.inputs
-        self.output_offset_ = self._offsets.outputs
-        self.output_drift_ = self._offsets.drifts / float(step)
+        self.offset_ = inner.offset_
+        offsets = of_rates(inner._offsets, inner.lti_.dc_gain(), flags)
+        self._take_offsets(offsets, step)
         return self
 
     def _of_sums(self, experiments: Sequence[Experiment], rates: Self) -> Self:
@@ -678,9 +659,7 @@ class SubspaceLTI(
                 sums.fit(table, y)
         except ValueError:  # too few samples for a constant
             return rates
-        grows = rates.lti_.is_stable and not sums.lti_.is_stable
-        worse = simulates_worse(sums._evidence, sums.lti_, rates.lti_)
-        return rates if grows or worse else sums
+        return rates if is_poorer(sums._evidence, sums.lti_, rates.lti_) else sums
 
     @all_or_nothing
     def partial_fit(self, X: Any, y: Any) -> Self:
@@ -917,12 +896,13 @@ class SubspaceLTI(
         self.singular_values_ = fitted.singular_values
         self.residual_ = fitted.residual
         self.stability_loss_ = fitted.stability_loss
-        self._offsets = fitted.offsets
         self.offset_ = DETRENDS[fitted.evidence.free.n_trend]
-        self.input_offset_ = fitted.offsets.inputs
-        self.output_offset_ = fitted.offsets.outputs
-        self.output_drift_ = fitted.offsets.drifts / step
-        self.offsets_differ_ = fitted.offsets.differ
+        self._take_offsets(fitted.offsets, step)
+
+    def _take_offsets(self, offsets: Offsets, step: float) -> None:
+        self._offsets, self.offsets_differ_ = offsets, offsets.differ
+        self.input_offset_, self.output_offset_ = offsets.inputs, offsets.outputs
+        self.output_drift_ = offsets.drifts / step
         self.steady_start_ = False  # but for experiments that are all there
 
     def _name(self, inputs: Any, outputs: Any) -> None:

@@ -17,8 +17,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..data.experiments import Experiment
+from ..exceptions import warn
 from ..models.statespace import ModelPair, StateSpace
 from ..validation import has_one_axis, is_whole, shown
+from .offsets import USELESS
 from .simulation_fit import Freedom, simulation_fit
 from .statistics import Evidence
 
@@ -102,6 +104,29 @@ def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:
     return table, y
 
 
+def options_of_rates(
+    table: pd.DataFrame, flags: Flags, feedthrough: Any, step: float
+) -> dict[str, Any]:
+    """Options of a model of the rates that are not those of the outputs' model.
+
+    `table` as of `as_table`, `step` in seconds, or True where nothing tells them.
+    """
+    *inputs, experiment = table.columns
+    # What acts at once follows from how rates are made: a table, which says so.
+    direct = np.broadcast_to(feedthrough, (len(flags), len(inputs))) | flags[:, None]
+    return {
+        "integrating": None,
+        "missing": "raise",
+        "feedthrough": direct,
+        "sampling_time": None if step is True else step,
+        "inputs": inputs,
+        "experiment": experiment,
+        "time": None,
+        "scheduling": None,
+        "operating_point": None,
+    }
+
+
 def integrated(model: StateSpace, flags: Flags) -> StateSpace:
     """The model of the outputs from that of the rates of some of them.
 
@@ -119,14 +144,33 @@ def integrated(model: StateSpace, flags: Flags) -> StateSpace:
     return StateSpace(A, B, C, D, model.sampling_time, input_delay=model.input_delay)
 
 
-def simulates_worse(evidence: Evidence, model: StateSpace, other: StateSpace) -> bool:
-    """Whether the poles and outputs of a model explain records worse than another's."""
+def is_poorer(evidence: Evidence, model: StateSpace, other: StateSpace) -> bool:
+    """Whether a model explains records worse than another, or grows unlike that.
+
+    What is compared are poles and outputs: the rest is fitted to the records.
+    """
 
     def loss(of: StateSpace) -> float:
         C = of.C / evidence.output_scale[:, None]
         return simulation_fit(of.A, C, evidence.records, evidence.free).loss
 
-    return loss(model) > _WORSE * loss(other)
+    grows = other.is_stable and not model.is_stable
+    return grows or loss(model) > _WORSE * loss(other)
+
+
+def warn_if_useless(residual: float, *, of_rates: bool) -> None:
+    """Tell the user that a model explains next to nothing, of outputs or their rates.
+
+    `residual` is its simulation error, relative.
+    """
+    if residual > USELESS:
+        what = "the rates of the outputs" if of_rates else "the outputs"
+        warn(
+            f"The model explains next to nothing of {what}: its simulation error is "
+            f"{100.0 * residual:.0f} % of their size. Check that the outputs "
+            "integrate, that inputs and outputs belong together, and that rows are in "
+            "the order of time; or leave `integrating` out."
+        )
 
 
 class RateEvidence:
