@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,11 @@ from ..data.preparation import (
     unbroken_runs,
 )
 from ..systems.simulation import delayed
+from ..validation import input_delays
 from .identification import Settings, fit_once
 from .noise import Whitening, autoregression, through_filter, whitening_filter
+from .offsets import N_TRENDS
+from .options import Choices
 from .records import FOR_A_CHOICE, Record
 from .selection import select
 from .simulation_fit import simulation_errors
@@ -129,6 +132,39 @@ def with_late_inputs(
         late.append(late_inputs(first, delay, rest=rest, before=before)[0])
         late += [late_inputs(run, delay, rest=False)[0] for run in others]
     return late if rest and not gaps else split_at_gaps(late)
+
+
+def delays_of(
+    experiments: Sequence[Experiment],
+    input_delay: Any,
+    choices: Choices,
+    *,
+    detrend: str | None,
+    gaps: bool,
+) -> Delay:
+    """Delay of every input, in samples: as given by an option, or found for "auto".
+
+    With `gaps` experiments may have some.
+    """
+    n_inputs = experiments[0].inputs.shape[1]
+    if not isinstance(input_delay, str):
+        return input_delays(input_delay, n_inputs, samples=True)
+    if input_delay != "auto":
+        raise ValueError(
+            "`input_delay` must be 'auto' or whole numbers of samples. Got "
+            f"{input_delay!r}."
+        )
+    if gaps:
+        experiments = split_at_gaps(experiments)
+    pairs = [(e.inputs, e.measured) for e in experiments]
+    pairs = remove_trends(pairs, detrend)[0]
+    n_outputs = pairs[0][1].shape[1]
+    if choices.method in ("auto", "pbsid"):  # a loop leaves delays where they are
+        choices = choices._replace(method="po-moesp")
+    # A constant more than there is costs little, one less is taken for a mode.
+    n_trend = 1 if choices.offset == "auto" else N_TRENDS[choices.offset]
+    settings = choices.settings(n_outputs, n_inputs, np.eye(n_inputs), n_trend)
+    return find_delays(pairs, settings, choices.order, choices.horizon)
 
 
 def find_delays(

@@ -25,28 +25,17 @@ from ..data.experiments import (
     read_experiments,
     read_outputs,
 )
-from ..data.preparation import (
-    DETRENDS,
-    has_gaps,
-    read_runs,
-    remove_trends,
-    split_at_gaps,
-)
+from ..data.preparation import DETRENDS, has_gaps, read_runs, remove_trends
 from ..data.scoring import score_from_rest
 from ..data.timestamps import TIME_TOL
-from ..exceptions import (
-    VersionedPickle,
-    all_or_nothing,
-    collected,
-    warn,
-)
+from ..exceptions import VersionedPickle, all_or_nothing, collected, warn
 from ..models.innovation import InnovationModel
 from ..models.statespace import ModelPair, StateSpace
 from ..systems.threads import one_blas_thread
-from ..validation import frequencies, input_delays, naming_argument, one_of
+from ..validation import frequencies, naming_argument, one_of
 from .completion import completed, completed_by
 from .cross_checks import tell_of_delay
-from .delay import Delay, find_delays, with_late_inputs
+from .delay import Delay, delays_of, with_late_inputs
 from .fit import fit_samples
 from .fit_warnings import TESTS, warn_about
 from .horizons import warn_about_horizon
@@ -62,10 +51,8 @@ from .integrating import (
     warn_if_useless,
 )
 from .local_fit import LocalFit
-from .missing_outputs import (
-    warn_of_many_pieces,
-)
-from .offsets import N_TRENDS, Offsets, of_rates
+from .missing_outputs import warn_of_many_pieces
+from .offsets import Offsets, of_rates
 from .one_fit import Samples
 from .options import (
     Choices,
@@ -852,26 +839,10 @@ class SubspaceLTI(
     @one_blas_thread
     def _delay_of(self, experiments: list[Experiment], choices: Choices) -> Delay:
         """Delays in samples, given or found."""
-        first = experiments[0]
-        n_inputs = first.inputs.shape[1]
-        if not isinstance(self.input_delay, str):
-            return input_delays(self.input_delay, n_inputs, samples=True)
-        if self.input_delay != "auto":
-            raise ValueError(
-                "`input_delay` must be 'auto' or whole numbers of samples. Got "
-                f"{self.input_delay!r}."
-            )
-        if self.missing == "split":
-            experiments = split_at_gaps(experiments)
-        pairs = [(e.inputs, e.measured) for e in experiments]
-        pairs = remove_trends(pairs, self.detrend)[0]
-        n_outputs = pairs[0][1].shape[1]
-        if choices.method in ("auto", "pbsid"):  # a loop leaves delays where they are
-            choices = choices._replace(method="po-moesp")
-        # A constant more than there is costs little, one less is taken for a mode.
-        n_trend = 1 if choices.offset == "auto" else N_TRENDS[choices.offset]
-        settings = choices.settings(n_outputs, n_inputs, np.eye(n_inputs), n_trend)
-        return find_delays(pairs, settings, choices.order, choices.horizon)
+        gaps = self.missing == "split"
+        return delays_of(
+            experiments, self.input_delay, choices, detrend=self.detrend, gaps=gaps
+        )
 
     def _with_late_inputs(
         self, experiments: list[Experiment], delay: Delay, gaps: bool
