@@ -49,6 +49,7 @@ from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
     spread_of,
+    state_and_level,
     trend_signals,
 )
 from ..systems.threads import one_blas_thread
@@ -189,9 +190,8 @@ def model_residuals(
                 errors.append(error - free @ x0)
                 continue
             own = predictor.estimate_initial_state(u, y, trend)
-            x0, trends = np.split(own, [len(own) - n_trend * y.shape[1]])
-            y = y - trend.T @ trends.reshape(n_trend, y.shape[1])
-            errors.append(y - predictor.predict(u, y, initial_state=x0))
+            x0, level = state_and_level(own, trend, y.shape[1])
+            errors.append(y - level - predictor.predict(u, y - level, initial_state=x0))
     if not all(np.isfinite(e).all() for e in errors):
         raise ValueError(
             "residual tests need a simulation that stays finite. The model is unstable "

@@ -30,6 +30,7 @@ from ..systems.simulation import (
     estimate_initial_state,
     free_responses,
     spread_of,
+    state_and_level,
     trend_signals,
     with_transit,
 )
@@ -138,8 +139,8 @@ class Simulator(NamedTuple):
         elif own is None:
             responses, error = self._unexplained(experiment, trend)
             own = estimate_initial_state(responses, error, spread_of(y))
-        x0, trends = np.split(own, [len(own) - n_trend * len(y0)])
-        return x0, y0 + trend.T @ trends.reshape(n_trend, len(y0))
+        x0, level = state_and_level(own, trend, len(y0))
+        return x0, y0 + level
 
     def _from(self, x0: Array | None, experiment: Experiment) -> Array:
         """Outputs about the mean offsets from a state there; None is rest."""

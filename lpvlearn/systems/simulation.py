@@ -148,6 +148,20 @@ def free_responses(
     return np.concatenate([free, *trends], axis=2)
 
 
+def state_and_level(own: Array, trend: Array, n_outputs: int) -> tuple[Array, Array]:
+    """Own unknowns of a run: its initial state, and what trends add to its outputs.
+
+    In the order of `free_responses`, with inputs in transit after the states where
+    there are some; the level is (n_samples, n_outputs).
+
+    >>> x0, level = state_and_level(np.array([7.0, 1.0, 2.0]), trend_signals(3, 2), 1)
+    >>> x0, level.ravel()
+    (array([7.]), array([-1.,  1.,  3.]))
+    """
+    x0, multiples = np.split(own, [len(own) - len(trend) * n_outputs])
+    return x0, trend.T @ multiples.reshape(len(trend), n_outputs)
+
+
 def spread_of(outputs: Array) -> Array:
     """How far outputs move (..., n_outputs), by which their errors count alike.
 
