@@ -588,7 +588,7 @@ class SubspaceLTI(
             fitted = fit_samples(samples, detrend=self.detrend, like=known)
         self._take(fitted, self._step_of(experiments), delay)
         asked = choices.initial_states or bool(fitted.offsets.inputs.any())
-        self.steady_start_ = asked and self._simulator().begin_held(experiments)
+        self.steady_start_ = asked and self._simulator().begins_held_in(experiments)
         warn_about(fitted, telling)
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
@@ -956,7 +956,7 @@ class SubspaceLTI(
         """
         check_is_fitted(self, "lti_")
         experiments = self._read(X, y, outputs=False)
-        return self._in_table(experiments, X, self._simulator().fitted_to_own)
+        return self._in_table(experiments, X, self._simulator().from_own_beginning)
 
     def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
         """Coefficient of determination of the simulation from rest.
@@ -1289,9 +1289,7 @@ class SubspaceLTI(
         y0 : ndarray of shape (n_outputs,)
         """
         check_is_fitted(self, "lti_")
-        offsets = self._offsets.begun() if begun else self._offsets
-        pooled = offsets.pooled()
-        return pooled.inputs[0], pooled.outputs[0]
+        return self._simulator().resting_point(begun=begun)
 
     def selection_text(self) -> str:
         """`selection_` as a text table, the choice marked."""

@@ -56,16 +56,19 @@ class Simulator(NamedTuple):
     offset: bool
     begins_held: bool = False
 
-    def resting_point(self) -> tuple[Array, Array]:
-        """Inputs and outputs at rest, the mean over all experiments of the fit."""
-        pooled = self.offsets.pooled()
+    def resting_point(self, *, begun: bool = False) -> tuple[Array, Array]:
+        """Inputs and outputs at rest, the mean over all experiments of the fit.
+
+        Where drifts are in the middle of the experiments, or where they have `begun`.
+        """
+        pooled = (self.offsets.begun() if begun else self.offsets).pooled()
         return pooled.inputs[0], pooled.outputs[0]
 
     def predictor(self) -> InnovationModel:
         """The innovation model, with all states of the noise."""
         return self.evidence.predictor(self.lti, None)
 
-    def begin_held(self, experiments: Sequence[Experiment]) -> bool:
+    def begins_held_in(self, experiments: Sequence[Experiment]) -> bool:
         """Whether experiments of the fit begin where their first inputs hold the model.
 
         And not at rest about zero, or, where there are levels, about their means.
@@ -100,7 +103,7 @@ class Simulator(NamedTuple):
         """Outputs from the beginning that the experiments of the fit let expect."""
         return self._from(self.beginning(experiment), experiment)
 
-    def fitted_to_own(self, experiment: Experiment) -> Array:
+    def from_own_beginning(self, experiment: Experiment) -> Array:
         """Outputs from the initial state, and about the level, of its measured ones."""
         x0, level = self.own_part(experiment)
         u0, _ = self.resting_point()
