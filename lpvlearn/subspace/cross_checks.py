@@ -24,9 +24,11 @@ _NAMED = 5  # experiments that a message lists
 _ROUGH = 0.1  # share of the outputs' size, left by a model, that is looked into
 
 # Experiments contradict one another where models of each leave less than this share of
-# the squared errors of the one for all. That is looked into for the longest ones, of so
-# many samples a parameter.
-_CONTRADICTED, _MOST_ALONE, _VALUES_EACH = 0.25, 6, 10
+# the squared errors of the one for all.
+_CONTRADICTED = 0.25
+
+_MOST_ALONE = 6  # experiments, the longest, of which that is looked into
+_VALUES_EACH = 10  # of their outputs for each parameter, at least
 
 # Share of an experiment's squared outputs, left by a model, that it has no part in.
 _FOREIGN = 0.5
@@ -34,11 +36,14 @@ _FOREIGN = 0.5
 # Share of the error that is left without samples of inputs that are not answered.
 _ANSWERED = 0.6
 
-# Samples of a delay, or states in its place, that are told: fewer cost next to nothing.
-# The response of the model comes to half its height within so many times a delay, over
-# so many times of which that is looked for, and is not so high yet half the way there.
-_LATE, _FEWER = 3, 2
-_RISEN, _WHOLE, _EARLY = 4, 20, 0.25
+# A delay is told that is long, or saves states: less costs next to nothing.
+_LATE = 3  # samples of it, at least
+_FEWER = 2  # states in its place, at least
+
+# An impulse response may be that of a delay which comes to half its height
+_RISEN = 4  # times the delay after the impulse, at the latest
+_EARLY = 0.25  # of its height: below it until half of the delay is over
+_WHOLE = 20  # times the delay, in which its height is looked for
 
 
 def tell_of_contradiction(samples: Samples, whole: LocalFit) -> None:

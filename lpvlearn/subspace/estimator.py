@@ -153,13 +153,13 @@ class SubspaceLTI(
         the input, is in the state. "auto" looks for delays of up to 300 samples (all
         inputs together), a tenth of the longest experiment, and takes those that are
         certain.
-    refine : {"auto", "simulation", "prediction", False}, default="auto"
+    refine : {"auto", "simulation", "prediction", True, False}, default="auto"
         What is minimised after the subspace step: "simulation" the simulation error,
         "prediction" that error whitened by an autoregression of itself and weighted by
         the inverse covariance of its innovations, which has the least variance
         under coloured or unequal noise. "auto" is "prediction" unless the other one, or
-        none, simulates parts held out clearly better. "pbsid" minimises the error of
-        prediction whatever is said, but for False.
+        none, simulates parts held out clearly better. True: as "auto". "pbsid"
+        minimises the error of prediction whatever is said, but for False.
     stability : {"warn", "enforce"}, default="warn"
         "warn" keeps an unstable model, with a warning, where a stable one fits
         clearly worse; "enforce" returns a stable one and reports in
@@ -339,14 +339,13 @@ class SubspaceLTI(
     has then a bias that no number of samples removes. A loop through which nothing but
     Gaussian white noise of the sensors goes does not show; it does no harm with
     ``feedthrough=False``. Channels that are not sampled at once look like a loop. So
-    "auto" looks how the plant of "pbsid" does on parts held out (its growing modes are
-    simulated backward), where inputs seem to explain a quarter of its simulation errors
-    or it is unstable: D is left free, or "po-moesp" taken, where that leaves less than
-    half of the squared errors, or makes a plant stable that is so within its
-    uncertainty. "po-moesp" with D free is taken where that leaves less than a tenth of
-    them and outputs seem to know later inputs, as of inputs that were filtered; and
-    where nothing but answers within the sample shows a loop, as noise of measured
-    inputs makes them, and it leaves less than a quarter.
+    "auto" compares the plant of "pbsid" with other models on parts held out (growing
+    modes are simulated backward), unless inputs follow from the past, as a few sines
+    do. D is left free, or "po-moesp" taken, where that leaves less than half of the
+    squared errors, or makes a plant stable that is so within its uncertainty;
+    "po-moesp" with D free, where it leaves less than a tenth and outputs seem to know
+    later inputs, as filtered ones, or less than a quarter and nothing but answers
+    within the sample shows a loop, as noise of measured inputs makes them.
 
     `fit` keeps its samples for the attributes and methods that are statistics of the
     simulation error, which are computed when first asked for.

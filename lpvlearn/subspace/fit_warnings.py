@@ -49,8 +49,9 @@ TESTS = {"held out", "orders", "static gain", "response", "decay", "bent", "lack
 # What was told of that bends a response as well
 _BENDS = {"bent", "limit", "held", "dropouts", "input spikes"}
 
-# Share of its motion by which a model moves where an output stays, and of the samples
-_MOVES_ON, _AT_LIMITS = 0.05, 0.01
+# An output is at a limit where it stays and its model moves on
+_MOVES_ON = 0.05  # of the motion of the model, at least
+_AT_LIMITS = 0.01  # of the samples, at least, to be told
 
 _SOME = 3  # values that are listed
 
@@ -61,20 +62,24 @@ _CONFIRMED = 0.5
 
 _NOTHING = 1.0  # best fit of parts held out, percent, that is none
 
-# Standard deviations of a pole, for its decay to be known; and one over the longest
-# experiment that matters: an integrator is known better.
-_DECAYS, _MATTERS = 2.0, 0.1
+_DECAYS = 2.0  # standard deviations of a pole, from which its decay is known
 
-# A pole on the unit circle is found this far outside at most; inside, an enforced one
-# keeps farther away than the second.
-_OUTSIDE, _INSIDE = 1e-8, 1e-9
+# Standard deviation of a pole, per longest experiment, from which it matters: that of
+# an integrator is less.
+_MATTERS = 0.1
+
+_OUTSIDE = 1e-8  # farther outside the unit circle no pole on it is found
+
+# A pole on the unit circle is found this far inside at most; an enforced one keeps
+# farther away.
+_INSIDE = 1e-9
 
 # Poles this close to one may be those of integrators.
 _ABOUT_ONE = 0.02
 
-# A stream fits much worse than its first samples where its error exceeds theirs by
-# this factor, and this share of the outputs' size.
-_MUCH_WORSE, _POOR = 5.0, 0.2
+# A stream fits much worse than its first samples where its error exceeds both
+_MUCH_WORSE = 5.0  # times theirs
+_POOR = 0.2  # of the outputs' size
 
 # What was poor from the start was told then; it is told again where it grows by this.
 _GROWN = 1.1

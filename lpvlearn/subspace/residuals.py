@@ -65,36 +65,49 @@ Array = NDArray[np.float64]
 N_LAGS = 25  # as in MATLAB's `resid`
 
 # Windows for each lagged input: an autoregression of fewer errors is itself too
-# uncertain for the tail of the F distribution. A number of lags that the user wants is
-# held to the second, as are the sensitivities: so many, that a fair F test remains.
-WINDOWS_PER_LAG, _FEWEST_WINDOWS = 10, 2
+# uncertain for the tail of the F distribution.
+WINDOWS_PER_LAG = 10
+
+# The same for a number of lags that the user wants, and for each sensitivity: so many,
+# that a fair F test remains.
+_FEWEST_WINDOWS = 2
 
 # Part of a regressor's size that others do not explain, below which it is taken for a
 # combination of them: inputs of a few sines, or held for many samples.
 DEPENDENT = 1e-4
 
-# Errors that are rounding, relative to the spread of the output (24-bit converters and
-# single precision resolve 6e-8) or to its largest value (double precision: 2e-16, some
-# of it lost in the least squares).
-_ROUNDING, _ROUNDING_OF_LARGEST = 1e-8, 1e-13
+# Errors that are rounding, relative to the spread of the output: 24-bit converters and
+# single precision resolve 6e-8.
+_ROUNDING = 1e-8
+
+# And relative to its largest value: double precision resolves 2e-16, some of which is
+# lost in the least squares.
+_ROUNDING_OF_LARGEST = 1e-13
 
 _HEAD = 50  # outputs by which an experiment is recognised: measured, hardly the same
 
 _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligible
 
-# A lack is told that explains this share of the errors, is larger than this share of
-# the output, and so improbable by chance; it is looked for in so many samples. Of them
-# it moves a response by more than its stated deviation, or by far more.
-_MUCH, _MUCH_OF_OUTPUT, CERTAIN, _MAX_SAMPLES = 0.03, 0.003, 1e-6, 4_096
+# A lack is told that is all of this:
+_MUCH = 0.03  # of the squared errors, at least
+_MUCH_OF_OUTPUT = 0.003  # of the output, root mean square, at least
+CERTAIN = 1e-6  # probability by chance, at most
 
-# A spike is so many times what half of the errors stay within (8 standard deviations of
-# Gaussian noise); spikes are told that make this share of the squared errors, in no
-# more than this share of the samples: others may be what the noise is.
-_SPIKE, _MUCH_OF_SPIKES, _FEW = 12.0, 0.25, 0.05
+_MAX_SAMPLES = 4_096  # in which a lack is looked for
 
-# Samples that are soon after a move of the inputs; share of all samples that are, where
-# these move seldom, and of the spikes, where they follow.
-_SOON, _SELDOM, _MOSTLY = 4, 0.3, 0.7
+# Times what half of the errors stay within, from which one is a spike: 8 standard
+# deviations of Gaussian noise.
+_SPIKE = 12.0
+
+# Spikes are told that make much of the errors and are few: others may be what the noise
+# is.
+_MUCH_OF_SPIKES = 0.25  # of the squared errors, at least
+_FEW = 0.05  # of the samples, at most
+
+# Spikes follow the inputs of which most come soon after a move, though few samples do.
+_SOON = 4  # samples after a move
+_SELDOM = 0.3  # of all samples are soon after one, at most
+_MOSTLY = 0.7  # of the spikes are, at least
 
 # Lags by which it is seen at little cost that errors are no larger than need be.
 _N_SCREEN = 10
