@@ -161,6 +161,8 @@ round(bft_score(data.y_large, y), 1)
 # * **More outputs than inputs:** the best :math:`u_0 - w` in the least-squares sense,
 #   the rest are offsets of sensors. **More inputs than outputs:** the smallest
 #   :math:`w`, for inputs of which the outputs tell nothing are what they are.
+# * **Outputs that measure all states**, by the same :math:`C` at all points, tell them:
+#   :math:`C x_0 = y_0 - D u_0`, though a source or a feed holds them that is no input.
 #
 # Between the points :math:`u_0`, :math:`y_0` and :math:`x_0` are splines. Where the
 # system schedules itself, the gains tell their slopes too, and the splines have these,

@@ -15,6 +15,10 @@ not reach stays an offset of the sensors. Inputs of which the outputs tell nothi
   same everywhere are the sensors', ``x0 = S (y0 - c)``. Where w is the same, too, that
   is taken by which there is less to hold.
 
+Outputs that measure all states, by one C at all points and hardly a D, tell x0
+themselves, whatever it is that holds it there (a source, a feed, that is no input):
+``C x0 = y0 - D u0``, but for what is the same at all points and moves no state.
+
 Where inputs stand about one level, all points are moved to one u0: what differs at
 random would bend the interpolation.
 
@@ -70,6 +74,9 @@ _CLEAR = 10.0
 _BETTER, _FEWEST, _BETWEEN = 0.25, 5, 8
 _BENT = 1e-4  # mean square of such an error, by the motion, that is worth it
 
+_ROUNDING = 1e-9  # of matrices that are the same
+_AT_ONCE = 0.1  # of the outputs' motion: what inputs do at once that hardly matters
+
 # Scheduling values of which there are logarithms and inverses
 _POSITIVE = 1e-100
 
@@ -119,6 +126,11 @@ def points_of_work(
         far = np.any(np.abs(change) > _FAR * y_scale, axis=1)
         outputs = outputs + np.where(far[:, None], 0.0, change)
         inputs = common
+    if _measure_all_states(models, scales):
+        shown = outputs - _times(np.array([model.D for model in models]), inputs)
+        C = models[0].C / y_scale[:, None]
+        x0 = np.linalg.lstsq(C, (shown / y_scale).T)[0].T
+        return np.hstack([inputs, outputs, x0])
     if _are_one_family(statics, kappa, inputs, outputs, u_scale):
         order, parents = spanning_tree(kappa)
         child, parent = order[1:], parents[order[1:]]
@@ -131,6 +143,21 @@ def points_of_work(
     bias = _constants_of_sensors(inputs, outputs, gains, inverse, u_scale)
     x0 = _times(states, outputs - bias) + _times(unseen, inputs)
     return np.hstack([inputs, outputs, x0])
+
+
+def _measure_all_states(
+    models: Sequence[StateSpace], scales: tuple[Array, Array]
+) -> bool:
+    """Whether states follow from outputs, at all points in the same way.
+
+    And inputs hardly act at once: with them, so would what comes in their place.
+    """
+    C, (u_scale, y_scale) = models[0].C, scales
+    atol = _ROUNDING * np.abs(C).max(initial=0.0)
+    if not all(np.allclose(model.C, C, rtol=0.0, atol=atol) for model in models):
+        return False
+    direct = max(np.max(np.abs(m.D) * u_scale / y_scale[:, None]) for m in models)
+    return bool(direct < _AT_ONCE and np.linalg.matrix_rank(C) == models[0].order)
 
 
 def _are_one_family(

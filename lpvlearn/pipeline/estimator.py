@@ -306,7 +306,8 @@ list, default=None
     models' static gains, ``dy0 = G(0) du0``, as where an output schedules the system,
     x0 moves likewise, by ``A dx0 + B du0 = 0``. Else constants that are the same
     everywhere are those of the sensors, and so is that of an output which does not
-    answer at rest, ``G(0) = 0``. `lpv_` is linear about these points, which its
+    answer at rest, ``G(0) = 0``. Outputs that measure all states, by one C everywhere,
+    tell x0 themselves. `lpv_` is linear about these points, which its
     `input_offset`, `output_offset` and `state_offset` tell; `predict` begins at rest at
     that of the first sample, or, where the local experiments do so, where its first
     inputs hold the model (`lpv_.steady_start`). See :ref:`guide_points_of_work`.

@@ -287,3 +287,20 @@ def test_equilibria_of_one_system_have_the_slopes_of_its_gains(
         np.abs(one.predict(between)[:, :2] - truth).max() for one in (found, alone)
     )
     assert ours < 0.5 * theirs
+
+
+def test_outputs_that_measure_all_states_tell_where_these_rest():
+    """A boost converter over its load, whose source is no input."""
+    load = np.linspace(0.05, 0.25, 5)[:, None]
+    models, x0 = [], []
+    for g in load[:, 0]:
+        A = np.array([[-0.6, -0.5], [0.5, -g]])
+        x0.append(np.linalg.solve(-A, [12.0, 0.0]))
+        current, voltage = x0[-1]
+        models.append(StateSpace(A, [[voltage], [-current]], [[0, 1], [2, 0]]))
+    outputs = np.array(x0) @ models[0].C.T + [3.0, -1.0]  # zeros of the sensors
+    scales = np.array([0.02]), np.array([0.5, 0.2])
+    inputs = np.full((5, 1), 0.5)
+    values = points_of_work(models, load, inputs, outputs, scales)
+    assert_allclose(values[:, :3], np.hstack([inputs, outputs]), rtol=1e-12)
+    assert_allclose(np.diff(values[:, 3:], axis=0), np.diff(x0, axis=0), rtol=1e-9)
