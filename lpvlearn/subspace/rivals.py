@@ -260,9 +260,10 @@ def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
     Such noise tells of the poles what inputs do not. A model of the simulation error
     has no use for that, and takes what noise does in a mode that inputs hardly excite
     for their doing. Parts held out hardly tell: there, that noise is all that is left
-    of either. The states of the plant must explain all of the noise, and where outputs
-    are several be no more than without, as further ones may be those of a noise that
-    the outputs share; unless parts held out are simulated far better with these. Noise
+    of either. The states of the plant must explain all of the noise, or with those of
+    the load that moves them be likelier beyond chance. Where outputs are several they
+    must be no more than without, as further ones may be those of a noise that the
+    outputs share; unless parts held out are simulated far better with these. Noise
     that drifts makes some models likelier by chance than a chi-square tells.
     """
     n_trend = first.evidence.free.n_trend
@@ -283,9 +284,10 @@ def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
         if not isinstance(evidence, ClosedLoopEvidence):
             continue
         n_joint, deviance = len(evidence.kept), _deviance(other)
-        if not evidence.kept.all() or other.grows():
+        doubt = 0.0 if evidence.kept.all() else CERTAIN
+        if other.grows() or not deviance < least - doubt:
             continue
-        if len(evidence.one_step.noise.A) or not deviance < least:
+        if len(evidence.one_step.noise.A):
             continue
         if follows_means_alone(evidence):
             continue  # what moves it is all called noise
@@ -296,7 +298,9 @@ def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
             continue
         if not error.clearly_better_than(its, DOUBT):
             best, least = other, deviance
-    return best
+    if best is first or not n_trend or samples.choices.offset != "auto":
+        return best
+    return with_trends(samples.having(method="pbsid"), best)  # judged anew
 
 
 def _deviance(fitted: LocalFit) -> float:

@@ -607,6 +607,45 @@ def test_noise_of_a_sensor_leaves_the_plant_alone(seed):
         assert SubspaceLTI().fit(*samples).method_ == "po-moesp"
 
 
+def in_wind(seed, n_samples=4000):
+    """A wind turbine: rotor speed and tower acceleration, by pitch and by gusts.
+
+    Gusts last some seconds. Returns the samples, and the plant of both inputs.
+    """
+    rng, square = np.random.default_rng(seed), (0.64 * np.pi) ** 2
+    A = [
+        [-0.02, 0.0, 0.0, 0.083],
+        [0.0, 0.0, 1.0, 0.0],
+        [0.0, -square, -0.06, 0.1],
+        [0.0, 0.0, 0.0, -0.25],
+    ]
+    B = [[-0.37, 0.0], [0.0, 0.0], [-0.25, 0.0], [0.0, 1.5]]
+    C, D = [[1.0, 0.0, 0.0, 0.0], A[2]], [[0.0, 0.0], B[2]]
+    plant = StateSpace(A, B, C, D)
+    u = 1.5 * np.repeat(rng.choice([-1.0, 1.0], n_samples // 20), 20)
+    both = np.column_stack([u, rng.standard_normal(n_samples)])
+    y = plant.simulate(both, sampling_time=0.1)
+    return (u[:, None], y + 0.02 * rng.standard_normal(y.shape)), plant
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_load_of_its_own_mode_tells_of_the_plant(seed):
+    """What makes the gusts is no state of the plant, but moves these."""
+    (u, y), plant = in_wind(seed)
+    v = 1.5 * np.repeat(np.random.default_rng(9).choice([-1.0, 1.0], 100), 20)
+    true = plant.simulate(np.column_stack([v, 0 * v]), sampling_time=0.1)[:, 0]
+    errors = []
+    for method in ("auto", "po-moesp"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error" if method == "auto" else "ignore")
+            model = SubspaceLTI(method=method, sampling_time=0.1).fit(u, y)
+        errors.append(np.linalg.norm(model.predict(v[:, None])[:, 0] - true))
+        if method == "auto":
+            assert (model.method_, model.order_, model.offset_) == ("pbsid", 3, None)
+    assert errors[0] < 0.6 * errors[1]
+
+
 def early_outputs(seed, n_samples=300):
     """Three modes under coloured inputs, the outputs read a sample before them."""
     rng = np.random.default_rng(seed)
