@@ -200,6 +200,7 @@ FORMS: dict[type, dict[str, str]] = {
         "output_offset_": "float[n_experiments, n_outputs]",
         "output_drift_": "float[n_experiments, n_outputs]",
         "steady_start_": "flag?",
+        "begun_state_": "float[order]?",
         "time_jitter_": "number",
         "n_outputs_": "size[n_outputs]",
         "n_features_in_": "whole",

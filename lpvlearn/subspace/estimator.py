@@ -98,6 +98,7 @@ _TAKEN = (
     "output_drift_",
     "offsets_differ_",
     "steady_start_",
+    "begun_state_",
 )
 
 
@@ -281,6 +282,10 @@ class SubspaceLTI(
         Whether the experiments begin where their first inputs hold the model, as step
         tests do, and not at rest at `input_offset_`. `predict` begins likewise, where
         inputs stand still at first and move later. False of batches.
+    begun_state_ : ndarray of shape (order,) or None
+        State in which the experiments begin, their mean, where a mode does not decay
+        over them and rest is farther from their outputs than these range: `predict`
+        begins there. None, as nearly always, for rest; and of batches.
     output_drift_ : ndarray of shape (n_experiments, n_outputs)
         Change per second (per sample where no time is known), about the middle of
         the experiment; zero unless `offset_` is "linear", and where an offset of the
@@ -588,6 +593,8 @@ class SubspaceLTI(
         self._take(fitted, self._step_of(experiments), delay)
         asked = choices.initial_states or bool(fitted.offsets.inputs.any())
         self.steady_start_ = asked and self._simulator().begins_held_in(experiments)
+        here = self._simulator()._replace(lti=self.lti_.with_input_delay(0))
+        self.begun_state_ = here.begun_state(experiments)
         warn_about(fitted, telling)
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
@@ -873,7 +880,8 @@ class SubspaceLTI(
         self._offsets, self.offsets_differ_ = offsets, offsets.differ
         self.input_offset_, self.output_offset_ = offsets.inputs, offsets.outputs
         self.output_drift_ = offsets.drifts / step
-        self.steady_start_ = False  # but for experiments that are all there
+        # But for experiments that are all there
+        self.steady_start_, self.begun_state_ = False, None
 
     def _name(self, inputs: Any, outputs: Any) -> None:
         """Let the model know the names of the columns, where they have some."""
@@ -1337,8 +1345,12 @@ class SubspaceLTI(
     def _simulator(self) -> Simulator:
         """The model with what is known of its experiments."""
         held = getattr(self, "steady_start_", False)
-        constants = self.offset is not None
-        return Simulator(self.lti_, self._evidence, self._offsets, constants, held)
+        state, constants = (
+            getattr(self, "begun_state_", None),
+            self.offset is not None,
+        )
+        known = self.lti_, self._evidence, self._offsets
+        return Simulator(*known, constants, held, state)
 
     def _in_table(
         self,

@@ -168,7 +168,8 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
         constants = outputs - levels @ gain.T
     if slowest <= _SETTLED and len(model.initial_states) == len(pairs):
         found = _as_they_begin(evidence, trends, lengths)
-        if found is not None and not (decays and _far_off(found[1], pairs)):
+        outputs_of = [y for _, y in pairs]
+        if found is not None and not (decays and far_off(found[1], outputs_of)):
             return Offsets(levels + found[0], found[1], none, constants, lengths)
     if not decays:
         return Offsets(levels, outputs, drifts, constants, lengths)
@@ -176,9 +177,9 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
     return Offsets(means, constants + means @ gain.T, drifts, constants, lengths)
 
 
-def _far_off(y0: Array, pairs: Pairs) -> bool:
+def far_off(y0: Array, outputs: Sequence[Array]) -> bool:
     """Whether an output is to rest farther from its range than that is wide."""
-    y = np.vstack([y for _, y in pairs])
+    y = np.vstack(outputs)
     least, most = np.nanmin(y, axis=0), np.nanmax(y, axis=0)
     wide = most - least
     return bool(((y0 < least - wide) | (y0 > most + wide)).any())

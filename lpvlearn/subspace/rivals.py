@@ -300,7 +300,8 @@ def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
             best, least = other, deviance
     if best is first or not n_trend or samples.choices.offset != "auto":
         return best
-    return with_trends(samples.having(method="pbsid"), best)  # judged anew
+    other = with_trends(samples.having(method="pbsid"), best)  # judged anew
+    return best if other.grows() else other
 
 
 def _deviance(fitted: LocalFit) -> float:

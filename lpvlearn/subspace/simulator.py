@@ -35,7 +35,7 @@ from ..systems.simulation import (
     with_transit,
 )
 from .integrating import RateEvidence
-from .offsets import Offsets, level_matters
+from .offsets import Offsets, far_off, lasting, level_matters
 from .statistics import Evidence
 
 Array = NDArray[np.float64]
@@ -47,7 +47,8 @@ class Simulator(NamedTuple):
     """A model with the constants of its fit.
 
     `offset` is whether experiments may have constants at all, `begins_held` whether
-    those begin where their inputs hold the model whose inputs stand still at first.
+    those begin where their inputs hold the model whose inputs stand still at first;
+    `begun` is the state that all of them begin in, if not at rest.
     """
 
     lti: StateSpace
@@ -55,6 +56,7 @@ class Simulator(NamedTuple):
     offsets: Offsets
     offset: bool
     begins_held: bool = False
+    begun: Array | None = None
 
     def resting_point(self, *, begun: bool = False) -> tuple[Array, Array]:
         """Inputs and outputs at rest, the mean over all experiments of the fit.
@@ -99,6 +101,35 @@ class Simulator(NamedTuple):
             starmap(beginning, compress(zip(experiments, *levels, strict=True), wait))
         )
 
+    def begun_state(self, experiments: Sequence[Experiment]) -> Array | None:
+        """Where experiments of the fit begin, if that is far from rest.
+
+        A mode that does not decay rests nearly anywhere, and may stand for a part of
+        the level, together with others: simulations from rest are off by that. None
+        where these begin no farther from all outputs than those are wide.
+        """
+        longest = max(len(e.inputs) for e in experiments)
+        if not self.evidence.free.initial_states:
+            return None
+        if not lasting(self.lti.poles(), longest).any():
+            return None
+        (u0, y0), outputs = self.resting_point(), [e.measured for e in experiments]
+        starts = [
+            y0 + self.lti.simulate(e.inputs[:1] - u0, initial_state=self.beginning(e))
+            for e in experiments
+        ]
+        if not far_off(np.mean(starts, axis=0)[0], outputs):
+            return None
+        try:
+            states = [self.own_part(e, of_fit=True)[0] for e in experiments]
+        except (np.linalg.LinAlgError, DivergenceError):
+            return None
+        state = np.mean(states, axis=0)
+        known = np.isfinite(state).all()
+        return (
+            state if known and not far_off(y0 + self.lti.C @ state, outputs) else None
+        )
+
     def simulated(self, experiment: Experiment) -> Array:
         """Outputs from the beginning that the experiments of the fit let expect."""
         return self._from(self.beginning(experiment), experiment)
@@ -112,6 +143,8 @@ class Simulator(NamedTuple):
     def beginning(self, experiment: Experiment) -> Array | None:
         """State and inputs in transit where the first inputs hold it; None for rest."""
         u, lti = experiment.inputs, self.lti
+        if self.begun is not None:
+            return np.append(self.begun, np.zeros(np.sum(lti.input_delay)))
         if not (self.begins_held and standing(u)):
             return None
         first = first_inputs(u) - self.resting_point()[0]

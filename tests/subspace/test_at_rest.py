@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lpvlearn import SubspaceLTI
+from lpvlearn import StateSpace, SubspaceLTI, load, save
 
 
 def step_test(seed, first=0.0, level=20.0, n=240, at=25, noise=0.01, decay=0.0):
@@ -210,3 +210,24 @@ def test_a_gap_that_cuts_off_the_step_is_told():
         warnings.simplefilter("ignore", UserWarning)
         with pytest.warns(UserWarning, match="in 1 of 2 pieces no input moves.*estim"):
             SubspaceLTI(2, missing="split").fit(u, y)
+
+
+def test_where_rest_is_far_from_all_outputs_predictions_begin_as_the_fit(tmp_path):
+    """A mode that does not decay holds the level, which was not to be a constant."""
+    rng = np.random.default_rng(0)
+    plant = StateSpace([[0.9]], [[0.01]], [[1.0]], None, 1.0)
+    u = np.repeat(rng.choice([-1.0, 1.0], (100, 1)), 6, axis=0)
+    y = 4.0 + plant.simulate(u) + 0.001 * rng.standard_normal((600, 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of that mode
+        model = SubspaceLTI(2, offset=None, sampling_time=1.0).fit(u, y)
+    assert np.abs(model.lti_.poles() - 1.0).min() < 1e-3
+    fresh = np.repeat(rng.choice([-1.0, 1.0], (30, 1)), 6, axis=0)
+    predicted = model.predict(fresh)
+    error = predicted - 4.0 - plant.simulate(fresh)
+    assert np.abs(error).max() < 0.02 and model.begun_state_ is not None
+    save(model, tmp_path / "model.zip")
+    same = load(tmp_path / "model.zip").predict(fresh)
+    np.testing.assert_array_equal(same, predicted)
+    moving = SubspaceLTI(1, offset=None, sampling_time=1.0).fit(u, y - 4.0)
+    assert moving.begun_state_ is None
