@@ -28,6 +28,7 @@ from .noise import Whitening
 from .offsets import (
     ALIKE,
     CERTAIN,
+    Offsets,
     attributed,
     lasting,
     motion_left,
@@ -36,7 +37,7 @@ from .offsets import (
 from .one_fit import Samples
 from .records import ScaledRecords, centred, output_energy, scale_records, shorten
 from .residuals import lacks
-from .simulation_fit import with_initial_states
+from .simulation_fit import simulation_errors, with_initial_states
 from .statistics import Evidence
 from .varx import find_feedback
 
@@ -51,6 +52,8 @@ _FEWEST = 3  # samples of an experiment, for more than one difference
 _SLOW, _SLOW_BESIDE, _FOLLOWS, _FAR = 12.0, 60.0, 1.0, 0.5
 
 _EXPLAINED = 0.02  # relative error below which drift does not matter
+
+_GOES = 2.0  # standard deviations of drift in which constants may be its doing
 
 _DIFFERENCE = np.array([1.0, -1.0])  # as a filter
 
@@ -202,7 +205,29 @@ def of_drifting_noise(samples: Samples, whole: LocalFit) -> LocalFit | None:
         held_out = held_out._replace(residual=share * other.residual)
         selection = replace(found.selection, held_out=held_out)
         other = other._replace(selection=selection)
-    return other
+    if n_trend == whole.evidence.free.n_trend or outlasts(other):
+        return other
+    return other._replace(offsets=_beyond_drift(other))
+
+
+def _beyond_drift(fitted: LocalFit) -> Offsets:
+    """Its offsets, without constants that may be where the noise has drifted.
+
+    Where outputs stand, no samples tell then: they are at rest at zero, unless they are
+    farther from that than drift goes.
+    """
+    evidence, offsets = fitted.evidence, fitted.offsets
+    errors = np.vstack(simulation_errors(evidence.model, evidence.records))
+    far = _GOES * errors.std(axis=0) * evidence.output_scale
+    by_chance = (np.abs(offsets.pooled().constants) < far)[0]
+    if by_chance.all():
+        none = np.zeros_like(offsets.outputs)
+        inputs = np.zeros_like(offsets.inputs)
+        return offsets._replace(inputs=inputs, outputs=none, constants=none)
+    left = np.where(by_chance, offsets.constants, 0.0)
+    return offsets._replace(
+        outputs=offsets.outputs - left, constants=offsets.constants - left
+    )
 
 
 def _of_samples(samples: Samples, found: LocalFit, n_trend: int) -> LocalFit:

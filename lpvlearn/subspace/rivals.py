@@ -12,6 +12,7 @@ from ..systems.modes import spectral_radius
 from .closed_loop import ClosedLoopEvidence
 from .criterion import PRICE
 from .delay import find_lead, with_later_inputs
+from .drift import n_lasting
 from .held_out import DOUBT, HeldOut
 from .local_fit import LocalFit
 from .offsets import CERTAIN, HARDLY_DECAYS, follows_means_alone
@@ -301,7 +302,9 @@ def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
     if best is first or not n_trend or samples.choices.offset != "auto":
         return best
     other = with_trends(samples.having(method="pbsid"), best)  # judged anew
-    return best if other.grows() else other
+    likelier = _deviance(other) < least and not other.grows()
+    # no mode is to stand for constants
+    return other if likelier and n_lasting(other) <= n_lasting(best) else best
 
 
 def _deviance(fitted: LocalFit) -> float:

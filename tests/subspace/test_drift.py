@@ -249,3 +249,18 @@ def test_no_slow_mode_stands_for_a_line_beside_slow_ones(slowest, drift, part, s
     fresh = _thermal(seed + 50, slowest, 0.0)[1]
     truth = plant.simulate(fresh, sampling_time=1.0)
     assert bft_score(truth, model.lti_.simulate(fresh)) > (95.0 if part else 98.0)
+
+
+@pytest.mark.parametrize("level", [0.0, 20.0])
+def test_constants_are_not_where_the_noise_has_drifted(level):
+    """By its size they are told from where outputs stand."""
+    rng = np.random.default_rng(0)
+    plant = StateSpace([[0.9, 0.2], [-0.2, 0.9]], [[1], [0]], [[1, 0]], None, 1.0)
+    u = np.repeat(rng.choice([-1.0, 1.0], (60, 1)), 10, axis=0)
+    y = plant.simulate(u)
+    walk = np.cumsum(rng.standard_normal(y.shape), axis=0)
+    drift = 0.5 * y.std() / walk.std() * walk
+    model = SubspaceLTI(sampling_time=1.0).fit(u, y + drift + level * y.std())
+    assert _of_differences(model)
+    expected = (drift.mean() + level * y.std()) if level else 0.0
+    assert model.output_offset_.item() == pytest.approx(expected, abs=0.2 * y.std())
