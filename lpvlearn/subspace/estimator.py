@@ -143,10 +143,10 @@ class SubspaceLTI(
     feedthrough : bool or array-like of bool, default=True
         Whether an input acts on an output at once; False fixes ``D = 0``, a table of
         shape (n_outputs, n_inputs) single entries of D. A feedthrough in a closed loop
-        can be told from a controller that answers within the sample only of a single
-        input, where signals are not Gaussian, as held references are: else
-        method="auto" takes ``D = 0`` instead of True where something acts within the
-        sample, unless parts held out refute it.
+        can be told from a controller that answers within the sample only where
+        signals are not Gaussian, as held references are: else method="auto" takes
+        ``D = 0`` instead of True where something acts within the sample, unless parts
+        held out refute it.
     input_delay : int, array-like of shape (n_inputs,) or "auto", default=0
         Samples by which the inputs, or each of them, act late: ``y[t]`` depends on
         ``u[t - input_delay]`` through D, on earlier inputs through the state. A sampled

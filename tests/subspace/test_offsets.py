@@ -11,8 +11,8 @@ from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
 from lpvlearn.metrics import bft_score
 from lpvlearn.subspace import hankel, offsets
 from lpvlearn.subspace.offsets import (
-    _far_off,
     _tail,
+    far_off,
     stands_by_chance,
     without_slow_modes,
 )
@@ -905,6 +905,5 @@ def test_a_mode_slower_than_the_record_is_told_from_a_constant(size):
 
 def test_an_output_far_off_its_range_is_no_place_to_rest():
     y = np.array([[2.0], [10.0], [4.0]])
-    pairs = [(y, y), (y, y + 1.0)]
-    assert not _far_off(np.array([[-5.0], [18.0]]), pairs)
-    assert _far_off(np.array([[-24.0], [5.0]]), pairs)
+    assert not far_off(np.array([[-5.0], [18.0]]), [y, y + 1.0])
+    assert far_off(np.array([[-24.0], [5.0]]), [y, y + 1.0])

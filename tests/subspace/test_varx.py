@@ -112,6 +112,16 @@ def test_steps_tell_a_feedthrough_from_a_controller_that_answers_at_once(kind):
         assert found.instantaneous and not found.answered
 
 
+@pytest.mark.parametrize("kind", ["answer", "feedthrough"])
+def test_an_input_beside_a_controller_does_not_hide_its_answers(kind):
+    for rng in map(np.random.default_rng, range(5)):
+        u, y = within_the_sample(rng, kind, n_samples=2000)
+        free = np.repeat(rng.choice([-1.0, 1.0], (250, 1)), 8, axis=0)
+        y = np.hstack([y, 0.5 * y + free + 0.3 * rng.standard_normal(y.shape)])
+        found = find_feedback(records_of((np.hstack([free, u]), y)))
+        assert found.instantaneous and found.answered == (kind == "answer")
+
+
 def test_lines_within_the_sample_are_hardly_refuted_by_chance():
     p = []
     for rng in map(np.random.default_rng, range(60)):
