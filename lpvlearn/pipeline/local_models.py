@@ -28,9 +28,9 @@ from ..models.statespace import (
 from ..restructuring.known_poles import integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
+from ..subspace.constants import lasting
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
-from ..subspace.offsets import lasting
 from ..systems.modes import mode_rates
 from .runner import Done, PointRunner, label_of, tell_skipped
 

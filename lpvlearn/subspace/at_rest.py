@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from ..systems.beginnings import Stands, first_inputs, stands
 from ..systems.modes import spectral_radius
+from .constants import ALIKE, CERTAIN, HARDLY_DECAYS, stands_by_chance
 from .criterion import PRICE
 from .local_fit import LocalFit
-from .offsets import ALIKE, CERTAIN, HARDLY_DECAYS, stands_by_chance
 from .one_fit import Samples, TooFewSamples
 from .simulation_fit import simulation_errors
 from .statistics import Evidence

@@ -22,18 +22,11 @@ from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
 from ..systems.modes import mode_rates
+from .constants import ALIKE, CERTAIN, lasting, motion_left, with_levels
 from .criterion import PRICE
 from .local_fit import LocalFit
 from .noise import Whitening
-from .offsets import (
-    ALIKE,
-    CERTAIN,
-    Offsets,
-    attributed,
-    lasting,
-    motion_left,
-    with_levels,
-)
+from .offsets import Offsets, attributed
 from .one_fit import Samples
 from .records import ScaledRecords, centred, output_energy, scale_records, shorten
 from .residuals import lacks

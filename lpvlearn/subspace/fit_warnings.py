@@ -21,16 +21,10 @@ from ..data.preparation import (
 )
 from ..exceptions import RankWarning
 from .constancy import change_over
+from .constants import CERTAIN, USELESS, follows_means_alone, motions_left, stays_far
 from .held_out import HeldOut
 from .linearity import bent_outputs
 from .local_fit import LocalFit
-from .offsets import (
-    CERTAIN,
-    USELESS,
-    follows_means_alone,
-    motions_left,
-    stays_far,
-)
 from .options import Choices
 from .records import thinned
 from .residuals import find_spikes, lacks

@@ -20,7 +20,7 @@ from ..data.experiments import Experiment
 from ..exceptions import warn
 from ..models.statespace import ModelPair, StateSpace
 from ..validation import has_one_axis, is_whole, shown
-from .offsets import USELESS
+from .constants import USELESS
 from .simulation_fit import Freedom, simulation_fit
 from .statistics import Evidence
 

@@ -28,7 +28,7 @@ from ..systems.threads import one_blas_thread
 from .noise import through_filter
 from .records import thinned
 from .residuals import (
-    CERTAIN,
+    BEYOND_CHANCE,
     DEPENDENT,
     N_LAGS,
     WINDOWS_PER_LAG,
@@ -129,7 +129,7 @@ def _is_bent(
     columns = of_size_one(_rows(signals, a, n_own))
     left, n_known = without(columns[:, :n_linear], columns)
     left, n = left[:, n_linear:], len(columns) - n_own * len(signals) - n_known
-    if not f_test(left[:, :-1], left[:, -1], n).p_value < CERTAIN:
+    if not f_test(left[:, :-1], left[:, -1], n).p_value < BEYOND_CHANCE:
         return False
     return bool(_explained_elsewhere(left) * noise.var() > least**2)
 

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from ..data.preparation import Pairs, independent_inputs
 from ..exceptions import RankWarning
 from .closed_loop import ClosedLoopEvidence, identify_closed_loop
+from .constants import with_levels, without_slow_modes
 from .held_out import HeldOut, held_out
 from .identification import Candidate, Settings, identify, validate
 from .local_fit import LocalFit
-from .offsets import attributed, with_levels, without_slow_modes
+from .offsets import attributed
 from .options import Choices
 from .records import Record, ScaledRecords, centred, scale_records, share_known, shorten
 from .selection import PlantFit, Row, Selection, select

@@ -91,7 +91,7 @@ _LONGEST_RESPONSE = 500  # of the predictor's filter; what is cut off is negligi
 # A lack is told that is all of this:
 _MUCH = 0.03  # of the squared errors, at least
 _MUCH_OF_OUTPUT = 0.003  # of the output, root mean square, at least
-CERTAIN = 1e-6  # probability by chance, at most
+BEYOND_CHANCE = 1e-6  # probability by chance, at most
 
 _MAX_SAMPLES = 4_096  # in which a lack is looked for
 
@@ -487,7 +487,7 @@ def explained_by_inputs(
         [
             max(
                 (test.statistic - test.dof) / (test.statistic + n)
-                if test.p_value < CERTAIN
+                if test.p_value < BEYOND_CHANCE
                 else 0.0
                 for test in of_output
             )

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from ..data.preparation import DETRENDS
 from ..systems.modes import spectral_radius
 from .closed_loop import ClosedLoopEvidence
-from .criterion import PRICE
+from .constants import CERTAIN, HARDLY_DECAYS, follows_means_alone
+from .criterion import PRICE, n_parameters
 from .delay import find_lead, with_later_inputs
 from .drift import n_lasting
 from .held_out import DOUBT, HeldOut
 from .local_fit import LocalFit
-from .offsets import CERTAIN, HARDLY_DECAYS, follows_means_alone
 from .one_fit import Samples, TooFewSamples
 from .options import Choices
 from .rounding import rounded_outputs
@@ -24,23 +24,23 @@ from .varx import Regression
 
 Array = NDArray[np.float64]
 
-# Share of the squared errors that later inputs leave where the outputs lead them; time
-# constants per experiment of a mode that may be a line of a reference
-_LED, _LINE = 0.1, 3.0
+# Share of the squared errors that later inputs leave where the outputs lead them
+_LED = 0.1
+_LINE = 3.0  # time constants per experiment of a mode that may be a reference's line
 
 # Share of the squared errors of a plant in a loop that must be left of them for another
-# model not to refute it; standard deviations by which a pole grows for certain.
-_OF_NOISE, _CERTAIN = 0.5, 3.0
-
-# The same of one with D free, where nothing but answers within the sample shows a loop.
+# model not to refute it; and for one with D free, where nothing but answers within the
+# sample shows a loop
+_OF_NOISE = 0.5
 _OF_ANSWERS = 0.25
 
-# Growth within a sample of a plant that no controller holds.
-_FASTEST = 2.0
+_SURELY = 3.0  # standard deviations by which a pole grows for certain
 
-# Lags of a noise that may be more than that of a sensor; samples of which more tell the
-# plant without it; share of the outputs' size below which either model is as good.
-_LAGS, _PLENTY, _AUDIBLE = 2, 20_000, 0.01
+_FASTEST = 2.0  # growth within a sample of a plant that no controller holds
+
+_LAGS = 2  # of a noise that may be more than that of a sensor
+_PLENTY = 20_000  # samples of which more tell the plant without its noise
+_AUDIBLE = 0.01  # share of the outputs' size, below which either model is as good
 
 # Share of the squared errors of parts held out that further states leave there where
 # they are the plant's.
@@ -103,7 +103,7 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
             other, found = rival(method="pbsid")
             better = found.total < _OF_NOISE * error.total
             # data do not tell it apart from the first
-            if better or best.grows(_CERTAIN) and not other.grows(_CERTAIN):
+            if better or best.grows(_SURELY) and not other.grows(_SURELY):
                 makeshift = found.total > error.total
                 best, error = other, found
             # inputs of the same sample tell the noise in the outputs: of a free D, all
@@ -112,10 +112,10 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
         said = answered or not isinstance(choices.feedthrough, bool)
         better = not said and of_blind.total < _OF_NOISE * error.total
         # growing modes simulate bounded signals by what is to come of the inputs
-        better &= not blind.grows(_CERTAIN)
+        better &= not blind.grows(_SURELY)
         # and are predicted: what they have of noise, simulations amplify
-        better &= not best.grows(_CERTAIN) or _deviance(blind) < _deviance(best)
-        unsure = makeshift or (best.grows() and not best.grows(_CERTAIN))
+        better &= not best.grows(_SURELY) or _deviance(blind) < _deviance(best)
+        unsure = makeshift or (best.grows() and not best.grows(_SURELY))
         if not said and not best.grows() and of_that.total < _LED * error.total:
             # inputs were made of later outputs, too
             unsure |= find_lead(samples.pairs)[0] > 0
@@ -193,7 +193,7 @@ def may_be_held(fitted: LocalFit, choices: Choices) -> bool:
         return False
     if choices.differences or feedback is None or feedback.regression is None:
         return False
-    if not fitted.residual > _AUDIBLE or fitted.grows(_CERTAIN):
+    if not fitted.residual > _AUDIBLE or fitted.grows(_SURELY):
         return False  # it may have grown
     growth = max(spectral_radius(_own_past(feedback.regression)), 1.0)
     grows = np.log(growth) * fitted.evidence.longest > HARDLY_DECAYS
@@ -224,7 +224,7 @@ def held_by_a_loop(samples: Samples, first: LocalFit) -> LocalFit:
         other = chosen.fit(n_trend, first)
         likelier = _deviance(other) < _deviance(first) - CERTAIN
         held = spectral_radius(other.model.A) < _FASTEST
-        if not (likelier and held and other.grows(_CERTAIN)):
+        if not (likelier and held and other.grows(_SURELY)):
             return first
         if choices.offset == "auto":  # constants are judged anew
             other = with_trends(chosen.having(offset="auto"), other)
@@ -244,7 +244,7 @@ def may_share_noise(fitted: LocalFit, choices: Choices) -> bool:
     feedback, records = fitted.feedback, fitted.scaled.records
     return bool(
         choices.method == "auto"
-        and sum(record.u.shape[1] for record in records) <= _PLENTY
+        and sum(record.n_samples for record in records) <= _PLENTY
         and choices.refine in ("auto", "prediction")
         and fitted.selection.order
         and not (choices.estimated or choices.differences)
@@ -314,9 +314,8 @@ def _deviance(fitted: LocalFit) -> float:
     noise is no evidence of states.
     """
     evidence = fitted.evidence.one_step
-    noise, (ny, n) = evidence.noise, evidence.model.C.shape
-    n_samples = sum(record.u.shape[1] for record in evidence.records)
-    n_parameters = n * (evidence.model.B.shape[1] + ny) + ny * len(noise.A)
-    n_parameters += evidence.free.n_own(n) * len(evidence.records)
+    noise, records, (ny, n) = evidence.noise, evidence.records, evidence.model.C.shape
+    n_samples = sum(record.n_samples for record in records)
+    n_unknown = n_parameters(n, records, evidence.free) + ny * len(noise.A)
     volume = float(np.linalg.slogdet(noise.covariance)[1])
-    return n_samples * volume + PRICE * n_parameters
+    return n_samples * volume + PRICE * n_unknown

@@ -6,8 +6,8 @@ import numpy as np
 
 from ..data.preparation import Rounded
 from ..exceptions import RankWarning
+from .constants import CERTAIN
 from .local_fit import LocalFit
-from .offsets import CERTAIN
 from .one_fit import Samples
 from .trends import with_trends
 

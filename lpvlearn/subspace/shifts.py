@@ -31,8 +31,8 @@ import scipy  # which loads its signal package when that is first used: slowly
 from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
+from .constants import shifts_matter
 from .local_fit import LocalFit
-from .offsets import shifts_matter
 from .one_fit import Samples
 from .records import Record
 from .telling import in_experiment

@@ -34,8 +34,9 @@ from ..systems.simulation import (
     trend_signals,
     with_transit,
 )
+from .constants import lasting, level_matters
 from .integrating import RateEvidence
-from .offsets import Offsets, far_off, lasting, level_matters
+from .offsets import Offsets, far_off
 from .statistics import Evidence
 
 Array = NDArray[np.float64]

@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..systems.beginnings import moves_of
-from .drift import n_lasting, outlasts, wanders
-from .local_fit import LocalFit
-from .offsets import (
+from .constants import (
     ALIKE,
     CERTAIN,
     HARDLY_MOVED,
-    N_TRENDS,
     constants_matter,
     drifts_off,
     leaves_rounding,
@@ -21,6 +18,9 @@ from .offsets import (
     stands_by_chance,
     unmoved_errors,
 )
+from .drift import n_lasting, outlasts, wanders
+from .local_fit import LocalFit
+from .offsets import N_TRENDS
 from .one_fit import Samples, TooFewSamples
 from .rounding import rounded_outputs
 from .statistics import Evidence

@@ -152,7 +152,7 @@ def n_windows(records: Sequence[Record], past: int) -> int:
     Less one for each of its trends, which are projected out of all channels.
     """
     return sum(
-        max(0, record.u.shape[1] - past - len(record.trend)) for record in records
+        max(0, record.n_samples - past - len(record.trend)) for record in records
     )
 
 

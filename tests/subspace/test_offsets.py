@@ -9,13 +9,9 @@ from scipy.signal import lfilter
 
 from lpvlearn import StateSpace, SubspaceLTI, make_bft_scorer
 from lpvlearn.metrics import bft_score
-from lpvlearn.subspace import hankel, offsets
-from lpvlearn.subspace.offsets import (
-    _tail,
-    far_off,
-    stands_by_chance,
-    without_slow_modes,
-)
+from lpvlearn.subspace import constants, hankel
+from lpvlearn.subspace.constants import _tail, stands_by_chance, without_slow_modes
+from lpvlearn.subspace.offsets import far_off
 from lpvlearn.subspace.records import Record, centred
 from lpvlearn.subspace.simulation_fit import Freedom, _general_regression, block_fit
 from lpvlearn.systems.simulation import lti_response, trend_signals
@@ -472,9 +468,9 @@ def test_where_slow_modes_hide_constants_the_criterion_decides(
         SubspaceLTI(1, offset=offset).fit(u, y)._evidence.one_step
         for offset in (None, "constant")
     )
-    monkeypatch.setattr(offsets, "chance_of_trend", lambda *_, **__: 1.0)
+    monkeypatch.setattr(constants, "chance_of_trend", lambda *_, **__: 1.0)
     without.__dict__["criterion"], other.__dict__["criterion"] = better, 0.0
-    assert offsets.constants_matter(without, other) == taken
+    assert constants.constants_matter(without, other) == taken
 
 
 def test_short_step_responses_are_not_spoilt():
