@@ -87,7 +87,7 @@ def fit_samples(
             tell_of_feedback(feedback, fitted, choices, doubt, telling)
         else:
             tell_of_answers(feedback, telling)
-        if like is None and not foreseen:
+        if like is None and feedback.shown and not foreseen:
             tell_of_lead(samples, fitted)
     if rest is not None:
         fitted = moved_back(fitted, first, differ)

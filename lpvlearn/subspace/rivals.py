@@ -135,7 +135,9 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
         return first, None
     doubt = Doubt(before.bft, error.bft, first.grows())
     if n_trend and choices.offset == "auto":  # constants are judged anew
-        best = with_trends(samples.having(method=best.method), best)
+        free = as_said if best.evidence.free.direct.any() else False
+        same = samples.having(method=best.method, feedthrough=free)
+        best = with_trends(same, best)
     return best, doubt
 
 
