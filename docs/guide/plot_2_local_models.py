@@ -218,9 +218,9 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 # %%
 # ``output_offset_`` is where the outputs rest at the mean inputs, ``input_offset_``; of
 # a plant that hardly settles within a record, both are where the experiments begin
-# nearest to rest. ``predict`` begins there; or, where that is far from all outputs, as a
-# mode that does not decay holds a part of their level, in the state that the experiments
-# begin in (``begun_state_``). Inputs alone do not tell which offset they
+# nearest to rest. ``predict`` begins there; or, where that is far from all outputs, as
+# a mode that does not decay holds a part of their level, in the state that the
+# experiments begin in (``begun_state_``). Inputs alone do not tell which offset they
 # have, so where those of the experiments differ, ``predict`` takes their mean and
 # warns; with outputs at hand, ``predict_with_initial_state``, scores with
 # ``initial_state="estimate"`` and ``residual_tests`` estimate each experiment's own.
@@ -232,8 +232,8 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 #   offset of the input is a straight line, and is told as ``input_offset_``, which
 #   ``predict`` knows. ``"auto"`` takes either where a mode that does not decay, and no
 #   input moves, would stand for it: on other records such a mode goes astray. Of a
-#   drift that is there beyond doubt it asks no more. Without a structure a pipeline asks
-#   all its operating points together. With ``integrating`` it is a constant rate.
+#   drift that is there beyond doubt it asks no more. Without a structure a pipeline
+#   asks all its operating points together. With ``integrating`` it is a constant rate.
 # * A load that comes or goes, or a sensor that moves, shifts the level within an
 #   experiment. A slow mode would explain it, and simulate other records by what it made
 #   up. ``"auto"`` looks for such shifts, which no regression on the past foresees, ends

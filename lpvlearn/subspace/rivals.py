@@ -305,8 +305,10 @@ def with_shared_noise(samples: Samples, first: LocalFit) -> LocalFit:
         return best
     other = with_trends(samples.having(method="pbsid"), best)  # judged anew
     likelier = _deviance(other) < least and not other.grows()
-    # no mode is to stand for constants
-    return other if likelier and n_lasting(other) <= n_lasting(best) else best
+    # no mode is to stand for constants, and none to be called noise for them
+    alike = n_lasting(other) <= n_lasting(best)
+    alike &= other.selection.order >= best.selection.order
+    return other if likelier and alike else best
 
 
 def _deviance(fitted: LocalFit) -> float:

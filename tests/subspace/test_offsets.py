@@ -285,8 +285,10 @@ def test_constants_of_the_size_of_the_noise_are_found(pole):
             np.random.default_rng(seed), levels=(2.0, -2.0, 3.0), noise=0.5, pole=pole
         )
         for offset, found in errors.items():
-            model = SubspaceLTI(3, horizon=6, offset=offset, **options()).fit(X, y)
-            found.append(error_of(model))
+            # without constants noise with a slow mode of its own may stand for them
+            method = "auto" if offset else "po-moesp"
+            model = SubspaceLTI(3, method=method, horizon=6, offset=offset, **options())
+            found.append(error_of(model.fit(X, y)))
     np.testing.assert_allclose(errors["auto"], errors["constant"])
     assert np.mean(errors["auto"]) < 0.7 * np.mean(errors[None])
 
