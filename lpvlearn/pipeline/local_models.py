@@ -148,11 +148,8 @@ def identify_points(
         lenient = replace(runner, on_error="skip")
         arguments = [(estimator, group) for group in groups]
         with collected(), suppress(ValueError):
-            return lenient.run(
-                "local models",
-                *(identify_point, arguments, points.kappa, known),
-                **options,
-            )
+            step = identify_point, arguments, points.kappa, known
+            return lenient.run("local models", *step, **options)
         return [None] * len(groups)
 
     if not chooses or structure is not None:
@@ -305,7 +302,7 @@ def _common_order(models: Sequence[LocalModel]) -> int:
 
 def _cost(model: LocalModel, order: int) -> float:
     """What an order costs; beyond those tried, more states bring nothing."""
-    return model.costs.get(min(order, max(model.costs)), np.inf)
+    return model.costs.get(min(order, max(model.costs, default=order)), np.inf)
 
 
 def identify_point(

@@ -1273,12 +1273,14 @@ class SubspaceLTI(
             Minus twice the logarithm of the likelihood but for a constant, and four
             for every parameter and every unknown of the experiments. Minus infinity
             where nothing is left of an output; NaN with `integrating`, where the errors
-            are those of the rates.
+            are those of the rates, and of a model from a file, which has no samples.
+            Of a long table or a stream, that of its first samples.
         """
         check_is_fitted(self, "lti_")
-        if isinstance(self._evidence, RateEvidence):
+        evidence = self._evidence
+        if isinstance(evidence, RateEvidence) or not evidence.records:
             return np.nan
-        return self._evidence.one_step.criterion
+        return float(evidence.one_step.criterion)
 
     def resting_point(self, *, begun: bool = False) -> tuple[Array, Array]:
         """Inputs and outputs at rest: `input_offset_` and `output_offset_` pooled.

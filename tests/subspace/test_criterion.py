@@ -1,9 +1,12 @@
 """The criterion of orders."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from lpvlearn import SubspaceLTI, load, save
 from lpvlearn.subspace.criterion import criterion_of
 from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.simulation_fit import Realization, with_initial_states
@@ -48,3 +51,21 @@ def test_initial_states_are_those_that_innovations_ask_for(rng):
         )
     # Ten parameters and two lags cost four each; the five fitted here gain one.
     assert np.mean(excess) == pytest.approx(40.0 * 300 / 290 + 8.0 - 5.0, abs=4.0)
+
+
+def test_a_model_tells_its_criterion(tmp_path):
+    """Of the same samples; a model from a file has none."""
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((400, 1))
+    y = lfilter([0.0, 1.0], [1.0, -0.8], u, axis=0)
+    y += 0.1 * rng.standard_normal(y.shape)
+    found = [SubspaceLTI(order, horizon=8).fit(u, y).criterion() for order in (1, 2)]
+    none = SubspaceLTI(0, horizon=8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found.append(none.fit(u, y).criterion())
+    assert found[0] < found[1] < found[0] + 30.0 < found[2]
+    integrating = SubspaceLTI(1, integrating=True).fit(u, np.cumsum(y, axis=0))
+    assert np.isnan(integrating.criterion())
+    save(none, tmp_path / "model.zip")
+    assert np.isnan(load(tmp_path / "model.zip").criterion())
