@@ -89,6 +89,8 @@ def fit_samples(
             tell_of_answers(feedback, telling)
         if like is None and feedback.shown and not foreseen:
             tell_of_lead(samples, fitted)
+    elif feedback is not None and feedback.may_be_answered and fitted.model.D.any():
+        tell_of_answers(feedback, telling)
     if rest is not None:
         fitted = moved_back(fitted, first, differ)
     if detrend is None:

@@ -249,7 +249,7 @@ def tell_of_answers(feedback: Feedback, telling: Telling) -> None:
     """Tell of an input that answers outputs, where D has it the other way round."""
     telling.once(
         "feedback",
-        "The input answers outputs within the sample, and these do not answer it (p = "
+        "An input answers outputs within the sample, and these do not answer it (p = "
         f"{feedback.p_direct:.1g}). If a controller makes it of them, D of this model "
         "is that of the controller: use method='pbsid', feedthrough=False. Else it is "
         "measured with noise, or the system is not linear.",
@@ -286,9 +286,10 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
     feedback = fitted.feedback
     if feedback is None or fitted.stability_loss:
         return
-    if not feedback.found and not telling.kinds & _BENDS:
+    in_loop = feedback.found or "feedback" in telling
+    if not in_loop and not telling.kinds & _BENDS:
         _warn_of_bends(fitted, telling)
-    if not feedback.found and not telling.kinds & (_BENDS | {"useless"}):
+    if not in_loop and not telling.kinds & (_BENDS | {"useless"}):
         _warn_of_change(fitted, telling)
     if fitted.method == "pbsid" or "lack" in telling:
         return

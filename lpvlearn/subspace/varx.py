@@ -20,6 +20,8 @@ two has errors that are independent of what they are errors beside (Shimizu, Hoy
 Hyvarinen and Kerminen, 2006); those of the other depend on nonlinear functions of it.
 References that are steps, held or binary are far from Gaussian. Of several inputs that
 is asked of each, beside whatever the others do: some may act at once, others answer.
+There inputs that are measured, rounded or limited look alike too often to be taken for
+a loop: it is told.
 
 Constants of the experiments, and drifts, are regressors too, projected out of all rows.
 Everything follows from the triangular factor of one Hankel matrix. In the columns
@@ -102,6 +104,7 @@ class Feedback(NamedTuple):
     foreseen: bool = False  # whether every input follows from the past and the outputs
     p_direct: float = 1.0  # of outputs on a straight line over inputs of the sample
     p_answer: float = 1.0  # of inputs on a straight line over outputs of the sample
+    alone: bool = True  # whether there is a single input
 
     @property
     def found(self) -> bool:
@@ -122,7 +125,15 @@ class Feedback(NamedTuple):
 
     @property
     def answered(self) -> bool:
-        """Whether the input answers outputs within the sample, which do not answer it.
+        """Whether the only input answers outputs within the sample.
+
+        Of several others may act at once, and what one seems to answer is no proof.
+        """
+        return self.alone and self.may_be_answered
+
+    @property
+    def may_be_answered(self) -> bool:
+        """Whether an input answers outputs within the sample, which do not answer it.
 
         As a controller makes it do. In open loop noise of a measured input does, too.
         """
@@ -238,6 +249,7 @@ def find_feedback(records: Sequence[Record]) -> Feedback | None:
         foreseen=foreseen,
         p_direct=p_direct,
         p_answer=p_answer,
+        alone=m == 1,
     )
 
 
