@@ -55,6 +55,16 @@ _STEPS = 100  # neighbours take ten; models that are no neighbours have no neare
 
 # States of which both Gramians are the Hankel singular values, or one is the identity
 STATES = ("balanced", "input-normal", "output-normal")
+OUTPUTS = "outputs"
+_SHOWN = 30.0  # condition of an output matrix, of states that are all to be seen
+
+
+def show_all_states(models: Sequence[StateSpace]) -> bool:
+    """Whether outputs, in units in which they move alike, may be the states."""
+    return all(
+        model.n_outputs == model.order > 0 and np.linalg.cond(model.C) < _SHOWN
+        for model in models
+    )
 
 
 def aligned_models(
@@ -64,8 +74,11 @@ def aligned_models(
 
     From the point in the middle of `kappa` (n_points, n_scheduling) outward along a
     minimum spanning tree, every variable in units of its range. The `states` are one of
-    `STATES`, the identity in units of the largest singular value of all models.
+    `STATES`, the identity in units of the largest singular value of all models; or
+    `OUTPUTS`, of models that `show_all_states`: these need not be turned.
     """
+    if states == OUTPUTS:
+        return [model.transform(model.C) for model in models]
     order, parents = spanning_tree(kappa)
     aligned = list(models)
     if states != STATES[0]:

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from ..data.experiments import Experiment
 from ..exceptions import warn
-from ..lpv.alignment import STATES, aligned_models, spanning_tree
+from ..lpv.alignment import (
+    OUTPUTS,
+    STATES,
+    aligned_models,
+    show_all_states,
+    spanning_tree,
+)
 from ..lpv.spline import SplineLPV
 from ..models.statespace import StateSpace, with_signs_of
 from ..structures.structure import GrayBoxStructure
@@ -33,8 +39,9 @@ from .runner import place_of
 Array = NDArray[np.float64]
 
 # Errors of points left out, in the largest gain: all are foreseen; one is as unlike the
-# others as may be; and the share of the error that other states must leave
-_FORESEEN, _UNLIKE, _CLEARLY = 0.01, 2.0, 0.8
+# others as may be; and the shares of the error that other states must leave, and that
+# they must where outputs are states, which tell where these rest
+_FORESEEN, _UNLIKE, _CLEARLY, _PLAINLY = 0.01, 2.0, 0.8, 0.5
 
 # Of points whose states may be noise: the share of the errors of the others that is
 # left without them, and the error of what these foresee, for which it is taken
@@ -150,15 +157,16 @@ def _foreseeable(
     """Of `some` points, in states in which they foresee the `judges` best.
 
     Of the other points what their `own` models tell, of themselves one left out at a
-    time; by interpolation. States other than balanced ones must be clearly better: what
-    they do while the scheduling moves no point tells.
+    time; by interpolation. States other than the outputs, where these show them all, or
+    than balanced ones must be clearly better: what they do while the scheduling moves
+    no point tells, but that outputs do not jump.
     """
     rest, places = [models[k] for k in some], kappa[list(some)]
     others = [k for k in range(len(models)) if k not in some]
     direct = _has_feedthrough(models)
     structure = _full(rest[0], direct)
     best, least = None, np.inf
-    for states in STATES:
+    for states in (OUTPUTS, *STATES) if show_all_states(rest) else STATES:
         known = _entries(aligned_models(rest, places, states), direct)
         left_out = errors_left_out(structure, rest, SplineLPV(), places, known)
         theta = known
@@ -172,7 +180,8 @@ def _foreseeable(
         found = _Foreseeable(theta, errors)
         error = found.mean(judges)
         if best is None or error < least:
-            best, least = found, _CLEARLY * error
+            best = found
+            least = error * (_PLAINLY if states == OUTPUTS else _CLEARLY)
         if error < _FORESEEN:
             break
     assert best is not None

@@ -250,3 +250,18 @@ def test_integrators_have_gains_of_any_size_and_states_of_one(seed):
         true = servo(kappa).frequency_response(omega)
         found = model.lpv_.at(kappa).frequency_response(omega)
         assert np.abs(found - true).max() < 0.03 * np.abs(true).max()
+
+
+def test_outputs_that_show_all_states_are_the_states():
+    """In any basis that the records have: C is the same at all points, then."""
+    rng, kappa = np.random.default_rng(0), np.linspace(0.05, 0.25, 5)[:, None]
+    points = []
+    for g in kappa[:, 0]:
+        A, B = np.array([[-0.6, -0.5], [0.5, -g]]), np.array([[12.0], [-2.0]])
+        plant = StateSpace(A, B, [[0.0, 1.0], [2.0, 0.0]])
+        points.append(local(plant.transform(rng.normal(size=(2, 2)))))
+    structure, theta = aligned(points, kappa, (3.0, 4.0))
+    found = [structure.model(row) for row in theta]
+    for model, point in zip(found, points, strict=True):
+        np.testing.assert_allclose(model.C, np.diag([3.0, 4.0]), atol=1e-9)
+        assert (model - point.lti).hinf_norm() < 1e-8 * model.hinf_norm()
