@@ -787,15 +787,21 @@ def _integrating(fitted: Any) -> list[int]:
 
 
 def _costs(fitted: Any, experiments: Sequence[Experiment]) -> dict[int, float]:
-    """What every order costs an estimator that tells it, above the best one."""
+    """What every order costs an estimator that tells it, above the best one.
+
+    The orders that "pbsid" chooses among are those of plant and noise together.
+    """
     table = getattr(fitted, "selection_", None)
     if table is None or "criterion" not in table:
         return {}
     n_values = sum(e.measured.size for e in experiments)
     orders, criteria = table["order"].to_numpy(), table["criterion"].to_numpy()
     known = ~np.isnan(criteria)
-    costs = n_values * criteria[known]
-    return dict(zip(orders[known].tolist(), costs.tolist(), strict=True))
+    orders, costs = orders[known], n_values * criteria[known]
+    if _from_closed_loop(fitted) and len(costs):
+        orders = orders - max(0, orders[np.argmin(costs)] - fitted.order_)
+    found = zip(orders.tolist(), costs.tolist(), strict=True)
+    return {order: cost for order, cost in found if order >= 0}
 
 
 def _horizon(fitted: Any) -> int | None:

@@ -309,3 +309,19 @@ def test_points_together_tell_that_outputs_drift(seed):
         assert found.dc_gain().item() == pytest.approx(
             2.0 * np.sqrt(level) / 0.45, rel=0.1
         )
+
+
+@pytest.mark.parametrize("method, cheapest", [("po-moesp", 3), ("pbsid", 2)])
+def test_states_of_the_noise_are_none_of_the_plant(method, cheapest):
+    """Behind "pbsid" the criterion is that of both together: here of a third one."""
+
+    class Fitted:
+        method_, order_ = method, 2
+        selection_ = pd.DataFrame(
+            {"order": [0, 1, 2, 3, 4], "criterion": [9.0, 4.0, 1.0, 0.0, 0.5]}
+        )
+
+    run = Experiment(0, np.arange(9), np.ones((9, 1)), np.ones((9, 1)))
+    costs = local_models._costs(Fitted(), [run])
+    assert min(costs, key=costs.__getitem__) == cheapest
+    assert costs[cheapest - 1] == 9.0 and min(costs) == 0
