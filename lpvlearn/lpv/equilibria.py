@@ -153,7 +153,9 @@ def _measure_all_states(
     And inputs hardly act at once: with them, so would what comes in their place.
     """
     C, (u_scale, y_scale) = models[0].C, scales
-    atol = _ROUNDING * np.abs(C).max(initial=0.0)
+    if not C.size:
+        return False
+    atol = _ROUNDING * np.abs(C).max()
     if not all(np.allclose(model.C, C, rtol=0.0, atol=atol) for model in models):
         return False
     direct = max(np.max(np.abs(m.D) * u_scale / y_scale[:, None]) for m in models)
