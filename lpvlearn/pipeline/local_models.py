@@ -121,10 +121,10 @@ def identify_points(
     groups = [[_bare(e) for e in group] for group in points.experiments]
 
     def identify(
-        estimator: Any, known: Sequence[Done | None] = ()
+        estimator: Any, known: Sequence[Done | None] = (), by: PointRunner = runner
     ) -> list[Done | None]:
         arguments = [(estimator, group) for group in groups]
-        return runner.run(
+        return by.run(
             "local models", identify_point, arguments, points.kappa, known, **options
         )
 
@@ -145,11 +145,8 @@ def identify_points(
         estimator: Any, known: Sequence[Done | None] = ()
     ) -> list[Done | None]:
         """Of all points; what fails is left open, and not told yet."""
-        lenient = replace(runner, on_error="skip")
-        arguments = [(estimator, group) for group in groups]
         with collected(), suppress(ValueError):
-            step = identify_point, arguments, points.kappa, known
-            return lenient.run("local models", *step, **options)
+            return identify(estimator, known, replace(runner, on_error="skip"))
         return [None] * len(groups)
 
     if not chooses or structure is not None:

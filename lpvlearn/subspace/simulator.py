@@ -126,10 +126,9 @@ class Simulator(NamedTuple):
         except (np.linalg.LinAlgError, DivergenceError):
             return None
         state = np.mean(states, axis=0)
-        known = np.isfinite(state).all()
-        return (
-            state if known and not far_off(y0 + self.lti.C @ state, outputs) else None
-        )
+        if not np.isfinite(state).all() or far_off(y0 + self.lti.C @ state, outputs):
+            return None
+        return state
 
     def simulated(self, experiment: Experiment) -> Array:
         """Outputs from the beginning that the experiments of the fit let expect."""
