@@ -387,9 +387,10 @@ def identify(
 # Times the squared errors of a model of plain ones, of one of whitened ones that may be
 # astray: in records where little but their beginning tells of the inputs, of which the
 # filter takes the first samples. And of one that is, for it takes what the inputs do
-# for noise: of an order that is too low, which leaves errors that look like it. One
+# for noise: of an order that is too low, which leaves errors that look like it, or of
+# a system that is not linear; and of one beside a mode that may follow a drift. One
 # with a state to no use has hardly larger ones: units of the criterion by which then.
-_ASTRAY, _FAR_ASTRAY, _LIKELIER = 2.0, 4.0, 10.0
+_ASTRAY, _FAR_ASTRAY, _BEYOND_DRIFTS, _LIKELIER = 2.0, 4.0, 16.0, 10.0
 _SETTLES = 5.0  # time constants per record, of modes that follow no drift
 
 
@@ -399,7 +400,8 @@ def _is_astray(
     """Whether a model of whitened errors is one that errors, or likelihood, refute."""
     longest = max(record.n_samples for record in records)
     settles = (1.0 - spectral_radius(plain.model.A)) * longest > _SETTLES
-    if settles and chosen.model.loss > _FAR_ASTRAY * plain.model.loss:
+    least = _FAR_ASTRAY if settles else _BEYOND_DRIFTS
+    if chosen.model.loss > least * plain.model.loss:
         return True
     free, repeated = settings.free, settings.repeated
     better = criterion_of(chosen.model, records, free, repeated)

@@ -140,3 +140,22 @@ def short_buffer(monkeypatch):
 def short_stream(short_buffer, monkeypatch):
     """Stretches of 2000 samples as well, so that tests stay small."""
     monkeypatch.setattr(summary_module, "STRETCH", 2000)
+
+
+def sweep_of_a_hardening_spring(n, damping, cubic, rates=(1.1, 0.9)):
+    """Force and position through the resonance, downwards, and again from above.
+
+    `rates` are those that the sweeps begin and end with, radians per sample.
+    """
+    t, third = np.arange(n), n // 3
+    below = np.interp(t, [0, third], [rates[0], 0.15])
+    above = np.interp(t, [third, n], [3.0, rates[1]])
+    u, y = 0.04 * np.sin(np.cumsum(np.where(t < third, below, above))), np.empty(n)
+    position = speed = 0.0
+    for k in range(n):
+        y[k] = position
+        for _ in range(20):
+            force = 0.5625 * (u[k] - position) - 1.5 * damping * speed
+            speed += (force - cubic * position**3) / 20.0
+            position += speed / 20.0
+    return u[:, None], y[:, None]

@@ -21,6 +21,7 @@ from .conftest import (
     identify,
     markov,
     sorted_poles,
+    sweep_of_a_hardening_spring,
 )
 
 
@@ -168,3 +169,11 @@ def test_a_model_of_whitened_errors_that_the_likelihood_refutes_is_astray(rng):
     assert _is_astray(chosen, plain, [record], settings)
     assert not _is_astray(plain, chosen, [record], settings)
     assert not _is_astray(plain, plain, [record], settings)
+
+
+@pytest.mark.filterwarnings("ignore")  # of what is not linear
+def test_what_fits_small_motions_alone_does_not_pass_for_the_model():
+    """Its whitened errors are small where little moves, which is most of the record."""
+    u, y = sweep_of_a_hardening_spring(480, damping=0.01, cubic=3.0)
+    y += 1e-3 * y.std() * np.random.default_rng(0).standard_normal(y.shape)
+    assert SubspaceLTI().fit(u, y).residual_ < 0.5
