@@ -70,7 +70,9 @@ _RCOND = 1e-9  # directions of the parameters that data do not tell, as in `refi
 _ROUNDING = 1e-9  # errors of outputs of unit size that are rounding
 _BEYOND = 100.0  # times the largest output: a constant that is none
 _FEW_MOVES = 10  # of inputs, whose answers may be straight lines
-_FAR = 3.0  # standard deviations between the mean of a channel and zero
+# Standard deviations between the mean of a channel and zero, from which constants are
+# likely; and from which they are looked for beside states of a given order.
+_FAR, _OFF = 3.0, 1.0
 
 # Motion that a state off rest would have made where inputs and outputs stand still at
 # the beginning, times what is seen.
@@ -79,7 +81,7 @@ _AT_REST = 5.0
 # Time constants per longest experiment of a mode that may stand for a constant, or a
 # drift; of one that may be the constant itself.
 HARDLY_DECAYS = 3.0
-_LASTING = 0.1
+_LASTING = 0.5
 
 # Times the squared errors without what inputs do to modes that do not decay, of ones
 # that they hardly move.
@@ -98,13 +100,14 @@ def with_levels(evidence: Evidence, offsets: Offsets) -> tuple[Evidence, Offsets
     return evidence, offsets
 
 
-def may_have_constants(evidence: Evidence) -> bool:
+def may_have_constants(evidence: Evidence, *, given: bool = False) -> bool:
     """Whether a model without constants should be tried with them.
 
     They show in its errors, or a slow mode may stand for them; where a channel is far
-    from zero, nothing but its mean may have been fitted.
+    from zero, nothing but its mean may have been fitted. One of a `given` order may
+    have spent its states on that already where channels are not as far.
     """
-    if _is_far(evidence.records):
+    if _is_far(evidence.records, _OFF if given else _FAR):
         return True
     return _has_slow_mode(evidence) or chance_of_trend(evidence) < _SUSPICIOUS
 
@@ -170,10 +173,13 @@ def may_be_better(without: Evidence, other: Evidence) -> bool:
     return better > 0.0 or chance_of_trend(other) < _SUSPICIOUS
 
 
-def _is_far(records: Sequence[Record]) -> bool:
-    """Whether means are next to all there is of a channel."""
+def _is_far(records: Sequence[Record], deviations: float = _FAR) -> bool:
+    """Whether the mean of a channel is so many standard deviations from zero.
+
+    By default it is next to all there is of it.
+    """
     level, motion = _levels([np.vstack((r.u, r.y)) for r in records])
-    return bool((np.abs(level) > _FAR * motion).any())
+    return bool((np.abs(level) > deviations * motion).any())
 
 
 def stays_far(records: Sequence[Record]) -> bool:

@@ -52,7 +52,8 @@ def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
     def may_matter() -> bool:
         if hides or stands:
             return True
-        return may_have_constants(tested) and judged.is_worth_a_choice(
+        given = choices.order is not None
+        return may_have_constants(tested, given=given) and judged.is_worth_a_choice(
             lambda near: may_be_better(tested, near.evidence), fitted, 1
         )
 

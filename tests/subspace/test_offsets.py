@@ -905,3 +905,32 @@ def test_an_output_far_off_its_range_is_no_place_to_rest():
     y = np.array([[2.0], [10.0], [4.0]])
     assert not far_off(np.array([[-5.0], [18.0]]), [y, y + 1.0])
     assert far_off(np.array([[-24.0], [5.0]]), [y, y + 1.0])
+
+
+def _tanks(rng, n=1024):
+    """Two tanks in a row: pump voltages (n, 1) and the lower level.
+
+    They flow out by the root of their levels, and over at the rim.
+    """
+    k = np.arange(1, 40)
+    phases = 2.0 * np.pi * np.outer(np.arange(n), k) / n + rng.uniform(0, 6.28, k.size)
+    u = (np.sin(phases) / np.sqrt(k)).sum(axis=1)
+    u = np.maximum(2.8 + 1.1 * u / u.std(), 0.3)
+    x, y = np.array([4.0, 5.0]), np.empty((n, 1))
+    for t in range(n):
+        y[t] = x[1]
+        for _ in range(4):
+            upper, lower = np.sqrt(np.maximum(x, 0.0))
+            flows = 0.05 * u[t] - 0.06 * upper, 0.06 * upper - 0.05 * lower
+            x = np.minimum(x + flows, [12.0, 10.0])
+    return u[:, None], y + 0.02 * rng.standard_normal(y.shape)
+
+
+@pytest.mark.filterwarnings("ignore")  # of limits, and of what is not linear
+def test_a_given_order_has_constants_where_channels_are_off_zero():
+    """Two and a half standard deviations: slow states took their place."""
+    u, y = _tanks(np.random.default_rng(2))
+    model = SubspaceLTI(2).fit(u, y)
+    assert model.offset_ == "constant"
+    others, measured = _tanks(np.random.default_rng(102))
+    assert bft_score(measured, model.predict(others)) > 70.0
