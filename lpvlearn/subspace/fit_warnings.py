@@ -277,7 +277,8 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
             f"undetermined; the smallest solution was taken. {remedy}",
             RankWarning,
         )
-    warn_about_pole(model.A, telling, fitted.method)
+    surely = fitted.grows(surely=True)
+    warn_about_pole(model.A, telling, fitted.method, surely=surely)
     _warn_of_error(fitted, chose_order, telling)
     _warn_of_spikes(fitted, telling)
     choice_is_told = TESTS <= telling.kinds or fitted.residual > USELESS
@@ -590,16 +591,27 @@ def _may_last(fitted: LocalFit) -> bool:
     return bool((lasting & unknown).any())
 
 
-def warn_about_pole(A: Array, telling: Telling, method: str = "po-moesp") -> None:
-    """Tell the user that a model is unstable, or on the border of that."""
+def warn_about_pole(
+    A: Array, telling: Telling, method: str = "po-moesp", *, surely: bool = False
+) -> None:
+    """Tell the user that a model is unstable, `surely` or not, or on the border."""
     poles = np.linalg.eigvals(A)
     moduli = np.abs(poles)
     radius = float(moduli.max(initial=0.0))
     if radius > 1.0 + _OUTSIDE:
-        remedy = (
-            "Use stability='enforce' for a stable one, another `order`, or a longer "
+        stable = (
+            "stability='enforce' for a stable one, another `order`, or a longer "
             "`horizon`."
         )
+        remedy = f"Use {stable}"
+        if surely:
+            remedy = (
+                "It grows beyond chance, as a plant does that a controller or a hand "
+                "holds: simulate from the state that outputs tell "
+                "(`predict_with_initial_state`) and not for long, or give "
+                "method='pbsid' and use `predict_ahead`. If the plant is stable, use "
+                f"{stable}"
+            )
         if method == "pbsid":
             remedy = (
                 "Such a plant can be predicted (`predict_ahead`), but not simulated "

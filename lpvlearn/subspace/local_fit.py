@@ -20,6 +20,8 @@ from .varx import Feedback
 
 Array = NDArray[np.float64]
 
+_SURELY = 3.0  # standard deviations by which a pole grows beyond chance
+
 
 class LocalFit(NamedTuple):
     """A fitted model and what is known of it."""
@@ -79,13 +81,13 @@ class LocalFit(NamedTuple):
         model = evidence.model._replace(C=evidence.model.C * ratio[:, None])
         return Candidate(model, horizon, evidence.whitening, True, self.signals)
 
-    def grows(self, deviations: float = 0.0) -> bool:
-        """Whether a pole is outside the unit circle, by so many standard deviations."""
+    def grows(self, *, surely: bool = False) -> bool:
+        """Whether a pole is outside the unit circle, `surely` by more than chance."""
         poles = self.evidence.state_space(self.model, 1.0).poles()
         growth, spread = np.abs(poles) - 1.0, np.zeros(len(poles))
-        if deviations and (growth > 0.0).any():
+        if surely and (growth > 0.0).any():
             try:
                 spread = np.abs(self.evidence.poles_std())
             except ValueError:  # it is not known
                 return False
-        return bool((growth > deviations * spread).any())
+        return bool((growth > _SURELY * spread).any())

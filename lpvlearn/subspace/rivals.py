@@ -34,9 +34,11 @@ _LINE = 3.0  # time constants per experiment of a mode that may be a reference's
 _OF_NOISE = 0.5
 _OF_ANSWERS = 0.25
 
-_SURELY = 3.0  # standard deviations by which a pole grows for certain
-
 _FASTEST = 2.0  # growth within a sample of a plant that no controller holds
+
+# Share of the first model's squared errors on parts held out that one of more states,
+# which grows, leaves there; or percent that it explains
+_OF_FIRST, _NEARLY_ALL = 0.25, 95.0
 
 _LAGS = 2  # of a noise that may be more than that of a sensor
 _PLENTY = 20_000  # samples of which more tell the plant without its noise
@@ -103,7 +105,7 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
             other, found = rival(method="pbsid")
             better = found.total < _OF_NOISE * error.total
             # data do not tell it apart from the first
-            if better or best.grows(_SURELY) and not other.grows(_SURELY):
+            if better or best.grows(surely=True) and not other.grows(surely=True):
                 makeshift = found.total > error.total
                 best, error = other, found
             # inputs of the same sample tell the noise in the outputs: of a free D, all
@@ -112,10 +114,10 @@ def believable(samples: Samples, first: LocalFit) -> tuple[LocalFit, Doubt | Non
         said = answered or not isinstance(choices.feedthrough, bool)
         better = not said and of_blind.total < _OF_NOISE * error.total
         # growing modes simulate bounded signals by what is to come of the inputs
-        better &= not blind.grows(_SURELY)
+        better &= not blind.grows(surely=True)
         # and are predicted: what they have of noise, simulations amplify
-        better &= not best.grows(_SURELY) or _deviance(blind) < _deviance(best)
-        unsure = makeshift or (best.grows() and not best.grows(_SURELY))
+        better &= not best.grows(surely=True) or _deviance(blind) < _deviance(best)
+        unsure = makeshift or (best.grows() and not best.grows(surely=True))
         if not said and not best.grows() and of_that.total < _LED * error.total:
             # inputs were made of later outputs, too
             unsure |= find_lead(samples.pairs)[0] > 0
@@ -195,7 +197,7 @@ def may_be_held(fitted: LocalFit, choices: Choices) -> bool:
         return False
     if choices.differences or feedback is None or feedback.regression is None:
         return False
-    if not fitted.residual > _AUDIBLE or fitted.grows(_SURELY):
+    if not fitted.residual > _AUDIBLE or fitted.grows(surely=True):
         return False  # it may have grown
     growth = max(spectral_radius(_own_past(feedback.regression)), 1.0)
     grows = np.log(growth) * fitted.evidence.longest > HARDLY_DECAYS
@@ -215,7 +217,8 @@ def held_by_a_loop(samples: Samples, first: LocalFit) -> LocalFit:
     """The model of a plant that grows for certain, if that is far likelier.
 
     In open loop its outputs would have grown: there is a loop, however little of it
-    the noise shows.
+    the noise shows. Of more states than in open loop, parts held out must show it as
+    well: what many of them predict of a system that is not linear may grow, too.
     """
     n_trend, feedback = first.evidence.free.n_trend, first.feedback
     choices = samples.choices
@@ -226,8 +229,12 @@ def held_by_a_loop(samples: Samples, first: LocalFit) -> LocalFit:
         other = chosen.fit(n_trend, first)
         likelier = _deviance(other) < _deviance(first) - CERTAIN
         held = spectral_radius(other.model.A) < _FASTEST
-        if not (likelier and held and other.grows(_SURELY)):
+        if not (likelier and held and other.grows(surely=True)):
             return first
+        if len(other.model.A) > len(first.model.A):
+            error, its = samples.errors_held_out(first), chosen.errors_held_out(other)
+            if not (its.total < _OF_FIRST * error.total or its.bft > _NEARLY_ALL):
+                return first
         if choices.offset == "auto":  # constants are judged anew
             other = with_trends(chosen.having(offset="auto"), other)
     except TooFewSamples:
@@ -236,7 +243,8 @@ def held_by_a_loop(samples: Samples, first: LocalFit) -> LocalFit:
         "feedback",
         "The outputs follow from their own past as those of a plant that grows by "
         "itself, though they have not grown: a controller holds it. method='pbsid' was "
-        "taken, which that does not bias. In open loop give method='po-moesp'.",
+        "taken, which that does not bias. In open loop, where one that is not linear "
+        "looks like it, give method='po-moesp'.",
     )
     return other
 

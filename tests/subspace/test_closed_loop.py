@@ -15,7 +15,14 @@ from lpvlearn.subspace.closed_loop import _Changes, _Innovation
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
-from .conftest import LOOP_PLANT, closed_loop, experiment, markov, record
+from .conftest import (
+    LOOP_PLANT,
+    closed_loop,
+    experiment,
+    markov,
+    record,
+    sweep_of_a_hardening_spring,
+)
 
 UNSTABLE = (
     np.array([[1.1, 0.3], [0.0, 0.7]]),
@@ -547,6 +554,17 @@ def test_a_plant_that_grows_is_held_though_noise_is_too_small_to_show_it(seed):
     assert model.method_ == "pbsid"
     poles = np.linalg.eigvals(A).real
     assert np.abs(model.lti_.poles()).max() == pytest.approx(poles.max(), abs=3e-3)
+
+
+def test_a_spring_that_hardens_is_no_plant_that_a_controller_holds():
+    """Many states predict it well in open loop, and some of these grow."""
+    u, y = sweep_of_a_hardening_spring(600, damping=0.02, cubic=4.0, rates=(1.2, 0.6))
+    y += 1e-4 * y.std() * np.random.default_rng(0).standard_normal(y.shape)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = SubspaceLTI().fit(u, y)
+    assert not any("controller holds" in str(one.message) for one in caught)
+    assert model.method_ == "po-moesp"
 
 
 def test_auto_is_po_moesp_in_open_loop(system):
