@@ -757,4 +757,12 @@ def _riccati_gain(A: Array, C: Array, W: Array, E: Array, n_columns: int) -> Arr
     """Kalman gain from the residuals of the state and of the output equation."""
     Q, S, R = (M / n_columns for M in (W @ W.T, W @ E.T, E @ E.T))
     Q = Q + _RICCATI_FLOOR * np.trace(Q) / len(Q) * np.eye(len(Q))
-    return kalman_filter(A, C, Q, S, R).gain
+    try:
+        return kalman_filter(A, C, Q, S, R).gain
+    except ValueError:  # of SciPy, in its own words
+        raise ValueError(
+            f"No predictor of {len(A)} states, of plant and noise together, is found "
+            "for these samples: their outputs grow beyond what numbers resolve, or "
+            "follow from fewer states. Use a lower `order` or method='po-moesp', or "
+            "give samples before the outputs have grown."
+        ) from None

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from lpvlearn import StateSpace, SubspaceLTI
-from lpvlearn.subspace.closed_loop import _Changes, _Innovation
+from lpvlearn.subspace.closed_loop import _Changes, _Innovation, _riccati_gain
 from lpvlearn.systems.simulation import lti_response
 
 from ..conftest import modes
@@ -565,6 +565,13 @@ def test_a_spring_that_hardens_is_no_plant_that_a_controller_holds():
         model = SubspaceLTI().fit(u, y)
     assert not any("controller holds" in str(one.message) for one in caught)
     assert model.method_ == "po-moesp"
+
+
+def test_states_that_grow_unseen_ask_for_fewer_of_them():
+    """Their Riccati equation has no solution, which SciPy says in words of its own."""
+    W, E = np.eye(3)[:2], np.eye(3)[2:]
+    with pytest.raises(ValueError, match="lower `order` or method='po-moesp'"):
+        _riccati_gain(np.diag([2.0, 0.5]), np.array([[0.0, 1.0]]), W, E, 3)
 
 
 def test_auto_is_po_moesp_in_open_loop(system):
