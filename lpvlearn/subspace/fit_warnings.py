@@ -277,8 +277,7 @@ def warn_about(fitted: LocalFit, telling: Telling) -> None:
             f"undetermined; the smallest solution was taken. {remedy}",
             RankWarning,
         )
-    surely = fitted.grows(surely=True)
-    warn_about_pole(model.A, telling, fitted.method, surely=surely)
+    warn_about_pole(model.A, telling, fitted)
     _warn_of_error(fitted, chose_order, telling)
     _warn_of_spikes(fitted, telling)
     choice_is_told = TESTS <= telling.kinds or fitted.residual > USELESS
@@ -591,10 +590,11 @@ def _may_last(fitted: LocalFit) -> bool:
     return bool((lasting & unknown).any())
 
 
-def warn_about_pole(
-    A: Array, telling: Telling, method: str = "po-moesp", *, surely: bool = False
-) -> None:
-    """Tell the user that a model is unstable, `surely` or not, or on the border."""
+def warn_about_pole(A: Array, telling: Telling, fitted: LocalFit | None = None) -> None:
+    """Tell the user that a model is unstable, or on the border of that.
+
+    The fit tells how sure it is, and what the model is good for; not that of a stream.
+    """
     poles = np.linalg.eigvals(A)
     moduli = np.abs(poles)
     radius = float(moduli.max(initial=0.0))
@@ -603,8 +603,13 @@ def warn_about_pole(
             "stability='enforce' for a stable one, another `order`, or a longer "
             "`horizon`."
         )
-        remedy = f"Use {stable}"
-        if surely:
+        if fitted is not None and fitted.method == "pbsid":
+            remedy = (
+                "Such a plant can be predicted (`predict_ahead`), but not simulated "
+                "for long nor brought into a structure: for that, identify the closed "
+                "loop, with the controller's reference as input."
+            )
+        elif fitted is not None and fitted.grows(surely=True):
             remedy = (
                 "It grows beyond chance, as a plant does that a controller or a hand "
                 "holds: simulate from the state that outputs tell "
@@ -612,12 +617,8 @@ def warn_about_pole(
                 "method='pbsid' and use `predict_ahead`. If the plant is stable, use "
                 f"{stable}"
             )
-        if method == "pbsid":
-            remedy = (
-                "Such a plant can be predicted (`predict_ahead`), but not simulated "
-                "for long nor brought into a structure: for that, identify the closed "
-                "loop, with the controller's reference as input."
-            )
+        else:
+            remedy = f"Use {stable}"
         if (np.abs(poles[moduli > 1.0] - 1.0) < _ABOUT_ONE).all():
             remedy = (
                 "Name outputs that integrate, as a position does, in `integrating`. "

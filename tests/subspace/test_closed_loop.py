@@ -567,6 +567,13 @@ def test_a_spring_that_hardens_is_no_plant_that_a_controller_holds():
     assert model.method_ == "po-moesp"
 
 
+def test_a_pole_that_grows_beyond_chance_is_not_told_to_be_enforced_first(rng):
+    u = rng.standard_normal(100)
+    y = lfilter([0.0, 1.0], [1.0, -1.05], u) + 0.1 * rng.standard_normal(100)
+    with pytest.warns(UserWarning, match="It grows beyond chance, as a plant"):
+        SubspaceLTI(1, method="po-moesp").fit(u[:, None], y)
+
+
 def test_states_that_grow_unseen_ask_for_fewer_of_them():
     """Their Riccati equation has no solution, which SciPy says in words of its own."""
     W, E = np.eye(3)[:2], np.eye(3)[2:]
