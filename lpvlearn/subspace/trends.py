@@ -36,7 +36,7 @@ _NOT_MOVED = 1.1
 def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
     """Choose and identify, with constants of the experiments where these matter."""
     choices = samples.choices
-    n_trend = N_TRENDS[choices.offset]
+    given, n_trend = choices.order is not None, N_TRENDS[choices.offset]
     # The errors of a rough model are not the noise that constants must stand out of.
     rough = choices.offset == "auto" and choices.refine is False
     judged = samples.having(refine="simulation") if rough else samples
@@ -45,14 +45,13 @@ def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
     # so does one of a model that has to start at rest. In the errors of a poor model of
     # a given order nothing stands out.
     hides = fitted.method == "pbsid" or not choices.initial_states
-    hides |= choices.order is not None and fitted.residual > _HARDLY
+    hides |= given and fitted.residual > _HARDLY
     tested = fitted.evidence.one_step
     stands = choices.offset == "auto" and stands_by_chance(tested)
 
     def may_matter() -> bool:
         if hides or stands:
             return True
-        given = choices.order is not None
         return may_have_constants(tested, given=given) and judged.is_worth_a_choice(
             lambda near: may_be_better(tested, near.evidence), fitted, 1
         )
@@ -67,17 +66,17 @@ def with_trends(samples: Samples, like: LocalFit | None = None) -> LocalFit:
             other = as_many if worse < 0.0 else other
         if constants_matter(tested, other.evidence.one_step):
             fitted, n_trend = other, 1
-        elif choices.order is not None:  # a poor model shows many things
+        elif given:  # a poor model shows many things
             refused = other.evidence.one_step.criterion
     # The states of a given order that are to follow a drift are missing elsewhere.
-    given = choices.order is not None and choices.initial_states and n_trend < 2
-    given &= fitted.method != "pbsid" and not choices.enforce_stability
+    follows = given and choices.initial_states and n_trend < 2
+    follows &= fitted.method != "pbsid" and not choices.enforce_stability
 
     def may_drift() -> bool:
-        if given:
+        if follows:
             lost = outlasts(fitted) or fitted.residual > _HARDLY
             return lost or _drifts_off(judged, fitted, tested)
-        shown = choices.order is None and not hides and not rough
+        shown = not (given or hides or rough)
         return shown and _may_drift_off(judged, fitted)
 
     if choices.offset == "auto" and moves and may_drift():
