@@ -60,7 +60,7 @@ def whole_folder(target: Path, overwrite: bool) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_file(target: Path) -> Iterator[Path]:
+def whole_output(target: Path) -> Iterator[Path]:
     """A new file's path, which becomes `target` when the block ends well."""
     if target.is_dir():
         raise ValueError(f"--output {target}: there is a folder of that name.")

@@ -18,7 +18,7 @@ from .judgement import (
     signals_of,
     simulation_text,
 )
-from .output import whole_file
+from .output import whole_output
 from .tables import check_table, read_tables, with_times, write_table
 
 
@@ -48,7 +48,7 @@ def predict(options: argparse.Namespace) -> None:
     if options.output is None:
         write_table(simulated, None, options.format)
     else:
-        with whole_file(options.output) as part:
+        with whole_output(options.output) as part:
             write_table(simulated, part, options.format)
     if told.warned:
         text.append(told.text())
@@ -68,7 +68,7 @@ def report(options: argparse.Namespace) -> None:
                 found = fit_report(pipeline, X, y, initial_state=options.initial_state)
                 text.append(simulation_text(found, name, options.initial_state))
         if options.output is not None:
-            with told.step("report", bar=True), whole_file(options.output) as part:
+            with told.step("report", bar=True), whole_output(options.output) as part:
                 pipeline.to_html_report(part, X, y, initial_state=options.initial_state)
     print("\n\n".join([*text, told.text()]))
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..models.statespace import StateSpace
+from ..systems.whole_files import whole_file
 from ..validation import file_name
 
 Array = NDArray[np.float64]
@@ -91,16 +92,10 @@ def write_mat(path: str | os.PathLike[str], grid: Grid) -> None:
         for what, texts in (("Name", map(str, names)), ("Unit", units)):
             cells = np.array([[text] for text in texts], dtype=object)
             content[f"{side}{what}"] = cells
-    target = file_name(path)
-    part = target.with_name(f".{target.name}.{os.getpid()}")
-    try:
-        with part.open("wb") as file:
-            from scipy.io import savemat  # slow to import
+    from scipy.io import savemat  # slow to import
 
-            savemat(file, content, long_field_names=True)
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(file_name(path)) as file:
+        savemat(file, content, long_field_names=True)
 
 
 def as_dataset(grid: Grid) -> Any:

@@ -51,6 +51,7 @@ from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
 from ..systems.threads import one_blas_thread
+from ..systems.whole_files import whole_file
 from ..validation import (
     file_name,
     one_of,
@@ -692,9 +693,8 @@ list, default=None
                 units=by_name or {},
                 figures=folder,
             )
-        part = place.with_name(f".{place.name}.part")
-        part.write_text(page, encoding="utf-8")
-        part.replace(place)
+        with whole_file(place) as file:
+            file.write(page.encode())
 
     def _summarised(self) -> Summary:
         check_is_fitted(self, "lpv_")

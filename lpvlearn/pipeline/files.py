@@ -14,10 +14,8 @@ import json
 import math
 import os
 import re
-import secrets
 import zipfile
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +26,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
 from ..exceptions import version
+from ..systems.whole_files import whole_file
 from ..validation import file_name, shown
 from .memory import unwritten
 from .schema import CLASSES, Form, after_loading, before_saving, forms_of
@@ -134,7 +133,8 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
             f"`model` must be one that `load` can build anew. Got {error}."
         ) from error
     try:
-        _replace(target, buffer.getbuffer())
+        with whole_file(target) as file:
+            file.write(buffer.getbuffer())
     except OSError as error:
         told = type(error)(unwritten(f"`path` {str(path)!r}", error))
         told.errno = error.errno
@@ -216,24 +216,6 @@ def _file(path: Any) -> Path:
             f"{kind}: take another name."
         )
     return place
-
-
-def _replace(target: Path, content: memoryview) -> None:
-    """Put a file in the place of another in one step, once it is on the disk."""
-    part = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
-    try:
-        with open(part, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, target)
-    finally:
-        part.unlink(missing_ok=True)
-    if hasattr(os, "O_DIRECTORY"):  # the name, too, shall survive a loss of power
-        folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
-        with suppress(OSError):  # not every file system can
-            os.fsync(folder)
-        os.close(folder)
 
 
 # -- writing ---------------------------------------------------------------------------
