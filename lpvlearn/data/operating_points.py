@@ -227,11 +227,18 @@ def moving_experiments(
     spread = np.array([np.ptp(signal, axis=0) for signal in signals])
     between = np.ptp([signal.mean(axis=0) for signal in signals], axis=0)
     travel = np.array([_travel(signal) for signal in signals])
-    far = spread > _MAX_SPREAD * np.ptp(np.vstack(signals), axis=0)
+    low, high = _extremes(signals)
+    far = spread > _MAX_SPREAD * (high - low)
     apart = between > spread.min(axis=0)
     moves = (far & (apart | (travel > _SWEEP * spread))).any(axis=1)
     local = [run for run, away in zip(experiments, moves, strict=True) if not away]
     return local, [run for run, away in zip(experiments, moves, strict=True) if away]
+
+
+def _extremes(signals: Sequence[Array]) -> tuple[Array, Array]:
+    """Smallest and largest values over all signals, NaN aside; one read at a time."""
+    low = np.fmin.reduce([np.fmin.reduce(signal) for signal in signals])
+    return low, np.fmax.reduce([np.fmax.reduce(signal) for signal in signals])
 
 
 def _motion(experiments: Sequence[Experiment]) -> Array:
@@ -266,8 +273,8 @@ def group_operating_points(
     signals = [run.scheduling for run in experiments if run.scheduling is not None]
     means = None
     if len(signals) == len(experiments):
-        rows = squarable("scheduling", np.vstack(signals))
-        if np.isinf(rows).any():
+        ends = squarable("scheduling", np.array(_extremes(signals)))
+        if np.isinf(ends).any():
             raise ValueError("`scheduling` must be finite. Got inf in its columns.")
         means = np.array([signal.mean(axis=0) for signal in signals])
     if all(run.operating_point is not None for run in experiments):
@@ -326,10 +333,10 @@ def _cluster(means: Array, near: Array, tol: Array) -> NDArray[np.intp]:
 
 def check_outputs(experiments: Sequence[Experiment], names: Sequence[object]) -> None:
     """Refuse outputs (of these names) that are constant."""
-    outputs = np.vstack([e.measured for e in experiments])
-    lowest, highest = np.fmin.reduce(outputs), np.fmax.reduce(outputs)  # without NaN
+    lowest, highest = _extremes([e.measured for e in experiments])
     constant = lowest == highest
-    if len(outputs) > len(experiments) and constant.any():
+    n_samples = sum(len(e.rows) for e in experiments)
+    if n_samples > len(experiments) and constant.any():
         j = int(np.argmax(constant))
         raise ValueError(
             f"Every output must vary. Got {names[j]!r} constant at {lowest[j]:g}: "

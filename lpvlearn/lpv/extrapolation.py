@@ -25,7 +25,9 @@ _BESIDE = 0.05  # of the ranges: distance from the hull that is still near it
 def describe_extrapolation(X: Array, scheduling_range: Array) -> str:
     """Say how far values are out of range; nothing when they are in it."""
     low, high = scheduling_range
+    width = np.where(high > low, high - low, 1.0)
     excess = np.maximum(low - X, X - high) - _RANGE_RTOL * (high - low)
+    excess /= width
     if not (excess > 0).any():
         return ""
     row, j = np.unravel_index(np.argmax(excess), excess.shape)

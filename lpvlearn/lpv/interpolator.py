@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from abc import ABC, abstractmethod
 from typing import Any, Self
 
@@ -188,7 +187,8 @@ class Interpolator(
                 f"`coefficients` must be {len(self.coefficients())} finite numbers. "
                 f"Got shape {vector.shape}."
             )
-        changed = copy.copy(self)
+        changed = type(self).__new__(type(self))  # a copy would draw the curve again
+        changed.__dict__.update(self.__dict__)
         rule = "be numbers that make finite curves"
         with (
             np.errstate(over="raise", invalid="raise"),

@@ -45,6 +45,7 @@ from ..validation import (
 from .coefficients import MatrixCoefficients, matrix_coefficients
 from .export import Grid, as_dataset, control_models, write_mat
 from .extrapolation import warn_extrapolation
+from .interpolator import domains
 from .lfr import LinearFractionalModel, linear_fractional
 from .weighting import covariance_factor
 
@@ -195,10 +196,17 @@ class LPVStateSpace(VersionedPickle):
                     f"{type(regressor).__name__}."
                 )
         bounds = real_array("scheduling_range", self.scheduling_range)
-        if bounds.ndim != 2 or len(bounds) != 2 or not (bounds[0] <= bounds[1]).all():
+        rows = bounds.ndim == 2 and len(bounds) == 2 and np.isfinite(bounds).all()
+        if not rows or not (bounds[0] <= bounds[1]).all():
             raise ValueError(
-                "`scheduling_range` must have shape (2, n_scheduling), smallest values "
-                f"first. Got {bounds.tolist()}."
+                "`scheduling_range` must be finite, of shape (2, n_scheduling), "
+                f"smallest values first. Got {bounds.tolist()}."
+            )
+        limits = self.identified_range
+        if limits is not None and np.shape(limits) != bounds.shape:
+            raise ValueError(
+                "`identified_range` must have the shape of `scheduling_range`, "
+                f"{bounds.shape}. Got {np.shape(limits)}."
             )
         bounds.setflags(write=False)
         object.__setattr__(self, "scheduling_range", bounds)
@@ -217,6 +225,9 @@ class LPVStateSpace(VersionedPickle):
         object.__setattr__(self, "steady_start", steady)
         delay = input_delays(self.input_delay, self.n_inputs, samples=False)
         object.__setattr__(self, "input_delay", delay)
+        for T in self.bases:
+            if not callable(T):
+                self._checked_basis(T)
         if self.covariance is not None:
             object.__setattr__(self, "covariance", self._checked_covariance())
 
@@ -507,8 +518,13 @@ class LPVStateSpace(VersionedPickle):
         model = model.transform(T)
         if speed is None:
             return model
-        slopes = numerical_jacobian(self._basis_at, place, self.scheduling_range[1])
-        term = np.tensordot(speed, slopes, 1) @ np.linalg.inv(T)
+        width = np.ptp(domains(self.scheduling_range), axis=0)  # the unit of slopes
+        slopes = numerical_jacobian(
+            lambda ahead: self._basis_at(place + width * (ahead - 1.0)),
+            np.ones_like(place),
+            np.ones_like(place),
+        )
+        term = np.tensordot(speed / width, slopes, 1) @ np.linalg.inv(T)
         return replace(model, A=model.A + term)
 
     def change_basis(self, T: _Basis) -> LPVStateSpace:
@@ -565,11 +581,14 @@ class LPVStateSpace(VersionedPickle):
         """T from the structure's state to this one's."""
         T = np.eye(self.order)
         for basis in self.bases:
-            own = matrix("T", basis(kappa) if callable(basis) else basis)
-            if own.shape != T.shape:
-                raise ValueError(f"`T` must have shape {T.shape}. Got {own.shape}.")
-            T = own @ T
+            T = self._checked_basis(basis(kappa) if callable(basis) else basis) @ T
         return T
+
+    def _checked_basis(self, T: ArrayLike) -> Array:
+        own, wanted = matrix("T", T), (self.order, self.order)
+        if own.shape != wanted:
+            raise ValueError(f"`T` must have shape {wanted}. Got {own.shape}.")
+        return own
 
     def frozen_poles(self, kappa: ArrayLike) -> NDArray[np.complex128]:
         """Poles (rad/s) of the frozen models, each row by modulus.

@@ -132,7 +132,7 @@ class RationalLPV(Interpolator):
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
         tensor = self.terms == "tensor"
         self.powers_ = resolvable_powers(self.degree, kappa, tensor=tensor)
-        n, q = points.theta.shape
+        n, q = len(np.unique(kappa, axis=0)), points.theta.shape[1]
         spare = (n - len(self.powers_)) * q
         for degree in range(min(self.denominator, n - 1), -1, -1):
             self.denominator_powers_ = resolvable_powers(degree, kappa, tensor=tensor)

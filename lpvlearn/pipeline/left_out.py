@@ -38,15 +38,15 @@ _NAMED = 3  # operating points that a message lists
 
 
 def interpolated_without(
-    point: int,
+    out: NDArray[np.bool_],
     form: Any,
     kappa: Array,
     theta: Array,
     places: Array,
     covariance: Array | None = None,
 ) -> Array | None:
-    """Parameters at places without one operating point; None where all are needed."""
-    keep = np.arange(len(kappa)) != point
+    """Parameters at places without some points; None where these are needed."""
+    keep = ~out
     form = clone(form)
     if keep.sum() == 1:
         form = PolynomialLPV(degree=0)
@@ -81,10 +81,11 @@ def errors_left_out(
     """
     errors = {}
     for out in inner_places(kappa):
-        k = int(out.argmax())
-        values = interpolated_without(k, form, kappa, theta, kappa[[k]], covariance)
-        if values is not None:
-            both = [structure.model(values[0]), models[k]]
+        values = interpolated_without(out, form, kappa, theta, kappa[out], covariance)
+        if values is None:
+            continue
+        for k, own in zip(np.flatnonzero(out).tolist(), values, strict=True):
+            both = [structure.model(own), models[k]]
             if seen is not None:
                 both = [seen(model) for model in both]
             errors[k] = largest_difference(*(forgetting(m, rate) for m in both))

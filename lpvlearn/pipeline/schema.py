@@ -475,7 +475,7 @@ def _check_powers(powers: Any) -> None:
 
 def _try_structure(structure: GrayBoxStructure) -> None:
     names, n = structure.parameter_names, structure.order
-    if len(set(names)) != len(names) or min(n, 0) < 0:
+    if len(set(names)) != len(names) or n < 0:
         raise ValueError("its parameters have equal names, or its order is negative")
     if min(structure.n_inputs, structure.n_outputs) < 1:
         raise ValueError("it has no inputs or outputs")
@@ -507,9 +507,3 @@ def _try_lpv(model: LPVStateSpace) -> None:
         found = np.size(regressor.predict(place))
         if found != size:
             raise ValueError(f"`{name}` must predict {size} values. Got {found}")
-    constant = [np.shape(T) for T in model.bases if not callable(T)]
-    limits = model.identified_range
-    if limits is not None and np.shape(limits) != model.scheduling_range.shape:
-        raise ValueError(f"`identified_range` has shape {np.shape(limits)}")
-    if any(shape != (model.order, model.order) for shape in constant):
-        raise ValueError(f"`bases` have the shapes {constant}")

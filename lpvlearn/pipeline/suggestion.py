@@ -118,7 +118,7 @@ def suggest_operating_point(
     left_out = np.full((len(kappa), len(places)), np.nan)
     for i in range(len(kappa)):
         without = interpolated_without(
-            i,
+            np.arange(len(kappa)) == i,
             pipeline.interpolator_,
             kappa,
             pipeline.parameters_.to_numpy(),

@@ -599,12 +599,14 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             The model that was restructured.
         n_restarts : int, default=10
         size : float, default=0.05
-            Relative standard deviation of the perturbations.
+            Relative standard deviation of the perturbations; of a parameter that is
+            zero, their own.
 
         Returns
         -------
         DataFrame of shape (n_restarts, n_params + 1)
-            Relative deviation of every parameter from `params_`, and `error_`.
+            Relative deviation of every parameter from `params_`, of one that is zero
+            the deviation, and `error_`.
         """
         check_is_fitted(self, "params_")
         whole_number("n_restarts", n_restarts, 1, _MOST_STARTS)
@@ -613,11 +615,12 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         rows, norm, params = [], self.norm, self.params_
         if norm == "covariance":
             norm, params = "hinf", self.hinf_params_
+        unit = np.where(params == 0.0, 1.0, params)
         for _ in range(n_restarts):
-            start = params * (1.0 + size * rng.normal(size=params.shape))
+            start = params + size * unit * rng.normal(size=params.shape)
             again = clone(self).set_params(norm=norm, init=start, n_starts=1)
             again.fit_model(model)
-            rows.append([*(again.params_ / params - 1.0), again.error_])
+            rows.append([*((again.params_ - params) / unit), again.error_])
         names = [*self.structure_.parameter_names, "error_"]
         return pd.DataFrame(rows, columns=names)
 

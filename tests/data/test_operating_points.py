@@ -1,5 +1,6 @@
 """Operating points: experiments grouped, and refused where they are not local."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.data.operating_points import (
     _check_local,
+    check_outputs,
     group_operating_points,
     without_spikes,
 )
@@ -154,3 +156,15 @@ def test_spikes_of_scheduling_variables_are_replaced_and_told():
 def test_what_moves_has_no_spikes(signal):
     run = _record(signal)
     assert without_spikes([run])[0] is run
+
+
+def test_measured_outputs_are_looked_at_one_experiment_at_a_time():
+    runs = [
+        Experiment(k, np.arange(20_000), np.zeros((20_000, 1)), np.full((20_000, 1), k))
+        for k in range(50)
+    ]
+    tracemalloc.start()
+    check_outputs(runs, ["y"])
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 50 * 20_000 * 8 / 4

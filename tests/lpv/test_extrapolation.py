@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from lpvlearn import PolynomialLPV
 from lpvlearn.exceptions import ExtrapolationWarning
 from lpvlearn.lpv.extrapolation import distance_from_hull, warn_outside_hull
 
@@ -64,3 +65,10 @@ def test_what_is_near_or_told_already_is_not(kappa, box):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_outside_hull(np.array(kappa), TRIANGLE, box, NAMES)
+
+
+def test_the_farthest_variable_is_that_farthest_out_of_its_range():
+    form = PolynomialLPV(1, extrapolation="error")
+    form.fit([[0.0, 0.0], [0.1, 0.0], [0.0, 1000.0]], [0.0, 1.0, 2.0])
+    with pytest.raises(ValueError, match=r"\[0, 0.1\] for variable 1.*farthest 1\."):
+        form.predict([[1.0, 1020.0]])

@@ -843,3 +843,36 @@ def test_step_responses_begin_at_rest():
         np.testing.assert_array_equal(
             found, spring_lpv().simulate(u, np.zeros(50), 0.05)
         )
+
+
+@pytest.mark.parametrize(
+    "low, width", [(1e5, 1.0), (-1e-8, 1e-8), (0.0, 1e6), (3.0, 0)]
+)
+def test_the_rate_of_a_basis_is_that_of_its_range(low, width):
+    kappa = np.array([[low], [low + width]])
+    spring = GrayBoxStructure.from_template(
+        A=[[0, 1], ["-k", -0.5]], B=[[0], [1]], C=[[1, 0]]
+    )
+    k = PolynomialLPV(0).fit(kappa, [[4.0], [4.0]])
+    unit = width or 1.0
+    lpv = LPVStateSpace(spring, k, kappa).change_basis(
+        lambda kappa: np.diag([1.0, np.exp((kappa[0] - low) / unit)])
+    )
+    for place in kappa.ravel():
+        at_rest, moving = lpv.at(place), lpv.at(place, rate=3.0 * unit)
+        assert np.allclose(moving.A - at_rest.A, [[0, 0], [0, 3.0]], atol=3e-5)
+
+
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        ({"scheduling_range": [[-np.inf], [np.inf]]}, "must be finite"),
+        ({"identified_range": [0.0, 1.0]}, "shape of `scheduling_range`"),
+        ({"bases": (np.eye(3),)}, "`T` must have shape"),
+    ],
+)
+def test_ranges_and_bases_that_do_not_fit_are_refused(wrong, said):
+    decay = GrayBoxStructure.from_template(A=[["-a"]], B=[[1]], C=[[1]])
+    a = PolynomialLPV(0).fit([[0.0], [1.0]], [[1.0], [1.0]])
+    with pytest.raises(ValueError, match=said):
+        LPVStateSpace(decay, a, **({"scheduling_range": [[0.0], [1.0]]} | wrong))

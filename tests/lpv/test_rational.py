@@ -149,3 +149,14 @@ def test_two_variables_of_a_tensor_rational():
 def test_bad_options_are_refused(options, words):
     with pytest.raises(ValueError, match=words):
         RationalLPV(**options).fit(KAPPA, KAPPA)
+
+
+@pytest.mark.parametrize("denominator", [1, 2, 3])
+def test_points_of_one_place_are_one_place_to_the_denominator(denominator):
+    kappa = np.repeat([[0.0], [1.0]], 3, axis=0)
+    values = [1.0, 1.1, 0.9, 2.0, 2.1, 1.9]
+    form = RationalLPV(1, denominator).fit(kappa, values)
+    assert len(form.denominator_powers_) == 1
+    assert np.allclose(form.predict([[0.0], [1.0]]), [1.0, 2.0])
+    auto = AutoLPV().fit(kappa, values, covariance=np.full(6, 0.01))
+    assert np.allclose(auto.predict([[0.5]]), 1.5)

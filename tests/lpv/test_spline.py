@@ -112,3 +112,14 @@ def test_one_value_of_a_variable_has_a_logarithm():
     kappa = np.column_stack([WIDE[:, 0], np.full(5, 0.01)])
     model = SplineLPV(scale="log").fit(kappa, WIDE[:, 0])
     np.testing.assert_allclose(model.predict(kappa), WIDE[:, 0])
+
+
+def test_other_coefficients_draw_the_curve_once(monkeypatch):
+    form = SplineLPV().fit([[0.0], [1.0], [2.0]], [1.0, 3.0, 2.0])
+    drawn, through = [], SplineLPV._through
+    monkeypatch.setattr(
+        SplineLPV, "_through", lambda self, t: drawn.append(t) or through(self, t)
+    )
+    moved = form.with_coefficients(form.coefficients() + 1.0)
+    assert len(drawn) == 1
+    assert np.allclose(moved.predict([[0.5]]), form.predict([[0.5]]) + 1.0)

@@ -5,7 +5,8 @@ import warnings
 import numpy as np
 import pytest
 
-from lpvlearn import AutoLPV, PolynomialLPV
+from lpvlearn import AutoLPV, GrayBoxStructure, PolynomialLPV, SplineLPV
+from lpvlearn.pipeline.left_out import errors_left_out
 
 from ..conftest import spring_pipeline, spring_tables
 
@@ -54,3 +55,12 @@ def test_scheduling_variables_that_move_together_are_told(tables, together):
     words = said(pipeline.set_params(scheduling=["kappa", "load"]), X, y)
     assert ("'kappa', 'load' move together over the 4" in words) == together
     assert np.isfinite(pipeline.parameters_.to_numpy()).all()
+
+
+def test_all_points_of_a_place_are_left_out_together():
+    decay = GrayBoxStructure.from_template(A=[["-a"]], B=[[1]], C=[[1]])
+    kappa, theta = np.array([[0.0], [1.0], [1.0], [2.0]]), np.array([[1.0, 5, 5, 1]]).T
+    models = [decay.model(values) for values in theta]
+    errors = errors_left_out(decay, models, SplineLPV(), kappa, theta)
+    assert sorted(errors) == [1, 2]  # 1/(s + 1) where 1/(s + 5) is: 4 of its gain
+    assert np.allclose([*errors.values()], 4.0, rtol=1e-2)

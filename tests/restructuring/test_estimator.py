@@ -897,3 +897,17 @@ def test_a_fit_that_fails_leaves_no_attribute():
     after = vars(fitted)
     assert after.keys() == before.keys()
     assert all(after[name] is value for name, value in before.items())
+
+
+def test_a_parameter_of_zero_is_perturbed_too():
+    structure = GrayBoxStructure.from_template(
+        A=[["-a"]],
+        B=[["b"]],
+        C=[[1]],
+        D=[["d"]],
+    )
+    truth = structure.model([2.0, 3.0, 0.0])
+    fit = GrayBoxRestructurer(structure).fit_model(truth)
+    fit.params_ = np.array([2.0, 3.0, 0.0])
+    found = fit.perturbation_check(truth, n_restarts=3)
+    assert np.abs(found.to_numpy()).max() < 1e-4
