@@ -421,6 +421,8 @@ def _fit_together(
     joint = _innovation_form(subspace, n_joint)
     if settings.refine:
         fitted, joint = _refined(joint, records, free)
+        if order is None:
+            fitted, joint = _with_more_states(fitted, joint, subspace, records, free)
         if fitted.model.blocks is None:  # it could not be refined
             fitted = None
     split, n = _split(joint, fitted, order, subspace.n_columns), subspace.n_columns
@@ -439,6 +441,43 @@ def _fit_together(
     return _Together(fitted, joint, np.eye(len(whole)), whole)
 
 
+def _with_more_states(
+    fitted: _Predictor,
+    joint: _Innovation,
+    subspace: _Subspace,
+    records: Sequence[Record],
+    free: Freedom,
+) -> tuple[_Predictor, _Innovation]:
+    """The refined model, or one of more states, while these are worth it.
+
+    Of modes that are slow beside the past window the subspace tells little: what it
+    leaves of the outputs without them is no more than with them. Schwarz's criterion,
+    as the refined models have as many states as they can use.
+    """
+    n, each = subspace.n_columns, sum(subspace.direct.shape) + len(joint.C)
+    while True:
+        best, found = -np.inf, None
+        for more in (1, 2):  # a mode is one state or two
+            order = len(joint.A) + more
+            if order > min(_MAX_ORDER, len(subspace.states)):
+                continue
+            other = _refined(_innovation_form(subspace, order), records, free)
+            gain = _volume(joint.covariance, records)
+            gain -= _volume(other[1].covariance, records)
+            gain -= more * each * np.log(n) / n
+            if gain > max(best, 0.0) and other[0].model.blocks is not None:
+                best, found = gain, other
+        if found is None:
+            return fitted, joint
+        fitted, joint = found
+
+
+def _volume(covariance: Array, records: Sequence[Record]) -> float:
+    """Logarithm of the determinant of innovations, rounding allowed for."""
+    floor = NO_INNOVATION * np.mean(np.hstack([r.y for r in records]) ** 2, axis=1)
+    return float(np.linalg.slogdet(covariance + np.diag(floor))[1])
+
+
 def _as_likely(
     model: _Innovation,
     whole: _Innovation,
@@ -453,10 +492,9 @@ def _as_likely(
     be trusted where the likelihood is as quadratic as it takes it for.
     """
     errors = np.vstack(_predicted(model, records, free)[1])
-    floor = NO_INNOVATION * np.mean(np.hstack([r.y for r in records]) ** 2, axis=1)
-    spreads = errors.T @ errors / len(errors), whole.covariance
-    volumes = [np.linalg.slogdet(S + np.diag(floor))[1] for S in spreads]
-    return bool(volumes[0] - volumes[1] < n_fewer * model.B.shape[1] * np.log(n) / n)
+    loss = _volume(errors.T @ errors / len(errors), records)
+    loss -= _volume(whole.covariance, records)
+    return bool(loss < n_fewer * model.B.shape[1] * np.log(n) / n)
 
 
 def _predictor_subspace(

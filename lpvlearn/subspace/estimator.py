@@ -249,7 +249,8 @@ class SubspaceLTI(
         criterion (per value, above the best; NaN for horizons that
         lost within their order), validation_bft (percent, on parts held out; NaN
         where that was not looked at), chosen. Of "pbsid" orders are those of plant and
-        noise together, error that of the regression on their states.
+        noise together, error that of the regression on their states, and further ones
+        are chosen where refinement shows that they are worth it.
     rates_ : SubspaceLTI
         With `integrating`, fitted to the rates of these outputs: `selection_`,
         `residual_` and what is not below are its own.

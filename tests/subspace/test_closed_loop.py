@@ -10,7 +10,7 @@ from scipy import linalg
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from lpvlearn import StateSpace, SubspaceLTI
+from lpvlearn import StateSpace, SubspaceLTI, bft_score
 from lpvlearn.subspace.closed_loop import _Changes, _Innovation, _riccati_gain
 from lpvlearn.systems.simulation import lti_response
 
@@ -621,6 +621,21 @@ def test_noise_that_moves_the_plant_tells_of_its_poles(seed):
     both = model.lti_.poles(), linalg.eigvals(plant[0])
     found, true = map(np.sort_complex, both)
     assert (np.abs(found - true) < 4.0 * np.abs(model.poles_std_).max()).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_mode_that_the_subspace_hardly_shows_is_found_by_refinement(seed):
+    rng = np.random.default_rng(seed)
+    mode = [[0.0, 1.0], [-0.49, -0.35]]
+    lagged = linalg.block_diag(mode, [[-0.1]])
+    lagged[1, 2] = 1.0
+    plant = StateSpace(lagged, np.eye(3)[:, 2:], np.eye(3)[:1]).to_discrete(0.2)
+    gusts = StateSpace(mode, [[0.0], [1.0]], [[1.0, 0.0]]).to_discrete(0.2)
+    u = np.repeat(rng.choice([-1.0, 1.0], 150), 20)[:, None]
+    y, noise = plant.simulate(u), gusts.simulate(rng.standard_normal((4000, 1)))[1000:]
+    noise = noise / noise.std() + 0.05 * rng.standard_normal(noise.shape)
+    model = SubspaceLTI(method="pbsid").fit(u, y + y.std() * noise)
+    assert model.order_ == 3 and bft_score(y, model.lti_.simulate(u)) > 80.0
 
 
 def test_little_noise_that_moves_the_plant_is_known_for_it():
