@@ -121,17 +121,23 @@ def balanced_entries(
 def balanced(local: LocalModel) -> StateSpace:
     """The local model, balanced: that of the rates of outputs that integrate.
 
-    Its derivatives do not see the states on which nothing else depends, ``A v = 0``.
     Poles on the negative real axis make the order grow in continuous time.
     """
-    model, integrating = local.lti, local.integrating
+    rates = of_rates(local.lti, local.integrating)
+    return rates.balance(min(local.order - len(local.integrating), rates.order))
+
+
+def of_rates(model: StateSpace, integrating: Sequence[int]) -> StateSpace:
+    """The model of the rates of outputs that integrate, and of the others.
+
+    Its derivatives do not see the states on which nothing else depends, ``A v = 0``.
+    """
     C, D = model.C.copy(), model.D.copy()
     C[integrating], D[integrating] = C[integrating] @ model.A, C[integrating] @ model.B
     n = model.order - len(integrating)
     seen = np.linalg.svd(model.A)[2][:n].T
     A, B = seen.T @ model.A @ seen, seen.T @ model.B
-    rates = StateSpace(A, B, C @ seen, D, input_delay=model.input_delay)
-    return rates.balance(min(local.order - len(integrating), n))
+    return StateSpace(A, B, C @ seen, D, input_delay=model.input_delay)
 
 
 class _Foreseeable(NamedTuple):

@@ -25,8 +25,13 @@ from ..lpv.spline import SplineLPV
 from ..models.statespace import DEVIATION, StateSpace
 from ..restructuring.coordinates import CanonicalForm
 from ..structures.structure import GrayBoxStructure
-from .black_boxes import scaled
-from .left_out import errors_left_out, forgotten
+from .black_boxes import of_rates, scaled
+from .left_out import (
+    errors_left_out,
+    forgetting,
+    forgotten,
+    largest_difference,
+)
 from .local_models import LocalModel
 from .stability import holds_within_range
 
@@ -37,7 +42,9 @@ _LOW = 2, 3  # the degree of a polynomial, and both degrees of a fraction, at mo
 # Times the chi-square of a form, that of constants: noise moves no point so far
 _EXPLAINED = 1e4
 
-_UNLIKE = 2.0  # an error of a point left out, in its largest gain, as bad as any
+# Errors in a model's largest gain: of a point left out, as bad as any, and one as good
+# as none; and of a form at a point of its own that it does not meet.
+_UNLIKE, _FORESEEN, _MISSED = 2.0, 0.01, 0.3
 
 
 class CanonicalModels(NamedTuple):
@@ -50,20 +57,20 @@ class CanonicalModels(NamedTuple):
 
 def canonical_black_boxes(local: Sequence[LocalModel]) -> CanonicalModels | None:
     """None where a model has no such form, or its covariance is not known."""
-    first = local[0].lti
-    if len({model.lti.order for model in local}) > 1 or not first.order:
+    integrating = local[0].integrating
+    models = [of_rates(model.lti, integrating) for model in local]
+    first = models[0]
+    if len({model.order for model in models}) > 1 or not first.order:
         return None
-    structure = GrayBoxStructure.observable_canonical(
-        first.order,
-        first.n_inputs,
-        first.n_outputs,
-        any(bool(model.lti.D.any()) for model in local),
-    )
-    form = CanonicalForm(structure, None)
+    sizes = first.order, first.n_inputs, first.n_outputs
+    direct = any(bool(model.D.any()) for model in models)
+    form = CanonicalForm(GrayBoxStructure.observable_canonical(*sizes, direct), None)
+    structure = GrayBoxStructure.observable_canonical(*sizes, direct, integrating)
     theta, covariance = [], []
     for model in local:
         around = [m for pair in model.deviated() for m in pair]
-        rows = [form.parameters(_matrix(m)) for m in (model.lti, *around)]
+        rates = [of_rates(m, integrating) for m in (model.lti, *around)]
+        rows = [form.parameters(_matrix(m)) for m in rates]
         known = [row for row in rows if row is not None]
         if not around or len(known) < len(rows):
             return None
@@ -94,12 +101,21 @@ def is_better_form(
     form = auto.best_estimator_
     if not _is_low(form) or not holds_within_range(structure, form):
         return False
+    models = [model.lti for model in local]
+    rate = forgotten(models, longest)
+
+    def seen(model: StateSpace) -> StateSpace:
+        return forgetting(scaled(model, *sizes), rate)
+
+    # covariances of parameters that outputs hardly tell apart say little of the model
+    met = map(structure.model, form.predict(kappa))
+    pairs = zip(met, models, strict=True)
+    if max(largest_difference(seen(a), seen(b)) for a, b in pairs) > _MISSED:
+        return False
     if form.degrees_of_freedom_ < 2 * structure.n_params:  # less than with a point less
         constant = auto.selection_["chi2"].iloc[0]
         if constant > _EXPLAINED * max(form.chi2_, form.degrees_of_freedom_):
             return True
-    models = [model.lti for model in local]
-    rate = forgotten(models, longest)
     ways = (*aligned, SplineLPV(), None), (structure, theta, form, covariance)
     other, own = (
         errors_left_out(
@@ -108,9 +124,8 @@ def is_better_form(
             curve,
             kappa,
             values,
-            rate,
             covariance=P,
-            seen=lambda model: scaled(model, *sizes),
+            seen=seen,
         )
         for of, values, curve, P in ways
     )
@@ -118,7 +133,8 @@ def is_better_form(
     # what the others do not surround is extrapolated, by any form
     both = [k for k in both if not _is_corner(k, kappa)] or both
     by_form, by_curve = (
-        sum(min(errors[k], _UNLIKE) for k in both) for errors in (own, other)
+        sum(min(max(errors[k], _FORESEEN), _UNLIKE) for k in both)
+        for errors in (own, other)
     )
     return bool(both) and by_form <= by_curve
 

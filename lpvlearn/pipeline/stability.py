@@ -76,8 +76,12 @@ def _rates(model: LPVStateSpace, kappa: Array, least: float) -> Array:
 
 
 def holds_within_range(structure: GrayBoxStructure, form: Interpolator) -> bool:
-    """Whether the model is stable and within its bounds over the range of a form."""
+    """Whether the model is within its bounds over the range of a form, and stable.
+
+    An integrator does not grow.
+    """
     values = form.predict(grid_over(form.scheduling_range_, _LEVELS))
     within = (values >= structure.lower) & (values <= structure.upper)
     poles = np.linalg.eigvals(structure.matrices(values)[0])
-    return bool(within.all() and (poles.real < 0).all())
+    rounding = _ROUNDING * np.abs(poles).max(axis=1, initial=0.0, keepdims=True)
+    return bool(within.all() and (poles.real <= rounding).all())

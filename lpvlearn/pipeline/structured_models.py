@@ -176,7 +176,7 @@ def without_structure(
         aligned = restructure_points("aligned", local, points, runner, sampling_time)
     # two points lie on a line, whatever states they have
     tells = isinstance(interpolator, AutoLPV) and (every or len(points) > 2)
-    if told or local[0].integrating or not tells:
+    if told or not tells:
         return [aligned]
     found = canonical_black_boxes(local)
     if found is None:

@@ -32,6 +32,7 @@ from .map import AffineMap, FramedMap, FunctionMap, StructureMap
 from .mechanical import FluxMap, ImplicitMap, descriptor_map, mechanical_map
 from .templates import (
     Entry,
+    SystemCells,
     affine_system,
     full_cells,
     integrated_cells,
@@ -302,6 +303,7 @@ class GrayBoxStructure(VersionedPickle):
         n_inputs: int = 1,
         n_outputs: int = 1,
         feedthrough: bool = False,
+        integrating: Sequence[int] = (),
     ) -> GrayBoxStructure:
         """Observable canonical form with generic observability indices.
 
@@ -315,6 +317,9 @@ class GrayBoxStructure(VersionedPickle):
             Order 0 is a pure gain and needs `feedthrough`.
         feedthrough : bool, default=False
             Also free the entries of D.
+        integrating : sequence of int, default=()
+            Places of outputs that are integrals of those of the form, with a state each
+            behind the others.
 
         Raises
         ------
@@ -330,8 +335,9 @@ class GrayBoxStructure(VersionedPickle):
         array([[ 0.,  1.],
                [-4., -1.]])
         """
-        return cls.from_template(
-            *observable_canonical_cells(order, n_inputs, n_outputs, feedthrough)
+        return cls._integrated(
+            observable_canonical_cells(order, n_inputs, n_outputs, feedthrough),
+            integrating,
         )
 
     @classmethod
@@ -357,10 +363,19 @@ class GrayBoxStructure(VersionedPickle):
         >>> servo.model([-2.0, 1.0, 3.0]).poles()
         array([ 0.+0.j, -2.+0.j])
         """
-        A, B, C, D = full_cells(order, n_inputs, n_outputs, feedthrough)
-        names = [str(name) for row in (*A, *B, *C, *(D or [])) for name in row]
+        return cls._integrated(
+            full_cells(order, n_inputs, n_outputs, feedthrough), integrating
+        )
+
+    @classmethod
+    def _integrated(
+        cls, cells: SystemCells, integrating: Sequence[int]
+    ) -> GrayBoxStructure:
+        """Integrals of outputs; the parameters stay those of the cells, in order."""
+        rows = [row for block in cells for row in block or []]
+        names = [cell for row in rows for cell in row if isinstance(cell, str)]
         return cls.from_template(
-            *integrated_cells((A, B, C, D), integrating), parameter_names=names
+            *integrated_cells(cells, integrating), parameter_names=names
         )
 
     @classmethod

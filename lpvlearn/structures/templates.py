@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 
 Entry = float | str
 Cells = list[list[Entry]]
+SystemCells = tuple[Cells, Cells, Cells, Cells | None]  # A, B, C, D
 Affine = dict[str, float]  # coefficient of every name; "" is the constant
 
 _LONGEST = 10_000  # characters of a cell: thousands of terms
@@ -285,7 +286,7 @@ class _Parser:
 
 def observable_canonical_cells(
     order: int, n_inputs: int, n_outputs: int, feedthrough: bool
-) -> tuple[Cells, Cells, Cells, Cells | None]:
+) -> SystemCells:
     """A, B, C, D of the form, see `GrayBoxStructure.observable_canonical`."""
     _, B, C, D = full_cells(order, n_inputs, n_outputs, feedthrough)
     A: Cells = [[0.0] * order for _ in range(order)]
@@ -303,7 +304,7 @@ def observable_canonical_cells(
 
 def full_cells(
     order: int, n_inputs: int, n_outputs: int, feedthrough: bool
-) -> tuple[Cells, Cells, Cells, Cells | None]:
+) -> SystemCells:
     """A, B, C, D whose entries are all parameters: ``a1_1, a1_2, ...``."""
     n, feedthrough = whole_number("order", order, 0), flag("feedthrough", feedthrough)
     if n == 0 and not feedthrough:
@@ -322,9 +323,7 @@ def full_cells(
     return _full_block("a", n, n), _full_block("b", n, m), _full_block("c", p, n), D
 
 
-def integrated_cells(
-    blocks: tuple[Cells, Cells, Cells, Cells | None], outputs: Sequence[int]
-) -> tuple[Cells, Cells, Cells, Cells | None]:
+def integrated_cells(blocks: SystemCells, outputs: Sequence[int]) -> SystemCells:
     """Blocks of a system some of whose outputs are the integrals of those of another.
 
     ``A' = [[A, 0], [C_i, 0]]``, ``B' = [[B], [D_i]]``; the last states are outputs i.
@@ -362,7 +361,7 @@ def modal_cells(
     n_real: int,
     feedthrough: bool,
     normalize: str,
-) -> tuple[Cells, Cells, Cells, Cells | None]:
+) -> SystemCells:
     """A, B, C, D of the real modal form, see `GrayBoxStructure.modal`."""
     n_modes = whole_number("n_modes", n_modes, 0)
     n_real = whole_number("n_real", n_real, 0)

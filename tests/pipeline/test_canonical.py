@@ -1,5 +1,7 @@
 """Black boxes without a structure: in canonical form where a low one carries it."""
 
+import warnings
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,6 +12,7 @@ from lpvlearn import (
     OutputErrorLPV,
     SplineLPV,
     StateSpace,
+    SubspaceLTI,
     bft_score,
     from_trajectories,
 )
@@ -150,3 +153,62 @@ def test_experiments_that_move_choose_the_states():
     assert list(model.parameters_)[0] == "a2_1"
     assert bft_score(y_sweep, model.predict(X_sweep)) > 99.5
     assert bft_score(y_sweep, alone.predict(X_sweep)) < 99.0
+
+
+def servo(kappa):
+    """A position, whose drive is the faster and stronger the further kappa is."""
+    pole = 0.3 + 1.2 * kappa
+    A = [[-pole, 0.0], [1.0 + 3.0 * kappa, 0.0]]
+    return StateSpace(A, [[0.5 + kappa], [0.0]], [[0.0, 1.0]])
+
+
+def position(u, kappa):
+    """Of the drive's equation ``v' = -p v + b u``, where v is the output's rate."""
+    drive, y, v = [], 0.0, 0.0
+    for value, place in zip(u, kappa, strict=True):
+        drive.append(y)
+        pole, gain = 0.3 + 1.2 * place, (0.5 + place) * (1.0 + 3.0 * place)
+        decay = np.exp(-pole * STEP)
+        held = gain * value / pole
+        y += held * STEP + (v - held) * (1.0 - decay) / pole
+        v = held + (v - held) * decay
+    return np.array(drive)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_an_output_that_integrates_is_behind_the_rates_in_canonical_form(seed):
+    rng = np.random.default_rng(seed)
+    X, y = tables(servo, 5, noise=0.0)
+    y = y + 0.002 * rng.standard_normal(y.shape)
+    local = SubspaceLTI(integrating=[0])
+    fitted = pipeline(local=local).fit(X, y)
+    names = ("a1_1", "b1_1", "d1_1")
+    assert fitted.lpv_.structure.parameter_names == names
+    kappa = 0.5 - 0.5 * np.cos(np.linspace(0.0, 6.0 * np.pi, 800))
+    u = prbs(800, clock=20, random_state=7)
+    simulated = fitted.lpv_.simulate(u, kappa, STEP)
+    assert bft_score(position(u.ravel(), kappa), simulated[:, 0]) > 98.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 4])
+def test_a_form_that_misses_its_own_points_is_not_taken(seed):
+    """Water in series: so many slow states that covariances say little of them."""
+    rng, trajectories = np.random.default_rng(seed), []
+    for flow in (1.0, 1.5, 2.2, 3.2):
+        rate = 4186.0 * flow / 6e4
+        A = rate * np.eye(8, k=-1) - (rate + 1.0 / 6e4) * np.eye(8)
+        B = np.zeros((8, 2))
+        B[:, 0], B[0, 1] = 16.8 / 6e4, rate
+        collector = StateSpace(A, B, np.eye(8)[-1:])
+        sun = 150.0 * np.repeat(rng.uniform(-1.0, 1.0, 59), 12)[:700]
+        water = 3.0 * np.repeat(rng.choice([-1.0, 1.0], 47), 15)[:700]
+        u = np.column_stack([sun, water])
+        y = collector.simulate(u, sampling_time=10.0)
+        y = np.round(y + 0.05 * rng.standard_normal(y.shape), 1)
+        trajectories.append((u + [600.0, 60.0], flow, y + 60.0))
+    X, y = from_trajectories(trajectories, sampling_time=10.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of poles on the negative real axis
+        fitted = pipeline().fit(X, y)
+    assert fitted.report_["interpolation_error"].max() < 0.3
