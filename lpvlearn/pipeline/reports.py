@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..data.experiments import Experiment
 from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
+from ..lpv.weighting import is_chance
 from ..metrics.reports import as_shown, readable_report
 from ..metrics.scores import best_fit, parameter_fit
 from ..models.statespace import StateSpace
@@ -25,6 +26,7 @@ from ..systems.simulation import (
     trend_signals,
     with_transit,
 )
+from ..validation import listed
 from .local_models import LocalModel, motions
 from .structured_models import StructuredModels
 
@@ -36,10 +38,12 @@ _WORTH, _POOR, _FAR = 5.0, 50.0, 2.0
 
 _ABOUT_ZERO = 1e-9  # of a pole by the fastest one: it is an integrator's
 
+_NAMED = 3  # operating points that a message lists
 _LOOKED_AT = 10  # experiments of an operating point: more tell the same of constants
 
 # Errors of an interpolation, percent of the model's norm, below which they are rounding
 _THROUGH = 1e-7
+_MISSED = 0.3  # in that norm, beyond which a point is missed
 
 _NO_FLOOR = 1e-8  # share of the black box's norm below which a floor is rounding
 _ROUNDED = 1e-6  # part of a step by which stamps are off that are rounded
@@ -150,6 +154,23 @@ def tables(
             "it misses what a constant of every experiment would explain. Have it "
             "found by offsets='auto', with local=SubspaceLTI(offset='auto'), or "
             "subtract from X and y where the system rests."
+        )
+    errors = pd.Series([row["interpolation_error"] for row in rows], dtype=float)
+    far = errors[errors > _MISSED].sort_values(ascending=False)
+    form = getattr(lpv.interpolator, "best_estimator_", lpv.interpolator)
+    dof = getattr(form, "degrees_of_freedom_", 0)
+    by_chance = dof > 0 and is_chance(getattr(form, "chi2_", np.nan), dof)
+    if len(far) and not by_chance:
+        named = [
+            f"{k} (scheduling {', '.join(f'{v:.4g}' for v in points.kappa[k])}: "
+            f"{100.0 * error:.0f} %)"
+            for k, error in far.items()
+        ]
+        warn(
+            "the LPV model misses the local models at operating point(s) "
+            f"{listed(named, _NAMED)}, in percent of their H-infinity norm: its "
+            "parameters do not follow so simple a form. Use a higher degree, or "
+            "interpolator=SplineLPV(), which meets all points."
         )
     by_parameter = {
         "lowest": theta.min(axis=0),

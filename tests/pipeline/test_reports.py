@@ -97,7 +97,9 @@ def test_what_an_interpolation_loses_at_the_points_is_reported(fitted):
     report = fitted.report_
     np.testing.assert_allclose(report["lpv_BFT"], report["structured_BFT"], atol=0.5)
     X, y = spring_tables(n_samples=200)
-    constant = spring_pipeline(interpolator=PolynomialLPV(0)).fit(X, y)
+    constant = spring_pipeline(interpolator=PolynomialLPV(0))
+    with pytest.warns(UserWarning, match=r"point\(s\) 3 \(scheduling 1.5: .* 1 more"):
+        constant.fit(X, y)
     report = constant.report_
     assert (report["lpv_BFT"] < 90.0).all() and (report["structured_BFT"] > 90.0).all()
     run = X["kappa"] == 0.0
