@@ -6,7 +6,7 @@ good a choice of them is: whether a point is foreseen by the others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -47,6 +47,10 @@ _FORESEEN, _UNLIKE, _CLEARLY, _PLAINLY = 0.01, 2.0, 0.8, 0.5
 # left without them, and the error of what these foresee, for which it is taken
 _RELIEF, _NEAR = 0.5, 0.1
 
+# Error of points left out, in the mean, from which fewer states are tried, so many of
+# these further than the best
+_UNFORESEEN, _FURTHER = 0.3, 2
+
 # An error of the others beside points whose records tell fewer states that is told
 _SPOILT = 0.05
 
@@ -68,11 +72,7 @@ def aligned_black_boxes(
     models = [scaled(balanced(model), u, y) for model in local]
     rate = forgotten(models, longest)
     models = [forgetting(model, rate).balance() for model in models]
-    fewer = [
-        k
-        for k, model in enumerate(local)
-        if model.own is not None and model.own.order < model.order
-    ]
+    fewer = _with_fewer_states(local)
     own = [
         model
         if one.own is None or k not in fewer
@@ -90,6 +90,85 @@ def aligned_black_boxes(
     ]
     whole = _full(first, direct, local[0].integrating)
     return whole, _entries(rows, direct)
+
+
+def _with_fewer_states(local: Sequence[LocalModel]) -> list[int]:
+    """Points whose own records tell fewer states than all together."""
+    return [
+        k
+        for k, model in enumerate(local)
+        if model.own is not None and model.own.order < model.order
+    ]
+
+
+def foreseen_order(
+    local: Sequence[LocalModel],
+    kappa: Array,
+    u: Array,
+    y: Array,
+    longest: float,
+    identified: Callable[[int], Sequence[LocalModel] | None],
+) -> int | None:
+    """A lower order, by which alone the points foresee one another; None for none.
+
+    Where records speak for orders of their own, some of the states may be no dynamics:
+    those of a resonance that is not linear, which many samples tell, differ from point
+    to point, and an interpolation of them is anything. The models of a lower order
+    (`identified` of it, None where they are not) are left out in turn as those of the
+    common one are, and compared with what the records themselves tell. Arguments as of
+    `aligned_black_boxes`; told.
+    """
+    if all(model.own is None for model in local):
+        return None
+    rate = forgotten([scaled(balanced(model), u, y) for model in local], longest)
+
+    def seen(models: Sequence[LocalModel]) -> list[StateSpace]:
+        return [
+            forgetting(scaled(balanced(model), u, y), rate).balance()
+            for model in models
+        ]
+
+    truth, every = seen([model.own or model for model in local]), range(len(local))
+
+    def error(models: Sequence[LocalModel] | None) -> float:
+        candidates = [] if models is None else seen(models)
+        if len({model.order for model in candidates}) != 1:
+            return np.inf
+        theta = _foreseeable(candidates, kappa, every, (), every).theta
+        structure = _full(candidates[0], _has_feedthrough(candidates))
+        errors = errors_left_out(structure, truth, SplineLPV(), kappa, theta)
+        return _Foreseeable(theta, errors).mean()
+
+    common, order = error(local), local[0].order - len(local[0].integrating)
+    poor = _with_fewer_states(local)
+    rich = [k for k in range(len(local)) if k not in poor]
+    models = seen([local[k] for k in rich])
+    if poor and len(rich) > 1 and len({model.order for model in models}) == 1:
+        # a mode may vanish at the others
+        beside = [models[rich.index(k)] if k in rich else truth[k] for k in every]
+        foreseen = _foreseeable(beside, kappa, rich, truth, poor)
+        common = min(common, foreseen.mean())
+    if not common > _UNFORESEEN:
+        return None
+    best, least = 0, np.inf
+    for lower in range(1, order):
+        if best and lower > best + _FURTHER:
+            break
+        found = error(identified(lower))
+        if found < _CLEARLY * least:
+            best, least = lower, found
+    if not least < _CLEARLY * min(common, _UNLIKE):
+        return None
+    warn(
+        f"with the order {order}, for which the records speak, operating points do not "
+        f"foresee one another: left out, they are missed by "
+        f"{100.0 * min(common, _UNLIKE):.0f} % of the largest gain. Order {best} was "
+        f"taken, by which that is {100.0 * least:.0f} %: states that points do not "
+        "share may be those of a "
+        "system that is not linear, and an interpolation of them is none. Use smaller "
+        f"inputs, or keep the order by local=SubspaceLTI(order={order})."
+    )
+    return best
 
 
 def channel_sizes(groups: Sequence[Sequence[Experiment]]) -> tuple[Array, Array]:

@@ -22,6 +22,7 @@ from ..lpv.extrapolation import distance_from_hull
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.rational import RationalLPV
 from ..lpv.spline import SplineLPV
+from ..lpv.weighting import is_chance
 from ..models.statespace import DEVIATION, StateSpace
 from ..restructuring.coordinates import CanonicalForm
 from ..structures.structure import GrayBoxStructure
@@ -43,8 +44,9 @@ _LOW = 2, 3  # the degree of a polynomial, and both degrees of a fraction, at mo
 _EXPLAINED = 1e4
 
 # Errors in a model's largest gain: of a point left out, as bad as any, and one as good
-# as none; and of a form at a point of its own that it does not meet.
-_UNLIKE, _FORESEEN, _MISSED = 2.0, 0.01, 0.3
+# as none; and of a form at a point of its own that it does not meet: by its noise, and
+# where that does not explain it.
+_UNLIKE, _FORESEEN, _BY_NOISE, _MISSED = 2.0, 0.01, 0.3, 0.05
 
 
 class CanonicalModels(NamedTuple):
@@ -110,7 +112,9 @@ def is_better_form(
     # covariances of parameters that outputs hardly tell apart say little of the model
     met = map(structure.model, form.predict(kappa))
     pairs = zip(met, models, strict=True)
-    if max(largest_difference(seen(a), seen(b)) for a, b in pairs) > _MISSED:
+    by_noise = is_chance(form.chi2_, form.degrees_of_freedom_)
+    missed = max(largest_difference(seen(a), seen(b)) for a, b in pairs)
+    if missed > (_BY_NOISE if by_noise else _MISSED):
         return False
     if form.degrees_of_freedom_ < 2 * structure.n_params:  # less than with a point less
         constant = auto.selection_["chi2"].iloc[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
@@ -29,6 +29,7 @@ from ..data.experiments import (
     read_outputs,
 )
 from ..data.operating_points import (
+    OperatingPoints,
     check_outputs,
     local_experiments,
     moving_experiments,
@@ -37,7 +38,7 @@ from ..data.operating_points import (
 )
 from ..data.preparation import has_gaps, split_at_gaps
 from ..data.timestamps import TIME_TOL
-from ..exceptions import all_or_nothing, retold, warn
+from ..exceptions import all_or_nothing, collected, retold, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import interpolated
 from ..lpv.extrapolation import warn_outside_hull
@@ -60,9 +61,15 @@ from ..validation import (
     units_by_name,
     verbosity,
 )
+from .black_boxes import channel_sizes, foreseen_order
 from .html_report import html_report
 from .left_out import tell_of_two_points, tell_unforeseen
-from .local_models import common_delay, estimates_outputs, identify_points
+from .local_models import (
+    LocalModel,
+    common_delay,
+    estimates_outputs,
+    identify_points,
+)
 from .memory import checked_memory
 from .output_error import (
     best_along,
@@ -531,11 +538,9 @@ list, default=None
             points = local_experiments(experiments, self.scheduling_tol)
             self.sampling_time_ = self._sampling_time(experiments, structure)
 
-        with watch.step("local models", bar=True):  # step 3
-            local, points = identify_points(
-                self._local(),
-                points,
-                runner,
+        with watch.step("local models", bar=True), retold() as told:  # step 3
+            identify = partial(
+                identify_points,
                 structure=structure,
                 sampling_time=self.sampling_time_,
                 combine=self.combine,
@@ -543,6 +548,13 @@ list, default=None
                 efficient=self.efficient or efficient,
                 deviate=self._needs_deviations(),
             )
+            local, points = identify(self._local(), points, runner)
+            if restructurer in (None, "aligned"):
+                order = self._foreseen_order(local, points, runner, identify)
+                if order is not None:
+                    told[:-1] = []  # what was said of the models of more states
+                    chosen = clone(self._local()).set_params(order=order)
+                    local, points = identify(chosen, points, runner)
 
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
@@ -695,6 +707,30 @@ list, default=None
             )
         with whole_file(place) as file:
             file.write(page.encode())
+
+    def _foreseen_order(
+        self,
+        local: list[LocalModel],
+        points: OperatingPoints,
+        runner: PointRunner,
+        identify: Callable[..., tuple[list[LocalModel], OperatingPoints]],
+    ) -> int | None:
+        """As `foreseen_order`; None where the estimator has no order to choose."""
+        estimator = self._local()
+        given = getattr(estimator, "order", None)
+        if not isinstance(given, str):
+            return None
+
+        def identified(order: int) -> list[LocalModel] | None:
+            fewer = clone(estimator).set_params(order=order)
+            with collected(), suppress(ValueError):
+                found, kept = identify(fewer, points, replace(runner, verbose=0))
+                return found if len(kept) == len(points) else None
+            return None
+
+        longest = self.sampling_time_ * points.n_longest
+        sizes = channel_sizes(points.experiments)
+        return foreseen_order(local, points.kappa, *sizes, longest, identified)
 
     def _summarised(self) -> Summary:
         check_is_fitted(self, "lpv_")
