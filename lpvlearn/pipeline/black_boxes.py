@@ -157,7 +157,7 @@ def foreseen_order(
         found = error(identified(lower))
         if found < _CLEARLY * least:
             best, least = lower, found
-    if not least < _CLEARLY * min(common, _UNLIKE):
+    if not least < _PLAINLY * min(common, _UNLIKE):
         return None
     warn(
         f"with the order {order}, for which the records speak, operating points do not "

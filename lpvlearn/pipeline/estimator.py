@@ -69,6 +69,7 @@ from .local_models import (
     common_delay,
     estimates_outputs,
     identify_points,
+    tell_of_integrators,
 )
 from .memory import checked_memory
 from .output_error import (
@@ -559,6 +560,9 @@ list, default=None
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
             known = local, points, runner, self.sampling_time_
+            if restructurer in (None, "aligned"):
+                longest = self.sampling_time_ * points.n_longest
+                tell_of_integrators(local, self.output_names_, longest)
             if restructurer is None:
                 form = self._interpolator(len(points))
                 ways = without_structure(*known, form, every=bool(moving))

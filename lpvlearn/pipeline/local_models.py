@@ -51,6 +51,7 @@ _APART = 0.1
 _STANDING = 0.05
 
 # One that much slower may be an integrator, known by samples that are not many.
+_HARDLY = 0.05  # share by which an integrator's pole may decay in a record
 _ABOUT_ZERO = 0.25
 
 # Points that look for their order everywhere, and states fewer and more than theirs
@@ -732,18 +733,51 @@ def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpa
     return lti
 
 
-def _integrating_outputs(lti: StateSpace) -> str:
-    """Which outputs integrate, where the only pole that does not decay is about zero.
+def _integrating_places(lti: StateSpace, rate: float = np.inf) -> list[int]:
+    """Which outputs integrate, where the only slow pole is about zero.
 
-    It is that of the outputs that show it.
+    Nearer to it than all others, and than a `rate`, 1/s. It is that of the outputs that
+    show it.
     """
+    if not lti.order:
+        return []
     poles, V = np.linalg.eig(lti.A)
     i = int(np.argmax(poles.real))
-    others = np.delete(np.abs(poles), i)
-    if poles[i].imag or abs(poles[i]) > _ABOUT_ZERO * others.min(initial=np.inf):
-        return ""
+    least = min(_ABOUT_ZERO * np.delete(np.abs(poles), i).min(initial=np.inf), rate)
+    if poles[i].imag or abs(poles[i]) > least:
+        return []
     seen = np.abs(lti.C @ V[:, i].real)
-    places = np.flatnonzero(seen > _STANDING * seen.max()).tolist()
+    return np.flatnonzero(seen > _STANDING * seen.max()).tolist()
+
+
+def tell_of_integrators(
+    local: Sequence[LocalModel], names: Sequence[Hashable], longest: float
+) -> None:
+    """Tell of outputs that integrate at all points, though nobody said so.
+
+    By a pole that does not decay by more than next to nothing in the `longest` record
+    (seconds). Without a structure the rate may jump with the scheduling variable, and
+    the integrator keeps that.
+    """
+    found = [_integrating_places(model.lti, _HARDLY / longest) for model in local]
+    if any(model.integrating for model in local) or not all(found):
+        return
+    places = sorted(set.intersection(*map(set, found)))
+    if places:
+        named = [names[k] for k in places]
+        warn(
+            f"outputs {named} integrate at all operating points, as a position does: "
+            "their local models have a pole that does not decay over the record. "
+            "Without a structure an LPV model drifts off where that is not known. Use "
+            f"local=SubspaceLTI(integrating={named})."
+        )
+
+
+def _integrating_outputs(lti: StateSpace) -> str:
+    """What to do about outputs that integrate, if there are any."""
+    places = _integrating_places(lti)
+    if not places:
+        return ""
     return (
         f"If outputs {places} integrate, as a position does, name them: "
         f"local=SubspaceLTI(integrating={places}) identifies their rates. "

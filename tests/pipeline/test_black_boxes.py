@@ -245,7 +245,9 @@ def test_integrators_have_gains_of_any_size_and_states_of_one(seed):
         columns = {"u": u[:, 0], "kappa": kappa, "run": run, "y": y}
         tables.append(pd.DataFrame(columns).assign(time=0.02 * np.arange(len(u))))
     table = pd.concat(tables, ignore_index=True)
-    model = LocalLPVPipeline(**ROLES).fit(table.drop(columns="y"), table[["y"]])
+    model = LocalLPVPipeline(**ROLES)
+    with pytest.warns(UserWarning, match=r"Use local=SubspaceLTI\(integrating=\['y'\]"):
+        model.fit(table.drop(columns="y"), table[["y"]])
     omega = np.geomspace(0.2, 80.0, 40)
     for kappa in (0.75, 1.25, 1.75):
         true = servo(kappa).frequency_response(omega)

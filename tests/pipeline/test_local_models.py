@@ -21,6 +21,7 @@ from lpvlearn.pipeline.local_models import (
     LocalModel,
     _of_own_orders,
     identify_point,
+    tell_of_integrators,
 )
 from lpvlearn.pipeline.runner import Done
 
@@ -137,8 +138,8 @@ def test_without_a_structure_points_take_the_order_of_most_evidence(
         warnings.simplefilter("ignore")  # a state too many may look like anything
         pipeline = LocalLPVPipeline(Restless(), **ROLES).fit(X, y)
     assert pipeline.report_["order"].tolist() == [order] * 4
-    # those that took another one are fitted again
-    assert GAIN["fits"] == 4 + (1 if order == 2 else 3)
+    # those that took another one are fitted again, and all of them with fewer states
+    assert GAIN["fits"] == 4 + (1 if order == 2 else 3) + 4 * (order - 1)
 
 
 class Everywhere(SubspaceLTI):
@@ -325,3 +326,25 @@ def test_states_of_the_noise_are_none_of_the_plant(method, cheapest):
     costs = local_models._costs(Fitted(), [run])
     assert min(costs, key=costs.__getitem__) == cheapest
     assert costs[cheapest - 1] == 9.0 and min(costs) == 0
+
+
+@pytest.mark.parametrize(
+    "poles, told",
+    [
+        ((-1e-6, -2e-6), True),
+        ((-1e-6, 0.0), True),
+        ((-1e-6, -0.01), False),  # at one point it decays
+    ],
+)
+def test_outputs_that_integrate_at_all_points_are_told(poles, told):
+    local = [
+        LocalModel(StateSpace(np.diag([pole, -1.0]), [[1.0], [1.0]], np.eye(2)), 2, 5)
+        for pole in poles
+    ]
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        tell_of_integrators(local, ["heading", "rate"], 100.0)
+    found = [
+        "outputs ['heading'] integrate" in str(warning.message) for warning in said
+    ]
+    assert found == [True] * told
