@@ -150,7 +150,8 @@ class LocalLPVPipeline(ScheduledEstimator):
         column roles are set by the pipeline. ``order="auto"`` becomes the order of the
         restructurer's structure where it has one, less where a state would but follow
         the noise, with a pole on the negative real axis; else one order for all points:
-        that of most evidence, all their records together.
+        that of most evidence, all their records together, or a lower one, with a
+        warning, where points left out are foreseen by that alone.
     restructurer : GrayBoxRestructurer, "aligned", "passthrough" or None, default=None
         Step 4. Without a structure, "aligned" interpolates the entries of
         the local models, each turned to its neighbour by the rotation that brings their
