@@ -157,10 +157,8 @@ def tables(
         )
     errors = pd.Series([row["interpolation_error"] for row in rows], dtype=float)
     far = errors[errors > _MISSED].sort_values(ascending=False)
-    form = getattr(lpv.interpolator, "best_estimator_", lpv.interpolator)
-    dof = getattr(form, "degrees_of_freedom_", 0)
-    by_chance = dof > 0 and is_chance(getattr(form, "chi2_", np.nan), dof)
-    if len(far) and not by_chance:
+    form = getattr(lpv.interpolator, "best_estimator_", None)  # nobody's choice
+    if len(far) and form is not None and not _by_chance(form):
         named = [
             f"{k} (scheduling {', '.join(f'{v:.4g}' for v in points.kappa[k])}: "
             f"{100.0 * error:.0f} %)"
@@ -169,8 +167,8 @@ def tables(
         warn(
             "the LPV model misses the local models at operating point(s) "
             f"{listed(named, _NAMED)}, in percent of their H-infinity norm: its "
-            "parameters do not follow so simple a form. Use a higher degree, or "
-            "interpolator=SplineLPV(), which meets all points."
+            "parameters do not follow so simple a form. Use interpolator=SplineLPV(), "
+            "which meets all points."
         )
     by_parameter = {
         "lowest": theta.min(axis=0),
@@ -275,6 +273,12 @@ def _restructuring(fitted: GrayBoxRestructurer) -> dict[str, float]:
         "stationarity": fitted.stationarity_,
         **weighed,
     }
+
+
+def _by_chance(form: Any) -> bool:
+    """Whether noise explains how far the parameters of the points are from a form."""
+    dof = getattr(form, "degrees_of_freedom_", 0)
+    return dof > 0 and is_chance(getattr(form, "chi2_", np.nan), dof)
 
 
 def summarise(

@@ -24,7 +24,6 @@ def test_a_page_of_a_pipeline_with_and_without_a_table(noisy, tables):
     figure.draw_without_rendering()
 
 
-@pytest.mark.filterwarnings("ignore:the LPV model misses")
 def test_a_page_over_two_variables_says_what_it_leaves_out(tables):
     X, y = tables
     X = X.assign(other=(X["run"] > "b") * 1.0)

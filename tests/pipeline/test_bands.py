@@ -104,7 +104,6 @@ def test_scales_of_outputs_scale_bands(memory, local):
     np.testing.assert_allclose(theirs[1:], 1e3 * ours[1:], rtol=0.02)
 
 
-@pytest.mark.filterwarnings("ignore:the LPV model misses")
 def test_what_is_not_known_is_refused_with_the_remedy(memory):
     X, y = spring_tables(noise=0.05, n_samples=N_SAMPLES)
     new, _ = spring_sweep(50)

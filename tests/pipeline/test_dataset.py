@@ -35,7 +35,6 @@ def assert_same_fit(one, other):
     assert [*one.feature_names_in_] == [*other.feature_names_in_]
 
 
-@pytest.mark.filterwarnings("ignore:the LPV model misses")
 @pytest.mark.parametrize("combine", ["pool", "average"])
 def test_a_file_and_a_table_give_one_fit(tables, tmp_path, combine):
     X, y = tables
@@ -58,7 +57,6 @@ def test_a_folder_of_partitions_is_read_by_its_names(tables, tmp_path):
     assert found.predict(table[X.columns]).ndim == 1
 
 
-@pytest.mark.filterwarnings("ignore:the LPV model misses")
 def test_a_dataset_of_arrow_is_one(tables):
     pa, arrow = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.dataset")
     X, y = tables

@@ -133,7 +133,6 @@ def test_a_restructurer_without_structure_takes_the_canonical_form(spring):
     assert bft_score(y_sweep, pipeline.predict(X_sweep)) > 99.9
 
 
-@pytest.mark.filterwarnings("ignore:the LPV model misses")
 def test_any_regressor_interpolates(spring, memory):
     X, y, X_sweep, y_sweep = spring
     linear = spring_pipeline(interpolator=LinearRegression(), memory=memory).fit(X, y)
@@ -175,7 +174,6 @@ def test_points_of_few_samples_count_by_their_covariances():
     assert errors[0] < errors[1] / 1.5
 
 
-@pytest.mark.filterwarnings("ignore:the LPV model misses")
 def test_sub_estimators_are_cloned(spring):
     X, y, _, _ = spring
     pipeline = spring_pipeline(local=SubspaceLTI(), interpolator=PolynomialLPV(1))
@@ -600,7 +598,6 @@ def test_a_stopwatch_adds_up_the_times_of_the_steps():
     assert table["seconds"].tolist()[-1] == sum(watch.seconds.values())
 
 
-@pytest.mark.filterwarnings("ignore:the LPV model misses")
 @pytest.mark.filterwarnings("ignore:Scheduling variable 'kappa' must be within")
 def test_a_prediction_that_diverges_names_the_experiment(spring):
     X, y, _, _ = spring

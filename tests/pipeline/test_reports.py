@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lpvlearn import (
+    AutoLPV,
     GrayBoxRestructurer,
     GrayBoxStructure,
     LocalLPVPipeline,
@@ -97,9 +98,7 @@ def test_what_an_interpolation_loses_at_the_points_is_reported(fitted):
     report = fitted.report_
     np.testing.assert_allclose(report["lpv_BFT"], report["structured_BFT"], atol=0.5)
     X, y = spring_tables(n_samples=200)
-    constant = spring_pipeline(interpolator=PolynomialLPV(0))
-    with pytest.warns(UserWarning, match=r"point\(s\) 3 \(scheduling 1.5: .* 1 more"):
-        constant.fit(X, y)
+    constant = spring_pipeline(interpolator=PolynomialLPV(0)).fit(X, y)
     report = constant.report_
     assert (report["lpv_BFT"] < 90.0).all() and (report["structured_BFT"] > 90.0).all()
     run = X["kappa"] == 0.0
@@ -184,3 +183,19 @@ def test_stamps_that_are_off_are_told():
     model = spring_pipeline().fit(X.assign(time=X["time"] + off), y)
     line = f"Time stamps off by up to {100.0 * model.time_jitter_:.2g} % of a step"
     assert line in model.summary()
+
+
+class Careless(AutoLPV):
+    """Chooses a constant, whatever the points say."""
+
+    def _fit(self, kappa, points):
+        super()._fit(kappa, points)
+        self.best_estimator_ = PolynomialLPV(0).fit(
+            kappa, points.theta, covariance=points.covariance
+        )
+
+
+def test_points_that_a_form_of_nobodys_choice_misses_are_told():
+    X, y = spring_tables(n_samples=200, noise=0.01)
+    with pytest.warns(UserWarning, match=r"point\(s\) 3 \(scheduling 1.5: .* 1 more"):
+        spring_pipeline(interpolator=Careless()).fit(X, y)

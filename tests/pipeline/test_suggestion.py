@@ -48,7 +48,6 @@ def test_a_form_that_is_true_leaves_only_noise(fitted):
     assert table["uncertainty"].is_monotonic_decreasing
 
 
-@pytest.mark.filterwarnings("ignore:the LPV model misses")
 def test_a_form_that_is_not_true_is_least_certain_where_it_bends(fitted):
     """A straight line for a parabola: near an end, where a point is missed most."""
     table = suggest_operating_point(fitted(PolynomialLPV(1)))
@@ -91,7 +90,6 @@ def test_neighbour_gaps_are_those_of_models_with_gains_of_one(fitted):
     assert_allclose(table["neighbour_gap"][0], gap(one, other), rtol=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore:the LPV model misses")
 def test_where_every_point_is_needed_the_gap_ranks(fitted):
     """A cubic through four points: none can be left out, and noise is not known."""
     table = suggest_operating_point(fitted(PolynomialLPV(3)))
