@@ -315,6 +315,12 @@ class Experiment:
     estimated: NDArray[np.bool_] | None = None
 
     @property
+    def kappa(self) -> Array:
+        """The scheduling values; zeros, (n_samples, 1), without any."""
+        known = self.scheduling
+        return np.zeros((len(self.rows), 1)) if known is None else known
+
+    @property
     def measured(self) -> Array:
         """The outputs, of a table that was read with them."""
         if self.outputs is None:
@@ -582,6 +588,17 @@ def as_numbers(
     read = complex_array if imaginary else real_array
     array = squarable(argument, np.atleast_1d(read(argument, values)))
     return all_finite(argument, array, "row {}") if finite else array
+
+
+def tolerances(argument: str, values: Any, n: int) -> Array:
+    """One for each of `n` scheduling variables, which may be given as one number."""
+    given = as_numbers(argument, values)
+    if given.shape not in ((1,), (n,)) or not (given >= 0).all():
+        raise ValueError(
+            f"`{argument}` must be a non-negative number, or one per scheduling "
+            f"variable ({n}). Got {shown(values)}."
+        )
+    return np.broadcast_to(given, n)
 
 
 def _numbers(columns: Sequence[Column], n_rows: int, argument: str) -> Array:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..validation import shown, whole_number
-from .experiments import Table, as_numbers, group_rows
+from ..validation import whole_number
+from .experiments import Table, group_rows, tolerances
 
 Array = NDArray[np.float64]
 
@@ -118,13 +118,7 @@ def _limits(tol: ArrayLike | None, values: Array) -> Array:
         lowest = values.min(axis=0, initial=np.inf, where=known)
         highest = values.max(axis=0, initial=-np.inf, where=known)
         return np.where(known.any(axis=0), _HELD * (highest - lowest), 0.0)
-    given = as_numbers("tol", tol)
-    if given.shape not in ((1,), (n,)) or not (given >= 0).all():
-        raise ValueError(
-            "`tol` must be a non-negative number, or one per scheduling variable "
-            f"({n}). Got {shown(tol)}."
-        )
-    return np.broadcast_to(given, n)
+    return tolerances("tol", tol, n)
 
 
 def _ends(x: Array, tol: float) -> Indices:

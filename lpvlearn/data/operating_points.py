@@ -16,8 +16,8 @@ from scipy.spatial import Delaunay, QhullError
 from scipy.spatial.distance import cdist
 
 from ..exceptions import warn
-from ..validation import listed, shown, squarable
-from .experiments import Experiment, as_numbers
+from ..validation import listed, squarable
+from .experiments import Experiment, tolerances
 
 Array = NDArray[np.float64]
 
@@ -302,13 +302,7 @@ def _tolerance(
         close, usual = _CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0)
         wider = np.maximum(spreads[:, None, :], spreads[None, :, :])
         return np.maximum(close, np.minimum(wider, usual)), np.maximum(close, usual)
-    given = as_numbers("scheduling_tol", tol)
-    if given.shape not in ((1,), (means.shape[1],)) or not (given >= 0).all():
-        raise ValueError(
-            "`scheduling_tol` must be a non-negative number, or one per scheduling "
-            f"variable ({means.shape[1]}). Got {shown(tol)}."
-        )
-    largest = np.broadcast_to(given, means.shape[1:])
+    largest = tolerances("scheduling_tol", tol, means.shape[1])
     return largest, largest
 
 

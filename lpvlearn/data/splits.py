@@ -55,6 +55,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from sklearn.model_selection import BaseCrossValidator
 from sklearn.utils import check_random_state
@@ -404,4 +405,4 @@ class BlockedTimeSeriesSplit(_SplitOfExperiments):
 
 def _turns(point: Indices) -> Indices:
     """How many experiments of the same operating point came before each."""
-    return np.array([np.sum(point[:k] == p) for k, p in enumerate(point)])
+    return pd.Series(point).groupby(point).cumcount().to_numpy()

@@ -140,7 +140,7 @@ def points_of_work(
             x0[k] = x0[j] + 0.5 * (states[k] + states[j]) @ step
             x0[k] += 0.5 * (unseen[k] + unseen[j]) @ of_input
         return np.hstack([inputs, outputs, x0])
-    bias = _constants_of_sensors(inputs, outputs, gains, inverse, u_scale)
+    bias = _bias_of_sensors(inputs, outputs, gains, inverse, u_scale)
     x0 = _times(states, outputs - bias) + _times(unseen, inputs)
     return np.hstack([inputs, outputs, x0])
 
@@ -201,7 +201,7 @@ def interpolated(
         return by_themselves
     points = _Points(kappa, values, models)
     # and the share of the errors of those before them that they may leave
-    ways: list[tuple[_Way, float]] = [(partial(_by_themselves, spline), np.inf)]
+    ways: list[tuple[_Way, float]] = [(partial(_over, _itself, spline), np.inf)]
     u, y = points.equilibria()
     distinct = len(np.unique(kappa)) == len(kappa)
     statics = _Statics.of(models, scales)
@@ -213,7 +213,8 @@ def interpolated(
     if len(kappa) >= _FEWEST:
         ways.append((partial(_by_constants, spline), _BETTER))
     if (kappa > _POSITIVE).all():
-        ways += [(partial(_over, f, spline), _BETTER) for f in (np.log, _inverted)]
+        # what stays in a flow is held for as long as one over it
+        ways += [(partial(_over, f, spline), _BETTER) for f in (np.log, np.reciprocal)]
     best, least = ways[0][0], np.inf
     for way, share in ways if len(ways) > 1 else ():
         error = _error_at_rest(way, points, scales[1])
@@ -274,22 +275,20 @@ def _error_at_rest(way: _Way, points: _Points, y_scale: Array) -> float:
     return float(np.mean(np.square(errors))) if errors else 0.0
 
 
-def _by_themselves(spline: Callable[[], Any], points: _Points) -> _AtRest:
-    """A curve through the points."""
-    curve = spline().fit(points.kappa, points.values)
-    return lambda place, model: _Work.of(model, curve.predict([place])[0])
-
-
 def _by_one_constant(spline: Callable[[], Any], points: _Points) -> _AtRest:
     """What the models answer to the inputs, beside the constants of the sensors."""
-    inputs = spline().fit(points.kappa, points.values)
+    inputs = spline().fit(points.kappa, points.equilibria()[0])
     bias = points.constants_of_sensors().mean(axis=0)
 
     def at_rest(place: Array, model: StateSpace) -> _Work:
-        u = inputs.predict([place])[0, : model.n_inputs]
+        u = inputs.predict([place])[0]
         return _Work.resting(model, u, np.concatenate([np.zeros(model.order), bias]))
 
     return at_rest
+
+
+def _itself(kappa: Array) -> Array:
+    return kappa
 
 
 def _over(
@@ -304,19 +303,15 @@ def _over(
     return at_rest
 
 
-def _inverted(kappa: Array) -> Array:
-    """One over a scheduling variable, as what stays in a flow is held for so long."""
-    return np.asarray(1.0 / kappa)
-
-
 def _by_constants(spline: Callable[[], Any], points: _Points) -> _AtRest:
     """A curve through the constants with which the models rest there."""
     pairs = zip(points.models, points.values, strict=True)
     constants = np.array([_Work.of(*pair).constants(pair[0]) for pair in pairs])
-    inputs, own = (spline().fit(points.kappa, v) for v in (points.values, constants))
+    both = points.equilibria()[0], constants
+    inputs, own = (spline().fit(points.kappa, values) for values in both)
 
     def at_rest(place: Array, model: StateSpace) -> _Work:
-        u = inputs.predict([place])[0, : model.n_inputs]
+        u = inputs.predict([place])[0]
         return _Work.resting(model, u, own.predict([place])[0])
 
     return at_rest
@@ -416,7 +411,7 @@ def _times(matrices: Array, vectors: Array) -> Array:
     return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
 
 
-def _constants_of_sensors(
+def _bias_of_sensors(
     inputs: Array, outputs: Array, gains: Array, inverse: Array, u_scale: Array
 ) -> Array:
     """Constants (n_outputs,) that the outputs of all points have; zero for none."""

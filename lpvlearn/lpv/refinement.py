@@ -370,7 +370,7 @@ def refine_with_rates(
     rough = options | {"fixed": fixed, "deviation": static.deviation}
 
     def loss(model: LPVStateSpace) -> float:
-        return sum(squares(model, r, there, 1.0 / static.deviation) for r in unseen)
+        return squares(model, unseen, there, 1.0 / static.deviation)
 
     def length(records: Sequence[Record]) -> int:
         return sum(len(r.u) for r in records)
@@ -402,14 +402,16 @@ def _pieces(record: Record, order: int) -> list[Record]:
     return [Record(u, y, kappa, record.dt) for u, y, kappa in zip(*parts, strict=True)]
 
 
-def squares(model: LPVStateSpace, record: Record, own: Own, weight: Array) -> float:
+def squares(
+    model: LPVStateSpace, records: Sequence[Record], own: Own, weight: Array
+) -> float:
     """Sum of the weighted squares of the errors; infinite where there are none."""
     try:
-        error = simulated(model, record, own, weight)[0] * weight
+        errors = [simulated(model, record, own, weight)[0] for record in records]
     except ValueError:  # it diverges, or has no matrices there
         return np.inf
     with np.errstate(over="ignore"):  # it nearly diverges
-        return float(np.sum(error**2))
+        return float(sum(np.sum((error * weight) ** 2) for error in errors))
 
 
 def local_prior(

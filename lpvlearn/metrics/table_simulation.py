@@ -86,11 +86,10 @@ def _simulate(
     if dt is None:
         raise ValueError(NO_TIME.format("the model is"))
     if isinstance(model, ScheduledModel):
-        kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
         if estimate:
             y = _outputs(e, model.n_outputs)
-            x0 = model.estimate_initial_state(e.inputs, kappa, y, dt)
-        return model.simulate(e.inputs, kappa, dt, x0)
+            x0 = model.estimate_initial_state(e.inputs, e.kappa, y, dt)
+        return model.simulate(e.inputs, e.kappa, dt, x0)
     return _simulate(model.to_discrete(dt), e, dt, estimate)
 
 

@@ -35,18 +35,15 @@ def prediction_std(
     n_samples = n_rows_of(X)
     by_parameters = np.full((n_samples, model.n_outputs), np.nan)
     for e in experiments:
-        kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
         dt = e.sampling_time or sampling_time
         with naming(e):
-            by_parameters[e.rows] = simulation_std(model, e.inputs, kappa, dt)
+            by_parameters[e.rows] = simulation_std(model, e.inputs, e.kappa, dt)
     names = ("parameters", "model_error", "total", "measurement")
-    found = np.empty((n_samples, model.n_outputs, len(names)))
-    for k, (model_error, noise) in enumerate(levels.to_numpy()):
-        own = by_parameters[:, k]
-        total = np.hypot(own, model_error)
-        found[:, k, 0], found[:, k, 1], found[:, k, 2] = own, model_error, total
-        found[:, k, 3] = np.hypot(total, noise)
-    found[np.isnan(by_parameters)] = np.nan
+    model_error, noise = levels.to_numpy().T
+    total = np.hypot(by_parameters, model_error)
+    alone = np.where(np.isnan(by_parameters), np.nan, model_error)
+    parts = [by_parameters, alone, total, np.hypot(total, noise)]
+    found = np.stack(parts, axis=2)
     columns = pd.MultiIndex.from_product(
         [levels.index, names], names=["output", "part"]
     )

@@ -27,6 +27,7 @@ from ..models.statespace import StateSpace, with_signs_of
 from ..structures.structure import GrayBoxStructure
 from ..validation import listed
 from .left_out import (
+    UNLIKE,
     changed,
     errors_left_out,
     forgetting,
@@ -38,10 +39,10 @@ from .runner import place_of
 
 Array = NDArray[np.float64]
 
-# Errors of points left out, in the largest gain: all are foreseen; one is as unlike the
-# others as may be; and the shares of the error that other states must leave, and that
-# they must where outputs are states, which tell where these rest
-_FORESEEN, _UNLIKE, _CLEARLY, _PLAINLY = 0.01, 2.0, 0.8, 0.5
+# Error of points left out, in the largest gain, if all are foreseen; the shares of
+# it that other states must leave, and that they must where outputs are states, which
+# tell where these rest
+_FORESEEN, _CLEARLY, _PLAINLY = 0.01, 0.8, 0.5
 
 # Of points whose states may be noise: the share of the errors of the others that is
 # left without them, and the error of what these foresee, for which it is taken
@@ -157,12 +158,12 @@ def foreseen_order(
         found = error(identified(lower))
         if found < _CLEARLY * least:
             best, least = lower, found
-    if not least < _PLAINLY * min(common, _UNLIKE):
+    if not least < _PLAINLY * min(common, UNLIKE):
         return None
     warn(
         f"with the order {order}, for which the records speak, operating points do not "
         f"foresee one another: left out, they are missed by "
-        f"{100.0 * min(common, _UNLIKE):.0f} % of the largest gain. Order {best} was "
+        f"{100.0 * min(common, UNLIKE):.0f} % of the largest gain. Order {best} was "
         f"taken, by which that is {100.0 * least:.0f} %: states that points do not "
         "share may be those of a "
         "system that is not linear, and an interpolation of them is none. Use smaller "
@@ -228,7 +229,7 @@ class _Foreseeable(NamedTuple):
     def mean(self, points: Sequence[int] | None = None) -> float:
         """Of some points, or all; what is worse than no model counts as that."""
         known = [k for k in self.errors if points is None or k in points]
-        errors = [min(self.errors[k], _UNLIKE) for k in known]
+        errors = [min(self.errors[k], UNLIKE) for k in known]
         return float(np.mean(errors)) if errors else 0.0
 
 

@@ -28,6 +28,7 @@ from ..restructuring.coordinates import CanonicalForm
 from ..structures.structure import GrayBoxStructure
 from .black_boxes import of_rates, scaled
 from .left_out import (
+    UNLIKE,
     errors_left_out,
     forgetting,
     forgotten,
@@ -43,10 +44,9 @@ _LOW = 2, 3  # the degree of a polynomial, and both degrees of a fraction, at mo
 # Times the chi-square of a form, that of constants: noise moves no point so far
 _EXPLAINED = 1e4
 
-# Errors in a model's largest gain: of a point left out, as bad as any, and one as good
-# as none; and of a form at a point of its own that it does not meet: by its noise, and
-# where that does not explain it.
-_UNLIKE, _FORESEEN, _BY_NOISE, _MISSED = 2.0, 0.01, 0.3, 0.05
+# Errors in a model's largest gain: of a point left out, as good as none; of a form at a
+# point of its own that it misses, by its noise, and where that does not explain it
+_FORESEEN, _BY_NOISE, _MISSED = 0.01, 0.3, 0.05
 
 
 class CanonicalModels(NamedTuple):
@@ -137,7 +137,7 @@ def is_better_form(
     # what the others do not surround is extrapolated, by any form
     both = [k for k in both if not _is_corner(k, kappa)] or both
     by_form, by_curve = (
-        sum(min(max(errors[k], _FORESEEN), _UNLIKE) for k in both)
+        sum(min(max(errors[k], _FORESEEN), UNLIKE) for k in both)
         for errors in (own, other)
     )
     return bool(both) and by_form <= by_curve

@@ -61,7 +61,7 @@ def tell_of_errors(
             steps = min(max_iter, _STEPS)
             found = refine(start, records, other, prior, max_iter=steps).model
             weight = np.ones(model.n_outputs)
-            squared = sum(squares(found, record, other, weight) for record in records)
+            squared = squares(found, records, other, weight)
             share = squared / np.sum(np.vstack(errors) ** 2)
             if share < _CONSTANT:
                 warn(

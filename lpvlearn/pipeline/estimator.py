@@ -580,14 +580,13 @@ list, default=None
             together = through_black_boxes(self.interpolator_, found)
             if together is not None:
                 self.interpolator_, covariance, models = together
-            span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
             self.scheduling_range_ = found.points.identified_range
             self.scheduling_names_ = list(experiments[0].scheduling_names)
             tell_of_joint_scheduling(kappa, self.scheduling_names_)
             self.lpv_ = LPVStateSpace(
                 found.structure,
                 self.interpolator_,
-                span,
+                found.points.span,
                 covariance=covariance,
                 scheduling_names=self.scheduling_names_ or None,
                 identified_range=self.scheduling_range_,

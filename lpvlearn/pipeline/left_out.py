@@ -30,6 +30,8 @@ _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 # one what is worse, as half the range is left.
 _ELSEWHERE, _WORSE, _MEDIAN, _MANY, _OF_FEW, _OF_ONE = 1.0, 1.5, 0.3, 4, 0.5, 0.8
 
+UNLIKE = 2.0  # an error of a point left out, in its largest gain, as bad as any
+
 # Difference of two models, in the largest gain, between which a line is a guess.
 _APART = 0.3
 

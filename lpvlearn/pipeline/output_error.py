@@ -618,7 +618,7 @@ def _promising(
     one = np.ones(models[0].n_outputs)
 
     def loss(model: LPVStateSpace) -> float:
-        return sum(squares(model, record, own, one) for record in records)
+        return squares(model, records, own, one)
 
     def soon(model: LPVStateSpace) -> float:
         try:
@@ -632,11 +632,9 @@ def _promising(
 
 def _through(form: Any, found: StructuredModels, dt: float) -> LPVStateSpace:
     """The LPV model through operating points, by a clone of a form."""
-    kappa = found.points.kappa
-    span = np.array([kappa.min(axis=0), kappa.max(axis=0)])
-    delay = common_delay(found.local, kappa, dt)
+    delay = common_delay(found.local, found.points.kappa, dt)
     form = over_points(clone(form), found)
-    return LPVStateSpace(found.structure, form, span, input_delay=delay)
+    return LPVStateSpace(found.structure, form, found.points.span, input_delay=delay)
 
 
 def best_along(
@@ -659,7 +657,7 @@ def best_along(
     def loss(found: StructuredModels) -> float:
         with collected():  # is told of what is taken
             model = _through(form, found, sampling_time)
-        return sum(squares(model, record, own, weight) for record in records)
+        return squares(model, records, own, weight)
 
     return min(ways, key=loss)
 
@@ -690,8 +688,7 @@ def _own_of_local(found: StructuredModels) -> Own:
 
 
 def _record(e: Experiment, sampling_time: float) -> Record:
-    kappa = np.zeros((len(e.rows), 1)) if e.scheduling is None else e.scheduling
-    return Record(e.inputs, e.measured, kappa, e.sampling_time or sampling_time)
+    return Record(e.inputs, e.measured, e.kappa, e.sampling_time or sampling_time)
 
 
 def _errors(model: LPVStateSpace, e: Experiment, record: Record, own: Own) -> Array:

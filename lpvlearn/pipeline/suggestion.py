@@ -16,6 +16,7 @@ from ..lpv.weighting import covariance_factor
 from ..models.gap import gap
 from ..models.statespace import DEVIATION, StateSpace
 from ..validation import one_of
+from .black_boxes import scaled
 from .estimator import LocalLPVPipeline
 from .left_out import interpolated_without
 
@@ -107,10 +108,10 @@ def suggest_operating_point(
     pairs = neighbours(kappa)
     places = kappa[pairs].mean(axis=1)
     local = [model.with_input_delay(0) for model in pipeline.structured_models_]
-    units = _units(local)
+    y, u = _units(local)
 
     def distance(one: StateSpace, other: StateSpace) -> float:
-        return gap(_in_units(one, units), _in_units(other, units))
+        return gap(scaled(one, 1.0 / u, y), scaled(other, 1.0 / u, y))
 
     structure, theta = pipeline.lpv_.structure, pipeline.lpv_.parameters(places)
     frozen = [structure.model(values) for values in theta]
@@ -164,8 +165,3 @@ def _units(models: Sequence[StateSpace]) -> tuple[Array, Array]:
     gains = np.abs([model.frequency_response(omega) for model in models])
     largest = np.where(np.isfinite(gains), gains, 0.0).max(axis=(0, 1))
     return scales(largest[None])
-
-
-def _in_units(model: StateSpace, units: tuple[Array, Array]) -> StateSpace:
-    y, u = units[0][:, None], units[1]
-    return StateSpace(model.A, model.B / u, model.C / y, model.D / y / u)
