@@ -39,9 +39,9 @@ from .runner import place_of
 
 Array = NDArray[np.float64]
 
-# Error of points left out, in the largest gain, if all are foreseen; the shares of
-# it that other states must leave, and that they must where outputs are states, which
-# tell where these rest
+# Error of points left out, in the largest gain, if all are foreseen; the shares of it
+# that other states must leave, and that they must where outputs are states, which tell
+# where these rest, or where they are fewer
 _FORESEEN, _CLEARLY, _PLAINLY = 0.01, 0.8, 0.5
 
 # Of points whose states may be noise: the share of the errors of the others that is
@@ -162,12 +162,12 @@ def foreseen_order(
         return None
     warn(
         f"with the order {order}, for which the records speak, operating points do not "
-        f"foresee one another: left out, they are missed by "
+        "foresee one another: left out, they are missed by "
         f"{100.0 * min(common, UNLIKE):.0f} % of the largest gain. Order {best} was "
         f"taken, by which that is {100.0 * least:.0f} %: states that points do not "
-        "share may be those of a "
-        "system that is not linear, and an interpolation of them is none. Use smaller "
-        f"inputs, or keep the order by local=SubspaceLTI(order={order})."
+        "share may be those of a system that is not linear, and an interpolation of "
+        "them is none. Use smaller inputs, or keep the order by "
+        f"local=SubspaceLTI(order={order})."
     )
     return best
 

@@ -550,13 +550,14 @@ list, default=None
                 efficient=self.efficient or efficient,
                 deviate=self._needs_deviations(),
             )
-            local, points = identify(self._local(), points, runner)
+            local, kept = identify(self._local(), points, runner)
             if restructurer in (None, "aligned"):
-                order = self._foreseen_order(local, points, runner, identify)
+                order = self._foreseen_order(local, kept, runner, identify)
                 if order is not None:
                     told[:-1] = []  # what was said of the models of more states
                     chosen = clone(self._local()).set_params(order=order)
-                    local, points = identify(chosen, points, runner)
+                    local, kept = identify(chosen, points, runner)
+            points = kept
 
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)

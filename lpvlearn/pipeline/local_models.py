@@ -50,9 +50,9 @@ _APART = 0.1
 # more than that part of the output that does most.
 _STANDING = 0.05
 
-# One that much slower may be an integrator, known by samples that are not many.
-_HARDLY = 0.05  # share by which an integrator's pole may decay in a record
-_ABOUT_ZERO = 0.25
+# One that much slower may be an integrator, known by samples that are not many; the
+# share by which it may decay in a record.
+_ABOUT_ZERO, _HARDLY = 0.25, 0.05
 
 # Points that look for their order everywhere, and states fewer and more than theirs
 # among which the others look first: a mode may vanish, or come.
