@@ -91,17 +91,21 @@ def is_better_form(
     longest: float,
     interpolator: AutoLPV,
 ) -> bool:
-    """Whether a low form carries canonical parameters, and foresees points no worse.
+    """Whether a form carries canonical parameters, and foresees points no worse.
 
     Points that are left out, no worse than what is interpolated of `aligned` models,
     inputs and outputs in units of their `sizes`, what does not decay in the `longest`
-    record (seconds) forgotten. Judged by what the `interpolator` chooses.
+    record (seconds) forgotten. Judged by what the `interpolator` chooses: a low form,
+    or any where outputs integrate.
     """
     structure, theta, covariance = canonical
     with collected():
         auto = clone(interpolator).fit(kappa, theta, covariance=covariance)
     form = auto.best_estimator_
-    if not _is_low(form) or not holds_within_range(structure, form):
+    # aligned states let the rate jump with kappa, and an integrator keeps that
+    if not (_is_low(form) or local[0].integrating):
+        return False
+    if not holds_within_range(structure, form):
         return False
     models = [model.lti for model in local]
     rate = forgotten(models, longest)
@@ -112,11 +116,12 @@ def is_better_form(
     # covariances of parameters that outputs hardly tell apart say little of the model
     met = map(structure.model, form.predict(kappa))
     pairs = zip(met, models, strict=True)
-    by_noise = is_chance(form.chi2_, form.degrees_of_freedom_)
+    dof = getattr(form, "degrees_of_freedom_", 0)  # none of a curve through the points
+    by_noise = dof > 0 and is_chance(form.chi2_, dof)
     missed = max(largest_difference(seen(a), seen(b)) for a, b in pairs)
     if missed > (_BY_NOISE if by_noise else _MISSED):
         return False
-    if form.degrees_of_freedom_ < 2 * structure.n_params:  # less than with a point less
+    if 0 < dof < 2 * structure.n_params:  # less than with a point less
         constant = auto.selection_["chi2"].iloc[0]
         if constant > _EXPLAINED * max(form.chi2_, form.degrees_of_freedom_):
             return True
