@@ -25,10 +25,9 @@ _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 
 # Error of what the others make of a model, in its largest gain: that of a resonance
 # that is elsewhere, as may be at a point of many; what is worse than that; and the
-# median of several, from which models between the points are seldom good to a tenth.
-# Of two or three the one at the worst gap, whose middle is nearly as wrong; of a lone
-# one what is worse, as half the range is left.
-_ELSEWHERE, _WORSE, _MEDIAN, _MANY, _OF_FEW, _OF_ONE = 1.0, 1.5, 0.3, 4, 0.5, 0.8
+# median of several, or of few, from which models between the points are seldom good to
+# a tenth: of few points, each that is left out leaves a large gap.
+_ELSEWHERE, _WORSE, _MEDIAN, _MANY, _OF_FEW = 1.0, 1.5, 0.3, 4, 0.8
 
 UNLIKE = 2.0  # an error of a point left out, in its largest gain, as bad as any
 
@@ -116,11 +115,11 @@ def tell_unforeseen(
     rate = forgotten(models, longest)
     errors = errors_left_out(lpv.structure, models, form, kappa, theta, rate)
     worst = sorted(((error, k) for k, error in errors.items()), reverse=True)
-    few = len(errors) < _MANY
-    limit = (_OF_ONE if len(errors) == 1 else _OF_FEW) if few else _ELSEWHERE
-    high = [(error, k) for error, k in worst if error > limit]
-    often = high and (few or high[0][0] > _WORSE or 2 * len(high) >= len(errors))
-    if often or (errors and not few and np.median([*errors.values()]) > _MEDIAN):
+    high = [(error, k) for error, k in worst if error > _ELSEWHERE]
+    often = high and (high[0][0] > _WORSE or 2 * len(high) >= len(errors))
+    limit = _MEDIAN if len(errors) >= _MANY else _OF_FEW
+    most = errors and np.median([*errors.values()]) > limit
+    if often or most:
         named = [
             f"{k} (scheduling {', '.join(f'{v:.4g}' for v in kappa[k])}: "
             f"{100.0 * error:.0f} %)"

@@ -270,13 +270,13 @@ def test_outputs_that_show_all_states_are_the_states():
         assert (model - point.lti).hinf_norm() < 1e-8 * model.hinf_norm()
 
 
-def hardening(u, mass, step=0.005, stiffer=1e3):
+def hardening(u, mass, step=0.005):
     """Position (mm) of a mass on a spring that hardens by next to nothing."""
     size = 0.5 * step
     position, x, v = [], 0.0, 0.0
 
     def moved(x, v, force):
-        return v, (force - 3.0 * v - 900.0 * x - stiffer * x**3) / mass
+        return v, (force - 3.0 * v - 900.0 * x - 1e3 * x**3) / mass
 
     for force in u:
         position.append(1e3 * x)
@@ -291,15 +291,14 @@ def hardening(u, mass, step=0.005, stiffer=1e3):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stiffer, seed", [(1e3, 1), (1e4, 0)])
-def test_states_that_no_two_points_share_are_given_up(stiffer, seed):
+def test_states_that_no_two_points_share_are_given_up():
     """What a sweep tells of a spring that hardens looks like modes beside the mode."""
-    rng, t = np.random.default_rng(seed), 0.005 * np.arange(2500)
+    rng, t = np.random.default_rng(1), 0.005 * np.arange(2500)
     growth = np.log(50.0) / 12.5
     u = 10.0 * np.sin(2.0 * np.pi * 0.3 / growth * np.expm1(growth * t))
     trajectories = []
     for load in (0.0, 0.5, 1.0, 2.0):
-        y = hardening(u, 1.0 + load, stiffer=stiffer)
+        y = hardening(u, 1.0 + load)
         y = y + 0.02 * y.std() * rng.standard_normal(y.shape)
         trajectories.append((u, load, y))
     X, y = from_trajectories(trajectories, sampling_time=0.005)
@@ -309,4 +308,4 @@ def test_states_that_no_two_points_share_are_given_up(stiffer, seed):
     fresh = 7.0 * np.repeat(rng.choice([-1.0, 1.0], 50), 20)
     free = {"scheduling": np.full(1000, 0.75), "sampling_time": 0.005}
     found = pipeline.lpv_.simulate(fresh, **free)[:, 0]
-    assert bft_score(hardening(fresh, 1.75, stiffer=stiffer), found) > 70.0
+    assert bft_score(hardening(fresh, 1.75), found) > 80.0

@@ -8,14 +8,11 @@ import pytest
 from lpvlearn import (
     AutoLPV,
     GrayBoxStructure,
-    LPVStateSpace,
     PolynomialLPV,
     SplineLPV,
 )
 from lpvlearn.pipeline.left_out import (
     errors_left_out,
-    largest_difference,
-    tell_unforeseen,
 )
 
 from ..conftest import spring_pipeline, spring_tables
@@ -74,22 +71,3 @@ def test_all_points_of_a_place_are_left_out_together():
     errors = errors_left_out(decay, models, SplineLPV(), kappa, theta)
     assert sorted(errors) == [1, 2]  # 1/(s + 1) where 1/(s + 5) is: 4 of its gain
     assert np.allclose([*errors.values()], 4.0, rtol=1e-2)
-
-
-def test_few_points_between_which_a_resonance_moves_are_told():
-    spring = GrayBoxStructure.from_template(
-        A=[[0, 1], ["-w2", "-d"]], B=[[0], ["w2"]], C=[[1, 0]]
-    )
-
-    def parameters(kappa):
-        frequency = 1.0 / (0.05 + kappa)
-        return np.hstack([frequency**2, 0.1 * frequency])
-
-    kappa, form = np.linspace(0.0, 1.0, 5)[:, None], SplineLPV()
-    theta = parameters(kappa)
-    models = [spring.model(row) for row in theta]
-    lpv = LPVStateSpace(spring, form.fit(kappa, theta), [[0.0], [1.0]])
-    with pytest.warns(UserWarning, match=r"do not foresee point\(s\) 1 "):
-        tell_unforeseen(lpv, models, form, kappa, theta, 100.0)
-    between = spring.model(parameters(np.array([[0.125]]))[0])
-    assert largest_difference(lpv.at(0.125), between) > 0.3  # and so it is
