@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -191,6 +192,12 @@ def is_chance(chi2: float, degrees_of_freedom: int) -> bool:
         return True
     surprise = chi_square.isf(_SURPRISE, degrees_of_freedom)
     return bool(chi2 <= max(_PLAUSIBLE * degrees_of_freedom, surprise))
+
+
+def noise_explains(form: Any) -> bool:
+    """Whether a fitted form misses its points by their noise; a curve misses none."""
+    dof = getattr(form, "degrees_of_freedom_", 0)
+    return dof > 0 and is_chance(getattr(form, "chi2_", np.nan), dof)
 
 
 def covariance_of(information: Array) -> Array:

@@ -70,14 +70,10 @@ def aligned_black_boxes(
     by how far they move, `u` and `y`, whatever their units. What decays in about the
     `longest` record (seconds) or later is `forgotten` while states are compared.
     """
-    models = [scaled(balanced(model), u, y) for model in local]
-    rate = forgotten(models, longest)
-    models = [forgetting(model, rate).balance() for model in models]
+    models, rate = _comparable(local, u, y, longest)
     fewer = _with_fewer_states(local)
     own = [
-        model
-        if one.own is None or k not in fewer
-        else forgetting(scaled(balanced(one.own), u, y), rate)
+        model if one.own is None or k not in fewer else _seen(one.own, u, y, rate)
         for k, (one, model) in enumerate(zip(local, models, strict=True))
     ]
     theta, mended = _foretold(models, own, fewer, kappa)
@@ -91,6 +87,20 @@ def aligned_black_boxes(
     ]
     whole = _full(first, direct, local[0].integrating)
     return whole, _entries(rows, direct)
+
+
+def _comparable(
+    local: Sequence[LocalModel], u: Array, y: Array, longest: float
+) -> tuple[list[StateSpace], float]:
+    """The models as they are compared, and the rate at which states are forgotten."""
+    models = [scaled(balanced(model), u, y) for model in local]
+    rate = forgotten(models, longest)
+    return [forgetting(model, rate).balance() for model in models], rate
+
+
+def _seen(model: LocalModel, u: Array, y: Array, rate: float) -> StateSpace:
+    """Another model in these units, its states forgotten at that rate."""
+    return forgetting(scaled(balanced(model), u, y), rate)
 
 
 def _with_fewer_states(local: Sequence[LocalModel]) -> list[int]:
@@ -108,31 +118,27 @@ def foreseen_order(
     u: Array,
     y: Array,
     longest: float,
-    identified: Callable[[int], Sequence[LocalModel] | None],
+    identified: Callable[[int], Sequence[LocalModel]],
 ) -> int | None:
     """A lower order, by which alone the points foresee one another; None for none.
 
     Where records speak for orders of their own, some of the states may be no dynamics:
     those of a resonance that is not linear, which many samples tell, differ from point
     to point, and an interpolation of them is anything. The models of a lower order
-    (`identified` of it, None where they are not) are left out in turn as those of the
+    (`identified` of it, none where they are not) are left out in turn as those of the
     common one are, and compared with what the records themselves tell. Arguments as of
     `aligned_black_boxes`; told.
     """
     if all(model.own is None for model in local):
         return None
-    rate = forgotten([scaled(balanced(model), u, y) for model in local], longest)
+    models, rate = _comparable(local, u, y, longest)
+    every = range(len(models))
+    truth = [
+        model if one.own is None else _seen(one.own, u, y, rate)
+        for one, model in zip(local, models, strict=True)
+    ]
 
-    def seen(models: Sequence[LocalModel]) -> list[StateSpace]:
-        return [
-            forgetting(scaled(balanced(model), u, y), rate).balance()
-            for model in models
-        ]
-
-    truth, every = seen([model.own or model for model in local]), range(len(local))
-
-    def error(models: Sequence[LocalModel] | None) -> float:
-        candidates = [] if models is None else seen(models)
+    def error(candidates: Sequence[StateSpace]) -> float:
         if len({model.order for model in candidates}) != 1:
             return np.inf
         theta = _foreseeable(candidates, kappa, every, (), every).theta
@@ -140,14 +146,12 @@ def foreseen_order(
         errors = errors_left_out(structure, truth, SplineLPV(), kappa, theta)
         return _Foreseeable(theta, errors).mean()
 
-    common, order = error(local), local[0].order - len(local[0].integrating)
+    common, order = error(models), local[0].order - len(local[0].integrating)
     poor = _with_fewer_states(local)
-    rich = [k for k in range(len(local)) if k not in poor]
-    models = seen([local[k] for k in rich])
-    if poor and len(rich) > 1 and len({model.order for model in models}) == 1:
+    rich = [k for k in every if k not in poor]
+    if poor and len(rich) > 1 and len({models[k].order for k in rich}) == 1:
         # a mode may vanish at the others
-        beside = [models[rich.index(k)] if k in rich else truth[k] for k in every]
-        foreseen = _foreseeable(beside, kappa, rich, truth, poor)
+        foreseen = _foreseeable(models, kappa, rich, truth, poor)
         common = min(common, foreseen.mean())
     if not common > _UNFORESEEN:
         return None
@@ -155,7 +159,8 @@ def foreseen_order(
     for lower in range(1, order):
         if best and lower > best + _FURTHER:
             break
-        found = error(identified(lower))
+        others = [_seen(model, u, y, rate).balance() for model in identified(lower)]
+        found = error(others)
         if found < _CLEARLY * least:
             best, least = lower, found
     if not least < _PLAINLY * min(common, UNLIKE):
@@ -212,6 +217,8 @@ def of_rates(model: StateSpace, integrating: Sequence[int]) -> StateSpace:
 
     Its derivatives do not see the states on which nothing else depends, ``A v = 0``.
     """
+    if not integrating:
+        return model
     C, D = model.C.copy(), model.D.copy()
     C[integrating], D[integrating] = C[integrating] @ model.A, C[integrating] @ model.B
     n = model.order - len(integrating)

@@ -22,7 +22,7 @@ from ..lpv.extrapolation import distance_from_hull
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.rational import RationalLPV
 from ..lpv.spline import SplineLPV
-from ..lpv.weighting import is_chance
+from ..lpv.weighting import noise_explains
 from ..models.statespace import DEVIATION, StateSpace
 from ..restructuring.coordinates import CanonicalForm
 from ..structures.structure import GrayBoxStructure
@@ -116,14 +116,13 @@ def is_better_form(
     # covariances of parameters that outputs hardly tell apart say little of the model
     met = map(structure.model, form.predict(kappa))
     pairs = zip(met, models, strict=True)
-    dof = getattr(form, "degrees_of_freedom_", 0)  # none of a curve through the points
-    by_noise = dof > 0 and is_chance(form.chi2_, dof)
     missed = max(largest_difference(seen(a), seen(b)) for a, b in pairs)
-    if missed > (_BY_NOISE if by_noise else _MISSED):
+    if missed > (_BY_NOISE if noise_explains(form) else _MISSED):
         return False
+    dof = getattr(form, "degrees_of_freedom_", 0)  # none of a curve through the points
     if 0 < dof < 2 * structure.n_params:  # less than with a point less
         constant = auto.selection_["chi2"].iloc[0]
-        if constant > _EXPLAINED * max(form.chi2_, form.degrees_of_freedom_):
+        if constant > _EXPLAINED * max(form.chi2_, dof):
             return True
     ways = (*aligned, SplineLPV(), None), (structure, theta, form, covariance)
     other, own = (

@@ -550,21 +550,23 @@ list, default=None
                 efficient=self.efficient or efficient,
                 deviate=self._needs_deviations(),
             )
-            local, kept = identify(self._local(), points, runner)
+            estimator = self._local()
+            local, kept = identify(estimator, points, runner)
             if restructurer in (None, "aligned"):
-                order = self._foreseen_order(local, kept, runner, identify)
+                longest = self.sampling_time_ * kept.n_longest
+                quiet = replace(runner, verbose=0)
+                again = partial(identify, points=kept, runner=quiet)
+                order = _foreseen_order(estimator, local, kept, longest, again)
                 if order is not None:
                     told[:-1] = []  # what was said of the models of more states
-                    chosen = clone(self._local()).set_params(order=order)
-                    local, kept = identify(chosen, points, runner)
+                    estimator = clone(estimator).set_params(order=order)
+                    local, kept = identify(estimator, points, runner)
+                tell_of_integrators(local, self.output_names_, longest)
             points = kept
 
         with watch.step("restructuring", bar=True):  # step 4
             limit = None if self.max_time is None else float(self.max_time)
             known = local, points, runner, self.sampling_time_
-            if restructurer in (None, "aligned"):
-                longest = self.sampling_time_ * points.n_longest
-                tell_of_integrators(local, self.output_names_, longest)
             if restructurer is None:
                 form = self._interpolator(len(points))
                 ways = without_structure(*known, form, every=bool(moving))
@@ -712,30 +714,6 @@ list, default=None
             )
         with whole_file(place) as file:
             file.write(page.encode())
-
-    def _foreseen_order(
-        self,
-        local: list[LocalModel],
-        points: OperatingPoints,
-        runner: PointRunner,
-        identify: Callable[..., tuple[list[LocalModel], OperatingPoints]],
-    ) -> int | None:
-        """As `foreseen_order`; None where the estimator has no order to choose."""
-        estimator = self._local()
-        given = getattr(estimator, "order", None)
-        if not isinstance(given, str):
-            return None
-
-        def identified(order: int) -> list[LocalModel] | None:
-            fewer = clone(estimator).set_params(order=order)
-            with collected(), suppress(ValueError):
-                found, kept = identify(fewer, points, replace(runner, verbose=0))
-                return found if len(kept) == len(points) else None
-            return None
-
-        longest = self.sampling_time_ * points.n_longest
-        sizes = channel_sizes(points.experiments)
-        return foreseen_order(local, points.kappa, *sizes, longest, identified)
 
     def _summarised(self) -> Summary:
         check_is_fitted(self, "lpv_")
@@ -890,6 +868,27 @@ def _told_apart(
             "sweeps to and fro, leave local models out: OutputErrorLPV().fit(X, y)."
         )
     return local, moving
+
+
+def _foreseen_order(
+    estimator: Any,
+    local: list[LocalModel],
+    points: OperatingPoints,
+    longest: float,
+    identify: Callable[[Any], tuple[list[LocalModel], OperatingPoints]],
+) -> int | None:
+    """As `foreseen_order`; None where the estimator has no order to choose."""
+    if not isinstance(getattr(estimator, "order", None), str):
+        return None
+
+    def identified(order: int) -> list[LocalModel]:
+        with collected(), suppress(ValueError):
+            found, kept = identify(clone(estimator).set_params(order=order))
+            return found if len(kept) == len(points) else []
+        return []
+
+    sizes = channel_sizes(points.experiments)
+    return foreseen_order(local, points.kappa, *sizes, longest, identified)
 
 
 def _check_channels(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ..models.statespace import StateSpace
 from ..restructuring.error_system import frequency_grid
 from ..structures.structure import GrayBoxStructure
 from ..validation import listed
+from .runner import label_of
 
 Array = NDArray[np.float64]
 
@@ -71,15 +73,14 @@ def errors_left_out(
     form: Any,
     kappa: Array,
     theta: Array,
-    rate: float = 0.0,
     *,
     covariance: Array | None = None,
     seen: Callable[[StateSpace], StateSpace] | None = None,
 ) -> dict[int, float]:
     """By points within the range of the others, the errors of what these make of them.
 
-    Of the response, in the largest gain of the point's model; of states forgotten at
-    a `rate`. Models are `seen` as they are, or otherwise.
+    Of the response, in the largest gain of the point's model. Models are `seen` as they
+    are, or otherwise.
     """
     errors = {}
     for out in inner_places(kappa):
@@ -90,7 +91,7 @@ def errors_left_out(
             both = [structure.model(own), models[k]]
             if seen is not None:
                 both = [seen(model) for model in both]
-            errors[k] = largest_difference(*(forgetting(m, rate) for m in both))
+            errors[k] = largest_difference(*both)
     return errors
 
 
@@ -113,18 +114,14 @@ def tell_unforeseen(
     if not models[0].is_continuous:
         return
     rate = forgotten(models, longest)
-    errors = errors_left_out(lpv.structure, models, form, kappa, theta, rate)
+    forgets = partial(forgetting, rate=rate)
+    errors = errors_left_out(lpv.structure, models, form, kappa, theta, seen=forgets)
     worst = sorted(((error, k) for k, error in errors.items()), reverse=True)
     high = [(error, k) for error, k in worst if error > _ELSEWHERE]
     often = high and (high[0][0] > _WORSE or 2 * len(high) >= len(errors))
     limit = _MEDIAN if len(errors) >= _MANY else _OF_FEW
     most = errors and np.median([*errors.values()]) > limit
     if often or most:
-        named = [
-            f"{k} (scheduling {', '.join(f'{v:.4g}' for v in kappa[k])}: "
-            f"{100.0 * error:.0f} %)"
-            for error, k in high or worst
-        ]
         known = (
             f"any {len(kappa)} points lie on a form of as many coefficients"
             if saturated
@@ -132,11 +129,20 @@ def tell_unforeseen(
         )
         warn(
             f"{known}, and the others do not foresee point(s) "
-            f"{listed(named, _NAMED)}, by the error in the largest gain: between "
-            "points the LPV model may be as wrong. Look at `parameters_` for a point "
-            "that is unlike the others, give a structure where there is none, or "
+            f"{listed_errors(high or worst, kappa)}, by the error in the largest gain: "
+            "between points the LPV model may be as wrong. Look at `parameters_` for a "
+            "point that is unlike the others, give a structure where there is none, or "
             "measure in between (`suggest_operating_point`)."
         )
+
+
+def listed_errors(errors: Sequence[tuple[float, int]], kappa: Array) -> str:
+    """The first of some points, with their errors in percent, for a message."""
+    named = [
+        f"{k} (scheduling {label_of(kappa[k])}: {100.0 * error:.0f} %)"
+        for error, k in errors
+    ]
+    return listed(named, _NAMED)
 
 
 def tell_of_two_points(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..data.experiments import Experiment
 from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
-from ..lpv.weighting import is_chance
+from ..lpv.weighting import noise_explains
 from ..metrics.reports import as_shown, readable_report
 from ..metrics.scores import best_fit, parameter_fit
 from ..models.statespace import StateSpace
@@ -26,7 +26,7 @@ from ..systems.simulation import (
     trend_signals,
     with_transit,
 )
-from ..validation import listed
+from .left_out import listed_errors
 from .local_models import LocalModel, motions
 from .structured_models import StructuredModels
 
@@ -38,7 +38,6 @@ _WORTH, _POOR, _FAR = 5.0, 50.0, 2.0
 
 _ABOUT_ZERO = 1e-9  # of a pole by the fastest one: it is an integrator's
 
-_NAMED = 3  # operating points that a message lists
 _LOOKED_AT = 10  # experiments of an operating point: more tell the same of constants
 
 # Errors of an interpolation, percent of the model's norm, below which they are rounding
@@ -155,20 +154,15 @@ def tables(
             "found by offsets='auto', with local=SubspaceLTI(offset='auto'), or "
             "subtract from X and y where the system rests."
         )
-    errors = pd.Series([row["interpolation_error"] for row in rows], dtype=float)
-    far = errors[errors > _MISSED].sort_values(ascending=False)
+    errors = [(row["interpolation_error"], k) for k, row in enumerate(rows)]
+    far = sorted(((e, k) for e, k in errors if e > _MISSED), reverse=True)
     form = getattr(lpv.interpolator, "best_estimator_", None)  # nobody's choice
-    if len(far) and form is not None and not _by_chance(form):
-        named = [
-            f"{k} (scheduling {', '.join(f'{v:.4g}' for v in points.kappa[k])}: "
-            f"{100.0 * error:.0f} %)"
-            for k, error in far.items()
-        ]
+    if far and form is not None and not noise_explains(form):
         warn(
             "the LPV model misses the local models at operating point(s) "
-            f"{listed(named, _NAMED)}, in percent of their H-infinity norm: its "
-            "parameters do not follow so simple a form. Use interpolator=SplineLPV(), "
-            "which meets all points."
+            f"{listed_errors(far, points.kappa)}, in percent of their H-infinity norm: "
+            "its parameters do not follow so simple a form. Use "
+            "interpolator=SplineLPV(), which meets all points."
         )
     by_parameter = {
         "lowest": theta.min(axis=0),
@@ -273,12 +267,6 @@ def _restructuring(fitted: GrayBoxRestructurer) -> dict[str, float]:
         "stationarity": fitted.stationarity_,
         **weighed,
     }
-
-
-def _by_chance(form: Any) -> bool:
-    """Whether noise explains how far the parameters of the points are from a form."""
-    dof = getattr(form, "degrees_of_freedom_", 0)
-    return dof > 0 and is_chance(getattr(form, "chi2_", np.nan), dof)
 
 
 def summarise(

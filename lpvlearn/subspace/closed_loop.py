@@ -52,7 +52,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -455,21 +455,25 @@ def _with_more_states(
     as the refined models have as many states as they can use.
     """
     n, each = subspace.n_columns, sum(subspace.direct.shape) + len(joint.C)
+    highest = min(_MAX_ORDER, len(subspace.states))
+
+    @cache
+    def refined(order: int) -> tuple[_Predictor, _Innovation]:
+        return _refined(_innovation_form(subspace, order), records, free)
+
+    def criterion(model: tuple[_Predictor, _Innovation]) -> float:
+        price = len(model[1].A) * each * np.log(n) / n
+        return _volume(model[1].covariance, records) + price
+
+    best = fitted, joint
     while True:
-        best, found = -np.inf, None
-        for more in (1, 2):  # a mode is one state or two
-            order = len(joint.A) + more
-            if order > min(_MAX_ORDER, len(subspace.states)):
-                continue
-            other = _refined(_innovation_form(subspace, order), records, free)
-            gain = _volume(joint.covariance, records)
-            gain -= _volume(other[1].covariance, records)
-            gain -= more * each * np.log(n) / n
-            if gain > max(best, 0.0) and other[0].model.blocks is not None:
-                best, found = gain, other
-        if found is None:
-            return fitted, joint
-        fitted, joint = found
+        order = len(best[1].A)  # a mode is one state or two
+        further = map(refined, range(order + 1, min(order + 2, highest) + 1))
+        others = [model for model in further if model[0].model.blocks is not None]
+        least = min([best, *others], key=criterion)
+        if least is best:
+            return best
+        best = least
 
 
 def _volume(covariance: Array, records: Sequence[Record]) -> float:
