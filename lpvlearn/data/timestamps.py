@@ -289,7 +289,10 @@ def _power_of_1000(ratio: float) -> bool:
 def _about_units(ratio: float) -> str:
     """What a step that is so many times another may come from."""
     if not _power_of_1000(ratio):
-        return "times are in seconds"
+        return (
+            "times are in seconds, and lpvlearn.resample puts records on the grid of "
+            "another step"
+        )
     return (
         f"{max(ratio, 1 / ratio):.0f} times {'as long' if ratio > 1 else 'shorter'}: "
         "numbers are read as seconds. Divide a column of milliseconds by 1000, or give "

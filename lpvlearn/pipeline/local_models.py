@@ -779,7 +779,7 @@ def _integrating_outputs(lti: StateSpace) -> str:
     if not places:
         return ""
     return (
-        f"If outputs {places} integrate, as a position does, name them: "
+        f"If the outputs at {places} (positions in y) integrate, name them: "
         f"local=SubspaceLTI(integrating={places}) identifies their rates. "
     )
 

@@ -228,6 +228,7 @@ def test_a_mode_that_exact_records_do_not_have_at_a_point_is_foreseen(vanishes):
         assert (lpv.at(z) - true).hinf_norm() < 0.03 * true.hinf_norm()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_integrators_have_gains_of_any_size_and_states_of_one(seed):
     """A position that a servo drives: its pole is anywhere near zero."""

@@ -97,6 +97,7 @@ def test_where_no_low_form_is_told_black_boxes_are_aligned(system, n_points):
     np.testing.assert_array_equal(model.parameters_, other.parameters_)
 
 
+@pytest.mark.slow
 def test_corners_of_two_scheduling_variables_speak_against_no_form():
     """What the others do not surround, no form foresees: the centre is what tells."""
     rng, trajectories = np.random.default_rng(0), []

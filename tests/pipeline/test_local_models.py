@@ -263,6 +263,7 @@ def test_a_mode_that_stands_for_constants_does_not_tell_where_outputs_rest():
     assert local_models._equilibrium(lti, [fitted], [low]) == (0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_what_drifts_at_some_points_is_looked_for_at_all():
     """Where it is not beyond doubt, a third mode would stand for it."""
     rng, X, Y = np.random.default_rng(0), [], []
@@ -286,6 +287,7 @@ def test_what_drifts_at_some_points_is_looked_for_at_all():
         assert (found - true).hinf_norm() < 0.05 * true.hinf_norm()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2])
 def test_points_together_tell_that_outputs_drift(seed):
     """Two tanks, not linear: each point alone has slow states for it, or grows."""

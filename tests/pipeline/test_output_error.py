@@ -189,6 +189,7 @@ def test_from_the_points_at_which_experiments_stay():
     assert fit > 97.0
 
 
+@pytest.mark.slow
 def test_without_a_structure_matrices_are_affine_in_the_scheduling():
     truth = spring_lpv()
     X, _ = sweeps()

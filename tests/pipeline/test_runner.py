@@ -67,6 +67,7 @@ def when(_):
     return time.time()
 
 
+@pytest.mark.slow
 def test_steps_begun_are_done_while_something_else_is():
     arguments, kappa = [(k,) for k in range(4)], np.arange(4.0)[:, None]
     steps = runner(Memory(None), n_jobs=2)

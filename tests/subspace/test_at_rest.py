@@ -40,6 +40,7 @@ def test_step_tests_tell_the_static_gain(first, order):
     assert np.median(np.abs(errors)) < 0.02 and np.max(np.abs(errors)) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of states that noise has
 @pytest.mark.parametrize("seed", range(3))
 def test_rest_that_is_said_may_be_where_inputs_go_on_slowly(seed):

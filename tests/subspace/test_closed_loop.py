@@ -533,6 +533,7 @@ def test_kicks_of_a_derivative_do_not_hide_the_loop(seed):
     assert poles[-1] == pytest.approx(np.exp(0.002 * np.sqrt(1800.0)), abs=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_plant_that_grows_is_held_though_noise_is_too_small_to_show_it(seed):
     """Its inputs are nearly all reference and answers to that."""

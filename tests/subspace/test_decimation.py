@@ -118,6 +118,7 @@ class TestSlowStarts:
         assert SlowStarts([Record.of(*_record())], 5, _settings()).best(0) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 10])
 def test_smooth_records_sampled_far_too_fast_are_fitted(seed):
     model = SubspaceLTI(sampling_time=STEP).fit(*_record(seed))
@@ -126,6 +127,7 @@ def test_smooth_records_sampled_far_too_fast_are_fitted(seed):
     assert bft_score(plant.simulate(u), model.lti_.simulate(u)) > 99.0
 
 
+@pytest.mark.slow
 def test_experiments_with_constants_are_fitted_alike():
     runs = [_record(seed) for seed in (0, 10)]
     pairs = [(u, y + level) for (u, y), level in zip(runs, (3.0, -2.0), strict=True)]

@@ -178,6 +178,7 @@ def test_cuts_that_make_a_stable_model_grow_are_not_made(monkeypatch):
     assert np.abs(found.lti_.poles()).max() < 1.0
 
 
+@pytest.mark.slow
 def test_a_level_that_is_no_input_beside_constants_is_left_alone():
     """A scheduling variable without its role: it stands still in every experiment."""
     rng, X, Y = np.random.default_rng(0), [], []
