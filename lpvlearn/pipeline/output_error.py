@@ -138,8 +138,9 @@ class OutputErrorLPV(ScheduledEstimator):
     initial_state : {"estimate", "rest"}, default="estimate"
         Whether the initial state of every experiment is unknown.
     offset : {None, "constant"}, default=None
-        "constant": every output of every experiment has an unknown constant, which
-        predictions leave out.
+        "constant": every output of every experiment has an unknown constant. The model
+        that `fit` gives has their mean as its `output_offset`, unless `start` has
+        offsets; that of a pipeline, where they are the sensors', leaves them out.
     inputs, scheduling, experiment, time : column name, position or list, default=None
         Roles of the columns of X, as in `LocalLPVPipeline`.
     sampling_time : float, default=None
@@ -326,6 +327,8 @@ class OutputErrorLPV(ScheduledEstimator):
             units={**(start.units or {}), **(self.units or {})} or None,
         )
         self.refine(start, experiments, dt)
+        if self.offset == "constant" and start.offsets is None:
+            self.lpv_ = replace(self.lpv_, offsets=self._mean_offset())
         levels = grid_over(self.lpv_.scheduling_range, 3)
         longest = dt * max(len(e.rows) for e in experiments)
         growth_rates(self.lpv_, levels, longest, _UNSEEN)
@@ -435,6 +438,15 @@ class OutputErrorLPV(ScheduledEstimator):
     @property
     def _splits(self) -> bool:
         return self.missing == "split"
+
+    def _mean_offset(self) -> PolynomialLPV:
+        """The constants of the outputs, as the offsets of a model over its range."""
+        lpv = self.lpv_
+        mean = self.offsets_.mean(axis=0)
+        values = np.concatenate([np.zeros(lpv.n_inputs), mean, np.zeros(lpv.order)])
+        ends = np.asarray(lpv.scheduling_range)
+        form = PolynomialLPV(0, extrapolation="ignore")
+        return form.fit(ends, np.tile(values, (len(ends), 1)))
 
     def _sampling_time(self, experiments: Sequence[Experiment]) -> float:
         steps = [e.sampling_time for e in experiments if e.sampling_time is not None]

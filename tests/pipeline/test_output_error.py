@@ -266,6 +266,17 @@ def test_constants_of_the_outputs_are_found():
     model = OutputErrorLPV(spring_lpv(), rate=False, offset="constant", **ROLES)
     model.fit(X, moved)
     np.testing.assert_allclose(model.offsets_[:, 0], [-0.2, 0.7], atol=0.05)
+    # predictions begin at their mean, and stay there without an input
+    mean = model.offsets_.mean(axis=0)
+    rest = model.predict(X.assign(force=0.0))
+    np.testing.assert_allclose(rest, np.tile(mean, (len(X), 1)), rtol=1e-12)
+    np.testing.assert_allclose(model.lpv_.output_offset([0.5]), [mean], rtol=1e-12)
+
+
+def test_a_record_far_from_zero_is_predicted_with_its_constant():
+    X, y = sweeps()
+    model = OutputErrorLPV(spring_lpv(), rate=False, offset="constant", **ROLES)
+    assert model.fit(X, y + 50.0).score(X, y + 50.0) > 0.9
 
 
 def test_what_it_knows_of_itself(alone):
