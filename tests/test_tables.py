@@ -311,13 +311,13 @@ def test_milliseconds_after_seconds_are_refused_and_agree_with_themselves(
     slow = SubspaceLTI(2, horizon=8, inputs="force", **ROLES).fit(ms, Y)
     assert slow.lti_.sampling_time == pytest.approx(20.0)
     assert_allclose(slow.predict(ms), slow.predict(X.drop(columns="time")))
-    with pytest.raises(ValueError, match="X must have the time step of the fit"):
+    with pytest.raises(ValueError, match="X must have the time step of the model"):
         slow.predict(X)
 
 
 def test_another_step_is_refused_by_a_discrete_model_and_followed_by_lpv(fitted):
     halved = X.assign(time=X["time"] / 2)
-    with pytest.raises(ValueError, match=r"step of the fit. Got 0.02 s, and 0.01 s"):
+    with pytest.raises(ValueError, match=r"step of the model. Got 0.02 s, and 0.01 s"):
         fitted["local"].predict(halved)
     first = X["run"] == "p0r0"
     simulated = fitted["pipeline"].predict(halved[first])[:, 0]

@@ -418,7 +418,7 @@ def read_experiments(
             ),
             (
                 UNTIMED._replace(step=fitted_step),
-                "X must have the time step of the fit",
+                "X must have the time step of the model",
             ),
         ],
     )
@@ -449,6 +449,16 @@ def read_experiments(
 def _by_channel(values: Array, rows: Indices) -> Array:
     """Rows of a table, channel after channel in memory, as sums and maxima want it."""
     return np.take(values.T, rows, axis=1).T
+
+
+def check_inputs(experiments: Sequence[Experiment], n_inputs: int) -> None:
+    """Refuse experiments of a table that do not have the inputs of a model."""
+    names = experiments[0].input_names
+    if len(names) != n_inputs:
+        raise ValueError(
+            f"`inputs` must name the {n_inputs} input(s) of the model among the "
+            f"columns of X. Got {list(names)}."
+        )
 
 
 def _check_apart(single: Mapping[str, Column | None], inputs: Sequence[Column]) -> None:

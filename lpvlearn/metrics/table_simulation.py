@@ -12,6 +12,7 @@ from sklearn.base import BaseEstimator
 from ..data.experiments import (
     NO_TIME,
     Experiment,
+    check_inputs,
     n_rows_of,
     naming,
     read_experiments,
@@ -82,7 +83,9 @@ def _simulate(
         if estimate:
             y = _outputs(e, model.n_outputs)
             x0 = model.estimate_initial_state(e.inputs, y)
-        return model.simulate(e.inputs, initial_state=x0)
+        known = e.sampling_time is None and model.sampling_time is not True
+        held = dt if known else None
+        return model.simulate(e.inputs, sampling_time=held, initial_state=x0)
     if dt is None:
         raise ValueError(NO_TIME.format("the model is"))
     if isinstance(model, ScheduledModel):
@@ -150,13 +153,12 @@ class TableSimulator(BaseEstimator):
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
                 "that the LPV model follows. Got None."
             )
+        step = getattr(self.model, "sampling_time", None)
+        own = None if step is True else step
         options |= {"split": True, "sampling_time": self.sampling_time}
+        options |= {"fitted_step": own}
         found = read_runs(self, X, y, **options)
-        if len(found[0].input_names) != self.model.n_inputs:
-            raise ValueError(
-                f"`inputs` must name the {self.model.n_inputs} input(s) of the model "
-                f"among the columns of X. Got {list(found[0].input_names)}."
-            )
+        check_inputs(found, self.model.n_inputs)
         return found
 
     def _simulate(

@@ -32,6 +32,9 @@ from .statespace import StateSpace
 
 Array = NDArray[np.float64]
 
+# Of an output, the least that its errors count for
+_CLEAN = 1e-9
+
 
 class NoiseModel(NamedTuple):
     """``x[t+1] = A x[t] + K e[t]``, ``v[t] = C x[t] + e[t]``."""
@@ -281,7 +284,20 @@ class InnovationModel(VersionedPickle):
             states, trends = np.split(responses, [len(self.A)], axis=2)
             transit = self._transit_responses(gains, len(y))
             responses = np.concatenate([states, transit, trends], axis=2)
-        return estimate_initial_state(responses, error, spread_of(y))
+        return estimate_initial_state(responses, error, self.error_sizes(y))
+
+    def error_sizes(self, y: Array) -> Array:
+        """How far the errors of outputs move: by which they count beside each other.
+
+        The standard deviations of the innovations (n_outputs,), and of an output `y`
+        (n_samples, n_outputs) that has next to none a part of its own: what a state
+        leaves of an output that is clean the noise model would carry, many times over,
+        to one that is not. Of predictions that are simulations, `spread_of`.
+        """
+        if not self.K.any():
+            return spread_of(y)
+        own = np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
+        return np.maximum(own, _CLEAN * spread_of(y))
 
     def _transit_responses(self, gains: Array, n_samples: int) -> Array:
         """Of one-step prediction to every input in transit, as of `with_transit`."""

@@ -20,6 +20,7 @@ from ..data.experiments import (
     OPTIONAL_ROLES,
     Experiment,
     Table,
+    check_inputs,
     n_rows_of,
     naming,
     read_experiments,
@@ -464,18 +465,29 @@ class SubspaceLTI(
             what these do, explain errors of more than 3 % of an output (in open loop,
             beyond chance): the system is not linear over the range of the record.
         """
-        self.__dict__.pop("rates_", None)  # of an earlier fit
+        self._forget()
         if self.integrating is not None:
             return self._fit_rates(X, y)
         return self._fit_table(X, y)
 
-    def _fit_table(self, X: Any, y: Any, *, rates: bool = False) -> Self:
-        """As `fit`, or of `rates`, most of which may be noise that was differenced."""
+    def _forget(self) -> None:
+        """Leave what an earlier fit or stream told."""
+        self._stream: SampleStream | None = None
+        for name in (*_TAKEN, "_stale", "rates_"):
+            self.__dict__.pop(name, None)
+
+    def _fit_table(
+        self, X: Any, y: Any, *, rates: tuple[Any, Any] | None = None
+    ) -> Self:
+        """As `fit`, or of `rates`, most of which may be noise that was differenced.
+
+        These have the names of the inputs and outputs whose rates they are.
+        """
         choices = check_options(self.get_params(deep=False))
-        choices = choices._replace(differences=rates)
+        choices = choices._replace(differences=rates is not None)
         experiments = self._read(X, y, reset=True, cut=False)
         self._single_output = np.asarray(y).ndim == 1
-        telling = Telling(*_labels_of(X, experiments, y))
+        telling = Telling(*(rates or _labels_of(X, experiments, y)))
         if rates:
             telling = telling.aside("noisy output", "useless", "dropouts")
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
@@ -574,7 +586,6 @@ class SubspaceLTI(
         self.time_jitter_ = max(e.jitter for e in experiments)
         gaps = self.missing != "raise"
         experiments = self._with_late_inputs(experiments, delay, gaps)
-        self._stream: SampleStream | None = None
         pairs = [(e.inputs, e.measured) for e in experiments]
         estimated = [e.estimated for e in experiments if e.estimated is not None]
         if estimated and np.vstack(estimated).all(axis=0).any():
@@ -609,13 +620,15 @@ class SubspaceLTI(
         check_for_rates(self.get_params(deep=False))
         experiments = self._read(X, y, reset=True)
         self.time_jitter_ = max(e.jitter for e in experiments)
-        self._stream, self._single_output = None, np.asarray(y).ndim == 1
+        self._single_output = np.asarray(y).ndim == 1
         flags = integrating_flags(self.integrating, read_outputs(y)[1])
         step = self._step_of(experiments)
         table, rates = as_table(rates_of(experiments, flags, float(step)))
         options = options_of_rates(table, flags, self.feedthrough, step)
         rate_model = clone(self).set_params(**options)
-        self.rates_ = inner = rate_model._fit_table(table, rates, rates=True)
+        self.rates_ = inner = rate_model._fit_table(
+            table, rates, rates=_labels_of(X, experiments, y)
+        )
         best = inner
         if flags.all() and inner.method_ != "pbsid":
             best = self._of_sums(experiments, inner)
@@ -747,6 +760,7 @@ class SubspaceLTI(
         jitter = 0.0 if before is None else self.time_jitter_
         self.time_jitter_ = max(jitter, *(e.jitter for e in experiments))
         if before is None:
+            self._forget()
             stream = SampleStream(
                 choices,
                 options,
@@ -803,9 +817,7 @@ class SubspaceLTI(
         >>> SubspaceLTI(1, horizon=5).fit_batches(batches(1)).lti_.poles().round(6)
         array([0.9+0.j])
         """
-        self._stream = None
-        for name in (*_TAKEN, "_stale", "rates_"):
-            self.__dict__.pop(name, None)
+        self._forget()
         with naming_argument("batches", "be an iterable of pairs (X, y)", batches):
             numbered = enumerate(batches)
         for number, batch in numbered:
@@ -1014,7 +1026,8 @@ class SubspaceLTI(
         """
         check_is_fitted(self, "lti_")
         one_of("initial_state", initial_state, ("estimate", "rest"))
-        experiments, predictor = self._read(X, y, outputs=False), self.predictor_
+        experiments = self._read(X, y, outputs=False)
+        predictor = self._predictor(self.lti_)
         model = self._simulator()
 
         def predicted(e: Experiment) -> Array:
@@ -1165,7 +1178,10 @@ class SubspaceLTI(
     def predictor_(self) -> InnovationModel:
         """Innovation model: `lti_`, the noise model, K and innovation covariance."""
         check_is_fitted(self, "lti_")
-        return self._predictor(self.lti_)
+        try:
+            return self._predictor(self.lti_)
+        except ValueError as error:
+            raise AttributeError(str(error)) from None
 
     def _predictor(self, lti: StateSpace) -> InnovationModel:
         n_states = None if self.n_noise_states == "auto" else int(self.n_noise_states)
@@ -1335,7 +1351,7 @@ class SubspaceLTI(
         """Experiments of a table; options as in `read_runs`."""
         options = {"split": self.missing != "raise", "reset": False} | options
         known = options["reset"] or self.time is None
-        return read_runs(
+        found = read_runs(
             self,
             X,
             y,
@@ -1344,6 +1360,9 @@ class SubspaceLTI(
             optional=(*OPTIONAL_ROLES, "scheduling"),
             **options,
         )
+        if not options["reset"]:
+            check_inputs(found, self.lti_.n_inputs)
+        return found
 
     def _simulator(self) -> Simulator:
         """The model with what is known of its experiments."""

@@ -21,6 +21,7 @@ from ..exceptions import warn
 from ..models.statespace import ModelPair, StateSpace
 from ..validation import has_one_axis, is_whole, shown
 from .constants import USELESS
+from .options import feedthrough_mask
 from .simulation_fit import Freedom, simulation_fit
 from .statistics import Evidence
 
@@ -110,10 +111,12 @@ def options_of_rates(
     """Options of a model of the rates that are not those of the outputs' model.
 
     `table` as of `as_table`, `step` in seconds, or True where nothing tells them.
+    Raises a ValueError for a `feedthrough` of another shape.
     """
     *inputs, experiment = table.columns
     # What acts at once follows from how rates are made: a table, which says so.
-    direct = np.broadcast_to(feedthrough, (len(flags), len(inputs))) | flags[:, None]
+    given = feedthrough_mask(feedthrough, len(flags), len(inputs), len(inputs))
+    direct = given | flags[:, None]
     return {
         "integrating": None,
         "missing": "raise",

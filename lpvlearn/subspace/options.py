@@ -53,7 +53,7 @@ class Choices(NamedTuple):
         `basis` (n_inputs, rank) are the original inputs in terms of the independent
         ones, which the models have; `n_trend` as in `Freedom`.
         """
-        mask = _feedthrough_mask(self.feedthrough, n_outputs, n_inputs, basis.shape[1])
+        mask = feedthrough_mask(self.feedthrough, n_outputs, n_inputs, basis.shape[1])
         return Settings(
             Freedom(mask, self.initial_states, n_trend),
             self.method,
@@ -216,7 +216,7 @@ def _feedthrough(value: Any) -> NDArray[np.bool_]:
     return mask.astype(bool)
 
 
-def _feedthrough_mask(
+def feedthrough_mask(
     feedthrough: Any, n_outputs: int, n_inputs: int, rank: int
 ) -> NDArray[np.bool_]:
     """Free entries of D for the independent inputs, (n_outputs, rank)."""

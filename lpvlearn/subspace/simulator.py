@@ -166,15 +166,16 @@ class Simulator(NamedTuple):
         """
         (u0, y0), y = self.resting_point(), experiment.measured
         n_trend, own = self.evidence.free.n_trend, None
+        size = spread_of(y) if predictor is None else predictor.error_sizes(y)
         if not n_trend and self.offset and not of_fit:
-            n_trend, own = self._as_it_stands(experiment)
+            n_trend, own = self._as_it_stands(experiment, size)
         trend = trend_signals(len(y), n_trend)
         if predictor is not None and predictor.gain is not None:
             u = experiment.inputs - u0
             own = predictor.estimate_initial_state(u, y - y0, trend)
         elif own is None:
             responses, error = self._unexplained(experiment, trend)
-            own = estimate_initial_state(responses, error, spread_of(y))
+            own = estimate_initial_state(responses, error, size)
         x0, level = state_and_level(own, trend, len(y0))
         return x0, y0 + level
 
@@ -198,10 +199,13 @@ class Simulator(NamedTuple):
             responses, error = responses * faint[:, :, None], error * faint
         return responses, error
 
-    def _as_it_stands(self, experiment: Experiment) -> tuple[int, Array | None]:
+    def _as_it_stands(
+        self, experiment: Experiment, size: Array
+    ) -> tuple[int, Array | None]:
         """1 where an experiment has a level that those of the fit did not have, or 0.
 
-        And its own unknowns, by simulation; None where that diverges.
+        And its own unknowns, by simulation, whose errors count by `size`; None where
+        that diverges.
         """
         y = experiment.measured
         try:
@@ -216,7 +220,7 @@ class Simulator(NamedTuple):
             unknown |= experiment.estimated
         if not (np.isfinite(responses).all() and np.isfinite(error[~unknown]).all()):
             return 0, None
-        size, found, left = spread_of(y), [], []
+        found, left = [], []
         for free in (responses[:, :, : -len(size)], responses):
             own = estimate_initial_state(free, error, size)
             found.append(own)

@@ -136,6 +136,19 @@ def test_the_start_of_a_record_in_the_middle_is_estimated(spring):
     assert estimated[1] >= rest[1]
 
 
+def test_a_discrete_model_keeps_its_own_step():
+    model = StateSpace(0.9, 0.1, 1.0, sampling_time=1.0)
+    u = np.sign(np.sin(np.arange(100.0)))
+    y = model.simulate(u)
+    X = pd.DataFrame({"u": u, "t": np.arange(100) * 0.01})
+    with pytest.raises(ValueError, match="the time step of the model. Got 1 s, and 0"):
+        compare_models({"m": model}, X, y, time="t")
+    with pytest.raises(ValueError, match="must be 1.0 s, the model's own. Got 0.01"):
+        compare_models({"m": model}, X[["u"]], y, sampling_time=0.01)
+    right = compare_models({"m": model}, X.assign(t=np.arange(100.0)), y, time="t")
+    assert right["BFT"].iloc[0] == pytest.approx(100.0)
+
+
 def test_a_discrete_model_is_compared_as_it_is(spring):
     X, y = spring[:2]
     first = (X["run"] == "p0r0").to_numpy()

@@ -72,6 +72,15 @@ def test_several_experiments_are_not_joined():
     np.testing.assert_allclose(poles, [-3.0, 0.0], atol=1e-6)
 
 
+def test_nothing_is_left_of_the_fit_before():
+    u, y = record(noise=0.01)
+    local = SubspaceLTI(1, sampling_time=STEP).fit(u, y)
+    local.set_params(integrating=[0]).fit(u, y)
+    assert not hasattr(local, "initial_states_")
+    with pytest.raises(ValueError, match="shape \\(n_outputs, n_inputs\\) = "):
+        local.set_params(feedthrough=[[True] * 3] * 2).fit(u, y)
+
+
 @pytest.mark.parametrize("integrating", [["angel"], [2], "x", [True]])
 def test_outputs_must_be_known(integrating):
     with pytest.raises(ValueError, match="`integrating` must be None, True, or name"):
@@ -81,8 +90,8 @@ def test_outputs_must_be_known(integrating):
 def test_what_is_known_of_the_rates_is_asked_of_them():
     u, y = record(noise=0.01)
     local = SubspaceLTI(1, sampling_time=STEP, integrating=[0]).fit(u, y)
+    assert not hasattr(local, "predictor_") and not hasattr(local, "poles_std_")
     for ask in (
-        lambda: local.predictor_,
         lambda: local.frequency_response_std([1.0]),
         lambda: local.residual_tests(u, y),
         lambda: local.predict_ahead(u, y),

@@ -70,14 +70,33 @@ def test_prediction_error_under_coloured_noise_is_that_of_the_true_predictor(
 def test_far_prediction_and_white_noise_are_the_simulation(coloured_fit):
     model = coloured_fit
     u, y = experiment(0, 3000, pole=0.9)
-    simulated = model.predict_with_initial_state(u, y)
-    np.testing.assert_allclose(model.predict_ahead(u, y, 400), simulated, atol=1e-9)
+    far = model.predict_ahead(u, y, 400) - model.predict_with_initial_state(u, y)
+    assert np.abs(far[:300]).max() < 0.01  # of outputs that count otherwise
+    np.testing.assert_allclose(far[300:], 0.0, atol=1e-9)
     u, y = experiment(0, 3000)
     model = SubspaceLTI(2, horizon=12).fit(u, y)
     assert not model.predictor_.K.any()
     np.testing.assert_array_equal(
         model.predict_ahead(u, y), model.predict_with_initial_state(u, y)
     )
+
+
+@pytest.mark.parametrize("clean", [1e-4, 1e-6])
+@pytest.mark.parametrize("missing", ["raise", "estimate"])
+def test_a_clean_output_spoils_no_prediction_of_a_noisy_one(clean, missing):
+    """What its noise leaves of the other one by the initial state is no innovation."""
+    rng = np.random.default_rng(0)
+    u, v, w = rng.standard_normal((3, 400))
+    true = StateSpace([[0.8, 0.2], [-0.2, 0.8]], [[1], [0]], [[1, 0]], None, True)
+    exact, noise = true.simulate(u)[:, 0], lfilter([1.0], [1.0, -0.9], 0.3 * w)
+    y = np.column_stack([exact + noise, exact + clean * v])
+    if missing == "estimate":
+        y[100:110, 0] = np.nan
+    model = SubspaceLTI(2, missing=missing).fit(u[:, None], y)
+    error = y[:, 0] - model.predict_ahead(u[:, None], y)[:, 0]
+    assert np.sqrt(np.nanmean(error**2)) < 0.32
+    tests = model.residual_tests(u[:, None], y, errors="prediction")
+    assert tests.loc[tests["test"] == "whiteness", "p_value"].iloc[0] > 1e-3
 
 
 def test_prediction_uses_no_later_output(coloured_fit):

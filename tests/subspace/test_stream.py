@@ -694,3 +694,20 @@ def test_batches_of_an_iterable_are_a_stream(system):
         with pytest.raises(ValueError, match=told):
             one.fit_batches(batches)
     assert one.lti_ is before
+
+
+def test_a_stream_after_a_fit_has_no_model_of_that():
+    u, y = np.random.default_rng(0).standard_normal((2, 300))
+    fitted = SubspaceLTI(1).fit(np.column_stack([u, y]), np.roll(u + y, 1))
+    fitted.partial_fit(u[:3, None], y[:3])
+    assert not hasattr(fitted, "lti_")
+    with pytest.raises(NotFittedError):
+        fitted.predict(u[:10, None])
+
+
+def test_a_model_is_fed_all_of_its_inputs():
+    table = pd.DataFrame(np.random.default_rng(0).standard_normal((300, 2)))
+    table.columns = ["a", "b"]
+    fitted = SubspaceLTI(1, inputs=["a", "b"]).fit(table, np.roll(table["a"], 1))
+    with pytest.raises(ValueError, match=r"must name the 2 input\(s\).* Got \['a'\]"):
+        fitted.set_params(inputs=["a"]).predict(table)
