@@ -431,9 +431,9 @@ def _fit_together(
         apart = joint.transformed(T)
         if fitted is None or kept.all():
             return _Together(fitted, apart, T, kept)
-        apart = _without_reached_noise(apart, fitted, T, kept, free.direct)
-        fewer = int((~kept).sum())
-        if order is not None or _as_likely(apart, joint, fewer, records, free, n):
+        models = _without_reached_noise(apart, fitted, T, kept, free.direct)
+        apart, fewer = _likeliest(models, records, free), int((~kept).sum())
+        if order is not None or _as_likely(apart, joint, fewer, records, n):
             return _Together(fitted, apart, T, kept)
     if order is not None and order != len(joint.A):
         joint, fitted = _innovation_form(subspace, order), None
@@ -482,12 +482,23 @@ def _volume(covariance: Array, records: Sequence[Record]) -> float:
     return float(np.linalg.slogdet(covariance + np.diag(floor))[1])
 
 
+def _likeliest(
+    models: Sequence[_Innovation], records: Sequence[Record], free: Freedom
+) -> _Innovation:
+    """The model of least errors, with the covariance of these."""
+    found = []
+    for model in models:
+        errors = np.vstack(_predicted(model, records, free)[1])
+        covariance = errors.T @ errors / len(errors)
+        found.append(model._replace(covariance=covariance))
+    return min(found, key=lambda model: _volume(model.covariance, records))
+
+
 def _as_likely(
     model: _Innovation,
     whole: _Innovation,
     n_fewer: int,
     records: Sequence[Record],
-    free: Freedom,
     n: int,
 ) -> bool:
     """Whether a model without B of so many states is worth what it loses.
@@ -495,9 +506,7 @@ def _as_likely(
     By Schwarz's criterion, as Wald's statistic has said of the whole model: which is to
     be trusted where the likelihood is as quadratic as it takes it for.
     """
-    errors = np.vstack(_predicted(model, records, free)[1])
-    loss = _volume(errors.T @ errors / len(errors), records)
-    loss -= _volume(whole.covariance, records)
+    loss = _volume(model.covariance, records) - _volume(whole.covariance, records)
     return bool(loss < n_fewer * model.B.shape[1] * np.log(n) / n)
 
 
@@ -725,21 +734,26 @@ def _without_reached_noise(
     transform: Array,
     kept: NDArray[np.bool_],
     direct: NDArray[np.bool_],
-) -> _Innovation:
-    """The model given that no input reaches the noise, to first order."""
+) -> list[_Innovation]:
+    """Models given that no input reaches the noise: to first order, and as it is.
+
+    The former where it is stable. Where outputs are of unequal quality, the first order
+    may be worse than none.
+    """
     shift = _knowledge(fitted, joint, transform, kept, direct).shift
     n, (ny, m) = int(kept.sum()), direct.shape
     A, B, C, D = (M.copy() for M in joint[:4])
+    B[~kept] = 0.0
+    as_it_is = joint._replace(B=B.copy())
     ends = np.cumsum([n * m, direct.sum(), n * n])
     by_B, by_D, by_A, by_C = np.split(shift, ends)
     B[kept] += by_B.reshape(n, m)
-    B[~kept] = 0.0
     D[direct] += by_D
     A[np.ix_(kept, kept)] += by_A.reshape(n, n)
     C[:, kept] += by_C.reshape(ny, n)
     moved = joint._replace(A=A, B=B, C=C, D=D)
     stable = spectral_radius(A - joint.K @ C) < 1.0
-    return moved if stable else joint._replace(B=B)
+    return [moved, as_it_is] if stable else [as_it_is]
 
 
 def _modes(A: Array) -> tuple[Array, list[NDArray[np.bool_]]]:

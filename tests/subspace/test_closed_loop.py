@@ -838,3 +838,20 @@ def test_a_controller_is_not_taken_for_the_feedthrough_of_its_plant(seed):
     G = true.frequency_response(omega)
     error = np.abs(model.lti_.frequency_response(omega) - G) / np.abs(G)
     assert error.mean() < 0.15
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_clean_output_keeps_its_part_of_a_given_order(seed):
+    """That no input reaches the noise is not taken to first order where that is worse."""
+    rng = np.random.default_rng(seed)
+    u, w, v = (rng.standard_normal(400) for _ in range(3))
+    true = StateSpace([[0.8, 0.2], [-0.2, 0.8]], [[1], [0]], [[1, 0]], None, True)
+    exact, noise = true.simulate(u)[:, 0], lfilter([1.0], [1.0, -0.9], 0.3 * w)
+    y = np.column_stack([exact + noise, exact + 1e-3 * v])
+    model = SubspaceLTI(2, method="pbsid").fit(u[:, None], y)
+    lti = model.lti_
+    row = StateSpace(lti.A, lti.B, lti.C[1:], lti.D[1:], True)
+    assert (row - true).hinf_norm() / true.hinf_norm() < 5e-4
+    error = (y - model.predict_ahead(u[:, None], y))[20:]
+    said = np.sqrt(np.diagonal(model.predictor_.covariance))
+    np.testing.assert_allclose(error.std(axis=0), said, rtol=0.1)
