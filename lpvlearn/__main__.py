@@ -192,10 +192,9 @@ def _points_done(output: Path, resume: bool) -> Iterator[Path]:
 
 
 def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1. Got {value}.")
-    return value
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be an integer, at least 1. Got {text}.")
+    return int(text)
 
 
 if __name__ == "__main__":

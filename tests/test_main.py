@@ -14,7 +14,7 @@ def test_counts_below_one_are_refused(
 ) -> None:
     with pytest.raises(SystemExit):
         main([*word, option, "0"])
-    assert "must be at least 1. Got 0." in capsys.readouterr().err
+    assert "must be an integer, at least 1. Got 0." in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("arguments", [[], ["--seed", "3"], ["paper", "--seed", "3"]])

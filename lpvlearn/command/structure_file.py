@@ -57,7 +57,7 @@ def _parsed(path: Path) -> dict[str, Any]:
 
 def _structure(found: dict[str, Any], counts: Mapping[str, int]) -> StructureFile:
     form = found.pop("form", "mechanical" if "M" in found else "template")
-    if form not in _FORMS:
+    if not isinstance(form, str) or form not in _FORMS:
         raise ValueError(f"`form` must be one of {', '.join(_FORMS)}. Got {form!r}.")
     known = {name: _mapping(name, found.pop(name, {})) for name in _KNOWN}
     arguments = inspect.signature(_FORMS[form]).parameters

@@ -149,7 +149,7 @@ def _records(path: Path, form: Format) -> list[Record]:
             found = _sheets(path)
         else:
             found = [_text_table(path, form)]
-    except (ValueError, LookupError, pd.errors.ParserError) as error:
+    except (ValueError, LookupError, pd.errors.ParserError, csv.Error) as error:
         raise ValueError(f"{path.name} cannot be read: {error}") from None
     stem = path.name[: -len(end)]
     named = []

@@ -21,7 +21,7 @@ from ..validation import (
 
 Array = NDArray[np.float64]
 
-_MOST_BITS = 10**6  # of a window that is balanced: all of one are held at once
+MOST_BITS = 10**6  # of a window that is balanced: all of one are held at once
 
 _MOST_STEPS = 2_000  # of integration in a sampling period: 1 s of the arm
 
@@ -90,7 +90,7 @@ def prbs(
         )
     clock, amplitude = check_count("clock", clock), check_size("amplitude", amplitude)
     if balance is not None:
-        balance = whole_number("balance", balance, 2, _MOST_BITS)
+        balance = whole_number("balance", balance, 2, MOST_BITS)
         if balance % 2:
             raise ValueError(f"`balance` must be even, or None. Got {balance}.")
     rng = (

@@ -408,7 +408,7 @@ class FlexibleArm:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ArmResponse:
     """Response of the arm at the sampling instants, before each input acts.
 

@@ -12,8 +12,10 @@ from sklearn.utils import Bunch
 
 from ..validation import number, real_array, shown
 from .excitation import (
+    MOST_BITS,
     check_count,
     check_rows,
+    check_size,
     decibels,
     measurement_noise,
     prbs,
@@ -26,8 +28,6 @@ Array = NDArray[np.float64]
 
 # The paper's sweep goes from the first of its operating points to the last in 3 s.
 _SWEEP_START, _SWEEP_RATE = np.pi / 8, (6 * np.pi / 8) / 3
-
-_LONGEST = 1e100  # s: what balances is divided by other times
 
 INPUTS, OUTPUTS = ["u1", "u2"], ["y1", "y2"]
 
@@ -185,10 +185,13 @@ def make_flexible_arm(
     )
     check_rows(n_operating_points=n_points, sweep_duration=n_sweep)
     clocks = _clock_samples("clock", clock, sampling_time)
+    check_size("sweep_amplitude", sweep_amplitude)
     sweep_clocks = _clock_samples("sweep_clock", sweep_clock, sampling_time)
     if balance_time is not None:
+        longest = MOST_BITS * sampling_time
+        rule = f"positive, at most {longest:g} s, or None"
         balance_time = number(
-            "balance_time", balance_time, "positive or None", above=0.0, high=_LONGEST
+            "balance_time", balance_time, rule, above=0.0, high=longest
         )
 
     input_rng, noise_rng, local_rng, sweep_rng = spawn_generators(random_state, 4)

@@ -321,6 +321,8 @@ class ErrorDisplay:
         for frequency, value in zip(
             self.active_frequencies, self.active_values, strict=True
         ):
+            if not value > 0.0:  # as where a bound at infinity is met: no place on it
+                continue
             marker = "<" if frequency < low else ">" if frequency > high else "o"
             (point,) = ax.plot(
                 np.clip(frequency, low, high),

@@ -100,11 +100,6 @@ def check_model(name: str, model: Any, hint: str = "") -> None:
 
 def with_others(own: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
     """An estimator's things and further ones to compare with, by name."""
-    if not isinstance(others, Mapping):
-        raise ValueError(
-            "`others` must be a dict from names to models. Got "
-            f"{type(others).__name__}."
-        )
     for name in others:
         if name in own:
             raise ValueError(

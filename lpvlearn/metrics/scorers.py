@@ -37,13 +37,32 @@ class TrajectoryScorer:
     burn_in : int
     multioutput : "uniform_average", "raw_values" or tuple of float
     average : {"pool", "experiment"}
+
+    Raises
+    ------
+    ValueError
+        When one of them is something else.
     """
 
     metric: Literal["BFT", "VAF"]
     initial_state: InitialState = "rest"
     burn_in: int = 0
-    multioutput: str | tuple[float, ...] = "uniform_average"
+    multioutput: Multioutput = "uniform_average"
     average: Average = "pool"
+
+    def __post_init__(self) -> None:
+        one_of("metric", self.metric, ("BFT", "VAF"))
+        check_options(self.initial_state, self.burn_in)
+        one_of("average", self.average, ("pool", "experiment"))
+        given = self.multioutput
+        if not isinstance(given, str):
+            weights = real_array("multioutput", given).ravel().tolist()
+            object.__setattr__(self, "multioutput", tuple(weights))
+        elif given not in ("uniform_average", "raw_values"):
+            raise ValueError(
+                "`multioutput` of a scorer must be 'uniform_average', 'raw_values' or "
+                f"one weight per output. Got {given!r}."
+            )
 
     def __call__(self, estimator: Any, X: Any, y: Any) -> float | dict[str, float]:
         """Score an estimator's simulation of `X` against `y`."""
@@ -114,7 +133,7 @@ def make_bft_scorer(
     >>> make_bft_scorer(burn_in=20).burn_in
     20
     """
-    return _make_scorer("BFT", initial_state, burn_in, multioutput, average)
+    return TrajectoryScorer("BFT", initial_state, burn_in, multioutput, average)
 
 
 def make_vaf_scorer(
@@ -149,26 +168,7 @@ def make_vaf_scorer(
     >>> make_vaf_scorer(multioutput=[1, 0]).multioutput
     (1.0, 0.0)
     """
-    return _make_scorer("VAF", initial_state, burn_in, multioutput, average)
-
-
-def _make_scorer(
-    metric: Literal["BFT", "VAF"],
-    initial_state: InitialState,
-    burn_in: int,
-    multioutput: Any,
-    average: Average,
-) -> TrajectoryScorer:
-    check_options(initial_state, burn_in)
-    one_of("average", average, ("pool", "experiment"))
-    if not isinstance(multioutput, str):
-        multioutput = tuple(real_array("multioutput", multioutput).ravel().tolist())
-    elif multioutput not in ("uniform_average", "raw_values"):
-        raise ValueError(
-            "`multioutput` of a scorer must be 'uniform_average', 'raw_values' or "
-            f"one weight per output. Got {multioutput!r}."
-        )
-    return TrajectoryScorer(metric, initial_state, burn_in, multioutput, average)
+    return TrajectoryScorer("VAF", initial_state, burn_in, multioutput, average)
 
 
 def check_options(initial_state: str, burn_in: int = 0) -> None:

@@ -67,15 +67,12 @@ def bft_score(
     >>> bft_score([1.0, 2.0, 3.0, 4.0], [1.5, 2.5, 2.5, 3.5])
     55.27...
     """
-    return _told(_best_fit, y_true, y_pred, multioutput)
+    return _told(best_fit, y_true, y_pred, multioutput)
 
 
 def best_fit(true: Array, pred: Array, multioutput: Multioutput = "raw_values") -> Any:
     """`bft_score` of matrices, NaN where not measured, without a word of these."""
-    return _best_fit(*_read_pair(true, pred), multioutput)
-
-
-def _best_fit(true: Array, pred: Array, multioutput: Multioutput) -> Any:
+    true, pred = _read_pair(true, pred)
     _check_measured(true)
     return _percent(_norm(true - pred), _norm(_centred(true)), multioutput)
 
@@ -122,17 +119,14 @@ def vaf_score(
     >>> vaf_score([1.0, 2.0, 3.0, 4.0], [1.5, 2.5, 2.5, 3.5])
     80.0
     """
-    return _told(_accounted_variance, y_true, y_pred, multioutput)
+    return _told(accounted_variance, y_true, y_pred, multioutput)
 
 
 def accounted_variance(
     true: Array, pred: Array, multioutput: Multioutput = "raw_values"
 ) -> Any:
     """`vaf_score` of matrices, NaN where not measured, without a word of these."""
-    return _accounted_variance(*_read_pair(true, pred), multioutput)
-
-
-def _accounted_variance(true: Array, pred: Array, multioutput: Multioutput) -> Any:
+    true, pred = _read_pair(true, pred)
     _check_measured(true)
     error, spread = _norm(_centred(true - pred)), _norm(_centred(true))
     return _percent(error, spread, multioutput, power=2)
@@ -178,7 +172,6 @@ def parameter_fit(params_true: ArrayLike, params_pred: ArrayLike) -> float:
             f"{eta.shape} and {eta_hat.shape}."
         )
     true, pred = _read_pair(eta.ravel(), eta_hat.ravel(), names, missing=False)
-    squarable(names[0], true), squarable(names[1], pred)
     fit = _fit_ratio(_norm(true - pred), _norm(_centred(true)))[0]
     return float(100 * max(fit, _WORST))
 

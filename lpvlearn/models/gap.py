@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 _LOST = 1e-4  # error of coprime factors, of which the gap has no more digits
 
+_HIDDEN = 1e-12  # of the matrices, what is left where inputs do not reach a state
+
 _ORTHOGONAL = 1.0 - 1e-12  # a norm of 1 but for rounding: somewhere the graphs are
 
 
@@ -149,6 +151,8 @@ def _right_factors(P: _System) -> _System:
     if len(A):
         solve = solve_discrete_are if discrete else solve_continuous_are
         try:
+            if _hides_unstable(A, B, discrete) or _hides_unstable(A.T, C.T, discrete):
+                raise LinAlgError
             X = solve(A, B, C.T @ C, R, s=C.T @ D)
         except LinAlgError:
             raise ValueError(
@@ -161,6 +165,18 @@ def _right_factors(P: _System) -> _System:
     root = np.linalg.inv(np.linalg.cholesky(R)).T
     outputs, feedthrough = np.vstack([C + D @ F, F]), np.vstack([D, np.eye(len(F))])
     return _System(A + B @ F, B @ root, outputs, feedthrough @ root, discrete)
+
+
+def _hides_unstable(A: Array, B: Array, discrete: bool) -> bool:
+    """Whether a mode that does not decay is out of reach, by Hautus's test."""
+    poles = np.linalg.eigvals(A)
+    size = np.linalg.norm(np.hstack([A, B]))
+    lasting = np.abs(poles) - 1.0 if discrete else poles.real
+    return any(
+        np.linalg.svd(np.hstack([A - pole * np.eye(len(A)), B]), compute_uv=False)[-1]
+        < _HIDDEN * size
+        for pole in poles[lasting > -_HIDDEN * size]
+    )
 
 
 def _annihilator(P: _System) -> _System:

@@ -28,6 +28,7 @@ from lpvlearn import (
     vaf_score,
     vaf_scorer,
 )
+from lpvlearn.metrics import TrajectoryScorer
 
 from .conftest import IN_MOTION, RNG
 
@@ -143,6 +144,8 @@ def test_scorers_are_pickled(scorer):
         (lambda: make_vaf_scorer(burn_in=0.5), ["`burn_in`", "0.5"]),
         (lambda: make_bft_scorer(multioutput="mean"), ["`multioutput`", "'mean'"]),
         (lambda: make_bft_scorer(average="mean"), ["`average`", "'mean'"]),
+        (lambda: TrajectoryScorer("R2"), ["`metric`", "'R2'"]),
+        (lambda: TrajectoryScorer("VAF", burn_in=-3), ["`burn_in`", "-3"]),
     ],
 )
 def test_bad_calls_raise_and_name_the_cause(call, words):

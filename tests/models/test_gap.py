@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.linalg import block_diag
 from scipy.stats import ortho_group
 
 from lpvlearn import StateSpace, gap
@@ -162,9 +163,17 @@ def test_hidden_states():
     """Stable ones count for nothing; unstable ones have no stabilising feedback."""
     hidden = StateSpace([[-1, 0], [0, -3]], [[1], [0]], [[1, 1]])
     assert_allclose(gap(hidden, StateSpace(-1, 1, 1)), 0, atol=1e-9)
-    unstable = StateSpace([[-1, 0], [0, 3]], [[1], [0]], [[1, 1]])
-    with pytest.raises(ValueError, match="feedback stabilises"):
-        gap(unstable, unstable)
+    seen = StateSpace(-1, 1, 1)
+    swing = np.array([[0.0, 2.0], [-2.0, 0.0]])
+    for block in (3 * np.eye(1), np.zeros((1, 1)), swing):
+        n = len(block)
+        A = block_diag(-1, block)
+        reached, shown = np.ones((n + 1, 1)), np.ones((1, n + 1))
+        lost = np.eye(n + 1)[:, :1]
+        for hidden in (StateSpace(A, lost, shown), StateSpace(A, reached, lost.T)):
+            for pair in ((hidden, hidden), (hidden, seen), (seen, hidden)):
+                with pytest.raises(ValueError, match="feedback stabilises"):
+                    gap(*pair)
 
 
 def test_models_that_do_not_fit_are_refused():

@@ -842,7 +842,7 @@ def test_a_controller_is_not_taken_for_the_feedthrough_of_its_plant(seed):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_clean_output_keeps_its_part_of_a_given_order(seed):
-    """That no input reaches the noise is not taken to first order where that is worse."""
+    """No input reaches the noise: not to first order where that is worse."""
     rng = np.random.default_rng(seed)
     u, w, v = (rng.standard_normal(400) for _ in range(3))
     true = StateSpace([[0.8, 0.2], [-0.2, 0.8]], [[1], [0]], [[1, 0]], None, True)
