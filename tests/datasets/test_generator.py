@@ -104,7 +104,7 @@ def test_scalar_clock_and_independent_bits():
         ({"clock": 0.0}, "`clock` must be a positive multiple"),
         ({"clock": 0.0015}, "`clock` must be a positive multiple"),
         ({"clock": (0.01, 0.01, 0.01)}, "`clock` must be one time"),
-        ({"balance_time": 0.0}, "`balance_time` must be positive, at most .* s, or None"),
+        ({"balance_time": 0.0}, "`balance_time` must be positive, at most"),
         ({"amplitude": 0.0}, "`amplitude` must be finite and positive"),
     ],
 )
