@@ -57,6 +57,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 from sklearn.model_selection import BaseCrossValidator
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_consistent_length, column_or_1d
@@ -75,7 +76,10 @@ from .operating_points import group_operating_points
 
 __all__ = ["BlockedTimeSeriesSplit", "ExperimentSplit"]
 
+Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+_BESIDE = 1e-3  # of the ranges: what is so near the others is within them
 
 # Rows of the experiments to train on, and of those to test on.
 Parts = tuple[list[Indices], list[Indices]]
@@ -255,11 +259,11 @@ class ExperimentSplit(_SplitOfExperiments):
             return whole_number("n_splits", self.n_splits, 2)
         if X is None:
             raise ValueError("`X` must be given to count the folds of n_splits='all'.")
-        return len(self._folds(self._points(self._read(X, groups))))
+        return len(self._folds(*self._points(self._read(X, groups))))
 
     def _parts(self, experiments: list[Experiment]) -> Iterator[Parts]:
-        point = self._points(experiments)
-        for held_out in self._folds(point):
+        point, kappa = self._points(experiments)
+        for held_out in self._folds(point, kappa):
             kept = np.array([k for k in range(len(point)) if k not in held_out])
             order = kept[np.lexsort((point[kept], _turns(point[kept])))]
             tested = held_out if self.test_on == "held_out" else range(len(point))
@@ -286,13 +290,13 @@ class ExperimentSplit(_SplitOfExperiments):
     def _knows_points(self) -> bool:
         return self.scheduling is not None or self.operating_point is not None
 
-    def _points(self, experiments: list[Experiment]) -> Indices:
-        """The operating point of every experiment."""
+    def _points(self, experiments: list[Experiment]) -> tuple[Indices, Array]:
+        """The operating point of every experiment, and the points' values."""
         if not self._knows_points:
-            return np.zeros(len(experiments), dtype=np.intp)
-        return group_operating_points(experiments)[0]
+            return np.zeros(len(experiments), dtype=np.intp), np.empty((1, 0))
+        return group_operating_points(experiments)
 
-    def _folds(self, point: Indices) -> list[set[int]]:
+    def _folds(self, point: Indices, kappa: Array) -> list[set[int]]:
         """Numbers of the experiments that every fold holds out."""
         # Neighbours go to different folds: the experiments of one point.
         interior, shuffle = (
@@ -302,7 +306,10 @@ class ExperimentSplit(_SplitOfExperiments):
         units = [[k] for k in np.argsort(point, kind="stable")]
         if self.hold_out == "operating_point":
             units = [np.flatnonzero(point == k).tolist() for k in range(max(point) + 1)]
-            units = units[1:-1] if interior else units
+            if interior:
+                units = [
+                    unit for unit, k in zip(units, _inner(kappa), strict=True) if k
+                ]
         n_units = len(units)
         if shuffle:
             rule = "be a whole number from 0 to 2**32 - 1, or None"
@@ -327,6 +334,25 @@ class ExperimentSplit(_SplitOfExperiments):
             {k for unit in units[fold::n_splits] for k in unit}
             for fold in range(n_splits)
         ]
+
+
+def _inner(kappa: Array) -> list[bool]:
+    """Which points others surround: convex combinations of these, but for jitter.
+
+    Without scheduling values all but the first and the last.
+
+    >>> _inner(np.array([[0.0, 0.0], [0.0, 2.0], [1.0, 1.0], [2.0, 0.0], [2.0, 2.0]]))
+    [False, False, True, False, False]
+    """
+    if not kappa.shape[1] or len(kappa) < 3:
+        return [0 < k < len(kappa) - 1 for k in range(len(kappa))]
+    span = np.ptp(kappa, axis=0)
+    unit = (kappa - kappa.min(axis=0)) / np.where(span > 0.0, span, 1.0)
+    weighed = np.column_stack([unit, np.ones(len(unit))]).T
+    return [
+        nnls(np.delete(weighed, k, axis=1), weighed[:, k])[1] < _BESIDE
+        for k in range(len(unit))
+    ]
 
 
 class BlockedTimeSeriesSplit(_SplitOfExperiments):

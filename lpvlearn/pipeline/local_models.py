@@ -342,7 +342,8 @@ def identify_point(
             lti = _continuous(fitted.lti_, discretization, advice).balance()
         else:  # stable but for the integrators
             _continuous(rates.lti_, discretization, advice)
-            lti = fitted.lti_.to_continuous(discretization)
+            with collected():  # said of the rates
+                lti = fitted.lti_.to_continuous(discretization)
         found = LocalModel(
             lti,
             fitted.lti_.order,

@@ -21,20 +21,27 @@ _ROUNDING = 1e-8  # of the largest pole: an integrator's may lie so far to the r
 
 _LEVELS = 41  # of each scheduling variable, at which a form is looked at
 
+_BETWEEN = "The local models are stable; "
 _OVERSHOT = (
-    "The local models are stable; the interpolation between them overshoots, which "
+    f"{_BETWEEN}the interpolation between them overshoots, which "
     "interpolator=SplineLPV() does not."
 )
+_MIXED = f"{_BETWEEN}what is interpolated between them is not."
 
 
 def growth_rates(
-    lpv: LPVStateSpace, kappa: Array, longest: float, cause: str = _OVERSHOT
+    lpv: LPVStateSpace, kappa: Array, longest: float, cause: str | None = None
 ) -> Array:
     """Largest real part (1/s) of the frozen poles about each operating point.
 
     Half-way to its neighbours. What grows is told: the range, and the `cause`; what
-    does so by next to nothing over the `longest` record (seconds) counts as zero.
+    does so by next to nothing over the `longest` record (seconds) counts as zero. None
+    is what the interpolation lets expect.
     """
+    form = getattr(lpv.interpolator, "best_estimator_", lpv.interpolator)
+    if cause is None:
+        shape = getattr(form, "kind", "") == "pchip"  # which does not overshoot
+        cause = _MIXED if shape else _OVERSHOT
     model, ends = lpv.silenced(), neighbours(kappa)
     least = _GROWN / longest
     rates = _rates(model, kappa, least)

@@ -57,6 +57,8 @@ _LEAST_MARGIN = 1e-6
 _HOP_FIT = 0.03  # error of a fit so far off that better basins may lie beside its own
 _HOPS = (0.1, 0.3, 1.0) * 4  # sizes of the hops of logarithms: 10 %, to a factor of 3
 _HOP_RETURNS = 5  # to the fit itself, after which its basin counts as wide
+_MOST_SIGNS = 12  # parameters whose sign is changed, one at a time
+
 _HOP_ROUNDS = 4  # from ever better fits
 _HOP_GAIN = 1e-3  # relative decrease of the cost that is worth another round
 _FAINT = 0.03  # size of modes that only fill the order: seen, but hardly disturbing
@@ -209,7 +211,8 @@ def _rounds(
             break
     if fits and best > _HOP_FIT:
         fits = hopped_fits(problem, fits, rng)
-        certain = certain or agreeing(fits) >= AGREEING
+        exact = problem.is_exact(fits[0], enough)
+        certain = certain or exact or agreeing(fits) >= AGREEING
     return fits, certain
 
 
@@ -231,8 +234,17 @@ def hopped_fits(
     """Fits from perturbations of the best one, as long as they find a better basin.
 
     Far from the black box the least-squares error has many minima beside each other.
+    No factor leads to those of other signs: every one is changed where nothing tells
+    it.
     """
     lower, upper = problem.structure.lower, problem.structure.upper
+    for j in np.flatnonzero(~has_sign(problem.structure))[:_MOST_SIGNS]:
+        if time_is_up():
+            break
+        theta = fits[0].x.copy()
+        theta[j] *= -1.0
+        fit = problem.fit(np.clip(theta, lower, upper))
+        fits = sorted([*fits, *([] if fit is None else [fit])], key=_COST)
     for _ in range(_HOP_ROUNDS):
         best, returned = fits[0], 0
         for size in _HOPS:
@@ -486,8 +498,7 @@ def continuation_candidates(
     if box is None or len(box.A) == 0:
         return nothing
     count = _N_CONTINUED if thorough else _N_QUICK
-    lower, upper, ranges = structure.lower, structure.upper, structure.ranges
-    signed = (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
+    signed, upper = has_sign(structure), structure.upper
     rows = [nothing if structure.initial is None else structure.initial[None]]
     equations = structure.implicit is not None
     physical = seeds[(seeds > 0).all(1)][:count] if equations else nothing
@@ -507,6 +518,12 @@ def continuation_candidates(
         every = np.ones_like(signed)
         found.append(continued_fits(structure, box, physical, every)[0])
     return np.vstack(found)
+
+
+def has_sign(structure: GrayBoxStructure) -> NDArray[np.bool_]:
+    """Parameters whose bounds or ranges tell their sign, (n_params,)."""
+    lower, upper, ranges = structure.lower, structure.upper, structure.ranges
+    return (lower >= 0) | (upper <= 0) | (ranges[0] * ranges[1] > 0)
 
 
 def _natural_sizes(

@@ -50,6 +50,7 @@ from .integrating import (
     rates_of,
     sums_of,
     warn_if_useless,
+    without_direct,
 )
 from .local_fit import LocalFit
 from .missing_outputs import warn_of_many_pieces
@@ -623,8 +624,12 @@ class SubspaceLTI(
         self._single_output = np.asarray(y).ndim == 1
         flags = integrating_flags(self.integrating, read_outputs(y)[1])
         step = self._step_of(experiments)
-        table, rates = as_table(rates_of(experiments, flags, float(step)))
-        options = options_of_rates(table, flags, self.feedthrough, step)
+        moved = rates_of(experiments, flags, float(step))
+        table, rates = as_table(moved)
+        direct = self.feedthrough
+        if direct is True and self.method == "auto" and not flags.all():
+            direct = not without_direct(experiments, moved)
+        options = options_of_rates(table, flags, direct, step)
         rate_model = clone(self).set_params(**options)
         self.rates_ = inner = rate_model._fit_table(
             table, rates, rates=_labels_of(X, experiments, y)

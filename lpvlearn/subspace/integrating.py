@@ -22,8 +22,10 @@ from ..models.statespace import ModelPair, StateSpace
 from ..validation import has_one_axis, is_whole, shown
 from .constants import USELESS
 from .options import feedthrough_mask
+from .records import scale_records
 from .simulation_fit import Freedom, simulation_fit
 from .statistics import Evidence
+from .varx import find_feedback
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -103,6 +105,32 @@ def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:
         np.arange(len(experiments)), [len(e.rows) for e in experiments]
     )
     return table, y
+
+
+def without_direct(
+    experiments: Sequence[Experiment], rates: Sequence[Experiment]
+) -> bool:
+    """Whether D = 0 is taken: a controller answers the outputs within the sample.
+
+    That there is one the records of the outputs tell, or of the `rates`; that it
+    answers at once those of the outputs, as the inputs of the step act on rates in any
+    case.
+    """
+    of_outputs, of_rates = (
+        find_feedback(scale_records([(e.inputs, e.measured) for e in some]).records)
+        for some in (experiments, rates)
+    )
+    if of_outputs is None or not of_outputs.instantaneous:
+        return False
+    known = [f for f in (of_outputs, of_rates) if f is not None and not f.cut_off]
+    if not any(feedback.found for feedback in known):
+        return False
+    warn(
+        "A controller answers the outputs within the sample: of those that do not "
+        "integrate D = 0 was taken. If it needs a sample to answer, give `feedthrough` "
+        "as a table."
+    )
+    return True
 
 
 def options_of_rates(

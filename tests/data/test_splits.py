@@ -181,6 +181,25 @@ def test_out_of_fold_predictions_are_those_of_the_folds(few, pipeline):
     assert bft_score(y, predicted) > 96
 
 
+@pytest.mark.parametrize("jitter", [0.0, 0.1])
+def test_interior_points_of_a_grid_are_those_that_others_surround(jitter):
+    rng = np.random.default_rng(0)
+    corners = [(a, b) for a in (65, 95) for b in (0, 30)]
+    grid = [(a, b) for a in (65, 75, 85, 95) for b in (0, 15, 30)]
+    a, b = np.repeat(np.array(grid, float), 50, axis=0).T
+    a, b = (x + jitter * rng.standard_normal(len(x)) for x in (a, b))
+    table = pd.DataFrame({"run": np.repeat(range(12), 50), "a": a, "b": b})
+    cv = ExperimentSplit(
+        "all",
+        hold_out="operating_point",
+        interior=True,
+        experiment="run",
+        scheduling=["a", "b"],
+    )
+    held_out = [grid[table["run"].iloc[test[0]]] for _, test in cv.split(table)]
+    assert sorted(held_out) == sorted(set(grid) - set(corners))
+
+
 def test_grid_search_over_all_three_steps_refits_the_best(data, pipeline):
     X, y = data
     grid = [

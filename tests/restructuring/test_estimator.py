@@ -911,3 +911,23 @@ def test_a_parameter_of_zero_is_perturbed_too():
     fit.params_ = np.array([2.0, 3.0, 0.0])
     found = fit.perturbation_check(truth, n_restarts=3)
     assert np.abs(found.to_numpy()).max() < 1e-4
+
+
+@pytest.mark.parametrize("signs", [(1, 1, -1), (1, -1, 1), (-1, 1, 1)])
+def test_signs_that_nothing_tells_are_tried(signs):
+    """M = I + p p.T: first guesses of one sign, and no factor leads to others."""
+    w = 2 * np.pi * 6.0 * np.array([1.0, 6.27, 17.5])
+    drive, show = np.array([0.1, 0.5, 1.1]), np.array([2.0, -2.0, 2.0])
+
+    def matrices(p):
+        M = np.linalg.inv(np.eye(3) + np.outer(p, p))
+        zero, D = np.zeros((3, 3)), np.diag(0.016 * w)
+        A = np.block([[zero, np.eye(3)], [-M @ np.diag(w**2), -M @ D]])
+        B = np.append(np.zeros(3), M @ drive)[:, None]
+        return A, B, np.append(np.zeros(3), show)[None], np.zeros((1, 1))
+
+    guess = {"p1": 0.3, "p2": 0.3, "p3": 0.3}
+    structure = GrayBoxStructure.from_function(matrices, guess)
+    true = np.array(signs) * [0.65, 0.35, 0.72]
+    model = GrayBoxRestructurer(structure).fit_model(StateSpace(*matrices(true)[:3]))
+    assert model.relative_error_ < 1e-9

@@ -249,3 +249,23 @@ def test_rates_of_an_output_that_answers_at_once_do_not_drop_out():
         warnings.simplefilter("always")
         SubspaceLTI(integrating=True).fit(u, y)
     assert not any("drops out" in str(one.message) for one in caught)
+
+
+@pytest.mark.filterwarnings("ignore:The inputs know the noise")
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_controller_that_answers_at_once_is_no_feedthrough_of_the_others(seed):
+    """The records of the outputs tell so, not those of the rates."""
+    rng, step = np.random.default_rng(seed), 0.02
+    plant = StateSpace([[0, 1], [0, -2]], [[0], [5]], np.eye(2)).to_discrete(step)
+    x, u, y = np.zeros(2), np.zeros((3000, 1)), np.zeros((3000, 2))
+    for k in range(3000):
+        y[k] = x + [0.01, 0.05] * rng.standard_normal(2)
+        u[k] = 0.5 * rng.standard_normal() - 20.0 * y[k, 0] - 2.0 * y[k, 1]
+        x = plant.A @ x + plant.B @ u[k]
+    local = SubspaceLTI(sampling_time=step, integrating=[0])
+    with pytest.warns(UserWarning, match="within the sample: of those that do not int"):
+        local.fit(u, y)
+    assert not local.lti_.D.any()
+    gain = local.lti_.to_continuous().frequency_response([3.0])[0]
+    true = plant.to_continuous().frequency_response([3.0])[0]
+    assert np.linalg.norm(gain - true) < 0.05 * np.linalg.norm(true)
