@@ -416,17 +416,26 @@ def _fit_together(
     n_joint: int,
     settings: Settings,
 ) -> _Together:
-    """Plant and noise of `n_joint` states, told apart; `order` is that of the plant."""
-    free, fitted = settings.free, None
-    joint = _innovation_form(subspace, n_joint)
+    """Plant and noise of `n_joint` states or more, told apart.
+
+    `order` is that of the plant. States of the noise that the subspace does not show
+    would be taken from those of a given one.
+    """
+    free, n = settings.free, subspace.n_columns
+    found: list[tuple[_Predictor | None, _Innovation]]
+    found = [(None, _innovation_form(subspace, n_joint))]
     if settings.refine:
-        fitted, joint = _refined(joint, records, free)
-        if order is None:
-            fitted, joint = _with_more_states(fitted, joint, subspace, records, free)
-        if fitted.model.blocks is None:  # it could not be refined
+        first = _refined(found[0][1], records, free)
+        found = [first]
+        if not settings.n_noise_states:
+            more = _with_more_states(*first, subspace, records, free)
+            found = [more] if order is None or more[1] is first[1] else [more, first]
+    for fitted, joint in found:
+        if fitted is not None and fitted.model.blocks is None:  # it was not refined
             fitted = None
-    split, n = _split(joint, fitted, order, subspace.n_columns), subspace.n_columns
-    if split is not None:
+        split = _split(joint, fitted, order, n)
+        if split is None:
+            continue
         T, kept = split
         apart = joint.transformed(T)
         if fitted is None or kept.all():

@@ -855,3 +855,31 @@ def test_a_clean_output_keeps_its_part_of_a_given_order(seed):
     error = (y - model.predict_ahead(u[:, None], y))[20:]
     said = np.sqrt(np.diagonal(model.predictor_.covariance))
     np.testing.assert_allclose(error.std(axis=0), said, rtol=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_states_of_the_disturbance_are_not_taken_from_a_given_order(seed):
+    """A turbine's drivetrain in wind, whose state the subspace hardly shows."""
+    rng, step, n = np.random.default_rng(seed), 0.05, 6000
+    rotor, generator, stiffness, loss, ratio = 4.4e7, 5.03e6, 8.68e8, 6.2e6, 97.0
+    damping, torque = 2.78e6, 5.25e5
+    A = np.array(
+        [
+            [-(loss + damping) / rotor, loss / rotor, -stiffness / rotor],
+            [loss / generator, -loss / generator, stiffness / generator],
+            [1.0, -1.0, 0.0],
+        ]
+    )
+    B = [[0, torque / rotor], [-1e3 * ratio / generator, 0], [0, 0]]
+    plant = StateSpace(A, B, [[0, 926.0, 0], [9.55, 0, 0]]).to_discrete(step)
+    fast, slow = np.sign(rng.standard_normal((2, n)))
+    u = fast[::3].repeat(3)[:n] + 1.5 * slow[::60].repeat(60)[:n]
+    wind = lfilter([1.0], [1.0, -0.98], np.sqrt(1 - 0.98**2) * rng.standard_normal(n))
+    y = plant.simulate(np.column_stack([u, 0.15 * wind]))
+    y += [1.0, 0.01] * rng.standard_normal(y.shape)
+    model = SubspaceLTI(3, method="pbsid", feedthrough=False, sampling_time=step)
+    model.fit(u[:, None], y)
+    poles, true = model.lti_.poles(), plant.poles()
+    slow = true[np.argmin(np.abs(true - 1.0))]
+    k = int(np.argmin(np.abs(poles - slow)))
+    assert abs(poles[k].real - slow.real) < 2.5 * model.poles_std_[k].real
