@@ -25,7 +25,7 @@ from ..models.statespace import (
     balanced_models,
     with_signs_of,
 )
-from ..restructuring.known_poles import integrators
+from ..restructuring.known_poles import hidden_integrators, integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
 from ..subspace.constants import lasting
@@ -185,9 +185,9 @@ def of_structure(local: Any, structure: Any) -> tuple[Any, bool]:
     free = isinstance(given, str) and given == "auto"
     if not (free and isinstance(structure, GrayBoxStructure)):
         return local, False
-    order = structure.order
+    order = structure.order - hidden_integrators(structure)
     if _integrates(local):  # the model of the rates has not the integrators
-        order -= integrators(structure)
+        order = structure.order - integrators(structure)
     return clone(local).set_params(order=order), isinstance(local, SubspaceLTI)
 
 

@@ -48,6 +48,8 @@ Complex = NDArray[np.complex128]
 Flags = NDArray[np.bool_]
 
 _DRAWS = 3  # random parameters at which a pole must be, to be there for all
+_TINY = np.finfo(float).tiny
+
 _FIXED = 1e-10  # relative singular value or difference that is rounding of a structure
 _ROUNDED = 1e-6  # relative error of the eigenvalues of a chain, which rounding splits
 _CLEAN = 1e-12  # entry of a unit eigenvector that is rounding
@@ -213,6 +215,24 @@ def integrators(structure: GrayBoxStructure) -> int:
     if not thetas or 0.0 not in _fixed_poles(structure, thetas, None):
         return 0
     return _directions(_blocks(structure, thetas[0])[0], 0.0, _FIXED).shape[1]
+
+
+def hidden_integrators(structure: GrayBoxStructure) -> int:
+    """How many of them no output shows, or no input reaches, for all parameters.
+
+    As positions where rates are measured and no spring pulls: no record has them.
+    """
+    n, thetas = structure.order, _drawn(structure)
+
+    def lost(theta: Array) -> list[int]:
+        S = structure.map.system_matrix(theta)
+        S = S / np.maximum(np.linalg.norm(S, axis=1, keepdims=True), _TINY)
+        T = S.T / np.maximum(np.linalg.norm(S.T, axis=1, keepdims=True), _TINY)
+        return [n - int(np.linalg.matrix_rank(M[:, :n], _FIXED)) for M in (S, T)]
+
+    if not (n and thetas):
+        return 0
+    return int(np.min([lost(theta) for theta in thetas], axis=0).max())
 
 
 def _without(A: Array, pole: complex) -> Array | Complex:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from sklearn.exceptions import ConvergenceWarning
 
-from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace
+from lpvlearn import GrayBoxRestructurer, GrayBoxStructure, StateSpace, SubspaceLTI
+from lpvlearn.pipeline.local_models import of_structure
 from lpvlearn.restructuring.error_system import series
-from lpvlearn.restructuring.known_poles import divide
+from lpvlearn.restructuring.known_poles import divide, hidden_integrators
 
 from .conftest import disguised, target_of
 
@@ -373,3 +374,19 @@ def test_the_integrator_of_fast_systems_is_told_from_their_slow_pole():
     box = structure.model({"a": 1.0, "w": 2e6, "b": 1e6})
     (step,) = divide(structure, None, [target_of(box)])[1].steps
     assert np.isclose(step.instead, -1.0)
+
+
+def test_positions_that_no_output_shows_are_no_states_of_the_records():
+    free = {"M": [["m", 0], [0, 1]], "D": [["d", 0], [0, 1]], "F": np.eye(2)}
+    for K, outputs, count in (
+        ([[0, 0], [0, 0]], "velocity", 2),
+        ([[0, 0], [0, 0]], "position", 0),
+        ([["k", 0], [0, 0]], "velocity", 1),
+        ([["k", 0], [0, 1e-6]], "velocity", 0),
+    ):
+        structure = GrayBoxStructure.mechanical(**free, K=K, outputs=outputs)
+        assert hidden_integrators(structure) == count
+        local, _ = of_structure(SubspaceLTI(), structure)
+        assert local.order == 4 - count
+    gain = GrayBoxStructure.from_template(A=[], B=[], C=[], D=[["d"]])
+    assert hidden_integrators(gain) == 0
