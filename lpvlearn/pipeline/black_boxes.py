@@ -51,6 +51,7 @@ _RELIEF, _NEAR = 0.5, 0.1
 # Error of points left out, in the mean, from which fewer states are tried, so many of
 # these further than the best
 _UNFORESEEN, _FURTHER = 0.3, 2
+_MANY = 12  # states, of which fewer are not tried
 
 # An error of the others beside points whose records tell fewer states that is told
 _SPOILT = 0.05
@@ -127,9 +128,11 @@ def foreseen_order(
     to point, and an interpolation of them is anything. The models of a lower order
     (`identified` of it, none where they are not) are left out in turn as those of the
     common one are, and compared with what the records themselves tell. Arguments as of
-    `aligned_black_boxes`; told.
+    `aligned_black_boxes`; told. Of very many states, as dead times take, that is left:
+    it would take minutes.
     """
-    if all(model.own is None for model in local):
+    order = local[0].order - len(local[0].integrating)
+    if order > _MANY or all(model.own is None for model in local):
         return None
     models, rate = _comparable(local, u, y, longest)
     every = range(len(models))
@@ -146,7 +149,7 @@ def foreseen_order(
         errors = errors_left_out(structure, truth, SplineLPV(), kappa, theta)
         return _Foreseeable(theta, errors).mean()
 
-    common, order = error(models), local[0].order - len(local[0].integrating)
+    common = error(models)
     poor = _with_fewer_states(local)
     rich = [k for k in every if k not in poor]
     if poor and len(rich) > 1 and len({models[k].order for k in rich}) == 1:
