@@ -90,6 +90,7 @@ from .structured_models import (
     offsets_of_points,
     over_points,
     restructure_points,
+    with_foreseen,
     without_structure,
 )
 from .together import through_black_boxes
@@ -245,7 +246,8 @@ list, default=None
         The fitted restructurers, empty without one.
     parameters_ : DataFrame of shape (n_points, n_params)
         Gray-box parameters, one row per operating point: the efficient ones, where
-        `efficient` applies.
+        `efficient` applies. Of those that the record of a point does not tell, as where
+        a mode vanishes, what the other points foresee, with a warning.
     hinf_parameters_ : DataFrame of shape (n_points, n_params)
         Those of the H-infinity optimum; equal to `parameters_` where that is kept.
     parameters_covariance_ : ndarray of shape (n_points, n_params, n_params)
@@ -572,7 +574,7 @@ list, default=None
                 ways = without_structure(*known, form, every=bool(moving))
                 found = best_along(ways, form, moving, self.sampling_time_)
             else:
-                found = restructure_points(restructurer, *known, limit)
+                found = with_foreseen(restructure_points(restructurer, *known, limit))
             self.restructurers_ = found.restructurers
 
         with watch.step("interpolation and report"):  # step 5: parameters over kappa

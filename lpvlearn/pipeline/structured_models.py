@@ -22,6 +22,7 @@ from ..exceptions import collected, retold, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import points_of_work
 from ..lpv.model import LPVStateSpace
+from ..lpv.weighting import inner_places
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..restructuring.deadline import bounded, time_is_up
 from ..restructuring.minimise_covariance import Estimate
@@ -38,6 +39,7 @@ from .black_boxes import (
 )
 from .branches import Doubt, tied_branches
 from .canonical import canonical_black_boxes, is_better_form
+from .left_out import interpolated_without, largest_difference
 from .local_models import LocalModel, motions
 from .runner import Done, PointRunner, place_of, tell_skipped
 
@@ -50,6 +52,13 @@ _SWEEPS = 4  # passes over the points: help travels that far from a good one
 _NEIGHBOURS = 2  # points that help one: those to either side along one variable
 
 _FIRST_SHARE = 0.75  # of `max_time`, before the points help one another
+
+# Of parameters at a point: the standard deviation, by those of the others, from which
+# these may foresee them better; points that are enough for that; the error, in the
+# largest gain of the black box, up to which a model is what the record tells; and of
+# others that are foreseen elsewhere, by so many times what is usual
+_UNTOLD, _FORESEEING, _NEAR = 10.0, 4, 0.1
+_ASTRAY, _LIKE = 5.0, 0.01
 
 _BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
 
@@ -156,6 +165,74 @@ def restructure_points(
     return StructuredModels(
         points, local, helped[0].structure_, theta, covariance, models, helped
     )
+
+
+def with_foreseen(found: StructuredModels) -> StructuredModels:
+    """The models with parameters of a point that its record does not tell.
+
+    As those of a mode that vanishes there: they may be anything, and a curve through
+    all points would follow them. What the others foresee is taken where it is more
+    certain, by what they miss when they are left out, than the point's own standard
+    deviation, and where with it the model is what the record does tell. Told.
+    """
+    kappa, n = found.points.kappa, len(found.theta)
+    std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    doubted = std > _UNTOLD * np.median(std, axis=0)
+    rest = np.asarray(~doubted.any(axis=1), dtype=bool)
+    if np.isnan(std).any() or rest.all() or rest.sum() < max(_FORESEEING, n - n // 3):
+        return found
+    foreseen = partial(
+        interpolated_without,
+        form=AutoLPV(),
+        kappa=kappa,
+        theta=found.theta,
+        covariance=found.covariance,
+    )
+    missed = []
+    for out in inner_places(kappa[rest]):
+        without = np.asarray(~rest, dtype=bool)
+        without[np.flatnonzero(rest)[out]] = True
+        places = kappa[rest][out]
+        values = foreseen(without, places=places)
+        if values is not None:
+            missed.append(values - found.theta[rest][out])
+    values = foreseen(np.asarray(~rest, dtype=bool), places=kappa[~rest])
+    if not missed or values is None:
+        return found
+    scatter = np.sqrt(np.mean(np.vstack(missed) ** 2, axis=0))
+    scatter = np.maximum(scatter, np.median(std, axis=0))
+    low, high = kappa[rest].min(axis=0), kappa[rest].max(axis=0)
+    theta, covariance = found.theta.copy(), found.covariance.copy()
+    models, told, worst = list(found.models), [], 0.0
+    names = np.array(found.structure.parameter_names, dtype=object)
+    for k, own in zip(np.flatnonzero(~rest).tolist(), values, strict=True):
+        untold = doubted[k] & (std[k] > scatter)
+        if not (untold.any() and ((low <= kappa[k]) & (kappa[k] <= high)).all()):
+            continue
+        # where one is anything, others may be, with a deviation that is none
+        astray = untold | (np.abs(own - theta[k]) > _ASTRAY * scatter)
+        for taken, most in ((astray, _LIKE), (untold, _NEAR)):
+            row = np.where(taken, own, theta[k])
+            row = np.clip(row, found.structure.lower, found.structure.upper)
+            delay = found.local[k].lti.input_delay
+            model = found.structure.model(row).with_input_delay(delay)
+            error = largest_difference(model, found.local[k].lti)
+            if not (model.is_stable and error < most):
+                continue
+            theta[k], models[k], worst = row, model, max(worst, error)
+            P = np.where(taken | taken[:, None], 0.0, covariance[k])
+            covariance[k] = P + np.diag(np.where(taken, scatter, 0.0) ** 2)
+            what = ", ".join(map(repr, names[taken]))
+            told.append(f"{what} at {place_of(k, kappa)}")
+            break
+    if told:
+        warn(
+            f"the record does not tell {'; '.join(told)}, as where a mode vanishes: "
+            "the LPV model takes what the other points foresee there instead. Within "
+            f"{100.0 * worst:.2g} % of the largest gain it is what the record does "
+            "tell. Give values or bounds of these parameters if they are known."
+        )
+    return found._replace(theta=theta, covariance=covariance, models=models)
 
 
 def without_structure(

@@ -1,6 +1,7 @@
 """Step 4 at the operating points: covariances, what is kept, time that is bounded."""
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -22,8 +23,10 @@ from lpvlearn import (
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.pipeline.local_models import LocalModel, identify_point
 from lpvlearn.pipeline.structured_models import (
+    StructuredModels,
     covariance_of_parameters,
     restructure_points,
+    with_foreseen,
 )
 
 from ..conftest import (
@@ -455,3 +458,53 @@ def test_max_time_is_shared_by_the_points_and_told():
 def test_no_time_is_refused(spring, seconds):
     with pytest.raises(ValueError, match="`max_time` must be a positive number"):
         spring_pipeline(max_time=seconds).fit(*spring[:2])
+
+
+def with_a_mode_that_vanishes(c2):
+    """Two modes at seven points, the second one not seen where `c2` is zero."""
+    structure = GrayBoxStructure.from_template(
+        [[0, 1, 0, 0], ["-k1", "-d1", 0, 0], [0, 0, 0, 1], [0, 0, "-k2", "-d2"]],
+        [[0], [1], [0], [1]],
+        [["c1", 0, "c2", 0]],
+    )
+    kappa = np.linspace(-1.0, 1.0, len(c2))[:, None]
+    values = {"k1": 4.0, "d1": 0.4, "k2": 100.0, "d2": 1.0, "c1": 1.0, "c2": c2}
+    names = structure.parameter_names
+    theta = np.column_stack([np.broadcast_to(values[n], len(c2)) for n in names])
+    known = np.tile(np.diag((1e-3 * np.abs(theta).max(axis=0)) ** 2), (len(c2), 1, 1))
+    models = [structure.model(row) for row in theta]
+    points = SimpleNamespace(kappa=kappa)
+    local = [SimpleNamespace(lti=model) for model in models]
+    return StructuredModels(points, local, structure, theta, known, models, [])
+
+
+def test_parameters_that_a_record_does_not_tell_are_foreseen_by_the_others():
+    true = with_a_mode_that_vanishes(np.linspace(-20.0, 20.0, 7))
+    theta, covariance = true.theta.copy(), true.covariance.copy()
+    k2, d2 = map(true.structure.parameter_names.index, ("k2", "d2"))
+    theta[3, [k2, d2]] = 9.0, 0.02
+    covariance[3, k2, k2], covariance[3, d2, d2] = 30.0**2, 4.0**2
+    spoilt = true._replace(theta=theta, covariance=covariance)
+    with pytest.warns(
+        UserWarning, match="does not tell 'd2', 'k2' at op"
+    ):
+        found = with_foreseen(spoilt)
+    np.testing.assert_allclose(found.theta, true.theta, rtol=1e-6, atol=1e-6)
+    deviation = np.sqrt(np.diagonal(found.covariance[3]))
+    np.testing.assert_allclose(deviation[[k2, d2]], [0.1, 1e-3])
+    # not where the record contradicts
+    bent = true.theta.copy()
+    bent[3, k2] = 60.0
+    seen = with_a_mode_that_vanishes(np.full(7, 20.0))
+    local = list(seen.local)
+    bent[:, true.structure.parameter_names.index("c2")] = 20.0
+    local[3] = SimpleNamespace(lti=true.structure.model(bent[3]))
+    kept = with_foreseen(seen._replace(theta=bent, covariance=covariance, local=local))
+    np.testing.assert_array_equal(kept.theta, bent)
+
+
+def test_what_all_records_tell_is_left_alone():
+    true = with_a_mode_that_vanishes(np.linspace(10.0, 20.0, 7))
+    assert with_foreseen(true) is true
+    unknown = true._replace(covariance=np.full_like(true.covariance, np.nan))
+    assert with_foreseen(unknown) is unknown
