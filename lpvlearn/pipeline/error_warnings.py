@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 # Errors that are told: constants, of a search of so many steps, leave less than this
 # share of their squares, or the inputs explain more than this share of the output.
 _CONSTANT, _STEPS, _OF_OUTPUT = 0.25, 15, 0.1
+
+# Errors with scheduling variables held, of those with them as measured, that are told
+_HELD, _SEEN = 0.7, 1e-3  # and of the outputs
 
 
 def tell_of_errors(
@@ -121,3 +124,30 @@ def _causes(record: Record, center: Array, span: Array) -> Array:
     u = record.u - record.u.mean(axis=0)
     products = [u * column[:, None] for column in kappa.T]
     return np.hstack([u, *products, kappa - kappa.mean(axis=0)])
+
+
+def tell_of_noisy_scheduling(
+    model: LPVStateSpace,
+    records: Sequence[Record],
+    errors: Sequence[Array],
+    held: Sequence[Array],
+    names: Sequence[Hashable],
+) -> None:
+    """Tell where scheduling variables do harm, as measured in local `records`.
+
+    Where errors are smaller with these `held` at their means. By points of work the
+    noise of a sensor moves the outputs at once.
+    """
+    own, other = (np.sum(np.vstack(e) ** 2, axis=0) for e in (errors, held))
+    share = np.sqrt(other / np.where(own > 0.0, own, np.inf))
+    moved = sum(np.sum((r.y - r.y.mean(axis=0)) ** 2, axis=0) for r in records)
+    worse = (share < _HELD) & (own > _SEEN**2 * moved)
+    if worse.any():
+        k = int(np.argmin(np.where(worse, share, np.inf)))
+        shown = list(model.scheduling_names or range(1, model.n_scheduling + 1))
+        warn(
+            f"the noise of the scheduling variables, {shown}, moves output "
+            f"{names[k]!r}: with their means over every local experiment in place of "
+            f"them the errors are {100.0 * share[k]:.2g} % as large. Smooth their "
+            "columns before `fit` and `predict`, or give their set-points."
+        )

@@ -62,7 +62,7 @@ from ..validation import (
 )
 from .bands import output_errors
 from .black_boxes import balanced_entries
-from .error_warnings import tell_of_errors
+from .error_warnings import tell_of_errors, tell_of_noisy_scheduling
 from .local_models import (
     common_delay,
     identify_point,
@@ -685,14 +685,26 @@ def local_covariance(form: Any, found: StructuredModels) -> Array | None:
 def local_output_errors(
     model: LPVStateSpace, found: StructuredModels, sampling_time: float
 ) -> pd.DataFrame:
-    """`output_errors` of an LPV model along some local experiments of each point."""
+    """`output_errors` of an LPV model along some local experiments of each point.
+
+    Tells of scheduling variables whose noise the model takes for motion.
+    """
     runs = [e for group in found.points.experiments for e in group[:_LOOKED_AT]]
+    records = [_record(e, sampling_time) for e in runs]
+    still = [r._replace(kappa=0.0 * r.kappa + r.kappa.mean(axis=0)) for r in records]
     quiet, own = model.silenced(), _own_of_local(found)
+    names = model.output_names or range(1, model.n_outputs + 1)
+
+    def along(some: Sequence[Record]) -> list[Array]:
+        return [_errors(quiet, e, r, own) for e, r in zip(runs, some, strict=True)]
+
     try:
-        errors = [_errors(quiet, e, _record(e, sampling_time), own) for e in runs]
+        errors = along(records)
+        if any(np.ptp(r.kappa, axis=0).any() for r in records):
+            tell_of_noisy_scheduling(model, records, errors, along(still), names)
     except ValueError:  # it diverges, or has no matrices there
         errors = [np.full((1, model.n_outputs), np.nan)]
-    return output_errors(model.output_names or range(1, model.n_outputs + 1), errors)
+    return output_errors(names, errors)
 
 
 def _own_of_local(found: StructuredModels) -> Own:

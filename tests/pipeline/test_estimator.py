@@ -16,6 +16,7 @@ from lpvlearn import (
     GrayBoxRestructurer,
     LocalLPVPipeline,
     PolynomialLPV,
+    StateSpace,
     SubspaceLTI,
     bft_score,
     compare_models,
@@ -848,3 +849,29 @@ def test_points_of_work_are_where_drifts_begin(structured):
     ]
     np.testing.assert_allclose(rest, 5.0, atol=0.02)
     assert (model.report_["local_BFT"] > 98.0).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_scheduling_whose_noise_moves_the_outputs_is_told(noise):
+    """A lag about a point of work: y = 100 kappa at rest."""
+    rng, step = np.random.default_rng(0), 0.1
+    rows = []
+    for run, kappa in enumerate([0.0, 0.5, 1.0]):
+        plant = StateSpace(-1.0 - kappa, 1.0 + kappa, 1.0)
+        u = np.sign(rng.standard_normal(100)).repeat(5)
+        y = 100.0 * kappa + plant.simulate(u, sampling_time=step)[:, 0]
+        y += 0.01 * rng.standard_normal(500)
+        level = kappa + noise * rng.standard_normal(500)
+        columns = {"run": run, "t": step * np.arange(500), "level": level, "u": u}
+        rows.append(pd.DataFrame({**columns, "y": y}))
+    table = pd.concat(rows, ignore_index=True)
+    roles = {"inputs": "u", "scheduling": "level", "experiment": "run", "time": "t"}
+    pipeline = LocalLPVPipeline(SubspaceLTI(1, feedthrough=False), **roles)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        pipeline.fit(table.drop(columns="y"), table[["y"]])
+    said = [
+        str(one.message) for one in told if "noise of the sched" in str(one.message)
+    ]
+    assert len(said) == (noise > 0.0)
+    assert all("'level'" in text and "'y'" in text for text in said)

@@ -485,9 +485,7 @@ def test_parameters_that_a_record_does_not_tell_are_foreseen_by_the_others():
     theta[3, [k2, d2]] = 9.0, 0.02
     covariance[3, k2, k2], covariance[3, d2, d2] = 30.0**2, 4.0**2
     spoilt = true._replace(theta=theta, covariance=covariance)
-    with pytest.warns(
-        UserWarning, match="does not tell 'd2', 'k2' at op"
-    ):
+    with pytest.warns(UserWarning, match="does not tell 'd2', 'k2' at op"):
         found = with_foreseen(spoilt)
     np.testing.assert_allclose(found.theta, true.theta, rtol=1e-6, atol=1e-6)
     deviation = np.sqrt(np.diagonal(found.covariance[3]))
