@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _CONSTANT, _STEPS, _OF_OUTPUT = 0.25, 15, 0.1
 
 # Errors with scheduling variables held, of those with them as measured, that are told
-_HELD, _SEEN = 0.7, 1e-3  # and of the outputs
+_HELD, _SEEN = 0.7, 0.01  # and of the outputs
 
 
 def tell_of_errors(

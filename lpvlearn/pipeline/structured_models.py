@@ -177,7 +177,11 @@ def with_foreseen(found: StructuredModels) -> StructuredModels:
     """
     kappa, n = found.points.kappa, len(found.theta)
     std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-    doubted = std > _UNTOLD * np.median(std, axis=0)
+    usual = np.median(std, axis=0)
+    ratio = std / np.where(usual > 0.0, usual, np.inf)
+    # but for a record that tells less of all parameters: covariances weigh that
+    least = ratio.min(axis=1, initial=np.inf, keepdims=True)
+    doubted = ratio > _UNTOLD * np.maximum(least, 1.0)
     rest = np.asarray(~doubted.any(axis=1), dtype=bool)
     if np.isnan(std).any() or rest.all() or rest.sum() < max(_FORESEEING, n - n // 3):
         return found
@@ -200,7 +204,7 @@ def with_foreseen(found: StructuredModels) -> StructuredModels:
     if not missed or values is None:
         return found
     scatter = np.sqrt(np.mean(np.vstack(missed) ** 2, axis=0))
-    scatter = np.maximum(scatter, np.median(std, axis=0))
+    scatter = np.maximum(scatter, usual)
     low, high = kappa[rest].min(axis=0), kappa[rest].max(axis=0)
     theta, covariance = found.theta.copy(), found.covariance.copy()
     models, told, worst = list(found.models), [], 0.0
