@@ -504,5 +504,9 @@ def test_parameters_that_a_record_does_not_tell_are_foreseen_by_the_others():
 def test_what_all_records_tell_is_left_alone():
     true = with_a_mode_that_vanishes(np.linspace(10.0, 20.0, 7))
     assert with_foreseen(true) is true
+    short = true.covariance.copy()
+    short[3] *= 400.0  # a short record: its covariance weighs it
+    known = true._replace(covariance=short)
+    assert with_foreseen(known) is known
     unknown = true._replace(covariance=np.full_like(true.covariance, np.nan))
     assert with_foreseen(unknown) is unknown
