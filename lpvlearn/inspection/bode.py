@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..data.experiments import as_numbers
 from ..models.frequencies import frequency_axis
 from ..models.statespace import StateSpace
-from ..validation import flag
 from .drawing import (
     axes_grid,
     by_name,
@@ -22,6 +21,7 @@ from .drawing import (
     names_of,
     tidy,
     units_of,
+    whole,
     with_unit,
 )
 from .fitted import check_model, models_of, places_of, unwrapped, with_others
@@ -271,7 +271,7 @@ class BodeDisplay:
         both = with_others(own, others)
         models = {name: both[name] for name in [*others, *both]}
         std = None
-        if flag("uncertainty", uncertainty):
+        if whole("uncertainty", uncertainty, range(2)):
             omega = frequency_axis(list(models.values())) if omega is None else omega
             std = _uncertainty_of(unwrapped(estimator), own, kappa, omega)
         return cls.from_models(
@@ -297,7 +297,7 @@ class BodeDisplay:
         BodeDisplay
         """
         n_outputs, n_inputs = len(self.output_names), len(self.input_names)
-        phase = flag("phase", phase)
+        phase = bool(whole("phase", phase, range(2)))
         kinds = 2 if phase else 1
         self.figure_, axes = axes_grid(
             ax,

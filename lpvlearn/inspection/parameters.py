@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
 from ..data.experiments import as_numbers
-from ..validation import flag
 from .drawing import (
     axes_grid,
     by_name,
@@ -275,7 +274,7 @@ class ParameterDisplay:
             name = "restructured" if pipeline.restructurers_ else "balanced"
         table = pipeline.parameters_
         known: dict[str, Any] = {}
-        asked = uncertainty is None or flag("uncertainty", uncertainty)
+        asked = uncertainty is None or whole("uncertainty", uncertainty, range(2))
         if asked and uncertainty is not None:
             pipeline.lpv_.covariance_root()  # refuses where there is none
         if asked:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import as_numbers
-from ..validation import flag
 from .drawing import (
     MUTED,
     axes_grid,
@@ -19,6 +18,7 @@ from .drawing import (
     labels_of,
     legend_above,
     tidy,
+    whole,
 )
 from .fitted import fitted_pipeline, scheduling_labels
 
@@ -220,7 +220,7 @@ class PoleDisplay:
         panels = [self._draw(j, one) for j, one in enumerate(self.axes_)]
         self.points_, self.local_points_ = panels[0]
         self.ax_.set_ylabel("Imaginary part (rad/s)")
-        if flag("damping", damping):
+        if whole("damping", damping, range(2)):
             for one in self.axes_:
                 _draw_damping(one)
         drawable(self.figure_)

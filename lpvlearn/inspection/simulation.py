@@ -19,7 +19,6 @@ from ..data.experiments import (
 from ..data.timestamps import time_in_seconds
 from ..metrics.scorers import check_options, simulate
 from ..metrics.scores import best_fit
-from ..validation import flag
 from .drawing import (
     ACCENT,
     axes_grid,
@@ -30,6 +29,7 @@ from .drawing import (
     names_of,
     tidy,
     units_of,
+    whole,
     with_unit,
 )
 from .fitted import units_for, unwrapped
@@ -249,7 +249,7 @@ class SimulationDisplay:
         """
         check_options(initial_state)
         estimator = unwrapped(estimator)
-        uncertainty = flag("uncertainty", uncertainty)
+        uncertainty = bool(whole("uncertainty", uncertainty, range(2)))
         if uncertainty and (
             initial_state != "rest" or not hasattr(estimator, "prediction_std")
         ):
