@@ -43,6 +43,8 @@ Array = NDArray[np.float64]
 
 _FAINT = 1e-3  # weight of an estimate beside an output that is known
 
+_GROWS = np.log(1e8)  # over an experiment: no simulation tells levels then
+
 
 class Simulator(NamedTuple):
     """A model with the constants of its fit.
@@ -205,9 +207,12 @@ class Simulator(NamedTuple):
         """1 where an experiment has a level that those of the fit did not have, or 0.
 
         And its own unknowns, by simulation, whose errors count by `size`; None where
-        that diverges.
+        that diverges, or grows so far that rounding decides.
         """
         y = experiment.measured
+        largest = np.abs(self.lti.poles()).max(initial=0.0)
+        if len(y) * np.log(max(largest, 1.0)) > _GROWS:
+            return 0, None
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 responses, error = self._unexplained(
