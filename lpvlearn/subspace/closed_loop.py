@@ -427,7 +427,7 @@ def _fit_together(
     if settings.refine:
         first = _refined(found[0][1], records, free)
         found = [first]
-        if not settings.n_noise_states:
+        if order is None or not settings.n_noise_states:
             more = _with_more_states(*first, subspace, records, free)
             found = [more] if order is None or more[1] is first[1] else [more, first]
     for fitted, joint in found:
