@@ -52,6 +52,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -307,9 +308,7 @@ class ExperimentSplit(_SplitOfExperiments):
         if self.hold_out == "operating_point":
             units = [np.flatnonzero(point == k).tolist() for k in range(max(point) + 1)]
             if interior:
-                units = [
-                    unit for unit, k in zip(units, _inner(kappa), strict=True) if k
-                ]
+                units = list(compress(units, _inner(kappa)))
         n_units = len(units)
         if shuffle:
             rule = "be a whole number from 0 to 2**32 - 1, or None"

@@ -153,10 +153,12 @@ class TableSimulator(BaseEstimator):
                 f"`scheduling` must name the {self.model.n_scheduling} column(s) of X "
                 "that the LPV model follows. Got None."
             )
-        step = getattr(self.model, "sampling_time", None)
-        own = None if step is True else step
-        options |= {"split": True, "sampling_time": self.sampling_time}
-        options |= {"fitted_step": own}
+        own = getattr(self.model, "sampling_time", None)
+        options |= {
+            "split": True,
+            "sampling_time": self.sampling_time,
+            "fitted_step": None if own is True else own,
+        }
         found = read_runs(self, X, y, **options)
         check_inputs(found, self.model.n_inputs)
         return found

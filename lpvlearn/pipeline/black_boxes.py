@@ -27,6 +27,7 @@ from ..models.statespace import StateSpace, with_signs_of
 from ..structures.structure import GrayBoxStructure
 from ..validation import listed
 from .left_out import (
+    NEAR,
     UNLIKE,
     changed,
     errors_left_out,
@@ -46,7 +47,7 @@ _FORESEEN, _CLEARLY, _PLAINLY = 0.01, 0.8, 0.5
 
 # Of points whose states may be noise: the share of the errors of the others that is
 # left without them, and the error of what these foresee, for which it is taken
-_RELIEF, _NEAR = 0.5, 0.1
+_RELIEF = 0.5
 
 # Error of points left out, in the mean, from which fewer states are tried, so many of
 # these further than the best
@@ -316,7 +317,7 @@ def _foretold(
             continue
         worst = max(alone.errors[k] for k in group)
         names = listed([place_of(k, kappa) for k in group], _NAMED)
-        if worst < _NEAR:
+        if worst < NEAR:
             warn(
                 f"the record at {names} does not tell all states of the other points, "
                 "as where a mode vanishes: what is identified of these there is noise. "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -32,6 +32,7 @@ _BESIDE = 1.0 + 1e-6  # of a pole: there may be no response at one on the axis
 _ELSEWHERE, _WORSE, _MEDIAN, _MANY, _OF_FEW = 1.0, 1.5, 0.3, 4, 0.8
 
 UNLIKE = 2.0  # an error of a point left out, in its largest gain, as bad as any
+NEAR = 0.1  # and one up to which what the others foresee is what the record tells
 
 # Difference of two models, in the largest gain, between which a line is a guess.
 _APART = 0.3
@@ -67,6 +68,19 @@ def interpolated_without(
         return None
 
 
+def values_left_out(
+    form: Any, kappa: Array, theta: Array, covariance: Array | None = None
+) -> Iterator[tuple[NDArray[np.bool_], Array]]:
+    """Points of every place within the range of the others, and what these foresee.
+
+    Their parameters; without places at which the others are too few.
+    """
+    for out in inner_places(kappa):
+        values = interpolated_without(out, form, kappa, theta, kappa[out], covariance)
+        if values is not None:
+            yield out, values
+
+
 def errors_left_out(
     structure: GrayBoxStructure,
     models: Sequence[StateSpace],
@@ -83,10 +97,7 @@ def errors_left_out(
     are, or otherwise.
     """
     errors = {}
-    for out in inner_places(kappa):
-        values = interpolated_without(out, form, kappa, theta, kappa[out], covariance)
-        if values is None:
-            continue
+    for out, values in values_left_out(form, kappa, theta, covariance):
         for k, own in zip(np.flatnonzero(out).tolist(), values, strict=True):
             both = [structure.model(own), models[k]]
             if seen is not None:

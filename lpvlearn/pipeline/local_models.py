@@ -185,9 +185,9 @@ def of_structure(local: Any, structure: Any) -> tuple[Any, bool]:
     free = isinstance(given, str) and given == "auto"
     if not (free and isinstance(structure, GrayBoxStructure)):
         return local, False
-    order = structure.order - hidden_integrators(structure)
-    if _integrates(local):  # the model of the rates has not the integrators
-        order = structure.order - integrators(structure)
+    # the model of the rates has not the integrators, no model what nothing shows
+    lost = integrators if _integrates(local) else hidden_integrators
+    order = structure.order - lost(structure)
     return clone(local).set_params(order=order), isinstance(local, SubspaceLTI)
 
 

@@ -691,7 +691,6 @@ def local_output_errors(
     """
     runs = [e for group in found.points.experiments for e in group[:_LOOKED_AT]]
     records = [_record(e, sampling_time) for e in runs]
-    still = [r._replace(kappa=0.0 * r.kappa + r.kappa.mean(axis=0)) for r in records]
     quiet, own = model.silenced(), _own_of_local(found)
     names = model.output_names or range(1, model.n_outputs + 1)
 
@@ -701,10 +700,17 @@ def local_output_errors(
     try:
         errors = along(records)
         if any(np.ptp(r.kappa, axis=0).any() for r in records):
+            still = [_held(record) for record in records]
             tell_of_noisy_scheduling(model, records, errors, along(still), names)
     except ValueError:  # it diverges, or has no matrices there
         errors = [np.full((1, model.n_outputs), np.nan)]
     return output_errors(names, errors)
+
+
+def _held(record: Record) -> Record:
+    """The record with its scheduling variables held at their means."""
+    kappa = record.kappa
+    return record._replace(kappa=np.broadcast_to(kappa.mean(axis=0), kappa.shape))
 
 
 def _own_of_local(found: StructuredModels) -> Own:

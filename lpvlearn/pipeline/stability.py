@@ -38,10 +38,9 @@ def growth_rates(
     does so by next to nothing over the `longest` record (seconds) counts as zero. None
     is what the interpolation lets expect.
     """
-    form = getattr(lpv.interpolator, "best_estimator_", lpv.interpolator)
-    if cause is None:
-        shape = getattr(form, "kind", "") == "pchip"  # which does not overshoot
-        cause = _MIXED if shape else _OVERSHOT
+    if cause is None:  # "pchip" does not overshoot
+        form = getattr(lpv.interpolator, "best_estimator_", lpv.interpolator)
+        cause = _MIXED if getattr(form, "kind", "") == "pchip" else _OVERSHOT
     model, ends = lpv.silenced(), neighbours(kappa)
     least = _GROWN / longest
     rates = _rates(model, kappa, least)

@@ -22,7 +22,6 @@ from ..exceptions import collected, retold, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import points_of_work
 from ..lpv.model import LPVStateSpace
-from ..lpv.weighting import inner_places
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..restructuring.deadline import bounded, time_is_up
 from ..restructuring.minimise_covariance import Estimate
@@ -39,7 +38,12 @@ from .black_boxes import (
 )
 from .branches import Doubt, tied_branches
 from .canonical import canonical_black_boxes, is_better_form
-from .left_out import interpolated_without, largest_difference
+from .left_out import (
+    NEAR,
+    interpolated_without,
+    largest_difference,
+    values_left_out,
+)
 from .local_models import LocalModel, motions
 from .runner import Done, PointRunner, place_of, tell_skipped
 
@@ -54,10 +58,9 @@ _NEIGHBOURS = 2  # points that help one: those to either side along one variable
 _FIRST_SHARE = 0.75  # of `max_time`, before the points help one another
 
 # Of parameters at a point: the standard deviation, by those of the others, from which
-# these may foresee them better; points that are enough for that; the error, in the
-# largest gain of the black box, up to which a model is what the record tells; and of
-# others that are foreseen elsewhere, by so many times what is usual
-_UNTOLD, _FORESEEING, _NEAR = 10.0, 4, 0.1
+# these may foresee them better, and points that are enough for that. And of others
+# there that are foreseen elsewhere: by so many times what is usual, up to which error
+_UNTOLD, _FORESEEING = 10.0, 4
 _ASTRAY, _LIKE = 5.0, 0.01
 
 _BETTER = 0.98  # factor by which a neighbour's start must lower the error: no rounding
@@ -182,44 +185,35 @@ def with_foreseen(found: StructuredModels) -> StructuredModels:
     # but for a record that tells less of all parameters: covariances weigh that
     least = ratio.min(axis=1, initial=np.inf, keepdims=True)
     doubted = ratio > _UNTOLD * np.maximum(least, 1.0)
-    rest = np.asarray(~doubted.any(axis=1), dtype=bool)
-    if np.isnan(std).any() or rest.all() or rest.sum() < max(_FORESEEING, n - n // 3):
+    doubtful: NDArray[np.bool_] = doubted.any(axis=1)
+    rest = np.flatnonzero(~doubtful)
+    enough = n > len(rest) >= max(_FORESEEING, n - n // 3)
+    if np.isnan(std).any() or not enough:
         return found
-    foreseen = partial(
-        interpolated_without,
-        form=AutoLPV(),
-        kappa=kappa,
-        theta=found.theta,
-        covariance=found.covariance,
+    form, others = AutoLPV(), found.theta[rest]
+    left_out = values_left_out(form, kappa[rest], others, found.covariance[rest])
+    missed = [values - others[out] for out, values in left_out]
+    places = kappa[doubtful]
+    foreseen = interpolated_without(
+        doubtful, form, kappa, found.theta, places, found.covariance
     )
-    missed = []
-    for out in inner_places(kappa[rest]):
-        without = np.asarray(~rest, dtype=bool)
-        without[np.flatnonzero(rest)[out]] = True
-        places = kappa[rest][out]
-        values = foreseen(without, places=places)
-        if values is not None:
-            missed.append(values - found.theta[rest][out])
-    values = foreseen(np.asarray(~rest, dtype=bool), places=kappa[~rest])
-    if not missed or values is None:
+    if not missed or foreseen is None:
         return found
-    scatter = np.sqrt(np.mean(np.vstack(missed) ** 2, axis=0))
-    scatter = np.maximum(scatter, usual)
+    scatter = np.maximum(np.sqrt(np.mean(np.vstack(missed) ** 2, axis=0)), usual)
     low, high = kappa[rest].min(axis=0), kappa[rest].max(axis=0)
     theta, covariance = found.theta.copy(), found.covariance.copy()
     models, told, worst = list(found.models), [], 0.0
     names = np.array(found.structure.parameter_names, dtype=object)
-    for k, own in zip(np.flatnonzero(~rest).tolist(), values, strict=True):
+    for k, own in zip(np.flatnonzero(doubtful).tolist(), foreseen, strict=True):
         untold = doubted[k] & (std[k] > scatter)
         if not (untold.any() and ((low <= kappa[k]) & (kappa[k] <= high)).all()):
             continue
         # where one is anything, others may be, with a deviation that is none
         astray = untold | (np.abs(own - theta[k]) > _ASTRAY * scatter)
-        for taken, most in ((astray, _LIKE), (untold, _NEAR)):
+        for taken, most in ((astray, _LIKE), (untold, NEAR)):
             row = np.where(taken, own, theta[k])
             row = np.clip(row, found.structure.lower, found.structure.upper)
-            delay = found.local[k].lti.input_delay
-            model = found.structure.model(row).with_input_delay(delay)
+            (model,) = _delayed(found.structure, row[None], [found.local[k]])
             error = largest_difference(model, found.local[k].lti)
             if not (model.is_stable and error < most):
                 continue

@@ -57,10 +57,9 @@ _LEAST_MARGIN = 1e-6
 _HOP_FIT = 0.03  # error of a fit so far off that better basins may lie beside its own
 _HOPS = (0.1, 0.3, 1.0) * 4  # sizes of the hops of logarithms: 10 %, to a factor of 3
 _HOP_RETURNS = 5  # to the fit itself, after which its basin counts as wide
-_MOST_SIGNS = 12  # parameters whose sign is changed, one at a time
-
 _HOP_ROUNDS = 4  # from ever better fits
 _HOP_GAIN = 1e-3  # relative decrease of the cost that is worth another round
+_MOST_SIGNS = 12  # parameters whose sign is changed, one at a time
 _FAINT = 0.03  # size of modes that only fill the order: seen, but hardly disturbing
 _FAST = 3.0  # decay of these modes, relative to the fastest: they are out of the way
 _AMONG = 1.3  # of modes without effect, relative to the mean: no pole's own
@@ -244,7 +243,8 @@ def hopped_fits(
         theta = fits[0].x.copy()
         theta[j] *= -1.0
         fit = problem.fit(np.clip(theta, lower, upper))
-        fits = sorted([*fits, *([] if fit is None else [fit])], key=_COST)
+        if fit is not None:
+            fits = sorted([*fits, fit], key=_COST)
     for _ in range(_HOP_ROUNDS):
         best, returned = fits[0], 0
         for size in _HOPS:

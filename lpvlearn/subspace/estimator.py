@@ -478,18 +478,18 @@ class SubspaceLTI(
             self.__dict__.pop(name, None)
 
     def _fit_table(
-        self, X: Any, y: Any, *, rates: tuple[Any, Any] | None = None
+        self, X: Any, y: Any, *, names: tuple[Any, Any] | None = None
     ) -> Self:
-        """As `fit`, or of `rates`, most of which may be noise that was differenced.
+        """As `fit`, or of rates, most of which may be noise that was differenced.
 
-        These have the names of the inputs and outputs whose rates they are.
+        These have the `names` of the inputs and of the outputs whose rates they are.
         """
         choices = check_options(self.get_params(deep=False))
-        choices = choices._replace(differences=rates is not None)
+        choices = choices._replace(differences=names is not None)
         experiments = self._read(X, y, reset=True, cut=False)
         self._single_output = np.asarray(y).ndim == 1
-        telling = Telling(*(rates or _labels_of(X, experiments, y)))
-        if rates:
+        telling = Telling(*(names or _labels_of(X, experiments, y)))
+        if names:
             telling = telling.aside("noisy output", "useless", "dropouts")
         if self.missing == "estimate" and any(map(has_gaps, experiments)):
             check_for_completion(self.detrend)
@@ -632,7 +632,7 @@ class SubspaceLTI(
         options = options_of_rates(table, flags, direct, step)
         rate_model = clone(self).set_params(**options)
         self.rates_ = inner = rate_model._fit_table(
-            table, rates, rates=_labels_of(X, experiments, y)
+            table, rates, names=_labels_of(X, experiments, y)
         )
         best = inner
         if flags.all() and inner.method_ != "pbsid":

@@ -25,7 +25,7 @@ from .options import feedthrough_mask
 from .records import scale_records
 from .simulation_fit import Freedom, simulation_fit
 from .statistics import Evidence
-from .varx import find_feedback
+from .varx import Feedback, find_feedback
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -116,14 +116,18 @@ def without_direct(
     answers at once those of the outputs, as the inputs of the step act on rates in any
     case.
     """
-    of_outputs, of_rates = (
-        find_feedback(scale_records([(e.inputs, e.measured) for e in some]).records)
-        for some in (experiments, rates)
-    )
+
+    def feedback(some: Sequence[Experiment]) -> Feedback | None:
+        pairs = [(e.inputs, e.measured) for e in some]
+        return find_feedback(scale_records(pairs).records)
+
+    def shows_loop(found: Feedback | None) -> bool:
+        return found is not None and found.found and not found.cut_off
+
+    of_outputs = feedback(experiments)
     if of_outputs is None or not of_outputs.instantaneous:
         return False
-    known = [f for f in (of_outputs, of_rates) if f is not None and not f.cut_off]
-    if not any(feedback.found for feedback in known):
+    if not (shows_loop(of_outputs) or shows_loop(feedback(rates))):
         return False
     warn(
         "A controller answers the outputs within the sample: of those that do not "
