@@ -23,6 +23,7 @@ from .fit_warnings import (
 )
 from .local_fit import LocalFit
 from .one_fit import Samples, TooFewSamples
+from .oscillations import with_oscillations, without_oscillations
 from .rivals import (
     believable,
     held_by_a_loop,
@@ -59,6 +60,8 @@ def fit_samples(
     fitted = with_trends(samples, like)
     samples, fitted = without_rounding(samples, fitted, like)
     fitted = of_drifting_noise(samples, fitted) or fitted
+    calm, fitted = without_oscillations(samples, fitted)
+    oscillating, samples = samples, calm
     if fitted.selection.order:
         tell_of_held_outputs(outputs, telling)
         tell_of_limits(outputs, fitted, telling)
@@ -91,6 +94,8 @@ def fit_samples(
             tell_of_lead(samples, fitted)
     elif feedback is not None and feedback.may_be_answered and fitted.model.D.any():
         tell_of_answers(feedback, telling)
+    if samples is calm:
+        fitted = with_oscillations(oscillating, calm, fitted)
     if rest is not None:
         fitted = moved_back(fitted, first, differ)
     if detrend is None:

@@ -147,6 +147,8 @@ class Evidence:
     levels: Array | None = None  # (n_experiments, n_outputs): constants less trends
     input_delay: ArrayLike = 0  # samples, which the records' inputs have already
     told: Known | None = None  # in the place of the records
+    # Of experiments, what was subtracted from their outputs; noise all the same.
+    disturbances: Sequence[Array] = ()
 
     def known(self) -> Known:
         """What is left without the records."""
@@ -183,7 +185,7 @@ class Evidence:
             return self.told.noise
         weight = self.whitening.weight
         model = with_initial_states(self.model, self.records, self.free, weight)
-        return _noise_of(model, self.records)
+        return _noise_of(model, self.records, self.disturbances)
 
     @cached_property
     def covariance(self) -> Array:
@@ -352,9 +354,13 @@ class Evidence:
         return np.einsum("yo,foup->fyup", to_outputs, J)
 
 
-def _noise_of(model: Realization, records: Sequence[Record]) -> NoiseModel:
-    """Autoregression of the simulation errors that are known."""
+def _noise_of(
+    model: Realization, records: Sequence[Record], beside: Sequence[Array] = ()
+) -> NoiseModel:
+    """Autoregression of the simulation errors that are known, and what is beside."""
     errors = simulation_errors(model, records)
+    if beside:
+        errors = [error + more for error, more in zip(errors, beside, strict=True)]
     return noise_of(
         [np.where(r.known, e, np.nan) for r, e in zip(records, errors, strict=True)]
     )

@@ -1,0 +1,180 @@
+"""Oscillations of the outputs that no input moves: hum of the mains, runout of a shaft.
+
+A sinusoid is the free motion of an undamped mode, and explains so much that two states
+are spent on it. They are none of the plant: between operating points such a mode is at
+the border of stability, what noise tells inputs do to it is a resonance, and where the
+order is given the plant lacks two other states.
+
+Sinusoids take the place of such modes where they explain as much of the outputs, and
+are subtracted. Where inputs move a mode, what is left still needs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from .constants import CERTAIN
+from .criterion import n_parameters
+from .local_fit import LocalFit
+from .one_fit import Samples
+from .records import Record
+from .simulation_fit import Freedom, Realization, simulation_fit
+from .statistics import Evidence
+from .trends import with_trends
+
+Array = NDArray[np.float64]
+
+# Time constants per record of a mode that stands for one; radians that it turns in it,
+# and that it is away from a change of sign with every sample.
+_DECAYS, _TURNS = 1.0, 20.0
+
+# Polynomials of time that amplitudes may follow, and the part of what a sinusoid
+# explains that they may add: noise that shakes a mode makes its amplitude wander.
+_DEGREE, _WANDERS = 3, 0.05
+
+_CHANCE = 1e-6  # of as large an oscillation of white noise
+
+_NEAR = 10.0  # per record: distance from a sinusoid of modes that do the same
+
+_ROUNDS = 3  # in each of which further ones may come out
+
+
+def without_oscillations(samples: Samples, whole: LocalFit) -> tuple[Samples, LocalFit]:
+    """Take out oscillations that modes of the model stand for, moved by no input.
+
+    Of as many states, as where the order is given, the model must be likelier then
+    beyond chance: two of them may have been meant for the oscillation.
+    """
+    choices = samples.choices
+    asked = choices.initial_states and choices.refine in ("auto", "prediction")
+    if not asked or choices.enforce_stability or whole.method == "pbsid":
+        return samples, whole
+    calm, fitted, turns = samples, whole, np.zeros(0)
+    for _ in range(_ROUNDS):
+        found = _turns(fitted.evidence)
+        if not len(found):
+            break
+        found = np.append(turns, found)
+        rest = _subtracted(samples, calm, fitted, found)
+        other = with_trends(rest.aside())
+        fewer = len(other.model.A) < len(fitted.model.A)
+        if not other.worse_than(fitted) < (CERTAIN if fewer else -CERTAIN):
+            break
+        calm, fitted, turns = rest, other, found
+    if len(turns):
+        motion = np.vstack(_differences(samples, calm))
+        size = np.sqrt(np.mean(motion**2, axis=0))
+        largest = int(np.argmax(size / whole.evidence.output_scale))
+        listed = ", ".join(f"{turn:.4g}" for turn in np.sort(turns))
+        samples.telling.once(
+            "oscillation",
+            f"Outputs oscillate where no input moves them, at {listed} rad per sample: "
+            f"{size[largest]:.3g} (rms) of output {samples.telling.output(largest)}. "
+            "That was taken for a disturbance, as hum or runout is, and not for the "
+            f"plant's. Where it is the plant's, use order={len(whole.model.A)}; else "
+            "remove it at its source, or by the same notch filter on inputs and "
+            "outputs.",
+        )
+    return calm, fitted
+
+
+def with_oscillations(samples: Samples, calm: Samples, fitted: LocalFit) -> LocalFit:
+    """The model of calm samples, whose noise is that of these: it foretells them."""
+    if samples is calm:
+        return fitted
+    evidence = fitted.evidence
+    motions = [m / evidence.output_scale for m in _differences(samples, calm)]
+    return fitted._replace(evidence=replace(evidence, disturbances=motions))
+
+
+def _differences(samples: Samples, calm: Samples) -> list[Array]:
+    pairs = zip(samples.pairs, calm.pairs, strict=True)
+    return [y - rest for (_, y), (_, rest) in pairs]
+
+
+def _turns(evidence: Evidence) -> Array:
+    """Radians per sample of modes whose like steady sinusoids are, beyond chance.
+
+    Of many frequencies one always looks like a sinusoid.
+    """
+    free, longest = evidence.free, evidence.longest
+    model = evidence.whitening.model(evidence.model)
+    poles = np.linalg.eigvals(model.A)
+    turns = np.angle(poles)
+    lasts = np.abs(1.0 - np.abs(poles)) * longest < _DECAYS
+    turns = turns[lasts & (np.sin(turns) * longest > _TURNS)]
+    records = evidence.whitening.records(evidence.records, free)
+    n_samples = sum(record.n_samples for record in records)
+    n_left = n_samples * len(model.C) - n_parameters(len(model.A), records, free)
+    if not (len(turns) and evidence.refined and n_left > 0):
+        return turns[:0]
+    fitted = _beside(turns, model, records, free, _DEGREE)
+    # (n_turns, degree + 1): energies, of real and imaginary parts together
+    energy = np.sum(fitted.trends[:, free.n_trend :] ** 2, axis=(0, 2))
+    energy = energy.reshape(len(turns), _DEGREE + 1, 2).sum(axis=2)
+    steady = energy[:, 1:].sum(axis=1) < _WANDERS * energy[:, 0]
+    by_chance = 2.0 * np.log(n_samples / _CHANCE) * fitted.loss / n_left
+    return turns[steady & (energy[:, 0] > by_chance)]
+
+
+def _subtracted(
+    samples: Samples, calm: Samples, fitted: LocalFit, turns: Array
+) -> Samples:
+    """The samples without sinusoids, which may decay or grow a little.
+
+    As a model tells them that was fitted to samples without some of them.
+    """
+    free, scale = fitted.evidence.free, fitted.evidence.output_scale
+    records = [
+        record._replace(y=record.y + (motion / scale).T)
+        for record, motion in zip(
+            fitted.scaled.records, _differences(samples, calm), strict=True
+        )
+    ]
+    beside = _beside(turns, fitted.model, records, free, 1)
+    left = []
+    for (u, y), trends in zip(samples.pairs, beside.trends, strict=True):
+        motion = _sinusoids(turns, len(y), 1) @ trends[free.n_trend :]
+        left.append((u, y - scale * motion))
+    return samples._replace(pairs=left)
+
+
+def _beside(
+    turns: Array,
+    model: Realization,
+    records: Sequence[Record],
+    free: Freedom,
+    degree: int,
+) -> Realization:
+    """A model with sinusoids among its trends, and without modes that do the same."""
+    poles, left = linalg.eig(model.A.T)
+    distance = np.abs(poles[:, None] - np.exp(1j * turns)).min(axis=1, initial=2.0)
+    its = distance * max(record.n_samples for record in records) < _NEAR
+    W = left[:, its].T
+    Z = linalg.null_space(np.vstack([W.real, W.imag]))
+    sinusoids = [_sinusoids(turns, r.n_samples, degree).T for r in records]
+    beside = [
+        r._replace(trend=np.vstack([r.trend.reshape(-1, r.n_samples), more]))
+        for r, more in zip(records, sinusoids, strict=True)
+    ]
+    free = free._replace(n_trend=free.n_trend + len(sinusoids[0]))
+    return simulation_fit(Z.T @ model.A @ Z, model.C @ Z, beside, free)
+
+
+def _sinusoids(turns: Array, n_samples: int, degree: int) -> Array:
+    """Orthonormal where they are apart, (n_samples, 2 n_turns (degree + 1)).
+
+    Turn by turn, times polynomials of time, one degree after the other.
+    """
+    time = np.arange(n_samples)
+    shapes = np.polynomial.legendre.legvander(2.0 * time / n_samples - 1.0, degree)
+    signals = []
+    for turn in turns:
+        both = np.column_stack([np.cos(turn * time), np.sin(turn * time)])
+        signals.append((shapes[:, :, None] * both[:, None]).reshape(n_samples, -1))
+    return np.hstack([np.linalg.qr(part)[0] for part in signals])

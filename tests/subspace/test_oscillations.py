@@ -1,0 +1,127 @@
+import warnings
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from lpvlearn import StateSpace, SubspaceLTI
+
+_TURN = 1.2341  # radians per sample
+
+
+def _turning(modulus, angle):
+    c, s = modulus * np.cos(angle), modulus * np.sin(angle)
+    return np.array([[c, s], [-s, c]])
+
+
+def _plant():
+    A = np.zeros((4, 4))
+    A[:2, :2], A[2:, 2:] = _turning(0.97, 0.1), _turning(0.95, 0.5)
+    B, C = [[0.0], [1.0], [0.0], [0.6]], [[0.1, 0.0, 0.3, 0.0]]
+    return StateSpace(A, B, C, None, 1.0)
+
+
+def _wave(rng, n_samples, turn=_TURN):
+    return np.sin(turn * np.arange(n_samples) + rng.uniform(0.0, 6.0))[:, None]
+
+
+def _records(seed, size, lengths=(800,), turns=(_TURN,)):
+    """Records of white inputs with noise of 2 %, and waves of a size by the outputs."""
+    rng, inputs, outputs = np.random.default_rng(seed), [], []
+    for n in lengths:
+        u, plant = rng.standard_normal((n, 1)), _plant()
+        y, noise = plant.simulate(u), 0.02 * rng.standard_normal((n, 1))
+        wave = sum(_wave(rng, n, turn) for turn in turns)
+        inputs.append(u)
+        outputs.append(y + y.std() * (size * wave + noise))
+    return inputs, outputs
+
+
+def _fit(u, y, **options):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = SubspaceLTI(**options).fit(u, y)
+    told = [str(w.message) for w in caught]
+    return model, [text for text in told if "oscillate" in text]
+
+
+def _error(model, plant=None):
+    omega = np.linspace(0.01, 3.1, 100)
+    truth = (plant or _plant()).frequency_response(omega)
+    left = model.lti_.frequency_response(omega) - truth
+    return np.linalg.norm(left) / np.linalg.norm(truth)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.3, 3.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_plant_is_that_of_records_without_the_oscillation(seed, size):
+    (u,), (y,) = _records(seed, size)
+    (_,), (calm,) = _records(seed, 0.0)
+    model, told = _fit(u, y)
+    assert model.lti_.order == 4
+    assert len(told) == 1
+    assert f"{_TURN:.4g}" in told[0]
+    assert _error(model) < 1.2 * _error(_fit(u, calm)[0]) + 2e-4
+    # a given order, of which two states were spent on it
+    assert _error(_fit(u, y, order=4)[0]) < 0.02
+
+
+def test_a_model_that_is_to_oscillate_does():
+    (u,), (y,) = _records(0, 0.3)
+    model, told = _fit(u, y, order=6)
+    assert not told
+    assert np.abs(np.angle(model.lti_.poles()) - _TURN).min() < 1e-3
+
+
+def test_experiments_have_phases_of_their_own_and_harmonics():
+    inputs, outputs = _records(2, 0.3, (300, 500, 400), (0.31, 0.62, 0.93))
+    rows = np.cumsum([0, 300, 500, 400])
+    group = np.repeat([0.0, 1.0, 2.0], np.diff(rows))[:, None]
+    u = np.hstack([np.vstack(inputs), group])
+    model, told = _fit(u, np.vstack(outputs), experiment=1)
+    assert model.lti_.order == 4
+    assert len(told) == 1
+    assert all(turn in told[0] for turn in ("0.31", "0.62", "0.93"))
+    assert _error(model) < 0.01
+
+
+def test_predictions_foretell_it():
+    (u, v), (y, z) = _records(3, 0.3, (800, 600))
+    model, _ = _fit(u, y)
+    size = z.std()
+    ahead = z - model.predict_ahead(v, z, 1)
+    assert ahead[100:].std() < 0.035 * size  # noise: 2 %, the wave: 20 %
+    assert (z - model.predict(v)).std() > 0.15 * size
+
+
+def test_a_mode_that_inputs_move_is_the_plants():
+    rng = np.random.default_rng(4)
+    u, noise = rng.standard_normal((600, 1)), rng.standard_normal((600, 1))
+    plant = StateSpace(_turning(1.0, 0.3), [[0.02], [0.0]], [[1.0, 0.0]], None, 1.0)
+    y = plant.simulate(u, initial_state=[1.0, 0.0]) + 0.002 * noise
+    model, told = _fit(u, y)
+    assert not told
+    assert model.lti_.order == 2
+    assert _error(model, plant) < 0.01
+
+
+def test_a_periodic_input_makes_no_resonance_of_it():
+    rng, k = np.random.default_rng(2), np.arange(999)
+    lines = 2.0 * np.pi * np.arange(1, 80, 2) / 333.0
+    u = np.cos(np.outer(k, lines) + rng.uniform(0.0, 6.0, len(lines))).sum(axis=1)
+    y = _plant().simulate(u[:, None])
+    y += y.std() * (0.2 * _wave(rng, 999, 2.7) + 0.02 * rng.standard_normal((999, 1)))
+    model, _ = _fit(u[:, None], y)
+    assert model.lti_.order == 4
+    assert _error(model) < 0.02
+
+
+@pytest.mark.parametrize("gain", [0.0, 2.0])
+def test_it_may_be_all_that_moves(gain):
+    rng = np.random.default_rng(5)
+    u = rng.standard_normal((500, 1))
+    noise = 0.02 * rng.standard_normal((500, 1))
+    model, told = _fit(u, gain * u + _wave(rng, 500) + noise)
+    assert told
+    assert model.lti_.order == 0
+    assert_allclose(model.lti_.D, gain, atol=0.01)
