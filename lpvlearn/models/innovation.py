@@ -17,7 +17,6 @@ from ..systems.simulation import (
     free_responses,
     spread_of,
     state_trajectory,
-    with_transit,
 )
 from ..validation import (
     finite_samples,
@@ -28,7 +27,7 @@ from ..validation import (
     state_vector,
     whole_number,
 )
-from .statespace import StateSpace
+from .statespace import StateSpace, unknown_responses
 
 Array = NDArray[np.float64]
 
@@ -276,8 +275,7 @@ class InnovationModel(VersionedPickle):
                 )
         if self.gain is None:
             lti, error = self.lti, y - self.lti.simulate(u)
-            responses = free_responses(lti.A, lti.C, len(y), trend)
-            responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
+            responses = unknown_responses(lti, len(y), trend)
         else:
             error, (gains, _) = y - self.predict(u, y), self._filter_gains(y)
             responses = prediction_responses(self.A, self.C, gains, len(y), trend)

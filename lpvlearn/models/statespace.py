@@ -414,8 +414,7 @@ class StateSpace(VersionedPickle):
         y = measured_samples(y, len(u), self.n_outputs)
         error = y - self.simulate(u)
         with np.errstate(over="ignore", invalid="ignore"):  # which is told instead
-            free = free_responses(self.A, self.C, len(y))
-            free = with_transit(free, self.B, self.D, self.input_delay)
+            free = unknown_responses(self, len(y))
         finite_simulation(free, self._why_it_diverges)
         return estimate_initial_state(free, error, spread_of(y))
 
@@ -748,6 +747,18 @@ class StateSpace(VersionedPickle):
 # large against rounding.
 ModelPair = tuple[StateSpace, StateSpace]
 DEVIATION = 1e-2
+
+
+def unknown_responses(
+    model: StateSpace, n_samples: int, trend: Array | None = None
+) -> Array:
+    """Outputs of a run to what is unknown of it, (n_samples, n_outputs, n_unknowns).
+
+    As `free_responses` has them, with inputs in transit after the states: what
+    `StateSpace.estimate_initial_state` returns, and multiples of trends.
+    """
+    free = free_responses(model.A, model.C, n_samples, trend)
+    return with_transit(free, model.B, model.D, model.input_delay)
 
 
 def balanced_models(models: Sequence[StateSpace]) -> list[StateSpace]:

@@ -15,16 +15,14 @@ from ..lpv.model import LPVStateSpace
 from ..lpv.weighting import noise_explains
 from ..metrics.reports import as_shown, readable_report
 from ..metrics.scores import best_fit, parameter_fit
-from ..models.statespace import StateSpace
+from ..models.statespace import StateSpace, unknown_responses
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..systems.simulation import (
     delayed,
     estimate_initial_state,
-    free_responses,
     spread_of,
     state_trajectory,
     trend_signals,
-    with_transit,
 )
 from .left_out import listed_errors
 from .local_models import LocalModel, motions
@@ -213,10 +211,7 @@ def _fit_of(
         x = state_trajectory(
             sampled.A, np.tensordot(u, sampled.B, (1, 1)).swapaxes(1, 2)
         )
-        free = free_responses(
-            sampled.A, sampled.C, length, trend_signals(length, n_trend)
-        )
-        free = with_transit(free, sampled.B, sampled.D, sampled.input_delay)
+        free = unknown_responses(sampled, length, trend_signals(length, n_trend))
         # channel by channel in memory, as experiments are: (n_outputs, n_runs, length)
         forced = (sampled.C @ x + sampled.D @ u).transpose(1, 2, 0)
         y = np.stack([_outputs(e).T for e in part], axis=1)

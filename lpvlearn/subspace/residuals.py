@@ -43,11 +43,10 @@ from scipy import linalg, special
 from ..data.preparation import DETRENDS, remove_trends
 from ..exceptions import warn
 from ..models.innovation import InnovationModel
-from ..models.statespace import StateSpace
+from ..models.statespace import StateSpace, unknown_responses
 from ..systems.beginnings import moves_of
 from ..systems.simulation import (
     estimate_initial_state,
-    free_responses,
     spread_of,
     state_and_level,
     trend_signals,
@@ -185,76 +184,103 @@ def model_residuals(
 ) -> Residuals:
     """Errors of one-step prediction (None: of simulation) from estimated states.
 
-    Errors that are rounding become zero, with a warning. The fit is recognised by the
-    samples that `evidence` keeps: it is allowed for where an experiment begins with
-    the outputs of one of theirs. Where only a part was fitted that costs some power,
-    and no test becomes wrong.
+    Errors that are rounding become zero, with a warning. The fit is allowed for where
+    it was to these samples.
     """
     n_trend = evidence.free.n_trend
-    pairs = remove_trends(list(pairs), detrend)[0]
-    pairs, errors = centred(pairs, n_trend, True)[0], []
+    pairs = centred(remove_trends(list(pairs), detrend)[0], n_trend, True)[0]
+    outputs = [y for _, y in pairs]
+    errors = _errors(lti, predictor, pairs, n_trend)
+    # The trend of an answer is not quite the answer to the trend of an input. Inputs
+    # are compared with what trends have left of the errors.
+    removed = DETRENDS[n_trend] or detrend
+    inputs = [u for u, _ in pairs]
+    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), removed)[0]
+    inputs, errors = [u for u, _ in cleaned], [e for _, e in cleaned]
+    errors = _beyond_rounding(errors, outputs, output_names)
+    fitted = None
+    if _are_of_fit(outputs, evidence):
+        fitted = _what_was_fitted(lti, predictor)
+    return Residuals(errors, inputs, output_names, input_names, fitted)
+
+
+def _errors(
+    lti: StateSpace,
+    predictor: InnovationModel | None,
+    pairs: Sequence[tuple[Array, Array]],
+    n_trend: int,
+) -> list[Array]:
+    """What is left of outputs beside their own initial states and trends."""
+    errors = []
     with np.errstate(over="ignore", invalid="ignore"):  # refused below
         for u, y in pairs:
             trend = trend_signals(len(y), n_trend)
             if predictor is None:
-                free = free_responses(lti.A, lti.C, len(y), trend)
-                error = y - lti.simulate(u)
-                x0 = estimate_initial_state(free, error, spread_of(y))
-                errors.append(error - free @ x0)
-                continue
-            own = predictor.estimate_initial_state(u, y, trend)
-            x0, level = state_and_level(own, trend, y.shape[1])
-            errors.append(y - level - predictor.predict(u, y - level, initial_state=x0))
+                free, error = unknown_responses(lti, len(y), trend), y - lti.simulate(u)
+                error = error - free @ estimate_initial_state(free, error, spread_of(y))
+            else:
+                own = predictor.estimate_initial_state(u, y, trend)
+                x0, level = state_and_level(own, trend, y.shape[1])
+                error = y - level - predictor.predict(u, y - level, initial_state=x0)
+            errors.append(error)
     if not all(np.isfinite(e).all() for e in errors):
         raise ValueError(
             "residual tests need a simulation that stays finite. The model is unstable "
             "and diverges over these samples: use stability='enforce', or "
             "errors='prediction' with method='pbsid'."
         )
-    inputs = [u for u, _ in pairs]
-    # The trend of an answer is not quite the answer to the trend of an input. Inputs
-    # are compared with what trends have left of the errors.
-    removed = DETRENDS[n_trend] or detrend
-    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), removed)[0]
-    inputs, errors = [u for u, _ in cleaned], [e for _, e in cleaned]
-    y, e = np.vstack([y for _, y in pairs]), np.vstack(errors)
+    return errors
+
+
+def _beyond_rounding(
+    errors: list[Array], outputs: Sequence[Array], names: Sequence[Hashable]
+) -> list[Array]:
+    """Errors of which those are zero, and told of, that are rounding."""
+    y, e = np.vstack(outputs), np.vstack(errors)
     size, largest = np.sqrt(np.mean(e**2, axis=0)), np.abs(y).max(axis=0)
     rounding = size <= _ROUNDING * y.std(axis=0)
     rounding |= size <= _ROUNDING_OF_LARGEST * largest
-    if rounding.any():
-        share = (size[rounding] / np.where(largest > 0, largest, 1.0)[rounding]).max()
-        names = ", ".join(
-            str(name) for name, bad in zip(output_names, rounding, strict=True) if bad
-        )
-        warn(
-            f"The errors of {names} are rounding ({share:.1g} of the output): there is "
-            "nothing to test, and all their tests pass."
-        )
-        errors = [np.where(rounding, 0.0, part) for part in errors]
+    if not rounding.any():
+        return errors
+    share = (size[rounding] / np.where(largest > 0, largest, 1.0)[rounding]).max()
+    listed = ", ".join(str(names[k]) for k in np.flatnonzero(rounding).tolist())
+    warn(
+        f"The errors of {listed} are rounding ({share:.1g} of the output): there is "
+        "nothing to test, and all their tests pass."
+    )
+    return [np.where(rounding, 0.0, part) for part in errors]
+
+
+def _are_of_fit(outputs: Sequence[Array], evidence: Evidence) -> bool:
+    """Whether an experiment begins with the outputs of one of the fit's.
+
+    These are known by the samples that the evidence keeps. Where only a part was fitted
+    that costs some power, and no test becomes wrong.
+    """
     records, scale = evidence.records, evidence.output_scale
     head = min([_HEAD, *(record.y.shape[1] for record in records)])
     known = {r.y[:, :head].tobytes() for r in records if not r.missing.any()}
     partly = [(r.y.T[:head], r.known[:head]) for r in records if r.missing.any()]
-    begun = [y[:head] / scale for _, y in pairs]
-    fitted = None
-    if any(
-        y.T.tobytes() in known
-        or any(
+
+    def is_known(y: Array) -> bool:
+        return y.T.tobytes() in known or any(
             there.any() and np.array_equal(y[there], own[there])
             for own, there in partly
         )
-        for y in begun
-    ):
-        response, n_noise = [np.eye(lti.n_outputs)], 0
-        if predictor is not None:
-            K, C = predictor.K, predictor.C
-            n_noise = -(-int(K.any(axis=1).sum()) // lti.n_outputs)
-            state, A = K, predictor.A - K @ C
-            while len(response) < _LONGEST_RESPONSE and state.any():
-                response.append(-C @ state)
-                state = A @ state
-        fitted = Fitted(lti.poles(), lti.D != 0.0, np.array(response), n_noise)
-    return Residuals(errors, inputs, output_names, input_names, fitted)
+
+    return any(is_known(y[:head] / scale) for y in outputs)
+
+
+def _what_was_fitted(lti: StateSpace, predictor: InnovationModel | None) -> Fitted:
+    response, n_noise = [np.eye(lti.n_outputs)], 0
+    if predictor is not None:
+        K, C = predictor.K, predictor.C
+        n_noise = -(-int(K.any(axis=1).sum()) // lti.n_outputs)
+        state, A = K, predictor.A - K @ C
+        while len(response) < _LONGEST_RESPONSE and state.any():
+            response.append(-C @ state)
+            state = A @ state
+    return Fitted(lti.poles(), lti.D != 0.0, np.array(response), n_noise)
 
 
 def input_labels(names: Sequence[Hashable]) -> list[str]:

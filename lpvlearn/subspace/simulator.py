@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..data.experiments import Experiment
 from ..exceptions import DivergenceError
 from ..models.innovation import InnovationModel
-from ..models.statespace import StateSpace
+from ..models.statespace import StateSpace, unknown_responses
 from ..systems.beginnings import (
     Beginning,
     begin_held,
@@ -28,11 +28,9 @@ from ..systems.beginnings import (
 )
 from ..systems.simulation import (
     estimate_initial_state,
-    free_responses,
     spread_of,
     state_and_level,
     trend_signals,
-    with_transit,
 )
 from .constants import lasting, level_matters
 from .integrating import RateEvidence
@@ -193,8 +191,7 @@ class Simulator(NamedTuple):
         n_outputs).
         """
         lti, y = self.lti, experiment.measured
-        responses = free_responses(lti.A, lti.C, len(y), trend)
-        responses = with_transit(responses, lti.B, lti.D, lti.input_delay)
+        responses = unknown_responses(lti, len(y), trend)
         error = y - self._from(None, experiment)
         if experiment.estimated is not None:  # lest known ones leave states open
             faint = np.where(experiment.estimated, _FAINT, 1.0)
