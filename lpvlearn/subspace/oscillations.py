@@ -41,6 +41,8 @@ _CHANCE = 1e-6  # of as large an oscillation of white noise
 
 _NEAR = 10.0  # per record: distance from a sinusoid of modes that do the same
 
+_SHARP = 0.03  # decay per sample of modes of an autoregression that may stand for one
+
 _ROUNDS = 3  # in each of which further ones may come out
 
 
@@ -57,9 +59,12 @@ def without_oscillations(samples: Samples, whole: LocalFit) -> tuple[Samples, Lo
     calm, fitted, turns = samples, whole, np.zeros(0)
     for _ in range(_ROUNDS):
         found = _turns(fitted.evidence)
+        if not len(found) and choices.order is not None:
+            found = _turns_of_noise(calm, fitted)
         if not len(found):
             break
-        found = np.append(turns, found)
+        apart = np.abs(turns[:, None] - found).min(axis=1) * whole.evidence.longest
+        found = np.append(turns[apart > _NEAR], found)
         rest = _subtracted(samples, calm, fitted, found)
         other = with_trends(rest.aside())
         fewer = len(other.model.A) < len(fitted.model.A)
@@ -120,6 +125,18 @@ def _turns(evidence: Evidence) -> Array:
     steady = energy[:, 1:].sum(axis=1) < _WANDERS * energy[:, 0]
     by_chance = 2.0 * np.log(n_samples / _CHANCE) * fitted.loss / n_left
     return turns[steady & (energy[:, 0] > by_chance)]
+
+
+def _turns_of_noise(samples: Samples, fitted: LocalFit) -> Array:
+    """Those that a model of a given order leaves to its noise, as two states show."""
+    evidence = fitted.evidence
+    poles = np.linalg.eigvals(evidence.noise.A)
+    decay = 1.0 - np.abs(poles[poles.imag > 0.0])
+    if not (decay < max(_SHARP, _TURNS / evidence.longest)).any():
+        return np.zeros(0)
+    more = samples.aside().having(order=len(evidence.model.A) + 2)
+    found = more.tried(evidence.free.n_trend)
+    return np.zeros(0) if found is None else _turns(found.evidence)
 
 
 def _subtracted(

@@ -61,9 +61,10 @@ def test_the_plant_is_that_of_records_without_the_oscillation(seed, size):
     assert model.lti_.order == 4
     assert len(told) == 1
     assert f"{_TURN:.4g}" in told[0]
-    assert _error(model) < 1.2 * _error(_fit(u, calm)[0]) + 2e-4
-    # a given order, of which two states were spent on it
-    assert _error(_fit(u, y, order=4)[0]) < 0.02
+    assert _error(model) < 1.1 * _error(_fit(u, calm)[0]) + 2e-4
+    # of a given order two states were spent on it, or its errors were for it
+    of_given = _fit(u, y, order=4)[0]
+    assert _error(of_given) < 1.1 * _error(model) + 2e-4
 
 
 def test_a_model_that_is_to_oscillate_does():
