@@ -149,7 +149,8 @@ class _Labels(NamedTuple):
     def built(self) -> pd.Index:
         if len(self.names) > 1:
             return pd.MultiIndex.from_tuples(self.values, names=self.names)
-        return pd.Index(self.values, dtype=self.dtype, name=self.names[0])
+        options = {"dtype": self.dtype, "name": self.names[0]}
+        return pd.Index(self.values, **options, tupleize_cols=False)
 
 
 class _PlainTable(NamedTuple):

@@ -67,6 +67,9 @@ def test_predictions_outside_of_the_range_name_the_caller():
         ),
         pd.DataFrame({"a": pd.to_datetime(["2026-01-01"]), "b": [1.0]}),
         pd.DataFrame({"a": [1.0, 2.0]}, index=pd.Index([3, 4], name="point")),
+        pd.DataFrame(  # as operating points of two scheduling variables are labelled
+            {"a": [1.0]}, pd.Index([(0.0, 2.0)], name="p", tupleize_cols=False)
+        ),
         pd.DataFrame({"a": pd.Categorical(["x"], ["x", "y"], ordered=True)}),
         pd.DataFrame({"a": np.float32([0.1])}),
         pd.DataFrame(index=["r"]),

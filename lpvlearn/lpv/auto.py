@@ -11,13 +11,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..exceptions import collected
 from ..validation import one_of
 from .interpolator import Interpolator
+from .left_out import inner_levels, inner_places, interpolated_without
 from .polynomial import PolynomialLPV, chebyshev_terms, resolvable_powers
 from .rational import RationalLPV
 from .spline import SplineLPV
-from .weighting import WeightedPoints, inner_levels, inner_places, is_chance
+from .weighting import WeightedPoints, is_chance
 
 Array = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ class AutoLPV(Interpolator):
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
         found: list[tuple[str, Any]] = []
         for name, form in _forms(kappa) if points.whitening is not None else ():
-            form.fit(kappa, points.theta, covariance=points.covariance)
+            form.fit(kappa, points.theta, points.root**2, points.covariance)
             saturated = form.degrees_of_freedom_ <= 0  # it meets any points
             if isinstance(form, PolynomialLPV) or not saturated:
                 found.append((name, form))
@@ -164,7 +164,7 @@ class AutoLPV(Interpolator):
                 proven = _foresees(found[chosen][1], curve, kappa, points)
         if not proven:
             chosen = len(found)
-            found.append((name, curve.fit(kappa, points.theta)))
+            found.append((name, curve.fit(kappa, points.theta, points.root**2)))
             chi2, dof, cost = np.r_[chi2, np.nan], np.r_[dof, 0], np.r_[cost, np.nan]
         self.form_, self.best_estimator_ = found[chosen]
         self.selection_ = pd.DataFrame(
@@ -252,14 +252,14 @@ def _errors_left_out(
         moves = spread > _NOISE * np.sqrt(variance)
     squares: list[Array] = []
     for out in (*inner_places(kappa), *inner_levels(kappa)):
-        rest, known = kappa[~out], None if covariance is None else covariance[~out]
-        try:
-            with collected():  # what few points do not determine
-                fitted = [copy(form).fit(rest, theta[~out], known) for form in forms]
-        except ValueError:  # the others are too few
-            continue
-        errors = np.array([form.predict(kappa[out]) - theta[out] for form in fitted])
-        squares.append(np.sum((errors[..., moves] / spread[moves]) ** 2, axis=1))
+        foreseen = [
+            interpolated_without(out, form, kappa, theta, kappa[out], covariance)
+            for form in forms
+        ]
+        known = [values for values in foreseen if values is not None]
+        if len(known) == len(forms):  # else the others are too few
+            errors = np.array(known) - theta[out]
+            squares.append(np.sum((errors[..., moves] / spread[moves]) ** 2, axis=1))
     shape = len(squares), len(forms), int(np.count_nonzero(moves))
     return np.reshape(squares, shape).swapaxes(0, 1)
 

@@ -51,7 +51,7 @@ from scipy.linalg import null_space
 
 from ..models.statespace import StateSpace
 from .alignment import spanning_tree
-from .weighting import inner_places
+from .left_out import inner_places
 
 Array = NDArray[np.float64]
 

@@ -55,7 +55,11 @@ class Interpolator(
     @all_or_nothing
     @one_blas_thread
     def fit(
-        self, X: ArrayLike, y: ArrayLike, covariance: ArrayLike | None = None
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
     ) -> Self:
         """Fit the parameters of operating points.
 
@@ -65,6 +69,10 @@ class Interpolator(
             Scheduling values of the operating points.
         y : array-like of shape (n_points, n_params) or (n_points,)
             Parameters of the local models.
+        sample_weight : array-like of shape (n_points,), default=None
+            Weights of the squared errors beside each other, not negative; without one
+            a point counts as absent. Where a curve meets all points they weigh those
+            of one place.
         covariance : array-like of shape (n_points, n_params, n_params), default=None
             Their covariances, or (n_points,) variances of one parameter; of use where
             they are finite and regular at all points.
@@ -76,10 +84,17 @@ class Interpolator(
         Raises
         ------
         ValueError
-            When an option is not one of those above, or shapes do not fit.
+            When an option is not one of those above, shapes do not fit, or the points
+            are too few for the form.
+
+        Warns
+        -----
+        RankWarning
+            When distinct points do not determine every product of two or three
+            scheduling variables, of a polynomial.
         """
         self._check_options()
-        kappa, points = self._read(X, y, None, covariance)
+        kappa, points = self._read(X, y, sample_weight, covariance)
         self._fit(kappa, points)
         return self
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Legendre, Polynomial
 from numpy.polynomial.chebyshev import chebvander
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..exceptions import RankWarning, all_or_nothing, warn
-from ..systems.threads import one_blas_thread
+from ..exceptions import RankWarning, warn
 from ..validation import one_of, whole_number
 from .interpolator import Interpolator, carried_by_terms, domains, to_unit
 from .weighting import WeightedPoints
@@ -114,49 +113,6 @@ class PolynomialLPV(Interpolator):
         self.degree = degree
         self.basis = basis
         self.extrapolation = extrapolation
-
-    @all_or_nothing
-    @one_blas_thread
-    def fit(  # type: ignore[override]  # scikit-learn has weights in third place
-        self,
-        X: ArrayLike,
-        y: ArrayLike,
-        sample_weight: ArrayLike | None = None,
-        covariance: ArrayLike | None = None,
-    ) -> Self:
-        """Fit the polynomial by least squares.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_points, n_scheduling)
-            Scheduling values of the operating points.
-        y : array-like of shape (n_points, n_params) or (n_points,)
-            Parameters of the local models.
-        sample_weight : array-like of shape (n_points,), optional
-            Weights of the squared errors, not negative.
-        covariance : array-like of shape (n_points, n_params, n_params), optional
-            Covariances of the parameters, or (n_points,) variances of one parameter.
-
-        Returns
-        -------
-        self : PolynomialLPV
-
-        Raises
-        ------
-        ValueError
-            When an option is not one of those above, or the only scheduling variable
-            takes fewer than `degree + 1` distinct values.
-
-        Warns
-        -----
-        RankWarning
-            When distinct points do not determine every product of two or three
-            scheduling variables.
-        """
-        self._check_options()
-        kappa, points = self._read(X, y, sample_weight, covariance)
-        self._fit(kappa, points)
-        return self
 
     def _fit(self, kappa: Array, points: WeightedPoints) -> None:
         self.powers_ = resolvable_powers(self.degree, kappa)

@@ -7,7 +7,6 @@ terms can describe the values, the minimum is a chi-square.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -107,8 +106,9 @@ def weighted_points(
 ) -> WeightedPoints:
     """Points with weights (n_points,) and covariances (n_points, n_params, n_params).
 
-    Points of weight zero are left out, and so are parameters of an infinite variance.
-    Where a covariance is not known (NaN) or singular, none is used.
+    Weights count beside each other, whatever their mean. Points of weight zero are left
+    out, and so are parameters of an infinite variance. Where a covariance is not known
+    (NaN) or singular, none is used.
     """
     used = weight > 0
     P = None
@@ -123,12 +123,15 @@ def weighted_points(
                 f"parameters of each operating point. Got {P.shape}."
             )
         P = P[used]
-    theta = theta[used]
-    spread, size = theta.std(axis=0), np.abs(theta).max(axis=0)
+    theta, share = theta[used], weight[used] / weight[used].mean()
+    spread = np.sqrt(
+        np.mean(share[:, None] * (theta - share @ theta / len(theta)) ** 2, 0)
+    )
+    size = np.abs(theta).max(axis=0)
     size = np.where(size > np.finfo(float).tiny, size, 1.0)
     scale = np.where(spread > _RESOLUTION * size, spread, size)
     whitening = None if P is None else _whitening(P, size)
-    return WeightedPoints(theta, np.sqrt(weight[used]), scale, P, whitening)
+    return WeightedPoints(theta, np.sqrt(share), scale, P, whitening)
 
 
 def _whitening(P: Array, size: Array) -> Array | None:
@@ -156,34 +159,6 @@ def _whitening(P: Array, size: Array) -> Array | None:
     if np.linalg.eigvalsh(correlation).min() < _SINGULAR:
         return None
     return np.linalg.inv(np.linalg.cholesky(correlation)) / deviation[:, None, :]
-
-
-def inner_places(kappa: Array) -> Iterator[NDArray[np.bool_]]:
-    """The points (n_points,) of every place that lies within the range of the others.
-
-    >>> [out.tolist() for out in inner_places(np.array([[0.0], [2.0], [1.0]]))]
-    [[False, False, True]]
-    """
-    for place in np.unique(kappa, axis=0):
-        out = (kappa == place).all(axis=1)
-        rest = kappa[~out]
-        if len(rest) and (place >= rest.min(axis=0)).all():
-            if (place <= rest.max(axis=0)).all():
-                yield out
-
-
-def inner_levels(kappa: Array) -> Iterator[NDArray[np.bool_]]:
-    """The points (n_points,) of every level between others that several places share.
-
-    >>> kappa = np.array([[0, 0], [0, 1], [1, 0], [1, 1], [2, 0], [2, 1]], float)
-    >>> [np.flatnonzero(out).tolist() for out in inner_levels(kappa)]
-    [[2, 3]]
-    """
-    for values in kappa.T:
-        for level in np.unique(values)[1:-1]:
-            out = values == level
-            if len(np.unique(kappa[out], axis=0)) > 1:
-                yield out
 
 
 def is_chance(chi2: float, degrees_of_freedom: int) -> bool:

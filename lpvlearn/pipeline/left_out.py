@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import clone
-from sklearn.utils.validation import has_fit_parameter
 
-from ..exceptions import collected, warn
+from ..exceptions import warn
+from ..lpv.left_out import values_left_out
 from ..lpv.model import LPVStateSpace
-from ..lpv.polynomial import PolynomialLPV
-from ..lpv.weighting import inner_places
 from ..models.statespace import StateSpace
 from ..restructuring.error_system import frequency_grid
 from ..structures.structure import GrayBoxStructure
@@ -40,45 +37,6 @@ _APART = 0.3
 _HARDLY = 3.0  # time constants in the longest record of what hardly decays
 
 _NAMED = 3  # operating points that a message lists
-
-
-def interpolated_without(
-    out: NDArray[np.bool_],
-    form: Any,
-    kappa: Array,
-    theta: Array,
-    places: Array,
-    covariance: Array | None = None,
-) -> Array | None:
-    """Parameters at places without some points; None where these are needed."""
-    keep = ~out
-    form = clone(form)
-    if keep.sum() == 1:
-        form = PolynomialLPV(degree=0)
-    elif getattr(form, "extrapolation", "ignore") in ("warn", "error"):
-        form.set_params(extrapolation="ignore")
-    known = {}
-    if covariance is not None and has_fit_parameter(form, "covariance"):
-        known["covariance"] = covariance[keep]
-    try:
-        with collected():  # what it warns of was said of all points
-            values = form.fit(kappa[keep], theta[keep], **known).predict(places)
-            return np.reshape(values, (len(places), theta.shape[1]))
-    except ValueError:
-        return None
-
-
-def values_left_out(
-    form: Any, kappa: Array, theta: Array, covariance: Array | None = None
-) -> Iterator[tuple[NDArray[np.bool_], Array]]:
-    """Points of every place within the range of the others, and what these foresee.
-
-    Their parameters; without places at which the others are too few.
-    """
-    for out in inner_places(kappa):
-        values = interpolated_without(out, form, kappa, theta, kappa[out], covariance)
-        if values is not None:
-            yield out, values
 
 
 def errors_left_out(

@@ -15,12 +15,12 @@ import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import NDArray
 from sklearn.base import clone
-from sklearn.utils.validation import has_fit_parameter
 
 from ..data.operating_points import OperatingPoints
 from ..exceptions import collected, retold, warn
 from ..lpv.auto import AutoLPV
 from ..lpv.equilibria import points_of_work
+from ..lpv.left_out import interpolated_without, takes_covariance, values_left_out
 from ..lpv.model import LPVStateSpace
 from ..models.statespace import DEVIATION, ModelPair, StateSpace
 from ..restructuring.deadline import bounded, time_is_up
@@ -38,12 +38,7 @@ from .black_boxes import (
 )
 from .branches import Doubt, tied_branches
 from .canonical import canonical_black_boxes, is_better_form
-from .left_out import (
-    NEAR,
-    interpolated_without,
-    largest_difference,
-    values_left_out,
-)
+from .left_out import NEAR, largest_difference
 from .local_models import LocalModel, motions
 from .runner import Done, PointRunner, place_of, tell_skipped
 
@@ -284,7 +279,7 @@ def _delayed(
 def over_points(interpolator: Any, found: StructuredModels) -> Any:
     """The interpolator, fitted to parameters, and by their covariances if it may."""
     known = {}
-    if has_fit_parameter(interpolator, "covariance"):
+    if takes_covariance(interpolator):
         known["covariance"] = found.covariance
     return interpolator.fit(found.points.kappa, found.theta, **known)
 

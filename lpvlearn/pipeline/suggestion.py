@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.operating_points import neighbours
+from ..lpv.left_out import interpolated_without
 from ..lpv.lfr import scales
 from ..lpv.weighting import covariance_factor
 from ..models.gap import gap
@@ -18,7 +19,6 @@ from ..models.statespace import DEVIATION, StateSpace
 from ..validation import one_of
 from .black_boxes import scaled
 from .estimator import LocalLPVPipeline
-from .left_out import interpolated_without
 
 Array = NDArray[np.float64]
 

@@ -170,6 +170,18 @@ def test_forms_with_nearly_a_coefficient_for_every_value_must_foresee_points():
     assert "rational" in fitted(true).form_
 
 
+@pytest.mark.parametrize("seed", [107, 266, 312])
+def test_polynomials_of_high_degrees_must_foresee_points(seed):
+    """Steps through six points, 2 to 9 beyond which a quartic swings."""
+    rng = np.random.default_rng(seed)
+    kappa = np.sort(rng.uniform(0.0, 1.0, 6))[:, None]
+    step = np.tanh(25.0 * (kappa[:, 0] - rng.uniform(0.3, 0.7)))
+    values = step + 0.02 * rng.standard_normal(6)
+    model = AutoLPV().fit(kappa, values, covariance=np.full(6, 4e-4))
+    drawn = model.predict(np.linspace(*model.scheduling_range_, 100))
+    assert np.abs(drawn).max() < np.abs(values).max() + 0.2
+
+
 def test_rational_forms_of_a_grid_must_foresee_whole_levels():
     """Three levels determine no common denominator, whatever single points tell."""
     kappa = np.array([[q, h] for q in (1.0, 4.0, 8.0) for h in (0.0, 0.5, 1.0)])

@@ -26,7 +26,30 @@ THETA = np.hstack([2 + KAPPA, 1 - KAPPA**2])
     ]
 )
 def test_scikit_learns_rules(estimator, check):
+    tensor = getattr(estimator, "terms", "") == "tensor"
+    if tensor and "sample_weight_equivalence" in str(check):
+        pytest.skip("2^30 terms of its 30 variables")
     check(estimator)
+
+
+@pytest.mark.parametrize(
+    "form", [PolynomialLPV(2), RationalLPV(1, 1), SplineLPV(), AutoLPV()]
+)
+@pytest.mark.parametrize("known", [False, True])
+def test_weights_count_beside_each_other(form, known):
+    """As many repetitions; another unit of them changes nothing."""
+    rng, times = np.random.default_rng(0), np.array([1, 3, 2, 1, 1, 2, 1])
+    theta = THETA + 0.1 * rng.standard_normal(THETA.shape)
+    P = np.tile(0.01 * np.eye(2), (7, 1, 1)) if known else None
+    weighted = clone(form).fit(KAPPA, theta, times, P)
+    scaled = clone(form).fit(KAPPA, theta, 1e-4 * times, P)
+    some = [np.repeat(part, times, axis=0) for part in (KAPPA, theta)]
+    repeated = clone(form).fit(*some, covariance=P if P is None else P[[0] * 11])
+    places = np.linspace(-1, 2, 20)[:, None]
+    for other in (scaled, repeated):
+        values = other.predict(places)
+        np.testing.assert_allclose(weighted.predict(places), values, rtol=1e-5)
+    assert getattr(weighted, "weighted_", None) == getattr(scaled, "weighted_", None)
 
 
 @pytest.mark.parametrize("interpolator", ALL)
