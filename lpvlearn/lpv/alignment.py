@@ -45,6 +45,8 @@ from ..systems.balancing import gramian_factor
 Array = NDArray[np.float64]
 Rows = NDArray[np.int32]
 
+_DIGITS = 9  # of distances from the middle, beyond which they are equal
+
 _APART = 1e-9  # of points at one place: a graph takes a distance of zero for none
 
 # Rates at which states are forgotten, by the modulus of the reference's fastest pole.
@@ -110,7 +112,8 @@ def spanning_tree(kappa: Array, *, outward: bool = True) -> tuple[Rows, Rows]:
         away = np.linalg.norm(scaled - np.median(scaled, axis=0), axis=1)
     else:
         away = -np.linalg.norm(scaled - scaled.mean(axis=0), axis=1)
-    order, parents = breadth_first_order(tree, int(np.argmin(away)), directed=False)
+    first = int(np.argmin(away.round(_DIGITS)))  # of equals, whatever the units
+    order, parents = breadth_first_order(tree, first, directed=False)
     return order, parents
 
 

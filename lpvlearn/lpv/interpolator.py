@@ -369,7 +369,7 @@ def carried_by_terms(outer: Array, terms: Array) -> Array:
     """
     each = terms[:, :, None] if terms.ndim == 2 else terms
     carried = outer[:, :, None, :] * each[:, None]
-    return carried.reshape(*outer.shape[:2], -1)
+    return carried.reshape(*outer.shape[:2], each.shape[1] * outer.shape[2])
 
 
 def domains(scheduling_range: Array) -> Array:

@@ -211,15 +211,14 @@ class LPVStateSpace(VersionedPickle):
         bounds.setflags(write=False)
         object.__setattr__(self, "scheduling_range", bounds)
         object.__setattr__(self, "n_scheduling", bounds.shape[1])
-        names = self.scheduling_names
-        if names is not None:
-            names_of("scheduling_names", names, bounds.shape[1], of_columns=True)
         for name in ("order", "n_inputs", "n_outputs"):
             object.__setattr__(self, name, getattr(self.structure, name))
-        for signal in ("input", "output"):
-            names, n = getattr(self, f"{signal}_names"), getattr(self, f"n_{signal}s")
-            if names is not None:
-                names_of(f"{signal}_names", names, n, of_columns=True)
+        n_names = (self.n_scheduling, self.n_inputs, self.n_outputs)
+        of = ("scheduling_names", "input_names", "output_names")
+        for argument, n in zip(of, n_names, strict=True):
+            if (names := getattr(self, argument)) is not None:
+                listed = names_of(argument, names, n, of_columns=True)
+                object.__setattr__(self, argument, listed)
         object.__setattr__(self, "units", units_by_name(self.units))
         steady = flag("steady_start", self.steady_start)
         object.__setattr__(self, "steady_start", steady)
@@ -360,7 +359,7 @@ class LPVStateSpace(VersionedPickle):
         ndarray of complex, shape (n_freq, n_outputs, n_inputs)
             The real part is the standard deviation of the real part of the response,
             the imaginary part that of the imaginary part, as
-            `SubspaceLTI.frequency_response_std` has them.
+            `SubspaceLTI.frequency_response_std` has them. NaN at a pole.
 
         Raises
         ------
@@ -375,6 +374,8 @@ class LPVStateSpace(VersionedPickle):
         theta = model.parameters(place[None])[0]
         A, B, C, _ = (M[0] for M in self.structure.matrices(theta[None]))
         resolvent = 1j * w[:, None, None] * np.eye(n) - A
+        singular = np.linalg.matrix_rank(resolvent) < n
+        resolvent[singular] = np.eye(n)
         eye_y = np.broadcast_to(np.eye(self.n_outputs), (len(w), *[self.n_outputs] * 2))
         eye_u = np.broadcast_to(np.eye(self.n_inputs), (len(w), *[self.n_inputs] * 2))
         states = np.linalg.solve(resolvent, np.broadcast_to(B, (len(w), *B.shape)))
@@ -390,6 +391,7 @@ class LPVStateSpace(VersionedPickle):
         std = np.linalg.norm(slopes.real, axis=1) + 1j * np.linalg.norm(
             slopes.imag, axis=1
         )
+        std[singular] = np.nan
         return np.asarray(std)
 
     def input_offset(self, kappa: ArrayLike) -> Array:

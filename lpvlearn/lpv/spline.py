@@ -37,7 +37,8 @@ class SplineLPV(Interpolator):
         two points wherever the points are), a cubic spline (smoother, and nearer to
         smooth precise parameters, but it may swing), or straight lines. With several,
         on scattered points: radial basis functions, of the distance ("linear") or its
-        cube (the others), with every variable mapped to [-1, 1].
+        cube (the others), with every variable mapped to [-1, 1]. One that takes a
+        single value does not count.
     scale : {"linear", "log"}, default="linear"
         What the curve is laid over: the scheduling variables, or their logarithms,
         where all are above zero: lengths, masses, speeds that range over a factor of
@@ -110,7 +111,8 @@ class SplineLPV(Interpolator):
         self._curve = self._through(theta)
 
     def _through(self, theta: Array) -> Any:
-        x, n = self._nodes, self._nodes.shape[1]
+        x = self._varying(self._nodes)
+        n = x.shape[1]
         if n > 1 or len(x) == 1:
             # a cubic needs points that determine a plane beside it
             plane = np.linalg.matrix_rank(np.column_stack([np.ones(len(x)), x])) > n
@@ -124,7 +126,12 @@ class SplineLPV(Interpolator):
         return curves[self.kind](x[:, 0], theta)
 
     def _evaluate(self, kappa: Array) -> Array:
-        return _along(self._curve, self._unit(kappa))
+        return _along(self._curve, self._varying(self._unit(kappa)))
+
+    def _varying(self, x: Array) -> Array:
+        """The variables that take more than one value; one at least."""
+        varies = np.ptp(self.scheduling_range_, axis=0) > 0.0
+        return x[:, varies] if varies.any() else x[:, :1]
 
     def _unit(self, kappa: Array) -> Array:
         """Where scheduling values lie from -1 to 1; beyond, along the tangent there."""
@@ -141,7 +148,7 @@ class SplineLPV(Interpolator):
         self._draw(coefficients.reshape(self._theta.shape))
 
     def _carried(self, outer: Array, kappa: Array) -> Array:
-        x, (n, q) = self._unit(kappa), self._theta.shape
+        x, (n, q) = self._varying(self._unit(kappa)), self._theta.shape
         if isinstance(self._curve, PchipInterpolator):  # its slopes follow the values
             nodes, units = self._nodes[:, 0], np.eye(n)[:, :, None].repeat(q, axis=2)
             changes = _pchip_slope_changes(nodes, self._theta)

@@ -784,6 +784,12 @@ def _balancings(what: str, models: Sequence[StateSpace]) -> list[Balancing]:
     return balancing_transformations(A, B, C, not models[0].is_continuous)
 
 
+def scaled(model: StateSpace, u: Array, y: Array) -> StateSpace:
+    """The model of inputs in units of `u` and outputs in units of `y`."""
+    C, D, dt = model.C / y[:, None], model.D * u / y[:, None], model.sampling_time
+    return StateSpace(model.A, model.B * u, C, D, dt, input_delay=model.input_delay)
+
+
 def with_signs_of(reference: StateSpace, model: StateSpace) -> StateSpace:
     """A balanced model with the signs of its states turned to those of another."""
     s = align_signs(model.B, model.C, reference.B, reference.C)[:, None]

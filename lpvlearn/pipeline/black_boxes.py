@@ -23,7 +23,7 @@ from ..lpv.alignment import (
     spanning_tree,
 )
 from ..lpv.spline import SplineLPV
-from ..models.statespace import StateSpace, with_signs_of
+from ..models.statespace import StateSpace, scaled, with_signs_of
 from ..structures.structure import GrayBoxStructure
 from ..validation import listed
 from .left_out import (
@@ -186,12 +186,6 @@ def channel_sizes(groups: Sequence[Sequence[Experiment]]) -> tuple[Array, Array]
     both = zip(*(motions(group) for group in groups), strict=True)
     u, y = (np.sqrt(np.mean([std**2 for _, std in one], axis=0)) for one in both)
     return u, y
-
-
-def scaled(model: StateSpace, u: Array, y: Array) -> StateSpace:
-    """The model of inputs in units of `u` and outputs in units of `y`."""
-    C, D, dt = model.C / y[:, None], model.D * u / y[:, None], model.sampling_time
-    return StateSpace(model.A, model.B * u, C, D, dt, input_delay=model.input_delay)
 
 
 def balanced_entries(

@@ -23,10 +23,10 @@ from ..lpv.polynomial import PolynomialLPV
 from ..lpv.rational import RationalLPV
 from ..lpv.spline import SplineLPV
 from ..lpv.weighting import noise_explains
-from ..models.statespace import DEVIATION, StateSpace
+from ..models.statespace import DEVIATION, StateSpace, scaled
 from ..restructuring.coordinates import CanonicalForm
 from ..structures.structure import GrayBoxStructure
-from .black_boxes import of_rates, scaled
+from .black_boxes import of_rates
 from .left_out import (
     UNLIKE,
     errors_left_out,

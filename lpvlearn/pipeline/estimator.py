@@ -400,7 +400,11 @@ list, default=None
         self.verbose = verbose
 
     def set_params(self, **params: Any) -> LocalLPVPipeline:
-        """Set parameters, also ``step__name`` of a step left None (its default)."""
+        """Set parameters, also ``step__name`` of a step left None.
+
+        That becomes `SubspaceLTI`, `GrayBoxRestructurer` (of a canonical form, where
+        None chooses among what needs no structure) or `AutoLPV`.
+        """
         for step, default in _DEFAULTS.items():
             nested = any(name.startswith(step + "__") for name in params)
             if nested and params.get(step, getattr(self, step)) is None:

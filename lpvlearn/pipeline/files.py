@@ -112,7 +112,10 @@ def save(model: Any, path: str | os.PathLike[str]) -> None:
     target = _file(path)
     writer = _Writer()
     if type(before_saving(model)) not in CLASSES.values():
-        raise ValueError(f"`model` must be one of this library. Got {shown(model)}.")
+        raise ValueError(
+            "`model` must be a StateSpace, InnovationModel, LPVStateSpace, "
+            f"GrayBoxStructure, or an estimator of this library. Got {shown(model)}."
+        )
     text = {
         "format": "lpvlearn",
         "schema": SCHEMA,
@@ -254,6 +257,10 @@ class _Writer:
             return {"dict": pairs}
         if isinstance(value, range) and not value[_LONGEST_RANGE:]:
             value = tuple(value)
+        if isinstance(value, pd.Index):
+            value = value.tolist()
+        if isinstance(value, list) and any(isinstance(v, complex) for v in value):
+            return self._array(np.array(value), place)
         if type(value) in (list, tuple):
             items = [self.node(v, f"{place}.{i}") for i, v in enumerate(value)]
             return items if isinstance(value, list) else {"tuple": items}

@@ -32,6 +32,7 @@ from ..inspection.simulation import SimulationDisplay
 from ..inspection.uncertainty import UncertaintyDisplay
 from ..metrics.reports import as_shown, fit_report, readable_report
 from ..metrics.scorers import InitialState
+from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
 from .reports import Summary
 
@@ -404,8 +405,13 @@ def _expression(value: Any, imports: dict[str, set[str]]) -> str:
     """Code of an estimator with the options that are not its defaults."""
     if isinstance(value, GrayBoxStructure):
         return "structure"
+    if isinstance(value, StateSpace):
+        imports.setdefault("lpvlearn", set()).add("StateSpace")
+        given = [_literal(M) for M in (value.A, value.B, value.C, value.D)]
+        time = value.sampling_time
+        return f"StateSpace({', '.join(given)}, sampling_time={time!r})"
     if not isinstance(value, BaseEstimator):
-        return repr(value)
+        return _literal(value)
     kind = type(value)
     public = [part for part in kind.__module__.split(".") if not part.startswith("_")]
     own = public[0] == __name__.split(".")[0]
@@ -421,6 +427,19 @@ def _expression(value: Any, imports: dict[str, set[str]]) -> str:
         return f"{kind.__name__}({', '.join(given)})"
     inner = ",\n".join(given).replace("\n", "\n    ")
     return f"{kind.__name__}(\n    {inner},\n)"
+
+
+def _literal(value: Any) -> str:
+    """A value as Python reads it: arrays as lists, and infinity by its name."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float) and not np.isfinite(value):
+        return f"float({str(value)!r})"
+    if type(value) is list:
+        return f"[{', '.join(map(_literal, value))}]"
+    if type(value) is tuple:
+        return f"({', '.join(map(_literal, value))}{',' * (len(value) == 1)})"
+    return repr(value)
 
 
 def _structure_code(structure: GrayBoxStructure) -> str:

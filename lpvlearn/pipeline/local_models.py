@@ -19,11 +19,12 @@ from ..data.experiments import ROLES, Experiment
 from ..data.operating_points import OperatingPoints
 from ..data.preparation import DETRENDS
 from ..exceptions import collected, retold, warn
+from ..lpv.alignment import rotation_to
 from ..models.statespace import (
     ModelPair,
     StateSpace,
     balanced_models,
-    with_signs_of,
+    scaled,
 )
 from ..restructuring.known_poles import hidden_integrators, integrators
 from ..restructuring.minimise_covariance import Estimate
@@ -383,9 +384,9 @@ def identify_point(
             f"{len(failures)} of {len(labels)} realisations were left out of the "
             f"average; the first, {failures[0][0]!r}: {failures[0][1]}"
         )
-    models = _of_lowest_order(models)  # where none grew
-    models = _of_lowest_order(balanced_models(models))  # nor lost what is rounding
-    known, lti = all(pairs for _, pairs in estimates), _average(models)
+    known = all(pairs for _, pairs in estimates)
+    models = _in_one_basis(models, experiments)
+    lti = _average(models)
     return LocalModel(
         lti,
         kept[0].lti_.order,
@@ -659,11 +660,27 @@ def _of_lowest_order(models: Sequence[StateSpace]) -> list[StateSpace]:
     return [model for model in models if model.order == lowest]
 
 
+def _in_one_basis(
+    models: Sequence[StateSpace], experiments: Sequence[Experiment]
+) -> list[StateSpace]:
+    """Balanced models of one order, each turned to be nearest to the first.
+
+    By signals of unit size: balancing, and what is near, depend on units. Signs alone
+    would not do where singular values are nearly equal, whose states may be turned.
+    """
+    (_, u), (_, y) = motions(experiments)
+    models = _of_lowest_order(models)  # where none grew
+    models = balanced_models([scaled(model, u, y) for model in models])
+    first, *others = _of_lowest_order(models)  # nor lost what is rounding
+    turned = [first, *(m.transform(rotation_to(m, first).T) for m in others)]
+    return [scaled(model, 1.0 / u, 1.0 / y) for model in turned]
+
+
 def _average(models: Sequence[StateSpace]) -> StateSpace:
-    """Average balanced models of one order, state signs aligned to the first."""
-    aligned = [with_signs_of(models[0], model) for model in models]
-    A, B, C, D = (np.mean([getattr(m, M) for m in aligned], axis=0) for M in "ABCD")
-    return StateSpace(A, B, C, D, input_delay=models[0].input_delay)
+    """The mean of the matrices of models in one basis."""
+    A, B, C, D = (np.mean([getattr(m, M) for m in models], axis=0) for M in "ABCD")
+    mean = StateSpace(A, B, C, D, input_delay=models[0].input_delay)
+    return mean.balance() if mean.is_stable else mean
 
 
 def _bare(experiment: Experiment) -> Experiment:

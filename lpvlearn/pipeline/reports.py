@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..data.experiments import Experiment
 from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
+from ..lpv.spline import SplineLPV
 from ..lpv.weighting import noise_explains
 from ..metrics.reports import as_shown, readable_report
 from ..metrics.scores import best_fit, parameter_fit
@@ -156,11 +157,20 @@ def tables(
     far = sorted(((e, k) for e, k in errors if e > _MISSED), reverse=True)
     form = getattr(lpv.interpolator, "best_estimator_", None)  # nobody's choice
     if far and form is not None and not noise_explains(form):
+        if isinstance(form, SplineLPV):  # which met all of them
+            why = (
+                "records that move have taken it from there. Look for what sets them "
+                "apart from the records of the points: another load, units, offsets."
+            )
+        else:
+            why = (
+                "its parameters do not follow so simple a form. Use "
+                "interpolator=SplineLPV(), which meets all points."
+            )
         warn(
             "the LPV model misses the local models at operating point(s) "
             f"{listed_errors(far, points.kappa)}, in percent of their H-infinity norm: "
-            "its parameters do not follow so simple a form. Use "
-            "interpolator=SplineLPV(), which meets all points."
+            f"{why}"
         )
     by_parameter = {
         "lowest": theta.min(axis=0),

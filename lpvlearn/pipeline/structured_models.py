@@ -370,12 +370,13 @@ def _with_structure(restructurer: Any, local: Sequence[LocalModel]) -> Any:
             f"needs local models of one order. Got orders {orders}. Fix the order: "
             "local=SubspaceLTI(order=...)."
         )
-    first = local[0].lti
+    first, integrating = local[0].lti, local[0].integrating
     form = GrayBoxStructure.observable_canonical(
-        orders[0],
+        orders[0] - len(integrating),
         first.n_inputs,
         first.n_outputs,
         orders[0] == 0 or any(model.lti.D.any() for model in local),
+        integrating,
     )
     return clone(restructurer).set_params(structure=form)
 

@@ -15,9 +15,8 @@ from ..lpv.left_out import interpolated_without
 from ..lpv.lfr import scales
 from ..lpv.weighting import covariance_factor
 from ..models.gap import gap
-from ..models.statespace import DEVIATION, StateSpace
+from ..models.statespace import DEVIATION, StateSpace, scaled
 from ..validation import one_of
-from .black_boxes import scaled
 from .estimator import LocalLPVPipeline
 
 Array = NDArray[np.float64]
@@ -116,18 +115,19 @@ def suggest_operating_point(
     structure, theta = pipeline.lpv_.structure, pipeline.lpv_.parameters(places)
     frozen = [structure.model(values) for values in theta]
 
+    def interpolated(out: NDArray[np.bool_]) -> list[StateSpace]:
+        """At the candidates, of the points themselves, refined or not."""
+        form, parameters = pipeline.interpolator_, pipeline.parameters_.to_numpy()
+        known = pipeline.parameters_covariance_
+        values = interpolated_without(out, form, kappa, parameters, places, known)
+        return [] if values is None else [structure.model(v) for v in values]
+
     left_out = np.full((len(kappa), len(places)), np.nan)
+    of_all = interpolated(np.zeros(len(kappa), bool))
     for i in range(len(kappa)):
-        without = interpolated_without(
-            np.arange(len(kappa)) == i,
-            pipeline.interpolator_,
-            kappa,
-            pipeline.parameters_.to_numpy(),
-            places,
-            pipeline.parameters_covariance_,
-        )
-        for k, values in enumerate([] if without is None else without):
-            left_out[i, k] = distance(structure.model(values), frozen[k])
+        without = interpolated(np.arange(len(kappa)) == i)
+        for k, pair in enumerate(zip(without, of_all, strict=False)):  # or of none
+            left_out[i, k] = distance(*pair)
     noise = np.full(len(places), np.nan)
     known = pipeline.lpv_.covariance is not None
     none: Any = []

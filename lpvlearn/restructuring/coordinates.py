@@ -338,7 +338,12 @@ class CanonicalForm:
             [[T @ problem.A @ inverse, T @ problem.B], [problem.C @ inverse, problem.D]]
         )
         d = new - problem.offset
-        theta = nearest_parameters(problem, d.reshape(1, -1))[0]
+        flat = problem.basis.reshape(structure.n_params, -1)
+        if (np.count_nonzero(flat, axis=0) <= 1).all():
+            # of their own entries, however much larger others are
+            theta = flat @ d.ravel() / np.sum(flat**2, axis=1)
+        else:
+            theta = nearest_parameters(problem, d.reshape(1, -1))[0]
         rest = d - np.tensordot(theta, problem.basis, axes=1)
         near = np.linalg.norm(rest) <= exact * np.linalg.norm(d)
         return theta if near else None

@@ -6,7 +6,13 @@ from numpy.testing import assert_allclose
 from scipy.linalg import solve_continuous_lyapunov
 
 from lpvlearn import StateSpace
-from lpvlearn.lpv.alignment import STATES, _Distance, aligned_models, rotation_to
+from lpvlearn.lpv.alignment import (
+    STATES,
+    _Distance,
+    aligned_models,
+    rotation_to,
+    spanning_tree,
+)
 
 from ..conftest import modes, stable_model
 
@@ -150,3 +156,11 @@ def test_units_of_the_scheduling_variables_do_not_matter():
     again = aligned_models(models, points * [1e-6, 1e6])
     for one, other in zip(found, again, strict=True):
         assert_allclose(one.A, other.A, atol=1e-9)
+
+
+def test_of_two_points_in_the_middle_units_choose_none():
+    kappa = np.array([1.0, 2.0, 3.3, 4.0, 6.0, 9.0])[:, None]
+    roots = {
+        int(spanning_tree(kappa * c)[0][0]) for c in (1, 1e-6, 1 / 3, 2.54, 1 / 60)
+    }
+    assert len(roots) == 1

@@ -22,6 +22,7 @@ from sklearn.preprocessing import StandardScaler
 from lpvlearn import GrayBoxStructure, LPVStateSpace, PolynomialLPV, StateSpace
 from lpvlearn.exceptions import DivergenceError, ExtrapolationWarning
 from lpvlearn.lpv import model as model_module
+from lpvlearn.lpv.bands import simulation_std
 
 from ..conftest import spring_lpv
 
@@ -876,3 +877,35 @@ def test_ranges_and_bases_that_do_not_fit_are_refused(wrong, said):
     a = PolynomialLPV(0).fit([[0.0], [1.0]], [[1.0], [1.0]])
     with pytest.raises(ValueError, match=said):
         LPVStateSpace(decay, a, **({"scheduling_range": [[0.0], [1.0]]} | wrong))
+
+
+def test_names_are_any_list_of_labels():
+    k = [[0.0, 0.0], [1.0, 1.0]]
+    flat = PolynomialLPV(0).fit(k, [[1.0], [1.0]])
+    structure = GrayBoxStructure.from_template([["-a"]], [[1]], [[1]])
+    for names in (np.array(["p", "q"]), pd.Index(["p", "q"])):
+        options = {"scheduling_names": names, "identified_range": k}
+        lpv = LPVStateSpace(structure, flat, k, **options)
+        assert list(lpv.scheduling_names) == ["p", "q"]
+        with pytest.warns(ExtrapolationWarning, match="'q'"):
+            lpv.simulate([1.0, 1.0], [[0.5, 3.0]] * 2, 0.1)
+
+
+def test_the_deviation_of_a_response_is_not_known_at_a_pole():
+    k = [[0.0], [1.0]]
+    integrator = GrayBoxStructure.from_template([[0]], [["b"]], [[1]])
+    form = PolynomialLPV(0).fit(k, [[1.0], [1.0]])
+    lpv = LPVStateSpace(integrator, form, k, covariance=[[0.01]])
+    std = lpv.frequency_response_std(0.0, [0.0, 2.0])
+    assert np.isnan(std[0]).all()
+    np.testing.assert_allclose(std[1], 0.05j)
+
+
+def test_models_without_states_have_slopes_from_a_steady_start():
+    k = [[0.0], [1.0]]
+    gain = PolynomialLPV(1).fit(k, [[1.0], [2.0]])
+    structure = GrayBoxStructure.full(0, 1, 1)
+    P = 0.01 * np.eye(2)
+    lpv = LPVStateSpace(structure, gain, k, covariance=P, steady_start=True)
+    std = simulation_std(lpv, np.ones((5, 1)), np.full((5, 1), 0.5), 0.1)
+    np.testing.assert_allclose(std, 0.1)

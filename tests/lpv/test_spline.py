@@ -123,3 +123,14 @@ def test_other_coefficients_draw_the_curve_once(monkeypatch):
     moved = form.with_coefficients(form.coefficients() + 1.0)
     assert len(drawn) == 1
     assert np.allclose(moved.predict([[0.5]]), form.predict([[0.5]]) + 1.0)
+
+
+@pytest.mark.parametrize("kind", ["pchip", "cubic", "linear"])
+def test_a_variable_of_one_value_changes_nothing(kind):
+    places = np.linspace(-1.0, 6.0, 30)[:, None]
+    alone = SplineLPV(kind).fit(KAPPA, THETA)
+    beside = SplineLPV(kind).fit(np.hstack([KAPPA, 7.0 + 0.0 * KAPPA]), THETA)
+    both = np.hstack([places, 7.0 + 0.0 * places])
+    np.testing.assert_array_equal(beside.predict(both), alone.predict(places))
+    slopes = alone.sensitivities(places)
+    np.testing.assert_array_equal(beside.sensitivities(both), slopes)

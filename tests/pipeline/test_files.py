@@ -470,7 +470,7 @@ def test_what_load_would_refuse_is_not_written(tmp_path):
     ],
 )
 def test_what_is_no_model_is_refused(model, got, tmp_path):
-    with pytest.raises(ValueError, match=f"`model` must be one of this.*{got}"):
+    with pytest.raises(ValueError, match=f"`model` must be a StateSpace.*{got}"):
         save(model, tmp_path / "model.zip")
     assert list(tmp_path.iterdir()) == []
 
@@ -888,3 +888,11 @@ def test_pickles_of_another_version_warn(fitted, monkeypatch):
     public = (getattr(lpvlearn, name) for name in lpvlearn.__all__)
     classes = (c for c in public if isinstance(c, type))
     assert all(issubclass(c, VersionedPickle) for c in classes)
+
+
+def test_options_are_lists_of_complex_numbers_and_labels_of_pandas(tmp_path):
+    path = tmp_path / "model.zip"
+    save(GrayBoxRestructurer(known_poles=[2j, -2j]), path)
+    np.testing.assert_array_equal(load(path).known_poles, [2j, -2j])
+    save(SubspaceLTI(inputs=pd.Index(["u", "v"])), path)
+    assert load(path).inputs == ["u", "v"]

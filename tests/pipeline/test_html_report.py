@@ -13,11 +13,12 @@ from lpvlearn import (
     GrayBoxRestructurer,
     GrayBoxStructure,
     LocalLPVPipeline,
+    StateSpace,
     SubspaceLTI,
     load,
     save,
 )
-from lpvlearn.pipeline.html_report import reproducing_code
+from lpvlearn.pipeline.html_report import _expression, reproducing_code
 
 from ..conftest import ROLES, spring_pipeline, stable_model
 
@@ -204,3 +205,21 @@ def test_a_browser_shows_it_without_complaint(fitted, spring, tmp_path):
     )
     assert "CONSOLE" not in told.stderr
     assert told.stdout.count("<svg") == path.read_text(encoding="utf-8").count("<svg")
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        GrayBoxRestructurer(init=np.ones(3)),
+        SubspaceLTI(np.int64(3)),
+        GrayBoxRestructurer(frequency_weight=(0.1, np.inf)),
+        GrayBoxRestructurer(frequency_weight=StateSpace(-1.0, 1.0, 1.0)),
+    ],
+    ids=str,
+)
+def test_its_code_is_python_whatever_the_options(step):
+    known = {kind.__name__: kind for kind in (type(step), StateSpace)}
+    again = eval(_expression(step, {}), known)
+    for name, option in step.get_params().items():
+        as_lists = option.tolist() if isinstance(option, np.ndarray) else option
+        assert str(again.get_params()[name]) == str(as_lists)

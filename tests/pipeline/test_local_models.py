@@ -1,6 +1,7 @@
 """Step 3 at the operating points: plants in a loop, plants that integrate."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -350,3 +351,23 @@ def test_outputs_that_integrate_at_all_points_are_told(poles, told):
         "outputs ['heading'] integrate" in str(warning.message) for warning in said
     ]
     assert found == [True] * told
+
+
+def test_an_average_knows_no_units_and_turns_states_of_equal_singular_values():
+    """Two axes that are alike: signs alone would average states turned anyhow."""
+    axis = np.array([[0.0, 1.0], [-4.0, -0.8]])
+    A, B = np.kron(np.eye(2), axis), np.kron(np.eye(2), [[0.0], [1.0]])
+    plant = StateSpace(A, B, np.kron(np.eye(2), [[1.0, 0.0]]))
+    rng, omega = np.random.default_rng(1), np.array([0.3, 2.0, 5.0])
+    options = {"sampling_time": 0.1, "combine": "average", "discretization": "zoh"}
+    records = []
+    for k in range(4):
+        u = np.sign(rng.standard_normal((400, 2)))
+        y = plant.simulate(u, sampling_time=0.1)
+        y += 0.02 * rng.standard_normal(y.shape)
+        records.append(Experiment(k, np.arange(400), u, y))
+    for size in ([1.0, 1.0], [1e5, 1.0]):
+        scaled = [replace(e, inputs=e.inputs * size) for e in records]
+        model = identify_point(SubspaceLTI(4), scaled, efficient=True, **options).lti
+        G, G0 = model.frequency_response(omega), plant.frequency_response(omega)
+        assert np.abs(G * size - G0).max() < 0.05 * np.abs(G0).max()

@@ -222,7 +222,9 @@ def servo(kappa):
     return StateSpace(A, [[0], [0], [6.0]], [[1, 0, 0], [0, 0, 1]])
 
 
-@pytest.mark.parametrize("restructurer", ["aligned", "passthrough"])
+@pytest.mark.parametrize(
+    "restructurer", ["aligned", "passthrough", GrayBoxRestructurer()], ids=str
+)
 def test_integrators_need_no_structure(restructurer):
     rng, runs = np.random.default_rng(3), []
     for kappa in (0.0, 1.0, 2.0):
