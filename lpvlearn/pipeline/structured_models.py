@@ -176,7 +176,8 @@ def with_foreseen(found: StructuredModels) -> StructuredModels:
     kappa, n = found.points.kappa, len(found.theta)
     std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     usual = np.median(std, axis=0)
-    ratio = std / np.where(usual > 0.0, usual, np.inf)
+    some = (usual > 0.0) & np.isfinite(usual)
+    ratio = np.divide(std, usual, out=np.zeros_like(std), where=some)
     # but for a record that tells less of all parameters: covariances weigh that
     least = ratio.min(axis=1, initial=np.inf, keepdims=True)
     doubted = ratio > _UNTOLD * np.maximum(least, 1.0)

@@ -186,12 +186,15 @@ def _beside(
 def _sinusoids(turns: Array, n_samples: int, degree: int) -> Array:
     """Orthonormal where they are apart, (n_samples, 2 n_turns (degree + 1)).
 
-    Turn by turn, times polynomials of time, one degree after the other.
+    Turn by turn, times polynomials of time, one degree after the other; in a record of
+    few turns, which other motions may look like, of degree 0.
     """
     time = np.arange(n_samples)
     shapes = np.polynomial.legendre.legvander(2.0 * time / n_samples - 1.0, degree)
-    signals = []
-    for turn in turns:
+    signals = np.zeros((n_samples, len(turns), 2 * (degree + 1)))
+    for k, turn in enumerate(turns):
         both = np.column_stack([np.cos(turn * time), np.sin(turn * time)])
-        signals.append((shapes[:, :, None] * both[:, None]).reshape(n_samples, -1))
-    return np.hstack([np.linalg.qr(part)[0] for part in signals])
+        shape = shapes if turn * n_samples > _TURNS else shapes[:, :1]
+        Q = np.linalg.qr((shape[:, :, None] * both[:, None]).reshape(n_samples, -1))[0]
+        signals[:, k, : Q.shape[1]] = Q
+    return signals.reshape(n_samples, -1)

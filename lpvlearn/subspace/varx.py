@@ -138,7 +138,7 @@ class Feedback(NamedTuple):
         As a controller makes it do. In open loop noise of a measured input does, too.
         """
         line = self.p_direct < _REFUTED and self.p_answer > _LIKELY
-        return line and not self.cut_off
+        return line and self.p_instantaneous < _LEVEL and not self.cut_off
 
     @property
     def instantaneous(self) -> bool:

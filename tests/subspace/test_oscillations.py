@@ -126,3 +126,16 @@ def test_it_may_be_all_that_moves(gain):
     assert told
     assert model.lti_.order == 0
     assert_allclose(model.lti_.D, gain, atol=0.01)
+
+
+def test_pieces_between_lost_rows_are_short():
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.choice([-1.0, 1.0], (600, 1)), 5, axis=0)
+    y, k = _plant().simulate(u), np.arange(3000)
+    y += y.std() * (0.3 * _wave(rng, 3000, 0.3) + 0.02 * rng.standard_normal(y.shape))
+    kept = rng.random(3000) > 0.01
+    X = np.hstack([u, k[:, None].astype(float)])[kept]
+    model, told = _fit(X, y[kept], time=1, missing="split")
+    assert told
+    assert model.lti_.order == 4
+    assert _error(model) < 0.01

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.signal import lfilter
 
-from lpvlearn import SubspaceLTI
+from lpvlearn import StateSpace, SubspaceLTI
 from lpvlearn.subspace.records import Record
 from lpvlearn.subspace.varx import find_feedback, longest_past, past_window
 
@@ -296,3 +296,18 @@ def test_an_output_that_repeats_others_makes_no_number_invalid():
             u, y = open_loop(rng, 500, "white")
             twice = find_feedback(records_of((u, np.hstack([y, y]))))
             assert np.isfinite(twice.p_value) and not twice.found
+
+
+@pytest.mark.parametrize("seed", [38, 206])
+def test_chance_within_the_sample_is_no_answer_to_outputs(seed):
+    """Held inputs of pieces, of which the past is short: half a per cent were."""
+    rng = np.random.default_rng(seed)
+    plant = StateSpace([[1.6, -0.8], [1, 0]], [[1], [0]], [[0.2, 0.1]], None, 1.0)
+    hold = int(rng.integers(2, 9))
+    u = np.sign(rng.standard_normal((3000 // hold + 1, 1))).repeat(hold, 0)[:3000]
+    y = plant.simulate(u)
+    y += 0.03 * y.std() * rng.standard_normal(y.shape)
+    kept = np.flatnonzero(rng.random(3000) > 0.01)
+    pieces = np.split(kept, np.flatnonzero(np.diff(kept) > 1) + 1)
+    records = [Record.of(u[k], y[k] / y.std(), 1) for k in pieces if len(k) > 2]
+    assert not find_feedback(records).found
