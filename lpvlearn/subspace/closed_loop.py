@@ -67,6 +67,7 @@ from ..systems.innovations import kalman_filter
 from ..systems.least_squares import scaled_lstsq
 from ..systems.modes import spectral_radius
 from ..systems.simulation import estimate_initial_state, state_trajectory
+from .criterion import PRICE
 from .hankel import hankel_factor
 from .identification import REFITS, STABLE_MARGIN, Settings
 from .noise import Whitening
@@ -126,6 +127,17 @@ class _Innovation(NamedTuple):
         """In the coordinates x' of ``x = T x'``."""
         A, B, K = (linalg.solve(T, part) for part in (self.A @ T, self.B, self.K))
         return self._replace(A=A, B=B, C=self.C @ T, K=K)
+
+    def rescaled(self, u: Array, y: Array) -> _Innovation:
+        """Of inputs and outputs divided by these numbers."""
+        return _Innovation(
+            self.A,
+            self.B * u,
+            self.C / y[:, None],
+            self.D * u / y[:, None],
+            self.K * y,
+            self.covariance / np.outer(y, y),
+        )
 
 
 class _Changes(NamedTuple):
@@ -299,6 +311,20 @@ class ClosedLoopEvidence(Evidence):
         states = np.zeros((len(records), len(A)))
         return Realization(A, B, C, D, states, np.inf)
 
+    def start(
+        self, scaled: ScaledRecords, free: Freedom
+    ) -> tuple[_Innovation, NDArray[np.bool_]] | None:
+        """Where models of the same samples with other trends may begin; of those only.
+
+        And which of its states are the plant's.
+        """
+        others = free.n_trend != self.free.n_trend
+        if not others or (free.direct != self.free.direct).any():
+            return None
+        ratios = scaled.input_scale / self.input_scale
+        sizes = scaled.output_scale / self.output_scale
+        return self.joint.rescaled(ratios, sizes), self.kept
+
     @cached_property
     def one_step(self) -> Evidence:
         """The predictor as a model driven by inputs and outputs, with its errors."""
@@ -337,6 +363,7 @@ def identify_closed_loop(
     order: int | None,
     horizon: int | None,
     settings: Settings,
+    like: Evidence | None = None,
 ) -> PlantFit:
     """Identify a plant that may stand in a feedback loop.
 
@@ -345,6 +372,9 @@ def identify_closed_loop(
     plant's that the inputs reach. Where these do not add up to a given order, the model
     is that of so many states of the subspace, not refined: the prediction error of so
     few would trade the plant for the noise.
+
+    A model `like` it, of the same samples with other trends, is begun from as well:
+    where trends are further parameters, it can only be likelier with them.
 
     Poles that `enforce_stability` refuses are reflected into the unit circle, and B
     and D minimise the simulation error. `basis` is that of the `Evidence`.
@@ -356,7 +386,10 @@ def identify_closed_loop(
     criteria = _criteria(left, subspace)
     free_order = order is None or (settings.refine and settings.n_noise_states == 0)
     n_joint = max(wanted, int(np.argmin(criteria))) if free_order else wanted
-    together = _fit_together(subspace, records, order, n_joint, settings)
+    start = None
+    if isinstance(like, ClosedLoopEvidence):
+        start = like.start(scaled, free)
+    together = _fit_together(subspace, records, order, n_joint, settings, start)
     fitted, joint, transform, kept = together
     own, errors = _predicted(joint, records, free)
     states, trends = free.own_parts(own, len(joint.A))
@@ -415,13 +448,15 @@ def _fit_together(
     order: int | None,
     n_joint: int,
     settings: Settings,
+    start: tuple[_Innovation, NDArray[np.bool_]] | None = None,
 ) -> _Together:
     """Plant and noise of `n_joint` states or more, told apart.
 
     `order` is that of the plant. States of the noise that the subspace does not show
-    would be taken from those of a given one.
+    would be taken from those of a given one. Where what is refined from a `start` is
+    not told apart, that is as it was.
     """
-    free, n = settings.free, subspace.n_columns
+    free = settings.free
     found: list[tuple[_Predictor | None, _Innovation]]
     found = [(None, _innovation_form(subspace, n_joint))]
     if settings.refine:
@@ -430,6 +465,37 @@ def _fit_together(
         if order is None or not settings.n_noise_states:
             more = _with_more_states(*first, subspace, records, free)
             found = [more] if order is None or more[1] is first[1] else [more, first]
+    together = _told_apart(found, records, order, subspace, free)
+    if together is None:
+        fitted, joint = found[-1]
+        if fitted is not None and fitted.model.blocks is None:  # it was not refined
+            fitted = None
+        if order is not None and order != len(joint.A):
+            joint, fitted = _innovation_form(subspace, order), None
+        whole = np.ones(len(joint.A), dtype=bool)
+        together = _Together(fitted, joint, np.eye(len(whole)), whole)
+    if start is None or not settings.refine:
+        return together
+    joint, kept = start
+    near = [_refined(joint, records, free)]
+    other = _told_apart(near, records, order, subspace, free)
+    if other is None:
+        joint = _likeliest([joint], records, free)
+        other = _Together(None, joint, np.eye(len(kept)), kept)
+    # at the price by which models with and without trends are compared
+    costs = [_cost(m.joint, subspace, records, PRICE) for m in (together, other)]
+    return other if costs[1] < costs[0] else together
+
+
+def _told_apart(
+    found: Sequence[tuple[_Predictor | None, _Innovation]],
+    records: Sequence[Record],
+    order: int | None,
+    subspace: _Subspace,
+    free: Freedom,
+) -> _Together | None:
+    """Plant and noise of the first of these models that tells them apart."""
+    n = subspace.n_columns
     for fitted, joint in found:
         if fitted is not None and fitted.model.blocks is None:  # it was not refined
             fitted = None
@@ -444,10 +510,7 @@ def _fit_together(
         apart, fewer = _likeliest(models, records, free), int((~kept).sum())
         if order is not None or _as_likely(apart, joint, fewer, records, n):
             return _Together(fitted, apart, T, kept)
-    if order is not None and order != len(joint.A):
-        joint, fitted = _innovation_form(subspace, order), None
-    whole = np.ones(len(joint.A), dtype=bool)
-    return _Together(fitted, joint, np.eye(len(whole)), whole)
+    return None
 
 
 def _with_more_states(
@@ -463,16 +526,15 @@ def _with_more_states(
     leaves of the outputs without them is no more than with them. Schwarz's criterion,
     as the refined models have as many states as they can use.
     """
-    n, each = subspace.n_columns, sum(subspace.direct.shape) + len(joint.C)
     highest = min(_MAX_ORDER, len(subspace.states))
+    price = float(np.log(subspace.n_columns))
 
     @cache
     def refined(order: int) -> tuple[_Predictor, _Innovation]:
         return _refined(_innovation_form(subspace, order), records, free)
 
     def criterion(model: tuple[_Predictor, _Innovation]) -> float:
-        price = len(model[1].A) * each * np.log(n) / n
-        return _volume(model[1].covariance, records) + price
+        return _cost(model[1], subspace, records, price)
 
     best = fitted, joint
     while True:
@@ -483,6 +545,15 @@ def _with_more_states(
         if least is best:
             return best
         best = least
+
+
+def _cost(
+    model: _Innovation, subspace: _Subspace, records: Sequence[Record], price: float
+) -> float:
+    """Criterion per sample of a model, by the price of a parameter."""
+    (ny, m), n = subspace.direct.shape, subspace.n_columns
+    parameters = len(model.A) * (m + 2 * ny)
+    return _volume(model.covariance, records) + price * parameters / n
 
 
 def _volume(covariance: Array, records: Sequence[Record]) -> float:

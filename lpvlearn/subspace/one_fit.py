@@ -78,7 +78,10 @@ class Samples(NamedTuple):
         settings = _heed(feedback, settings, choices.feedthrough is True)
         if settings.method == "pbsid":
             try:
-                plant = identify_closed_loop(scaled, basis, order, horizon, settings)
+                near = None if like is None else like.evidence
+                plant = identify_closed_loop(
+                    scaled, basis, order, horizon, settings, near
+                )
                 found = plant.selection.order
                 if order is None and found not in (settings.orders or [found]):
                     # a state too few spoils the plant, one too many costs little

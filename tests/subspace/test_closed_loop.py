@@ -883,3 +883,41 @@ def test_states_of_the_disturbance_are_not_taken_from_a_given_order(seed):
     slow = true[np.argmin(np.abs(true - 1.0))]
     k = int(np.argmin(np.abs(poles - slow)))
     assert abs(poles[k].real - slow.real) < 2.5 * model.poles_std_[k].real
+
+
+def car_with_biases(seed, speed=32.0, n_samples=4000, step=0.01):
+    """Yaw rate and lateral acceleration of a car that a driver keeps straight."""
+    mass, inertia, front, rear, Cf, Cr = 1500.0, 2500.0, 1.2, 1.5, 8e4, 9e4
+    turn = front * Cf - rear * Cr
+    A = [
+        [-(Cf + Cr) / (mass * speed), -speed - turn / (mass * speed)],
+        [-turn / (inertia * speed), -(front**2 * Cf + rear**2 * Cr) / inertia / speed],
+    ]
+    B = [[Cf / mass], [front * Cf / inertia]]
+    C = [[0.0, 1.0], [A[0][0], A[0][1] + speed]]
+    plant = StateSpace(A, B, C, [[0.0], [Cf / mass]]).to_discrete(step)
+    rng, x = np.random.default_rng(seed), np.zeros(2)
+    yaw = seen = filtered = gust = 0.0
+    moves = np.repeat(rng.choice([-0.03, 0.03], n_samples // 60 + 1), 60)
+    noise = rng.standard_normal((n_samples, 3)) * [1.0, 0.003, 0.08]
+    u, y = np.zeros((n_samples, 1)), np.zeros((n_samples, 2))
+    for k in range(n_samples):
+        filtered += step / 0.15 * (moves[k] - filtered)
+        gust = 0.98 * gust + 0.02 * noise[k, 0]
+        u[k] = filtered - 0.05 * yaw - 0.1 * seen
+        seen = x[1] + noise[k, 1]
+        y[k] = plant.C @ x + plant.D @ u[k] + [noise[k, 1], noise[k, 2]]
+        yaw += step * x[1]
+        x = plant.A @ x + plant.B @ u[k] + 0.002 * gust
+    return u + 0.01, y + [0.004, 0.15]
+
+
+@pytest.mark.parametrize("speed, seed", [(20.0, 1), (20.0, 5), (26.0, 6)])
+def test_constants_beside_a_given_order_are_no_less_likely_than_none(speed, seed):
+    """The model with constants begins at the one without: levels were lost else."""
+    u, y = car_with_biases(seed, speed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the loop
+        model = SubspaceLTI(2, method="pbsid").fit(u, y)
+    assert model.offset_ == "constant"
+    assert model.score(u, y) > 0.99
