@@ -39,6 +39,7 @@ _SUPPORT = 10.0
 # A rational form, or a polynomial of a high degree, that has coefficients for more than
 # this share of the values meets most points: it must foresee those left out as well.
 _FREE = 0.5
+_BETTER = 0.99  # of the squared errors of points left out: no equals but for rounding
 _NOISE = 10.0  # standard deviations over which a parameter moves by more than noise
 
 # Where no form is true: the first, or one of the others that meets points left out, so
@@ -87,7 +88,7 @@ class AutoLPV(Interpolator):
     -----
     A rational form, or a polynomial of a degree above 2, with more than half as many
     coefficients as there are values must foresee points that are left out, within the
-    range of the others, as well as interpolation does.
+    range of the others, as well as interpolation does; a rational form better.
 
     If a form is true, its chi-square is about its degrees of freedom. A form whose
     chi-square is more than four times that (and no chance, for few degrees of freedom)
@@ -209,9 +210,13 @@ class AutoLPV(Interpolator):
 def _foresees(
     form: Any, curve: SplineLPV, kappa: Array, points: WeightedPoints
 ) -> bool:
-    """Whether points left out are met as well as by a curve through the others."""
+    """Whether points left out are met as well as by a curve through the others.
+
+    Better, of a form with a denominator: through few points it may be the cubic that a
+    spline is, and that tells nothing of what it is through all.
+    """
     own, other = _errors_left_out([form, curve], kappa, points).sum(axis=(1, 2))
-    return bool(own <= other)
+    return bool(own <= (_BETTER if getattr(form, "denominator", 0) else 1.0) * other)
 
 
 def _interpolation(kappa: Array, points: WeightedPoints) -> tuple[str, SplineLPV]:

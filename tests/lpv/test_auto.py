@@ -198,3 +198,15 @@ def test_rational_forms_of_a_grid_must_foresee_whole_levels():
         covariance = np.array([np.diag((0.002 * row) ** 2) for row in clean])
         model = AutoLPV().fit(kappa, theta, covariance=covariance)
         assert np.abs(model.predict(fine) / truth(fine) - 1.0).max() < 0.1
+
+
+def test_a_rational_form_that_is_a_cubic_without_a_point_is_not_told_by_that():
+    """Through five points it has a pole, through four of them it meets the spline's."""
+    kappa = np.array([0.0, 0.22, 0.44, 0.67, 1.0])[:, None]
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        values = np.cos(np.pi * kappa + np.arange(3.0)) * [1.0, 0.3, 2.0]
+        values += 1e-5 * rng.standard_normal(values.shape)
+        P = np.tile(1e-10 * np.eye(3), (5, 1, 1))
+        model = AutoLPV().fit(kappa, values, covariance=P)
+        assert model.form_ == "cubic"
