@@ -822,7 +822,9 @@ def common_delay(
             "the input delay differs between operating points (scheduling: samples of "
             f"each input; {each}). The LPV model takes the median, {taken}; the local "
             "models keep their own. Where the system has one delay, give it: "
-            "local=SubspaceLTI(input_delay=...)."
+            "local=SubspaceLTI(input_delay=...). Where it follows the scheduling "
+            "variable, as transport at another speed does, shift the column of the "
+            "input by what is known of it, for the fit and for predictions."
         )
     return median
 

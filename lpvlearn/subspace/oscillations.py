@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 # Time constants per record of a mode that stands for one; radians that it turns in it,
 # and that it is away from a change of sign with every sample.
-_DECAYS, _TURNS = 1.0, 20.0
+_DECAYS, _TURNS = 1.0, 11.0
 
 # Polynomials of time that amplitudes may follow, and the part of what a sinusoid
 # explains that they may add: noise that shakes a mode makes its amplitude wander.
