@@ -196,8 +196,8 @@ def _check_local(experiments: Sequence[Experiment], kappa: Array) -> None:
                 f"{_MAX_SPREAD:g} times the {compared} ({scale[worst]:.4g}). Keep such "
                 "a record for validation, cut it into local experiments, put the mean "
                 "of the variable in its place where it only moves about one point, or "
-                "refine the model with it: refiner=OutputErrorLPV(). In the place of an "
-                f"angle that turns over, take its cosine and sine.{several}"
+                "refine the model with it: refiner=OutputErrorLPV(). For an angle that "
+                f"turns over, take its cosine and sine.{several}"
             )
         changes = np.count_nonzero(np.diff(run.scheduling, axis=0), axis=0)
         steps = (changes > 0) & (changes <= min(_FEW_STEPS, len(run.rows) // _STILL))

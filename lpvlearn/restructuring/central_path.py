@@ -32,7 +32,6 @@ Complex = NDArray[np.complex128]
 _BARRIER = 1e-2
 _SHRINK, _FAST = 0.3, 0.1  # of mu, to the next stage; after one that took one step
 _FIRST_LEVEL = 2.0  # level of the first stage, relative to the largest singular value
-_SINGULAR = 1e-12  # relative curvature: flatter directions are taken as that steep
 # Of a trust-region step: relative curvature that still counts as positive, the excess
 # of the shift over the lowest eigenvalue, and digits of the shift, of which few matter
 _POSITIVE, _EXCESS, _CLOSE = 1e-13, 1e-14, 1.001

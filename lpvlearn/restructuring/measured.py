@@ -264,16 +264,9 @@ def realize_response(omega: Array, G: Complex, order: int) -> Target | None:
     observability = U[:, :order]
     C = observability[:p]
     A = np.linalg.lstsq(observability[:-p], observability[p:], rcond=None)[0]
-    # B and D enter the response linearly
     try:
-        X = np.linalg.inv(z[:, None, None] * np.eye(order) - A)
-        left = np.concatenate([C @ X, np.broadcast_to(np.eye(p), (k, p, p))], axis=2)
-        flat = left.reshape(k * p, order + p)
-        rhs = G.reshape(k * p, m)
-        regressors = np.vstack([flat.real, flat.imag])
-        responses = np.vstack([rhs.real, rhs.imag])
-        BD = np.linalg.lstsq(regressors, responses, rcond=None)[0]
-        return Target(*d2c_tustin(A, BD[:order], C, BD[order:], 2.0 / centre))
+        model = _with_poles(z, G, A, C)
+        return Target(*d2c_tustin(model.A, model.B, C, model.D, 2.0 / centre))
     except ValueError:  # a pole on a data point or at infinity
         return None
 
@@ -286,6 +279,7 @@ def stable_realization(omega: Array, G: Complex, order: int) -> Target | None:
     realisation to the right. Of a lower order where the data are too few, and lags of
     the middle frequency where there is none; None for order 0 alone.
     """
+    s = laplace_variable(omega, None)[0]
     for n in range(order, 0, -1):
         model = realize_response(omega, G, n)
         if model is None:
@@ -300,18 +294,18 @@ def stable_realization(omega: Array, G: Complex, order: int) -> Target | None:
         except np.linalg.LinAlgError:  # poles that coincide
             continue
         if (np.linalg.eigvals(A).real < 0).all():
-            return _with_poles(omega, G, A, model.C)
+            return _with_poles(s, G, A, model.C)
     if order == 0:
         return None
     p, positive = G.shape[1], omega[omega > 0]
     rate = float(np.sqrt(positive.min()) * np.sqrt(positive.max()))
-    return _with_poles(omega, G, -rate * np.eye(p), np.eye(p))
+    return _with_poles(s, G, -rate * np.eye(p), np.eye(p))
 
 
-def _with_poles(omega: Array, G: Complex, A: Array, C: Array) -> Target:
-    """The model of least squares with that A and C."""
+def _with_poles(z: Complex, G: Complex, A: Array, C: Array) -> Target:
+    """The model with that A and C, whose B and D meet a response at z best."""
     (k, p, m), n = G.shape, len(A)
-    X = resolvent(A, laplace_variable(omega, None)[0])
+    X = resolvent(A, z)
     left = np.concatenate([C @ X, np.broadcast_to(np.eye(p), (k, p, p))], axis=2)
     flat, rhs = left.reshape(k * p, n + p), G.reshape(k * p, m)
     rows, target = np.vstack([flat.real, flat.imag]), np.vstack([rhs.real, rhs.imag])

@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 from ..minimax.problem import MinimaxResult, Peaks, shortest_in_hull
 from .coordinates import metric_coordinates
 from .deadline import time_is_up
-from .error_system import ErrorSystem, Target
+from .error_system import ErrorSystem, Target, remembering
 from .least_squares import LeastSquaresResult
 from .limits import Limits, within_bounds
 from .minimise_hinf import NEARLY
@@ -161,6 +161,7 @@ def _quasi_newton(
 
     least, best = J, np.zeros(T.shape[1])
 
+    @remembering
     def objective(y: Array) -> tuple[float, Array]:
         nonlocal least, best
         if time_is_up():
@@ -173,6 +174,7 @@ def _quasi_newton(
             least, best = value, y.copy()
         return value / J, (gradient[active] @ T) / J
 
+    @remembering
     def kept(y: Array) -> tuple[Array, Array]:
         end = theta_of(y)
         if not np.isfinite(system.poles(end)).all():

@@ -2,7 +2,9 @@
 
 A structure holds one of them: an :class:`AffineMap`, the :class:`FunctionMap` of a
 user's function, or the :class:`~lpvlearn.structures.mechanical.ImplicitMap` of
-equations of motion. A function without derivatives is differentiated by a complex
+equations of motion; or one that is made of another, with some parameters fixed
+(:class:`FixedMap`), of some rows (:class:`RowsMap`), or between other matrices
+(:class:`FramedMap`). A function without derivatives is differentiated by a complex
 step, or by differences.
 """
 
