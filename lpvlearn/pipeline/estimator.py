@@ -887,9 +887,13 @@ def _foreseen_order(
     if not isinstance(getattr(estimator, "order", None), str):
         return None
 
+    chosen, methods = {}, {model.method for model in local}
+    if len(methods) == 1 and getattr(estimator, "method", None) == "auto":
+        chosen["method"] = methods.pop()  # looked for once
+
     def identified(order: int) -> list[LocalModel]:
         with collected(), suppress(ValueError):
-            found, kept = identify(clone(estimator).set_params(order=order))
+            found, kept = identify(clone(estimator).set_params(order=order, **chosen))
             return found if len(kept) == len(points) else []
         return []
 

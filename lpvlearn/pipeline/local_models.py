@@ -72,6 +72,7 @@ class LocalModel:
     lti: StateSpace  # continuous time, balanced
     order: int  # as identified, in discrete time
     horizon: int | None  # of the subspace step, where the estimator tells it
+    method: str | None = None  # of identification, where the estimator tells it
     costs: dict[int, float] = field(default_factory=dict)  # of orders, by the criterion
     realizations: list[StateSpace] = field(default_factory=list)  # what was averaged
     # to either side of it, as identified
@@ -349,6 +350,7 @@ def identify_point(
             lti,
             fitted.lti_.order,
             _horizon(fitted),
+            getattr(fitted, "method_", None),
             _costs(fitted, experiments),
             pairs=pairs,
             discretization=discretization,
@@ -391,6 +393,7 @@ def identify_point(
         lti,
         kept[0].lti_.order,
         _horizon(kept[0]),
+        getattr(kept[0], "method_", None),
         _costs(kept[0], realisations[0]),
         realizations=models,
         estimates=estimates if known else [],
