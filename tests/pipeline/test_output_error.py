@@ -315,7 +315,7 @@ def test_columns_of_a_multiindex_are_named_by_tuples():
     roles = {role: ("t", column) for role, column in ROLES.items()}
     model = OutputErrorLPV(spring_lpv(), rate=False, max_iter=1, **roles).fit(X, y)
     assert model.scheduling_names_ == [("t", "kappa")]
-    assert model.lpv_.input_names == (("t", "force"),)
+    assert model.lpv_.input_names == [("t", "force")]
 
 
 def test_leaving_the_range_is_told(alone):
