@@ -39,7 +39,7 @@ _SUPPORT = 10.0
 # A rational form, or a polynomial of a high degree, that has coefficients for more than
 # this share of the values meets most points: it must foresee those left out as well.
 _FREE = 0.5
-_BETTER = 0.99  # of the squared errors of points left out: no equals but for rounding
+_BETTER = 1.0 - 1e-6  # of the squared errors of points left out: no equals, to rounding
 _NOISE = 10.0  # standard deviations over which a parameter moves by more than noise
 
 # Where no form is true: the first, or one of the others that meets points left out, so
