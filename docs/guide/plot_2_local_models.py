@@ -247,7 +247,9 @@ pd.DataFrame(offset.output_offset_, ["morning", "evening"], moved.columns).round
 #   drift are none.
 # * Hum of the mains or the runout of a shaft, a sinusoid that no input moves, is
 #   subtracted, with a warning that says at which frequency. Two states would stand for
-#   it at the border of stability, or be missing where the order is given.
+#   it at the border of stability, or be missing where the order is given. It must stay
+#   what it is for two periods of a record or more; with ``refine="simulation"`` or
+#   False, ``stability="enforce"`` and starts at rest it is not looked for.
 # * An output that stays at its largest or smallest value while the inputs move is at a
 #   limit, of its sensor or of the plant. A fit tells of it; NaN for these samples and
 #   ``missing="estimate"`` leave them out.

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator
-from copy import copy
+from copy import copy, deepcopy
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..exceptions import collected
+from .interpolator import Interpolator
 from .polynomial import PolynomialLPV
 
 Array = NDArray[np.float64]
@@ -54,7 +55,8 @@ def interpolated_without(
 ) -> Array | None:
     """Parameters at places without some points; None where these are needed."""
     keep = ~out
-    form = copy(form)
+    # of another library's regressor steps may be shared by a copy, and fitted anew
+    form = copy(form) if isinstance(form, Interpolator) else deepcopy(form)
     if keep.sum() == 1:
         form = PolynomialLPV(degree=0)
     elif getattr(form, "extrapolation", "ignore") in ("warn", "error"):

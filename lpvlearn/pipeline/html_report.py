@@ -408,8 +408,8 @@ def _expression(value: Any, imports: dict[str, set[str]]) -> str:
     if isinstance(value, StateSpace):
         imports.setdefault("lpvlearn", set()).add("StateSpace")
         given = [_literal(M) for M in (value.A, value.B, value.C, value.D)]
-        time = value.sampling_time
-        return f"StateSpace({', '.join(given)}, sampling_time={time!r})"
+        given += [repr(value.sampling_time), _literal(value.input_delay)]
+        return f"StateSpace({', '.join(given)})"
     if not isinstance(value, BaseEstimator):
         return _literal(value)
     kind = type(value)
@@ -435,6 +435,9 @@ def _literal(value: Any) -> str:
         value = value.tolist()
     if isinstance(value, float) and not np.isfinite(value):
         return f"float({str(value)!r})"
+    if type(value) is dict:
+        items = (f"{_literal(k)}: {_literal(v)}" for k, v in value.items())
+        return f"{{{', '.join(items)}}}"
     if type(value) is list:
         return f"[{', '.join(map(_literal, value))}]"
     if type(value) is tuple:

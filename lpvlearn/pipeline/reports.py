@@ -157,21 +157,21 @@ def tables(
     far = sorted(((e, k) for e, k in errors if e > _MISSED), reverse=True)
     form = getattr(lpv.interpolator, "best_estimator_", None)  # nobody's choice
     if far and form is not None and not noise_explains(form):
+        missed_at = listed_errors(far, points.kappa)
         if isinstance(form, SplineLPV):  # which met all of them
-            why = (
-                "records that move have taken it from there. Look for what sets them "
-                "apart from the records of the points: another load, units, offsets."
+            warn(
+                f"records that move have taken the LPV model from operating point(s) "
+                f"{missed_at}, in percent of the H-infinity norm of the local models. "
+                "Check what sets these records apart from those of the points: another "
+                "load, units, offsets."
             )
         else:
-            why = (
-                "its parameters do not follow so simple a form. Use "
-                "interpolator=SplineLPV(), which meets all points."
+            warn(
+                "the LPV model misses the local models at operating point(s) "
+                f"{missed_at}, in percent of their H-infinity norm: its parameters do "
+                "not follow so simple a form. Use interpolator=SplineLPV(), which "
+                "meets all points."
             )
-        warn(
-            "the LPV model misses the local models at operating point(s) "
-            f"{listed_errors(far, points.kappa)}, in percent of their H-infinity norm: "
-            f"{why}"
-        )
     by_parameter = {
         "lowest": theta.min(axis=0),
         "highest": theta.max(axis=0),

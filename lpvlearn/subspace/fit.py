@@ -60,8 +60,9 @@ def fit_samples(
     fitted = with_trends(samples, like)
     samples, fitted = without_rounding(samples, fitted, like)
     fitted = of_drifting_noise(samples, fitted) or fitted
-    calm, fitted = without_oscillations(samples, fitted)
-    oscillating, samples = samples, calm
+    as_measured = samples
+    samples, fitted = without_oscillations(samples, fitted)
+    calm = samples
     if fitted.selection.order:
         tell_of_held_outputs(outputs, telling)
         tell_of_limits(outputs, fitted, telling)
@@ -94,8 +95,8 @@ def fit_samples(
             tell_of_lead(samples, fitted)
     elif feedback is not None and feedback.may_be_answered and fitted.model.D.any():
         tell_of_answers(feedback, telling)
-    if samples is calm:
-        fitted = with_oscillations(oscillating, calm, fitted)
+    if samples is calm:  # and has not been cut at shifts, or moved to rest
+        fitted = with_oscillations(as_measured, calm, fitted)
     if rest is not None:
         fitted = moved_back(fitted, first, differ)
     if detrend is None:

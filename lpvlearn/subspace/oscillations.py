@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from .constants import CERTAIN
-from .criterion import n_parameters
+from .criterion import PRICE, n_parameters
 from .local_fit import LocalFit
 from .one_fit import Samples
 from .records import Record
@@ -29,9 +29,8 @@ from .trends import with_trends
 
 Array = NDArray[np.float64]
 
-# Time constants per record of a mode that stands for one; radians that it turns in it,
-# and that it is away from a change of sign with every sample.
-_DECAYS, _TURNS = 1.0, 11.0
+_DECAYS = 1.0  # time constants per record of a mode that stands for one
+_TURNS = 11.0  # radians that it turns in a record, and as many less than half turns
 
 # Polynomials of time that amplitudes may follow, and the part of what a sinusoid
 # explains that they may add: noise that shakes a mode makes its amplitude wander.
@@ -67,8 +66,10 @@ def without_oscillations(samples: Samples, whole: LocalFit) -> tuple[Samples, Lo
         found = np.append(turns[apart > _NEAR], found)
         rest = _subtracted(samples, calm, fitted, found)
         other = with_trends(rest.aside())
+        worse = other.worse_than(fitted)
+        worse += (len(found) - len(turns)) * _price_of(fitted.evidence)
         fewer = len(other.model.A) < len(fitted.model.A)
-        if not other.worse_than(fitted) < (CERTAIN if fewer else -CERTAIN):
+        if not worse < (CERTAIN if fewer else -CERTAIN):
             break
         calm, fitted, turns = rest, other, found
     if len(turns):
@@ -93,8 +94,18 @@ def with_oscillations(samples: Samples, calm: Samples, fitted: LocalFit) -> Loca
     if samples is calm:
         return fitted
     evidence = fitted.evidence
-    motions = [m / evidence.output_scale for m in _differences(samples, calm)]
+    both = zip(_differences(samples, calm), evidence.records, strict=True)
+    motions = [m[: record.n_samples] / evidence.output_scale for m, record in both]
     return fitted._replace(evidence=replace(evidence, disturbances=motions))
+
+
+def _price_of(evidence: Evidence) -> float:
+    """What a sinusoid costs of the criterion, as its modes do by their parameters.
+
+    Two amplitudes of every record and output, and a frequency that was looked for.
+    """
+    unknown = 2 * len(evidence.model.C) * len(evidence.records) + 1
+    return PRICE * unknown + 2.0 * float(np.log(evidence.longest))
 
 
 def _differences(samples: Samples, calm: Samples) -> list[Array]:
@@ -132,7 +143,7 @@ def _turns_of_noise(samples: Samples, fitted: LocalFit) -> Array:
     evidence = fitted.evidence
     poles = np.linalg.eigvals(evidence.noise.A)
     decay = 1.0 - np.abs(poles[poles.imag > 0.0])
-    if not (decay < max(_SHARP, _TURNS / evidence.longest)).any():
+    if not (decay < max(_SHARP, _NEAR / evidence.longest)).any():
         return np.zeros(0)
     more = samples.aside().having(order=len(evidence.model.A) + 2)
     found = more.tried(evidence.free.n_trend)
@@ -142,7 +153,7 @@ def _turns_of_noise(samples: Samples, fitted: LocalFit) -> Array:
 def _subtracted(
     samples: Samples, calm: Samples, fitted: LocalFit, turns: Array
 ) -> Samples:
-    """The samples without sinusoids, which may decay or grow a little.
+    """The samples without sinusoids.
 
     As a model tells them that was fitted to samples without some of them.
     """
@@ -153,10 +164,10 @@ def _subtracted(
             fitted.scaled.records, _differences(samples, calm), strict=True
         )
     ]
-    beside = _beside(turns, fitted.model, records, free, 1)
+    beside = _beside(turns, fitted.model, records, free, 0)
     left = []
     for (u, y), trends in zip(samples.pairs, beside.trends, strict=True):
-        motion = _sinusoids(turns, len(y), 1) @ trends[free.n_trend :]
+        motion = _sinusoids(turns, len(y), 0) @ trends[free.n_trend :]
         left.append((u, y - scale * motion))
     return samples._replace(pairs=left)
 
@@ -186,8 +197,9 @@ def _beside(
 def _sinusoids(turns: Array, n_samples: int, degree: int) -> Array:
     """Orthonormal where they are apart, (n_samples, 2 n_turns (degree + 1)).
 
-    Turn by turn, times polynomials of time, one degree after the other; in a record of
-    few turns, which other motions may look like, of degree 0.
+    Turn by turn, times polynomials of time, one degree after the other. In a record of
+    few turns, which other motions may look like, only degree 0 is not zero; of as many
+    samples as signals or fewer some are.
     """
     time = np.arange(n_samples)
     shapes = np.polynomial.legendre.legvander(2.0 * time / n_samples - 1.0, degree)

@@ -134,7 +134,10 @@ def _left_singular(
         gram = matrix @ matrix.T
     values, vectors = _of_squares(gram, max_order)
     if vectors is None:
-        vectors, values, _ = linalg.svd(matrix, full_matrices=False, check_finite=False)
+        try:
+            vectors, values, _ = linalg.svd(matrix, False, check_finite=False)
+        except linalg.LinAlgError:  # of divide and conquer, now and then
+            vectors, values, _ = linalg.svd(matrix, False, lapack_driver="gesvd")
     return vectors[:, :max_order], values
 
 

@@ -62,7 +62,8 @@ _MAX_SAMPLES, _MAX_ROWS, _N_FUTURE = 10_000, 120, 8
 # in open loop one came to 5e-13), and lags of the nonlinear terms that may be it
 _LEVEL, _BEYOND_DOUBT, _N_CURVED = 1e-4, 1e-20, 3
 
-_INSTANTANEOUS = 0.01  # p-value below which something acts within the sample
+# p-values below which something acts within the sample, and may be an answer
+_INSTANTANEOUS, _AT_ONCE = 0.01, 1e-3
 
 # p-values above which inputs answer, if below them outputs do not answer inputs; root
 # mean squares from which the cubes of the nonlinear terms grow no more; moves that a
@@ -138,7 +139,7 @@ class Feedback(NamedTuple):
         As a controller makes it do. In open loop noise of a measured input does, too.
         """
         line = self.p_direct < _REFUTED and self.p_answer > _LIKELY
-        return line and self.p_instantaneous < _LEVEL and not self.cut_off
+        return line and self.p_instantaneous < _AT_ONCE and not self.cut_off
 
     @property
     def instantaneous(self) -> bool:

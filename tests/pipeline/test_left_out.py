@@ -4,6 +4,9 @@ import warnings
 
 import numpy as np
 import pytest
+from sklearn.linear_model import LinearRegression
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from lpvlearn import (
     AutoLPV,
@@ -11,6 +14,7 @@ from lpvlearn import (
     PolynomialLPV,
     SplineLPV,
 )
+from lpvlearn.lpv.left_out import values_left_out
 from lpvlearn.pipeline.left_out import (
     errors_left_out,
 )
@@ -71,3 +75,11 @@ def test_all_points_of_a_place_are_left_out_together():
     errors = errors_left_out(decay, models, SplineLPV(), kappa, theta)
     assert sorted(errors) == [1, 2]  # 1/(s + 1) where 1/(s + 5) is: 4 of its gain
     assert np.allclose([*errors.values()], 4.0, rtol=1e-2)
+
+
+def test_regressors_of_other_libraries_stay_what_they_are():
+    kappa = np.linspace(0.0, 1.0, 5)[:, None]
+    form = make_pipeline(StandardScaler(), LinearRegression()).fit(kappa, kappa**2)
+    before = form.predict(kappa)
+    assert len(list(values_left_out(form, kappa, kappa**2))) == 3
+    np.testing.assert_array_equal(form.predict(kappa), before)

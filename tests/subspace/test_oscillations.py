@@ -139,3 +139,26 @@ def test_pieces_between_lost_rows_are_short():
     assert told
     assert model.lti_.order == 4
     assert _error(model) < 0.01
+
+
+def test_long_records_keep_the_heads_of_it():
+    (u,), (y,) = _records(6, 0.3, (31_000,))
+    model, told = _fit(u, y, order=4)
+    assert told
+    ahead = y[:500] - model.predict_ahead(u[:500], y[:500], 1)
+    assert ahead[100:].std() < 0.03 * y.std()
+
+
+@pytest.mark.parametrize("order", ["auto", 2])
+def test_ring_downs_are_the_plants(order):
+    """Many short ones, in which a weak input hardly moves the mode."""
+    rng, inputs, outputs = np.random.default_rng(1), [], []
+    plant = StateSpace(_turning(0.99, 0.8), [[0.0], [1.0]], [[1.0, 0.0]], None, 1.0)
+    for k in range(20):
+        u, x0 = 0.025 * rng.choice([-1.0, 1.0], (60, 1)), 2.0 * rng.standard_normal(2)
+        y = plant.simulate(u, initial_state=x0) + 0.2 * rng.standard_normal((60, 1))
+        inputs.append(np.hstack([u, np.full((60, 1), k)]))
+        outputs.append(y)
+    model, told = _fit(np.vstack(inputs), np.vstack(outputs), experiment=1, order=order)
+    assert not told
+    assert _error(model, plant) < 0.2
