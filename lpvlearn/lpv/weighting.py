@@ -124,9 +124,8 @@ def weighted_points(
             )
         P = P[used]
     theta, share = theta[used], weight[used] / weight[used].mean()
-    spread = np.sqrt(
-        np.mean(share[:, None] * (theta - share @ theta / len(theta)) ** 2, 0)
-    )
+    middle = np.average(theta, axis=0, weights=share)
+    spread = np.sqrt(np.average((theta - middle) ** 2, axis=0, weights=share))
     size = np.abs(theta).max(axis=0)
     size = np.where(size > np.finfo(float).tiny, size, 1.0)
     scale = np.where(spread > _RESOLUTION * size, spread, size)

@@ -314,7 +314,7 @@ class ClosedLoopEvidence(Evidence):
     def start(
         self, scaled: ScaledRecords, free: Freedom
     ) -> tuple[_Innovation, NDArray[np.bool_]] | None:
-        """Where models of the same samples with other trends may begin; of those only.
+        """Where models of the same samples may begin, if these have other trends.
 
         And which of its states are the plant's.
         """
@@ -479,6 +479,8 @@ def _fit_together(
     joint, kept = start
     near = [_refined(joint, records, free)]
     other = _told_apart(near, records, order, subspace, free)
+    if other is None and order not in (None, int(kept.sum())):
+        return together
     if other is None:
         joint = _likeliest([joint], records, free)
         other = _Together(None, joint, np.eye(len(kept)), kept)

@@ -30,7 +30,10 @@ from .trends import with_trends
 Array = NDArray[np.float64]
 
 _DECAYS = 1.0  # time constants per record of a mode that stands for one
-_TURNS = 11.0  # radians that it turns in a record, and as many less than half turns
+
+# Radians that it turns in a record, at least. And by which it is off a half turn with
+# every sample, whose cosine and sine are the same.
+_TURNS = 11.0
 
 # Polynomials of time that amplitudes may follow, and the part of what a sinusoid
 # explains that they may add: noise that shakes a mode makes its amplitude wander.
