@@ -199,12 +199,18 @@ def warn_if_useless(residual: float, *, of_rates: bool) -> None:
     `residual` is its simulation error, relative.
     """
     if residual > USELESS:
-        what = "the rates of the outputs" if of_rates else "the outputs"
+        what, noise = "the outputs", ""
+        if of_rates:
+            what = "the rates of the outputs"
+            noise = (
+                " Of outputs that hardly move from sample to sample rates are mostly "
+                "noise: then look at `score`, or `resample`."
+            )
         warn(
             f"The model explains next to nothing of {what}: its simulation error is "
             f"{100.0 * residual:.0f} % of their size. Check that the outputs "
             "integrate, that inputs and outputs belong together, and that rows are in "
-            "the order of time; or leave `integrating` out."
+            f"the order of time; or leave `integrating` out.{noise}"
         )
 
 
