@@ -359,13 +359,13 @@ class LPVStateSpace(VersionedPickle):
         ndarray of complex, shape (n_freq, n_outputs, n_inputs)
             The real part is the standard deviation of the real part of the response,
             the imaginary part that of the imaginary part, as
-            `SubspaceLTI.frequency_response_std` has them. NaN at a pole.
+            `SubspaceLTI.frequency_response_std` has them.
 
         Raises
         ------
         ValueError
-            If `covariance` is None, or `kappa` is not one finite value of every
-            scheduling variable.
+            If `covariance` is None, `kappa` is not one finite value of every scheduling
+            variable, or a frequency is that of a pole.
         """
         place, w = self._place(kappa), frequencies(omega)
         if not np.isfinite(w).all():
@@ -374,11 +374,16 @@ class LPVStateSpace(VersionedPickle):
         theta = model.parameters(place[None])[0]
         A, B, C, _ = (M[0] for M in self.structure.matrices(theta[None]))
         resolvent = 1j * w[:, None, None] * np.eye(n) - A
-        singular = np.linalg.matrix_rank(resolvent) < n
-        resolvent[singular] = np.eye(n)
         eye_y = np.broadcast_to(np.eye(self.n_outputs), (len(w), *[self.n_outputs] * 2))
         eye_u = np.broadcast_to(np.eye(self.n_inputs), (len(w), *[self.n_inputs] * 2))
-        states = np.linalg.solve(resolvent, np.broadcast_to(B, (len(w), *B.shape)))
+        try:
+            states = np.linalg.solve(resolvent, np.broadcast_to(B, (len(w), *B.shape)))
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                "`omega` must be off the poles of the model, where the response and "
+                f"its deviation are infinite. Got {shown(omega)}; take frequencies "
+                "beside it."
+            ) from None
         left = np.linalg.solve(resolvent.mT, np.broadcast_to(C.T, (len(w), *C.T.shape)))
         left = np.concatenate([left.mT, eye_y], axis=2)  # [C (jw - A)^-1, I]
         late = np.exp(-1j * np.outer(w, self.input_delay))
@@ -391,7 +396,6 @@ class LPVStateSpace(VersionedPickle):
         std = np.linalg.norm(slopes.real, axis=1) + 1j * np.linalg.norm(
             slopes.imag, axis=1
         )
-        std[singular] = np.nan
         return np.asarray(std)
 
     def input_offset(self, kappa: ArrayLike) -> Array:
