@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
 
 from ..exceptions import (
     WRITTEN_BY,
@@ -782,6 +783,13 @@ def _balancings(what: str, models: Sequence[StateSpace]) -> list[Balancing]:
             )
     A, B, C = (np.array([getattr(model, M) for model in models]) for M in "ABC")
     return balancing_transformations(A, B, C, not models[0].is_continuous)
+
+
+def with_free_states(model: StateSpace, A: Array, C: Array) -> StateSpace:
+    """The model with further states that no input moves, after its own."""
+    B = np.vstack([model.B, np.zeros((len(A), model.n_inputs))])
+    both = block_diag(model.A, A), B, np.hstack([model.C, C]), model.D
+    return model._of(*both, model.sampling_time, model.input_delay)
 
 
 def scaled(model: StateSpace, u: Array, y: Array) -> StateSpace:

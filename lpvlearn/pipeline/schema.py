@@ -183,6 +183,7 @@ FORMS: dict[type, dict[str, str]] = {
         "filter": "float[n_lags]",
         "weight": "float[n_outputs, n_outputs]",
         "input_delay": "int[n_inputs]",
+        "turns": "float[n_turns]?",
     },
     SubspaceLTI: {
         "lti_": "StateSpace[order, n_inputs, n_outputs]",

@@ -263,7 +263,8 @@ class SubspaceLTI(
         Increase of `residual_` that enforced stability cost; 0 where it cost nothing.
     predictor_ : InnovationModel
         `lti_` with a noise model, Kalman gain and innovation covariance. That of
-        "pbsid" predicts unstable plants, too.
+        "pbsid" predicts unstable plants, too. Sinusoids that no input moves are
+        further states of its `lti`.
     poles_std_ : ndarray of complex, shape (order_,)
         Standard deviations of the real and imaginary parts of ``lti_.poles()``.
     offset_ : {None, "constant", "linear"}

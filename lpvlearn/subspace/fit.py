@@ -7,6 +7,8 @@ drifts, shifts, rest at their beginning, a model of the closed loop.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..data.preparation import check_excitation, remove_trends
@@ -23,7 +25,7 @@ from .fit_warnings import (
 )
 from .local_fit import LocalFit
 from .one_fit import Samples, TooFewSamples
-from .oscillations import with_oscillations, without_oscillations
+from .oscillations import without_oscillations
 from .rivals import (
     believable,
     held_by_a_loop,
@@ -60,9 +62,7 @@ def fit_samples(
     fitted = with_trends(samples, like)
     samples, fitted = without_rounding(samples, fitted, like)
     fitted = of_drifting_noise(samples, fitted) or fitted
-    as_measured = samples
-    samples, fitted = without_oscillations(samples, fitted)
-    calm = samples
+    samples, fitted, turns = without_oscillations(samples, fitted)
     if fitted.selection.order:
         tell_of_held_outputs(outputs, telling)
         tell_of_limits(outputs, fitted, telling)
@@ -95,8 +95,8 @@ def fit_samples(
             tell_of_lead(samples, fitted)
     elif feedback is not None and feedback.may_be_answered and fitted.model.D.any():
         tell_of_answers(feedback, telling)
-    if samples is calm:  # and has not been cut at shifts, or moved to rest
-        fitted = with_oscillations(as_measured, calm, fitted)
+    if len(turns) and fitted.method != "pbsid":
+        fitted = fitted._replace(evidence=replace(fitted.evidence, turns=turns))
     if rest is not None:
         fitted = moved_back(fitted, first, differ)
     if detrend is None:

@@ -54,6 +54,8 @@ _MAX_CONDITION = 1e8  # of eigenvectors, which would lose half of the spectrum's
 # Size of an error, relative to the output or to other errors, that is not noise
 _ROUNDING = 1e-9
 
+_FORGOTTEN = 100.0  # samples, after which the amplitude of a wave is another
+
 # Samples of an experiment by those that a filter takes away from it at its start.
 _LEAST_LEFT = 8
 
@@ -463,6 +465,29 @@ def reduced_noise_model(model: NoiseModel, order: int) -> NoiseModel:
     Q, S = K @ model.covariance @ K.T, K @ model.covariance
     gain, covariance = kalman_filter(A, C, Q, S, model.covariance)
     return NoiseModel(A, C, gain, 0.5 * (covariance + covariance.T))
+
+
+def beside_waves(
+    noise: NoiseModel, turns: Array
+) -> tuple[Array, Array, Array, NoiseModel]:
+    """Sinusoids of every output beside a noise, and the predictor of both.
+
+    ``w[t+1] = R w[t]``, ``y[t] = C w[t] + v[t]``: R, C, the gain of w, and the noise
+    with its own. Amplitudes and phases wander a little, so that they are forgotten.
+    """
+    ny, n = noise.C.shape
+    c, s = np.cos(turns), np.sin(turns)
+    rotations = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
+    R = linalg.block_diag(*np.repeat(rotations, ny, axis=0))
+    C = np.tile(np.kron(np.eye(ny), [[1.0, 0.0]]), len(turns))
+    covariance = noise.covariance + _ROUNDING**2 * np.eye(ny)
+    wander = np.tile(np.repeat(np.diagonal(covariance), 2), len(turns)) / _FORGOTTEN**2
+    Q = linalg.block_diag(noise.K @ covariance @ noise.K.T, np.diag(wander))
+    S = np.vstack([noise.K @ covariance, np.zeros((len(R), ny))])
+    A, both = linalg.block_diag(noise.A, R), np.hstack([noise.C, C])
+    gain, found = kalman_filter(A, both, Q, S, covariance)
+    found = 0.5 * (found + found.T)
+    return R, C, gain[n:], NoiseModel(noise.A, noise.C, gain[:n], found)
 
 
 def spectral_density(model: NoiseModel, omega: Array) -> NDArray[np.complex128]:

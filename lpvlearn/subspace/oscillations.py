@@ -12,7 +12,6 @@ are subtracted. Where inputs move a mode, what is left still needs it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,16 +47,19 @@ _SHARP = 0.03  # decay per sample of modes of an autoregression that may stand f
 _ROUNDS = 3  # in each of which further ones may come out
 
 
-def without_oscillations(samples: Samples, whole: LocalFit) -> tuple[Samples, LocalFit]:
+def without_oscillations(
+    samples: Samples, whole: LocalFit
+) -> tuple[Samples, LocalFit, Array]:
     """Take out oscillations that modes of the model stand for, moved by no input.
 
-    Of as many states, as where the order is given, the model must be likelier then
-    beyond chance: two of them may have been meant for the oscillation.
+    The third value are their radians per sample. Of as many states, as where the order
+    is given, the model must be likelier then beyond chance: two of them may have been
+    meant for the oscillation.
     """
     choices = samples.choices
     asked = choices.initial_states and choices.refine in ("auto", "prediction")
     if not asked or choices.enforce_stability or whole.method == "pbsid":
-        return samples, whole
+        return samples, whole, np.zeros(0)
     calm, fitted, turns = samples, whole, np.zeros(0)
     for _ in range(_ROUNDS):
         found = _turns(fitted.evidence)
@@ -89,17 +91,7 @@ def without_oscillations(samples: Samples, whole: LocalFit) -> tuple[Samples, Lo
             "remove it at its source, or by the same notch filter on inputs and "
             "outputs.",
         )
-    return calm, fitted
-
-
-def with_oscillations(samples: Samples, calm: Samples, fitted: LocalFit) -> LocalFit:
-    """The model of calm samples, whose noise is that of these: it foretells them."""
-    if samples is calm:
-        return fitted
-    evidence = fitted.evidence
-    both = zip(_differences(samples, calm), evidence.records, strict=True)
-    motions = [m[: record.n_samples] / evidence.output_scale for m, record in both]
-    return fitted._replace(evidence=replace(evidence, disturbances=motions))
+    return calm, fitted, turns
 
 
 def _price_of(evidence: Evidence) -> float:

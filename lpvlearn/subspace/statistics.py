@@ -28,12 +28,23 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from ..models.innovation import InnovationModel, NoiseModel
-from ..models.statespace import DEVIATION, ModelPair, StateSpace
+from ..models.statespace import (
+    DEVIATION,
+    ModelPair,
+    StateSpace,
+    with_free_states,
+)
 from ..systems.innovations import covariance_root
 from ..systems.modes import spectral_radius
 from ..systems.response import resolvent
 from .criterion import criterion_of
-from .noise import Whitening, noise_of, reduced_noise_model, spectral_density
+from .noise import (
+    Whitening,
+    beside_waves,
+    noise_of,
+    reduced_noise_model,
+    spectral_density,
+)
 from .records import Record
 from .signals import block_slices, signal_pieces
 from .simulation_fit import (
@@ -95,6 +106,7 @@ class Known(NamedTuple):
     filter: Array
     weight: Array
     input_delay: NDArray[np.intp]
+    turns: Array | None = None  # of sinusoids beside; None: none
 
     def evidence(self) -> Evidence:
         """What answers as the evidence that it was told by."""
@@ -125,6 +137,7 @@ class Known(NamedTuple):
             1.0,
             input_delay=self.input_delay,
             told=self,
+            turns=self.turns,
         )
 
 
@@ -147,8 +160,7 @@ class Evidence:
     levels: Array | None = None  # (n_experiments, n_outputs): constants less trends
     input_delay: ArrayLike = 0  # samples, which the records' inputs have already
     told: Known | None = None  # in the place of the records
-    # Of experiments, what was subtracted from their outputs; noise all the same.
-    disturbances: Sequence[Array] = ()
+    turns: Array | None = None  # of sinusoids that were subtracted, radians per sample
 
     def known(self) -> Known:
         """What is left without the records."""
@@ -172,6 +184,7 @@ class Evidence:
             int(self.free.n_trend),
             *self.whitening,
             np.broadcast_to(self.input_delay, (m,)).astype(int),
+            self.turns,
         )
 
     def _gain(self) -> Array | None:
@@ -185,7 +198,7 @@ class Evidence:
             return self.told.noise
         weight = self.whitening.weight
         model = with_initial_states(self.model, self.records, self.free, weight)
-        return _noise_of(model, self.records, self.disturbances)
+        return _noise_of(model, self.records)
 
     @cached_property
     def covariance(self) -> Array:
@@ -254,11 +267,15 @@ class Evidence:
     def predictor(self, lti: StateSpace, n_noise_states: int | None) -> InnovationModel:
         """Innovation model of `lti`; None keeps all states of the noise model.
 
-        With a gain the fit has chosen them.
+        With a gain the fit has chosen them. Sinusoids are further states of `lti`.
         """
         noise, sy, gain = self.noise, self.output_scale, self._gain()
         if n_noise_states is not None and gain is None:
             noise = reduced_noise_model(noise, n_noise_states)
+        if self.turns is not None:
+            n, (R, C, waves, noise) = lti.order, beside_waves(noise, self.turns)
+            lti = with_free_states(lti, R, sy[:, None] * C)
+            gain = np.vstack([np.zeros((n, len(sy))) if gain is None else gain, waves])
         C, K = sy[:, None] * noise.C, noise.K / sy
         covariance = noise.covariance * np.outer(sy, sy)
         gain = None if gain is None else gain / sy
@@ -354,13 +371,9 @@ class Evidence:
         return np.einsum("yo,foup->fyup", to_outputs, J)
 
 
-def _noise_of(
-    model: Realization, records: Sequence[Record], beside: Sequence[Array] = ()
-) -> NoiseModel:
-    """Autoregression of the simulation errors that are known, and what is beside."""
+def _noise_of(model: Realization, records: Sequence[Record]) -> NoiseModel:
+    """Autoregression of the simulation errors that are known."""
     errors = simulation_errors(model, records)
-    if beside:
-        errors = [error + more for error, more in zip(errors, beside, strict=True)]
     return noise_of(
         [np.where(r.known, e, np.nan) for r, e in zip(records, errors, strict=True)]
     )
