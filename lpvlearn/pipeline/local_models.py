@@ -668,10 +668,12 @@ def _in_one_basis(
 ) -> list[StateSpace]:
     """Balanced models of one order, each turned to be nearest to the first.
 
-    By signals of unit size: balancing, and what is near, depend on units. Signs alone
-    would not do where singular values are nearly equal, whose states may be turned.
+    By signals of about unit size: balancing, and what is near, depend on units. Signs
+    alone would not do where singular values are nearly equal, whose states may be
+    turned.
     """
-    (_, u), (_, y) = motions(experiments)
+    # Powers of two: no rounding, and the same wherever in memory the samples are.
+    u, y = (np.exp2(np.rint(np.log2(size))) for _, size in motions(experiments))
     models = _of_lowest_order(models)  # where none grew
     models = balanced_models([scaled(model, u, y) for model in models])
     first, *others = _of_lowest_order(models)  # nor lost what is rounding
