@@ -149,8 +149,8 @@ class _Labels(NamedTuple):
     def built(self) -> pd.Index:
         if len(self.names) > 1:
             return pd.MultiIndex.from_tuples(self.values, names=self.names)
-        options = {"dtype": self.dtype, "name": self.names[0]}
-        return pd.Index(self.values, **options, tupleize_cols=False)
+        known = pd.Index(self.values, dtype=self.dtype, tupleize_cols=False)
+        return known.set_names(self.names)
 
 
 class _PlainTable(NamedTuple):

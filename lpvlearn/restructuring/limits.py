@@ -15,7 +15,7 @@ Complex = NDArray[np.complex128]
 _FASTEST = 1e6
 _STANDING = 1e-12  # size of a pole, relative to the fastest, that is none
 _MARGIN = 0.02  # stability margin, relative to the slowest decay of the black box
-LEEWAY = 0.2  # part of the margin that a step may use
+_LEEWAY = 0.2  # part of the margin that a step may use
 
 
 def growth(poles: Complex, dt: float | None) -> Array:
@@ -68,7 +68,7 @@ class Limits:
 
     def admissible(self, theta: Array) -> bool:
         """Whether the gray-box model keeps most of the margin."""
-        return keeps_margin(self.system, theta, (1.0 - LEEWAY) * self.margin)
+        return keeps_margin(self.system, theta, (1.0 - _LEEWAY) * self.margin)
 
     def strict(self, theta: Array) -> bool:
         """Whether `theta` is off all limits."""

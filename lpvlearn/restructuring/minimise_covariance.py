@@ -43,7 +43,7 @@ from ..systems.least_squares import levenberg_marquardt
 from .deadline import time_is_up
 from .error_system import ErrorSystem, Structure, Target, remembering
 from .known_poles import divide
-from .limits import LEEWAY, keeps_margin, natural_margin
+from .limits import Limits, keeps_margin, natural_margin
 from .singular_points import bend_of, squared_combinations
 
 Array = NDArray[np.float64]
@@ -277,10 +277,9 @@ def minimise_covariance(
         z, J = coordinates(x[0])
         return z[None], lambda _: J[None]
 
-    # The start may stand at the margin, in the leeway that its search had.
-    if not keeps_margin(system, start, margin):
-        margin *= 1.0 - LEEWAY
     kept = admissible or (lambda theta: keeps_margin(system, theta, margin))
+    if admissible is None and not kept(start):  # in the leeway that its search had
+        kept = Limits(system, margin).admissible
     lower, upper = system.structure.lower, system.structure.upper
     reached, costs = levenberg_marquardt(
         residuals,

@@ -433,6 +433,10 @@ def identify_closed_loop(
     )
 
 
+# A model, and the predictor that it belongs to: None where it was not refined
+_Found = tuple[_Predictor | None, _Innovation]
+
+
 class _Together(NamedTuple):
     """Plant and noise."""
 
@@ -457,8 +461,7 @@ def _fit_together(
     not told apart, that is as it was.
     """
     free = settings.free
-    found: list[tuple[_Predictor | None, _Innovation]]
-    found = [(None, _innovation_form(subspace, n_joint))]
+    found: list[_Found] = [(None, _innovation_form(subspace, n_joint))]
     if settings.refine:
         first = _refined(found[0][1], records, free)
         found = [first]
@@ -468,8 +471,6 @@ def _fit_together(
     together = _told_apart(found, records, order, subspace, free)
     if together is None:
         fitted, joint = found[-1]
-        if fitted is not None and fitted.model.blocks is None:  # it was not refined
-            fitted = None
         if order is not None and order != len(joint.A):
             joint, fitted = _innovation_form(subspace, order), None
         whole = np.ones(len(joint.A), dtype=bool)
@@ -479,9 +480,9 @@ def _fit_together(
     joint, kept = start
     near = [_refined(joint, records, free)]
     other = _told_apart(near, records, order, subspace, free)
-    if other is None and order not in (None, int(kept.sum())):
-        return together
     if other is None:
+        if order not in (None, int(kept.sum())):
+            return together
         joint = _likeliest([joint], records, free)
         other = _Together(None, joint, np.eye(len(kept)), kept)
     # at the price by which models with and without trends are compared
@@ -490,7 +491,7 @@ def _fit_together(
 
 
 def _told_apart(
-    found: Sequence[tuple[_Predictor | None, _Innovation]],
+    found: Sequence[_Found],
     records: Sequence[Record],
     order: int | None,
     subspace: _Subspace,
@@ -499,8 +500,6 @@ def _told_apart(
     """Plant and noise of the first of these models that tells them apart."""
     n = subspace.n_columns
     for fitted, joint in found:
-        if fitted is not None and fitted.model.blocks is None:  # it was not refined
-            fitted = None
         split = _split(joint, fitted, order, n)
         if split is None:
             continue
@@ -516,12 +515,12 @@ def _told_apart(
 
 
 def _with_more_states(
-    fitted: _Predictor,
+    fitted: _Predictor | None,
     joint: _Innovation,
     subspace: _Subspace,
     records: Sequence[Record],
     free: Freedom,
-) -> tuple[_Predictor, _Innovation]:
+) -> _Found:
     """The refined model, or one of more states, while these are worth it.
 
     Of modes that are slow beside the past window the subspace tells little: what it
@@ -532,17 +531,17 @@ def _with_more_states(
     price = float(np.log(subspace.n_columns))
 
     @cache
-    def refined(order: int) -> tuple[_Predictor, _Innovation]:
+    def refined(order: int) -> _Found:
         return _refined(_innovation_form(subspace, order), records, free)
 
-    def criterion(model: tuple[_Predictor, _Innovation]) -> float:
+    def criterion(model: _Found) -> float:
         return _cost(model[1], subspace, records, price)
 
     best = fitted, joint
     while True:
         order = len(best[1].A)  # a mode is one state or two
         further = map(refined, range(order + 1, min(order + 2, highest) + 1))
-        others = [model for model in further if model[0].model.blocks is not None]
+        others = [model for model in further if model[0] is not None]
         least = min([best, *others], key=criterion)
         if least is best:
             return best
@@ -712,7 +711,7 @@ def _refined(
     records: Sequence[Record],
     free: Freedom,
     max_iter: int | None = None,
-) -> tuple[_Predictor, _Innovation]:
+) -> _Found:
     r"""Minimise the one-step prediction error, weighted by the innovation covariance.
 
     The predictor ``x[t+1] = A_K x[t] + B_K z[t]``, ``y[t] = C x[t] + D u[t] + e[t]``
@@ -744,7 +743,8 @@ def _refined(
     fitted = _Predictor(found, heads, predictor, root, share)
     joint = fitted.innovation(found, covariance)
     errors = np.vstack(_predicted(joint, records, free)[1])
-    return fitted, joint._replace(covariance=errors.T @ errors / n_samples)
+    joint = joint._replace(covariance=errors.T @ errors / n_samples)
+    return None if found.blocks is None else fitted, joint
 
 
 def _predicted(
