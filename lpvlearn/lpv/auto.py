@@ -45,8 +45,9 @@ _NOISE = 10.0  # standard deviations over which a parameter moves by more than n
 # Where no form is true: the first, or one of the others that meets points left out, so
 # many at least, with less than this share of its squared errors of most parameters.
 _CURVES = (("pchip", "linear"), ("cubic", "linear"), ("pchip", "log"), ("cubic", "log"))
-_SMOOTHER, _LEFT_OUT = 0.1, 3
-_FORESEEN = 0.02  # mean squared error, in the spread, of what must not be met worse
+_SMOOTHER, _LEFT_OUT = 0.7, 3
+# Mean squared error, in the spread, of what must not be met worse; but for this share.
+_FORESEEN, _FEW = 0.02, 0.1
 
 
 class AutoLPV(Interpolator):
@@ -60,7 +61,7 @@ class AutoLPV(Interpolator):
     Where none is left, or the covariances are not known, the interpolation follows the
     points (`SplineLPV`): it keeps their shape, unless a cubic spline, or a curve over
     the logarithms of the scheduling variables, meets points that are left out, three at
-    least, at a third of the errors of most parameters.
+    least, with clearly smaller errors of most parameters.
 
     Parameters
     ----------
@@ -233,8 +234,9 @@ def _interpolation(kappa: Array, points: WeightedPoints) -> tuple[str, SplineLPV
     each = errors.sum(axis=1)
     shares = np.median(each[:, each[0] > 0.0] / each[0, each[0] > 0.0], axis=1)
     seen = each[0] < _FORESEEN * errors.shape[1]
-    worse = (each[:, seen] > _FORESEEN * errors.shape[1]).any(axis=1)
-    best = int(np.argmin(np.where(worse, np.inf, shares)))
+    worse = np.sum(each[:, seen] > _FORESEEN * errors.shape[1], axis=1)
+    allowed = worse <= _FEW * np.count_nonzero(seen)
+    best = int(np.argmin(np.where(allowed, shares, np.inf)))
     if not shares[best] < _SMOOTHER:
         best = 0
     return names[best], curves[best]

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.operating_points import neighbours
 from ..exceptions import warn
 from ..lpv.left_out import values_left_out
 from ..lpv.model import LPVStateSpace
+from ..lpv.spline import SplineLPV
 from ..models.statespace import StateSpace
 from ..restructuring.error_system import frequency_grid
 from ..structures.structure import GrayBoxStructure
@@ -31,8 +33,9 @@ _ELSEWHERE, _WORSE, _MEDIAN, _MANY, _OF_FEW = 1.0, 1.5, 0.3, 4, 0.8
 UNLIKE = 2.0  # an error of a point left out, in its largest gain, as bad as any
 NEAR = 0.1  # and one up to which what the others foresee is what the record tells
 
-# Difference of two models, in the largest gain, between which a line is a guess.
-_APART = 0.3
+# Difference of two models, in the largest gain, between which a line is a guess; and of
+# what two curves make of the middle between two points, where either is.
+_APART, _GUESS = 0.3, 0.35
 
 _HARDLY = 3.0  # time constants in the longest record of what hardly decays
 
@@ -78,7 +81,7 @@ def tell_unforeseen(
 
     Where no form is true the interpolation follows the points: one that the others do
     not foresee is another system, or there are too few of them; as where a form is
-    `saturated`.
+    `saturated`. And of points between which curves differ that both pass through them.
     """
     if not models[0].is_continuous:
         return
@@ -103,6 +106,40 @@ def tell_unforeseen(
             "point that is unlike the others, give a structure where there is none, or "
             "measure in between (`suggest_operating_point`)."
         )
+    if often or most or saturated:
+        return
+    differences = _differences_between(lpv.structure, form, kappa, theta, forgets)
+    apart, k, other = max(differences, default=(0.0, 0, 0))
+    if apart > _GUESS:
+        warn(
+            "no form fits the parameters over the operating points, and between points "
+            f"{k} and {other} (scheduling {label_of(kappa[k])} and "
+            f"{label_of(kappa[other])}) curves through all of them differ, one that "
+            f"keeps their shape and a smooth one: by {100.0 * apart:.0f} % of the "
+            "largest gain, as wrong as the LPV model may be there. Give a structure "
+            "where there is none, or measure in between (`suggest_operating_point`)."
+        )
+
+
+def _differences_between(
+    structure: GrayBoxStructure,
+    form: SplineLPV,
+    kappa: Array,
+    theta: Array,
+    seen: Callable[[StateSpace], StateSpace],
+) -> Iterator[tuple[float, int, int]]:
+    """How far a smooth curve is from one that keeps the shape, between neighbours.
+
+    In the middle of each pair of points, by the response, in the largest gain of the
+    `form`. Nothing of a form that is smooth itself: points left out speak for it.
+    """
+    if form.kind != "pchip" or not np.ptp(kappa, axis=0).any():
+        return
+    pairs = neighbours(kappa)
+    smooth = SplineLPV("cubic", scale=form.scale).fit(kappa, theta)
+    own, other = (f.predict(kappa[pairs].mean(axis=1)) for f in (form, smooth))
+    for (k, at), *parameters in zip(pairs.tolist(), other, own, strict=True):
+        yield largest_difference(*(seen(structure.model(p)) for p in parameters)), k, at
 
 
 def listed_errors(errors: Sequence[tuple[float, int]], kappa: Array) -> str:

@@ -68,8 +68,8 @@ def test_a_form_that_is_not_true_is_not_taken_however_good():
 def test_without_covariances_the_points_are_followed():
     theta, _ = noisy(TRUTHS["polynomial 2"], np.random.default_rng(2))
     model = AutoLPV().fit(KAPPA, theta)
-    assert model.selection_["form"].tolist() == ["pchip"]
-    expected = SplineLPV().fit(KAPPA, theta).predict(FINE)
+    assert model.selection_["form"].tolist() == ["cubic"]
+    expected = SplineLPV("cubic").fit(KAPPA, theta).predict(FINE)
     np.testing.assert_array_equal(model.predict(FINE), expected)
 
 
@@ -98,6 +98,24 @@ def test_what_is_smooth_over_any_variable_is_followed_by_a_cubic_spline():
     assert AutoLPV().fit(kappa, steps).form_ == "pchip"
     few = AutoLPV().fit(kappa[:4], theta[:4])  # two left out tell too little
     assert few.form_ == "pchip"
+
+
+def test_black_boxes_of_smooth_matrices_are_followed_by_a_cubic_spline():
+    """Of thirty entries some hardly move, by noise, and are better left as they are."""
+    kappa = np.linspace(0.0, 1.0, 7)[:, None]
+    rng = np.random.default_rng(3)
+    entries = rng.uniform(-1.0, 1.0, (2, 30)) * np.repeat([1.0, 1e-3], [27, 3])
+    noise = 5e-3 * rng.standard_normal((7, 30))
+
+    def truth(at):
+        return np.column_stack([np.sin(5.0 * at), at]) @ entries
+
+    between = 0.5 * (kappa[1:] + kappa[:-1])
+    model = AutoLPV().fit(kappa, truth(kappa) + noise)
+    assert model.form_ == "cubic"
+    kept = SplineLPV().fit(kappa, truth(kappa) + noise).predict(between)
+    error, other = model.predict(between) - truth(between), kept - truth(between)
+    assert np.linalg.norm(error) < 0.4 * np.linalg.norm(other)
 
 
 @pytest.mark.parametrize(("n_points", "form"), [(1, 0), (2, 1), (3, 2)])

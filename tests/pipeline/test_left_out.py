@@ -11,13 +11,12 @@ from sklearn.preprocessing import StandardScaler
 from lpvlearn import (
     AutoLPV,
     GrayBoxStructure,
+    LPVStateSpace,
     PolynomialLPV,
     SplineLPV,
 )
 from lpvlearn.lpv.left_out import values_left_out
-from lpvlearn.pipeline.left_out import (
-    errors_left_out,
-)
+from lpvlearn.pipeline.left_out import errors_left_out, tell_unforeseen
 
 from ..conftest import spring_pipeline, spring_tables
 
@@ -75,6 +74,25 @@ def test_all_points_of_a_place_are_left_out_together():
     errors = errors_left_out(decay, models, SplineLPV(), kappa, theta)
     assert sorted(errors) == [1, 2]  # 1/(s + 1) where 1/(s + 5) is: 4 of its gain
     assert np.allclose([*errors.values()], 4.0, rtol=1e-2)
+
+
+@pytest.mark.parametrize("kind, told", [("pchip", True), ("cubic", False)])
+def test_a_gap_that_two_curves_cross_in_their_own_ways_is_told(kind, told):
+    """Points close to one another foresee one another, and say nothing of the gap."""
+    spring = GrayBoxStructure.from_template(
+        A=[[0, 1], ["-k", -0.1]], B=[[0], [1]], C=[[1, 0]]
+    )
+    kappa = np.array([[8.0], [0.0], [3.0], [4.0], [5.0], [6.0], [7.0]])
+    theta = np.maximum(4.0, 2.0 * kappa - 2.0)
+    models = [spring.model(values) for values in theta]
+    form = SplineLPV(kind).fit(kappa, theta)
+    lpv = LPVStateSpace(spring, form, np.array([[0.0], [8.0]]))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        tell_unforeseen(lpv, models, form, kappa, theta, 100.0)
+    words = " ".join(str(w.message) for w in found)
+    between = "between points 1 and 2 (scheduling 0 and 3)"
+    assert (between in words and "curves through all of them differ" in words) == told
 
 
 def test_regressors_of_other_libraries_stay_what_they_are():
