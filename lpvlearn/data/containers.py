@@ -53,4 +53,5 @@ class OutputContainer:
             from polars import DataFrame
 
             return DataFrame(columns, schema=[str(name) for name in names])
-        return pd.DataFrame(columns, getattr(X, "index", None), list(names))
+        rows = X.index if isinstance(X, pd.DataFrame) else None
+        return pd.DataFrame(columns, rows, list(names))

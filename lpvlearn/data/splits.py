@@ -191,6 +191,9 @@ class ExperimentSplit(_SplitOfExperiments):
         Column that tells experiments apart; None reads `groups` of ``split``.
     scheduling : column name, position or list, default=None
         Experiments are grouped to operating points by the mean of these columns.
+    scheduling_tol : float, default=None
+        Distance below which experiments belong to one operating point, as in
+        `LocalLPVPipeline`; None chooses it from the data.
     operating_point : column name or position, default=None
         Groups them by label instead.
     hold_out : {"experiment", "operating_point"}, default="experiment"
@@ -238,6 +241,7 @@ class ExperimentSplit(_SplitOfExperiments):
         *,
         experiment: Any = None,
         scheduling: Any = None,
+        scheduling_tol: float | None = None,
         operating_point: Any = None,
         hold_out: str = "experiment",
         interior: bool = False,
@@ -248,6 +252,7 @@ class ExperimentSplit(_SplitOfExperiments):
         self.n_splits = n_splits
         self.experiment = experiment
         self.scheduling = scheduling
+        self.scheduling_tol = scheduling_tol
         self.operating_point = operating_point
         self.hold_out = hold_out
         self.interior = interior
@@ -295,7 +300,7 @@ class ExperimentSplit(_SplitOfExperiments):
         """The operating point of every experiment, and the points' values."""
         if not self._knows_points:
             return np.zeros(len(experiments), dtype=np.intp), np.empty((1, 0))
-        return group_operating_points(experiments)
+        return group_operating_points(experiments, self.scheduling_tol)
 
     def _folds(self, point: Indices, kappa: Array) -> list[set[int]]:
         """Numbers of the experiments that every fold holds out."""

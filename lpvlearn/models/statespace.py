@@ -800,14 +800,8 @@ def scaled(model: StateSpace, u: Array, y: Array) -> StateSpace:
 
 def with_signs_of(reference: StateSpace, model: StateSpace) -> StateSpace:
     """A balanced model with the signs of its states turned to those of another."""
-    s = align_signs(model.B, model.C, reference.B, reference.C)[:, None]
-    return StateSpace(
-        s * model.A * s.T,
-        s * model.B,
-        model.C * s.T,
-        model.D,
-        input_delay=model.input_delay,
-    )
+    signs = align_signs(model.B, model.C, reference.B, reference.C)
+    return model.transform(np.diag(signs))
 
 
 def split_delay(seconds: Array, dt: float) -> tuple[NDArray[np.intp], Array]:

@@ -278,7 +278,14 @@ class _Writer:
     def _object(self, value: Any, place: str) -> dict[str, Any]:
         node: dict[str, Any] = {"class": type(value).__name__}
         forms = {name: form for name, form in forms_of(value).items() if form.kept}
-        ended = all(hasattr(value, n) for n, form in forms.items() if form.needed)
+        told = [name for name, form in forms.items() if form.fitted and form.needed]
+        ended = bool(told) and hasattr(value, told[0])
+        missing = [name for name in told if ended and not hasattr(value, name)]
+        if missing:
+            raise ValueError(
+                f"`{place}` must have what its fit tells. Got none of {missing}. Fit "
+                "it again."
+            )
         for name, form in forms.items():
             if hasattr(value, name) and (ended or not form.fitted):
                 field = name.lstrip("_")

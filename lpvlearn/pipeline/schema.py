@@ -37,6 +37,7 @@ from ..structures.map import AffineMap, FixedMap, FunctionMap, RowsMap, Structur
 from ..structures.mechanical import FluxMap, ImplicitMap
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI
+from ..subspace.integrating import RateEvidence
 from ..subspace.offsets import Offsets
 from ..subspace.statistics import Evidence, Known
 from .estimator import LocalLPVPipeline
@@ -185,6 +186,11 @@ FORMS: dict[type, dict[str, str]] = {
         "input_delay": "int[n_inputs]",
         "turns": "float[n_turns]?",
     },
+    RateEvidence: {
+        "models": "StateSpace[n_inputs, n_outputs]*",
+        "flags": "bool[n_outputs]",
+        "n_inputs": "size[n_inputs]",
+    },
     SubspaceLTI: {
         "lti_": "StateSpace[order, n_inputs, n_outputs]",
         "method_": "text",
@@ -192,7 +198,7 @@ FORMS: dict[type, dict[str, str]] = {
         "order_": "whole",
         "horizon_": "whole",
         "singular_values_": "float[n_values]",
-        "initial_states_": "float[n_starts, order]",
+        "initial_states_": "float[n_starts, order]?",
         "input_delay_": "int[n_inputs]",
         "selection_": "table",
         "residual_": "number",
@@ -207,7 +213,7 @@ FORMS: dict[type, dict[str, str]] = {
         "n_features_in_": "whole",
         "_single_output": "flag",
         "_offsets": "Offsets[n_experiments, n_inputs, n_outputs]",
-        "_evidence": "Known[n_inputs, n_outputs]",
+        "_evidence": "evidence[n_inputs, n_outputs]",
         "_stream": "-",
         "_stale": "-",
     },
@@ -299,7 +305,11 @@ FORMS: dict[type, dict[str, str]] = {
 
 CLASSES = {kind.__name__: kind for kind in FORMS}
 
-_GROUPS = {"map": StructureMap, "interpolator": Interpolator}
+_GROUPS: dict[str, Any] = {
+    "map": StructureMap,
+    "interpolator": Interpolator,
+    "evidence": Known | RateEvidence,
+}
 
 _ARRAYS = {"float": "f", "int": "i", "bool": "b", "complex": "c"}
 

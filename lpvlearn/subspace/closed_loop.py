@@ -283,7 +283,8 @@ class ClosedLoopEvidence(Evidence):
     @cached_property
     def sections(self) -> Realization:
         """The plant as one section, of which derivatives may move every entry."""
-        return self.model._replace(blocks=(self.model.A,))
+        A = self.model.A
+        return self.model._replace(blocks=(A,) if len(A) else ())
 
     @cached_property
     def covariance(self) -> Array:

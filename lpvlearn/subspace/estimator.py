@@ -242,7 +242,8 @@ class SubspaceLTI(
         Initial state of every experiment, in the order of first appearance (a run
         between two gaps, or two shifts of level, is one); after `partial_fit` of a long
         stream, of its last stretch only. With delays and ``initial_state="estimate"``,
-        that of the first sample with known inputs, number ``max(input_delay_)``.
+        that of the first sample with known inputs, number ``max(input_delay_)``. Not
+        with `integrating`: `rates_` has those of the rates.
     input_delay_ : ndarray of shape (n_inputs,)
         Samples, as found or given; also that of `lti_`.
     selection_ : DataFrame
@@ -641,8 +642,8 @@ class SubspaceLTI(
         warn_if_useless(best.residual_, of_rates=best is inner)
         self.lti_: StateSpace = integrated(best.lti_, flags)
         self._name(*_names_of(experiments, y))
-        models, n_inputs = best.deviated_models(), self.lti_.n_inputs
-        self._evidence: Any = RateEvidence(models, flags, n_inputs)
+        around = [model for pair in best.deviated_models() for model in pair]
+        self._evidence: Any = RateEvidence(around, flags, self.lti_.n_inputs)
         self.input_delay_, self.order_ = self.lti_.input_delay, self.lti_.order
         self.horizon_, self.method_ = inner.horizon_, inner.method_
         self.selection_, self.residual_ = inner.selection_, inner.residual_

@@ -9,7 +9,7 @@ of the outputs, exactly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -214,22 +214,26 @@ def warn_if_useless(residual: float, *, of_rates: bool) -> None:
         )
 
 
+@dataclass(frozen=True, eq=False)
 class RateEvidence:
     """What is known of a model with integrators: that of the rates, integrated.
 
     What has no place here (noise, residuals) is known of the rates alone.
     """
 
-    def __init__(self, pairs: list[ModelPair], flags: Flags, n_inputs: int) -> None:
-        self._pairs, self._flags = pairs, flags
-        self.free = Freedom(np.ones((len(flags), n_inputs), bool))
+    models: list[StateSpace]  # of the rates, to either side: above, below, above, ...
+    flags: Flags  # (n_outputs,): which of them integrate
+    n_inputs: int
+
+    @property
+    def free(self) -> Freedom:
+        """What is estimated of D."""
+        return Freedom(np.ones((len(self.flags), self.n_inputs), bool))
 
     def deviated_models(self, lti: StateSpace) -> list[ModelPair]:
         """Models to either side, with the integrators."""
-        return [
-            (integrated(above, self._flags), integrated(below, self._flags))
-            for above, below in self._pairs
-        ]
+        moved = [integrated(model, self.flags) for model in self.models]
+        return list(zip(moved[::2], moved[1::2], strict=True))
 
     @property
     def records(self) -> Any:

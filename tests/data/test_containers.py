@@ -33,6 +33,11 @@ def test_arrays_are_the_default_and_none_changes_nothing(tables, model):
     assert list(found.index) == list(tables[0].index)
     assert list(found.columns) == ["y1"]
     np.testing.assert_array_equal(found, plain)
+    unlabelled = clone(model).set_params(experiment=None, time=None, inputs=None)
+    unlabelled.set_params(sampling_time=0.1).set_output(transform="pandas")
+    u = tables[0][["force"]].to_numpy()
+    rows = unlabelled.fit(u, tables[1].to_numpy()).predict(u.tolist()).index
+    assert list(rows) == list(range(len(u)))
     back = tabled.set_output(transform="default").predict(tables[0])
     np.testing.assert_array_equal(back, plain)
 

@@ -393,6 +393,12 @@ def test_operating_points_are_held_out_whole(table):
     assert len(train) == 12
 
 
+def test_points_are_as_near_as_the_pipeline_takes_them(table):
+    X = table.assign(kappa=table["kappa"] + 0.1 * (table["run"] == "c"))
+    for tol, n_points in ((0.05, 4), (0.2, 3)):
+        assert points_held_out(scheduling_tol=tol).get_n_splits(X) == n_points
+
+
 def test_a_prefix_of_the_training_rows_covers_the_points(table):
     cv = ExperimentSplit("all", experiment="run", scheduling="kappa")
     for train, _ in cv.split(table):

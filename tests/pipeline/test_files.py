@@ -9,6 +9,7 @@ import textwrap
 import tracemalloc
 import warnings
 import zipfile
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -38,6 +39,7 @@ from lpvlearn import (
     load,
     save,
 )
+from lpvlearn.datasets import prbs
 from lpvlearn.exceptions import VersionedPickle, VersionWarning, collected
 from lpvlearn.models.innovation import NoiseModel
 from lpvlearn.pipeline.files import _TEXT, SCHEMA
@@ -314,6 +316,38 @@ def test_local_models_come_back_to_the_bit(options, fitted, tmp_path):
     else:
         with pytest.raises(AttributeError, match="refine"):
             other.poles_std_  # noqa: B018
+
+
+def test_models_of_integrating_outputs_come_back_to_the_bit(tmp_path):
+    u = prbs(400, clock=3, random_state=0)
+    rate = StateSpace(0.8, 0.2, 1.0, sampling_time=0.1)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((400, 1))
+    y = np.cumsum(rate.simulate(u), axis=0) + noise
+    model = SubspaceLTI(1, integrating=True, sampling_time=0.1).fit(u, y)
+    other = there_and_back(model, tmp_path / "model.zip")
+    assert_same(model, other)
+    assert_same(model.predict(u), other.predict(u))
+    assert_same(model.deviated_models(), other.deviated_models())
+    assert_same(model.rates_.poles_std_, other.rates_.poles_std_)
+    with pytest.raises(AttributeError, match="Ask `rates_`"):
+        other.poles_std_  # noqa: B018
+
+
+@pytest.mark.parametrize("method", ["po-moesp", "pbsid"])
+def test_models_without_states_come_back_to_the_bit(method, tmp_path):
+    u = prbs(300, random_state=0)
+    y = 2.0 * u + 0.1 * np.random.default_rng(0).standard_normal(u.shape)
+    model = SubspaceLTI(0, method=method).fit(u, y)
+    other = there_and_back(model, tmp_path / "model.zip")
+    assert_same(model, other)
+    assert_same(model.predict(u), other.predict(u))
+
+
+def test_a_fit_that_lacks_what_files_need_is_no_estimator_without_one(fitted, tmp_path):
+    model = copy(fitted[0])
+    del model.horizon_
+    with pytest.raises(ValueError, match=r"Got none of \['horizon_"):
+        save(model, tmp_path / "model.zip")
 
 
 def test_a_loaded_local_model_takes_any_table_for_a_new_one(fitted, tmp_path):
