@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from ..systems.least_squares import RCOND, column_scale, levenberg_marquardt
-from ..systems.simulation import estimate_initial_state
+from ..systems.simulation import estimate_initial_state, spread_of
 from .interpolator import grid_over
 from .model import LPVStateSpace
 from .polynomial import PolynomialLPV
@@ -123,12 +123,15 @@ class Refined(NamedTuple):
 
 
 def simulated(
-    model: LPVStateSpace, record: Record, own: Own, weight: Array
+    model: LPVStateSpace, record: Record, own: Own, weight: Array | None = None
 ) -> tuple[Array, Array]:
     """Errors (n_samples, n_outputs) of a model, and the own unknowns behind them.
 
-    These make the least of the weighted errors. Raises a DivergenceError.
+    These make the least of the weighted errors: weighted by how far outputs move, if
+    not otherwise. Raises a DivergenceError.
     """
+    if weight is None:
+        weight = weights_of([record])
     if own.initial_state:
         y, free = model.rest_and_free_responses(record.u, record.kappa, record.dt)
         free = free[:, :, : model.order]
@@ -141,6 +144,12 @@ def simulated(
     columns = own.columns(free)
     found = estimate_initial_state(columns * weight[:, None], error * weight)
     return columns @ found - error, found
+
+
+def weights_of(records: Sequence[Record]) -> Array:
+    """Of the errors of outputs (n_outputs,), by how far these move in the records."""
+    power = np.mean([spread_of(record.y) ** 2 for record in records], axis=0)
+    return np.asarray(1.0 / np.sqrt(power))
 
 
 def initial_state(
@@ -434,8 +443,7 @@ def local_prior(
     for k, records in enumerate(groups):
         constant = PolynomialLPV(0).fit(kappa[[k]], theta[[k]])
         local = replace(model.silenced(), interpolator=constant, bases=())
-        one = np.ones(model.n_outputs)
-        found = [simulated(local, record, own, one) for record in records]
+        found = [simulated(local, record, own) for record in records]
         rms = np.sqrt(np.mean(np.vstack([e for e, _ in found]) ** 2, axis=0))
         size = np.sqrt(np.mean(np.vstack([r.y for r in records]) ** 2, axis=0))
         weight = 1.0 / np.maximum(rms, _EXACT * size)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
-from ..lpv.refinement import Own, Prior, Record, refine, squares
+from ..lpv.refinement import Own, Prior, Record, refine, squares, weights_of
 from ..subspace.residuals import explained_by_inputs
 
 Array = NDArray[np.float64]
@@ -63,9 +63,9 @@ def tell_of_errors(
             other = own._replace(constant=True)
             steps = min(max_iter, _STEPS)
             found = refine(start, records, other, prior, max_iter=steps).model
-            weight = np.ones(model.n_outputs)
+            weight = weights_of(records)
             squared = squares(found, records, other, weight)
-            share = squared / np.sum(np.vstack(errors) ** 2)
+            share = squared / np.sum((np.vstack(errors) * weight) ** 2)
             if share < _CONSTANT:
                 warn(
                     "with a constant of every experiment and output the errors are "

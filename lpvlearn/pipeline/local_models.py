@@ -672,13 +672,31 @@ def _in_one_basis(
     alone would not do where singular values are nearly equal, whose states may be
     turned.
     """
-    # Powers of two: no rounding, and the same wherever in memory the samples are.
-    u, y = (np.exp2(np.rint(np.log2(size))) for _, size in motions(experiments))
+    u, y = _sizes(experiments)
     models = _of_lowest_order(models)  # where none grew
     models = balanced_models([scaled(model, u, y) for model in models])
     first, *others = _of_lowest_order(models)  # nor lost what is rounding
     turned = [first, *(m.transform(rotation_to(m, first).T) for m in others)]
     return [scaled(model, 1.0 / u, 1.0 / y) for model in turned]
+
+
+def balanced_by_motion(
+    model: StateSpace, experiments: Sequence[Experiment]
+) -> StateSpace:
+    """The model balanced for signals of about unit size; as it is where it grows."""
+    if not model.is_stable:
+        return model
+    u, y = _sizes(experiments)
+    return scaled(scaled(model, u, y).balance(), 1.0 / u, 1.0 / y)
+
+
+def _sizes(experiments: Sequence[Experiment]) -> tuple[Array, Array]:
+    """How far inputs and outputs move, about.
+
+    Powers of two: no rounding, and the same wherever in memory the samples are.
+    """
+    u, y = (np.exp2(np.rint(np.log2(size))) for _, size in motions(experiments))
+    return u, y
 
 
 def _average(models: Sequence[StateSpace]) -> StateSpace:

@@ -45,6 +45,7 @@ from ..lpv.refinement import (
     refine_with_rates,
     simulated,
     squares,
+    weights_of,
 )
 from ..lpv.weighting import covariance_of
 from ..metrics.scores import best_fit
@@ -64,6 +65,7 @@ from .bands import output_errors
 from .black_boxes import balanced_entries
 from .error_warnings import tell_of_errors, tell_of_noisy_scheduling
 from .local_models import (
+    balanced_by_motion,
     common_delay,
     identify_point,
     identify_points,
@@ -544,6 +546,7 @@ class OutputErrorLPV(ScheduledEstimator):
             most=most,
         ).lti
         if structure is None:
+            lti = balanced_by_motion(lti, identified)
             structure, (theta,) = balanced_entries([lti])
         else:
             theta = GrayBoxRestructurer(structure).fit_model(lti).params_
@@ -627,10 +630,10 @@ def _promising(
     models: Sequence[LPVStateSpace], records: Sequence[Record], own: Own
 ) -> LPVStateSpace:
     """The start of a search whose first steps come farthest."""
-    one = np.ones(models[0].n_outputs)
+    weight = weights_of(records)
 
     def loss(model: LPVStateSpace) -> float:
-        return squares(model, records, own, one)
+        return squares(model, records, own, weight)
 
     def soon(model: LPVStateSpace) -> float:
         try:
@@ -662,9 +665,7 @@ def best_along(
     if len(ways) == 1:
         return ways[0]
     records = [_record(e, sampling_time) for e in experiments]
-    power = np.mean([r.y.var(axis=0) for r in records], axis=0)
-    weight = 1.0 / np.sqrt(np.where(power > 0.0, power, 1.0))
-    own = Own(initial_state=True, constant=True)
+    own, weight = Own(initial_state=True, constant=True), weights_of(records)
 
     def loss(found: StructuredModels) -> float:
         with collected():  # is told of what is taken
@@ -724,7 +725,7 @@ def _record(e: Experiment, sampling_time: float) -> Record:
 def _errors(model: LPVStateSpace, e: Experiment, record: Record, own: Own) -> Array:
     """Simulation errors of a run with the unknowns of its own that fit best."""
     with naming(e):
-        return simulated(model, record, own, np.ones(model.n_outputs))[0]
+        return simulated(model, record, own)[0]
 
 
 def _report(
