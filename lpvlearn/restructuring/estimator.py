@@ -46,6 +46,7 @@ from .deadline import bounded, time_is_up
 from .least_squares import LeastSquaresResult
 from .measured import stack_response
 from .minimise_covariance import (
+    IMPLAUSIBLE,
     Estimate,
     efficient_parameters,
     measured_response,
@@ -85,10 +86,6 @@ _POOR_FIT = 2e-2  # relative least-squares error that is warned about: it shows 
 
 _AGREE = 1e-3  # relative difference of the errors of fits in one basin
 _PROVEN = 1e-8  # an error that much above its lower bound, its rounding, is optimal
-
-# A structure is doubted where chance explains it that rarely, and the parameters would
-# suffer: errors of twice the standard deviations that are told.
-_IMPLAUSIBLE, _MISFIT = 1e-3, 4.0
 
 _ABSENT_ELSEWHERE = (  # attributes that not every fit has
     "params_covariance_",
@@ -727,7 +724,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         self.params_, result, floor = self._minimise(problem, fits)
         self._describe(problem, result, floor)
         if self.norm == "covariance":
-            self._weigh(problem, estimates)
+            self._weigh(problem, estimates, [fit.x for fit in promising(fits)])
         at = ParameterUncertainty(problem, self.params_)
         self.identifiability_ = at.identifiability()
         doubted = isinstance(self.init, str) and not only_given and not found.certain
@@ -802,9 +799,15 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
             self.remaining_error_ = self.error_
 
     def _weigh(
-        self, problem: RestructuringProblem, estimates: Sequence[Estimate]
+        self,
+        problem: RestructuringProblem,
+        estimates: Sequence[Estimate],
+        others: Sequence[Array],
     ) -> None:
-        """From the H-infinity optimum to the parameters weighed by the uncertainty."""
+        """From the H-infinity optimum to the parameters weighed by the uncertainty.
+
+        Or from `others`, least-squares fits of several basins.
+        """
         self.hinf_params_, self.hinf_error_ = self.params_, self.error_
         self.chi2_ = self.degrees_of_freedom_ = self.p_value_ = np.nan
         dt, size = problem.system.dt, problem.reference
@@ -814,6 +817,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 problem.whole,
                 estimates,
                 self.params_,
+                others=others,
                 sampling_time=dt,
                 admissible=admissible,
             )
@@ -838,7 +842,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 "structure of fewer parameters, or norm='hinf'.",
                 ConvergenceWarning,
             )
-        if found.p_value < _IMPLAUSIBLE and found.misfit > _MISFIT:
+        if not found.is_plausible:
             warn(
                 f"the structure lies {np.sqrt(found.misfit):.1f} times as far from the "
                 "black box as its noise explains (`p_value_` "
@@ -906,7 +910,7 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
                 ConvergenceWarning,
             )
         floor = self.structural_floor_ / max(problem.reference, 1e-300)
-        explained = getattr(self, "p_value_", 0.0) > _IMPLAUSIBLE  # by the noise
+        explained = getattr(self, "p_value_", 0.0) > IMPLAUSIBLE  # by the noise
         error = min(self.fit_error_, self.relative_error_) - floor
         if error > max(_POOR_FIT, enough) and not explained:
             costs = self.starts_["relative_error"].to_numpy()

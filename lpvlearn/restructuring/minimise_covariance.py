@@ -72,6 +72,10 @@ _SETTLED = 1e-6
 # rounding costs nothing.
 _DECREASE = 1e-10
 
+# A structure is doubted where chance explains it that rarely, and the parameters would
+# suffer: errors of twice the standard deviations that are told.
+IMPLAUSIBLE, _MISFIT = 1e-3, 4.0
+
 # Steps over many systems, and the relative decrease of their chi-square that ends them
 _MANY, _ROUGH = 60, 1e-8
 
@@ -202,9 +206,23 @@ class CovarianceFit:
     cost: float  # |z|^2
     degrees_of_freedom: int  # known directions minus parameters that they determine
     covariance: Array  # (n_params, n_params)
-    p_value: float  # of such a cost, or a higher one, if the structure is true
-    misfit: float  # cost by degree of freedom: about 1 where the structure is true
     converged: bool  # a further step would change the parameters by next to nothing
+
+    @property
+    def p_value(self) -> float:
+        """Of such a cost, or a higher one, if the structure is true."""
+        freedom = self.degrees_of_freedom
+        return float(chi2.sf(self.cost, freedom)) if freedom else 1.0
+
+    @property
+    def misfit(self) -> float:
+        """Cost by degree of freedom: about 1 where the structure is true."""
+        return self.cost / max(self.degrees_of_freedom, 1)
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether the noise explains the cost, or nearly."""
+        return self.p_value >= IMPLAUSIBLE or self.misfit <= _MISFIT
 
 
 def efficient_parameters(
@@ -212,6 +230,7 @@ def efficient_parameters(
     estimates: Sequence[Estimate],
     start: Array,
     *,
+    others: Sequence[Array] = (),
     sampling_time: float | None = None,
     admissible: Callable[[Array], bool] | None = None,
 ) -> CovarianceFit | None:
@@ -219,16 +238,25 @@ def efficient_parameters(
 
     The estimates are those of all experiments, or of each realization of the noise, as
     for `UncertainBoxes`. None where an uncertainty is not known, or the start does not
-    keep the stability margin. Of models with known poles a margin says nothing: what is
-    `admissible` is given.
+    keep the stability margin. If the noise does not explain what is found, the search
+    begins at `others` as well: in other units of the outputs another basin is the
+    lowest. Of models with known poles a margin says nothing: what is `admissible` is
+    given.
     """
-    found = UncertainBoxes.of(structure, estimates, sampling_time)
-    if found is None:
+    known = UncertainBoxes.of(structure, estimates, sampling_time)
+    if known is None:
         return None
-    margin = natural_margin(found.system.target)
-    return minimise_covariance(
-        found.system, start, margin, found.boxes, admissible=admissible
-    )
+    system, boxes = known.system, known.boxes
+    margin = natural_margin(system.target)
+
+    def search(start: Array) -> CovarianceFit | None:
+        return minimise_covariance(system, start, margin, boxes, admissible=admissible)
+
+    best = search(start)
+    if best is None or best.is_plausible:
+        return best
+    found = [best, *map(search, others)]
+    return min((fit for fit in found if fit is not None), key=lambda fit: fit.cost)
 
 
 def minimise_covariance(
@@ -306,16 +334,13 @@ def minimise_covariance(
         covariance = _linear_analysis(np.column_stack([J, more]))[0]
         covariance = covariance[: len(theta), : len(theta)]
     freedom = len(z) - explained.shape[1]
-    misfit = cost / max(freedom, 1)
     remaining = float(np.sum((explained.T @ z) ** 2))  # gain of a Gauss-Newton step
     return CovarianceFit(
         theta,
         cost,
         freedom,
         covariance,
-        p_value=float(chi2.sf(cost, freedom)) if freedom else 1.0,
-        misfit=misfit,
-        converged=remaining <= _SETTLED * max(1.0, misfit),
+        converged=remaining <= _SETTLED * max(1.0, cost / max(freedom, 1)),
     )
 
 

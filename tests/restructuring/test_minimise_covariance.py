@@ -268,6 +268,22 @@ def test_the_stability_margin_is_kept(black_box):
     )
 
 
+def test_a_fit_that_noise_does_not_explain_begins_at_other_starts_too():
+    """A resonance that the first start has elsewhere, by far."""
+    spring = GrayBoxStructure.from_template(
+        A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0]]
+    )
+    theta, start = np.array([4.0, 0.05]), np.array([40.0, 0.05])
+    model = spring.model(theta)
+    estimates = [(model, pairs_around(model, random_changes(model)))]
+    alone = efficient_parameters(spring, estimates, start)
+    assert not alone.is_plausible
+    others = [1.2 * start, theta * 1.05]
+    found = efficient_parameters(spring, estimates, start, others=others)
+    assert found.is_plausible
+    np.testing.assert_allclose(found.theta, theta, rtol=1e-6)
+
+
 def test_nothing_is_weighed_where_no_uncertainty_is_left():
     box = StateSpace([[-2.0]], [[3.0]], [[1.0]])
     omega = np.geomspace(0.1, 10, 5)
