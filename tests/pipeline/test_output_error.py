@@ -19,7 +19,7 @@ from lpvlearn import (
     SubspaceLTI,
     bft_score,
 )
-from lpvlearn.exceptions import ExtrapolationWarning
+from lpvlearn.exceptions import ExtrapolationWarning, collected
 from lpvlearn.inspection import SimulationDisplay
 
 from ..conftest import (
@@ -82,6 +82,32 @@ def test_moving_experiments_refine_and_local_ones_identify(refined, both, memory
     np.testing.assert_array_equal(
         refined.interpolator_.predict(FINE[:, None]), refined.lpv_.parameters(FINE)
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("structured", [True, False])
+def test_units_of_outputs_do_not_matter(structured):
+    """Of short records in mid-motion, whose initial states two outputs share."""
+    X, y = sweeps(n=1)
+    steps = {"sampling_time": 0.1, "inputs": "force", "scheduling": "kappa"}
+    rows = slice(150, 270)
+    rates = np.gradient(y["position"].to_numpy(), 0.1)
+    y = y.assign(rate=rates + 0.1 * np.random.default_rng(2).normal(size=len(y)))[rows]
+    X = X[rows].drop(columns=["run", "time"])
+    found = []
+    for unit in (1.0, 1024.0):
+        spring = GrayBoxStructure.from_template(
+            A=[[0, 1], ["-k", "-c"]], B=[[0], [1]], C=[[1, 0], [0, unit]]
+        )
+        refiner = OutputErrorLPV(
+            spring if structured else None, rate=False, max_iter=5, **steps
+        )
+        with collected():  # few steps of a short record
+            refiner.fit(X, y * [1.0, unit])
+        found.append((refiner.predict(X) / [1.0, unit], refiner.output_errors_))
+    np.testing.assert_allclose(found[1][0], found[0][0], rtol=1e-3, atol=1e-4)
+    errors = found[1][1].div([1.0, 1024.0], axis=0)
+    np.testing.assert_allclose(errors, found[0][1], rtol=1e-3)
 
 
 def test_without_a_refiner_moving_experiments_are_refused_with_the_remedy(both):
