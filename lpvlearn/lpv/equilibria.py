@@ -10,7 +10,9 @@ not reach stays an offset of the sensors. Inputs of which the outputs tell nothi
 
 - They follow one another by the models' own gain, ``du0 = P dy0``: they are equilibria
   of one system that schedules itself, and ``A dx0 + B du0 = 0`` along them. So
-  ``dx0 = S dy0``, from neighbour to neighbour, whatever basis these share.
+  ``dx0 = S dy0``, from neighbour to neighbour, whatever basis these share. Where G
+  changes its sign (a plant with an optimum), P has a pole between the points, and it
+  is ``dy0 = G du0`` that tells them, and ``dx0 = -A^-1 B du0``.
 - They do not: inputs are free at every point. Constants ``c = y0 - G u0`` that are the
   same everywhere are the sensors', ``x0 = S (y0 - c)``. Where w is the same, too, that
   is taken by which there is less to hold.
@@ -118,7 +120,7 @@ def points_of_work(
         x0 = np.array([_state_at_rest(*point, scales) for point in found])
         return np.hstack([inputs, outputs, x0])
     statics = _Statics.of(models, scales)
-    gains, inverse, states, unseen = statics
+    gains = statics.gains
     if np.sum(np.var(inputs / u_scale, axis=0)) <= _STANDING:
         common = np.broadcast_to(inputs.mean(axis=0), inputs.shape)
         change = _times(gains, common - inputs)
@@ -131,17 +133,18 @@ def points_of_work(
         C = models[0].C / y_scale[:, None]
         x0 = np.linalg.lstsq(C, (shown / y_scale).T)[0].T
         return np.hstack([inputs, outputs, x0])
-    if _are_one_family(statics, kappa, inputs, outputs, u_scale):
-        order, parents = spanning_tree(kappa)
-        child, parent = order[1:], parents[order[1:]]
-        du, dy = inputs[child] - inputs[parent], outputs[child] - outputs[parent]
-        x0 = _times(states, outputs) + _times(unseen, inputs)
-        for k, j, step, of_input in zip(child, parent, dy, du, strict=True):
-            x0[k] = x0[j] + 0.5 * (states[k] + states[j]) @ step
-            x0[k] += 0.5 * (unseen[k] + unseen[j]) @ of_input
+    family = _Family.of(statics, kappa, inputs, outputs, scales)
+    if family.is_one:
+        x0 = statics.states_at_rest(inputs, outputs)
+        for k, j, *step in family.steps:
+            if family.by_outputs:
+                change = statics.states_at_rest(*step)
+            else:
+                change = statics.moved @ step[0]
+            x0[k] = x0[j] + 0.5 * (change[k] + change[j])
         return np.hstack([inputs, outputs, x0])
-    bias = _bias_of_sensors(inputs, outputs, gains, inverse, u_scale)
-    x0 = _times(states, outputs - bias) + _times(unseen, inputs)
+    bias = _bias_of_sensors(inputs, outputs, gains, statics.inverse, u_scale)
+    x0 = statics.states_at_rest(inputs, outputs - bias)
     return np.hstack([inputs, outputs, x0])
 
 
@@ -162,18 +165,50 @@ def _measure_all_states(
     return bool(direct < _AT_ONCE and np.linalg.matrix_rank(C) == models[0].order)
 
 
-def _are_one_family(
-    statics: _Statics, kappa: Array, inputs: Array, outputs: Array, u_scale: Array
-) -> bool:
-    """Whether points follow one another by their models' own gain, du0 = P dy0."""
-    order, parents = spanning_tree(kappa)
-    child, parent = order[1:], parents[order[1:]]
-    du, dy = inputs[child] - inputs[parent], outputs[child] - outputs[parent]
-    inverse, seen = statics.inverse, statics.inverse @ statics.gains
-    asked = _times(0.5 * (seen[child] + seen[parent]), du) / u_scale
-    answer = _times(0.5 * (inverse[child] + inverse[parent]), dy) / u_scale
-    moved = np.sum(asked**2) + np.sum(answer**2)
-    return bool(asked.any() and np.sum((asked - answer) ** 2) <= _UNEXPLAINED * moved)
+class _Family(NamedTuple):
+    """Whether points follow one another by their models' own gain.
+
+    As their outputs tell, ``du0 = P dy0``, or as their inputs do, ``dy0 = G du0``.
+    """
+
+    steps: Sequence[tuple[int, int, Array, Array]]  # point, the one before, du0, dy0
+    by_outputs: bool
+    by_inputs: bool
+
+    @classmethod
+    def of(
+        cls,
+        statics: _Statics,
+        kappa: Array,
+        inputs: Array,
+        outputs: Array,
+        scales: tuple[Array, Array],
+    ) -> _Family:
+        """Of equilibria; `scales` are the sizes of the motions."""
+        order, parents = spanning_tree(kappa)
+        child, parent = order[1:], parents[order[1:]]
+        du, dy = inputs[child] - inputs[parent], outputs[child] - outputs[parent]
+
+        def between(matrices: Array) -> Array:
+            return np.asarray(0.5 * (matrices[child] + matrices[parent]))
+
+        def explained(asked: Array, answer: Array) -> bool:
+            moved = np.sum(asked**2) + np.sum(answer**2)
+            left = np.sum((asked - answer) ** 2)
+            return bool(asked.any() and left <= _UNEXPLAINED * moved)
+
+        gains, inverse = statics.gains, statics.inverse
+        u_scale, y_scale = scales
+        asked = _times(between(inverse @ gains), du) / u_scale
+        answer = _times(between(inverse), dy) / u_scale
+        moved = _times(between(gains), du) / y_scale
+        steps = list(zip(child, parent, du, dy, strict=True))
+        return cls(steps, explained(asked, answer), explained(moved, dy / y_scale))
+
+    @property
+    def is_one(self) -> bool:
+        """By either."""
+        return self.by_outputs or self.by_inputs
 
 
 def _any_integrates(models: Sequence[StateSpace]) -> bool:
@@ -205,9 +240,11 @@ def interpolated(
     u, y = points.equilibria()
     distinct = len(np.unique(kappa)) == len(kappa)
     statics = _Statics.of(models, scales)
-    if distinct and _are_one_family(statics, kappa, u, y, scales[0]):
+    family = _Family.of(statics, kappa, u, y, scales)
+    if distinct and family.is_one:
         straight = _bend(kappa, y / scales[1]) <= _bend(kappa, u / scales[0])
-        ways.append((partial(_by_slopes, scales, straight), 1.0))
+        of_outputs = family.by_outputs and straight
+        ways.append((partial(_by_slopes, scales, of_outputs), 1.0))
     if points.have_one_constant(scales[1]):
         ways.append((partial(_by_one_constant, spline), _BETTER))
     if len(kappa) >= _FEWEST:
@@ -327,13 +364,14 @@ def _by_slopes(
     """
     points = points.kept(np.argsort(points.kappa[:, 0]))
     x = points.kappa[:, 0]
-    gains, inverse, states, unseen = _Statics.of(points.models, scales)
+    statics = _Statics.of(points.models, scales)
+    gains, inverse = statics.gains, statics.inverse
     u, y = (CubicSpline(x, values)(x, 1) for values in points.equilibria())
     if of_outputs:
         u = u + _times(inverse, y - _times(gains, u))
     else:
         y = y + _times(gains, u - _times(inverse, y))
-    slopes = np.hstack([u, y, _times(states, y) + _times(unseen, u)])
+    slopes = np.hstack([u, y, statics.states_at_rest(u, y)])
     curve = CubicHermiteSpline(x, points.values, slopes)
     return lambda place, model: _Work.of(model, curve(place[0]))
 
@@ -352,8 +390,7 @@ class _Statics(NamedTuple):
 
     gains: Array
     inverse: Array  # P, from outputs to the inputs that they show
-    states: Array  # S, from outputs to states
-    unseen: Array  # from inputs to the states by what the outputs do not show of them
+    moved: Array  # -A^-1 B, from inputs to states
 
     @classmethod
     def of(cls, models: Sequence[StateSpace], scales: tuple[Array, Array]) -> _Statics:
@@ -362,8 +399,14 @@ class _Statics(NamedTuple):
         inverse = _inverse(gains * u_scale / y_scale[:, None])
         inverse *= u_scale[:, None] / y_scale
         moved = -np.array([np.linalg.solve(m.A, m.B) for m in models])
-        rest = np.eye(len(u_scale)) - inverse @ gains
-        return cls(gains, inverse, moved @ inverse, moved @ rest)
+        return cls(gains, inverse, moved)
+
+    def states_at_rest(self, u: Array, y: Array) -> Array:
+        """Of outputs, S y, and of inputs by what these do not show of them."""
+        shown = self.moved @ self.inverse
+        rest = np.eye(self.moved.shape[-1]) - self.inverse @ self.gains
+        u, y = (np.broadcast_to(x, (len(shown), x.shape[-1])) for x in (u, y))
+        return _times(shown, y) + _times(self.moved @ rest, u)
 
 
 class _Work(NamedTuple):

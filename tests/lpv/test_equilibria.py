@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from lpvlearn import StateSpace
-from lpvlearn.lpv.equilibria import interpolated, points_of_work
+from lpvlearn.lpv.equilibria import _Family, _Statics, interpolated, points_of_work
 from lpvlearn.lpv.spline import SplineLPV
 
 ONE = (np.ones(1), np.ones(1))
@@ -304,3 +304,28 @@ def test_outputs_that_measure_all_states_tell_where_these_rest():
     values = points_of_work(models, load, inputs, outputs, scales)
     assert_allclose(values[:, :3], np.hstack([inputs, outputs]), rtol=1e-12)
     assert_allclose(np.diff(values[:, 3:], axis=0), np.diff(x0, axis=0), rtol=1e-9)
+
+
+def test_a_plant_with_an_optimum_is_one_family_by_its_inputs():
+    """Gains that are 10, 4, -2 and -8: their inverses have a pole between points."""
+    u = np.array([0.5, 0.8, 1.1, 1.4])[:, None]
+    y = 10.0 * (1.0 - (u - 1.0) ** 2)
+    models = [
+        StateSpace([[-2.0, 0.0], [60.0 * (1.0 - at), -3.0]], [[2.0], [0.0]], [[0, 1.0]])
+        for at in u[:, 0]
+    ]
+    scales = np.array([0.04]), np.array([0.2])
+    found = points_of_work(models, u, u, y, scales)
+    np.testing.assert_allclose(found[:, :2], np.hstack([u, y]))
+    steps = np.diff(np.hstack([u, y]), axis=0)
+    np.testing.assert_allclose(np.diff(found[:, 2:], axis=0), steps, atol=1e-12)
+
+
+def test_what_moves_outputs_without_inputs_makes_no_family_by_inputs():
+    """Levels that an input of its own accord does not explain."""
+    kappa = np.arange(4.0)[:, None]
+    models = [StateSpace(-1.0 - k, 1.0, [[1.0], [0.5]]) for k in kappa[:, 0]]
+    u = np.array([[0.0], [1.0], [0.0], [1.0]])
+    y = np.hstack([10.0 * kappa, -3.0 * kappa])
+    statics = _Statics.of(models, (np.ones(1), np.ones(2)))
+    assert not _Family.of(statics, kappa, u, y, (np.ones(1), np.ones(2))).is_one
