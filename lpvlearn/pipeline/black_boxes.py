@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from ..data.experiments import Experiment
 from ..exceptions import warn
@@ -207,7 +208,34 @@ def balanced(local: LocalModel) -> StateSpace:
     Poles on the negative real axis make the order grow in continuous time.
     """
     rates = of_rates(local.lti, local.integrating)
-    return rates.balance(min(local.order - len(local.integrating), rates.order))
+    more = rates.order - (local.order - len(local.integrating))
+    return (_with_fast_states(rates, more) if more > 0 else rates).balance()
+
+
+def _with_fast_states(model: StateSpace, n_pairs: int) -> StateSpace:
+    """The model with a real state in the place of each of its fastest pairs of poles.
+
+    Those at the Nyquist frequency, of a state that alternates from sample to sample:
+    the real ones are as fast, and have the same static gain (of rank one, at best).
+    """
+    poles, V = np.linalg.eig(model.A)
+    rising = np.argsort(poles.imag)[::-1]
+    pairs = rising[: min(n_pairs, np.count_nonzero(poles.imag > 0.0))]
+    W = np.linalg.inv(V)
+    c, b = model.C @ V[:, pairs], W[pairs] @ model.B
+    rest = np.ones(len(poles), bool)
+    rest[[*pairs, *rising[::-1][: len(pairs)]]] = False
+    kept = (V[:, rest] @ W[rest]).real
+    U = np.linalg.svd(kept)[0][:, : np.count_nonzero(rest)]
+    A, B, C = [U.T @ model.A @ U], [U.T @ kept @ model.B], [model.C @ U]
+    for k, pole in enumerate(poles[pairs]):
+        gain = -2.0 * np.real(np.outer(c[:, k], b[k]) / pole)
+        left, size, right = np.linalg.svd(gain)
+        A.append(np.array([[-np.abs(pole)]]))
+        B.append(np.abs(pole) * size[0] * right[:1])
+        C.append(left[:, :1])
+    matrices = block_diag(*A), np.vstack(B), np.hstack(C), model.D
+    return StateSpace(*matrices, input_delay=model.input_delay)
 
 
 def of_rates(model: StateSpace, integrating: Sequence[int]) -> StateSpace:

@@ -768,8 +768,9 @@ def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpa
             f"the identified model of order {model.order} has "
             f"{lti.order - model.order} pole(s) on the negative real axis "
             f"({', '.join(f'{p:.3g}' for p in poles)}), as no continuous-time model of "
-            "that order has: what becomes of the point is the nearest one. A shorter "
-            "sampling time or a lower `order` avoids it."
+            "that order has: without a structure a state as fast, of the same static "
+            "gain, takes the place of each. A shorter sampling time or a lower `order` "
+            "avoids it."
         )
     return lti
 

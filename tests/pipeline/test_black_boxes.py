@@ -19,6 +19,7 @@ from lpvlearn.datasets import prbs
 from lpvlearn.lpv.alignment import aligned_models
 from lpvlearn.pipeline.black_boxes import (
     _entries,
+    _with_fast_states,
     aligned_black_boxes,
     tell_of_forced,
 )
@@ -310,3 +311,28 @@ def test_states_that_no_two_points_share_are_given_up():
     free = {"scheduling": np.full(1000, 0.75), "sampling_time": 0.005}
     found = pipeline.lpv_.simulate(fresh, **free)[:, 0]
     assert bft_score(hardening(fresh, 1.75), found) > 80.0
+
+
+@pytest.mark.parametrize("n_outputs", [1, 2])
+def test_a_state_that_alternates_leaves_the_plant_as_it_is(n_outputs):
+    """In continuous time it is a pair of poles, whose place a fast one takes."""
+    plant = StateSpace(-1.0, 1.0, [[1.0], [-2.0]][:n_outputs]).to_discrete(0.5)
+    sampled = StateSpace(
+        np.diag([plant.A[0, 0], -0.6]),
+        [*plant.B, [0.3]],
+        np.hstack([plant.C, [[1.0], [0.5]][:n_outputs]]),
+        sampling_time=0.5,
+    )
+    with pytest.warns(RuntimeWarning, match="a pair at the Nyquist frequency"):
+        lti = sampled.to_continuous()
+    assert lti.order == 3
+    found = _with_fast_states(lti, 1)
+    assert found.order == 2 and found.is_stable
+    assert np.isclose(found.poles(), -1.0).any()
+    np.testing.assert_allclose(found.dc_gain(), sampled.dc_gain(), rtol=1e-9)
+    omega = np.linspace(0.0, 1.0, 5)
+    G = lti.frequency_response(omega)
+    error = found.frequency_response(omega) - G
+    assert np.abs(error).max() < 0.03 * np.abs(G).max()
+    truncated = lti.balance(2).frequency_response(omega) - G
+    assert np.abs(truncated).max() > 3.0 * np.abs(error).max()
