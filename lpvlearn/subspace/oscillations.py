@@ -30,13 +30,14 @@ Array = NDArray[np.float64]
 
 _DECAYS = 1.0  # time constants per record of a mode that stands for one
 
-# Radians that it turns in a record, at least. And by which it is off a half turn with
-# every sample, whose cosine and sine are the same.
-_TURNS = 11.0
+# Radians that it turns in a record, at least: less is a drift. And by which it is off a
+# half turn with every sample, whose cosine and sine are the same.
+_TURNS = 3.0
 
-# Polynomials of time that amplitudes may follow, and the part of what a sinusoid
-# explains that they may add: noise that shakes a mode makes its amplitude wander.
-_DEGREE, _WANDERS = 3, 0.05
+# Polynomials of time that amplitudes may follow in records of so many radians, and the
+# part of what a sinusoid explains that they may add: noise that shakes a mode makes its
+# amplitude wander.
+_DEGREE, _FOLLOWED, _WANDERS = 3, 11.0, 0.05
 
 _CHANCE = 1e-6  # of as large an oscillation of white noise
 
@@ -201,7 +202,7 @@ def _sinusoids(turns: Array, n_samples: int, degree: int) -> Array:
     signals = np.zeros((n_samples, len(turns), 2 * (degree + 1)))
     for k, turn in enumerate(turns):
         both = np.column_stack([np.cos(turn * time), np.sin(turn * time)])
-        shape = shapes if turn * n_samples > _TURNS else shapes[:, :1]
+        shape = shapes if turn * n_samples > _FOLLOWED else shapes[:, :1]
         Q = np.linalg.qr((shape[:, :, None] * both[:, None]).reshape(n_samples, -1))[0]
         signals[:, k, : Q.shape[1]] = Q
     return signals.reshape(n_samples, -1)
