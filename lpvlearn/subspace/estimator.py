@@ -604,7 +604,9 @@ class SubspaceLTI(
         samples = Samples(pairs, choices, telling)
         fitted = fit_as_stream(samples, detrend=self.detrend, gaps=gaps)
         if fitted is None:
-            fitted = fit_samples(samples, detrend=self.detrend, like=known)
+            fitted, samples = fit_samples(samples, detrend=self.detrend, like=known)
+        else:
+            samples = samples._replace(pairs=remove_trends(pairs, self.detrend)[0])
         self._take(fitted, self._step_of(experiments), delay)
         asked = choices.initial_states or bool(fitted.offsets.inputs.any())
         self.steady_start_ = asked and self._simulator().begins_held_in(experiments)
@@ -614,8 +616,7 @@ class SubspaceLTI(
         if known is None and None not in (choices.order, choices.horizon):
             warn_about_horizon(fitted, choices)
         if known is None and not isinstance(self.input_delay, str) and not delay.any():
-            pairs = remove_trends(pairs, self.detrend)[0]
-            tell_of_delay(samples._replace(pairs=pairs), fitted)
+            tell_of_delay(samples, fitted)
         return fitted
 
     def _fit_rates(self, X: Any, y: Any) -> Self:

@@ -41,10 +41,12 @@ from .trends import with_trends
 
 def fit_samples(
     samples: Samples, *, detrend: str | None = None, like: LocalFit | None = None
-) -> LocalFit:
+) -> tuple[LocalFit, Samples]:
     """Check, detrend, choose and identify.
 
-    Of samples `like` those of another fit feedback is not looked for again.
+    With the samples that the model was made of: without what no input moves, cut where
+    levels shift. Of samples `like` those of another fit feedback is not looked for
+    again.
     `TooFewSamples` where an input is constant or the samples are too few.
     """
     pairs, choices, telling = samples
@@ -99,6 +101,6 @@ def fit_samples(
         fitted = fitted._replace(evidence=replace(fitted.evidence, turns=turns))
     if rest is not None:
         fitted = moved_back(fitted, first, differ)
-    if detrend is None:
-        return fitted
-    return fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
+    if detrend is not None:
+        fitted = fitted._replace(offsets=fitted.offsets.shifted(u_mean, y_mean))
+    return fitted, samples

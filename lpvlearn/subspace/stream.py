@@ -472,7 +472,7 @@ class SampleStream:
         while True:
             full = bool(left) or buffer.n_samples >= BUFFER
             try:
-                fitted = fit_samples(Samples(buffer.pairs, choices, self._telling))
+                fitted, _ = fit_samples(Samples(buffer.pairs, choices, self._telling))
                 break
             except TooFewSamples as error:
                 if not full:
@@ -537,7 +537,7 @@ def fit_as_stream(
     if not _as_independent(first, pairs):
         return None
     try:
-        begun = fit_samples(samples._replace(pairs=first))
+        begun, _ = fit_samples(samples._replace(pairs=first))
         if begun.method == "pbsid":
             return None
         choices = choices._replace(method=begun.method)

@@ -486,7 +486,7 @@ def test_a_fit_that_parts_held_out_do_not_confirm_is_told(rng):
     u, y = record(rng, 300)
     y = y + 0.1 * rng.standard_normal(y.shape)
     choices = check_options(SubspaceLTI().get_params())
-    fitted = fit_samples(Samples([(u, y)], choices, Telling()))
+    fitted, _ = fit_samples(Samples([(u, y)], choices, Telling()))
     for residual, expected in ((0.05, 0), (0.4, 0), (0.6, 1)):
         held_out = fitted.selection.held_out._replace(residual=residual)
         poor = fitted._replace(selection=replace(fitted.selection, held_out=held_out))
@@ -520,7 +520,7 @@ def test_an_order_that_the_likelihood_disputes_is_told(rng):
     """By more than 30: of a chance of 1e-7."""
     u, e = rng.standard_normal((2, 300, 1))
     y = lfilter([0.0, 1.0], [1.0, -0.7], u, axis=0) + 0.1 * e
-    fitted = fit_samples(
+    fitted, _ = fit_samples(
         Samples([(u, y)], check_options(SubspaceLTI().get_params()), Telling())
     )
     chosen = fitted.selection.order, fitted.selection.horizon
@@ -671,7 +671,7 @@ def test_parts_that_only_means_explain_are_told(bft, told, rng):
     u = np.repeat(rng.standard_normal((30, 1)), 10, axis=0)
     y = 20.0 + StateSpace([[0.9]], [[0.1]], [[1.0]], None, 1.0).simulate(u)
     y = y + 0.01 * rng.standard_normal(y.shape)
-    fitted = fit_samples(Samples([(u + 10.0, y)], Choices(), Telling()))
+    fitted, _ = fit_samples(Samples([(u + 10.0, y)], Choices(), Telling()))
     held_out = fitted.selection.held_out._replace(bft=bft)
     selection = replace(fitted.selection, held_out=held_out)
     with warnings.catch_warnings(record=True) as caught:

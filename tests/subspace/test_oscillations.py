@@ -68,6 +68,25 @@ def test_the_plant_is_that_of_records_without_the_oscillation(seed, size):
     assert _error(of_given) < 1.1 * _error(model) + 2e-4
 
 
+@pytest.mark.parametrize("kind, seed", [("shifts", 0), ("shifts", 1), ("hum", 3)])
+def test_what_is_taken_out_is_no_delay(kind, seed):
+    """Beside it inputs seemed to arrive late."""
+    rng = np.random.default_rng(seed)
+    A, B = [[0, 1.0, 0], [-9, -1.2, 0], [22.5, 0, -2.5]], [[0], [1], [0]]
+    u = np.repeat(rng.choice([-1.0, 1.0], (125, 1)), 8, axis=0)
+    y = StateSpace(A, B, [[0, 0, 2]]).to_discrete(0.05).simulate(u)
+    y += 0.03 * rng.standard_normal(y.shape)
+    if kind == "shifts":
+        y += np.repeat(rng.standard_normal((4, 1)), 250, axis=0)
+    else:
+        y += 0.5 * np.sin(2.9 * np.arange(1000))[:, None]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = SubspaceLTI().fit(u, y)
+    assert model.order_ == 3
+    assert len(caught) == 1  # of the shifts, or of the hum
+
+
 def test_a_model_that_is_to_oscillate_does():
     (u,), (y,) = _records(0, 0.3)
     model, told = _fit(u, y, order=6)
