@@ -30,6 +30,7 @@ from ..restructuring.known_poles import hidden_integrators, integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
 from ..subspace.constants import lasting
+from ..subspace.criterion import PRICE
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
 from ..systems.modes import mode_rates
@@ -54,6 +55,10 @@ _STANDING = 0.05
 # One that much slower may be an integrator, known by samples that are not many; the
 # share by which it may decay in a record.
 _ABOUT_ZERO, _HARDLY = 0.25, 0.05
+
+# Points that together tell one delay of all, and by how much, in twice the logarithm of
+# the likelihood, it must be likelier than another; or a delay of a point of its own.
+_PROBED, _CLEARER = 5, 6.0
 
 # Points that look for their order everywhere, and states fewer and more than theirs
 # among which the others look first: a mode may vanish, or come.
@@ -152,6 +157,7 @@ def identify_points(
             return identify(estimator, known, replace(runner, on_error="skip"))
         return [None] * len(groups)
 
+    local = _with_one_delay(local, tried, groups, options["sampling_time"])
     if not chooses or structure is not None:
         found = identify(local)
     else:
@@ -191,6 +197,70 @@ def of_structure(local: Any, structure: Any) -> tuple[Any, bool]:
     lost = integrators if _integrates(local) else hidden_integrators
     order = structure.order - lost(structure)
     return clone(local).set_params(order=order), isinstance(local, SubspaceLTI)
+
+
+def _with_one_delay(
+    local: Any,
+    tried: Callable[[Any, Sequence[int]], list[Done | None]],
+    groups: Sequence[Sequence[Experiment]],
+    sampling_time: float,
+) -> Any:
+    """The estimator with the delay of all points, where each was to find its own.
+
+    A short record takes a sample more or less for states, or for noise. Criteria of
+    independent records add up: beginning at the median of some points, longer delays of
+    an input are taken where these together are likelier so by more than a state, which
+    may stand for a sample, and shorter ones where they are as likely. Not where delays
+    of their own are likelier beyond doubt, as with transport at another speed.
+    """
+    asked = type(local) is SubspaceLTI and isinstance(local.input_delay, str)
+    if not asked or len(groups) < 2:
+        return local
+    n_probed = min(len(groups), _PROBED)
+    some = np.linspace(0, len(groups) - 1, n_probed).round().astype(int).tolist()
+
+    def delays(found: Sequence[Done | None]) -> Array:
+        each = [done.result.lti.input_delay for done in found if done is not None]
+        return np.round(np.array(each) / sampling_time)
+
+    def cost(found: Sequence[Done | None]) -> float:
+        """Of as many samples, whatever is unknown of the first ones."""
+        known = [(k, done.result) for k, done in enumerate(found) if done is not None]
+        if len(known) < n_probed:
+            return np.inf
+        total = 0.0
+        for k, model in known:
+            late = model.lti.input_delay.max() / sampling_time
+            n_samples = sum(len(e.rows) for e in groups[k])
+            unknown = len(groups[k]) * late if local.initial_state != "rest" else 0.0
+            total += model.criterion * n_samples / (n_samples - unknown)
+        return total
+
+    def having(delay: Array) -> Any:
+        return clone(local).set_params(input_delay=delay.astype(int).tolist())
+
+    own = tried(local, some)
+    if not np.isfinite(cost(own)):
+        return local
+    delay = np.sort(delays(own), axis=0)[(n_probed - 1) // 2]
+    if delay.any() and (delays(own) == delay).all():
+        return having(delay)
+    state = n_probed * PRICE * (len(delay) + groups[0][0].measured.shape[1])
+    least = cost(tried(having(delay), some))
+    for sample in np.eye(len(delay)):
+        for step, worth in ((sample, _CLEARER + state), (-sample, -_CLEARER)):
+            best, lowest, before, other = delay, least - worth, least, delay + step
+            while (other >= 0).all():
+                reached = cost(tried(having(other), some))
+                if not reached < before + _CLEARER:
+                    break
+                if reached < lowest:
+                    best, lowest = other, reached
+                before, other = min(before, reached), other + step
+            if (best != delay).any():
+                delay, least = best, lowest
+    alike = least < cost(own) + _CLEARER * (n_probed - 1)
+    return having(delay) if alike else local
 
 
 def _of_own_orders(

@@ -14,6 +14,7 @@ from sklearn.linear_model import LinearRegression
 from lpvlearn import (
     AutoLPV,
     GrayBoxRestructurer,
+    GrayBoxStructure,
     LocalLPVPipeline,
     PolynomialLPV,
     StateSpace,
@@ -769,6 +770,35 @@ def test_delays_go_along_with_the_options(options):
     local = SubspaceLTI(input_delay=3)
     pipeline = spring_pipeline(local=local, **options).fit(X, y)
     np.testing.assert_allclose(pipeline.parameters_, spring_truth(KAPPA), rtol=1e-5)
+
+
+def test_points_tell_a_delay_together():
+    """A furnace at four throughputs: short records, each of which tells another one."""
+    rng, parts, dt = np.random.default_rng(0), [], 30.0
+    throughputs = np.array([0.2, 0.5, 0.8, 1.1])
+    for run, p in enumerate(np.repeat(throughputs, 2)):
+        n = 45 + int(rng.integers(-8, 12))
+        u = np.full(n, 5.0 * rng.choice([-1.0, 1.0]))
+        u[:6] = 0.0
+        gain, rate = 3.0 / (0.5 + p), (0.5 + p) / 300.0
+        late = np.concatenate([np.zeros(2), u[:-2]])
+        y = StateSpace(-rate, gain * rate, 1.0).simulate(late, sampling_time=dt)[:, 0]
+        y += 400.0 + 40.0 * p + 0.1 * gain * rng.standard_normal(n)
+        columns = {"gas": 50.0 + u, "p": p, "T": y, "t": dt * np.arange(n)}
+        parts.append(pd.DataFrame(columns).assign(run=run))
+    table = pd.concat(parts, ignore_index=True)
+    furnace = GrayBoxStructure.from_template(A=[["-a"]], B=[["b"]], C=[[1]])
+    pipeline = LocalLPVPipeline(
+        SubspaceLTI(input_delay="auto"),
+        GrayBoxRestructurer(furnace),
+        scheduling="p",
+        experiment="run",
+        time="t",
+    )
+    pipeline.fit(table[["run", "t", "gas", "p"]], table["T"])
+    assert pipeline.input_delay_.tolist() == [2]
+    rates = (0.5 + throughputs) / 300.0
+    np.testing.assert_allclose(pipeline.parameters_["a"], rates, rtol=0.06)
 
 
 def test_no_delay_is_imagined():
