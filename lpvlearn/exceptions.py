@@ -132,7 +132,7 @@ def version() -> str:
 
 
 # Of columns and labels: what lists, texts and arrays of NumPy give back as it was.
-_PLAIN_DTYPES = ("object", "str", "float64", "int64", "bool")
+PLAIN_DTYPES = ("object", "str", "float64", "int64", "bool")
 
 
 class _Labels(NamedTuple):
@@ -168,7 +168,7 @@ class _PlainTable(NamedTuple):
             return value
         rows, columns = _Labels.of(value.index), _Labels.of(value.columns)
         dtypes = [str(dtype) for dtype in value.dtypes]
-        if not {rows.dtype, columns.dtype, *dtypes} <= {*_PLAIN_DTYPES}:
+        if not {rows.dtype, columns.dtype, *dtypes} <= {*PLAIN_DTYPES}:
             return value
         arrays = [value.iloc[:, k].to_numpy() for k in range(len(dtypes))]
         return cls(rows, columns, dtypes, arrays)

@@ -181,8 +181,9 @@ for delay in (0, "auto"):
 # In a pipeline, ``LocalLPVPipeline(SubspaceLTI(input_delay="auto"), ...)``: the
 # structure is compared with what is left of the local model and has no delay itself;
 # the structured model and ``lpv_`` carry it. ``report_`` has it in columns
-# ``"delay_"`` by input. Where operating points differ, a warning lists them, and
-# ``lpv_`` takes the median.
+# ``"delay_"`` by input. The points tell one delay together where that is as likely as
+# one of each. Where they differ beyond doubt, a warning lists them, and ``lpv_`` takes
+# the median.
 #
 # .. _guide_offsets:
 #

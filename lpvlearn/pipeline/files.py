@@ -25,7 +25,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from ..exceptions import version
+from ..exceptions import PLAIN_DTYPES, version
 from ..systems.whole_files import whole_file
 from ..validation import file_name, shown
 from .memory import unwritten
@@ -53,8 +53,6 @@ _HEADER = re.compile(
     re.DOTALL,
 )
 _MOST_HEADER = 1000
-
-_TABLE_DTYPES = ("object", "str", "float64", "int64", "bool")
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal models make equal files
 
@@ -320,7 +318,7 @@ class _Writer:
 
     def _series(self, values: pd.Series | pd.Index, place: str) -> dict[str, Any]:
         dtype = str(values.dtype)
-        if dtype not in _TABLE_DTYPES:
+        if dtype not in PLAIN_DTYPES:
             raise ValueError(
                 f"`{place}` must hold numbers or text. Got a table of {dtype}."
             )
@@ -526,7 +524,7 @@ class _Reader:
     def _series(self, node: Any, place: str) -> tuple[Any, Any, str]:
         match node:
             case {"name": name, "dtype": str(dtype), "values": values, **rest}:
-                if not rest and dtype in _TABLE_DTYPES:
+                if not rest and dtype in PLAIN_DTYPES:
                     name = _scalar(name, place)
                     if isinstance(values, list):
                         return name, _labels(values, place), dtype

@@ -11,11 +11,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from ..data.experiments import ROLES, Experiment
+from ..data.experiments import ROLES, Experiment, as_table
 from ..data.operating_points import OperatingPoints
 from ..data.preparation import DETRENDS
 from ..exceptions import collected, retold, warn
@@ -702,30 +701,18 @@ def _fit_table(
     local: Any, experiments: Sequence[Experiment], sampling_time: float, method: str
 ) -> Any:
     """What a clone's method of fitting returns for the experiments as one table."""
-    u = np.vstack([e.inputs for e in experiments])
-    y = np.vstack([e.measured for e in experiments])
-    label = np.repeat(np.arange(len(experiments)), [len(e.rows) for e in experiments])
-    names = _column_names(experiments[0].input_names, u.shape[1])
-    table = pd.DataFrame(np.column_stack([u, label]), columns=names)
+    table, y = as_table(experiments)
+    *inputs, label = table.columns
     own: dict[str, Any] = {
         **dict.fromkeys(ROLES),
-        "inputs": names[:-1],
-        "experiment": names[-1],
+        "inputs": inputs,
+        "experiment": label,
         "sampling_time": sampling_time,
     }
     estimator = clone(local)
     known = estimator.get_params(deep=False)
     estimator.set_params(**{name: own[name] for name in own if name in known})
     return getattr(estimator, method)(table, y)
-
-
-def _column_names(inputs: Sequence[Hashable], n_inputs: int) -> list[str]:
-    """Names of the inputs as the user knows them, and of a column of labels."""
-    names = [str(name) for name in inputs or range(n_inputs)]
-    label = "experiment"
-    while label in names:
-        label += "_"
-    return [*names, label]
 
 
 def _of_lowest_order(models: Sequence[StateSpace]) -> list[StateSpace]:

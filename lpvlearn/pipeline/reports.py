@@ -210,7 +210,7 @@ def _fit_of(
     sampled = model.to_discrete(sampling_time)
     if n_trend and _integrates(model):  # what offsets of the inputs add up to
         n_trend = 2
-    size = spread_of(np.vstack([_outputs(e) for e in group]))
+    size = spread_of(np.vstack([e.measured for e in group]))
     true, simulated = [], []
     for length in sorted({len(e.rows) for e in group}):
         part = [e for e in group if len(e.rows) == length]
@@ -224,17 +224,12 @@ def _fit_of(
         free = unknown_responses(sampled, length, trend_signals(length, n_trend))
         # channel by channel in memory, as experiments are: (n_outputs, n_runs, length)
         forced = (sampled.C @ x + sampled.D @ u).transpose(1, 2, 0)
-        y = np.stack([_outputs(e).T for e in part], axis=1)
+        y = np.stack([e.measured.T for e in part], axis=1)
         own = estimate_initial_state(free, (y - forced).transpose(2, 0, 1), size)
         found = forced + own.T @ free.transpose(1, 2, 0)
         true.append(y.reshape(model.n_outputs, -1))
         simulated.append(found.reshape(model.n_outputs, -1))
     return float(best_fit(np.hstack(true).T, np.hstack(simulated).T, "uniform_average"))
-
-
-def _outputs(experiment: Experiment) -> Array:
-    assert experiment.outputs is not None
-    return experiment.outputs
 
 
 def _misses_constants(

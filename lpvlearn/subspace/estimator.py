@@ -20,6 +20,7 @@ from ..data.experiments import (
     OPTIONAL_ROLES,
     Experiment,
     Table,
+    as_table,
     check_inputs,
     n_rows_of,
     naming,
@@ -42,7 +43,6 @@ from .fit_warnings import TESTS, warn_about
 from .horizons import warn_about_horizon
 from .integrating import (
     RateEvidence,
-    as_table,
     integrated,
     integrating_flags,
     is_poorer,

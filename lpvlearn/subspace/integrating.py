@@ -92,21 +92,6 @@ def sums_of(experiments: Sequence[Experiment], step: float) -> list[Experiment]:
     ]
 
 
-def as_table(experiments: Sequence[Experiment]) -> tuple[pd.DataFrame, Array]:
-    """Inputs with a last column that tells the experiments apart, and outputs."""
-    u = np.vstack([e.inputs for e in experiments])
-    y = np.vstack([e.measured for e in experiments])
-    names = [str(name) for name in experiments[0].input_names or range(u.shape[1])]
-    label = "experiment"
-    while label in names:
-        label += "_"
-    table = pd.DataFrame(u, columns=names)
-    table[label] = np.repeat(
-        np.arange(len(experiments)), [len(e.rows) for e in experiments]
-    )
-    return table, y
-
-
 def without_direct(
     experiments: Sequence[Experiment], rates: Sequence[Experiment]
 ) -> bool:

@@ -194,14 +194,19 @@ def model_residuals(
     # The trend of an answer is not quite the answer to the trend of an input. Inputs
     # are compared with what trends have left of the errors.
     removed = DETRENDS[n_trend] or detrend
-    inputs = [u for u, _ in pairs]
-    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), removed)[0]
-    inputs, errors = [u for u, _ in cleaned], [e for _, e in cleaned]
+    inputs, errors = _without_trends([u for u, _ in pairs], errors, removed)
     errors = _beyond_rounding(errors, outputs, output_names)
     fitted = None
     if _are_of_fit(outputs, evidence):
         fitted = _what_was_fitted(lti, predictor)
     return Residuals(errors, inputs, output_names, input_names, fitted)
+
+
+def _without_trends(
+    inputs: Sequence[Array], errors: Sequence[Array], trend: str | None
+) -> tuple[list[Array], list[Array]]:
+    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), trend)[0]
+    return [u for u, _ in cleaned], [e for _, e in cleaned]
 
 
 def _errors(
@@ -470,9 +475,7 @@ def lacks(evidence: Evidence, innovations: Array) -> bool:
     weight, trend = evidence.whitening.weight, DETRENDS[evidence.free.n_trend]
     model = with_initial_states(evidence.model, records, evidence.free, weight)
     errors = simulation_errors(model, records)
-    inputs = [record.u.T for record in records]
-    cleaned = remove_trends(list(zip(inputs, errors, strict=True)), trend)[0]
-    inputs, errors = [u for u, _ in cleaned], [e for _, e in cleaned]
+    inputs, errors = _without_trends([record.u.T for record in records], errors, trend)
     outputs = np.hstack([record.y for record in records])
     size = np.mean(outputs**2, axis=1)
     variances = np.mean(np.vstack(errors) ** 2, axis=0)
