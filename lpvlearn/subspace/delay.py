@@ -50,7 +50,9 @@ Delay = NDArray[np.intp]
 # it is not found among these.
 LONGEST, _MOST_LAGS = 30, 300
 
-_SHARE = 10  # and no longer than this part of the longest experiment, a tenth
+# And no longer than a tenth of the longest experiment; than a fifth where nothing is
+# certain among these.
+_SHARE, _LARGEST_SHARE = 10, 5
 
 # Past outputs and, after the longest delay, inputs in the regression: enough for its
 # error to be nearly white, and for the answers of systems of usual orders.
@@ -207,12 +209,13 @@ def longest_delays(pairs: Pairs, direct: NDArray[np.bool_]) -> Delay:
     Those that are `direct` (n_inputs,) act through D, others a sample later. They are
     looked for over more lags where there are none, and no delay is longer.
     """
-    most = max(len(u) for u, _ in pairs) // _SHARE
-    longest = min(LONGEST, most)
+    n_samples = max(len(u) for u, _ in pairs)
+    longest = min(LONGEST, n_samples // _SHARE)
     answers = first_answers(pairs, longest)
-    most = min(most, max(longest, _MOST_LAGS // len(answers)))
+    most = max(longest, _MOST_LAGS // len(answers))
+    most = min(n_samples // _LARGEST_SHARE, most)
     while (answers < 0).any() and longest < most:
-        longest = min(2 * longest, most)
+        longest = min(2 * longest + 1, most)
         answers = np.where(answers < 0, first_answers(pairs, longest), answers)
     return np.where(answers < 0, 0, np.maximum(answers - ~direct, 0))
 

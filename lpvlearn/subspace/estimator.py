@@ -154,7 +154,7 @@ class SubspaceLTI(
         ``u[t - input_delay]`` through D, on earlier inputs through the state. A sampled
         system without feedthrough has a delay of 0: its first answer, a sample after
         the input, is in the state. "auto" looks for delays of up to 300 samples (all
-        inputs together), a tenth of the longest experiment, and takes those that are
+        inputs together), a fifth of the longest experiment, and takes those that are
         certain.
     refine : {"auto", "simulation", "prediction", True, False}, default="auto"
         What is minimised after the subspace step: "simulation" the simulation error,

@@ -360,6 +360,17 @@ def test_few_samples_tell_of_no_delay(n_samples):
     np.testing.assert_array_equal(find_delays([(u, y)], settings, None, None), [0])
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_dead_time_of_more_than_a_tenth_of_a_record_is_found(seed):
+    """Two steps of a furnace, sixty samples."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat([0.0, 5.0, -2.0], [8, 22, 30])[:, None]
+    lag = StateSpace([[0.78]], [[0.55]], [[1.0]], sampling_time=1.0, input_delay=8)
+    y = lag.simulate(u) + 0.3 * rng.standard_normal(u.shape)
+    found = SubspaceLTI(1, input_delay="auto").fit(u, y)
+    assert found.input_delay_.tolist() == [8]
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_few_samples_of_a_system_leak_no_numerical_warnings():
     for seed in range(12):
