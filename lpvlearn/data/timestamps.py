@@ -36,6 +36,11 @@ _SLOP, _LARGEST_SLOP = 1e-6, 0.01
 
 _LATEST = 1e30  # seconds: single precision holds them too
 
+_HOUR = 3600.0  # s
+_OF_A_ZONE = (
+    "A jump by an hour is that of a clock to or from summer time: give times with "
+    "their zone (pandas.Series.dt.tz_localize, with ambiguous='infer'), or in UTC."
+)
 _USE_INSTEAD = (
     "A dynamic model needs the samples of an experiment complete and in the order of "
     "time. Do not shuffle rows: split by experiment with ExperimentSplit, GroupKFold "
@@ -142,6 +147,12 @@ def check_time_tol(time_tol: Any) -> float:
     return float(time_tol)
 
 
+def _is_clock_change(steps: NDArray[Any], k: int) -> bool:
+    """Whether a step is an hour longer, or shorter, than the others."""
+    typical = float(np.median(steps))
+    return abs(abs(steps[k] - typical) - _HOUR) <= typical < 0.5 * _HOUR
+
+
 def read_clock(
     seconds: NDArray[Any],
     *,
@@ -182,6 +193,8 @@ def read_clock(
             )
         elif steps[k] == 0:
             remedy = "Drop rows that stand twice (drop_duplicates of pandas). " + remedy
+        elif _is_clock_change(steps, k):
+            remedy = _OF_A_ZONE
         elif np.sum(steps <= 0) <= _FEW * len(t):
             remedy = _RESTARTS + remedy
         raise ValueError(
@@ -216,6 +229,8 @@ def read_clock(
     if missing.any() and not allow_missing:
         k = int(np.argmax(missing))
         remedy = _CUT_THERE
+        if _is_clock_change(steps, k):
+            remedy = f"{_OF_A_ZONE} Where the logger rested: {remedy}"
         if missing.sum() > _FEW * len(t):
             remedy = (
                 f"{_USE_INSTEAD} If a logger lost them: {remedy[0].lower()}{remedy[1:]}"

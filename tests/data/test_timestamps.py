@@ -69,6 +69,17 @@ def test_uneven_time_raises_and_says_what_to_use(stamps, remedy):
     assert re.search(remedy, str(raised.value))
 
 
+@pytest.mark.parametrize("hour", [3600.0, -3600.0])
+def test_a_jump_by_an_hour_is_that_of_a_clock_without_its_zone(hour):
+    stamps = 0.1 * np.arange(400) + hour * (np.arange(400) >= 200)
+    with pytest.raises(ValueError, match="summer time: give times with their zone"):
+        read_clock(stamps, column="t", experiment=0)
+    rested = 0.1 * np.arange(400) + 0.9 * hour * (np.arange(400) >= 200)
+    with pytest.raises(ValueError) as raised:
+        read_clock(rested, column="t", experiment=0)
+    assert "summer time" not in str(raised.value)
+
+
 def test_stamps_that_are_rounded_too_coarsely_are_no_rows_that_stand_twice():
     stamps = np.round(0.05 * np.arange(100), 1)
     with pytest.raises(ValueError, match="rounded more coarsely.*`sampling_time`"):
