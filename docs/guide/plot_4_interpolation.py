@@ -110,7 +110,8 @@ pipeline.interpolator_.selection_.round(1)
 # took; where no form can be true, or the covariances are not known, the interpolation
 # goes through the points and keeps their shape (:class:`~lpvlearn.SplineLPV`), or
 # follows smooth laws by cubic pieces, over the logarithm of a length or a mass too,
-# where points left out show that this is nearer.
+# where points left out show that this is nearer. A warning tells of points that the
+# others do not foresee, and of gaps that the two kinds of curves cross far apart.
 
 pipeline.interpolator_.form_
 
