@@ -136,12 +136,14 @@ def points_of_work(
     family = _Family.of(statics, kappa, inputs, outputs, scales)
     if family.is_one:
         x0 = statics.states_at_rest(inputs, outputs)
-        for k, j, *step in family.steps:
-            if family.by_outputs:
-                change = statics.states_at_rest(*step)
-            else:
-                change = statics.moved @ step[0]
-            x0[k] = x0[j] + 0.5 * (change[k] + change[j])
+        ends = statics.of_points(family.child), statics.of_points(family.parent)
+        if family.by_outputs:
+            changes = [some.states_at_rest(family.du, family.dy) for some in ends]
+        else:
+            changes = [_times(some.moved, family.du) for some in ends]
+        step = 0.5 * (changes[0] + changes[1])
+        for k, j, change in zip(family.child, family.parent, step, strict=True):
+            x0[k] = x0[j] + change
         return np.hstack([inputs, outputs, x0])
     bias = _bias_of_sensors(inputs, outputs, gains, statics.inverse, u_scale)
     x0 = statics.states_at_rest(inputs, outputs - bias)
@@ -171,7 +173,10 @@ class _Family(NamedTuple):
     As their outputs tell, ``du0 = P dy0``, or as their inputs do, ``dy0 = G du0``.
     """
 
-    steps: Sequence[tuple[int, int, Array, Array]]  # point, the one before, du0, dy0
+    child: NDArray[np.int32]  # (n_steps,): points after their `parent` in a tree
+    parent: NDArray[np.int32]
+    du: Array  # (n_steps, n_inputs): from the parent to the child
+    dy: Array
     by_outputs: bool
     by_inputs: bool
 
@@ -202,8 +207,8 @@ class _Family(NamedTuple):
         asked = _times(between(inverse @ gains), du) / u_scale
         answer = _times(between(inverse), dy) / u_scale
         moved = _times(between(gains), du) / y_scale
-        steps = list(zip(child, parent, du, dy, strict=True))
-        return cls(steps, explained(asked, answer), explained(moved, dy / y_scale))
+        found = explained(asked, answer), explained(moved, dy / y_scale)
+        return cls(child, parent, du, dy, *found)
 
     @property
     def is_one(self) -> bool:
@@ -401,12 +406,14 @@ class _Statics(NamedTuple):
         moved = -np.array([np.linalg.solve(m.A, m.B) for m in models])
         return cls(gains, inverse, moved)
 
+    def of_points(self, points: NDArray[np.int32]) -> _Statics:
+        """Those of some points."""
+        return _Statics(*(matrices[points] for matrices in self))
+
     def states_at_rest(self, u: Array, y: Array) -> Array:
         """Of outputs, S y, and of inputs by what these do not show of them."""
-        shown = self.moved @ self.inverse
-        rest = np.eye(self.moved.shape[-1]) - self.inverse @ self.gains
-        u, y = (np.broadcast_to(x, (len(shown), x.shape[-1])) for x in (u, y))
-        return _times(shown, y) + _times(self.moved @ rest, u)
+        unseen = u - _times(self.inverse, _times(self.gains, u))
+        return _times(self.moved, _times(self.inverse, y) + unseen)
 
 
 class _Work(NamedTuple):
