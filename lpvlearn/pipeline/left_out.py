@@ -35,7 +35,7 @@ NEAR = 0.1  # and one up to which what the others foresee is what the record tel
 
 # Difference of two models, in the largest gain, between which a line is a guess; and of
 # what two curves make of the middle between two points, where either is.
-_APART, _GUESS = 0.3, 0.35
+_APART, _GUESS = 0.3, 0.5
 
 _HARDLY = 3.0  # time constants in the longest record of what hardly decays
 
