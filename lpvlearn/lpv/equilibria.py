@@ -11,8 +11,9 @@ not reach stays an offset of the sensors. Inputs of which the outputs tell nothi
 - They follow one another by the models' own gain, ``du0 = P dy0``: they are equilibria
   of one system that schedules itself, and ``A dx0 + B du0 = 0`` along them. So
   ``dx0 = S dy0``, from neighbour to neighbour, whatever basis these share. Where G
-  changes its sign (a plant with an optimum), P has a pole between the points, and it
-  is ``dy0 = G du0`` that tells them, and ``dx0 = -A^-1 B du0``.
+  changes its sign (a plant with an optimum), P has a pole between the points. Then, if
+  no one constant of the sensors explains them, it is ``dy0 = G du0`` that tells them,
+  and ``dx0 = -A^-1 B du0``.
 - They do not: inputs are free at every point. Constants ``c = y0 - G u0`` that are the
   same everywhere are the sensors', ``x0 = S (y0 - c)``. Where w is the same, too, that
   is taken by which there is less to hold.
@@ -170,7 +171,8 @@ def _measure_all_states(
 class _Family(NamedTuple):
     """Whether points follow one another by their models' own gain.
 
-    As their outputs tell, ``du0 = P dy0``, or as their inputs do, ``dy0 = G du0``.
+    As their outputs tell, ``du0 = P dy0``, or as their inputs do, ``dy0 = G du0``,
+    where a constant of the sensors does not tell as much.
     """
 
     child: NDArray[np.int32]  # (n_steps,): points after their `parent` in a tree
@@ -207,13 +209,22 @@ class _Family(NamedTuple):
         asked = _times(between(inverse @ gains), du) / u_scale
         answer = _times(between(inverse), dy) / u_scale
         moved = _times(between(gains), du) / y_scale
-        found = explained(asked, answer), explained(moved, dy / y_scale)
-        return cls(child, parent, du, dy, *found)
+        by_inputs = explained(moved, dy / y_scale)
+        if by_inputs:
+            constants = outputs - _times(gains, inputs)
+            by_inputs = not _are_one(constants, outputs, y_scale)
+        return cls(child, parent, du, dy, explained(asked, answer), by_inputs)
 
     @property
     def is_one(self) -> bool:
         """By either."""
         return self.by_outputs or self.by_inputs
+
+
+def _are_one(constants: Array, outputs: Array, y_scale: Array) -> bool:
+    """Whether constants of sensors are the same at all points."""
+    c, y = (float(np.max(np.ptp(x, axis=0) / y_scale)) for x in (constants, outputs))
+    return c < _SAME_CONSTANT * y
 
 
 def _any_integrates(models: Sequence[StateSpace]) -> bool:
@@ -299,9 +310,7 @@ class _Points(NamedTuple):
 
     def have_one_constant(self, y_scale: Array) -> bool:
         """Whether these are the same at all points, beside how outputs differ."""
-        both = self.constants_of_sensors(), self.equilibria()[1]
-        c, y = (float(np.max(np.ptp(x, axis=0) / y_scale)) for x in both)
-        return c < _SAME_CONSTANT * y
+        return _are_one(self.constants_of_sensors(), self.equilibria()[1], y_scale)
 
 
 def _error_at_rest(way: _Way, points: _Points, y_scale: Array) -> float:

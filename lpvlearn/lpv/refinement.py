@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from ..systems.least_squares import RCOND, column_scale, levenberg_marquardt
-from ..systems.simulation import estimate_initial_state, spread_of
+from ..systems.simulation import estimate_initial_state
 from .interpolator import grid_over
 from .model import LPVStateSpace
 from .polynomial import PolynomialLPV
@@ -148,8 +148,8 @@ def simulated(
 
 def weights_of(records: Sequence[Record]) -> Array:
     """Of the errors of outputs (n_outputs,), by how far these move in the records."""
-    power = np.mean([spread_of(record.y) ** 2 for record in records], axis=0)
-    return np.asarray(1.0 / np.sqrt(power))
+    power = np.mean([np.var(record.y, axis=0) for record in records], axis=0)
+    return np.asarray(1.0 / np.sqrt(np.where(power > 0.0, power, 1.0)))
 
 
 def initial_state(

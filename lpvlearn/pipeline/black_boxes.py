@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy import linalg
 
 from ..data.experiments import Experiment
 from ..exceptions import warn
@@ -40,6 +40,10 @@ from .local_models import LocalModel, motions
 from .runner import place_of
 
 Array = NDArray[np.float64]
+
+# Part of the fastest pole, and frequencies up to it, at which a model must be met that
+# is to have fewer states.
+_SLOWER, _N_SLOWER = 0.2, 40
 
 # Error of points left out, in the largest gain, if all are foreseen; the shares of it
 # that other states must leave, and that they must where outputs are states, which tell
@@ -205,11 +209,24 @@ def balanced_entries(
 def balanced(local: LocalModel) -> StateSpace:
     """The local model, balanced: that of the rates of outputs that integrate.
 
-    Poles on the negative real axis make the order grow in continuous time.
+    Poles on the negative real axis make the order grow in continuous time: what the
+    model is then without some states is the nearer one, in its slower part, of itself
+    with fast states in their place, and of what balanced truncation leaves.
     """
     rates = of_rates(local.lti, local.integrating)
-    more = rates.order - (local.order - len(local.integrating))
-    return (_with_fast_states(rates, more) if more > 0 else rates).balance()
+    order = local.order - len(local.integrating)
+    if rates.order <= order:
+        return rates.balance()
+    ways = _with_fast_states(rates, rates.order - order), rates.balance(order)
+    omega = _SLOWER * np.abs(rates.poles()).max() * np.linspace(0.0, 1.0, _N_SLOWER)
+    G = rates.frequency_response(omega)
+    size = np.abs(G).max(axis=0)
+
+    def error(model: StateSpace) -> float:
+        left = np.abs(model.frequency_response(omega) - G).max(axis=0)
+        return float((left / np.where(size > 0.0, size, 1.0)).max())
+
+    return min(ways, key=error).balance()
 
 
 def _with_fast_states(model: StateSpace, n_pairs: int) -> StateSpace:
@@ -218,15 +235,14 @@ def _with_fast_states(model: StateSpace, n_pairs: int) -> StateSpace:
     Those at the Nyquist frequency, of a state that alternates from sample to sample:
     the real ones are as fast, and have the same static gain (of rank one, at best).
     """
-    poles, V = np.linalg.eig(model.A)
-    rising = np.argsort(poles.imag)[::-1]
-    pairs = rising[: min(n_pairs, np.count_nonzero(poles.imag > 0.0))]
-    W = np.linalg.inv(V)
-    c, b = model.C @ V[:, pairs], W[pairs] @ model.B
-    rest = np.ones(len(poles), bool)
-    rest[[*pairs, *rising[::-1][: len(pairs)]]] = False
-    kept = (V[:, rest] @ W[rest]).real
-    U = np.linalg.svd(kept)[0][:, : np.count_nonzero(rest)]
+    poles, L, V = linalg.eig(model.A, left=True)
+    pairs = np.argsort(poles.imag)[::-1]
+    pairs = pairs[: min(n_pairs, np.count_nonzero(poles.imag > 0.0))]
+    L, V = L[:, pairs].conj().T, V[:, pairs]
+    W = np.linalg.solve(L @ V, L)  # the other modes may be defective
+    c, b = model.C @ V, W @ model.B
+    kept = np.eye(model.order) - 2.0 * (V @ W).real
+    U = np.linalg.svd(kept)[0][:, : model.order - 2 * len(pairs)]
     A, B, C = [U.T @ model.A @ U], [U.T @ kept @ model.B], [model.C @ U]
     for k, pole in enumerate(poles[pairs]):
         gain = -2.0 * np.real(np.outer(c[:, k], b[k]) / pole)
@@ -234,7 +250,7 @@ def _with_fast_states(model: StateSpace, n_pairs: int) -> StateSpace:
         A.append(np.array([[-np.abs(pole)]]))
         B.append(np.abs(pole) * size[0] * right[:1])
         C.append(left[:, :1])
-    matrices = block_diag(*A), np.vstack(B), np.hstack(C), model.D
+    matrices = linalg.block_diag(*A), np.vstack(B), np.hstack(C), model.D
     return StateSpace(*matrices, input_delay=model.input_delay)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -139,7 +140,9 @@ def _differences_between(
     smooth = SplineLPV("cubic", scale=form.scale).fit(kappa, theta)
     own, other = (f.predict(kappa[pairs].mean(axis=1)) for f in (form, smooth))
     for (k, at), *parameters in zip(pairs.tolist(), other, own, strict=True):
-        yield largest_difference(*(seen(structure.model(p)) for p in parameters)), k, at
+        with suppress(ValueError):  # beyond the points a structure may have no model
+            both = [seen(structure.model(values)) for values in parameters]
+            yield largest_difference(*both), k, at
 
 
 def listed_errors(errors: Sequence[tuple[float, int]], kappa: Array) -> str:

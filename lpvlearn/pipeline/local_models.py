@@ -5,7 +5,7 @@ The experiments of every point make one model, or one each; these are averaged t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -30,6 +30,7 @@ from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
 from ..subspace.constants import lasting
 from ..subspace.criterion import PRICE
+from ..subspace.delay import with_late_inputs
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
 from ..systems.modes import mode_rates
@@ -161,7 +162,7 @@ def identify_points(
         found = identify(local)
     else:
         search = free and len(groups) > _SCOUTS and type(local) is SubspaceLTI
-        some = np.linspace(0, len(groups) - 1, _SCOUTS).round().astype(int).tolist()
+        some = _spread(len(groups), _SCOUTS)
         scouts = tried(local, some) if search else []
         if local.get_params(deep=False).get("offset") == "auto":
             found = _of_own_orders(local, attempted, scouts)
@@ -198,6 +199,11 @@ def of_structure(local: Any, structure: Any) -> tuple[Any, bool]:
     return clone(local).set_params(order=order), isinstance(local, SubspaceLTI)
 
 
+def _spread(n_points: int, most: int) -> list[int]:
+    """Some of the points, from the first to the last."""
+    return np.unique(np.linspace(0, n_points - 1, most).round().astype(int)).tolist()
+
+
 def _with_one_delay(
     local: Any,
     tried: Callable[[Any, Sequence[int]], list[Done | None]],
@@ -215,42 +221,52 @@ def _with_one_delay(
     asked = type(local) is SubspaceLTI and isinstance(local.input_delay, str)
     if not asked or len(groups) < 2:
         return local
-    n_probed = min(len(groups), _PROBED)
-    some = np.linspace(0, len(groups) - 1, n_probed).round().astype(int).tolist()
+    some = _spread(len(groups), _PROBED)
 
-    def delays(found: Sequence[Done | None]) -> Array:
-        each = [done.result.lti.input_delay for done in found if done is not None]
-        return np.round(np.array(each) / sampling_time)
+    def models_of(found: Sequence[Done | None]) -> dict[int, LocalModel]:
+        return {k: done.result for k, done in enumerate(found) if done is not None}
 
-    def cost(found: Sequence[Done | None]) -> float:
+    own = models_of(tried(local, some))
+    rest, gaps = local.initial_state == "rest", local.missing != "raise"
+
+    def delay_of(model: LocalModel) -> NDArray[np.intp]:
+        return np.round(model.lti.input_delay / sampling_time).astype(np.intp)
+
+    def n_samples(k: int, delay: NDArray[np.intp]) -> int:
+        """Those of a point whose inputs are known."""
+        late = with_late_inputs(groups[k], delay, rest=rest, gaps=gaps)
+        return sum(len(e.rows) for e in late)
+
+    def cost(models: Mapping[int, LocalModel]) -> float:
         """Of as many samples, whatever is unknown of the first ones."""
-        known = [(k, done.result) for k, done in enumerate(found) if done is not None]
-        if len(known) < n_probed:
+        if models.keys() != own.keys():
             return np.inf
-        total = 0.0
-        for k, model in known:
-            late = model.lti.input_delay.max() / sampling_time
-            n_samples = sum(len(e.rows) for e in groups[k])
-            unknown = len(groups[k]) * late if local.initial_state != "rest" else 0.0
-            total += model.criterion * n_samples / (n_samples - unknown)
-        return total
+        return sum(
+            model.criterion * n_samples(k, none) / n_samples(k, delay_of(model))
+            for k, model in models.items()
+        )
 
-    def having(delay: Array) -> Any:
-        return clone(local).set_params(input_delay=delay.astype(int).tolist())
+    def having(delay: NDArray[np.intp]) -> Any:
+        return clone(local).set_params(input_delay=delay.tolist())
 
-    own = tried(local, some)
-    if not np.isfinite(cost(own)):
+    def cost_with(delay: NDArray[np.intp]) -> float:
+        return cost(models_of(tried(having(delay), list(own))))
+
+    none = np.zeros(groups[0][0].inputs.shape[1], np.intp)
+    if len(own) < 2 or not np.isfinite(cost(own)):
         return local
-    delay = np.sort(delays(own), axis=0)[(n_probed - 1) // 2]
-    if delay.any() and (delays(own) == delay).all():
+    delays = np.array([delay_of(model) for model in own.values()])
+    delay = np.sort(delays, axis=0)[(len(own) - 1) // 2]
+    agree = bool((delays == delay).all())
+    if agree and delay.any():
         return having(delay)
-    state = n_probed * PRICE * (len(delay) + groups[0][0].measured.shape[1])
-    least = cost(tried(having(delay), some))
-    for sample in np.eye(len(delay)):
+    state = len(own) * PRICE * (len(delay) + groups[0][0].measured.shape[1])
+    least = cost(own) if agree else cost_with(delay)
+    for sample in np.eye(len(delay), dtype=np.intp):
         for step, worth in ((sample, _CLEARER + state), (-sample, -_CLEARER)):
             best, lowest, before, other = delay, least - worth, least, delay + step
             while (other >= 0).all():
-                reached = cost(tried(having(other), some))
+                reached = cost_with(other)
                 if not reached < before + _CLEARER:
                     break
                 if reached < lowest:
@@ -258,7 +274,7 @@ def _with_one_delay(
                 before, other = min(before, reached), other + step
             if (best != delay).any():
                 delay, least = best, lowest
-    alike = least < cost(own) + _CLEARER * (n_probed - 1)
+    alike = least < cost(own) + _CLEARER * (len(own) - 1)
     return having(delay) if alike else local
 
 

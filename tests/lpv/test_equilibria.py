@@ -329,3 +329,19 @@ def test_what_moves_outputs_without_inputs_makes_no_family_by_inputs():
     y = np.hstack([10.0 * kappa, -3.0 * kappa])
     statics = _Statics.of(models, (np.ones(1), np.ones(2)))
     assert not _Family.of(statics, kappa, u, y, (np.ones(1), np.ones(2))).is_one
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_one_constant_of_the_sensors_is_no_family(seed):
+    """Inputs that happen to go along with the scheduling explain most of the steps."""
+    rng = np.random.default_rng(seed)
+    kappa = np.linspace(0.0, 1.0, 5)[:, None]
+    gain, rate = 1.0 + 0.1 * kappa[:, 0], 1.0 + kappa[:, 0]
+    models = [
+        StateSpace([[-a, 0], [1, -2]], [[a * g], [0]], [[0, 2.0]])
+        for a, g in zip(rate, gain, strict=True)
+    ]
+    u = 3.0 * kappa + 0.3 * rng.standard_normal(kappa.shape)
+    x = np.hstack([gain[:, None] * u, 0.5 * gain[:, None] * u])
+    found = points_of_work(models, kappa, u, 2.0 * x[:, 1:] + 5.0, ONE)
+    np.testing.assert_allclose(np.diff(found[:, 2:], axis=0), np.diff(x, axis=0))

@@ -21,6 +21,7 @@ from lpvlearn.lpv.refinement import (
     local_prior,
     refine,
     refine_with_rates,
+    weights_of,
     with_rate_terms,
 )
 from lpvlearn.lpv.sensitivity import coefficients_of, with_coefficients
@@ -292,3 +293,14 @@ def test_experiments_in_parallel_are_the_same():
     np.testing.assert_array_equal(
         coefficients_of(one.model), coefficients_of(two.model)
     )
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_an_output_that_stands_still_in_one_record_weighs_by_the_others(unit):
+    rng = np.random.default_rng(0)
+    y = rng.standard_normal((50, 2)) * [1.0, unit]
+    records = [Record(y[:, :1], some, y[:, :1], 0.1) for some in (y, y * [1.0, 0.0])]
+    size = np.sqrt([np.mean([np.var(r.y[:, k]) for r in records]) for k in (0, 1)])
+    np.testing.assert_allclose(weights_of(records), 1.0 / size)
+    still = Record(y[:, :1], 0.0 * y, y[:, :1], 0.1)
+    np.testing.assert_array_equal(weights_of([still]), 1.0)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.linalg import block_diag
 
 from lpvlearn import (
     LocalLPVPipeline,
@@ -16,6 +17,7 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.datasets import prbs
+from lpvlearn.exceptions import collected
 from lpvlearn.lpv.alignment import aligned_models
 from lpvlearn.pipeline.black_boxes import (
     _entries,
@@ -336,3 +338,18 @@ def test_a_state_that_alternates_leaves_the_plant_as_it_is(n_outputs):
     assert np.abs(error).max() < 0.03 * np.abs(G).max()
     truncated = lti.balance(2).frequency_response(omega) - G
     assert np.abs(truncated).max() > 3.0 * np.abs(error).max()
+
+
+def test_equal_lags_beside_a_state_that_alternates_stay_as_they_are():
+    """No basis of eigenvectors shows them."""
+    lags = StateSpace([[-0.5, 0], [0.5, -0.5]], [[0.5], [0]], [[0, 1.0]]).to_discrete(1)
+    A = block_diag(lags.A, -0.4)
+    B, C = np.vstack([lags.B, [[0.1]]]), np.hstack([lags.C, [[0.3]]])
+    sampled = StateSpace(A, B, C, sampling_time=1.0)
+    with collected():  # of the pair
+        lti = sampled.to_continuous().balance()
+    found = _with_fast_states(lti, 1)
+    assert found.order == 3
+    np.testing.assert_allclose(found.dc_gain(), sampled.dc_gain(), rtol=1e-9)
+    slow = np.sort_complex(found.poles())[1:]
+    np.testing.assert_allclose(slow, -0.5, atol=1e-5)
