@@ -217,7 +217,10 @@ def balanced(local: LocalModel) -> StateSpace:
     order = local.order - len(local.integrating)
     if rates.order <= order:
         return rates.balance()
-    ways = _with_fast_states(rates, rates.order - order), rates.balance(order)
+    ways = [rates.balance(order)]
+    with_fast = _with_fast_states(rates, rates.order - order)
+    if with_fast.order <= order:
+        ways.append(with_fast.balance())
     omega = _SLOWER * np.abs(rates.poles()).max() * np.linspace(0.0, 1.0, _N_SLOWER)
     G = rates.frequency_response(omega)
     size = np.abs(G).max(axis=0)
@@ -226,7 +229,7 @@ def balanced(local: LocalModel) -> StateSpace:
         left = np.abs(model.frequency_response(omega) - G).max(axis=0)
         return float((left / np.where(size > 0.0, size, 1.0)).max())
 
-    return min(ways, key=error).balance()
+    return min(ways, key=error)
 
 
 def _with_fast_states(model: StateSpace, n_pairs: int) -> StateSpace:

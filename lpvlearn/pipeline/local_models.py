@@ -264,18 +264,31 @@ def _with_one_delay(
     least = cost(own) if agree else cost_with(delay)
     for sample in np.eye(len(delay), dtype=np.intp):
         for step, worth in ((sample, _CLEARER + state), (-sample, -_CLEARER)):
-            best, lowest, before, other = delay, least - worth, least, delay + step
-            while (other >= 0).all():
-                reached = cost_with(other)
-                if not reached < before + _CLEARER:
-                    break
-                if reached < lowest:
-                    best, lowest = other, reached
-                before, other = min(before, reached), other + step
-            if (best != delay).any():
-                delay, least = best, lowest
+            delay, least = _along(step, worth, (delay, least), cost_with)
     alike = least < cost(own) + _CLEARER * (len(own) - 1)
     return having(delay) if alike else local
+
+
+def _along(
+    step: NDArray[np.intp],
+    worth: float,
+    start: tuple[NDArray[np.intp], float],
+    cost: Callable[[NDArray[np.intp]], float],
+) -> tuple[NDArray[np.intp], float]:
+    """The delay of least cost some steps from a start, where that is `worth` it.
+
+    Up to where the cost rises beyond doubt.
+    """
+    delay, least = start
+    best, lowest, other = start, least - worth, delay + step
+    while (other >= 0).all():
+        reached = cost(other)
+        if not reached < least + _CLEARER:
+            break
+        if reached < lowest:
+            best, lowest = (other, reached), reached
+        least, other = min(least, reached), other + step
+    return best
 
 
 def _of_own_orders(
@@ -841,8 +854,8 @@ def _continuous(model: StateSpace, discretization: str, advice: str) -> StateSpa
             f"the identified model of order {model.order} has "
             f"{lti.order - model.order} pole(s) on the negative real axis "
             f"({', '.join(f'{p:.3g}' for p in poles)}), as no continuous-time model of "
-            "that order has: without a structure a state as fast, of the same static "
-            "gain, takes the place of each. A shorter sampling time or a lower `order` "
+            "that order has: without a structure what becomes of the point is near it "
+            "at low frequencies only. A shorter sampling time or a lower `order` "
             "avoids it."
         )
     return lti
