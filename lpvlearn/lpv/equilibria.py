@@ -256,8 +256,8 @@ def interpolated(
     u, y = points.equilibria()
     distinct = len(np.unique(kappa)) == len(kappa)
     statics = _Statics.of(models, scales)
-    family = _Family.of(statics, kappa, u, y, scales)
-    if distinct and family.is_one:
+    family = _Family.of(statics, kappa, u, y, scales) if distinct else None
+    if family is not None and family.is_one:
         straight = _bend(kappa, y / scales[1]) <= _bend(kappa, u / scales[0])
         of_outputs = family.by_outputs and straight
         ways.append((partial(_by_slopes, scales, of_outputs), 1.0))

@@ -205,6 +205,7 @@ def model_residuals(
 def _without_trends(
     inputs: Sequence[Array], errors: Sequence[Array], trend: str | None
 ) -> tuple[list[Array], list[Array]]:
+    """Inputs and errors of experiments, of which no trend explains the other's."""
     cleaned = remove_trends(list(zip(inputs, errors, strict=True)), trend)[0]
     return [u for u, _ in cleaned], [e for _, e in cleaned]
 
