@@ -23,7 +23,7 @@ from ..exceptions import RankWarning
 from .constancy import change_over
 from .constants import CERTAIN, USELESS, follows_means_alone, motions_left, stays_far
 from .held_out import HeldOut
-from .linearity import bent_outputs
+from .linearity import find_bend
 from .local_fit import LocalFit
 from .options import Choices
 from .records import thinned
@@ -459,12 +459,26 @@ def _warn_of_bends(fitted: LocalFit, telling: Telling) -> None:
 
     In a loop, inputs and what they do know the noise.
     """
-    bent = bent_outputs(fitted.evidence)
-    if bent:
+    bend = find_bend(fitted.evidence)
+    if bend is None:
+        return
+    if bend.by_direction:
         telling.once(
             "bent",
-            f"The errors of output {telling.output(bent[0])} follow squares or cubes "
-            "of the inputs or of what these do, beyond chance and by more than a "
+            f"The errors of output {telling.output(bend.output)} follow the direction "
+            "in which the inputs or outputs move, beyond chance and by more than a "
+            "little, as friction and backlash make them: the model, which stands in "
+            "for the system over motions like those of this record, simulates smaller "
+            "ones worse, and others where motion turns. Use inputs that move the "
+            "system well beyond the play and seldom turn, or measure behind what has "
+            "the play and give that as the input. Where inputs were measured with "
+            "noise, which looks the same, give what was commanded.",
+        )
+    else:
+        telling.once(
+            "bent",
+            f"The errors of output {telling.output(bend.output)} follow squares or "
+            "cubes of the inputs or of what these do, beyond chance and by more than a "
             "little: over the range of this record the system is not linear, and the "
             "model, which stands in for it there, simulates larger, smaller or other "
             "motions worse. Use inputs that move less, about one operating point at a "

@@ -1,12 +1,13 @@
-"""Is a system linear over the range of its record? What its errors know of powers.
+"""Is a system linear over the range of its record? What its errors know of bends.
 
 Squares and cubes of the inputs, and of what a model answers to these from rest, act
 through its modes as inputs do. Of the errors of a linear system in open loop they
 explain nothing, whatever its noise is: both are given by the inputs (after Ramsey,
-*Journal of the Royal Statistical Society B* 31, 1969). What lagged inputs explain, and
-the signals themselves, is taken from all of them before: states that a model lacks are
-another thing. So is what initial states and trends do: where little is left of slow
-noise, much of that is of the first samples.
+*Journal of the Royal Statistical Society B* 31, 1969). Nor does what signals lose in
+play: that of backlash, and nearly the sign of their rates, by which friction acts. What
+lagged inputs explain, and the signals themselves, is taken from all of them before:
+states that a model lacks are another thing. So is what initial states and trends do:
+where little is left of slow noise, much of that is of the first samples.
 """
 
 from __future__ import annotations
@@ -49,30 +50,41 @@ Array = NDArray[np.float64]
 _POWERS, _BENT = (2, 3), 0.03
 _BENT_SAMPLES, _ROWS_PER_TERM, _SLOWEST, _LAGGED = 2_048, 2, 4, 50
 
+_PLAY = (0.1, 0.5)  # standard deviations of a signal, to each side
+
+
+class Bend(NamedTuple):
+    """An output whose errors follow what no linear system does."""
+
+    output: int
+    by_direction: bool  # of motion, as friction and backlash do
+
 
 class _Terms(NamedTuple):
     """What may explain the errors of an experiment, one row per sample."""
 
     own: Array  # (n_rows, n_outputs, n_own), by initial states and trends
     linear: Array
-    bent: Array
+    powers: Array
+    lost_in_play: Array
 
 
 @one_blas_thread
-def bent_outputs(evidence: Evidence) -> list[int]:
-    """Outputs whose errors clearly follow powers of signals, and not just by a little.
+def find_bend(evidence: Evidence) -> Bend | None:
+    """The first output whose errors clearly are bent, and not just by a little.
 
-    Those of a model that is unstable may be anything, and are not looked at.
+    By powers of signals, or else by what these lose in play. Errors of a model that is
+    unstable may be anything, and are not looked at.
     """
     poles = np.linalg.eigvals(evidence.model.A).astype(complex)
     if not np.isfinite(evidence.model.loss) or np.abs(poles).max(initial=0.0) > 1.0:
-        return []
+        return None
     poles = poles[poles.imag >= 0.0]
     poles = poles[np.argsort(np.abs(1.0 - poles))[:_SLOWEST]]
     records, free = thinned(evidence.records, _BENT_SAMPLES), evidence.free
     records = [record for record in records if record.n_samples > 2 * N_LAGS]
     if not records:
-        return []
+        return None
     model = with_initial_states(
         evidence.model, records, free, evidence.whitening.weight
     )
@@ -83,11 +95,11 @@ def bent_outputs(evidence: Evidence) -> list[int]:
         moved = [np.hstack([u, lti_response(A, B, C, D, u, rest)]) for u in inputs]
     whole = np.vstack(moved)
     if not all(np.isfinite(x).all() for x in (whole, *errors)):
-        return []
+        return None
     least = _BENT * np.hstack([record.y for record in records]).std(axis=1)
     large = np.flatnonzero(np.vstack(errors).std(axis=0) > least).tolist()
     if not large:
-        return []
+        return None
     moves = whole.std(axis=0) > 0.0
     centre, spread = whole.mean(axis=0)[moves], whole.std(axis=0)[moves]
     m = inputs[0].shape[1]
@@ -98,24 +110,47 @@ def bent_outputs(evidence: Evidence) -> list[int]:
         late = [delayed(u, np.full(m, k)) for k in range(n_lags + 1)]
         linear = [through_modes(poles, u, 2), *late, through_modes(poles, z), z]
         powers = np.hstack([z**power for power in _POWERS])
+        lost = np.hstack([z - _play(z, radius) for radius in _PLAY])
         parts = (
             free_responses(A, C, len(u), trend_signals(len(u), 2)),
             np.hstack(linear),
             np.hstack([through_modes(poles, powers), powers]),
+            np.hstack([through_modes(poles, lost), lost]),
         )
         terms.append(_Terms(*(x[n_lags:] for x in parts)))  # of inputs that are known
     errors = [e[n_lags:] for e in errors]
-    return [i for i in large if _is_bent(terms, errors, i, least[i])]
+    for by_direction in (False, True):
+        bent = [one.lost_in_play if by_direction else one.powers for one in terms]
+        for i in large:
+            if _is_bent(terms, bent, [e[:, i] for e in errors], i, least[i]):
+                return Bend(i, by_direction)
+    return None
+
+
+def _play(signals: Array, radius: float) -> Array:
+    """What follows each column within the radius, and rests while it can."""
+    follow = np.empty_like(signals)
+    for signal, column in zip(signals.T, follow.T, strict=True):
+        at, places = float(signal[0]), []
+        for value in signal.tolist():
+            at = min(max(at, value - radius), value + radius)
+            places.append(at)
+        column[:] = places
+    return follow
 
 
 def _is_bent(
-    terms: Sequence[_Terms], errors: Sequence[Array], output: int, least: float
+    terms: Sequence[_Terms],
+    bent: Sequence[Array],
+    errors: Sequence[Array],
+    output: int,
+    least: float,
 ) -> bool:
-    """Whether powers explain more of the errors of an output than `least`."""
+    """Whether bent signals explain more of the errors of an output than `least`."""
     n_linear, n_own = terms[0].linear.shape[1], terms[0].own.shape[2]
     signals = [
-        np.column_stack([one.own[:, output], one.linear, one.bent, e[:, output]])
-        for one, e in zip(terms, errors, strict=True)
+        np.column_stack([one.own[:, output], one.linear, some, e])
+        for one, some, e in zip(terms, bent, errors, strict=True)
     ]
     # What is left of the errors is filtered: what the model lacks is no noise.
     columns = _rows(signals, np.ones(1), n_own)

@@ -29,6 +29,32 @@ def test_a_fit_tells_that_a_system_is_not_linear(bend, sensor):
         SubspaceLTI(2, method="po-moesp", horizon=12, offset="constant").fit(u, y)
 
 
+def behind_play(signal, radius):
+    place, places = signal[0], []
+    for value in signal:
+        place = min(max(place, value - radius), value + radius)
+        places.append(place)
+    return np.array(places)
+
+
+@pytest.mark.parametrize("at_input", [True, False])
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_fit_tells_of_backlash(at_input, smooth):
+    rng = np.random.default_rng(7)
+    u = rng.standard_normal((800, 1))
+    if smooth:
+        u = lfilter([0.3], [1.0, -0.95], u, axis=0)
+    system = StateSpace(modes(0.9 + 0.2j), [[0.0], [1.0]], [[0.3, 0.0]], [[0.0]], 1.0)
+    if at_input:
+        y = system.simulate(behind_play(u, 0.4))
+    else:
+        y = system.simulate(u)
+        y = behind_play(y, 0.15 * y.std())
+    y += 0.01 * y.std() * rng.standard_normal(y.shape)
+    with pytest.warns(UserWarning, match="of output 1 follow the direction"):
+        SubspaceLTI(3, offset=None).fit(u, y)
+
+
 @pytest.mark.parametrize("noise", ["t", "AR(.99)", "by the output", "walk"])
 def test_no_noise_makes_a_linear_system_seem_bent(noise):
     for seed in range(4):
