@@ -25,7 +25,7 @@ from .fit_warnings import (
 )
 from .local_fit import LocalFit
 from .one_fit import Samples, TooFewSamples
-from .oscillations import without_oscillations
+from .oscillations import without_modes_of_few_lines, without_oscillations
 from .rivals import (
     believable,
     held_by_a_loop,
@@ -65,6 +65,7 @@ def fit_samples(
     samples, fitted = without_rounding(samples, fitted, like)
     fitted = of_drifting_noise(samples, fitted) or fitted
     samples, fitted, turns = without_oscillations(samples, fitted)
+    fitted = without_modes_of_few_lines(samples, fitted)
     if fitted.selection.order:
         tell_of_held_outputs(outputs, telling)
         tell_of_limits(outputs, fitted, telling)

@@ -7,6 +7,10 @@ order is given the plant lacks two other states.
 
 Sinusoids take the place of such modes where they explain as much of the outputs, and
 are subtracted. Where inputs move a mode, what is left still needs it.
+
+To inputs of a few lines, modes that do not decay are as good a plant as any: enough of
+them answer at these lines whatever one that is not linear does. From rest they go on
+for ever. A model without them stands where it explains nearly as much.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import linalg
 
@@ -21,13 +26,15 @@ from .constants import CERTAIN
 from .criterion import PRICE, n_parameters
 from .local_fit import LocalFit
 from .one_fit import Samples
-from .records import Record
+from .records import Record, thinned
 from .simulation_fit import Freedom, Realization, simulation_fit
 from .statistics import Evidence
 from .trends import with_trends
 
 Array = NDArray[np.float64]
 
+# And of one that clearly does not.
+_SETTLED = 10.0
 _DECAYS = 1.0  # time constants per record of a mode that stands for one
 
 # Radians that it turns in a record, at least: less is a drift. And by which it is off a
@@ -44,6 +51,13 @@ _CHANCE = 1e-6  # of as large an oscillation of white noise
 _NEAR = 10.0  # per record: distance from a sinusoid of modes that do the same
 
 _SHARP = 0.03  # decay per sample of modes of an autoregression that may stand for one
+
+# Independent values of the inputs for each parameter, below which these are of few
+# lines; lower orders tried for a model whose modes decay, before the same one; and the
+# part of the outputs, root mean square, that it may leave beyond the likeliest.
+_PER_PARAMETER, _FEWER, _LEFT = 2, 3, 0.1
+
+_INDEPENDENT = 1e-6  # singular values of windows of inputs, next to the largest
 
 _ROUNDS = 3  # in each of which further ones may come out
 
@@ -95,6 +109,54 @@ def without_oscillations(
     return calm, fitted, turns
 
 
+def without_modes_of_few_lines(samples: Samples, fitted: LocalFit) -> LocalFit:
+    """The model, or one whose modes decay where few lines tell the two apart."""
+    evidence, order = fitted.evidence, len(fitted.model.A)
+    chosen = samples.choices.order is None and fitted.method != "pbsid"
+    if not (chosen and len(_lasting_turns(fitted.model, evidence.longest))):
+        return fitted
+    unknown = n_parameters(order, (), evidence.free)
+    if not _are_of_few_lines(thinned(evidence.records), _PER_PARAMETER * unknown):
+        return fitted
+    rows = [r for r in fitted.selection.rows if 0 < r.order <= order]
+    rows = [row for row in rows if row.criterion >= 0.0]
+    rows.sort(key=lambda row: (row.order == order, row.criterion))
+    for row in [*rows[:_FEWER], *rows[_FEWER:][-1:]]:
+        other = samples.aside().having(order=row.order).tried(evidence.free.n_trend)
+        longest = evidence.longest
+        if other is None or len(_lasting_turns(other.model, longest, _SETTLED)):
+            continue
+        if not other.residual**2 - fitted.residual**2 < _LEFT**2:
+            continue
+        samples.telling.once(
+            "few lines",
+            f"Modes of the likeliest model, of order {order}, do not decay, and the "
+            "inputs are of so few lines that such modes may stand for what a plant "
+            "that is not linear does there. A model whose modes decay was taken, of "
+            f"order {row.order}, which leaves {100.0 * other.residual:.2g} % of the "
+            f"outputs where that leaves {100.0 * fitted.residual:.2g} %. Excite at "
+            f"more frequencies, or give the `order` of a plant that has such modes.",
+        )
+        return other._replace(selection=other.selection.among(fitted.selection))
+    return fitted
+
+
+def _are_of_few_lines(records: Sequence[Record], n_values: int) -> bool:
+    """Whether windows of so many values of the inputs are not independent."""
+    width = -(-n_values // len(records[0].u))
+    windows = [
+        sliding_window_view(r.u, width, axis=1)
+        .swapaxes(0, 1)
+        .reshape(-1, len(r.u) * width)
+        for r in records
+        if r.n_samples >= width
+    ]
+    if not windows:
+        return False
+    sizes = np.linalg.svd(np.vstack(windows), compute_uv=False)
+    return bool((sizes > _INDEPENDENT * sizes[0]).sum() < n_values)
+
+
 def _price_of(evidence: Evidence) -> float:
     """What a sinusoid costs of the criterion, as its modes do by their parameters.
 
@@ -114,12 +176,9 @@ def _turns(evidence: Evidence) -> Array:
 
     Of many frequencies one always looks like a sinusoid.
     """
-    free, longest = evidence.free, evidence.longest
+    free = evidence.free
     model = evidence.whitening.model(evidence.model)
-    poles = np.linalg.eigvals(model.A)
-    turns = np.angle(poles)
-    lasts = np.abs(1.0 - np.abs(poles)) * longest < _DECAYS
-    turns = turns[lasts & (np.sin(turns) * longest > _TURNS)]
+    turns = _lasting_turns(model, evidence.longest)
     records = evidence.whitening.records(evidence.records, free)
     n_samples = sum(record.n_samples for record in records)
     n_left = n_samples * len(model.C) - n_parameters(len(model.A), records, free)
@@ -132,6 +191,17 @@ def _turns(evidence: Evidence) -> Array:
     steady = energy[:, 1:].sum(axis=1) < _WANDERS * energy[:, 0]
     by_chance = 2.0 * np.log(n_samples / _CHANCE) * fitted.loss / n_left
     return turns[steady & (energy[:, 0] > by_chance)]
+
+
+def _lasting_turns(model: Realization, longest: int, within: float = _DECAYS) -> Array:
+    """Radians per sample of modes that neither decay nor grow over a record.
+
+    By so many time constants.
+    """
+    poles = np.linalg.eigvals(model.A)
+    turns = np.angle(poles)
+    lasts = np.abs(1.0 - np.abs(poles)) * longest < within
+    return turns[lasts & (np.sin(turns) * longest > _TURNS)]
 
 
 def _turns_of_noise(samples: Samples, fitted: LocalFit) -> Array:

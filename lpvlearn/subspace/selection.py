@@ -88,6 +88,11 @@ _AS_GOOD = 0.999  # share of the loss of the order below that more states must b
 # Horizon for the states that an order adds to the one below.
 _SHORT_HORIZON = 10
 
+# Times the squared errors of the pilot, in samples whitened alike, beyond which its
+# order must be reached: where outputs hardly show noise, as behind a filter, what they
+# make of their own past is likelier than what a few states make of the inputs.
+_UNEXPLAINED = 4.0
+
 _DOUBT = 1.0  # standard errors by which another order must be better
 
 # How far below the choice other orders are simulated on parts held out.
@@ -590,7 +595,8 @@ def _try_orders(
 
     A `pilot` that is better yet, a model of the records themselves, tells that they do.
     """
-    orders, limit, n_pilot, free = wanted.orders, np.inf, 0, settings.free
+    orders, free = wanted.orders, settings.free
+    limit, n_pilot, least = np.inf, 0, np.inf
     # Least variance of what a model leaves: no start has to leave less.
     n_values, variance = sum(record.n_values for record in records), 0.0
 
@@ -603,10 +609,10 @@ def _try_orders(
     if pilot is not None:
         model = with_initial_states(whitening.model(pilot), records, settings.free)
         limit = criterion_of(model, records, settings.free, settings.repeated)
-        n_pilot = len(model.A)
+        n_pilot, least = len(model.A), model.loss
         variance = model.loss / left(n_pilot)
     tried: list[_Tried] = []
-    best, stale = np.inf, 0
+    best, stale, left_by_best = np.inf, 0, np.inf
     energy = output_energy(records)
     slow_starts = SlowStarts(records, orders[-1], settings)
     for order in orders:
@@ -628,9 +634,11 @@ def _try_orders(
         candidate = Candidate(model, horizon, whitening, True)
         errors = _relative_errors(starts, records)
         tried.append(_Tried(order, candidate, criterion, errors))
-        stale = 0 if criterion < best else stale + 1
-        best = min(best, criterion)
-        known = best <= limit or order >= n_pilot
+        stale += 1
+        if criterion < best:
+            best, stale, left_by_best = criterion, 0, model.loss
+        known = best <= limit and left_by_best <= _UNEXPLAINED * least
+        known |= order >= n_pilot
         if (known and stale > _PATIENCE) or model.loss <= EXACT * energy:
             break
     return tried

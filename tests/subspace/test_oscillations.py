@@ -196,3 +196,30 @@ def test_ring_downs_are_the_plants(order):
     model, told = _fit(np.vstack(inputs), np.vstack(outputs), experiment=1, order=order)
     assert not told
     assert _error(model, plant) < 0.2
+
+
+@pytest.mark.parametrize("lines, seed", [((5, 60), 0), ((5, 60), 1), ((3, 7, 31), 0)])
+def test_modes_of_few_lines_give_way_to_those_that_decay(lines, seed):
+    """A plant with play at its output, moved at a few frequencies, on other phases."""
+
+    def simulated(rng):
+        time, phases = np.arange(1000), rng.uniform(0.0, 6.0, (len(lines), 1))
+        angles = 2e-3 * np.pi * np.outer(lines, time) + phases
+        u = np.cos(angles).sum(axis=0)[:, None]
+        A, B = [[1.6, -0.8], [1.0, 0.0]], [[1.0], [0.0]]
+        y = StateSpace(A, B, [[0.1, 0.1]], None, 1.0).simulate(u)[:, 0]
+        place, places = y[0], []
+        for value in y:
+            place = min(max(place, value - 0.2), value + 0.2)
+            places.append(place)
+        return u, np.array(places)[:, None]
+
+    rng = np.random.default_rng(seed)
+    u, y = simulated(rng)
+    y += 0.01 * y.std() * rng.standard_normal(y.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = SubspaceLTI().fit(u, y)
+    u, y = simulated(rng)
+    error = (y - model.lti_.simulate(u))[200:]
+    assert np.linalg.norm(error) < 0.15 * np.linalg.norm(y)
