@@ -264,8 +264,9 @@ def group_operating_points(
     Experiments with an operating-point label are grouped by it; the others by the mean
     of their scheduling variable: means of one point are within `tol` of a neighbour, by
     default the larger of 1 % of their range and the spread of the variable within one
-    of the two, or the median spread where that is less. A ValueError where they form a
-    longer chain.
+    of the two, or the median spread where that is less. Values that stand still within
+    both experiments are within 1 % of their size as well: 1, 10, 100, 1000 are four
+    points. A ValueError where they form a longer chain.
 
     The values (n_points, n_scheduling) are the means over a point's experiments, in
     lexicographic order; without scheduling columns `n_scheduling` is 0, and points are
@@ -302,7 +303,11 @@ def _tolerance(
         spreads = np.array([np.ptp(signal, axis=0) for signal in signals])
         close, usual = _CLOSE * np.ptp(means, axis=0), np.median(spreads, axis=0)
         wider = np.maximum(spreads[:, None, :], spreads[None, :, :])
-        return np.maximum(close, np.minimum(wider, usual)), np.maximum(close, usual)
+        size = np.abs(means)
+        of_size = _CLOSE * np.maximum(size[:, None, :], size[None, :, :])
+        of_size = np.maximum(of_size, _ROUNDING * np.ptp(means, axis=0))
+        near = np.where(wider > 0.0, close, np.minimum(close, of_size))
+        return np.maximum(near, np.minimum(wider, usual)), np.maximum(close, usual)
     largest = tolerances("scheduling_tol", tol, means.shape[1])
     return largest, largest
 

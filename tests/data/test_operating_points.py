@@ -78,9 +78,19 @@ def test_without_scheduling_there_is_one_point():
 
 
 @pytest.mark.parametrize(
+    "values", [[1, 10, 100, 1e3, 1e4], [0, 1, 2, 100], [5e3, 1e4, 1e5, 1e6]]
+)
+def test_values_that_stand_still_are_points_where_they_differ_by_their_size(values):
+    index, kappa = group_operating_points(_runs(values))
+    np.testing.assert_array_equal(kappa[index, 0], values)
+    index, kappa = group_operating_points(_runs([300.1, 300.2, 350.0, 350.1]))
+    np.testing.assert_allclose(kappa[:, 0], [300.15, 350.05])
+
+
+@pytest.mark.parametrize(
     ("values", "tol", "words"),
     [
-        (np.linspace(0, 1, 200), None, ["200 experiments", "chain", "scheduling_tol"]),
+        (np.linspace(1, 2, 200), None, ["200 experiments", "chain", "scheduling_tol"]),
         ([0.0, 1.0], -1, ["scheduling_tol", "Got -1"]),
         ([0.0, 1.0], [0.1, 0.1], ["scheduling_tol", "variable (1)"]),
     ],
