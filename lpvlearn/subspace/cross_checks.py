@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import DETRENDS, far_out
+from ..data.faulty_signals import far_out
+from ..data.preparation import DETRENDS
 from ..systems.simulation import delayed, lti_response
 from ..validation import listed
 from .delay import first_samples, longest_delays

@@ -21,6 +21,7 @@ from .fit_warnings import (
     tell_of_feedback,
     tell_of_held_outputs,
     tell_of_limits,
+    tell_of_logging,
     tell_of_still_outputs,
 )
 from .local_fit import LocalFit
@@ -59,6 +60,7 @@ def fit_samples(
     outputs = [y for _, y in pairs]
     tell_of_still_outputs(outputs, telling)
     tell_of_dropouts(pairs, telling)
+    tell_of_logging(pairs, telling)
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     samples = samples._replace(pairs=pairs)
     fitted = with_trends(samples, like)

@@ -10,15 +10,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.preparation import (
-    Pairs,
-    constant_columns,
+from ..data.faulty_signals import (
     drops_out,
     far_out,
     held_for,
-    independent_inputs,
+    line_length,
+    repeated_in_bursts,
     stays_put,
+    wraps,
 )
+from ..data.preparation import Pairs, constant_columns, independent_inputs
 from ..exceptions import RankWarning
 from .constancy import change_over
 from .constants import CERTAIN, USELESS, follows_means_alone, motions_left, stays_far
@@ -41,7 +42,7 @@ Array = NDArray[np.float64]
 TESTS = {"held out", "orders", "static gain", "response", "decay", "bent", "lack"}
 
 # What was told of that bends a response as well
-_BENDS = {"bent", "limit", "held", "dropouts", "input spikes"}
+_BENDS = {"bent", "limit", "held", "dropouts", "input spikes", "lines", "bursts"}
 
 # An output is at a limit where it stays and its model moves on
 _MOVES_ON = 0.05  # of the motion of the model, at least
@@ -128,6 +129,44 @@ def tell_of_dropouts(pairs: Pairs, telling: Telling) -> None:
                 f"after; the first is sample {where}, counted from 0. Its "
                 "sensor, or what logs it, drops out: put NaN in place of these "
                 "samples and use missing='estimate'.",
+            )
+
+
+def tell_of_logging(pairs: Pairs, telling: Telling) -> None:
+    """Tell of outputs that a logger has filled in, or turned back."""
+    inputs, outputs = zip(*pairs, strict=True)
+    for k in range(outputs[0].shape[1]):
+        signals = [y[:, k] for y in outputs]
+        length = line_length(signals, inputs) if "lines" not in telling else 1
+        if length > 1:
+            telling.once(
+                "lines",
+                f"Output {telling.output(k)} runs along straight lines for {length} "
+                "samples at a time: it was sampled more slowly than the table, and "
+                "interpolated, as the response of no linear system is. Take one row of "
+                f"every {length}, those in which its lines end, for all columns; or "
+                "put NaN in place of what is between them, and use missing='estimate' "
+                "with a given `order`.",
+            )
+        bursts = repeated_in_bursts(signals) if "bursts" not in telling else []
+        if bursts:
+            n, (first, start, _) = sum(b - a for _, a, b in bursts), bursts[0]
+            where = in_experiment(start, first, len(outputs))
+            telling.once(
+                "bursts",
+                f"Output {telling.output(k)} repeats its last value in {n} samples, "
+                f"{len(bursts)} time(s), and then catches up; the first is sample "
+                f"{where}, counted from 0. What logs it had nothing new: put NaN in "
+                "place of the repeated samples and use missing='estimate'.",
+            )
+        n_turns = wraps(signals) if "wraps" not in telling else 0
+        if n_turns:
+            telling.once(
+                "wraps",
+                f"Output {telling.output(k)} jumps back by nearly its whole range "
+                f"{n_turns} times, and moves by small steps else, as angles do that "
+                "are kept within a revolution. Use `numpy.unwrap`, with the `period` "
+                "of its unit, for every experiment.",
             )
 
 

@@ -8,7 +8,6 @@ import pytest
 from lpvlearn.data.experiments import Experiment
 from lpvlearn.data.preparation import (
     complete_runs,
-    far_out,
     has_gaps,
     independent_inputs,
     split_at_gaps,
@@ -54,19 +53,3 @@ def test_inputs_that_rest_are_no_scale():
     u[:, 1] = 0.0
     P = independent_inputs([u])
     assert P.shape == (3, 2) and not P[1].any()
-
-
-@pytest.mark.parametrize(
-    ("signal", "found"),
-    [
-        (np.sign(np.random.default_rng(0).standard_normal(200)), []),
-        (np.eye(200)[70], []),  # an impulse, beside which nothing moves
-        (np.random.default_rng(0).standard_normal(5000), []),
-        (np.full(20, 1.0), []),
-        (np.linspace(-1, 1, 200) + 40.0 * np.eye(200)[33], [33]),
-        (np.linspace(-1, 1, 200) + 40.0 * np.eye(200)[[33, 34]].sum(axis=0), []),
-    ],
-    ids=["two values", "impulse", "noise", "short", "one", "two that are neighbours"],
-)
-def test_single_samples_stand_far_out(signal, found):
-    assert np.flatnonzero(far_out(signal[:, None])).tolist() == found

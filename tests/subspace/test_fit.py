@@ -10,7 +10,8 @@ import pytest
 from scipy.signal import lfilter, tf2ss
 
 from lpvlearn import StateSpace, SubspaceLTI, bft_score
-from lpvlearn.data.preparation import drops_out, remove_trends, stays_put
+from lpvlearn.data.faulty_signals import drops_out, stays_put
+from lpvlearn.data.preparation import remove_trends
 from lpvlearn.exceptions import RankWarning
 from lpvlearn.subspace.fit import fit_samples
 from lpvlearn.subspace.fit_warnings import warn_about
