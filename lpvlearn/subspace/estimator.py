@@ -327,6 +327,10 @@ class SubspaceLTI(
     refined on the prediction error it has the least variance that the noise allows
     (the bound of Cramer and Rao).
 
+    Experiments whose noise differs by a factor of two or more count by their own, as a
+    linear system allows (both signals of each are divided by it), unless that is
+    refuted, as where errors grow with the motion of a system that is not linear.
+
     Of a table of more than 131,072 samples the first ones choose order and horizon;
     the others are added in one pass, as `partial_fit` does, which refines on the
     simulation error.

@@ -25,6 +25,7 @@ from .fit_warnings import (
     tell_of_still_outputs,
 )
 from .local_fit import LocalFit
+from .noise_levels import by_own_noise
 from .one_fit import Samples, TooFewSamples
 from .oscillations import without_modes_of_few_lines, without_oscillations
 from .rivals import (
@@ -80,6 +81,8 @@ def fit_samples(
     if rest is not None:
         samples, fitted, first = rest
         choices = samples.choices
+    if like is None:
+        samples, fitted = by_own_noise(samples, fitted)
     doubt = None
     foreseen = fitted.feedback is not None and fitted.feedback.foreseen
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):

@@ -1,0 +1,121 @@
+"""Experiments of unequal noise, of which each counts by its own.
+
+A linear system answers ``w u`` by ``w y``, whatever w is, and initial states and
+constants of the experiments take it as well. Divided by how large its noise is, every
+experiment has errors of one variance, and least squares of all together are those of
+the maximum likelihood: a noisy one spoils nothing that others know.
+
+Errors of a system that is not linear are larger where it moves more, and are no noise:
+the model that small motions would have, which simulates large ones worse, is refused.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..systems.simulation import trend_signals
+from .constants import CERTAIN
+from .criterion import criterion_of, n_parameters
+from .local_fit import LocalFit
+from .noise import through_filter
+from .one_fit import Samples
+from .simulation_fit import simulation_errors, with_initial_states
+from .trends import with_trends
+
+Array = NDArray[np.float64]
+
+_UNEQUAL = 2.0  # times the noise of another experiment
+# Times that the noise is estimated, of errors that the last model has freed of what a
+# noisy experiment did to it; until it differs between experiments by less than that.
+_ROUNDS, _SAME = 4, 1.1
+
+_VALUES = 50  # of an experiment, of which the noise is known to a tenth
+
+# Of the criterion, for each parameter: what a model loses by chance in samples that it
+# does not fit best. Experiments of unequal noise are fewer than they seem.
+_BY_CHANCE = 5.0
+
+
+def by_own_noise(samples: Samples, fitted: LocalFit) -> tuple[Samples, LocalFit]:
+    """Samples of experiments of equal noise and their model; else those given.
+
+    Offsets are those of the samples that were given.
+    """
+    choices = samples.choices
+    asked = choices.refine in ("auto", "prediction") and not choices.enforce_stability
+    asked &= fitted.method != "pbsid" and fitted.evidence.refined
+    if not asked or choices.estimated or len(samples.pairs) < 2:
+        return samples, fitted
+    sizes = _noise_sizes(fitted)
+    if sizes is None or sizes.max() < _UNEQUAL * sizes.min():
+        return samples, fitted
+    as_chosen = samples.aside()._replace(choices=fitted.chosen(choices))
+    for _ in range(_ROUNDS):
+        left = _noise_sizes(with_trends(_divided(as_chosen, sizes)))
+        if left is None:
+            return samples, fitted
+        sizes = sizes * left
+        if left.max() < _SAME * left.min():
+            break
+    lengths = [len(u) for u, _ in samples.pairs]
+    # Likelihoods are then those of the samples as they were given.
+    sizes = sizes / np.exp(np.average(np.log(sizes), weights=lengths))
+    weighted = _divided(samples, sizes)
+    other = with_trends(weighted.aside())
+    residual = _residual_of_given(fitted, other)
+    if residual is None:
+        return samples, fitted
+    offsets = other.offsets.multiplied(sizes)
+    return weighted, other._replace(offsets=offsets, residual=residual)
+
+
+def _divided(samples: Samples, sizes: Array) -> Samples:
+    pairs = zip(sizes, samples.pairs, strict=True)
+    return samples._replace(pairs=[(u / size, y / size) for size, (u, y) in pairs])
+
+
+def _noise_sizes(fitted: LocalFit) -> Array | None:
+    """Root mean square of the whitened errors of every experiment.
+
+    None where some are too short to tell.
+    """
+    evidence = fitted.evidence
+    records, (filter_, weight) = evidence.records, evidence.whitening
+    model = with_initial_states(evidence.model, records, evidence.free, weight)
+    lost, sizes = len(filter_) - 1, []
+    for error in simulation_errors(model, records):
+        if len(error) <= 2 * lost or (len(error) - lost) * len(weight) < _VALUES:
+            return None
+        sizes.append(np.sqrt(np.mean((through_filter(filter_, error) @ weight.T) ** 2)))
+    found = np.array(sizes)
+    return found if np.isfinite(found).all() and found.min() > 0.0 else None
+
+
+def _residual_of_given(fitted: LocalFit, other: LocalFit) -> float | None:
+    """Error of the `other` model in the samples of a fit; None if that is refuted."""
+    own, new = fitted.evidence, other.evidence
+    if other.method == "pbsid" or own.basis.shape != new.basis.shape:
+        return None
+    of_inputs = own.input_scale / new.input_scale
+    of_outputs = (new.output_scale / own.output_scale)[:, None]
+    model = new.model._replace(
+        B=new.model.B * of_inputs,
+        C=of_outputs * new.model.C,
+        D=of_outputs * new.model.D * of_inputs,
+        blocks=None,
+    )
+    free, weight = new.free, own.whitening.weight
+    records = [
+        record._replace(trend=trend_signals(record.n_samples, free.n_trend))
+        for record in own.records
+    ]
+    model = with_initial_states(model, records, free, weight)
+    worse = criterion_of(model, records, free, ())
+    worse -= criterion_of(own.model, own.records, own.free, ())
+    unknown = max(n_parameters(len(e.model.A), (), e.free) for e in (own, new))
+    if not worse < CERTAIN + _BY_CHANCE * unknown:
+        return None
+    errors = np.vstack(simulation_errors(model, records))
+    outputs = np.vstack([record.y.T for record in records])
+    return float(np.sqrt(np.sum(errors**2) / (np.sum(outputs**2) or 1.0)))
