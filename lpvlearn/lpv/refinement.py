@@ -441,6 +441,8 @@ def local_prior(
     missed, slopes = model.parameters(kappa) - theta, form.sensitivities(kappa)
     rows, errors = [], []
     for k, records in enumerate(groups):
+        if not records:  # it tells nothing
+            continue
         constant = PolynomialLPV(0).fit(kappa[[k]], theta[[k]])
         local = replace(model.silenced(), interpolator=constant, bases=())
         found = [simulated(local, record, own) for record in records]
@@ -456,6 +458,9 @@ def local_prior(
         root = np.sqrt(values[known])[:, None] * vectors[:, known].T
         rows.append(root @ slopes[k])
         errors.append(root @ missed[k])
+    if not rows:
+        n_coefficients = len(form.coefficients())
+        return Prior(form.coefficients(), np.zeros((n_coefficients,) * 2))
     R, e = np.vstack(rows), np.concatenate(errors)
     inflation = 1.0 if is_chance(e @ e, len(e)) else e @ e / len(e)
     return Prior(form.coefficients(), R.T @ R / inflation)

@@ -27,7 +27,7 @@ from ..data.operating_points import (
     moving_experiments,
     without_spikes,
 )
-from ..data.preparation import part_of
+from ..data.preparation import complete_runs, part_of
 from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, collected
 from ..lpv.auto import AutoLPV
@@ -606,7 +606,8 @@ def known_coefficients(
 ) -> Prior:
     """What the operating points tell of the coefficients.
 
-    By the covariances of the parameters; without these, from the local experiments.
+    By the covariances of the parameters; without these, from the local experiments,
+    where nothing of them is missing.
     """
     form = model.interpolator
     if not isinstance(form, Interpolator):
@@ -615,7 +616,8 @@ def known_coefficients(
     information = form.information(points.kappa, found.covariance)
     if information is not None:
         return Prior(form.coefficients(), information)
-    groups = [[_record(e, sampling_time) for e in g] for g in points.experiments]
+    runs = [[run for e in g for run in complete_runs(e)] for g in points.experiments]
+    groups = [[_record(e, sampling_time) for e in g] for g in runs]
     own = _own_of_local(found)
     return local_prior(model, points.kappa, found.theta, groups, own)
 

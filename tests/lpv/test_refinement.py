@@ -283,6 +283,16 @@ def test_local_experiments_tell_what_their_covariances_do():
     )
 
 
+def test_an_operating_point_without_records_tells_nothing():
+    truth, points = spring_lpv(), np.array([[0.0], [1.0]])
+    own, theta = [record(truth)], truth.parameters(points)
+    one = local_prior(truth, points[:1], theta[:1], [own], MOVING).information
+    both = local_prior(truth, points, theta, [own, []], MOVING).information
+    np.testing.assert_array_equal(both, one)
+    none = local_prior(truth, points, theta, [[], []], MOVING).information
+    np.testing.assert_array_equal(none, np.zeros_like(one))
+
+
 @pytest.mark.slow
 def test_experiments_in_parallel_are_the_same():
     truth = spring_lpv()

@@ -12,6 +12,7 @@ from sklearn.model_selection import GridSearchCV, cross_validate
 
 from lpvlearn import (
     GrayBoxStructure,
+    LocalLPVPipeline,
     OutputErrorLPV,
     PolynomialLPV,
     RationalLPV,
@@ -152,6 +153,20 @@ def test_without_a_structure_local_experiments_are_the_prior(both, memory):
     ).set_params(local__order=2, local__feedthrough=False)
     pipeline.fit(*both[1])
     assert (pipeline.refiner_.report_["BFT"] > 96.5).all()
+
+
+def test_the_prior_leaves_out_what_is_missing_of_local_experiments(both):
+    X, y = both[1]
+    y = y.copy()
+    y.iloc[50:55] = np.nan
+    model = LocalLPVPipeline(
+        SubspaceLTI(2, missing="estimate", feedthrough=False),
+        "aligned",
+        PolynomialLPV(2),
+        refiner=OutputErrorLPV(rate=False, max_iter=10),
+        **ROLES,
+    ).fit(X, y)
+    assert (model.refiner_.report_["BFT"] > 96.5).all()
 
 
 @pytest.mark.slow
