@@ -14,6 +14,11 @@ from ..validation import one_of
 _CONTAINERS = ("default", "pandas", "polars", None)
 
 
+def row_labels(X: Any) -> pd.Index | None:
+    """Those of a table of pandas; any other has none."""
+    return X.index if isinstance(X, pd.DataFrame | pd.Series) else None
+
+
 class OutputContainer:
     """An estimator of which `set_output` chooses the container of predictions.
 
@@ -53,5 +58,4 @@ class OutputContainer:
             from polars import DataFrame
 
             return DataFrame(columns, schema=[str(name) for name in names])
-        rows = X.index if isinstance(X, pd.DataFrame) else None
-        return pd.DataFrame(columns, rows, list(names))
+        return pd.DataFrame(columns, row_labels(X), list(names))

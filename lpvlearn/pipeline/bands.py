@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ..data.containers import row_labels
 from ..data.experiments import Experiment, n_rows_of, naming
 from ..lpv.bands import levels_of, simulation_std
 from ..lpv.model import LPVStateSpace
@@ -47,6 +48,4 @@ def prediction_std(
     columns = pd.MultiIndex.from_product(
         [levels.index, names], names=["output", "part"]
     )
-    return pd.DataFrame(
-        found.reshape(n_samples, -1), getattr(X, "index", None), columns
-    )
+    return pd.DataFrame(found.reshape(n_samples, -1), row_labels(X), columns)

@@ -69,6 +69,22 @@ def test_tables_where_they_are_wanted(local):
         np.testing.assert_array_equal(found, plain)
 
 
+def test_rows_may_be_lists():
+    X, y = sweeps()
+    X["run"] = X["run"].str[-1].astype(int)
+    places = {role: X.columns.get_loc(name) for role, name in ROLES.items()}
+    model = OutputErrorLPV(spring_lpv(), **places).fit(X.to_numpy(), y.to_numpy())
+    rows, _ = spring_sweep(50)
+    rows = rows.assign(run=0)[list(X)].to_numpy()
+    for ours, theirs in zip(
+        model.predict(rows.tolist(), return_std=True),
+        model.predict(rows, return_std=True),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    assert list(model.prediction_std(rows.tolist()).index) == [*range(50)]
+
+
 @pytest.mark.parametrize("name", ["local", "moving"])
 def test_the_noise_is_found_and_a_true_model_has_no_error(name, request):
     model = request.getfixturevalue(name)
