@@ -256,6 +256,16 @@ def _travel(scheduling: Array) -> Array:
     return np.ptp([part.mean(axis=0) for part in parts], axis=0)
 
 
+def mean_values(values: Array) -> Array:
+    """Means of columns, NaN left out: of a constant one its value, to the last digit.
+
+    >>> mean_values(np.full((3, 1), 0.1)), np.full(3, 0.1).mean()
+    (array([0.1]), np.float64(0.10000000000000002))
+    """
+    low, high = _extremes([values])
+    return np.where(low == high, low, np.nanmean(values, axis=0))
+
+
 def group_operating_points(
     experiments: Sequence[Experiment], tol: ArrayLike | None = None
 ) -> tuple[NDArray[np.intp], Array]:
@@ -278,7 +288,7 @@ def group_operating_points(
         ends = squarable("scheduling", np.array(_extremes(signals)))
         if np.isinf(ends).any():
             raise ValueError("`scheduling` must be finite. Got inf in its columns.")
-        means = np.array([signal.mean(axis=0) for signal in signals])
+        means = np.array([mean_values(signal) for signal in signals])
     if all(run.operating_point is not None for run in experiments):
         group, _ = pd.factorize(
             pd.Series([run.operating_point for run in experiments], dtype=object)
@@ -290,7 +300,7 @@ def group_operating_points(
     n_points = int(group.max()) + 1
     if means is None:
         return group, np.empty((n_points, 0))
-    kappa = np.array([means[group == k].mean(axis=0) for k in range(n_points)])
+    kappa = np.array([mean_values(means[group == k]) for k in range(n_points)])
     order = np.lexsort(kappa.T[::-1])
     return np.argsort(order)[group], kappa[order]
 

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..data.experiments import OPTIONAL_ROLES, ROLES, Table, fitted_roles
+from ..data.operating_points import mean_values
 from ..models.statespace import StateSpace
 from ..validation import one_of, squarable
 from .scorers import (
@@ -138,7 +139,7 @@ def _labels(
         points = point.labels([rows[0] for rows in groups])
     elif kappa:
         values = np.column_stack([column.numbers("X") for column in kappa])
-        means = [tuple(np.nanmean(values[rows], axis=0).tolist()) for rows in groups]
+        means = [tuple(mean_values(values[rows]).tolist()) for rows in groups]
         points = [mean if len(mean) > 1 else mean[0] for mean in means]
     return list(zip(names, points, strict=True))
 

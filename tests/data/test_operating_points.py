@@ -39,6 +39,18 @@ def test_realizations_of_a_point_are_grouped_whatever_their_order():
     np.testing.assert_allclose(kappa.ravel(), values.reshape(3, 10).mean(axis=1))
 
 
+@pytest.mark.parametrize("n_samples", [300, 400])
+def test_points_of_constant_experiments_are_at_these_very_values(n_samples):
+    values = [0.1, 0.4, 0.7]
+    runs = [
+        replace(run, scheduling=np.full((n_samples, 1), run.scheduling[0]))
+        for run in _runs(3 * values)
+    ]
+    index, kappa = group_operating_points(runs)
+    assert kappa.ravel().tolist() == values
+    np.testing.assert_array_equal(index, 3 * [0, 1, 2])
+
+
 def test_points_are_as_far_apart_as_their_own_records_move():
     """Of a level that moves by a part of itself: the lowest points are the nearest."""
     levels = np.array([1.0, 2.5, 4.0, 6.0, 8.5, 11.0, 13.5, 16.0])

@@ -16,6 +16,7 @@ from lpvlearn import (
     readable_report,
     vaf_score,
 )
+from lpvlearn.metrics.table_simulation import TableSimulator
 
 from ..conftest import (
     KAPPA,
@@ -63,6 +64,17 @@ def test_the_report_has_a_row_for_each_experiment_and_output(data):
         assert row["VAF"] == pytest.approx(vaf_score(true, pred))
         assert row["RMSE"] == pytest.approx(np.sqrt(mean_squared_error(true, pred)))
         assert row["R2"] == pytest.approx(r2_score(true, pred))
+
+
+def test_experiments_at_one_value_are_at_one_operating_point():
+    rng = np.random.default_rng(0)
+    for n_samples in (300, 400):
+        values = np.repeat([0.1, 0.4, 0.7], n_samples)
+        X = pd.DataFrame({"force": rng.normal(size=len(values)), "kappa": values})
+        X["run"], X["time"] = values, np.tile(0.1 * np.arange(n_samples), 3)
+        model = TableSimulator(spring_lpv(), **ROLES)
+        report = fit_report(model, X, rng.normal(size=len(X)))
+        assert report["operating_point"].tolist() == [0.1, 0.4, 0.7]
 
 
 @IN_MOTION
