@@ -44,6 +44,7 @@ from .timestamps import (
     TIME_TOL,
     UNTIMED,
     Clock,
+    are_local_times,
     check_time_tol,
     read_clock,
     time_in_seconds,
@@ -673,6 +674,7 @@ def _clocks(
     if column is None:
         return [UNTIMED] * len(labels)
     seconds = time_in_seconds(column.values, column.name)
+    local = are_local_times(column.values)
     clocks: list[Clock] = []
     rule = "All experiments must have the same time step"
     for label, rows in zip(labels, groups, strict=True):
@@ -681,6 +683,7 @@ def _clocks(
             seconds[rows],
             column=column.name,
             experiment=label,
+            local=local,
             expected=[*expected, (common, rule)],
             **options,
         )

@@ -74,15 +74,31 @@ _FEW = 0.05
 _OFTEN = 0.2  # share of equal stamps from which rounding makes them
 
 
+def _series(values: Any) -> pd.Series:
+    series = pd.Series(values)
+    with suppress(OverflowError):  # of integers beyond floats, in older versions
+        series = series.infer_objects()
+    return series
+
+
+def are_local_times(values: Any) -> bool:
+    """Whether times are dates without a zone, which summer time may shift.
+
+    >>> dates = pd.date_range("2024-10-27", periods=3, freq="s")
+    >>> are_local_times(dates), are_local_times(dates.tz_localize("UTC"))
+    (True, False)
+    """
+    dtype = _series(values).dtype
+    return getattr(dtype, "kind", "O") == "M" and getattr(dtype, "tz", None) is None
+
+
 def time_in_seconds(values: Any, column: Hashable) -> NDArray[np.floating]:
     """Seconds from numbers (seconds already), or datetimes (from the earliest).
 
     A float32 column stays float32: its rounding is part of the guard's tolerance.
     Raises a ValueError on what is neither a finite number nor a date, naming `column`.
     """
-    series = pd.Series(values)
-    with suppress(OverflowError):  # of integers beyond floats, in older versions
-        series = series.infer_objects()
+    series = _series(values)
     kind = getattr(series.dtype, "kind", "O")
     if kind in "mM":
         if series.isna().any():
@@ -150,7 +166,8 @@ def check_time_tol(time_tol: Any) -> float:
 def _is_clock_change(steps: NDArray[Any], k: int) -> bool:
     """Whether a step is an hour longer, or shorter, than the others."""
     typical = float(np.median(steps))
-    return abs(abs(steps[k] - typical) - _HOUR) <= typical < 0.5 * _HOUR
+    off = abs(abs(steps[k] - typical) - _HOUR)
+    return typical < 0.5 * _HOUR and off <= _LARGEST_TOL * typical
 
 
 def read_clock(
@@ -160,6 +177,7 @@ def read_clock(
     experiment: Hashable,
     time_tol: float = 0.0,
     allow_missing: bool = False,
+    local: bool = False,
     expected: Sequence[tuple[Clock, str]] = (),
 ) -> Clock:
     """Read the stamps of an experiment, which must increase on an even grid.
@@ -167,7 +185,8 @@ def read_clock(
     They may deviate from it by `time_tol` times the step, and by their rounding (to a
     number of decimals or to single precision: by one unit of the last place, as long
     as that is less than half the step). With `allow_missing` samples may be missing;
-    the grid after them need not be that before. Raises a ValueError where time is
+    the grid after them need not be that before. Of `local` times a jump by an hour is
+    told to be that of a clock. Raises a ValueError where time is
     otherwise, or its step not the one `expected`: pairs of a clock and of the rule that
     the message begins with.
 
@@ -193,7 +212,7 @@ def read_clock(
             )
         elif steps[k] == 0:
             remedy = "Drop rows that stand twice (drop_duplicates of pandas). " + remedy
-        elif _is_clock_change(steps, k):
+        elif local and _is_clock_change(steps, k):
             remedy = _OF_A_ZONE
         elif np.sum(steps <= 0) <= _FEW * len(t):
             remedy = _RESTARTS + remedy
@@ -229,7 +248,7 @@ def read_clock(
     if missing.any() and not allow_missing:
         k = int(np.argmax(missing))
         remedy = _CUT_THERE
-        if _is_clock_change(steps, k):
+        if local and _is_clock_change(steps, k):
             remedy = f"{_OF_A_ZONE} Where the logger rested: {remedy}"
         if missing.sum() > _FEW * len(t):
             remedy = (

@@ -32,7 +32,13 @@ from ..data.preparation import (
     remove_trends,
     unbroken_runs,
 )
-from ..data.timestamps import TIME_TOL, Clock, read_clock, time_in_seconds
+from ..data.timestamps import (
+    TIME_TOL,
+    Clock,
+    are_local_times,
+    read_clock,
+    time_in_seconds,
+)
 from ..systems.threads import one_blas_thread
 from ..validation import SQUARED, input_delays
 from .delay import late_inputs
@@ -119,8 +125,8 @@ class StreamClock:
         self, times: Any, name: Hashable, label: Hashable, **options: Any
     ) -> Clock:
         seconds = time_in_seconds(times, name)
-        known = {"column": name, "experiment": label} | self._options
-        return read_clock(seconds, **known, **options)
+        known = options | self._options | {"local": are_local_times(times)}
+        return read_clock(seconds, column=name, experiment=label, **known)
 
     def _check_border(self, joined: Any, name: Hashable, label: Hashable) -> bool:
         n_before = len(self._tail)

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from lpvlearn import SubspaceLTI
 from lpvlearn.data.timestamps import (
     UNTIMED,
     check_time_tol,
@@ -71,13 +72,30 @@ def test_uneven_time_raises_and_says_what_to_use(stamps, remedy):
 
 @pytest.mark.parametrize("hour", [3600.0, -3600.0])
 def test_a_jump_by_an_hour_is_that_of_a_clock_without_its_zone(hour):
-    stamps = 0.1 * np.arange(400) + hour * (np.arange(400) >= 200)
-    with pytest.raises(ValueError, match="summer time: give times with their zone"):
-        read_clock(stamps, column="t", experiment=0)
-    rested = 0.1 * np.arange(400) + 0.9 * hour * (np.arange(400) >= 200)
-    with pytest.raises(ValueError) as raised:
-        read_clock(rested, column="t", experiment=0)
-    assert "summer time" not in str(raised.value)
+    since = pd.Timestamp("2024-05-01")
+
+    def told(jump, **zone):
+        stamps = 0.1 * np.arange(400) + jump * (np.arange(400) >= 200)
+        dates = (since + pd.to_timedelta(stamps, unit="s")).tz_localize(**zone)
+        X = pd.DataFrame({"u": np.arange(400.0), "t": dates})
+        with pytest.raises(ValueError, match="must (increase|be evenly)") as raised:
+            SubspaceLTI(2, time="t").fit(X, np.arange(400.0))
+        return "summer time: give times with their zone" in str(raised.value)
+
+    assert told(hour, tz=None)
+    assert not told(hour, tz="UTC")
+    assert not told(0.9 * hour, tz=None)
+
+
+@pytest.mark.parametrize("step", [60, 600, 900, 1500])
+def test_lost_rows_are_no_change_of_a_clock(step):
+    for n_lost in range(1, 8):
+        stamps = np.delete(float(step) * np.arange(400), range(100, 100 + n_lost))
+        for local in (False, True):
+            with pytest.raises(ValueError, match="row.s. are missing") as raised:
+                read_clock(stamps, column="t", experiment=0, local=local)
+            an_hour = local and step * n_lost == 3600
+            assert ("summer time" in str(raised.value)) == an_hour
 
 
 def test_stamps_that_are_rounded_too_coarsely_are_no_rows_that_stand_twice():
