@@ -182,8 +182,9 @@ for delay in (0, "auto"):
 # structure is compared with what is left of the local model and has no delay itself;
 # the structured model and ``lpv_`` carry it. ``report_`` has it in columns
 # ``"delay_"`` by input. The points tell one delay together where that is as likely as
-# one of each. Where they differ beyond doubt, a warning lists them, and ``lpv_`` takes
-# the median.
+# one of each; not with ``integrating``, nor where models of experiments are averaged,
+# where each finds its own. Where they differ beyond doubt, a warning lists them, and
+# ``lpv_`` takes the median.
 #
 # .. _guide_offsets:
 #

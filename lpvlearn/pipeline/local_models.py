@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -136,16 +137,19 @@ def identify_points(
             "local models", identify_point, arguments, points.kappa, known, **options
         )
 
-    def tried(estimator: Any, some: Sequence[int]) -> list[Done | None]:
+    def tried(
+        estimator: Any, some: Sequence[int], known: Sequence[Done | None] = ()
+    ) -> list[Done | None]:
         """Of some points alone; what fails is not told."""
         found: list[Done | None] = [None] * len(groups)
+        known = [known[k] for k in some] if known else ()
         arguments = [(estimator, groups[k]) for k in some]
         quiet = replace(runner, on_error="skip", verbose=0)
+        run = partial(quiet.run, "local models", identify_point, arguments)
         with collected(), suppress(ValueError):
-            known = quiet.run(
-                "local models", identify_point, arguments, points.kappa[some], **options
-            )
-            for k, done in zip(some, known, strict=True):
+            for k, done in zip(
+                some, run(points.kappa[some], known, **options), strict=True
+            ):
                 found[k] = done
         return found
 
@@ -157,27 +161,29 @@ def identify_points(
             return identify(estimator, known, replace(runner, on_error="skip"))
         return [None] * len(groups)
 
-    local = _with_one_delay(local, tried, groups, options["sampling_time"])
+    known: list[Done | None] = [None] * len(groups)
+    if _looks_for_delays(local, groups, options["combine"]):
+        local, known = _with_one_delay(local, tried, groups, options["sampling_time"])
     if not chooses or structure is not None:
-        found = identify(local)
+        found = identify(local, known)
     else:
         search = free and len(groups) > _SCOUTS and type(local) is SubspaceLTI
         some = _spread(len(groups), _SCOUTS)
-        scouts = tried(local, some) if search else []
+        scouts = tried(local, some, known) if search else []
         if local.get_params(deep=False).get("offset") == "auto":
-            found = _of_own_orders(local, attempted, scouts)
+            found = _of_own_orders(local, attempted, scouts, known)
             found = _drifting_alike(local, tried, found)
             found = identify(local, found) if None in found else found
         else:
-            found = _of_own_orders(local, identify, scouts)
+            found = _of_own_orders(local, identify, scouts, known)
         models = [done.result for done in found if done is not None]
         if len({model.order for model in models}) > 1:
             order = _common_order(models)
-            known = [
+            alike = [
                 done if done is not None and _own_order(done.result) == order else None
                 for done in found
             ]
-            own, found = found, identify(clone(local).set_params(order=order), known)
+            own, found = found, identify(clone(local).set_params(order=order), alike)
             found = [_beside(*pair) for pair in zip(found, own, strict=True)]
     tell_skipped(found, points.kappa)
     kept = [k for k, done in enumerate(found) if done is not None]
@@ -204,30 +210,41 @@ def _spread(n_points: int, most: int) -> list[int]:
     return np.unique(np.linspace(0, n_points - 1, most).round().astype(int)).tolist()
 
 
-def _with_one_delay(
-    local: Any,
-    tried: Callable[[Any, Sequence[int]], list[Done | None]],
-    groups: Sequence[Sequence[Experiment]],
-    sampling_time: float,
-) -> Any:
-    """The estimator with the delay of all points, where each was to find its own.
+def _looks_for_delays(
+    local: Any, groups: Sequence[Sequence[Experiment]], combine: str
+) -> bool:
+    """Whether points find delays, by models whose criteria tell which are likelier.
 
-    A short record takes a sample more or less for states, or for noise. Criteria of
-    independent records add up: beginning at the median of some points, longer delays of
-    an input are taken where these together are likelier so by more than a state, which
-    may stand for a sample, and shorter ones where they are as likely. Not where delays
-    of their own are likelier beyond doubt, as with transport at another speed.
+    Those of rates have none, nor has an average.
     """
     asked = type(local) is SubspaceLTI and isinstance(local.input_delay, str)
-    if not asked or len(groups) < 2:
-        return local
-    some = _spread(len(groups), _PROBED)
+    averages = combine == "average" and any(len(_labels_of(g)) > 1 for g in groups)
+    return asked and len(groups) > 1 and not averages and not _integrates(local)
+
+
+def _with_one_delay(
+    local: Any,
+    tried: Callable[..., list[Done | None]],
+    groups: Sequence[Sequence[Experiment]],
+    sampling_time: float,
+) -> tuple[Any, list[Done | None]]:
+    """The estimator with the delay of all points, where each was to find its own.
+
+    And its models of the points that told. A short record takes a sample more or less
+    for states, or for noise. Criteria of independent records add up: beginning at the
+    median of some points, longer delays of an input are taken where these together are
+    likelier so by more than a state, which may stand for a sample, and shorter ones
+    where they are as likely. Not where delays of their own are likelier beyond doubt,
+    as with transport at another speed.
+    """
+    found = tried(local, _spread(len(groups), _PROBED))
+    rest, gaps = local.initial_state == "rest", local.missing != "raise"
+    known: dict[tuple[int, ...], list[Done | None]] = {}
 
     def models_of(found: Sequence[Done | None]) -> dict[int, LocalModel]:
         return {k: done.result for k, done in enumerate(found) if done is not None}
 
-    own = models_of(tried(local, some))
-    rest, gaps = local.initial_state == "rest", local.missing != "raise"
+    own = models_of(found)
 
     def delay_of(model: LocalModel) -> NDArray[np.intp]:
         return np.round(model.lti.input_delay / sampling_time).astype(np.intp)
@@ -246,27 +263,38 @@ def _with_one_delay(
             for k, model in models.items()
         )
 
-    def having(delay: NDArray[np.intp]) -> Any:
-        return clone(local).set_params(input_delay=delay.tolist())
+    def having(delay: NDArray[np.intp]) -> tuple[Any, list[Done | None]]:
+        """The estimator and its models, which of a delay found is that of one given."""
+        given, key = delay.tolist(), tuple(delay.tolist())
+        estimator = clone(local).set_params(input_delay=given)
+        if key not in known:
+            same = [
+                done is not None and (delay_of(done.result) == delay).all()
+                for done in found
+            ]
+            pairs = zip(found, same, strict=True)
+            alike = [done if is_same else None for done, is_same in pairs]
+            known[key] = tried(estimator, list(own), alike)
+        return estimator, known[key]
 
     def cost_with(delay: NDArray[np.intp]) -> float:
-        return cost(models_of(tried(having(delay), list(own))))
+        return cost(models_of(having(delay)[1]))
 
     none = np.zeros(groups[0][0].inputs.shape[1], np.intp)
     if len(own) < 2 or not np.isfinite(cost(own)):
-        return local
+        return local, found
     delays = np.array([delay_of(model) for model in own.values()])
     delay = np.sort(delays, axis=0)[(len(own) - 1) // 2]
     agree = bool((delays == delay).all())
     if agree and delay.any():
         return having(delay)
     state = len(own) * PRICE * (len(delay) + groups[0][0].measured.shape[1])
-    least = cost(own) if agree else cost_with(delay)
+    least = cost_with(delay)
     for sample in np.eye(len(delay), dtype=np.intp):
         for step, worth in ((sample, _CLEARER + state), (-sample, -_CLEARER)):
             delay, least = _along(step, worth, (delay, least), cost_with)
     alike = least < cost(own) + _CLEARER * (len(own) - 1)
-    return having(delay) if alike else local
+    return having(delay) if alike else (local, found)
 
 
 def _along(
@@ -295,15 +323,16 @@ def _of_own_orders(
     local: Any,
     identify: Callable[..., list[Done | None]],
     scouts: Sequence[Done | None],
+    known: Sequence[Done | None],
 ) -> list[Done | None]:
     """Models of all points, each of the order that it takes itself.
 
     What the `scouts` among them take tells the others where to look. One that finds its
-    order at an end of that looks everywhere.
+    order at an end of that looks everywhere, as those have that are `known`.
     """
     orders = [_own_order(done.result) for done in scouts if done is not None]
     if not orders:
-        return identify(local)
+        return identify(local, known)
     about = range(max(0, min(orders) - _FEWER), max(orders) + _MORE + 1)
     found = identify(clone(local).set_params(order=about), scouts)
     ends = {about[0], about[-1]} - {0}
@@ -313,8 +342,8 @@ def _of_own_orders(
     ]
     if not any(unsure):
         return found
-    pairs = zip(found, unsure, strict=True)
-    return identify(local, [None if again else done for done, again in pairs])
+    kinds = zip(found, known, unsure, strict=True)
+    return identify(local, [own if again else done for done, own, again in kinds])
 
 
 def _drifting_alike(
@@ -430,7 +459,7 @@ def identify_point(
             "with integrators cannot be balanced. Got 'average'."
         )
     advice = _look_at_outputs(experiments, local)
-    labels = list(dict.fromkeys(e.label for e in experiments))
+    labels = _labels_of(experiments)
     if combine == "pool" or len(labels) == 1:
         fit = _fit_at_most if most else _fit_local
         fitted = fit(local, experiments, sampling_time)
@@ -507,6 +536,10 @@ def experiments_of(u: Array, y: Array, sampling_time: float) -> list[Experiment]
         Experiment(k, rows, *pair, sampling_time=sampling_time)
         for k, pair in enumerate(zip(u, y, strict=True))
     ]
+
+
+def _labels_of(experiments: Sequence[Experiment]) -> list[Hashable]:
+    return list(dict.fromkeys(e.label for e in experiments))
 
 
 def _integrates(local: Any) -> bool:

@@ -17,6 +17,7 @@ from lpvlearn import (
     from_trajectories,
 )
 from lpvlearn.data.experiments import Experiment
+from lpvlearn.exceptions import collected
 from lpvlearn.pipeline import local_models
 from lpvlearn.pipeline.local_models import (
     LocalModel,
@@ -187,9 +188,41 @@ def test_an_order_at_the_end_of_those_looked_at_is_looked_for_everywhere(own, ag
         for k, one in enumerate(identify(SubspaceLTI(), [None] * 5))
     ]
     searched.clear()
-    found = _of_own_orders(SubspaceLTI(), identify, scouts)
+    found = _of_own_orders(SubspaceLTI(), identify, scouts, [None] * 5)
     assert [done.result.order for done in found] == list(own)
     assert searched == again
+
+
+@pytest.mark.parametrize(
+    ("late", "options", "others"),
+    [
+        (2, {}, 0),
+        (0, {}, 8),  # of a sample more, and of two
+        (0, {"local__integrating": True}, 0),
+        (0, {"combine": "average"}, 0),
+    ],
+)
+def test_points_that_told_the_delay_are_not_identified_again(
+    late, options, others, monkeypatch
+):
+    asked = []
+
+    def counted(local, experiments, **how):
+        asked.append(local.input_delay)
+        return identify_point(local, experiments, **how)
+
+    monkeypatch.setattr(local_models, "identify_point", counted)
+    X, y = spring_tables(noise=0.01, n_samples=150, n_repeats=2)
+    shifted = y.groupby(X["run"]).shift(late).fillna(0.0)
+    if "local__integrating" in options:
+        shifted = shifted.groupby(X["run"]).cumsum()
+    local = SubspaceLTI(2, input_delay="auto")
+    pipeline = LocalLPVPipeline(local, "aligned", **ROLES).set_params(**options)
+    with collected():
+        pipeline.fit(X, shifted)
+    assert pipeline.input_delay_.tolist() == [late]
+    n_points = len(pipeline.operating_points_)
+    assert asked.count("auto") == n_points and len(asked) == n_points + others
 
 
 @pytest.mark.parametrize("order", [[1, 2, 3], (3, 2), np.arange(1, 4)])
