@@ -870,8 +870,8 @@ class GrayBoxRestructurer(VersionedPickle, RegressorMixin, BaseEstimator):
         timed_out = hurried and errors[0] > enough
         if timed_out or (time_is_up() and not result.converged):
             warn(
-                f"the search ended at `max_time`={self.max_time} s, with a relative "
-                f"error of {self.relative_error_:.2g} and `stationarity_` "
+                "the search ended at `max_time`, with a relative error of "
+                f"{self.relative_error_:.2g} and `stationarity_` "
                 f"{self.stationarity_:.1g} (0 at an optimum): it did not look at all "
                 "starts, or not to the end. The best point is kept. Raise `max_time`, "
                 "or give `init`.",

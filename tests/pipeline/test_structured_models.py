@@ -448,6 +448,7 @@ def test_max_time_is_shared_by_the_points_and_told():
         pipeline.fit(X, y)
     assert len(told) >= 2
     assert {fit.max_time for fit in pipeline.restructurers_} == {0.75e-6 / 2}
+    assert not any("`max_time`=" in str(warning.message) for warning in told)
     own = GrayBoxRestructurer(spring_structure(), max_time=1e-9)
     with pytest.warns(ConvergenceWarning, match="max_time"):
         pipeline.set_params(restructurer=own).fit(X, y)
