@@ -128,7 +128,7 @@ def _roles(
 def _held(
     table: pd.DataFrame, roles: dict[str, Any], tol: float | bool
 ) -> pd.DataFrame:
-    """The rows at levels, each level an experiment; the column joins the roles."""
+    """The rows at levels, each level an experiment; its column joins the roles."""
     if roles["scheduling"] is None:
         raise ValueError(
             "--levels are those of --scheduling, which names nothing: name the column "
@@ -143,7 +143,11 @@ def _held(
     labels = pd.Series(numbers, table.index).map("level {}".format)
     if roles["experiment"] is not None:
         labels = table[roles["experiment"]].astype(str) + ", " + labels
-    roles["experiment"] = roles["experiment"] or EXPERIMENT
+    others = _all_of(roles | {"experiment": None})
+    if roles["experiment"] in (None, *others):  # whose values have to stay
+        roles["experiment"] = EXPERIMENT
+        while roles["experiment"] in table.columns:
+            roles["experiment"] += "_"
     return table.assign(**{roles["experiment"]: labels})[numbers >= 0]
 
 

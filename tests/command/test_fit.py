@@ -52,6 +52,20 @@ def test_one_record_of_levels_is_cut_at_them(folder, tmp_path):
     assert "`--levels` must be a non-negative number" in told[2]
 
 
+def test_levels_of_the_column_that_tells_experiments_apart(tmp_path):
+    X, y = spring_tables(n_samples=300)
+    log = X.join(y).drop(columns=["run", "time"]).assign(experiment="bench")
+    log.to_csv(tmp_path / "long.csv", index=False)
+    options = ["--inputs", "force", "--outputs", "position", "--scheduling", "kappa"]
+    options += ["--order", 2, "--sampling-time", 0.02, "--quiet", "--levels"]
+    for column in ("kappa", "experiment"):
+        target = tmp_path / column
+        given = ["fit", tmp_path / "long.csv", *options, "--experiment", column]
+        assert run(*given, "--output", target) == (0, "", "")
+        points = pd.read_csv(target / "points.csv", index_col=0)
+        assert_allclose(points.index, KAPPA)
+
+
 def test_a_folder_is_not_written_over_unasked(folder):
     before = (folder / "spring" / "report.txt").stat().st_mtime_ns
     status, _, error = run("fit", folder / "runs.csv", *ROLES, "--output", folder)
