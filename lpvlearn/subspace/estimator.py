@@ -153,9 +153,9 @@ class SubspaceLTI(
         Samples by which the inputs, or each of them, act late: ``y[t]`` depends on
         ``u[t - input_delay]`` through D, on earlier inputs through the state. A sampled
         system without feedthrough has a delay of 0: its first answer, a sample after
-        the input, is in the state. "auto" looks for delays of up to 300 samples (all
-        inputs together), a fifth of the longest experiment, and takes those that are
-        certain.
+        the input, is in the state. "auto" looks for delays of up to 300 samples by
+        the number of inputs, 30 where that is more, and a fifth of the longest
+        experiment at most, and takes those that are certain.
     refine : {"auto", "simulation", "prediction", True, False}, default="auto"
         What is minimised after the subspace step: "simulation" the simulation error,
         "prediction" that error whitened by an autoregression of itself and weighted by
@@ -235,7 +235,8 @@ class SubspaceLTI(
     method_ : str
         As chosen or given.
     order_, horizon_ : int
-        As chosen or given.
+        As chosen or given; with `integrating` the order of `lti_`, which has a state
+        more for each of these outputs than the model of the rates.
     singular_values_ : ndarray of shape (horizon_ * n_outputs,)
         Of the estimated observability subspace, descending.
     initial_states_ : ndarray of shape (n_experiments, order_)
