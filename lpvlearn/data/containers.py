@@ -26,6 +26,8 @@ class OutputContainer:
     it searches and cross-validation, takes it along.
     """
 
+    _single_output: bool
+
     def set_output(self, *, transform: str | None = None) -> Self:
         """Choose what `predict` and its like return, as scikit-learn's transformers do.
 
@@ -44,10 +46,15 @@ class OutputContainer:
             self._sklearn_output_config = {"transform": transform}
         return self
 
+    def _remember_shape(self, y: Any) -> None:
+        """Predictions have one dimension where the outputs of the fit had."""
+        self._single_output = np.asarray(y).ndim == 1
+
     def _contained(
         self, found: NDArray[np.float64], X: Any, names: Sequence[Hashable] | None
     ) -> Any:
-        """Outputs in the rows of X, in the container that was chosen."""
+        """Outputs (n_samples, n_outputs) in the rows of X, as fitted and chosen."""
+        found = found[:, 0] if self._single_output else found
         wanted = getattr(self, "_sklearn_output_config", {}).get("transform", "default")
         if wanted == "default":
             return found

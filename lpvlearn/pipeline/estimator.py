@@ -506,7 +506,7 @@ list, default=None
         cut_at_outputs = not estimates_outputs(self.local)
         experiments = self._read(X, y, reset=True, outputs=cut_at_outputs, **options)
         self.output_names_ = read_outputs(y)[1]
-        self._single_output = np.asarray(y).ndim == 1
+        self._remember_shape(y)
         return experiments
 
     def _read_by_part(self, dataset: Any, outputs: Any) -> Iterator[Experiment]:

@@ -317,7 +317,7 @@ class OutputErrorLPV(ScheduledEstimator):
         experiments = without_spikes(self._read(X, y, reset=True))
         names = read_outputs(y)[1]
         check_outputs(experiments, names)
-        self._single_output = np.asarray(y).ndim == 1
+        self._remember_shape(y)
         self.output_names_, self.n_outputs_ = names, len(names)
         dt = self._sampling_time(experiments)
         start, first = self._start(experiments, dt), experiments[0]

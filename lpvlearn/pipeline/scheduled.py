@@ -44,7 +44,6 @@ class ScheduledEstimator(
     sampling_time_: float
     scheduling_range_: Array
     scheduling_names_: list[Any]
-    _single_output: bool
 
     @property
     @abstractmethod
@@ -96,7 +95,6 @@ class ScheduledEstimator(
         if not return_std:
             return y
         total = self.prediction_std(X).xs("total", axis=1, level="part").to_numpy()
-        total = total[:, 0] if self._single_output else total
         return y, self._contained(total, X, self.lpv_.output_names)
 
     def prediction_std(self, X: Any) -> pd.DataFrame:
@@ -203,7 +201,6 @@ class ScheduledEstimator(
         out = simulate_experiments(
             model, experiments, self.sampling_time_, n_rows_of(X), estimate=estimate
         )
-        out = out[:, 0] if self._single_output else out
         return self._contained(out, X, model.output_names)
 
     def _tell_extrapolation(self, kappa: Array) -> None:

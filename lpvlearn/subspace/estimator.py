@@ -494,7 +494,7 @@ class SubspaceLTI(
         choices = check_options(self.get_params(deep=False))
         choices = choices._replace(differences=names is not None)
         experiments = self._read(X, y, reset=True, cut=False)
-        self._single_output = np.asarray(y).ndim == 1
+        self._remember_shape(y)
         telling = Telling(*(names or _labels_of(X, experiments, y)))
         if names:
             telling = telling.aside("noisy output", "useless", "dropouts")
@@ -569,7 +569,7 @@ class SubspaceLTI(
         choices = choices_of_each(self.get_params(deep=False))
         first = clone(self)
         experiments = first._read(X, y, reset=True, cut=False)
-        first._single_output = np.asarray(y).ndim == 1
+        first._remember_shape(y)
         others = [copy(first) for _ in experiments[1:]]
         delay = first._delay_of(experiments[:1], choices)
         telling = Telling(*_labels_of(X, experiments, y))
@@ -629,7 +629,7 @@ class SubspaceLTI(
         check_for_rates(self.get_params(deep=False))
         experiments = self._read(X, y, reset=True)
         self.time_jitter_ = max(e.jitter for e in experiments)
-        self._single_output = np.asarray(y).ndim == 1
+        self._remember_shape(y)
         flags = integrating_flags(self.integrating, read_outputs(y)[1])
         step = self._step_of(experiments)
         moved = rates_of(experiments, flags, float(step))
@@ -782,7 +782,7 @@ class SubspaceLTI(
                 _names_of(experiments, y),
                 Telling(*_labels_of(X, experiments, y)),
             )
-            self._single_output = np.asarray(y).ndim == 1
+            self._remember_shape(y)
         else:
             stream = before.branch()
         fitted = stream.add(experiments, Table(X).one(self.time, "time"))
@@ -1398,7 +1398,6 @@ class SubspaceLTI(
         for e in experiments:
             with naming(e):
                 out[e.rows] = outputs(e)
-        out = out[:, 0] if self._single_output else out
         return self._contained(out, X, self.lti_.output_names)
 
 
