@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 _PAD = 10.0  # a decade beyond the slowest and the fastest pole
 
+_N_FREQUENCIES = 400  # of a curve as wide as a page, which then looks smooth
+
 _SMALLEST = 1e-6  # slower poles, relative to the fastest, count as integrators
 
 
@@ -21,7 +23,7 @@ _SMALLEST = 1e-6  # slower poles, relative to the fastest, count as integrators
 _AROUND = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.3, 1.7, 2.3, 3.2, 5.0, 8.0])
 
 
-def frequency_axis(models: Sequence[StateSpace], n_points: int = 400) -> Array:
+def frequency_axis(models: Sequence[StateSpace]) -> Array:
     """Angular frequencies (rad/s) from a decade below to one above the poles.
 
     Logarithmic, with further points around resonances. Ends at the highest Nyquist
@@ -44,7 +46,7 @@ def frequency_axis(models: Sequence[StateSpace], n_points: int = 400) -> Array:
     low = min(low, high / _PAD**2) if np.isfinite(nyquist) else low
     resonant = poles[(poles.imag > 0) & (poles.real != 0)]
     offsets = np.concatenate([-_AROUND, _AROUND])
-    grid = pole_grid(resonant, low, high, n_points, offsets)
+    grid = pole_grid(resonant, low, high, _N_FREQUENCIES, offsets)
     return grid[(grid >= low) & (grid <= high)]
 
 

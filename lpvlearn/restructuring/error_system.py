@@ -37,6 +37,10 @@ _RESPONSE_ROUNDING = 1e-12  # of a response, whose digits the error has lost
 # input, are taken entry by entry: ten times faster for canonical forms of 24 states.
 _FEW = 25
 
+# Frequencies between those of the poles, over which responses are smooth; and points
+# that are remembered: a search asks for a few, one after another, again and again.
+_N_FREQUENCIES, _N_KNOWN = 60, 4
+
 _CACHED = 100_000  # numbers that stay in a cache between two products of matrices
 
 # singular values are told apart down to that fraction of the largest: their gap divides
@@ -102,7 +106,7 @@ def series(
     )
 
 
-def frequency_grid(poles: NDArray, dt: float | None, n_points: int = 60) -> Array:
+def frequency_grid(poles: NDArray, dt: float | None) -> Array:
     """Frequencies (rad/s) that see every pole: logarithmic, and around resonances.
 
     From `poles` in the time domain of `dt`; ends at the Nyquist frequency.
@@ -113,7 +117,7 @@ def frequency_grid(poles: NDArray, dt: float | None, n_points: int = 60) -> Arra
     low, high = (size.min(), size.max()) if size.size else (1.0, 1.0)
     if dt is not None:  # poles next to zero are faster than any frequency
         low = min(low, np.pi / dt)
-    around = pole_grid(rates, low / 20, high * 10, n_points, [-1.0, 0.0, 1.0])
+    around = pole_grid(rates, low / 20, high * 10, _N_FREQUENCIES, [-1.0, 0.0, 1.0])
     grid = np.append(around, size)
     if dt is not None:
         grid = grid[grid < np.pi / dt]
@@ -172,7 +176,7 @@ def derivatives(L: Complex, S: Array, R: Complex) -> Complex:
     return changes
 
 
-def remembering(f: Callable[[NDArray], Any], points: int = 4) -> Callable[..., Any]:
+def remembering(f: Callable[[NDArray], Any]) -> Callable[..., Any]:
     """The function `f` of one array, with its values at the last points remembered.
 
     Examples
@@ -189,7 +193,7 @@ def remembering(f: Callable[[NDArray], Any], points: int = 4) -> Callable[..., A
         key = x.tobytes()
         if key not in known:
             value = f(x)
-            while len(known) >= points:
+            while len(known) >= _N_KNOWN:
                 known.pop(next(iter(known)), None)
             known[key] = value
         return known[key]

@@ -57,6 +57,8 @@ Estimate = tuple[StateSpace, Sequence[ModelPair]]  # with models on either side 
 # to some 1e-13.
 _EXACT = 1e-9
 
+_MAX_ITER = 100  # steps of a search; one that has not ended by then is told
+
 # Relative singular value of the scaled V below which a direction is rounding. Well
 # excited models stay above 1e-3; in the differences of pairs 1e-6 is still exact.
 _FAINT = 1e-6
@@ -266,7 +268,6 @@ def minimise_covariance(
     boxes: Sequence[UncertainResponse],
     *,
     admissible: Callable[[Array], bool] | None = None,
-    max_iter: int = 100,
 ) -> CovarianceFit | None:
     """Parameters nearest to black boxes in the metric of their own uncertainty.
 
@@ -314,7 +315,7 @@ def minimise_covariance(
         np.asarray(start, dtype=float)[None],
         lower=lower,
         upper=upper,
-        max_iter=max_iter,
+        max_iter=_MAX_ITER,
         tol=_DECREASE,
         stop=time_is_up,
     )

@@ -24,6 +24,7 @@ from .error_system import Structure, Target, derivatives, response_point
 
 Array = NDArray[Any]
 
+_MAX_ITER = 40  # steps of a start: it need not be an optimum
 _EXACT = 4  # starts that reach the structure exactly; no more are needed
 
 # relative singular value of the linear equations that noise of a black box may leave
@@ -116,8 +117,6 @@ def similarity_starts(
     problem: AffineProblem,
     n_starts: int,
     rng: np.random.Generator,
-    *,
-    max_iter: int = 40,
 ) -> tuple[Array, Array]:
     """Parameter vectors from random similarities, all starts in one batch.
 
@@ -139,7 +138,7 @@ def similarity_starts(
     Z, cost = levenberg_marquardt(
         _distances(problem, T0, N, directions),
         Z,
-        max_iter=max_iter,
+        max_iter=_MAX_ITER,
         tol=_SLOW,
         patience=_PATIENCE,
         exact=_ROUNDING * (1.0 + np.abs(problem.offset).sum()) ** 2,
