@@ -29,12 +29,11 @@ from ..models.statespace import (
 from ..restructuring.known_poles import hidden_integrators, integrators
 from ..restructuring.minimise_covariance import Estimate
 from ..structures.structure import GrayBoxStructure
-from ..subspace.constants import lasting
 from ..subspace.criterion import PRICE
 from ..subspace.delay import with_late_inputs
 from ..subspace.estimator import SubspaceLTI
 from ..subspace.integrating import integrating_flags
-from ..systems.modes import mode_rates
+from ..systems.modes import lasting, n_changes
 from .runner import Done, PointRunner, label_of, tell_skipped
 
 Array = NDArray[np.float64]
@@ -599,7 +598,7 @@ def _equilibrium(
     longest = max(len(e.inputs) for e in experiments)
     (u, u_scale), (y, y_scale) = motions(_without_drifts(fitted, experiments))
     gain = lti.dc_gain()
-    if (mode_rates(first.lti_.A) * longest < 1.0).any():
+    if n_changes(first.lti_.A, longest) < 1.0:
         far = np.abs(y0 - y) > _FAR * y_scale
         if not (far.any() and np.isfinite(gain).all()):
             return u0, y0

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..systems.beginnings import Stands, first_inputs, stands
-from ..systems.modes import spectral_radius
-from .constants import ALIKE, CERTAIN, HARDLY_DECAYS, stands_by_chance
+from ..systems.modes import HARDLY_DECAYS, n_decays
+from .constants import ALIKE, CERTAIN, stands_by_chance
 from .criterion import PRICE
 from .local_fit import LocalFit
 from .one_fit import Samples, TooFewSamples
@@ -101,8 +101,8 @@ def _is_as_likely(own: Evidence, other: Evidence, seen: bool) -> bool:
     """
     worse = own.one_step.criterion - other.one_step.criterion
     by_chance, drifts_off = stands_by_chance(other.one_step), other.free.n_trend > 1
-    rate = 1.0 - spectral_radius(own.model.A)
-    settles = rate * own.longest > (HARDLY_DECAYS if drifts_off else 1.0)
+    decays = n_decays(own.model.A, own.longest)
+    settles = decays > (HARDLY_DECAYS if drifts_off else 1.0)
     if not (len(own.model.A) and settles):
         return False
     left, plainly = _plain_errors(own, other)

@@ -22,7 +22,13 @@ from scipy import linalg, special
 
 from ..systems.beginnings import moves_of, standing
 from ..systems.least_squares import column_scale
-from ..systems.modes import mode_rates, spectral_radius
+from ..systems.modes import (
+    HARDLY_DECAYS,
+    lasting,
+    n_changes,
+    n_decays,
+    spectral_radius,
+)
 from ..systems.simulation import lti_response, trend_signals
 from .noise import autoregression, spectral_density
 from .offsets import Offsets
@@ -78,10 +84,7 @@ _FAR, _OFF = 3.0, 1.0
 # the beginning, times what is seen.
 _AT_REST = 5.0
 
-# Time constants per longest experiment of a mode that may stand for a constant, or a
-# drift; of one that may be the constant itself.
-HARDLY_DECAYS = 3.0
-_LASTING = 0.5
+_LASTING = 0.5  # time constants per longest experiment of one that may be a constant
 
 # Times the squared errors without what inputs do to modes that do not decay, of ones
 # that they hardly move.
@@ -200,7 +203,7 @@ def follows_means_alone(evidence: Evidence) -> bool:
     What one that grows over the record simulates tells nothing.
     """
     stays = not evidence.free.n_trend and stays_far(evidence.records)
-    stays &= evidence.longest * (spectral_radius(evidence.model.A) - 1.0) < 1.0
+    stays &= n_decays(evidence.model.A, evidence.longest) > -1.0
     return stays and motion_left(evidence) > USELESS**2
 
 
@@ -294,11 +297,6 @@ def constants_matter(without: Evidence, other: Evidence) -> bool:
     return chance < _SIGNIFICANT or (chance < _LIKELY and (far or better > CERTAIN))
 
 
-def lasting(poles: NDArray, longest: int) -> NDArray[np.bool_]:
-    """Which modes do not decay over the longest experiment, or grow."""
-    return (np.abs(1.0 - poles) * longest < HARDLY_DECAYS) | (np.abs(poles) > 1.0)
-
-
 def may_have_drift(evidence: Evidence) -> bool:
     """Whether a model without drifts should be tried with them.
 
@@ -318,7 +316,7 @@ def drifts_off(evidence: Evidence) -> bool:
 
 def _lasts(evidence: Evidence) -> bool:
     """Whether a mode stays what it is over the longest record."""
-    return bool((mode_rates(evidence.model.A) * evidence.longest < _LASTING).any())
+    return n_changes(evidence.model.A, evidence.longest) < _LASTING
 
 
 def unmoved_errors(evidence: Evidence, *, beside_drifts: bool = False) -> float:

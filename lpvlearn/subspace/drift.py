@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import Pairs
-from ..systems.modes import mode_rates
-from .constants import ALIKE, CERTAIN, lasting, motion_left, with_levels
+from ..systems.modes import lasting, mode_rates, n_changes
+from .constants import ALIKE, CERTAIN, motion_left, with_levels
 from .criterion import PRICE
 from .local_fit import LocalFit
 from .noise import Whitening
@@ -76,9 +76,9 @@ def may_drift(fitted: LocalFit) -> bool:
     shortest = min(record.n_samples for record in evidence.records)
     if shortest < _FEWEST or motion_left(evidence) < _EXPLAINED**2:
         return False
-    rates = mode_rates(evidence.noise.A)
-    slow = rates * evidence.longest < _SLOW
-    return bool(slow.any()) or (len(rates) > 0 and outlasts(fitted))
+    noise = evidence.noise.A
+    slow = n_changes(noise, evidence.longest) < _SLOW
+    return slow or (len(noise) > 0 and outlasts(fitted))
 
 
 def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
@@ -111,8 +111,7 @@ def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
 
 def wanders(evidence: Evidence) -> bool:
     """Whether noise beside which there may be more is as slow as drift."""
-    rates = mode_rates(evidence.noise.A) * evidence.longest
-    return bool((rates < _SLOW_BESIDE).any())
+    return n_changes(evidence.noise.A, evidence.longest) < _SLOW_BESIDE
 
 
 def settles(level: LocalFit, other: LocalFit) -> bool:

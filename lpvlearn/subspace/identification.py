@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..systems.modes import spectral_radius
+from ..systems.modes import n_decays, spectral_radius
 from .criterion import criterion_of
 from .hankel import data_factors
 from .held_out import DOUBT, HeldOut, held_out
@@ -399,7 +399,7 @@ def _is_astray(
 ) -> bool:
     """Whether a model of whitened errors is one that errors, or likelihood, refute."""
     longest = max(record.n_samples for record in records)
-    settles = (1.0 - spectral_radius(plain.model.A)) * longest > _SETTLES
+    settles = n_decays(plain.model.A, longest) > _SETTLES
     least = _FAR_ASTRAY if settles else _BEYOND_DRIFTS
     if chosen.model.loss > least * plain.model.loss:
         return True

@@ -20,7 +20,7 @@ from scipy import linalg
 from ..data.preparation import Pairs
 from ..exceptions import DivergenceError
 from ..systems.least_squares import column_scale
-from ..systems.modes import mode_rates
+from ..systems.modes import n_changes
 from ..systems.simulation import free_responses, trend_signals
 from .records import Centres
 from .statistics import Evidence
@@ -102,7 +102,8 @@ def attributed(evidence: Evidence, centres: Centres, pairs: Pairs) -> Offsets:
         drifts = trends[:, 1] * 2.0 / np.maximum(lengths - 1, 1)[:, None]
     if not evidence.free.initial_states:
         return Offsets(levels, outputs, drifts, constants, lengths)
-    slowest = mode_rates(model.A).min(initial=1.0) * lengths.max()
+    longest = int(lengths.max())
+    slowest = min(n_changes(model.A, longest), longest)
     decays = slowest > 1.0  # over the longest experiment
     if decays:
         gain = evidence.state_space(model, 1.0).dc_gain()

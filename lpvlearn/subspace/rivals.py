@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.preparation import DETRENDS
-from ..systems.modes import spectral_radius
+from ..systems.modes import HARDLY_DECAYS, spectral_radius
 from .closed_loop import ClosedLoopEvidence
-from .constants import CERTAIN, HARDLY_DECAYS, follows_means_alone
+from .constants import CERTAIN, follows_means_alone
 from .criterion import PRICE, n_parameters
 from .delay import find_lead, with_later_inputs
 from .drift import n_lasting

@@ -26,13 +26,14 @@ from ..systems.beginnings import (
     standing,
     waiting,
 )
+from ..systems.modes import lasting
 from ..systems.simulation import (
     estimate_initial_state,
     spread_of,
     state_and_level,
     trend_signals,
 )
-from .constants import lasting, level_matters
+from .constants import level_matters
 from .integrating import RateEvidence
 from .offsets import Offsets, far_off
 from .statistics import Evidence
