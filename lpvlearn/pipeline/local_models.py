@@ -459,73 +459,103 @@ def identify_point(
         )
     advice = _look_at_outputs(experiments, local)
     labels = _labels_of(experiments)
-    if combine == "pool" or len(labels) == 1:
-        fit = _fit_at_most if most else _fit_local
-        fitted = fit(local, experiments, sampling_time)
-        pairs = _deviated(fitted) if deviate else []
-        if _from_closed_loop(fitted):
-            advice = _HELD + advice
-        rates = getattr(fitted, "rates_", None)
-        if rates is None:
-            lti = _continuous(fitted.lti_, discretization, advice).balance()
-        else:  # stable but for the integrators
-            _continuous(rates.lti_, discretization, advice)
-            with collected():  # said of the rates
-                lti = fitted.lti_.to_continuous(discretization)
-        found = LocalModel(
-            lti,
-            fitted.lti_.order,
-            _horizon(fitted),
-            getattr(fitted, "method_", None),
-            _costs(fitted, experiments),
-            pairs=pairs,
-            discretization=discretization,
-            integrating=_integrating(fitted),
-            n_trend=_n_trend(fitted),
-            lasts=_lasts(fitted, experiments),
-            criterion=_criterion(fitted),
-            rest=_equilibrium(lti, [fitted], experiments),
-        )
-        if efficient and pairs:
-            found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
-        return found
-    realisations = [[e for e in experiments if e.label == label] for label in labels]
+    if combine == "average" and len(labels) > 1:
+        runs = [[e for e in experiments if e.label == label] for label in labels]
+        each = zip(labels, _fit_alike(local, runs, sampling_time), strict=True)
+        return _averaged(dict(each), experiments, discretization, advice, efficient)
+    fit = _fit_at_most if most else _fit_local
+    pooled = fit(local, experiments, sampling_time)
+    return _pooled(pooled, experiments, discretization, advice, efficient, deviate)
+
+
+def _pooled(
+    fitted: Any,
+    experiments: Sequence[Experiment],
+    discretization: str,
+    advice: str,
+    efficient: bool,
+    deviate: bool,
+) -> LocalModel:
+    """That of one fit of all experiments of a point; options as in `identify_point`."""
+    pairs = _deviated(fitted) if deviate else []
+    if _from_closed_loop(fitted):
+        advice = _HELD + advice
+    rates = getattr(fitted, "rates_", None)
+    if rates is None:
+        lti = _continuous(fitted.lti_, discretization, advice).balance()
+    else:  # stable but for the integrators
+        _continuous(rates.lti_, discretization, advice)
+        with collected():  # said of the rates
+            lti = fitted.lti_.to_continuous(discretization)
+    found = LocalModel(
+        lti,
+        **_told_by(fitted, experiments),
+        pairs=pairs,
+        discretization=discretization,
+        integrating=_integrating(fitted),
+        n_trend=_n_trend(fitted),
+        lasts=_lasts(fitted, experiments),
+        criterion=_criterion(fitted),
+        rest=_equilibrium(lti, [fitted], experiments),
+    )
+    if efficient and pairs:
+        found.estimates.append(_in_own_time(fitted.lti_, pairs, discretization))
+    return found
+
+
+def _averaged(
+    fitted: Mapping[Hashable, Any],
+    experiments: Sequence[Experiment],
+    discretization: str,
+    advice: str,
+    efficient: bool,
+) -> LocalModel:
+    """The mean of fits of the realisations of a point, by label.
+
+    Those without a stable model are left out, with a warning.
+    """
     models, failures = [], []
     kept: list[Any] = []
     estimates: list[Estimate] = []
-    for label, fitted in zip(
-        labels, _fit_alike(local, realisations, sampling_time), strict=True
-    ):
-        if not kept and _from_closed_loop(fitted):
+    for label, own in fitted.items():
+        if not kept and _from_closed_loop(own):
             advice = _HELD + advice
-        model, pairs = fitted.lti_, _deviated(fitted) if efficient else []
+        model, pairs = own.lti_, _deviated(own) if efficient else []
         try:
             models.append(_continuous(model, discretization, advice))
             estimates.append(_in_own_time(model, pairs, discretization))
-            kept.append(fitted)
+            kept.append(own)
         except ValueError as error:
             failures.append((label, error))
     if not models:
         raise failures[0][1]
     if failures:
         warn(
-            f"{len(failures)} of {len(labels)} realisations were left out of the "
+            f"{len(failures)} of {len(fitted)} realisations were left out of the "
             f"average; the first, {failures[0][0]!r}: {failures[0][1]}"
         )
     known = all(pairs for _, pairs in estimates)
+    first = [e for e in experiments if e.label == next(iter(fitted))]
     models = _in_one_basis(models, experiments)
     lti = _average(models)
     return LocalModel(
         lti,
-        kept[0].lti_.order,
-        _horizon(kept[0]),
-        getattr(kept[0], "method_", None),
-        _costs(kept[0], realisations[0]),
+        **_told_by(kept[0], first),
         realizations=models,
         estimates=estimates if known else [],
         n_trend=max(map(_n_trend, kept)),
         rest=_equilibrium(lti, kept, experiments),
     )
+
+
+def _told_by(fitted: Any, experiments: Sequence[Experiment]) -> dict[str, Any]:
+    """What an estimator chose for experiments, as a `LocalModel` has it."""
+    return {
+        "order": fitted.lti_.order,
+        "horizon": _horizon(fitted),
+        "method": getattr(fitted, "method_", None),
+        "costs": _costs(fitted, experiments),
+    }
 
 
 def experiments_of(u: Array, y: Array, sampling_time: float) -> list[Experiment]:
