@@ -763,9 +763,11 @@ def _predicted(
     for unknowns, record in zip(own, records, strict=True):
         u, y = record.u.T, record.y.T
         driven = u @ (B - K @ D).T + y @ K.T
-        error = y - state_trajectory(A - K @ C, driven) @ C.T - u @ D.T
+        with np.errstate(over="ignore", invalid="ignore"):  # of models on the way
+            error = y - state_trajectory(A - K @ C, driven) @ C.T - u @ D.T
         if own.size:
-            responses = prediction_responses(A, C, K, len(y), record.trend)
+            with np.errstate(over="ignore", invalid="ignore"):
+                responses = prediction_responses(A, C, K, len(y), record.trend)
             responses = responses[:, :, n - free.n_states(n) :]
             weighted = weight @ responses, error @ weight.T
             unknowns[:] = estimate_initial_state(*weighted)

@@ -29,7 +29,8 @@ def kalman_filter(A: Array, C: Array, Q: Array, S: Array, R: Array) -> KalmanFil
     """
     P = linalg.solve_discrete_are(A.T, C.T, Q, R, s=S)
     covariance = C @ P @ C.T + R
-    gain = linalg.solve(covariance, (A @ P @ C.T + S).T, assume_a="pos").T
+    factor = linalg.cho_factor(covariance)  # `solve` tells users how poor it is
+    gain = linalg.cho_solve(factor, (A @ P @ C.T + S).T).T
     return KalmanFilter(gain, covariance)
 
 
