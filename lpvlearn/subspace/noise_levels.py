@@ -66,7 +66,7 @@ def by_own_noise(samples: Samples, fitted: LocalFit) -> tuple[Samples, LocalFit]
     residual = _residual_of_given(fitted, other)
     if residual is None:
         return samples, fitted
-    offsets = other.offsets.multiplied(sizes)
+    offsets = other.offsets.multiplied(sizes)._replace(differ=fitted.offsets.differ)
     return weighted, other._replace(offsets=offsets, residual=residual)
 
 

@@ -3,6 +3,7 @@
 import warnings
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.signal import lfilter
 
@@ -232,3 +233,23 @@ def test_where_rest_is_far_from_all_outputs_predictions_begin_as_the_fit(tmp_pat
     np.testing.assert_array_equal(same, predicted)
     moving = SubspaceLTI(1, offset=None, sampling_time=1.0).fit(u, y - 4.0)
     assert moving.begun_state_ is None
+
+
+@pytest.mark.parametrize("seed", [1, 2, 6])
+def test_short_records_in_motion_are_not_held_where_some_stand_by_chance(seed):
+    """Lag and resonance, from anywhere: inputs of a quarter stand at first."""
+    rng = np.random.default_rng(seed)
+    A = [[-2.8, -17.6, -32.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    system = StateSpace(A, [[1.0], [0.0], [0.0]], [[0.0, 0.0, 40.0]], None)
+    system, n_runs = system.to_discrete(0.05), 60
+    inputs, outputs = [], []
+    for _ in range(n_runs):
+        u = np.repeat(rng.choice([-1.0, 1.0], 13), 2)[:25, None]
+        x0 = 0.05 * rng.standard_normal(3)
+        inputs.append(u)
+        outputs.append(system.simulate(u, initial_state=x0))
+        outputs[-1] += 0.01 * rng.standard_normal(u.shape)
+    X = pd.DataFrame({"u": np.vstack(inputs)[:, 0], "run": np.arange(1500) // 25})
+    options = {"horizon": 6, "method": "po-moesp", "refine": "simulation"}
+    model = SubspaceLTI(3, experiment="run", offset=None, **options)
+    assert not model.fit(X, np.vstack(outputs)).steady_start_
