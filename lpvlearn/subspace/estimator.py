@@ -286,8 +286,9 @@ class SubspaceLTI(
         Whether the constants of the experiments do, by more than their uncertainty.
     steady_start_ : bool
         Whether the experiments begin where their first inputs hold the model, as step
-        tests do, and not at rest at `input_offset_`. `predict` begins likewise, where
-        inputs stand still at first and move later. False of batches.
+        tests do, and not at rest at `input_offset_`: told by those whose inputs stand
+        still at first and move later, half of all at least. `predict` begins likewise
+        where they do. False of batches.
     begun_state_ : ndarray of shape (order,) or None
         State in which the experiments begin, their mean, where a mode does not decay
         over them and rest is farther from their outputs than these range: `predict`
