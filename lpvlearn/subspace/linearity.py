@@ -119,11 +119,10 @@ def find_bend(evidence: Evidence) -> Bend | None:
         )
         terms.append(_Terms(*(x[n_lags:] for x in parts)))  # of inputs that are known
     errors = [e[n_lags:] for e in errors]
-    for by_direction in (False, True):
-        bent = [one.lost_in_play if by_direction else one.powers for one in terms]
-        for i in large:
-            if _is_bent(terms, bent, [e[:, i] for e in errors], i, least[i]):
-                return Bend(i, by_direction)
+    for i in large:
+        by_direction = _bend(terms, [e[:, i] for e in errors], i, least[i])
+        if by_direction is not None:
+            return Bend(i, by_direction)
     return None
 
 
@@ -139,34 +138,40 @@ def _play(signals: Array, radius: float) -> Array:
     return follow
 
 
-def _is_bent(
-    terms: Sequence[_Terms],
-    bent: Sequence[Array],
-    errors: Sequence[Array],
-    output: int,
-    least: float,
-) -> bool:
-    """Whether bent signals explain more of the errors of an output than `least`."""
+def _bend(
+    terms: Sequence[_Terms], errors: Sequence[Array], output: int, least: float
+) -> bool | None:
+    """Whether what signals lose in play explains more of an output than `least`.
+
+    False where powers do, None where neither does.
+    """
     n_linear, n_own = terms[0].linear.shape[1], terms[0].own.shape[2]
+    n_powers, n_lost = terms[0].powers.shape[1], terms[0].lost_in_play.shape[1]
     signals = [
-        np.column_stack([one.own[:, output], one.linear, some, e])
-        for one, some, e in zip(terms, bent, errors, strict=True)
+        np.column_stack(
+            [one.own[:, output], one.linear, one.powers, one.lost_in_play, e]
+        )
+        for one, e in zip(terms, errors, strict=True)
     ]
     # What is left of the errors is filtered: what the model lacks is no noise.
     columns = _rows(signals, np.ones(1), n_own)
-    if len(columns) < _ROWS_PER_TERM * columns.shape[1]:
-        return False
+    if len(columns) < _ROWS_PER_TERM * (n_linear + max(n_powers, n_lost) + 1):
+        return None
     noise = without(of_size_one(columns[:, :n_linear]), columns[:, -1:])[0]
     if not noise.std() > least:
-        return False
+        return None
     stops = np.cumsum([len(part) for part in signals])[:-1]
     (a,) = whitening_filters(np.split(noise, stops))
     columns = of_size_one(_rows(signals, a, n_own))
     left, n_known = without(columns[:, :n_linear], columns)
     left, n = left[:, n_linear:], len(columns) - n_own * len(signals) - n_known
-    if not f_test(left[:, :-1], left[:, -1], n).p_value < BEYOND_CHANCE:
-        return False
-    return bool(_explained_elsewhere(left) * noise.var() > least**2)
+    for by_direction, bent in enumerate((left[:, :n_powers], left[:, n_powers:-1])):
+        if not f_test(bent, left[:, -1], n).p_value < BEYOND_CHANCE:
+            continue
+        explained = _explained_elsewhere(np.column_stack([bent, left[:, -1]]))
+        if explained * noise.var() > least**2:
+            return bool(by_direction)
+    return None
 
 
 def _rows(signals: Sequence[Array], a: Array, n_own: int) -> Array:

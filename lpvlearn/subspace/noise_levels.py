@@ -95,14 +95,14 @@ def _noise_sizes(fitted: LocalFit) -> Array | None:
 def _residual_of_given(fitted: LocalFit, other: LocalFit) -> float | None:
     """Error of the `other` model in the samples of a fit; None if that is refuted."""
     own, new = fitted.evidence, other.evidence
-    if other.method == "pbsid" or own.basis.shape != new.basis.shape:
+    if other.method == "pbsid":
         return None
-    of_inputs = own.input_scale / new.input_scale
+    of_inputs = new.basis.T @ own.basis * own.input_scale / new.input_scale[:, None]
     of_outputs = (new.output_scale / own.output_scale)[:, None]
     model = new.model._replace(
-        B=new.model.B * of_inputs,
+        B=new.model.B @ of_inputs,
         C=of_outputs * new.model.C,
-        D=of_outputs * new.model.D * of_inputs,
+        D=of_outputs * new.model.D @ of_inputs,
         blocks=None,
     )
     free, weight = new.free, own.whitening.weight

@@ -112,8 +112,9 @@ def without_oscillations(
 def without_modes_of_few_lines(samples: Samples, fitted: LocalFit) -> LocalFit:
     """The model, or one whose modes decay where few lines tell the two apart."""
     evidence, order = fitted.evidence, len(fitted.model.A)
+    longest = evidence.longest
     chosen = samples.choices.order is None and fitted.method != "pbsid"
-    if not (chosen and len(_lasting_turns(fitted.model, evidence.longest))):
+    if not (chosen and len(_lasting_turns(fitted.model, longest))):
         return fitted
     unknown = n_parameters(order, (), evidence.free)
     if not _are_of_few_lines(thinned(evidence.records), _PER_PARAMETER * unknown):
@@ -123,7 +124,6 @@ def without_modes_of_few_lines(samples: Samples, fitted: LocalFit) -> LocalFit:
     rows.sort(key=lambda row: (row.order == order, row.criterion))
     for row in [*rows[:_FEWER], *rows[_FEWER:][-1:]]:
         other = samples.aside().having(order=row.order).tried(evidence.free.n_trend)
-        longest = evidence.longest
         if other is None or len(_lasting_turns(other.model, longest, _SETTLED)):
             continue
         if not other.residual**2 - fitted.residual**2 < _LEFT**2:
