@@ -201,19 +201,20 @@ def test_a_model_that_is_not_minimal_has_no_chart():
         LocalChart(matrix_of(model), 2, None, False)
 
 
-def test_a_canonical_form_of_many_states_keeps_digits_that_it_holds():
-    box = stable_model(np.random.default_rng(1), 12, 1, 1)
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_canonical_form_of_many_states_keeps_digits_that_it_holds(seed):
+    """In errors that a unit in the last place of its entries makes."""
+    box = stable_model(np.random.default_rng(seed), 12, 1, 1)
     structure = GrayBoxStructure.observable_canonical(12, 1, 1)
     system = ErrorSystem(structure, target_of(box))
     form = CanonicalForm(structure, None)
-    errors = [
+    found = form.parameters(matrix_of(box))
+    refined = form.refined(matrix_of(box), system.grid)
+    found_error, error = (
         np.abs(system.weighted_error(theta, system.grid)).max()
-        for theta in (
-            form.parameters(matrix_of(box)),
-            form.refined(matrix_of(box), system.grid),
-        )
-    ]
-    assert errors[1] < 0.01 * errors[0]
+        for theta in (found, refined)
+    )
+    assert error < 1e4 * system.rounding(refined) < found_error
 
 
 @pytest.mark.parametrize("kind, digits", [("chain", 1e-13), ("stiff", 1e-10)])
