@@ -32,16 +32,16 @@ _APART, _MOST, _BACK, _SELDOM, _FOLLOWED = 4.0, 0.95, 0.5, 0.1, 0.7
 # others are, of so many at least.
 _FAR, _USUAL, _FAR_OF = 5.0, 0.95, 50
 
-# It is drawn by lines where this share of its second differences, and no more than of
-# lines of so many samples, are zero next to their largest. Inputs that move as often as
-# lines end, but for this factor, may be what draws them.
-_STRAIGHT, _LONGEST_LINE, _ZERO, _AS_OFTEN = 0.4, 100, 1e-9, 1.2
+# It is drawn by lines where this share of its second differences are zero next to their
+# largest; and lines are as long as the usual one, but for the rest of them.
+_STRAIGHT, _LONGEST_LINE, _ZERO = 0.4, 100, 1e-9
 
 # It repeats itself in bursts of so many samples, so many of them, that take no more
-# than this share of all; other values come again in no more than this share; and this
-# share of the bursts begins and ends with steps that are those of no rest, of this part
-# of the usual one at least.
-_BURST, _BURSTS, _MOSTLY_NEW, _TWICE, _IN_MOTION, _STEPS = 3, 3, 0.5, 0.01, 0.7, 0.05
+# than this share of all; other values come again in no more than this share. This share
+# of the bursts begins with steps that are those of no rest, of this part of the usual
+# one at least; and half of them end with steps of this part, as after play they do not.
+_BURST, _BURSTS, _MOSTLY_NEW, _TWICE, _IN_MOTION = 3, 3, 0.5, 0.01, 0.7
+_BEFORE, _AFTER = 0.05, 0.75
 
 # It is wrapped where it steps by this share of its range, so many times, no other step
 # is larger than this one, and that of its samples are neither near the top nor bottom.
@@ -162,14 +162,13 @@ def drops_out(
     return DroppedOut(value, runs) if few and n > 1 else None
 
 
-def line_length(signals: Sequence[Array], inputs: Sequence[Array]) -> int:
+def line_length(signals: Sequence[Array]) -> int:
     """Samples for which a signal runs along straight lines: 1 if it does not.
 
-    Of signals (n_samples,) by experiment. Nor where `inputs` (n_samples, n_inputs) move
-    as often as lines end: behind them an integrator has lines.
+    Of signals (n_samples,) by experiment.
 
-    >>> u = np.random.default_rng(0).standard_normal((121, 1))
-    >>> line_length([np.interp(np.arange(121), np.arange(0, 121, 4), u[::4, 0])], [u])
+    >>> y = np.random.default_rng(0).standard_normal(31)
+    >>> line_length([np.interp(np.arange(121), np.arange(0, 121, 4), y)])
     4
     """
     bends = [np.abs(np.diff(y, 2)) for y in signals]
@@ -180,16 +179,12 @@ def line_length(signals: Sequence[Array], inputs: Sequence[Array]) -> int:
         np.count_nonzero(moves & (b <= _ZERO * largest))
         for moves, b in zip(runs, bends, strict=True)
     )
-    gaps = np.concatenate([np.diff(at) for at in corners]) if corners else np.zeros(0)
+    gaps = np.concatenate([np.diff(at) for at in corners])
     if len(gaps) < _ENOUGH_CHANGES or n_straight < _STRAIGHT * sum(map(len, bends)):
         return 1
     length = int(np.median(gaps))
-    if not 1 < length <= _LONGEST_LINE or np.mean(gaps % length == 0) < _HELD:
-        return 1
-    moved = sum(np.any(np.diff(u, axis=0) != 0.0, axis=1).sum() for u in inputs)
-    n_lines = sum(map(len, corners))
-    as_often = n_lines <= _AS_OFTEN * moved and moved <= _AS_OFTEN * n_lines
-    return 1 if as_often else length
+    alike = 1 < length <= _LONGEST_LINE and np.mean(gaps % length == 0) >= _HELD
+    return length if alike else 1
 
 
 def repeated_in_bursts(signals: Sequence[Array]) -> list[tuple[int, int, int]]:
@@ -203,7 +198,7 @@ def repeated_in_bursts(signals: Sequence[Array]) -> list[tuple[int, int, int]]:
     >>> repeated_in_bursts([y])
     [(0, 41, 44), (0, 91, 94), (0, 201, 204)]
     """
-    found, in_motion, n_new, n_twice = [], 0, 0, 0
+    found, in_motion, caught_up, n_new, n_twice = [], 0, 0, 0, 0
     steps = np.abs(np.concatenate([np.diff(y) for y in signals]))
     usual = np.median(steps[steps > 0.0]) if steps.any() else 0.0
     for e, y in enumerate(signals):
@@ -212,8 +207,8 @@ def repeated_in_bursts(signals: Sequence[Array]) -> list[tuple[int, int, int]]:
         long = (stop - start >= _BURST) & (start > 0) & (stop < len(y))
         found += [(e, a + 1, b) for a, b in zip(start[long], stop[long], strict=True)]
         a, b = start[long], stop[long]
-        step = np.minimum(np.abs(y[a] - y[a - 1]), np.abs(y[b] - y[b - 1]))
-        in_motion += int(np.sum(step > _STEPS * usual))
+        in_motion += int(np.sum(np.abs(y[a] - y[a - 1]) > _BEFORE * usual))
+        caught_up += int(np.sum(np.abs(y[b] - y[b - 1]) > _AFTER * usual))
         n_new += len(start)
         n_twice += len(start) - len(np.unique(y[start]))
     n_repeated = sum(stop - start for _, start, stop in found)
@@ -223,22 +218,32 @@ def repeated_in_bursts(signals: Sequence[Array]) -> list[tuple[int, int, int]]:
     at = {signals[e][start] for e, start, _ in found}
     if min(in_motion, len(at)) < _IN_MOTION * len(found):  # at a limit they are alike
         return []
+    if 2 * caught_up < len(found):
+        return []
     return [(e, int(start), int(stop)) for e, start, stop in found]
 
 
-def wraps(signals: Sequence[Array]) -> int:
+def wraps(signals: Sequence[Array], inputs: Sequence[Array]) -> int:
     """Times that signals (n_samples,) turn back by a revolution, as angles do.
 
-    >>> wraps([np.mod(np.linspace(0.0, 50.0, 400), 2.0 * np.pi)])
-    7
+    Not where an input (n_samples, n_inputs) jumps, at most two samples before.
+
+    >>> angle = np.mod(np.linspace(0.0, 50.0, 400), 2.0 * np.pi)
+    >>> wraps([angle], [np.ones((400, 1))]), wraps([angle], [angle[:, None]])
+    (7, 0)
     """
-    steps = np.abs(np.concatenate([np.diff(y) for y in signals]))
-    y = np.concatenate(signals)
-    low, width = y.min(), np.ptp(y)
-    far = steps > _REVOLUTION * width
-    if not width > 0.0 or np.count_nonzero(far) < _REVOLUTIONS:
-        return 0
-    place = (y - low) / width
-    between = np.mean((place > 0.2) & (place < 0.8))
-    smooth = steps[~far].max(initial=0.0) < _OTHER_STEPS * width
-    return int(np.count_nonzero(far)) if smooth and between > _BETWEEN else 0
+    y, u = np.concatenate(signals), np.vstack(inputs)
+    low, width, widths = y.min(), np.ptp(y), np.ptp(u, axis=0)
+    n_turns, largest = 0, 0.0
+    for signal, moved in zip(signals, inputs, strict=True):
+        steps = np.abs(np.diff(signal))
+        far = steps > _REVOLUTION * width
+        largest = max(largest, steps[~far].max(initial=0.0))
+        jumps = (np.abs(np.diff(moved, axis=0)) > _OTHER_STEPS * widths).any(axis=1)
+        for lag in range(3):  # which a plant may take
+            far[lag:] &= ~jumps[: max(len(jumps) - lag, 0)]
+        n_turns += int(far.sum())
+    place = (y - low) / (width or 1.0)
+    between = np.mean((place > 0.2) & (place < 0.8)) > _BETWEEN
+    found = n_turns >= _REVOLUTIONS and largest < _OTHER_STEPS * width and between
+    return n_turns if found else 0

@@ -25,7 +25,7 @@ from .fit_warnings import (
     tell_of_still_outputs,
 )
 from .local_fit import LocalFit
-from .noise_levels import by_own_noise
+from .noise_levels import as_given, by_own_noise
 from .one_fit import Samples, TooFewSamples
 from .oscillations import without_modes_of_few_lines, without_oscillations
 from .rivals import (
@@ -61,7 +61,6 @@ def fit_samples(
     outputs = [y for _, y in pairs]
     tell_of_still_outputs(outputs, telling)
     tell_of_dropouts(pairs, telling)
-    tell_of_logging(pairs, telling)
     pairs, u_mean, y_mean = remove_trends(pairs, detrend)
     samples = samples._replace(pairs=pairs)
     fitted = with_trends(samples, like)
@@ -69,6 +68,7 @@ def fit_samples(
     fitted = of_drifting_noise(samples, fitted) or fitted
     samples, fitted, turns = without_oscillations(samples, fitted)
     fitted = without_modes_of_few_lines(samples, fitted)
+    tell_of_logging(pairs, fitted, telling)
     if fitted.selection.order:
         tell_of_held_outputs(outputs, telling)
         tell_of_limits(outputs, fitted, telling)
@@ -81,8 +81,9 @@ def fit_samples(
     if rest is not None:
         samples, fitted, first = rest
         choices = samples.choices
+    sizes, constants_differ = None, fitted.offsets.differ
     if like is None:
-        samples, fitted = by_own_noise(samples, fitted)
+        samples, fitted, sizes = by_own_noise(samples, fitted)
     doubt = None
     foreseen = fitted.feedback is not None and fitted.feedback.foreseen
     if fitted.method == "pbsid" and (choices.method == "auto" or choices.order is None):
@@ -105,6 +106,8 @@ def fit_samples(
         tell_of_answers(feedback, telling)
     if len(turns) and fitted.method != "pbsid":
         fitted = fitted._replace(evidence=replace(fitted.evidence, turns=turns))
+    if sizes is not None:
+        fitted = as_given(fitted, sizes, constants_differ)
     if rest is not None:
         fitted = moved_back(fitted, first, differ)
     if detrend is not None:

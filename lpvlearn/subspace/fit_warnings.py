@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 TESTS = {"held out", "orders", "static gain", "response", "decay", "bent", "lack"}
 
 # What was told of that bends a response as well
-_BENDS = {"bent", "limit", "held", "dropouts", "input spikes", "lines", "bursts"}
+_BENDS = {"bent", "limit", "held", "dropouts", "input spikes", "lines"}
 
 # An output is at a limit where it stays and its model moves on
 _MOVES_ON = 0.05  # of the motion of the model, at least
@@ -71,6 +71,8 @@ _INSIDE = 1e-9
 
 # Poles this close to one may be those of integrators.
 _ABOUT_ONE = 0.02
+
+_EXPLAINED = 1e-4  # error, relative to the outputs, that rounded numbers leave
 
 # A stream fits much worse than its first samples where its error exceeds both
 _MUCH_WORSE = 5.0  # times theirs
@@ -132,12 +134,17 @@ def tell_of_dropouts(pairs: Pairs, telling: Telling) -> None:
             )
 
 
-def tell_of_logging(pairs: Pairs, telling: Telling) -> None:
-    """Tell of outputs that a logger has filled in, or turned back."""
+def tell_of_logging(pairs: Pairs, fitted: LocalFit, telling: Telling) -> None:
+    """Tell of outputs that a logger has filled in, or turned back.
+
+    None that a linear model explains but for rounding.
+    """
+    if fitted.residual < _EXPLAINED:
+        return
     inputs, outputs = zip(*pairs, strict=True)
     for k in range(outputs[0].shape[1]):
         signals = [y[:, k] for y in outputs]
-        length = line_length(signals, inputs) if "lines" not in telling else 1
+        length = line_length(signals) if "lines" not in telling else 1
         if length > 1:
             telling.once(
                 "lines",
@@ -159,7 +166,7 @@ def tell_of_logging(pairs: Pairs, telling: Telling) -> None:
                 f"{where}, counted from 0. What logs it had nothing new: put NaN in "
                 "place of the repeated samples and use missing='estimate'.",
             )
-        n_turns = wraps(signals) if "wraps" not in telling else 0
+        n_turns = wraps(signals, inputs) if "wraps" not in telling else 0
         if n_turns:
             telling.once(
                 "wraps",

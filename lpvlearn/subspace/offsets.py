@@ -53,16 +53,6 @@ class Offsets(NamedTuple):
         inputs, outputs = self.inputs + inputs, self.outputs + outputs
         return self._replace(inputs=inputs, outputs=outputs)
 
-    def multiplied(self, sizes: Array) -> Offsets:
-        """Of experiments before these were divided by the sizes."""
-        size = sizes[:, None]
-        return self._replace(
-            inputs=size * self.inputs,
-            outputs=size * self.outputs,
-            drifts=size * self.drifts,
-            constants=size * self.constants,
-        )
-
     def begun(self) -> Offsets:
         """With the outputs where the drifts of the experiments begin."""
         gone = self.drifts * (self.n_samples - 1)[:, None] / 2.0

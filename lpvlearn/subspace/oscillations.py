@@ -33,9 +33,8 @@ from .trends import with_trends
 
 Array = NDArray[np.float64]
 
-# And of one that clearly does not.
-_SETTLED = 10.0
 _DECAYS = 1.0  # time constants per record of a mode that stands for one
+_SETTLED = 10.0  # of one that clearly does not
 
 # Radians that it turns in a record, at least: less is a drift. And by which it is off a
 # half turn with every sample, whose cosine and sine are the same.
@@ -55,7 +54,7 @@ _SHARP = 0.03  # decay per sample of modes of an autoregression that may stand f
 # Independent values of the inputs for each parameter, below which these are of few
 # lines; lower orders tried for a model whose modes decay, before the same one; and the
 # part of the outputs, root mean square, that it may leave beyond the likeliest.
-_PER_PARAMETER, _FEWER, _LEFT = 2, 3, 0.1
+_PER_PARAMETER, _FEWER, _LEFT = 1, 3, 0.1
 
 _INDEPENDENT = 1e-6  # singular values of windows of inputs, next to the largest
 

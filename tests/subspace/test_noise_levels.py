@@ -32,6 +32,17 @@ def _error(model):
     return np.linalg.norm(model.lti_.simulate(u) - exact) / np.linalg.norm(exact)
 
 
+def test_collinear_inputs_and_a_short_experiment_are_no_obstacle():
+    X, y = _tables(1, [0.05, 2.0, 0.05], [1, 1, 1])
+    X, y = X[:1230].assign(v=-2.0 * X["u"]), y[:1230]
+    with pytest.warns(UserWarning, match="collinear"):
+        model = SubspaceLTI(3, method="po-moesp", experiment="run").fit(X, y)
+    u = np.repeat(np.random.default_rng(9).choice([-1.0, 1.0], 200), 4)[:, None]
+    exact = SYSTEM.simulate(u)
+    error = model.lti_.simulate(np.hstack([u, -2.0 * u])) - exact
+    assert np.linalg.norm(error) < 5e-3 * np.linalg.norm(exact)
+
+
 @pytest.mark.parametrize("noises, sizes", [([0.05, 2.0], [1, 1]), ([0.1, 2], [1, 20])])
 def test_a_noisy_experiment_spoils_nothing(noises, sizes):
     """A scaled experiment is one of a linear system as well: the model is the same."""
@@ -50,6 +61,12 @@ def test_a_noisy_experiment_spoils_nothing(noises, sizes):
     offset = np.diff(by_hand.output_offset_[:, 0] * noises)
     assert_allclose(model.poles_std_, by_hand.poles_std_, rtol=0.1)
     assert_allclose(np.diff(model.output_offset_[:, 0]), offset, atol=0.5)
+    for run, noise in enumerate(noises):  # the states are those of the samples
+        rows = (X["run"] == run).to_numpy()
+        moved = X["u"].to_numpy()[rows, None] - model.input_offset_[run]
+        begun = model.lti_.simulate(moved, initial_state=model.initial_states_[run])
+        left = y.to_numpy()[rows] - begun - model.output_offset_[run]
+        assert np.sqrt(np.mean(left**2)) < 1.2 * noise
 
 
 def test_errors_of_a_bend_are_no_noise():
