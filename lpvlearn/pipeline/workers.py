@@ -62,7 +62,11 @@ def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
     backend, _ = get_active_backend()
     as_they_come = "generator" if backend.supports_return_generator else "list"
     parallel = Parallel(n_jobs=n_jobs, return_as=as_they_come)
-    return _guarded(iter(parallel(_watched(tasks))), parallel)
+    try:
+        results = iter(parallel(_watched(tasks)))
+    except BrokenProcessPool as error:  # by a first task, while others were sent
+        raise _as_told(error) from error
+    return _guarded(results, parallel)
 
 
 def _watched(tasks: Iterable[Task]) -> Iterator[Task]:
@@ -105,6 +109,15 @@ def _ready() -> None:
     import_module("scipy.signal")
 
 
+def _as_told(error: BrokenProcessPool) -> RuntimeError:
+    """What is said of a pool that broke."""
+    cause = error.__cause__  # the traceback of a worker that lives, its last line
+    if "task has failed to un-serialize" not in str(error) or cause is None:
+        return RuntimeError(_KILLED)
+    last = str(cause).strip(' \n"').splitlines()[-1]
+    return RuntimeError(_UNREADABLE.format(cause=last))
+
+
 def _guarded(results: Iterator[Any], parallel: Parallel) -> Iterator[Any]:
     done = threading.Event()
     for watch, of in ((_watch_workers, ()), (_watch_tasks, (parallel,))):
@@ -112,11 +125,7 @@ def _guarded(results: Iterator[Any], parallel: Parallel) -> Iterator[Any]:
     try:
         yield from results
     except BrokenProcessPool as error:
-        cause = error.__cause__  # the traceback of a worker that lives, its last line
-        if "task has failed to un-serialize" not in str(error) or cause is None:
-            raise RuntimeError(_KILLED) from error
-        last = str(cause).strip(' \n"').splitlines()[-1]
-        raise RuntimeError(_UNREADABLE.format(cause=last)) from error
+        raise _as_told(error) from error
     except MemoryError as error:
         raise MemoryError(
             f"The work takes more memory than there is ({error}). Take fewer `n_jobs`, "

@@ -28,6 +28,7 @@ from .trends import with_trends
 Array = NDArray[np.float64]
 
 _UNEQUAL = 2.0  # times the noise of another experiment
+
 # Times that the noise is estimated, of errors that the last model has freed of what a
 # noisy experiment did to it; until it differs between experiments by less than that.
 _ROUNDS, _SAME = 4, 1.1
@@ -128,7 +129,7 @@ def _residual_of_given(
     if other.method == "pbsid":
         return None
     inputs = np.vstack([u for u, _ in samples.pairs])
-    to_new = np.linalg.lstsq(inputs @ own.basis, inputs @ new.basis)[0]
+    to_new = np.linalg.lstsq(inputs @ own.basis, inputs @ new.basis, rcond=None)[0]
     of_inputs = (own.input_scale[:, None] * to_new / new.input_scale).T
     of_outputs = (new.output_scale / own.output_scale)[:, None]
     model = new.model._replace(
