@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from numbers import Integral
@@ -62,10 +63,8 @@ def results_of(tasks: Iterable[Task], n_jobs: int | None) -> Iterator[Any]:
     backend, _ = get_active_backend()
     as_they_come = "generator" if backend.supports_return_generator else "list"
     parallel = Parallel(n_jobs=n_jobs, return_as=as_they_come)
-    try:
+    with _broken_pools_told():  # by a first task, while others are sent
         results = iter(parallel(_watched(tasks)))
-    except BrokenProcessPool as error:  # by a first task, while others were sent
-        raise _as_told(error) from error
     return _guarded(results, parallel)
 
 
@@ -109,13 +108,17 @@ def _ready() -> None:
     import_module("scipy.signal")
 
 
-def _as_told(error: BrokenProcessPool) -> RuntimeError:
-    """What is said of a pool that broke."""
-    cause = error.__cause__  # the traceback of a worker that lives, its last line
-    if "task has failed to un-serialize" not in str(error) or cause is None:
-        return RuntimeError(_KILLED)
-    last = str(cause).strip(' \n"').splitlines()[-1]
-    return RuntimeError(_UNREADABLE.format(cause=last))
+@contextmanager
+def _broken_pools_told() -> Iterator[None]:
+    """Say why a pool is broken, and what to do about it."""
+    try:
+        yield
+    except BrokenProcessPool as error:
+        cause = error.__cause__  # the traceback of a worker that lives, its last line
+        if "task has failed to un-serialize" not in str(error) or cause is None:
+            raise RuntimeError(_KILLED) from error
+        last = str(cause).strip(' \n"').splitlines()[-1]
+        raise RuntimeError(_UNREADABLE.format(cause=last)) from error
 
 
 def _guarded(results: Iterator[Any], parallel: Parallel) -> Iterator[Any]:
@@ -123,9 +126,8 @@ def _guarded(results: Iterator[Any], parallel: Parallel) -> Iterator[Any]:
     for watch, of in ((_watch_workers, ()), (_watch_tasks, (parallel,))):
         threading.Thread(target=watch, args=(done, *of), daemon=True).start()
     try:
-        yield from results
-    except BrokenProcessPool as error:
-        raise _as_told(error) from error
+        with _broken_pools_told():
+            yield from results
     except MemoryError as error:
         raise MemoryError(
             f"The work takes more memory than there is ({error}). Take fewer `n_jobs`, "
