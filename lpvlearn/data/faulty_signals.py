@@ -81,6 +81,11 @@ def held_for(signals: Sequence[Array]) -> int:
     return next(k for k in range(longest, 0, -1) if np.mean(gaps % k == 0) >= _HELD)
 
 
+def _edges(signal: Array) -> NDArray[np.intp]:
+    """Where its runs of equal values begin, and the end."""
+    return np.concatenate([[0], np.flatnonzero(np.diff(signal)) + 1, [len(signal)]])
+
+
 def stays_put(signals: Sequence[Array]) -> list[list[tuple[int, int]]]:
     """Where a signal stays at its largest or smallest value, as at a limit.
 
@@ -92,9 +97,7 @@ def stays_put(signals: Sequence[Array]) -> list[list[tuple[int, int]]]:
     >>> stays_put([np.clip(np.sin(t), -1.0, 0.8)])
     [[(10, 23), (72, 85), (135, 148)]]
     """
-    edges = [
-        np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [len(y)]]) for y in signals
-    ]
+    edges = [_edges(y) for y in signals]
     value = np.concatenate([y[k[:-1]] for y, k in zip(signals, edges, strict=True)])
     length = np.concatenate([np.diff(k) for k in edges])
     low, high = value.min(), value.max()
@@ -141,7 +144,7 @@ def drops_out(
     least = _APART * np.quantile(steps, _MOST)
     found: dict[float, list[tuple[int, int, int]]] = {}
     for e, y in enumerate(signals):
-        k = np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [len(y)]])
+        k = _edges(y)
         start, stop = k[1:-2], k[2:-1]  # but for the first run and the last
         value, before, after = y[start], y[start - 1], y[stop]
         jump = np.minimum(np.abs(value - before), np.abs(value - after))
@@ -152,14 +155,14 @@ def drops_out(
             found.setdefault(v, []).append((e, *run))
     if not found:
         return None
-    value, runs = max(found.items(), key=lambda item: len(item[1]))
+    common, runs = max(found.items(), key=lambda item: len(item[1]))
     n = sum(stop - start for _, start, stop in runs)
     few = n < _SELDOM * sum(map(len, signals))
     if inputs is not None:
         moves = [np.any(np.diff(u, axis=0, prepend=u[:1]) != 0, axis=1) for u in inputs]
         followed = np.mean([moves[e][start] for e, start, _ in runs])
         few &= not followed > _FOLLOWED or np.mean(np.concatenate(moves)) > followed / 2
-    return DroppedOut(value, runs) if few and n > 1 else None
+    return DroppedOut(common, runs) if few and n > 1 else None
 
 
 def line_length(signals: Sequence[Array]) -> int:
@@ -198,15 +201,16 @@ def repeated_in_bursts(signals: Sequence[Array]) -> list[tuple[int, int, int]]:
     >>> repeated_in_bursts([y])
     [(0, 41, 44), (0, 91, 94), (0, 201, 204)]
     """
-    found, in_motion, caught_up, n_new, n_twice = [], 0, 0, 0, 0
+    found: list[tuple[int, int, int]] = []
+    in_motion = caught_up = n_new = n_twice = 0
     steps = np.abs(np.concatenate([np.diff(y) for y in signals]))
     usual = np.median(steps[steps > 0.0]) if steps.any() else 0.0
     for e, y in enumerate(signals):
-        k = np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [len(y)]])
+        k = _edges(y)
         start, stop = k[:-1], k[1:]
         long = (stop - start >= _BURST) & (start > 0) & (stop < len(y))
-        found += [(e, a + 1, b) for a, b in zip(start[long], stop[long], strict=True)]
         a, b = start[long], stop[long]
+        found += [(e, *run) for run in zip((a + 1).tolist(), b.tolist(), strict=True)]
         in_motion += int(np.sum(np.abs(y[a] - y[a - 1]) > _BEFORE * usual))
         caught_up += int(np.sum(np.abs(y[b] - y[b - 1]) > _AFTER * usual))
         n_new += len(start)
@@ -218,9 +222,7 @@ def repeated_in_bursts(signals: Sequence[Array]) -> list[tuple[int, int, int]]:
     at = {signals[e][start] for e, start, _ in found}
     if min(in_motion, len(at)) < _IN_MOTION * len(found):  # at a limit they are alike
         return []
-    if 2 * caught_up < len(found):
-        return []
-    return [(e, int(start), int(stop)) for e, start, stop in found]
+    return found if 2 * caught_up >= len(found) else []
 
 
 def wraps(signals: Sequence[Array], inputs: Sequence[Array]) -> int:

@@ -92,11 +92,7 @@ def of_levels(other: Evidence, scaled: ScaledRecords, n_trend: int) -> Evidence:
     free = other.free._replace(n_trend=n_trend)
     weight = other.whitening.weight / of_outputs
     weight = weight / np.linalg.det(weight) ** (1.0 / len(weight))
-    model = other.model._replace(
-        B=other.model.B * of_inputs,
-        C=of_outputs[:, None] * other.model.C,
-        D=of_outputs[:, None] * other.model.D * of_inputs,
-    )
+    model = other.model.of_channels(np.diag(of_inputs), of_outputs)
     return replace(
         other,
         model=with_initial_states(model, records, free, weight),

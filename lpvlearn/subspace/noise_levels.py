@@ -131,21 +131,15 @@ def _residual_of_given(
     inputs = np.vstack([u for u, _ in samples.pairs])
     to_new = np.linalg.lstsq(inputs @ own.basis, inputs @ new.basis, rcond=None)[0]
     of_inputs = (own.input_scale[:, None] * to_new / new.input_scale).T
-    of_outputs = (new.output_scale / own.output_scale)[:, None]
-    model = new.model._replace(
-        B=new.model.B @ of_inputs,
-        C=of_outputs * new.model.C,
-        D=of_outputs * new.model.D @ of_inputs,
-        blocks=None,
-    )
+    model = new.model.of_channels(of_inputs, new.output_scale / own.output_scale)
     free, weight = new.free, own.whitening.weight
     records = [
         record._replace(trend=trend_signals(record.n_samples, free.n_trend))
         for record in own.records
     ]
     model = with_initial_states(model, records, free, weight)
-    worse = criterion_of(model, records, free, ())
-    worse -= criterion_of(own.model, own.records, own.free, ())
+    worse = criterion_of(model, records, free)
+    worse -= criterion_of(own.model, own.records, own.free)
     unknown = max(n_parameters(len(e.model.A), (), e.free) for e in (own, new))
     if not worse < CERTAIN + _BY_CHANCE * unknown:
         return None

@@ -93,6 +93,17 @@ class Realization(NamedTuple):
     blocks: tuple[Array, ...] | None = None  # of A, where it is in section form
     trends: Array = np.zeros((0, 0, 0))  # (n_experiments, n_trend, n_outputs)
 
+    def of_channels(self, inputs: Array, outputs: Array) -> Realization:
+        """The dynamics in other channels: inputs ``inputs @ u``, outputs times these.
+
+        Initial states, trends and the loss stay those of the records as they were.
+        """
+        return self._replace(
+            B=self.B @ inputs,
+            C=outputs[:, None] * self.C,
+            D=outputs[:, None] * self.D @ inputs,
+        )
+
     def outputs(self, record: Record, experiment: int) -> Array:
         """Simulated outputs (n_samples, n_outputs) of a record, its trends included."""
         x0 = self.initial_states[experiment]
