@@ -1,7 +1,8 @@
 """Minimisation of the H-infinity norm of the error over the parameters, Eq. (14)-(16).
 
-From the least-squares fit along the central path, and to the end by one of the minimax
-solvers; what a constant peak leaves free is chosen by the remaining error.
+From the least-squares fit along the central path (none where the fit is near), and to
+the end by one of the minimax solvers; what a constant peak leaves free is chosen by the
+remaining error.
 """
 
 from __future__ import annotations
@@ -51,6 +52,9 @@ _ROUNDS = ((1e-4, 8), (1e-5, 12), (1e-6, 15), (1e-8, 60))
 _MANY, _MANY_ROUNDS = 100, ((3e-8, 10), (1e-9, 60))
 _NO_DIGIT = 1e-6  # relative decrease promised of the norm, of many parameters
 _CLOSELY, _ROUGHLY = 0.1, 1.0  # what a stage of the path may leave; of many parameters
+# Near the black box the solver needs no path: its iterations from a fit that is alone
+# promising, of at most that relative error. Where it converges, its end is the path's.
+_AT_ONCE, _NEAR = 8, 0.03
 _BUNDLE_PACE = 10  # as many iterations of a first-order method
 _PATH_SHARE = 0.6  # of the steps that are left, for the path of a round
 _PROGRESS = 1e-9  # a round that converged and brings less is the last one
@@ -269,14 +273,27 @@ def _from_least_squares(
     max_iter: int,
     options: dict[str, Any],
 ) -> tuple[Array, MinimaxResult, float]:
-    """Rounds of the central path and a solver; parameters, result and floor."""
+    """Rounds of the central path and a solver; parameters, result and floor.
+
+    The solver alone where it ends at once.
+    """
     form = CanonicalForm.of(system, fits[0].x)
     starts = [View.of(system, fit.x, limits, form) for fit in promising(fits)]
-    path, used = _best_path(starts, max_iter)
-    history, floor = list(path.history), 0.0
+    many = len(fits[0].x) >= _MANY
+    near = len(starts) == 1 and fits[0].relative_error <= _NEAR and not many
+    used, history = 0, []
+    if near and solver is minimax_sqp:
+        most = min(_AT_ONCE, max_iter)
+        end, result, floor = _ended(starts[0], solver, max_iter=most, **options)
+        used, history = result.n_iter, result.history
+        if result.converged and result.stationarity <= _STATIONARY:
+            there = _ended(end, solver, max_iter=0, **options)[1]  # in its own metric
+            there = replace(there, n_iter=used, history=history, converged=True)
+            return end.theta, there, floor
+    path, steps = _best_path(starts, max_iter - used)
+    used, history, floor = used + steps, history + list(path.history), 0.0
     pace = 1 if solver is minimax_sqp else _BUNDLE_PACE
     best: tuple[View, MinimaxResult] | None = None
-    many = len(fits[0].x) >= _MANY
     rounds, proof = (_MANY_ROUNDS, NEARLY) if many else (_ROUNDS, _STATIONARY)
     for mu_end, solver_iter in rounds:
         steps = int(_PATH_SHARE * (max_iter - used))
