@@ -56,8 +56,8 @@ class AutoLPV(Interpolator):
     A sample is an operating point: `X` holds its scheduling values, `y` the parameters
     of its local model. Polynomials and rational functions compete where the covariances
     of the parameters are known; of those whose errors can be chance, and whose
-    criterion is within 10 of the lowest, a polynomial of degree 2 at most, and then the
-    one with fewest coefficients, is taken.
+    criterion is within 10 of the lowest, a polynomial of degree 2 at most (in each of
+    several variables: 1), and then the one with fewest coefficients, is taken.
     Where none is left, or the covariances are not known, the interpolation follows the
     points (`SplineLPV`): it keeps their shape, unless a cubic spline, or a curve over
     the logarithms of the scheduling variables, meets points that are left out, three at
@@ -87,9 +87,10 @@ class AutoLPV(Interpolator):
 
     Notes
     -----
-    A rational form, or a polynomial of a degree above 2, with more than half as many
-    coefficients as there are values must foresee points that are left out, within the
-    range of the others, as well as interpolation does; a rational form better.
+    A rational form, or a polynomial of a higher degree than these, with more than half
+    as many coefficients as there are values must foresee points that are left out,
+    within the range of the others, as well as interpolation does; a rational form
+    better.
 
     If a form is true, its chi-square is about its degrees of freedom. A form whose
     chi-square is more than four times that (and no chance, for few degrees of freedom)
@@ -153,10 +154,7 @@ class AutoLPV(Interpolator):
         if good.any():
             supported = np.flatnonzero(good & (cost <= cost[good].min() + _SUPPORT))
             # few points tell a parabola from a pole poorly: then it is the parabola
-            bent = [
-                form.degree > _SATURATED or getattr(form, "denominator", 0) > 0
-                for _, form in found
-            ]
+            bent = [not _is_parabola(form) for _, form in found]
             chosen = int(min(supported, key=lambda k: (bent[k], -dof[k], cost[k])))
             free = bent[chosen] and n - dof[chosen] > _FREE * n
             proven = not free
@@ -206,6 +204,16 @@ class AutoLPV(Interpolator):
     def _check_options(self) -> None:
         super()._check_options()
         one_of("criterion", self.criterion, _CRITERIA)
+
+
+def _is_parabola(form: PolynomialLPV | RationalLPV) -> bool:
+    """Whether a form has no pole, and no terms of a higher degree than a parabola.
+
+    As a tensor of degree 2 has in several variables, and swings by them.
+    """
+    if isinstance(form, PolynomialLPV):
+        return form.degree <= _SATURATED
+    return form.denominator == 0 and form.degree < _TENSOR
 
 
 def _foresees(

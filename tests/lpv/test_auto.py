@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 
 from lpvlearn import AutoLPV, PolynomialLPV, SplineLPV
 
@@ -228,3 +229,22 @@ def test_a_rational_form_that_is_a_cubic_without_a_point_is_not_told_by_that():
         P = np.tile(1e-10 * np.eye(3), (5, 1, 1))
         model = AutoLPV().fit(kappa, values, covariance=P)
         assert model.form_ == "cubic"
+
+
+@pytest.mark.parametrize("seed", [0, 22, 24, 38])
+def test_squares_of_several_variables_must_foresee_scattered_points(seed):
+    """Products of squares, nine for twelve points: they swing between these."""
+    rng = np.random.default_rng(seed)
+
+    def truth(kappa):
+        p, q = 0.2 + kappa[:, 0], kappa[:, 1]
+        return np.column_stack([1 / p, (1 + 0.3 * q) / np.sqrt(p), 1 + q + 0.2 * p])
+
+    kappa, fine = rng.uniform(0.0, 1.0, (12, 2)), rng.uniform(0.0, 1.0, (600, 2))
+    fine = fine[Delaunay(kappa).find_simplex(fine) >= 0]
+    clean, spread = truth(kappa), np.ptp(truth(fine), axis=0)
+    theta = clean + 0.01 * spread * rng.standard_normal(clean.shape)
+    P = np.tile(np.diag((0.01 * spread) ** 2), (12, 1, 1))
+    model = AutoLPV().fit(kappa, theta, covariance=P)
+    error = (model.predict(fine) - truth(fine)) / spread
+    assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.04
