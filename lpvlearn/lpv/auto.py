@@ -282,7 +282,7 @@ def _errors_left_out(
 def _forms(kappa: Array) -> Iterator[tuple[str, PolynomialLPV | RationalLPV]]:
     """Name and form of all whose numerators the points determine."""
     places = np.unique(kappa, axis=0)
-    n, n_variables = places.shape
+    n, n_variables = len(places), max(int(np.count_nonzero(np.ptp(places, axis=0))), 1)
     for kind in ("total", "tensor")[:n_variables]:
         tensor = kind == "tensor"
         prefix = "tensor " if tensor else ""

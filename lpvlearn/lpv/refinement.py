@@ -364,10 +364,12 @@ def refine_with_rates(
     Every second piece of the records tells of terms that were fitted to the others:
     how strongly these are to be drawn to zero, and whether they lower the errors at
     all. A single experiment (`groups` of the records) cannot tell that: what it says
-    of one direction need not be true of the other.
+    of one direction need not be true of the other. Rate terms change A, and a model
+    without states has none.
     """
     alone = rate == "auto" and len(set(groups)) < 2
-    if rate is False or alone or start.rate_terms is not None:
+    none = rate is False or alone or start.order == 0
+    if none or start.rate_terms is not None:
         return refine(start, records, own, prior, **options)
     c0, (moving, kinematic) = coefficients_of(start), with_rate_terms(start)
     fixed = np.concatenate([np.zeros(len(c0), bool), kinematic])

@@ -248,3 +248,15 @@ def test_squares_of_several_variables_must_foresee_scattered_points(seed):
     model = AutoLPV().fit(kappa, theta, covariance=P)
     error = (model.predict(fine) - truth(fine)) / spread
     assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.04
+
+
+@pytest.mark.parametrize("n_points", [1, 3, 4, 5])
+def test_a_variable_of_one_value_does_not_count(n_points):
+    kappa = np.linspace(0.0, 2.0, n_points)[:, None]
+    noise = 0.05 * np.random.default_rng(0).standard_normal((n_points, 1))
+    theta, P = 4.0 + 3.0 * kappa**2 + noise, np.full(n_points, 0.0025)
+    one = AutoLPV().fit(kappa, theta, covariance=P)
+    two = AutoLPV().fit(np.insert(kappa, 0, 5.0, axis=1), theta, covariance=P)
+    assert two.form_ == one.form_
+    beside = np.insert(FINE, 0, 5.0, axis=1)
+    np.testing.assert_allclose(two.predict(beside), one.predict(FINE), rtol=1e-9)

@@ -442,3 +442,16 @@ def test_a_delay_that_is_missing_is_told():
     late = y.groupby(X["run"]).shift(4).fillna(0.0)
     with pytest.warns(UserWarning, match="'position' follow from the inputs.*delay"):
         OutputErrorLPV(spring_structure(), **roles).fit(X, late)
+
+
+@pytest.mark.parametrize("rate", ["auto", True])
+def test_a_gain_without_states_has_no_rate_terms(rate):
+    rng = np.random.default_rng(0)
+    X, y = spring_sweep(200, seed=1)
+    X = pd.concat([X.assign(run=run) for run in ("up", "down")], ignore_index=True)
+    gain, force = 2.0 + X["kappa"], rng.standard_normal(len(X))
+    X, y = X.assign(force=force), gain * force + 0.01 * rng.standard_normal(len(X))
+    static = GrayBoxStructure.full(0, 1, 1)
+    model = OutputErrorLPV(static, rate=rate, **ROLES).fit(X, y)
+    assert not model.rate_
+    np.testing.assert_allclose(model.lpv_.parameters(FINE)[:, 0], 2.0 + FINE, atol=0.01)
