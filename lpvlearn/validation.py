@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 _SHOWN = 80  # characters of a value in a message, lest a table fills the screen
+_SHORT = 8  # characters of a number that is shown as it was written
+_OF_WIDTH = 3  # digits of a range that a number of it shows
 
 SQUARED = 1e150  # numbers below it have squares that are numbers
 
@@ -147,6 +150,23 @@ def shown(value: Any) -> str:
     except Exception:  # of a foreign object, or an integer of too many digits
         text = f"a value of type {type(value).__name__}"
     return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+
+
+def number_shown(value: float, width: float = 0.0) -> str:
+    """A number that labels something, as it was written where that is short.
+
+    Of a range of that `width`, to a thousandth of it.
+
+    >>> [number_shown(value) for value in (101310.0, 293.15, 0.1 + 0.2, np.pi / 4)]
+    ['101310', '293.15', '0.3', '0.7854']
+    >>> number_shown(101312.3456, width=30.0)
+    '101312.35'
+    """
+    if width > 0.0:
+        value = round(float(value), _OF_WIDTH - math.floor(math.log10(width)))
+        return f"{value + 0.0:.12g}"
+    text = f"{value:.12g}"
+    return text if len(text) <= _SHORT or text.isdigit() else f"{value:.4g}"
 
 
 def squarable(name: str, array: NDArray[Any]) -> NDArray[Any]:

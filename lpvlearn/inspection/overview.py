@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..metrics.reports import LABEL, as_shown
 from .bode import BodeDisplay
 from .drawing import WIDTH, by_name
 from .fitted import fitted_pipeline, units_for
@@ -78,7 +79,7 @@ def plot_overview(
     maps = points.shape[1] == 2
     n_rows = -(-len(names) // (2 if maps else 4))
     middle = points[len(points) // 2]
-    place = ", ".join(f"{value:.4g}" for value in middle)
+    place = as_shown(tuple(middle), LABEL)
     more = len(pipeline.parameters_.columns) - len(names)
     heads = {
         "Parameters" + (f" (not drawn: {more} more)" if more else ""): max(

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from ..exceptions import ExtrapolationWarning, warn
+from ..validation import number_shown
 
 Array = NDArray[np.float64]
-
-_DIGITS = 3  # of a range that a message shows
 
 # Values this close to the identified range, relative to its width, are in it: a
 # measured mean and a range read from a report differ by rounding.
@@ -52,13 +51,14 @@ def warn_extrapolation(
     excess = np.maximum(low - kappa, kappa - high) / width
     said = []
     for j in np.flatnonzero((excess > 0).any(axis=0)):
-        digits = _DIGITS - int(np.floor(np.log10(width[j])))
-        shown = [f"{round(float(bound[j]), digits) + 0.0:g}" for bound in (low, high)]
         farthest = kappa[np.argmax(excess[:, j]), j]
+        least, most, value = (
+            number_shown(v, width[j]) for v in (low[j], high[j], farthest)
+        )
         said.append(
             f"Scheduling variable {names[int(j)]!r} must be within the identified "
-            f"range, {shown[0]} to {shown[1]}. Got {int((excess[:, j] > 0).sum())} of "
-            f"{len(kappa)} samples outside, the farthest at {farthest:.4g}"
+            f"range, {least} to {most}. Got {int((excess[:, j] > 0).sum())} of "
+            f"{len(kappa)} samples outside, the farthest at {value}"
         )
     if said:
         warn(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..data.experiments import OPTIONAL_ROLES, ROLES, Table, fitted_roles
 from ..data.operating_points import mean_values
 from ..models.statespace import StateSpace
-from ..validation import one_of, squarable
+from ..validation import number_shown, one_of, squarable
 from .scorers import (
     InitialState,
     check_options,
@@ -145,13 +145,14 @@ def _labels(
 
 
 _DIGITS = "{:.4g}"  # of numbers without a format of their own
+LABEL = "{}"  # what tells rows apart
 
 # Heading and format of the columns of the reports, for people.
 _READABLE = {
-    "model": ("model", "{}"),
-    "experiment": ("experiment", "{}"),
-    "operating_point": ("operating point", "{}"),
-    "output": ("output", "{}"),
+    "model": ("model", LABEL),
+    "experiment": ("experiment", LABEL),
+    "operating_point": ("operating point", LABEL),
+    "output": ("output", LABEL),
     "BFT": ("BFT", "{:.2f}"),
     "VAF": ("VAF", "{:.2f}"),
     "RMSE": ("RMSE", "{:.3g}"),
@@ -223,7 +224,7 @@ def readable_report(report: pd.DataFrame) -> pd.DataFrame:
         heading = heading.removeprefix("param_").replace("std_", "std ", 1)
         headings.append(heading)
         columns.append([as_shown(value, style) for value in column])
-    index = pd.Index([as_shown(value) for value in report.index])
+    index = pd.Index([as_shown(value, LABEL) for value in report.index])
     index.name = _READABLE.get(str(report.index.name), (report.index.name,))[0]
     return pd.DataFrame(
         dict(enumerate(columns)), index=index if len(index) else None
@@ -233,11 +234,11 @@ def readable_report(report: pd.DataFrame) -> pd.DataFrame:
 def as_shown(value: Any, style: str = _DIGITS) -> str:
     """A cell of a report as text; nothing for a value that is not known."""
     if isinstance(value, tuple):
-        return ", ".join(as_shown(part) for part in value)
+        return ", ".join(as_shown(part, style) for part in value)
     if isinstance(value, (float, np.floating)):
         if np.isnan(value):
             return ""
-        return (_DIGITS if style == "{}" else style).format(value)
+        return number_shown(float(value)) if style == LABEL else style.format(value)
     return "" if value is None else str(value)
 
 

@@ -30,7 +30,7 @@ from ..inspection.poles import PoleDisplay
 from ..inspection.residuals import ResidualDisplay
 from ..inspection.simulation import SimulationDisplay
 from ..inspection.uncertainty import UncertaintyDisplay
-from ..metrics.reports import as_shown, fit_report, readable_report
+from ..metrics.reports import LABEL, as_shown, fit_report, readable_report
 from ..metrics.scorers import InitialState
 from ..models.statespace import StateSpace
 from ..structures.structure import GrayBoxStructure
@@ -270,7 +270,7 @@ class _Page:
                     )
             # the first operating point, the middle one and the last
             for k in sorted({0, len(points) // 2, len(points) - 1}):
-                place = as_shown(pipeline.report_.index[k])
+                place = as_shown(pipeline.report_.index[k], LABEL)
                 shape = (lpv.n_outputs, lpv.n_inputs)
                 with self._axes(f"Gain at operating point {place}", shape) as axes:
                     BodeDisplay.from_estimator(

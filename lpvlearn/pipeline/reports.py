@@ -14,7 +14,7 @@ from ..exceptions import warn
 from ..lpv.model import LPVStateSpace
 from ..lpv.spline import SplineLPV
 from ..lpv.weighting import noise_explains
-from ..metrics.reports import as_shown, readable_report
+from ..metrics.reports import LABEL, as_shown, readable_report
 from ..metrics.scores import best_fit, parameter_fit
 from ..models.statespace import StateSpace, unknown_responses
 from ..restructuring.estimator import GrayBoxRestructurer
@@ -25,6 +25,7 @@ from ..systems.simulation import (
     state_trajectory,
     trend_signals,
 )
+from ..validation import number_shown
 from .left_out import listed_errors
 from .local_models import LocalModel, motions
 from .structured_models import StructuredModels
@@ -290,7 +291,7 @@ def summarise(
     places = "no scheduling variable"
     if scheduling:
         spans = [
-            f"{name} from {low:.4g} to {high:.4g}"
+            f"{name} from {number_shown(low)} to {number_shown(high)}"
             for name, low, high in zip(
                 scheduling, kappa.min(0), kappa.max(0), strict=True
             )
@@ -403,4 +404,4 @@ def _largest(values: pd.Series) -> int:
 
 
 def _label_of_largest(values: pd.Series) -> str:
-    return as_shown(values.index[_largest(values)])
+    return as_shown(values.index[_largest(values)], LABEL)

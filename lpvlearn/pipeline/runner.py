@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..exceptions import Told, collected, warn
 from ..systems.threads import one_blas_thread
+from ..validation import number_shown
 from .memory import Remembered
 from .workers import results_of
 
@@ -218,4 +219,4 @@ def place_of(number: int, kappa: Array) -> str:
 
 
 def label_of(kappa: Array) -> str:
-    return ", ".join(f"{value:.4g}" for value in kappa)
+    return ", ".join(map(number_shown, kappa))

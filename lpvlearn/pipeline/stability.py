@@ -10,6 +10,7 @@ from ..exceptions import warn
 from ..lpv.interpolator import Interpolator, grid_over
 from ..lpv.model import LPVStateSpace
 from ..structures.structure import GrayBoxStructure
+from ..validation import number_shown
 
 Array = NDArray[np.float64]
 
@@ -58,10 +59,14 @@ def growth_rates(
         rates[last] = max(rates[last], found[half - 1 :].max())
     if unstable:
         names = lpv.scheduling_names or range(1, lpv.n_scheduling + 1)
-        spans = zip(np.min(unstable, 0), np.max(unstable, 0), where, names, strict=True)
+        low, high = np.min(unstable, 0), np.max(unstable, 0)
+        widths = np.ptp(lpv.scheduling_range, axis=0)
+        spans = zip(low, high, where, names, widths, strict=True)
         places = ", ".join(
-            f"{name!r} from {low:.4g} to {high:.4g} (worst at {place:.4g})"
-            for low, high, place, name in spans
+            "{!r} from {} to {} (worst at {})".format(
+                name, *(number_shown(value, width) for value in span)
+            )
+            for *span, name, width in spans
         )
         warn(
             f"`lpv_` is unstable at values within its range, of {places}: a pole has "

@@ -285,3 +285,11 @@ def test_a_simulation_that_is_not_finite_is_no_missing_sample(data):
     )
     with pytest.raises(ValueError, match="`y_pred` must be finite. Got nan at row 0"):
         fit_report(broken, X, y)
+
+
+@pytest.mark.parametrize("labels", [[101310.0, 101320.0], [20240101.0, 20240102.0]])
+def test_labels_of_many_digits_are_told_apart(labels):
+    report = pd.DataFrame({"BFT": [98.0, 97.0]}, index=labels)
+    assert readable_report(report).index.tolist() == [f"{v:.0f}" for v in labels]
+    column = readable_report(report.rename_axis("experiment").reset_index())
+    assert column["experiment"].tolist() == readable_report(report).index.tolist()
