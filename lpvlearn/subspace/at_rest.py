@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..systems.beginnings import Stands, first_inputs, stands
+from ..systems.beginnings import Stands, first_inputs, pulsed, stands
 from ..systems.modes import HARDLY_DECAYS, n_decays
 from .constants import ALIKE, CERTAIN, stands_by_chance
 from .criterion import PRICE
@@ -46,12 +46,23 @@ def from_rest(samples: Samples, free: LocalFit, like: LocalFit | None) -> AtRest
         asked = not like.evidence.free.initial_states
     if not asked or free.method == "pbsid" or not len(free.model.A):
         return None
-    stand, evidence = stands(pairs), free.evidence
+    stand = stands(pairs)
     if stand is None and said:  # where it is not to be seen
         stand = Stands(np.array([first_inputs(u) for u, _ in pairs]), False)
-    if stand is None:
-        return None
-    first, seen = stand
+    found = [
+        one
+        for how in (stand, pulsed(pairs))
+        if how is not None and (one := _at(how, samples, free)) is not None
+    ]
+    return min(
+        found, key=lambda one: one.fitted.evidence.one_step.criterion, default=None
+    )
+
+
+def _at(stand: Stands, samples: Samples, free: LocalFit) -> AtRest | None:
+    """The model of experiments that begin at such a stand, if as likely as `free`."""
+    (pairs, choices, _), (first, seen) = samples, stand
+    said, evidence = not choices.initial_states, free.evidence
     at_rest = samples.having(initial_states=False)
     if first.any():  # a level is that of the answer to these
         sure = said or choices.offset == "constant" or bool(evidence.free.n_trend)

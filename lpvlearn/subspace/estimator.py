@@ -180,7 +180,8 @@ class SubspaceLTI(
         inputs of zero, or, with constants (`offset`), at their first inputs where that
         is likelier. Where all experiments begin at a stand, as step tests do,
         "estimate" has them start at rest at their first inputs, unless likelihood
-        refutes it.
+        refutes it; and where they begin with an impact or a dose, at the inputs that
+        they come back to.
     detrend : {None, "constant", "linear"}, default=None
         Subtract its mean or straight line from every channel of every experiment
         beforehand. A mean is not where a system rests: what transients add to it stays
@@ -275,7 +276,8 @@ class SubspaceLTI(
         Mean of the inputs of every experiment, as of `initial_states_`. Of a plant
         whose slowest mode takes a tenth of the longest experiment, or does not decay:
         where the experiment begins nearest to rest. What they begin with, where the
-        experiments begin at a stand. Zero without `offset_` and `detrend`, and with
+        experiments begin at a stand (what they come back to, where that is with an
+        impact). Zero without `offset_` and `detrend`, and with
         ``initial_state="rest"``.
     output_offset_ : ndarray of shape (n_experiments, n_outputs)
         Where the outputs rest at these inputs: but for transients and drifts

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 _STANDING = 5  # samples in which inputs that move later stand still
 _STILL = 0.02  # part of their range that measured ones may move meanwhile
 _OFTEN = 10  # moves of inputs that are no step test's
+_BRIEF = 0.5  # part of the samples that inputs of pulses are away from their level
 _SELDOM = 4  # moves of inputs that are one, whatever they begin with
 _NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
 # Of outputs that move: part of what there is between two beginnings, and standard
@@ -117,6 +118,30 @@ def stands(records: Iterable[tuple[Array, Array]]) -> Stands | None:
         seen &= shown
         first.append(np.median(u[:n], axis=0))
     return Stands(np.array(first), seen)
+
+
+def pulsed(records: Iterable[tuple[Array, Array]]) -> Stands | None:
+    """How records (u, y) begin whose inputs stand at one level for most of them.
+
+    There before they begin, as before the impact, the kick or the dose with which some
+    begin, or soon go on. None where none does.
+
+    >>> u = np.repeat([[3.0], [2.0]], [2, 9], axis=0)
+    >>> pulsed([(u, u), (u[4:], u[4:])])
+    Stands(first=array([[2.],
+           [2.]]), seen=False)
+    >>> pulsed([(u[4:], u[4:])]), pulsed([(u.cumsum()[:, None], u)])
+    (None, None)
+    """
+    levels, soon = [], False
+    for u, _ in records:
+        level = np.median(u, axis=0)
+        away = (np.abs(u - level) > _STILL * np.ptp(u, axis=0)).any(axis=1)
+        if np.mean(away) > _BRIEF:
+            return None
+        soon |= bool(away[:_STANDING].any())
+        levels.append(level)
+    return Stands(np.array(levels), False) if soon else None
 
 
 def held_state(A: Array, B: Array, u: Array, *, discrete: bool) -> Array | None:

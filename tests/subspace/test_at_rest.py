@@ -253,3 +253,38 @@ def test_short_records_in_motion_are_not_held_where_some_stand_by_chance(seed):
     options = {"horizon": 6, "method": "po-moesp", "refine": "simulation"}
     model = SubspaceLTI(3, experiment="run", offset=None, **options)
     assert not model.fit(X, np.vstack(outputs)).steady_start_
+
+
+@pytest.mark.parametrize("level", [0.0, 5.0])
+@pytest.mark.parametrize("pause", [0, 2])
+@pytest.mark.parametrize("width", [1, 4])
+def test_records_begin_with_an_impact(width, pause, level):
+    """Free states would take its answer, of a resonance that rings for the record."""
+    A, B = np.array([[0.97, 0.2], [-0.2, 0.97]]), np.array([[0.0], [1.0]])
+    plant = StateSpace(A, B, [[1.0, 0.0]], None, 1.0)
+    rng, tables, outputs = np.random.default_rng(width), [], []
+    for run in range(3):
+        u = np.zeros((200, 1))
+        u[pause : pause + width] = rng.uniform(1.0, 2.0, (width, 1))
+        y = plant.simulate(u)
+        outputs.append(y + 0.02 * y.std() * rng.standard_normal(y.shape))
+        tables.append(pd.DataFrame({"run": run, "force": level + u[:, 0]}))
+    X, y = pd.concat(tables, ignore_index=True), np.vstack(outputs)
+    model = SubspaceLTI(experiment="run", sampling_time=1.0).fit(X, y)
+    assert model.order_ == 2 and not model.initial_states_.any()
+    assert not model.steady_start_
+    omega = np.linspace(0.01, 3.0, 200)
+    G, own = (m.frequency_response(omega) for m in (plant, model.lti_))
+    assert np.linalg.norm(own - G) < 0.02 * np.linalg.norm(G)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # the gain is poorly known
+def test_a_record_that_is_cut_within_an_impact_is_in_motion():
+    rng = np.random.default_rng(0)
+    u = np.zeros((700, 1))
+    u[[280, 300, 400, 450, 600]] = [[2.0], [1.0], [-1.0], [-2.0], [1.5]]
+    plant = StateSpace(0.95, 1.0, 1.0, None, 1.0)
+    y = plant.simulate(u) + 0.01 * rng.standard_normal(u.shape)
+    model = SubspaceLTI(1).fit(u[300:], y[300:])
+    assert model.initial_states_.any()
+    assert abs(model.lti_.poles().real.item() - 0.95) < 0.01
