@@ -18,7 +18,7 @@ _STANDING = 5  # samples in which inputs that move later stand still
 _STILL = 0.02  # part of their range that measured ones may move meanwhile
 _OFTEN = 10  # moves of inputs that are no step test's
 _BRIEF = 0.5  # part of the samples that inputs of pulses are away from their level
-_SELDOM = 4  # moves of inputs that are one, whatever they begin with
+_SELDOM = 4  # moves of inputs that are one, whatever they begin with; pulses of few
 _NEARER = 0.5  # of what there is between two beginnings: nearer to one beyond noise
 # Of outputs that move: part of what there is between two beginnings, and standard
 # deviations of the means of noise
@@ -121,7 +121,7 @@ def stands(records: Iterable[tuple[Array, Array]]) -> Stands | None:
 
 
 def pulsed(records: Iterable[tuple[Array, Array]]) -> Stands | None:
-    """How records (u, y) begin whose inputs stand at one level for most of them.
+    """How records (u, y) begin whose inputs stand at one level but for few pulses.
 
     There before they begin, as before the impact, the kick or the dose with which some
     begin, or soon go on. None where none does.
@@ -137,7 +137,8 @@ def pulsed(records: Iterable[tuple[Array, Array]]) -> Stands | None:
     for u, _ in records:
         level = np.median(u, axis=0)
         away = (np.abs(u - level) > _STILL * np.ptp(u, axis=0)).any(axis=1)
-        if np.mean(away) > _BRIEF:
+        n_pulses = np.count_nonzero(np.diff(away.astype(int), prepend=0) > 0)
+        if n_pulses > _SELDOM or np.mean(away) > _BRIEF:
             return None
         soon |= bool(away[:_STANDING].any())
         levels.append(level)
