@@ -17,7 +17,7 @@ from .left_out import inner_levels, inner_places, interpolated_without
 from .polynomial import PolynomialLPV, chebyshev_terms, resolvable_powers
 from .rational import RationalLPV
 from .spline import SplineLPV
-from .weighting import WeightedPoints, is_chance
+from .weighting import WeightedPoints, is_chance, noise_explains
 
 Array = NDArray[np.float64]
 
@@ -41,6 +41,10 @@ _SUPPORT = 10.0
 _FREE = 0.5
 _BETTER = 1.0 - 1e-6  # of the squared errors of points left out: no equals, to rounding
 _NOISE = 10.0  # standard deviations over which a parameter moves by more than noise
+
+# Chi-square of straight parameters whose bends one pole explains: of 540 random
+# parabolas, which meet three points whatever these are, none looked like a pole by it.
+_SURE = 1e3
 
 # Where no form is true: the first, or one of the others that meets points left out, so
 # many at least, with less than this share of its squared errors of most parameters.
@@ -152,12 +156,17 @@ class AutoLPV(Interpolator):
         price = 2.0 if self.criterion == "aic" else math.log(n)
         cost = chi2 / excess + price * (n - dof)
         if good.any():
-            supported = np.flatnonzero(good & (cost <= cost[good].min() + _SUPPORT))
+            near = good & (cost <= cost[good].min() + _SUPPORT)
+            supported = np.flatnonzero(near).tolist()
             # few points tell a parabola from a pole poorly: then it is the parabola
             bent = [not _is_parabola(form) for _, form in found]
-            chosen = int(min(supported, key=lambda k: (bent[k], -dof[k], cost[k])))
+            chosen = min(supported, key=lambda k: (bent[k], -dof[k], cost[k]))
             free = bent[chosen] and n - dof[chosen] > _FREE * n
             proven = not free
+            if dof[chosen] <= 0:  # it meets any points; a common pole would not
+                poles = [k for k in supported if _has_shown_pole(k, found, points)]
+                if poles:
+                    chosen, proven = min(poles, key=lambda k: cost[k]), True
         if not proven:
             name, curve = _interpolation(kappa, points)
             if good.any():
@@ -216,6 +225,27 @@ def _is_parabola(form: PolynomialLPV | RationalLPV) -> bool:
     return form.denominator == 0 and form.degree < _TENSOR
 
 
+def _has_shown_pole(
+    k: int, found: Sequence[tuple[str, Any]], points: WeightedPoints
+) -> bool:
+    """Whether one pole explains how several parameters bend, far beyond their noise."""
+    form = found[k][1]
+    if getattr(form, "denominator", 0) != 1 or not noise_explains(form):
+        return False
+    spare = np.count_nonzero(_moving(points)) * (len(points.theta) - form.rank_)
+    straight = next(f for name, f in found if name == f"polynomial {form.degree}")
+    return bool(spare >= len(form.denominator_) and straight.chi2_ > _SURE)
+
+
+def _moving(points: WeightedPoints) -> NDArray[np.bool_]:
+    """Which parameters move, by more than their noise where that is known."""
+    spread = np.ptp(points.theta, axis=0)
+    if points.whitening is None or points.covariance is None:
+        return spread > 0.0
+    variance = np.mean(np.diagonal(points.covariance, axis1=1, axis2=2), axis=0)
+    return np.asarray(spread > _NOISE * np.sqrt(variance))
+
+
 def _foresees(
     form: Any, curve: SplineLPV, kappa: Array, points: WeightedPoints
 ) -> bool:
@@ -261,10 +291,7 @@ def _errors_left_out(
     """
     theta, spread = points.theta, np.ptp(points.theta, axis=0)
     covariance = points.covariance if points.whitening is not None else None
-    moves = spread > 0.0
-    if covariance is not None:
-        variance = np.mean(np.diagonal(covariance, axis1=1, axis2=2), axis=0)
-        moves = spread > _NOISE * np.sqrt(variance)
+    moves = _moving(points)
     squares: list[Array] = []
     for out in (*inner_places(kappa), *inner_levels(kappa)):
         foreseen = [

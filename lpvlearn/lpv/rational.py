@@ -19,18 +19,20 @@ from ..systems.least_squares import levenberg_marquardt
 from ..validation import one_of, whole_number
 from .interpolator import Interpolator, carried_by_terms
 from .polynomial import chebyshev_terms, resolvable_powers
-from .weighting import WeightedPoints
+from .weighting import WeightedPoints, noise_explains
 
 Array = NDArray[np.float64]
 
 _TERMS = ("total", "tensor")
 
-# The denominator has no zero within the range widened by this share of it on either
-# side: a sweep overshoots the outermost of the points. The second where with the first
-# no function is plausible: the pole of a length, or a mass, is where that is zero.
-_MARGINS = 0.1, 0.02
+# The denominator has no zero within the range widened by the first share of it on
+# either side: a sweep overshoots the outermost of the points. Nor is it smaller there
+# than the second share of its largest value. The next pair where with those before no
+# function is plausible: the pole of a length, or a mass, is where that is zero, and
+# squares of lengths from one to twenty are small.
+_LIMITS = (0.1, 0.02), (0.02, 0.02), (0.02, 0.002)
 
-_LEAST = 0.02  # of the denominator's largest value there: smaller is as good as a zero
+_EXACT = 1e-6  # mean square in the spread of values that are the function's own
 
 # Places over that range where the denominator is looked at; of many variables, the
 # corners, and then the points alone.
@@ -94,8 +96,9 @@ class RationalLPV(Interpolator):
     this error itself.
 
     The denominator is positive, 0.02 of its largest value at least, within the range
-    of the points and a margin of 10 % of its width on either side, or of 2 % where no
-    such function is plausible by the covariances. Beyond there may be a pole.
+    of the points and a margin of 10 % of its width on either side. Where no such
+    function is plausible by the covariances, or without these meets the points, the
+    margin is 2 %, and at last 0.002 of its largest value. Beyond there may be a pole.
 
     References
     ----------
@@ -140,15 +143,24 @@ class RationalLPV(Interpolator):
                 break
         phi = self._terms(kappa, self.powers_)
         psi = self._terms(kappa, self.denominator_powers_)[:, 1:]
-        wide, narrow = (self._away_from_poles(kappa, margin) for margin in _MARGINS)
-        for places in (wide, narrow):
-            found = fit_rational(phi, psi, places, points)
+        limits = [self._limit(kappa, *limit) for limit in _LIMITS]
+        alike, plausible = points.unweighted(), None
+        for limit in limits:
+            found = fit_rational(phi, psi, limit, points)
             values = phi @ found.numerator / (1.0 + psi @ found.denominator)[:, None]
-            self._judge(points, values, found.rank * q + psi.shape[1])
-            if points.whitening is None or self.weighted_:
+            at = values, found.rank * q + psi.shape[1]
+            self._judge(points, *at)
+            exact = alike.misfit(values) <= _EXACT * values.size
+            if noise_explains(self) or points.whitening is None and exact:
                 break
+            if self.weighted_ and plausible is None:
+                plausible = found, at
         else:
-            found = fit_rational(phi, psi, wide, points.unweighted())
+            if plausible is None:
+                found = fit_rational(phi, psi, limits[0], alike)
+            else:
+                found, at = plausible
+                self._judge(points, *at)
         self.numerator_, self.rank_ = found.numerator, found.rank
         self.denominator_ = np.concatenate([[1.0], found.denominator])
 
@@ -162,20 +174,19 @@ class RationalLPV(Interpolator):
 
     def _set(self, coefficients: Array) -> None:
         numerator, d = np.split(coefficients, [self.numerator_.size])
-        places = self._away_from_poles(self.scheduling_range_, _MARGINS[1])
-        if not _is_allowed(places, d):
+        if not self._limit(self.scheduling_range_, *_LIMITS[-1]).allows(d):
             raise ValueError(
                 "`coefficients` must keep the denominator positive within the range "
-                f"of the points, {_LEAST:g} of its largest value at least. Got "
+                f"of the points, {_LIMITS[-1][1]:g} of its largest value at least. Got "
                 f"{d.tolist()} beside its constant 1."
             )
         self.numerator_ = numerator.reshape(self.numerator_.shape)
         self.denominator_ = np.concatenate([[1.0], d])
 
-    def _away_from_poles(self, kappa: Array, margin: float) -> Array:
-        """Terms of the denominator but for its constant where that must not vanish."""
+    def _limit(self, kappa: Array, margin: float, least: float) -> _Limit:
+        """Where the denominator must not vanish, and how small it may be there."""
         places = _places(self.scheduling_range_, kappa, margin)
-        return self._terms(places, self.denominator_powers_)[:, 1:]
+        return _Limit(self._terms(places, self.denominator_powers_)[:, 1:], least)
 
     def _carried(self, outer: Array, kappa: Array) -> Array:
         psi = self._terms(kappa, self.denominator_powers_)
@@ -203,16 +214,27 @@ class Rational(NamedTuple):
     rank: int  # of the terms of a numerator
 
 
+class _Limit(NamedTuple):
+    """What a denominator must keep."""
+
+    places: Array  # (n_places, n_denominator_terms - 1): its terms but for its constant
+    least: float  # of its largest value at all of these
+
+    def allows(self, d: Array) -> bool:
+        """Whether a denominator, without its constant 1, stays so large."""
+        below = 1.0 + self.places @ d
+        return bool(below.min() >= self.least * below.max())  # False of NaN
+
+
 def fit_rational(
-    phi: Array, psi: Array, places: Array, points: WeightedPoints
+    phi: Array, psi: Array, limit: _Limit, points: WeightedPoints
 ) -> Rational:
     """The least misfit among functions without a pole.
 
-    Terms of the numerators (n_points, n_terms), of the denominator but for its
-    constant (n_points, n_denominator_terms - 1), and these at places where it must
-    stay positive.
+    Terms of the numerators (n_points, n_terms), and of the denominator but for its
+    constant (n_points, n_denominator_terms - 1), which keeps a limit.
     """
-    d = _Search(orth(phi), psi, places, points).least()
+    d = _Search(orth(phi), psi, limit, points).least()
     numerator, rank = points.coefficients(phi / (1.0 + psi @ d)[:, None])
     return Rational(numerator, d, rank)
 
@@ -229,7 +251,7 @@ class _Search(NamedTuple):
 
     phi: Array  # independent terms of the numerators
     psi: Array
-    places: Array
+    limit: _Limit
     points: WeightedPoints
 
     def starts(self) -> Iterator[Array]:
@@ -237,7 +259,7 @@ class _Search(NamedTuple):
         yield np.zeros(self.psi.shape[1])
         if self.psi.shape[1]:
             guess = self._sanathanan_koerner()
-            if _is_allowed(self.places, guess):
+            if self.limit.allows(guess):
                 yield guess
 
     def _sanathanan_koerner(self) -> Array:
@@ -285,9 +307,7 @@ class _Search(NamedTuple):
         def residuals(trial: Array, rows: NDArray[np.intp]) -> tuple[Array, Any]:
             none = np.full(self.points.theta.size, np.inf)
             refused = _State(none, np.zeros((len(none), len(trial[0]))))
-            states = [
-                self._at(d) if _is_allowed(self.places, d) else refused for d in trial
-            ]
+            states = [self._at(d) if self.limit.allows(d) else refused for d in trial]
             errors = np.array([state.errors for state in states])
             return errors, lambda kept: np.array([states[k].slopes for k in kept])
 
@@ -296,12 +316,6 @@ class _Search(NamedTuple):
             residuals, starts, max_iter=_MAX_ITERATIONS, tol=_SAME, patience=1
         )
         return found.x[np.argmin(found.cost)]
-
-
-def _is_allowed(places: Array, d: Array) -> bool:
-    """Whether a denominator stays positive at places, by its terms there."""
-    below = 1.0 + places @ d
-    return bool(below.min() >= _LEAST * below.max())  # False of NaN
 
 
 def _places(scheduling_range: Array, kappa: Array, margin: float) -> Array:

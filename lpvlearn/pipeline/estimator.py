@@ -631,8 +631,7 @@ list, default=None
             form = getattr(self.interpolator_, "best_estimator_", None)
             if form is not None:
                 tell_of_two_points(self.structured_models_, kappa, longest)
-            unknown = getattr(restructurer, "structure", None) is None and not moving
-            saturated = unknown and getattr(form, "degrees_of_freedom_", 1) <= 0
+            saturated = not moving and getattr(form, "degrees_of_freedom_", 1) <= 0
             if isinstance(form, SplineLPV) or (saturated and len(kappa) > 2):
                 tell_unforeseen(
                     self.lpv_,

@@ -160,3 +160,19 @@ def test_points_of_one_place_are_one_place_to_the_denominator(denominator):
     assert np.allclose(form.predict([[0.0], [1.0]]), [1.0, 2.0])
     auto = AutoLPV().fit(kappa, values, covariance=np.full(6, 0.01))
     assert np.allclose(auto.predict([[0.5]]), 1.5)
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("longest", [3.0, 7.0, 12.0])
+def test_squares_of_lengths_over_a_wide_range_are_found(longest, known):
+    """A crane's rope: the denominator is small where it is short."""
+    length = np.geomspace(0.8, longest, 6)[:, None]
+    between = np.sqrt(length[1:] * length[:-1])
+
+    def truth(length):
+        return np.hstack([9.81 / length, 0.3 / length**2, 1.0 / length])
+
+    P = np.array([np.diag((1e-4 * row) ** 2) for row in truth(length)])
+    model = RationalLPV(1, 2)
+    model.fit(length, truth(length), covariance=P if known else None)
+    np.testing.assert_allclose(model.predict(between), truth(between), rtol=1e-3)
