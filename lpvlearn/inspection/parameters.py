@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
 from ..data.experiments import as_numbers
+from ..models.scheduling_range import domains
 from .drawing import (
     axes_grid,
     by_name,
@@ -358,8 +359,11 @@ class ParameterDisplay:
 
     def _draw_maps(self, _: float) -> None:
         """The interpolation as a map, points as dots and rings in its colours."""
-        sides = [np.linspace(low, high, _N_MAP) for low, high in _limits(self.kappa)]
-        grid = np.stack(np.meshgrid(*sides), axis=-1)
+        ends = np.array([self.kappa.min(axis=0), self.kappa.max(axis=0)])
+        low, high = domains(ends)
+        sides = np.linspace(low, high, _N_MAP)
+        inside = np.clip(sides, *ends)  # none is beyond a constant one
+        grid = np.stack(np.meshgrid(*inside.T), axis=-1)
         shown = next(iter(self.interpolators), None)
         surface = None
         if shown is not None:
@@ -372,7 +376,7 @@ class ParameterDisplay:
             colours = colour_scale(np.concatenate(values))
             if surface is not None:
                 drawn = one.pcolormesh(
-                    *sides,
+                    *sides.T,
                     surface[..., column],
                     shading="nearest",
                     rasterized=True,
@@ -466,12 +470,6 @@ class ParameterDisplay:
         # Else the axis magnifies rounding errors of a constant.
         if high - low < _CONSTANT * size:
             ax.set_ylim(low - 0.1 * size, high + 0.1 * size)
-
-
-def _limits(kappa: Array) -> Array:
-    """Lowest and highest value of each variable, a little apart where they agree."""
-    low, high = kappa.min(axis=0), kappa.max(axis=0)
-    return np.column_stack([low, np.where(high > low, high, low + 1.0)])
 
 
 def _check_can(argument: str, named: Mapping[str, Any], method: str) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..data.experiments import as_numbers
 from ..models.frequencies import frequency_axis
+from ..models.scheduling_range import grid_over
 from ..models.statespace import StateSpace
 from .drawing import (
     ACCENT,
@@ -146,11 +147,9 @@ class UncertaintyDisplay:
         n = points.shape[1]
         if lpv.covariance is not None and n <= 2:
             size = _N_CURVE if n == 1 else _N_MAP
-            axes = [
-                np.linspace(low, high, size) for low, high in lpv.scheduling_range.T
-            ]
-            grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, n)
-            std = [_deviation(lpv, place, omega) for place in grid]
+            grid = grid_over(lpv.scheduling_range, size)
+            inside = np.clip(grid, *lpv.scheduling_range)  # none beyond a constant one
+            std = [_deviation(lpv, place, omega) for place in inside]
             known = {"grid": grid, "std": std}
         labels = scheduling_labels(pipeline, n, units)
         return cls(points, error, **known, scheduling_label=labels).plot(ax)

@@ -15,11 +15,11 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from ..exceptions import VersionedPickle, warn
+from ..models.scheduling_range import domains
 from ..models.statespace import StateSpace
 from ..models.system_matrix import blocks
 from ..structures.structure import GrayBoxStructure
 from ..validation import flag, place
-from .interpolator import domains
 from .polynomial import PolynomialLPV, conversion_to
 from .rational import RationalLPV
 

@@ -32,8 +32,6 @@ _EXTRAPOLATIONS = ("ignore", "warn", "clip", "error")
 
 _POINTS = "be a table of finite numbers, shape (n_points, n_scheduling)"
 
-_CLOSE = 1e-8  # of a number: half the least interval about it that digits resolve well
-
 
 class Interpolator(
     VersionedPickle, MultiOutputMixin, RegressorMixin, BaseEstimator, ABC
@@ -370,26 +368,3 @@ def carried_by_terms(outer: Array, terms: Array) -> Array:
     each = terms[:, :, None] if terms.ndim == 2 else terms
     carried = outer[:, :, None, :] * each[:, None]
     return carried.reshape(*outer.shape[:2], each.shape[1] * outer.shape[2])
-
-
-def domains(scheduling_range: Array) -> Array:
-    """Ends (2, n_scheduling) of the intervals; of width 2 around a constant one.
-
-    Where that is none besides so large a number, of a larger one.
-    """
-    low, high = scheduling_range
-    half = np.where(low == high, np.maximum(1.0, _CLOSE * np.abs(low)), 0.0)
-    return np.array([low - half, high + half])
-
-
-def grid_over(scheduling_range: Array, levels: int) -> Array:
-    """All combinations of levels of the variables, (levels^n_scheduling, n)."""
-    low, high = domains(scheduling_range)
-    axes = [np.linspace(a, b, levels) for a, b in zip(low, high, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-
-
-def to_unit(kappa: Array, scheduling_range: Array) -> Array:
-    """Scheduling values mapped linearly from their range to [-1, 1]."""
-    low, high = domains(scheduling_range)
-    return (2 * kappa - (low + high)) / (high - low)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..exceptions import DivergenceError, VersionedPickle, finite_simulation
+from ..models.scheduling_range import domains
 from ..models.statespace import StateSpace, sorted_poles, split_delay
 from ..models.system_matrix import blocks
 from ..structures.map import numerical_jacobian
@@ -45,7 +46,6 @@ from ..validation import (
 from .coefficients import MatrixCoefficients, matrix_coefficients
 from .export import Grid, as_dataset, control_models, write_mat
 from .extrapolation import warn_extrapolation
-from .interpolator import domains
 from .lfr import LinearFractionalModel, linear_fractional
 from .weighting import covariance_factor
 

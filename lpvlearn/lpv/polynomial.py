@@ -10,8 +10,9 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 
 from ..exceptions import RankWarning, warn
+from ..models.scheduling_range import domains, to_unit
 from ..validation import one_of, whole_number
-from .interpolator import Interpolator, carried_by_terms, domains, to_unit
+from .interpolator import Interpolator, carried_by_terms
 from .weighting import WeightedPoints
 
 Array = NDArray[np.float64]

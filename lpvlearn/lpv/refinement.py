@@ -18,9 +18,9 @@ from joblib import delayed as later
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from ..models.scheduling_range import grid_over
 from ..systems.least_squares import RCOND, column_scale, levenberg_marquardt
 from ..systems.simulation import estimate_initial_state
-from .interpolator import grid_over
 from .model import LPVStateSpace
 from .polynomial import PolynomialLPV
 from .sensitivity import coefficients_of, output_slopes, with_coefficients

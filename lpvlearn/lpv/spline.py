@@ -14,8 +14,9 @@ from scipy.interpolate import (
     make_interp_spline,
 )
 
+from ..models.scheduling_range import to_unit
 from ..validation import one_of
-from .interpolator import Interpolator, carried_by_terms, to_unit
+from .interpolator import Interpolator, carried_by_terms
 from .weighting import WeightedPoints
 
 Array = NDArray[np.float64]

@@ -32,7 +32,7 @@ from ..data.timestamps import TIME_TOL
 from ..exceptions import all_or_nothing, collected
 from ..lpv.auto import AutoLPV
 from ..lpv.bands import left_out_errors
-from ..lpv.interpolator import Interpolator, grid_over
+from ..lpv.interpolator import Interpolator
 from ..lpv.model import LPVStateSpace
 from ..lpv.polynomial import PolynomialLPV
 from ..lpv.refinement import (
@@ -49,6 +49,7 @@ from ..lpv.refinement import (
 )
 from ..lpv.weighting import covariance_of
 from ..metrics.scores import best_fit
+from ..models.scheduling_range import grid_over
 from ..restructuring.estimator import GrayBoxRestructurer
 from ..structures.structure import GrayBoxStructure
 from ..subspace.estimator import SubspaceLTI

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from ..data.operating_points import neighbours
 from ..exceptions import warn
-from ..lpv.interpolator import Interpolator, grid_over
+from ..lpv.interpolator import Interpolator
 from ..lpv.model import LPVStateSpace
+from ..models.scheduling_range import grid_over
 from ..structures.structure import GrayBoxStructure
 from ..validation import number_shown
 

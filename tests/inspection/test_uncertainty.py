@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from lpvlearn.inspection import UncertaintyDisplay
+from lpvlearn import (
+    GrayBoxRestructurer,
+    LocalLPVPipeline,
+    PolynomialLPV,
+    SubspaceLTI,
+)
+from lpvlearn.inspection import ParameterDisplay, UncertaintyDisplay
 
-from .conftest import KAPPA
+from .conftest import KAPPA, SPRING
 
 
 def test_the_line_is_two_deviations_of_the_response_and_points_are_distances(noisy):
@@ -48,6 +54,28 @@ def test_two_variables_make_a_map():
     assert_allclose(drawn.T.ravel(), 200 * std)
     assert_allclose(display.points_.get_array(), [2.0, 3.0])
     assert (display.ax_.get_xlabel(), display.ax_.get_ylabel()) == ("a", "b")
+
+
+def test_maps_give_a_constant_variable_a_width_and_do_not_leave_its_value(tables):
+    X, y = tables
+    fitted = LocalLPVPipeline(
+        SubspaceLTI(order=2, horizon=8),
+        GrayBoxRestructurer(SPRING),
+        PolynomialLPV(2, extrapolation="error"),
+        inputs="u",
+        scheduling=["kappa", "load"],
+        experiment="run",
+        time="time",
+    ).fit(X.assign(load=7.0), y + np.random.default_rng(1).normal(size=y.shape))
+    uncertain = UncertaintyDisplay.from_estimator(fitted)
+    ends = uncertain.grid.min(axis=0), uncertain.grid.max(axis=0)
+    assert_allclose(ends, [[KAPPA[0], 6.0], [KAPPA[-1], 8.0]])
+    shown = ParameterDisplay.from_estimator(fitted)
+    (maps,) = shown.curves_.values()
+    for drawn in (uncertain.curve_, *maps):
+        values = drawn.get_array()
+        assert_allclose(values, np.broadcast_to(values[0], values.shape))
+        assert np.ptp(values) > 0.0
 
 
 def test_uncertainty_errors_teach(pipeline):
